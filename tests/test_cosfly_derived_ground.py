@@ -16,7 +16,7 @@ from cosfly.maps.derived_ground import CREDITS, NEAR_M, PAVEMENT_M, with_derived
 from cosfly.maps.stage import MapsConfig, load_map, run
 from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
-from cosfly.render.draping import drape, is_draped
+from cosfly.render.surfaces import drape, is_draped
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig, simplify
 

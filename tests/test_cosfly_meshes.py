@@ -29,8 +29,8 @@ from cosfly.render.contract import (
     plane_z_m,
     scene_origin,
 )
-from cosfly.render.solids import solids_of
 from cosfly.render.stage import RENDERERS, open_renderer
+from cosfly.render.surfaces import solids_of
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import InputError
 from cosfly.simplify.passes import SimplifyConfig, simplify

@@ -68,7 +68,7 @@ def test_four_pictures_of_a_frame(trees, tmp_path):
 
 @needs_gl
 def test_without_boxes_there_is_one_clear_error(trees, tmp_path):
-    with pytest.raises(InputError, match=r"without debug\.png.*--map.*render\.debug=true"):
+    with pytest.raises(InputError, match=r"has no debug\.png.*--map.*render\.debug=true"):
         four_panels(trees[False], tmp_path / "a.png")
     with pytest.raises(InputError):
         four_panels(trees[True], tmp_path / "a.png", frame="../../elsewhere")

@@ -33,9 +33,10 @@ from cosfly.render.contract import (
     instance_ids,
     other_id,
 )
+from cosfly.render.figure import figure_of
 from cosfly.render.gl import meshes as unit_meshes
-from cosfly.render.gl.figure import make_body
-from cosfly.render.person import cast_of, choose_clothes, draw_appearance
+from cosfly.render.gl.movers import figure_parts
+from cosfly.render.person import choose_clothes, draw_appearance, dress_bystanders
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import make_track_script, open_renderer, run
@@ -96,27 +97,28 @@ def test_boxes_leave_the_ids_of_others_free():
 @settings(max_examples=100)
 def test_the_figure_stands_on_the_ground_within_the_targets_box(heading, phase, swing, x, z, seed):
     hip = np.array([x, 3.0, z + 0.9])
-    body = make_body(PosedPerson(hip, heading, phase, swing, choose_clothes(np.random.default_rng(seed))))
+    figure = figure_of(PosedPerson(hip, heading, phase, swing, choose_clothes(np.random.default_rng(seed))))
+    records, mesh = figure_parts(figure, PERSON_ID, hip)
     points = []
-    for k in range(len(body.mesh)):
-        local = ALL_MESHES[body.mesh[k]].vertices[:, :3] * body.records["half"][k]
-        q = body.records["quaternion"][k].astype(float)
-        points.append(local + 2.0 * np.cross(q[:3], np.cross(q[:3], local) + q[3] * local) + body.centers_m[k])
+    for k in range(len(mesh)):
+        local = ALL_MESHES[mesh[k]].vertices[:, :3] * records["half"][k]
+        q = records["quaternion"][k].astype(float)
+        points.append(local + 2.0 * np.cross(q[:3], np.cross(q[:3], local) + q[3] * local) + figure.centers_m[k])
     offset = np.vstack(points) - hip
     assert np.abs(np.hypot(offset[:, 0], offset[:, 1])).max() < np.hypot(*PERSON_HALF_EXTENTS_M[:2]) + 0.003
     assert -0.96 < offset[:, 2].min() < -0.86, "a foot stands on the ground"
     assert 0.78 < offset[:, 2].max() < 0.93, "the head ends at 1.8 m, a woman's at 1.73"
-    ends = body.bones_m - hip
-    assert (np.hypot(ends[..., 0], ends[..., 1]) + body.bone_radii_m[:, None]).max() < 0.48, "and its shadow with it"
-    assert ((body.records["tag"] >> 16) == PERSON_ID).all()
-    assert ((body.records["tag"] & 0xFF) == KINDS["Pedestrians"]).all()
+    ends = figure.bones_m - hip
+    assert (np.hypot(ends[..., 0], ends[..., 1]) + figure.bone_radii_m[:, None]).max() < 0.48, "and its shadow with it"
+    assert ((records["tag"] >> 16) == PERSON_ID).all()
+    assert ((records["tag"] & 0xFF) == KINDS["Pedestrians"]).all()
 
 
 def test_look_alikes_differ_from_the_target_in_one_thing_and_nobody_looks_just_like_it():
     target = draw_appearance(np.random.default_rng(1))
     stands = Bystander("Pedestrians", np.zeros((2, 3)), np.zeros(2))
     others = [Bystander("Car", np.zeros((2, 3)), np.zeros(2)), replace(stands, is_look_alike=True), stands] * 20
-    people = cast_of(others, np.arange(2) * 0.5, target, np.random.default_rng(0)).people(target)
+    people = dress_bystanders(others, np.arange(2) * 0.5, target, np.random.default_rng(0)).people(target)
     assert list(people.others) == [other_id(number) for number in range(60) if number % 3]
     different = np.array([len(target.differences(looks)) for looks in people.others.values()])
     assert (different[::2] == 1).all()
@@ -171,8 +173,8 @@ def test_rendered_visibility_by_hand():
     half[:, :160] = 5.0
     assert rendered_visibility(blank_frame(half), hip, view, pose, CAMERA)[0] == pytest.approx(0.5, abs=0.03)
     drawn = blank_frame(half)
-    drawn.ids[90, 161:164] = PERSON_ID
-    assert rendered_visibility(drawn, hip, view, pose, CAMERA)[1] == 3
+    drawn.ids[:, :160] = PERSON_ID
+    assert rendered_visibility(drawn, hip, view, pose, CAMERA) == (1.0, 0.0, 0.0), "it does not hide itself"
 
 
 # --- perturbation -----------------------------------------------------------------------------------------------------

@@ -19,8 +19,9 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import read_paths
 from cosfly.formats.roi import read_roi
 from cosfly.geometry.grid import roi_mask
-from cosfly.pedestrians.roi_editor import Server, open_editor
+from cosfly.pedestrians.roi_editor import open_editor
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
+from cosfly.viz.page_server import PageServer
 
 CFG = PedestriansConfig(num_paths=2, min_distance_m=20, max_distance_m=40, min_component_cells=50)
 SQUARE = [[10, 10], [90, 10], [90, 70], [10, 70]]
@@ -42,7 +43,7 @@ def map_file(tmp_path) -> Path:
 
 
 @contextlib.contextmanager
-def serving(map_file: Path, roi: Path, **more: object) -> Iterator[Server]:
+def serving(map_file: Path, roi: Path, **more: object) -> Iterator[PageServer]:
     server = open_editor(map_file, CFG, roi, 0, more.get("backdrop"))
     thread = threading.Thread(target=server.serve)
     thread.start()
@@ -53,7 +54,7 @@ def serving(map_file: Path, roi: Path, **more: object) -> Iterator[Server]:
         thread.join()
 
 
-def ready(page: Page, server: Server) -> None:
+def ready(page: Page, server: PageServer) -> None:
     page.open(server.address)
     page.wait("document.body.dataset.ready === 'yes'")
 
@@ -121,7 +122,7 @@ def test_a_polygon_with_a_hole_is_drawn_saved_and_walked_in(map_file, tmp_path):
         assert ground.is_in_roi[y, x].all()
 
 
-def asked(server: Server, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, bytes]:
+def asked(server: PageServer, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, bytes]:
     connection = http.client.HTTPConnection(server.host, timeout=20)
     own = {"Origin": f"http://{server.host}"} | headers
     connection.request(method, path, body, own)

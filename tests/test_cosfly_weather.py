@@ -89,7 +89,7 @@ def test_fixed_takes_the_named_presets():
         assert weather_of(cfg, read_pools(cfg), 3).model_dump() == wanted
 
 
-def test_pools_that_cannot_be_are_one_error_with_all_problems(tmp_path):
+def test_a_bad_pool_is_one_error_with_all_its_problems(tmp_path):
     sky, tod = tmp_path / "sky.yaml", tmp_path / "tod.yaml"
     rest = "precipitation: 0, fog_density: 0, fog_distance: 9}"
     many = ["a.cloudiness", "presets.a.precipitation", "finite", "a.fog_density", "a.fog_distance", "4 to fix"]
@@ -102,7 +102,7 @@ def test_pools_that_cannot_be_are_one_error_with_all_problems(tmp_path):
         ("presets: {}", ["presets"]),
         ("{}", ["presets"]),
         ("presets: [1]", ["presets"]),
-        (f"presets: {{a b: &x {{cloudiness: 1, {rest}, a_b: *x}}", ["two presets have one name"]),
+        (f"presets: {{a b: &x {{cloudiness: 1, {rest}, a_b: *x}}", ["two presets have the same name"]),
         ("!!python/object:os.system {}", ["tag"]),
     ):
         sky.write_text(text)
@@ -110,9 +110,11 @@ def test_pools_that_cannot_be_are_one_error_with_all_problems(tmp_path):
             read_pools(config(**RANDOM, weather_pool=str(sky)))
         assert [word for word in [*words, "sky.yaml"] if word not in str(caught.value)] == []
     tod.write_text("presets: {late: {sun_altitude_angle: 91, sun_azimuth_angle: 360}}")
-    with pytest.raises(ConfigError) as caught:  # problems of both pools together
-        read_pools(config(**RANDOM, weather_pool=str(tmp_path / "none.yaml"), tod_pool=str(tod)))
-    assert all(word in str(caught.value) for word in ("none.yaml", "sun_altitude_angle", "sun_azimuth_angle"))
+    with pytest.raises(ConfigError) as caught:
+        read_pools(config(**RANDOM, tod_pool=str(tod)))
+    assert all(word in str(caught.value) for word in ("tod.yaml", "sun_altitude_angle", "sun_azimuth_angle"))
+    with pytest.raises(ConfigError, match=r"none\.yaml"):
+        read_pools(config(**RANDOM, weather_pool=str(tmp_path / "none.yaml")))
 
 
 # --- light and fog in numbers -----------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""cosfly/render/lens.py: levels of zoom, changes between them, and who reads the camera of a frame; what cannot be
+"""cosfly/render/camera.py: levels of zoom, changes between them, and who reads the camera of a frame; what cannot be
 drawn."""
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cosfly.formats.playback import read_track, write_track
 from cosfly.formats.segments import Segment
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.tracks import find_tracks
-from cosfly.render.lens import ZoomConfig, zoomed_deg
+from cosfly.render.camera import ZoomConfig, zoomed_deg
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
 from cosfly.runtime.config import build

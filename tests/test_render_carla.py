@@ -33,7 +33,7 @@ from cosfly.simulators.conventions import DEPTH_STEP_M
 pytest.importorskip("carla")
 FRAMES = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0], "town": "Street", "first_timestamp": 1776000000}
 CLEAN = {**FRAMES, "tracks": ["clean"]}
-QUICK = {"timeout_s": 20.0, "picture_s": 5.0}
+QUICK = {"timeout_s": 15.0}
 
 
 def on_the_wire(trace: DroneTrace) -> DroneTrace:
@@ -163,7 +163,7 @@ def test_lost_late_double_and_disordered_pictures_change_nothing(tmp_path):
         "faulty": ("drop:depth@5", "duplicate@7", "reorder:rgb@9", "delay:instance@11=7"),
     }.items():
         with serving(street(), tmp_path / name, *faults) as port:
-            trees.append(run(config(port, picture_s=2.0), *inputs, tmp_path / f"tree_{name}", workers=1))
+            trees.append(run(config(port, timeout_s=6.0), *inputs, tmp_path / f"tree_{name}", workers=1))
     assert files_of(trees[0]) == files_of(trees[1])
 
 
@@ -171,7 +171,7 @@ def test_lost_late_double_and_disordered_pictures_change_nothing(tmp_path):
 def test_a_silent_sensor_fails_the_flight_with_its_name_and_keeps_the_finished_ones(tmp_path):
     inputs = flown(tmp_path / "in", 3, 4)
     with serving(street(), tmp_path / "town", "drop:depth@9+") as port:
-        tree = run(config(port, picture_s=1.5, retries=1), *inputs, tmp_path / "tree", workers=1)
+        tree = run(config(port, timeout_s=4.5), *inputs, tmp_path / "tree", workers=1)
     failures = [json.loads(line) for line in (tree / "failures.jsonl").read_text().splitlines()]
     assert len(failures) == 2
     for failure in failures:

@@ -185,7 +185,7 @@ def test_a_server_that_ends_is_named_and_the_run_goes_on_with_the_next(fault, to
         serving(street(), tmp_path / "town", fault, protocol="unrealcv") as port,
         pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port} \(UnrealCV.*{told}"),
     ):
-        run(config(port, timeout_s=2.0, retries=1), *given, tmp_path / "tree", workers=1)
+        run(config(port, timeout_s=2.0), *given, tmp_path / "tree", workers=1)
     assert len(find_tracks(tmp_path / "tree")) == 1
     kept = files_of(tmp_path / "tree")
     with serving(street(), tmp_path / "town", protocol="unrealcv") as port:
@@ -218,5 +218,5 @@ def test_the_papers_options(tmp_path):
 
     with Image.open(tmp_path / "render/look.gif") as gif:
         assert (gif.n_frames, gif.info["duration"]) == (3, 120)
-    assert "render.path_index: no such flight; got 7; expected below 2" in str(other.exception)
+    assert "render.path_index: no trajectory has this index; got 7; expected an index below 2" in str(other.exception)
     assert not (tmp_path / "other").exists()

@@ -36,7 +36,7 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import box_corners, intrinsic_matrix, look_at, project, rotation_matrices, world_from_camera
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run as inspect_tree
-from cosfly.render.camera import hidden_shares, rendered_visibility, view_target
+from cosfly.render.camera import rendered_visibility, view_target
 from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.contract import (
     FAR_M,
@@ -52,10 +52,10 @@ from cosfly.render.contract import (
     other_id,
     plane_z_m,
 )
-from cosfly.render.draping import layers_of
 from cosfly.render.person import choose_clothes
-from cosfly.render.settings import ENGINES, RenderConfig
+from cosfly.render.settings import SIMULATORS, RenderConfig
 from cosfly.render.stage import RENDERERS, open_renderer, run
+from cosfly.render.surfaces import layers_of
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import EnvironmentMissing, RenderError
 from cosfly.viz.frame_views import PEDESTRIAN_RGB, read_view
@@ -159,7 +159,7 @@ def away_from_silhouettes(depth: np.ndarray, ids: np.ndarray) -> np.ndarray:
 
 # The second renderer is an extra, and draws slowly; engines need a server, of one town (tests/test_render_carla.py),
 # and ids of objects of its own (tests/test_render_unrealcv.py).
-EMBEDDED = sorted(RENDERERS.keys() - set(ENGINES))
+EMBEDDED = sorted(RENDERERS.keys() - set(SIMULATORS))
 NAMES = [pytest.param(name, marks=pytest.mark.slow if name == "pyrender" else ()) for name in EMBEDDED]
 
 
@@ -360,12 +360,11 @@ def test_the_person_is_drawn_in_the_projected_box(renderer):
     assert rows.min() >= y0 - 2
     assert rows.max() <= y1 + 2
     assert rows.max() - rows.min() > 0.7 * (y1 - y0)
-    score, num_px = rendered_visibility(frame, HIP, view, pose, camera)
-    assert score > 0.98
-    assert num_px == person.sum()
+    assert rendered_visibility(frame, HIP, view, pose, camera)[0] > 0.98
     behind = pose_towards((10.0, 40.0, 3.0), HIP)  # a house in between
     hidden = renderer.render(behind, camera.intrinsic, walker)
-    assert rendered_visibility(hidden, HIP, view_target(HIP, behind, camera), behind, camera) == (0.0, 0)
+    assert rendered_visibility(hidden, HIP, view_target(HIP, behind, camera), behind, camera) == (0.0, 0.0, 1.0)
+    assert not (hidden.ids == PERSON_ID).any()
 
 
 def test_a_person_under_a_tree_is_seen_from_the_side_and_hidden_from_above(renderer_name):
@@ -380,7 +379,8 @@ def test_a_person_under_a_tree_is_seen_from_the_side_and_hidden_from_above(rende
     for name, eye in {"side": (0.0, -12.0, 1.2), "above": (0.0, -1.0, 15.0), "through": (-14.0, 0.0, 0.9)}.items():
         pose = pose_towards(eye, hip)
         frame = renderer.render(pose, camera.intrinsic, walker)
-        seen[name] = rendered_visibility(frame, hip, view_target(hip, pose, camera), pose, camera)
+        score = rendered_visibility(frame, hip, view_target(hip, pose, camera), pose, camera)[0]
+        seen[name] = score, int(np.count_nonzero(frame.ids == PERSON_ID))
         assert set(np.unique(frame.ids)) >= {1, 2}
     renderer.close()
     assert seen["side"][0] > 0.98
@@ -589,8 +589,7 @@ def test_who_stands_before_the_target_hides_it_and_is_told_from_the_map(renderer
     shares = []
     for others in ((), (before,)):
         frame = renderer.render(pose, camera.intrinsic, walker, others)
-        score, _ = rendered_visibility(frame, HIP, view, pose, camera)
-        by_others, by_map = hidden_shares(frame, HIP, view, pose, camera, ids)
+        score, by_others, by_map = rendered_visibility(frame, HIP, view, pose, camera, ids)
         assert score + by_others + by_map == pytest.approx(1.0), "all of the box lies in the image"
         shares.append((score, by_others, by_map))
     assert shares[0][0] > 0.98
@@ -599,7 +598,8 @@ def test_who_stands_before_the_target_hides_it_and_is_told_from_the_map(renderer
     assert shares[1][2] == shares[0][2]
     behind = pose_towards((10.0, 40.0, 3.0), HIP)  # a house in between
     frame = renderer.render(behind, camera.intrinsic, walker, (before,))
-    assert hidden_shares(frame, HIP, view_target(HIP, behind, camera), behind, camera, ids) == (0.0, 1.0)
+    view = view_target(HIP, behind, camera)
+    assert rendered_visibility(frame, HIP, view, behind, camera, ids) == (0.0, 0.0, 1.0)
 
 
 def test_nobody_else_has_the_ids_of_others(renderer_name):

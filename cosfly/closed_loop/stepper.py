@@ -146,7 +146,7 @@ class ClosedLoopTrajectory:
     def _begin(self) -> None:
         planned, last = self.planned, self.num_lead - 1
         flown = Poses(planned.positions_m, planned.rotations_deg, planned.targets_m, planned.clearances_m)
-        self.script = replace(self.script, perturbed=PerturbedTrack.nothing(flown))  # which copies it
+        self.script = replace(self.script, perturbed=PerturbedTrack.unperturbed(flown))  # which copies it
         self.poses = self.script.perturbed.poses  # written as it is flown; what lies ahead is still the plan
         self.index, self._unseen_s = last, 0.0
         self.ended: Ended | None = None

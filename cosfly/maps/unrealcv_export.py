@@ -23,7 +23,7 @@ from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.maps.simworld import read_sizes
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import write_json
-from cosfly.simulators.assets import asset_of, id_of, is_nothing, kind_of
+from cosfly.simulators.assets import asset_of, id_of, is_no_part_of_town, kind_of
 from cosfly.simulators.conventions import CM_PER_M, world_pose
 from cosfly.simulators.unrealcv_client import UnrealCvConfig, UnrealCvConnection, connect
 
@@ -143,7 +143,7 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
 
 def _unfit(one: _Object, kind: str | None, box: np.ndarray | None, source: str, cfg: UnrealCvMapConfig) -> str:
     """Why an object is no box of the map; "" if it is."""
-    if kind is None and is_nothing(one.class_name):
+    if kind is None and is_no_part_of_town(one.class_name):
         return "not of the town"
     if box is None or (kind is None and source == "default"):
         return "no body"

@@ -15,7 +15,7 @@ from cosfly.formats.traces import read_traces
 from cosfly.maps.stage import load_map
 from cosfly.pipeline.runs import STAGES
 from cosfly.pipeline.settings import RunConfig
-from cosfly.render.weather import dark_flights
+from cosfly.render.weather import dark_trajectories
 
 UNITS = {
     "maps": "map", "simplify": "map", "pedestrians": "pedestrians", "plan": "pedestrians", "render": "frames",
@@ -122,7 +122,7 @@ def caveats(cfg: RunConfig) -> list[str]:
     lines = cfg.plan.remarks()
     for name, town in ({name: cfg.of_town(name) for name in cfg.towns} or {cfg.name: cfg}).items():
         num = town.pedestrians.num_paths
-        if dark := dark_flights(town.render, num, partial(load_map, town.maps, seed=town.seed)):
+        if dark := dark_trajectories(town.render, num, partial(load_map, town.maps, seed=town.seed)):
             listed = ", ".join(map(walk_id, dark[:4])) + ", ..." * (len(dark) > 4)
             lines.append(
                 f"{name}: {len(dark)} of {num} trajectories are dark ({listed}): they are at night, on a map without "

@@ -25,7 +25,7 @@ from cosfly.render.contract import Frame
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of
-from cosfly.render.weather import WeatherConfig, drawn_seed, read_pools, weather_of
+from cosfly.render.weather import WeatherConfig, random_seed, read_pools, weather_of
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.seeding import rng_for
@@ -156,7 +156,7 @@ def render_frames(
     cfg = build(RenderConfig, settings | camera, "render_frames")
     _check_taken(settings, OF_PICTURE, "render_frames")
     if cfg.weather_seed < 0:
-        cfg = cfg.model_copy(update={"weather_seed": drawn_seed()})
+        cfg = cfg.model_copy(update={"weather_seed": random_seed()})
     weather = weather_of(cfg, read_pools(cfg), 0)
     intrinsic = intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg)
     gait = None if targets is None else gait_of(targets, STEP_S * np.arange(len(targets)))

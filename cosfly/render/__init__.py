@@ -1,1 +1,1 @@
-"""Step 5: flights to frames."""
+"""Step 5: drone trajectories to frames."""

@@ -1,7 +1,7 @@
-"""A map from above as a renderer draws it: the backdrop on which regions are marked (sec:appendix_g_mask_editor).
+"""A rendered map from above: the backdrop of the editor of regions (sec:appendix_g_mask_editor).
 
-Of square tiles, each seen from straight above its middle, so that the ground lies where the world has it, to the pixel,
-and what stands on it leans little: a wall of 30 m by 2 m at most.
+It consists of square tiles, each seen from straight above its middle, so that the ground is in place to the pixel and
+a wall of 30 m leans by 2 m at most.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Bounds = tuple[float, float, float, float]  # west, south, east, north, m
 
 
 def draw_backdrop(cfg: RenderConfig, box_map: BoxMap, view: TopView, seed: int = 0) -> np.ndarray:
-    """Draw the window of the world by the backend of the settings, without weather and haze; CARLA in its own air.
+    """Draw a window of the world by the backend of the settings, without weather and haze.
 
     Returns:
         (h, w, 3) uint8 RGB of the view's size.
@@ -58,12 +58,13 @@ def draw_backdrop(cfg: RenderConfig, box_map: BoxMap, view: TopView, seed: int =
 def run(
     cfg: RenderConfig, boxes: Path, out: Path, *, bounds_m: Bounds | None = None, pixels_per_m: float, seed: int = 0
 ) -> Path:
-    """Reads `boxes_3d.json`; writes the PNG `out`, whose path it gives, and its frame beside it.
+    """Reads `boxes_3d.json`; writes the PNG `out` and its world frame, and returns `out`.
 
     Args:
-        bounds_m: what is shown; None shows the whole map.
+        bounds_m: Shown part; None shows the whole map.
+
     Raises:
-        ConfigError: bounds without an area, or more pixels than a picture may have. Others as `draw_backdrop`.
+        ConfigError: If the bounds have no area, or the picture would have too many pixels.
     """
     box_map = read_boxes(boxes)
     check_ground(box_map, boxes)
@@ -72,8 +73,8 @@ def run(
     size = np.ceil(np.array([east - west, north - south]) * pixels_per_m)
     if not (np.isfinite(size).all() and (size >= 1).all() and size.max() <= LONGEST_SIDE_PX):
         got = f"{size[0]:g} x {size[1]:g} px of {west:g} {south:g} {east:g} {north:g}"
-        expected, fix = f"1 to {LONGEST_SIDE_PX} px each way", "give other --bounds or fewer --pixels-per-m"
-        raise ConfigError("no picture of this size", where="--bounds", got=got, expected=expected, fix=fix)
+        expected, fix = f"1 to {LONGEST_SIDE_PX} px each way", "set other --bounds or fewer --pixels-per-m"
+        raise ConfigError("the picture cannot have this size", where="--bounds", got=got, expected=expected, fix=fix)
     frame = WorldFrame(west_m=west, north_m=north, metres_per_px=1.0 / pixels_per_m)
     view = TopView(west, north, pixels_per_m, (int(size[0]), int(size[1])))
     write_backdrop(out, png_bytes(draw_backdrop(cfg, box_map, view, seed)), frame)

@@ -1,20 +1,26 @@
-"""What a camera sees of the target: its box and depth, and how much of it is seen (sec:step6)."""
+"""Cameras of a trajectory, and what they see of the target: box, depth, visibility, legibility (sec:step6)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from cosfly.formats.frames import LEGIBLE_CONTRAST, LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE, Camera, TargetMeta
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
-from cosfly.geometry.axes import box_corners, mask_box, project
+from cosfly.formats.segments import Segment
+from cosfly.geometry.axes import box_corners, focal_px, intrinsic_matrix, mask_box, project
 from cosfly.render.contract import NEAR_M, PERSON_ID, Frame
+from cosfly.runtime.config import Config
 
 DEPTH_TOLERANCE_M = 0.05  # something this little in front of the target's box does not hide it
 NOT_HIDDEN = -1  # no instance id
-RING_LEAST_PX = 4  # around a person, whose colours are held against its own
+NO_IDS = np.empty(0, np.int64)
+RING_LEAST_PX = 4  # around a person, for the contrast of colours
 MOST_SAMPLES = 40_000  # rays through the target's box; more are thinned evenly
 
 # Pairs of corners (order of geometry.box_corners) that an edge of the box joins.
@@ -23,7 +29,7 @@ _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count(
 
 @dataclass(frozen=True)
 class TargetView:
-    """Where the target is in one frame.
+    """The projected target in one frame.
 
     uv: (2,) px of the hip point, NaN behind the camera. depth_m: z-depth of the hip point. box_px: (4,) xmin, ymin,
     xmax, ymax of the projected box, not clipped, NaN where all of it is behind the camera. bbox_px: (4,) the same
@@ -37,12 +43,12 @@ class TargetView:
 
     @property
     def in_view(self) -> bool:
-        """Some of the box is inside the image."""
+        """Return whether some of the box is inside the image."""
         return not np.isnan(self.bbox_px).any()
 
 
 def view_target(target_m: np.ndarray, camera_pose: np.ndarray, camera: Camera) -> TargetView:
-    """Project the target's 3D box, which stands round its hip point, (3,) world."""
+    """Project the target's 3D box around its hip point, (3,) world."""
     uv, z = project(np.asarray(target_m)[None], camera_pose, camera.intrinsic)
     corners = box_corners(target_m, np.array(PERSON_HALF_EXTENTS_M))
     in_camera = (corners - camera_pose[:3, 3]) @ camera_pose[:3, :3]
@@ -59,7 +65,7 @@ def view_target(target_m: np.ndarray, camera_pose: np.ndarray, camera: Camera) -
 
 
 def _in_front(corners: np.ndarray) -> np.ndarray:
-    """Corners of the part of a box that is beyond the near plane; corners (8, 3) in camera axes."""
+    """Return the corners of the part of a box beyond the near plane; corners (8, 3) in camera axes."""
     points = [corner for corner in corners if corner[2] >= NEAR_M]
     for a, b in _EDGES:
         za, zb = corners[a, 2], corners[b, 2]
@@ -71,7 +77,7 @@ def _in_front(corners: np.ndarray) -> np.ndarray:
 def box_depths(
     pixels: np.ndarray, center_m: np.ndarray, half_m: np.ndarray, camera_pose: np.ndarray, intrinsic: np.ndarray
 ) -> np.ndarray:
-    """Depth at which rays enter an axis-aligned box.
+    """Return the depth at which rays enter an axis-aligned box.
 
     Args:
         pixels: (n, 2) px; center_m, half_m: (3,) world; camera_pose: (4, 4) world_from_camera; intrinsic: (3, 3).
@@ -89,43 +95,35 @@ def box_depths(
 
 
 def rendered_visibility(
-    frame: Frame, target_m: np.ndarray, view: TargetView, camera_pose: np.ndarray, camera: Camera
-) -> tuple[float, int]:
-    """How much of the target a frame shows.
+    frame: Frame, target_m: np.ndarray, view: TargetView, camera_pose: np.ndarray, camera: Camera,
+    other_ids: np.ndarray = NO_IDS,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return how much of the target a frame shows.
 
-    The score is the share of the target's projected 3D box that nothing hides: at each pixel centre the box's near
-    side, computed, is compared with the depth image; where the person itself was drawn the box is visible. What lies
+    The score is the share of the target's projected 3D box that nothing hides: at each pixel centre the depth of the
+    box's near side is compared with the depth image; where the person itself was drawn the box is visible. The part
     outside the image counts as hidden.
 
     Returns:
-        Score in [0, 1], and the number of pixels of the person in the whole mask.
+        Score, share that bystanders (`other_ids`) hide, share that the map hides, each in [0, 1].
     """
-    num_person_px = int(np.count_nonzero(frame.ids == PERSON_ID))
-    num_rays, hiding = _rays_to_box(frame, target_m, view, camera_pose, camera)
-    return (float(np.count_nonzero(hiding == NOT_HIDDEN)) / num_rays if num_rays else 0.0), num_person_px
-
-
-def hidden_shares(
-    frame: Frame, target_m: np.ndarray, view: TargetView, camera_pose: np.ndarray, camera: Camera, other_ids: np.ndarray
-) -> tuple[float, float]:
-    """Return what hides the target's box: the shares of it, in [0, 1], that others hide and that the map hides."""
     num_rays, hiding = _rays_to_box(frame, target_m, view, camera_pose, camera)
     if num_rays == 0:
-        return 0.0, 0.0
-    num_others = int(np.isin(hiding, other_ids).sum())
-    return num_others / num_rays, float(np.count_nonzero(hiding != NOT_HIDDEN) - num_others) / num_rays
+        return 0.0, 0.0, 0.0
+    num_visible, num_others = int(np.count_nonzero(hiding == NOT_HIDDEN)), int(np.isin(hiding, other_ids).sum())
+    return num_visible / num_rays, num_others / num_rays, (len(hiding) - num_visible - num_others) / num_rays
 
 
 def _rays_to_box(
     frame: Frame, target_m: np.ndarray, view: TargetView, camera_pose: np.ndarray, camera: Camera
 ) -> tuple[int, np.ndarray]:
-    """Look at the target's box through pixel centres.
+    """Cast rays at the target's box through pixel centres.
 
     Returns:
-        how many rays enter the box, those outside the image included; and for each inside the image, (k,), the id of
-        what was drawn in front of the box, NOT_HIDDEN where that is nothing or the person.
+        the number of rays that enter the box, also outside the image; and for each inside the image, (k,), the id
+        drawn in front of the box, NOT_HIDDEN where that is nothing or the person.
     """
-    nothing = 0, np.empty(0, np.int64)
+    nothing = 0, NO_IDS
     if not view.in_view:
         return nothing
     x0, y0, x1, y1 = view.box_px
@@ -145,7 +143,7 @@ def _rays_to_box(
 
 
 def contrast_of(rgb: np.ndarray, is_person: np.ndarray) -> float | None:
-    """How much the person's colours differ from those around it: CIE76, of the upper or the lower half, the greater.
+    """Return the contrast of a person to its surroundings: CIE76, the greater of the upper and the lower half.
 
     Args:
         rgb: (h, w, 3) uint8; is_person: (h, w) bool.
@@ -168,8 +166,7 @@ def contrast_of(rgb: np.ndarray, is_person: np.ndarray) -> float | None:
 
 
 def legibility(meta: TargetMeta, contrast: float | None) -> dict[str, float | bool | None]:
-    """Return `height_px`, `contrast` and `legible` of a target in a frame: whether a person can be made out, beside
-    `visible`, which geometry tells."""
+    """Return `height_px`, `contrast` and `legible` of a target in a frame: whether a viewer can recognize a person."""
     height_px = 0.0 if meta.bbox_2d is None else round(meta.bbox_2d[3] - meta.bbox_2d[1], 2)
     contrast = None if contrast is None else round(contrast, 2)
     is_legible = (
@@ -179,3 +176,71 @@ def legibility(meta: TargetMeta, contrast: float | None) -> dict[str, float | bo
         and (contrast or 0.0) >= LEGIBLE_CONTRAST
     )
     return {"height_px": height_px, "contrast": contrast, "legible": is_legible}
+
+
+# --- fields of view ---------------------------------------------------------------------------------------------------
+
+
+class ZoomConfig(Config):
+    """Changes of the field of view within a trajectory."""
+
+    mode: Literal["fixed", "dynamic"] = Field(
+        "fixed",
+        description="fixed: a trajectory keeps its level; dynamic: each of its parts draws one, and meta.json and "
+        "trajectory.json have the intrinsics of each frame",
+    )
+    part_s: float = Field(20.0, ge=1, description="dynamic: length of the parts of a trajectory without segments, s")
+    ramp_s: float = Field(4.0, ge=0, description="dynamic: duration of a change of level, s; 0: at once")
+
+
+def cameras_of(
+    size_px: tuple[int, int],
+    first_deg: float,
+    fovs_deg: Sequence[float],
+    zoom: ZoomConfig,
+    time_s: np.ndarray,
+    segments: Sequence[Segment],
+    rng: np.random.Generator,
+) -> tuple[Camera, ...]:
+    """Return the camera of each frame of a trajectory.
+
+    Args:
+        size_px: (width, height). first_deg: The level of the first part. fovs_deg: All levels. time_s: (n,). rng: Draws
+            the levels of the later parts.
+    """
+    if zoom.mode == "fixed":
+        return (Camera(*size_px, intrinsic_matrix(*size_px, first_deg)),) * len(time_s)
+    fovs = zoomed_deg(first_deg, fovs_deg, zoom, time_s, segments, rng)
+    return tuple(Camera(*size_px, intrinsic_matrix(*size_px, fov)) for fov in fovs.tolist())
+
+
+def zoomed_deg(
+    first_deg: float,
+    fovs_deg: Sequence[float],
+    zoom: ZoomConfig,
+    time_s: np.ndarray,
+    segments: Sequence[Segment],
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Return fields of view, (n,) degrees, that go from part to part to another level, if there is one.
+
+    Within a change the picture grows by equal factors in equal times, with smooth ends.
+    """
+    begins_s = _begins_s(zoom, time_s, segments)
+    focal = np.full(len(time_s), np.log(focal_px(1, first_deg)))
+    level = first_deg
+    for begin_s, end_s in zip(begins_s, [*begins_s, float(time_s[-1])][1:], strict=True):
+        choices = [fov for fov in dict.fromkeys(fovs_deg) if fov != level] or [level]
+        following = choices[int(rng.integers(len(choices)))]
+        duration_s = min(zoom.ramp_s, end_s - begin_s)
+        share = np.clip(time_s - begin_s, 0.0, duration_s) / duration_s if duration_s > 0 else time_s >= begin_s
+        focal += np.log(focal_px(1, following) / focal_px(1, level)) * share**2 * (3.0 - 2.0 * share)
+        level = following
+    return np.degrees(2.0 * np.arctan(0.5 / np.exp(focal)))
+
+
+def _begins_s(zoom: ZoomConfig, time_s: np.ndarray, segments: Sequence[Segment]) -> list[float]:
+    """Return the times at which parts begin, without the first."""
+    if segments:
+        return [float(time_s[segment.begin]) for segment in segments if segment.begin > 0]
+    return np.arange(time_s[0] + zoom.part_s, time_s[-1], zoom.part_s).tolist()

@@ -1,15 +1,14 @@
-"""What every renderer gives and takes: a map of boxes and a look in, one frame for each camera and posed person out.
+"""The contract of renderers: from a map of boxes and a look to one frame for each camera and posed person.
 
-Any renderer draws the same things in the same places, so that depth, kinds and ids do not depend on who draws:
+All renderers draw the same things in the same places, so that depth, kinds and ids do not depend on the renderer:
 
 - every box, or something of its kind that stays inside it, with its id of `instance_ids`; the person with PERSON_ID;
-- others that move, people and cars, each with the id that the caller gives it (`other_id`), nobody else's;
+- bystanders, people and cars, each with its own id from the caller (`other_id`);
 - of a tree that is one box a stem, and foliage only from `crown_low` of `plants_of` up: people walk under it;
-- a ground plane of Terrain under everything (`ground_plane`) or, on ground that slopes, its triangles and surfaces
-  (draping.py) with the plane below their lowest place; and sky where nothing stands between NEAR_M and FAR_M
-  (`far_as_sky`);
-- what lies beyond the map, where it is asked for (rim.py), with nobody's id;
-- of coplanar surfaces the one of the higher layer, and of one layer always the same one (draping.py).
+- a ground plane of Terrain under everything (`ground_plane`) or, on sloping ground, its triangles and surfaces
+  (surfaces.py) with the plane below their lowest place; sky where nothing is between NEAR_M and FAR_M (`far_as_sky`);
+- scenery beyond the map if it is asked for (rim.py), with NO_INSTANCE;
+- of coplanar surfaces the one of the higher layer, and within a layer always the same one (surfaces.py).
 """
 
 from __future__ import annotations
@@ -32,12 +31,12 @@ DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"  # OpenGL without a window, o
 
 NEAR_M, FAR_M = 0.3, SKY_DEPTH_M  # clip planes (sec:step5)
 
-# Instance ids of the 16 bits that instance.png has, beside PERSON_ID: 0 is nobody (sky, ground plane, rim).
+# Instance ids, 16 bits in instance.png, in addition to PERSON_ID: 0 is no instance (sky, ground plane, rim).
 SHARED_ID, MAX_BOX_ID = 65534, 65533
 NO_INSTANCE = 0
 
 GROUND_PLANE_HALF_M = 1500.0
-GROUND_PLANE_DROP_M = 0.02  # under the lowest slab, so that the two never fight for a pixel
+GROUND_PLANE_DROP_M = 0.02  # under the lowest slab, so that no pixel alternates between the two
 UNDER_RIM_M = 0.5
 
 # A layer moves the depth *test* by LAYER_STEP of the distance, never the depth written (kinds.LAYERS).
@@ -45,8 +44,7 @@ LAYER_STEP = 1e-4
 STANDING_LAYER = 7
 LAWN_HALF_M = 0.2  # vegetation of a smaller half height is a lawn; it lies in the layer of road lines
 
-# What a box of vegetation is drawn as. Lawns, hedges and trunks fill their box, the others are round, the last two on a
-# stem.
+# Forms of a box of vegetation. Lawns, hedges and trunks fill their box, the others are round, the last two on a stem.
 LAWN, HEDGE, TRUNK, BUSH, CROWN, CONIFER, BROADLEAF = range(7)
 CONIFER_LOW = -0.78  # of a conifer's half height
 
@@ -67,7 +65,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Clothes:
-    """What one person wears, and linear RGB, (3,) each, of what no appearance tells."""
+    """The appearance of a person, and linear RGB, (3,) each, of what it does not contain."""
 
     looks: Appearance
     hair: np.ndarray
@@ -75,14 +73,14 @@ class Clothes:
     shoes: np.ndarray
 
     def color(self, slot: str) -> np.ndarray:
-        """Linear RGB of what is worn there, (3,)."""
+        """Return the linear RGB of a garment, (3,)."""
         return np.array(COLORS[getattr(self.looks, f"{slot}_color")][1])
 
 
 @dataclass(frozen=True)
 class PosedPerson:
-    """One person of 1.8 m in one moment. hip_m (3,) world, the middle of the target's box, whose bottom the feet stand
-    on; phase_rad of the stride, two steps to a turn; swing from 0, standing, to 1, walking.
+    """One person of 1.8 m at one time. hip_m (3,) world, the middle of the person's box, with the feet on its bottom;
+    phase_rad of the stride, two steps to a turn; swing from 0, standing, to 1, walking.
     """
 
     hip_m: np.ndarray
@@ -94,7 +92,8 @@ class PosedPerson:
 
 @dataclass(frozen=True)
 class PosedCar:
-    """One car in one moment: its box's middle (3,) world, half sizes, x along the heading; seed in [0, 1) paints it."""
+    """One car at one time: its box's middle (3,) world, half sizes, x along the heading; seed in [0, 1) of its
+    paint."""
 
     center_m: np.ndarray
     heading_rad: float
@@ -104,38 +103,37 @@ class PosedCar:
 
 @dataclass(frozen=True)
 class PosedBystander:
-    """Somebody beside the target in one moment, and the id of `instance.png`."""
+    """One bystander at one time, and its id in `instance.png`."""
 
     instance_id: int
     body: PosedPerson | PosedCar
 
     @property
     def center_m(self) -> np.ndarray:
-        """Middle of the box, (3,) world."""
+        """Return the middle of the box, (3,) world."""
         return self.body.hip_m if isinstance(self.body, PosedPerson) else self.body.center_m
 
 
 class Renderer(Protocol):
-    """Draws frames of one map. `RENDERERS[name](box_map, width_px, height_px, look, num_others, rim)` opens one; used
-    from one thread.
+    """A renderer of one map, for one thread: `RENDERERS[name](box_map, width_px, height_px, look, num_others, rim)`.
 
     num_others: ids of `other_id` that no box may have. rim: boxes beyond the map (rim.py), without ids.
 
-    dresses: whether people wear what they are told to; else a flight says nothing of what they look like.
-    device: what draws, one line. Opening raises EnvironmentMissing where a package or driver is not there.
+    dresses: whether people wear the given clothes; otherwise tracks do not record appearances. device: hardware and
+    driver, one line. Opening raises EnvironmentMissing if a package or driver is missing.
     """
 
     dresses: bool
     device: str
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
-        """Get ready for a flight within these corners, (3,) each, in this weather or, without one, in the look: shadows
-        and the like.
+        """Compute shadows and the like for a trajectory within these corners, (3,) each, in this weather or in the
+        look.
 
-        Weather changes colours alone, never depth, kinds and ids.
+        Weather changes colours only, never depth, kinds and ids.
 
         Raises:
-            RenderError: this renderer draws no weather.
+            RenderError: If this renderer draws no weather.
         """
 
     def render(
@@ -148,19 +146,20 @@ class Renderer(Protocol):
         """Draw one frame from world_from_camera (4, 4), OpenCV axes, through K (3, 3) px.
 
         Raises:
-            RenderError: the pose is not finite.
+            RenderError: If the pose is not finite.
         """
         ...
 
     def close(self) -> None:
-        """Return the device back."""
+        """Release the device."""
 
 
-# --- the same for all -------------------------------------------------------------------------------------------------
+# --- shared by all renderers
+# ----------------------------------------------------------------------------------------------
 
 
 def far_as_sky(frame: Frame) -> Frame:
-    """Count as sky what stands at FAR_M or beyond: a clip plane that a layer or rounding moves lets some of it pass."""
+    """Set pixels at FAR_M or beyond to sky: layers and rounding move the clip plane."""
     is_far = frame.depth >= FAR_M
     if np.count_nonzero(is_far) == np.count_nonzero(frame.kinds == KINDS["Sky"]):
         return frame
@@ -169,20 +168,20 @@ def far_as_sky(frame: Frame) -> Frame:
 
 
 def other_id(number: int) -> int:
-    """Return the id of the other of this number: from MAX_BOX_ID downwards, which boxes leave free."""
+    """Return the id of a bystander by its number, from MAX_BOX_ID downwards."""
     return MAX_BOX_ID - number
 
 
 def has_own_ids(box_map: BoxMap, num_others: int = 0) -> bool:
-    """Return whether boxes can keep their ids in `instance.png`: all in 1..MAX_BOX_ID, and none an other's."""
+    """Return whether boxes can keep their ids in `instance.png`: all in 1..MAX_BOX_ID, none that of a bystander."""
     return bool(((box_map.ids >= 1) & (box_map.ids <= MAX_BOX_ID - num_others)).all())
 
 
 def instance_ids(box_map: BoxMap, num_others: int = 0) -> np.ndarray:
-    """Return every box its id for `instance.png`, (n,) uint16 in the map's order.
+    """Return the id of every box in `instance.png`, (n,) uint16 in the map's order.
 
-    The boxes' own ids are used if they can be. Otherwise ids are counted from 1, first through the boxes that are not
-    vegetation, then through the vegetation, each in the map's order; boxes left over share SHARED_ID.
+    The boxes' own ids are used if possible. Otherwise ids are counted from 1, first for boxes that are not vegetation,
+    then for vegetation, each in the map's order; the rest share SHARED_ID.
     """
     if has_own_ids(box_map, num_others):
         return box_map.ids.astype(np.uint16)
@@ -202,14 +201,13 @@ def with_rim(box_map: BoxMap, num_others: int, rim: BoxMap | None) -> tuple[BoxM
 
 
 def scene_origin(box_map: BoxMap) -> np.ndarray:
-    """Return a whole-metre place in the middle of a map, (3,) world: what a GPU computes in float32 is best relative
-    to it."""
+    """Return a whole-metre place in the middle of a map, (3,) world: the origin of float32 computations."""
     low, high = box_map.bounds() if len(box_map) else (np.zeros(3), np.zeros(3))
     return np.round((low + high) / 2.0)
 
 
 def plane_z_m(box_map: BoxMap) -> float:
-    """Height of the ground plane: the map's own, never above a slab that covers it; on a slope the lowest height."""
+    """Return the height of the ground plane: the map's own, at most that of the lowest slab; on a slope the minimum."""
     if not box_map.ground.is_flat:
         return float(box_map.ground.heights_m.min())
     tops = box_map.maxs[np.isin(box_map.kinds, list(GROUND_KINDS)), 2]
@@ -217,9 +215,9 @@ def plane_z_m(box_map: BoxMap) -> float:
 
 
 def ground_plane(box_map: BoxMap, rim: BoxMap | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and half sizes, (3,) each, world, of the flat box of Terrain under everything; its id is NO_INSTANCE.
+    """Return centre and half sizes, (3,) each, world, of the flat box of Terrain under everything, with NO_INSTANCE.
 
-    Under a rim, whose fields lie in its place, it is deeper: so large a triangle is drawn to some centimetres.
+    Under the fields of a rim it is deeper: a triangle this large is drawn to some centimetres.
     """
     x, y, _ = scene_origin(box_map)
     drop_m = GROUND_PLANE_DROP_M + (0.0 if rim is None else UNDER_RIM_M)
@@ -228,13 +226,13 @@ def ground_plane(box_map: BoxMap, rim: BoxMap | None = None) -> tuple[np.ndarray
 
 
 def plants_of(centers_m: np.ndarray, half_m: np.ndarray, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tell plants apart by the shapes of their boxes.
+    """Classify plants by the shapes of their boxes.
 
     Args:
         centers_m, half_m: (n, 3); seeds: (n,), `seeds_of` their ids.
     Returns:
         forms (n,), LAWN .. BROADLEAF; crown_low (n,): where foliage begins, in units of the half height, -1 the box's
-        bottom. What is under it is a stem of `stem_radius_m` along the box's axis, and air.
+        bottom. Under it is a stem of `stem_radius_m` along the box's axis.
     """
     hx, hy, hz = half_m.T
     wide, narrow = np.maximum(hx, hy), np.minimum(hx, hy)
@@ -250,16 +248,16 @@ def plants_of(centers_m: np.ndarray, half_m: np.ndarray, seeds: np.ndarray) -> t
 
 
 def stem_radius_m(half_m: np.ndarray) -> np.ndarray:
-    """Radius of the stem of a tree that is one box, (n,)."""
+    """Return the radius of the stem of a tree that is one box, (n,)."""
     narrow = half_m[:, :2].min(axis=1)
     return np.minimum(np.clip(0.075 * narrow, 0.05, 0.32), narrow)
 
 
 def _over_a_trunk(centers_m: np.ndarray, half_m: np.ndarray, is_trunk: np.ndarray) -> np.ndarray:
-    """Return which boxes hang beside or over a trunk that the map keeps as a box of its own, (n,) bool."""
+    """Return which boxes are the crown of a trunk that is a box of its own, (n,) bool."""
     if not is_trunk.any():
         return np.zeros(len(centers_m), dtype=bool)
-    from scipy.spatial import cKDTree  # half a second, which every command would pay for the settings beside it
+    from scipy.spatial import cKDTree  # takes half a second to import, which every command would pay
 
     gap, nearest = cKDTree(centers_m[is_trunk, :2]).query(centers_m[:, :2])
     foot = (centers_m[is_trunk, 2] - half_m[is_trunk, 2])[nearest]
@@ -267,7 +265,7 @@ def _over_a_trunk(centers_m: np.ndarray, half_m: np.ndarray, is_trunk: np.ndarra
 
 
 def seeds_of(ids: np.ndarray) -> np.ndarray:
-    """Return a fixed number in [0, 1) for each box id, so that a house keeps its colour between runs (splitmix64)."""
+    """Return a fixed number in [0, 1) for each box id (splitmix64), so that a house keeps its colour between runs."""
     with np.errstate(over="ignore"):
         x = np.asarray(ids, dtype=np.uint64) + np.uint64(0x9E3779B97F4A7C15)
         x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

@@ -1,7 +1,7 @@
-"""The figure of a walking person, as solids that any renderer draws: proportions of 1.8 m, a walk cycle driven by the
-distance walked, and what an appearance says is worn.
+"""The figure of a walking person, as solids for any renderer: 1.8 m high, with a walk cycle driven by the distance
+walked, and the garments of an appearance.
 
-It stays within the circle round the target's box (PERSON_HALF_EXTENTS_M), to 3 mm: in mid-stride the tips of the shoes
+It stays within the circle around the target's box (PERSON_HALF_EXTENTS_M), to 3 mm: in mid-stride the tips of the shoes
 pass its sides by up to 13 cm.
 """
 
@@ -18,7 +18,7 @@ from cosfly.render.contract import Clothes, PosedPerson
 HIP_SWING_RAD, ARM_SWING_RAD, KNEE_BEND_RAD = 0.25, 0.38, 0.65
 HIP_M, KNEE_M, ANKLE_M, SHOULDER_M = 0.93, 0.50, 0.085, 1.45
 SIZES, BREADTHS = {"woman": 0.96, "man": 1.0}, {"woman": 0.84, "man": 1.05}
-# What hangs open below the waist: low end, high end, radii ahead and aside, m.
+# Garments that hang open below the waist: low end, high end, radii ahead and aside, m.
 HEMS = {"jacket": (0.82, 1.12, 0.15, 0.19), "coat": (0.46, 1.14, 0.22, 0.235), "skirt": (0.47, 1.04, 0.24, 0.26)}
 
 
@@ -42,7 +42,7 @@ class PersonFigure:
 
 @dataclass
 class _Body:
-    """Collects what a figure is made of, in the person's own axes: x forward, y left, z up, feet at 0."""
+    """The pieces of a figure in the person's own axes: x forward, y left, z up, feet at 0."""
 
     solids: list[tuple] = field(default_factory=list)  # (shape, center, half, color, pitch, roll)
     limbs: list[tuple] = field(default_factory=list)  # (low, high, radius, color)
@@ -55,7 +55,7 @@ class _Body:
         self.solids.append((shape, center, half, color, -pitch_rad, roll_rad))
 
     def limb(self, low: np.ndarray, high: np.ndarray, radius: float, color: np.ndarray) -> None:
-        """A limb between two points, thicker at `high`."""
+        """Add a limb between two points, thicker at `high`."""
         self.limbs.append((low, high, radius, color))
 
     def hem(self, garment: str, color: np.ndarray) -> None:
@@ -63,7 +63,7 @@ class _Body:
         self.solid("limb", [0.0, 0.0, (low + high) / 2.0], [ahead, aside, (high - low) / 2.0], color, pitch_rad=np.pi)
 
     def placed(self, feet_m: np.ndarray, heading_rad: float, size: float) -> PersonFigure:
-        """All of it at once: piece by piece it would take four times as long, of every person in every frame."""
+        """Return the figure at a place; all pieces at once, four times as fast as one by one."""
         shapes, centers, half, colors, pitch, roll = zip(*self.solids, strict=True)
         turns = rotation_matrices(np.column_stack([pitch, np.zeros(len(pitch)), roll]))
         low, high, radius, limb_colors = (np.array(column) for column in zip(*self.limbs, strict=True))
@@ -91,7 +91,7 @@ def figure_of(person: PosedPerson) -> PersonFigure:
     size, breadth = SIZES[clothes.looks.figure], BREADTHS[clothes.looks.figure]
     sides = ((1.0, person.phase_rad), (-1.0, person.phase_rad + np.pi))
     feet = [_leg(figure, side, phase, swing, clothes) for side, phase in sides]
-    lift = size * (min(foot[2] for foot in feet) - ANKLE_M)  # the lower foot stands on the ground
+    lift = size * (min(foot[2] for foot in feet) - ANKLE_M)  # the lower foot is on the ground
     for side, phase in sides:
         _arm(figure, breadth * side, phase, swing, clothes)
     _trunk(figure, breadth, swing, clothes)
@@ -106,7 +106,7 @@ def _swung(angle_rad: float, length: float) -> np.ndarray:
 
 
 def _leg(figure: _Body, side: float, phase: float, swing: float, clothes: Clothes) -> np.ndarray:
-    """Thigh, shin and shoe; gives the ankle."""
+    """Add thigh, shin and shoe; return the ankle."""
     hip = np.array([0.0, 0.09 * side, HIP_M])
     angle = HIP_SWING_RAD * swing * np.sin(phase)
     bend = swing * (0.12 + KNEE_BEND_RAD * max(0.0, np.cos(phase)) ** 1.5)  # the leg that swings forward is bent
@@ -166,7 +166,7 @@ def _head(figure: _Body, clothes: Clothes) -> None:
 
 
 def _bag(figure: _Body, breadth: float, clothes: Clothes) -> None:
-    """A backpack with two straps, or a bag at the right hip with one across."""
+    """Add a backpack with two straps, or a bag at the right hip with one across."""
     if clothes.looks.bag == "backpack":
         color = clothes.color("bag")
         figure.solid("rounded", [-0.205, 0.0, 1.24], [0.10, 0.155, 0.22], color)

@@ -1,4 +1,4 @@
-"""The walking person in numbers, as every renderer is given it: the gait along a flight, and clothes."""
+"""People and cars of a trajectory as renderers draw them: gait along the path, clothes, poses of bystanders."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHOES = np.array([[0.03, 0.025, 0.02], [0.55, 0.55, 0.53], [0.14, 0.07, 0.03]])
 
 
 def choose_clothes(rng: np.random.Generator, looks: Appearance | None = None) -> Clothes:
-    """Draw what a person looks like, or what an appearance leaves open."""
+    """Choose an appearance at random, or only what a given appearance does not fix."""
     looks = looks or draw_appearance(rng)
     return Clothes(looks, *(palette[rng.integers(len(palette))] for palette in (HAIR_RGB, SKIN, SHOES)))
 
@@ -59,14 +59,14 @@ def _one(rng: np.random.Generator, names: tuple[str, ...]) -> str:
 
 @dataclass(frozen=True)
 class Gait:
-    """How the person moves along a flight: headings_rad (n,), phases_rad (n,) of the stride, swings (n,) in [0, 1]."""
+    """Motion of a person, n frames: headings_rad (n,), phases_rad (n,) of the stride, swings (n,) in [0, 1]."""
 
     headings_rad: np.ndarray
     phases_rad: np.ndarray
     swings: np.ndarray
 
     def since(self, first: int) -> Gait:
-        """Return the same from a frame on."""
+        """Return the gait from a frame on."""
         return Gait(self.headings_rad[first:], self.phases_rad[first:], self.swings[first:])
 
     def posed(self, i: int, hip_m: np.ndarray, clothes: Clothes) -> PosedPerson:
@@ -77,27 +77,25 @@ class Gait:
 
 
 def gait_of(targets_m: np.ndarray, time_s: np.ndarray) -> Gait:
-    """Read heading and stride from positions, (n, 3), at times (n,). A standing person keeps the last heading."""
+    """Compute heading and stride from positions, (n, 3), at times (n,). A standing person keeps the last heading."""
     n = len(targets_m)
     if n == 1:
         return Gait(np.zeros(1), np.zeros(1), np.zeros(1))
     steps = np.diff(targets_m[:, :2], axis=0)
-    walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
+    walked_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
     speed = np.linalg.norm(np.gradient(targets_m[:, :2], time_s, axis=0), axis=1)
-    phases = 2.0 * np.pi * walked / STRIDE_M
+    phases = 2.0 * np.pi * walked_m / STRIDE_M
     return Gait(headings_of(targets_m, time_s), phases, np.clip(speed / SLOW_MPS, 0.0, 1.0))
 
 
-# --- others -----------------------------------------------------------------------------------------------------------
-# The others of one flight as renderers are given them, frame by frame, and what a frame's annotation tells of them.
-
+# --- bystanders -------------------------------------------------------------------------------------------------------
 
 SHARE_DIGITS = 6
 
 
 @dataclass(frozen=True)
-class Cast:
-    """Everybody beside the target in one flight; gaits and clothes of those who walk, a seed for the paint of each."""
+class DressedBystanders:
+    """All bystanders of one trajectory: gaits and clothes of pedestrians, a seed for the paint of each."""
 
     others: list[Bystander]
     gaits: list[Gait]
@@ -108,12 +106,12 @@ class Cast:
         return len(self.others)
 
     def people(self, target: Appearance) -> People:
-        """What everybody who walks looks like."""
+        """Return the appearance of the target and of every pedestrian."""
         walking = (number for number, other in enumerate(self.others) if other.kind == "Pedestrians")
         return People(target, {other_id(number): self.clothes[number].looks for number in walking})
 
     def posed(self, i: int) -> list[PosedBystander]:
-        """All of them in frame i."""
+        """Return all bystanders in frame i."""
         return [PosedBystander(other_id(number), self._body(number, i)) for number in range(len(self))]
 
     def _body(self, number: int, i: int) -> PosedPerson | PosedCar:
@@ -124,7 +122,7 @@ class Cast:
         return PosedCar(center_m, float(other.headings_rad[i]), other.build.half_extents_m, float(self.seeds[number]))
 
     def meta(self, i: int, frame: Frame, hidden_by_others: float, hidden_by_map: float) -> BystandersMeta:
-        """What the annotation of frame i says of them."""
+        """Return the annotation of the bystanders in frame i."""
         pixels = np.bincount(frame.ids.ravel(), minlength=other_id(0) + 1)
         lines = [
             BystanderMeta(
@@ -144,23 +142,25 @@ class Cast:
         )
 
     def distance_m(self, i: int, point_m: np.ndarray) -> float:
-        """From a point, (3,), to the nearest box of frame i; infinity without others."""
+        """Return the distance of a point, (3,), to the nearest box of frame i; infinity without bystanders."""
         return min((float(distances_to_boxes_m(point_m, other.at(i))[0]) for other in self.others), default=np.inf)
 
     def are_in_the_way(self, i: int, person_m: np.ndarray) -> bool:
-        """Return whether a person at a hip point, (3,), would touch somebody."""
+        """Return whether a person at a hip point, (3,), would touch a bystander."""
         return any(other.at(i).gap_to_person_m(person_m) < 0.0 for other in self.others)
 
 
-NOBODY = Cast([], [], [], np.empty(0))
+NO_BYSTANDERS = DressedBystanders([], [], [], np.empty(0))
 
 
-def cast_of(others: list[Bystander], time_s: np.ndarray, target: Appearance, rng: np.random.Generator) -> Cast:
-    """Dress the others of a flight at times (n,): look-alikes as the target but for one thing, nobody just as it."""
+def dress_bystanders(
+    others: list[Bystander], time_s: np.ndarray, target: Appearance, rng: np.random.Generator
+) -> DressedBystanders:
+    """Dress the bystanders: hard distractors differ from the target in one garment, everybody in at least one."""
     gaits, clothes = [gait_of(other.positions_m, time_s) for other in others], []
     for other in others:
         looks = target
         while not target.differences(looks):
             looks = look_alike(target, rng) if other.is_look_alike else draw_appearance(rng)
         clothes.append(choose_clothes(rng, looks))
-    return Cast(others, gaits, clothes, rng.random(len(others)))
+    return DressedBystanders(others, gaits, clothes, rng.random(len(others)))

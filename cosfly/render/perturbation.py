@@ -1,9 +1,9 @@
-"""The perturbed track (app:dual_track): small random shifts of person, drone and view, frame by frame, with a way back.
+"""The perturbed track (app:dual_track): small random shifts of person, drone and view, frame by frame, with fallbacks.
 
 Each frame draws two independent events. *Position*: the person is shifted on the ground and the drone in space.
-*Rotation*: the camera looks at a point beside the person, at most theta_max off per axis, and may roll. A shift that
-puts person or drone too near an obstacle, the person out of the picture or, once it is drawn, out of sight, is not
-made, and the frame says so.
+*Rotation*: the camera looks at a point near the person, at most theta_max off per axis, and may roll. A shift that
+puts person or drone too near an obstacle, the person out of the picture or, once it is drawn, hides the person, is not
+applied, and the frame's state records why.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from cosfly.geometry.axes import look_at, project, rotation_matrices, world_from
 from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M
 from cosfly.render.contract import plane_z_m
-from cosfly.render.person import NOBODY, Cast
+from cosfly.render.person import NO_BYSTANDERS, DressedBystanders
 from cosfly.runtime.config import Config
 from cosfly.runtime.seeding import rng_for
 
@@ -33,21 +33,21 @@ HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # from the hip point: where branches 
 NONE, APPLIED = "none", "applied"
 OUT_OF_VIEW, HIDDEN = "fallback: target out of view", "fallback: target hidden"
 PERTURBED = "aug_001"  # the variant of the perturbed track
-STEP_UP_M = 0.5  # a shifted person may stand this much higher or lower than before, not on a roof
+STEP_UP_M = 0.5  # a shifted person may be this much higher or lower than before, not on a roof
 
 
 class PerturbationConfig(Config):
     """Settings of the perturbed track; defaults from tab:augmentation_params."""
 
     position_probability: float = Field(
-        0.6, ge=0, le=1, description="chance that a frame's positions are shifted; 0 for never"
+        0.6, ge=0, le=1, description="probability that a frame's positions are shifted; 0 for never"
     )
     rotation_probability: float = Field(
-        0.6, ge=0, le=1, description="chance that a frame's view is turned; 0 for never"
+        0.6, ge=0, le=1, description="probability that a frame's view is turned; 0 for never"
     )
     pedestrian_radius_m: float = Field(2.0, ge=0, description="largest shift of the person on the ground (R_h), m")
     drone_radius_m: float = Field(3.0, ge=0, description="largest shift of the drone (R_d), m")
-    view_radius_m: float = Field(2.0, ge=0, description="how far beside the person the camera may look, m")
+    view_radius_m: float = Field(2.0, ge=0, description="how far from the person the camera may look, m")
     max_view_deg: float = Field(
         5.0, ge=0, le=45, description="largest turn of the view, for yaw and for pitch (theta_max), degrees"
     )
@@ -63,13 +63,12 @@ class PerturbationConfig(Config):
         description="distance that a shifted drone keeps from obstacles, m; where the plan is nearer, as far as the "
         "plan",
     )
-    frame_margin: ClassVar[float] = 0.02  # share of the image at each border where the person may not be
+    frame_margin: ClassVar[float] = 0.02  # share of the image at each border that the person is kept out of
 
 
 @dataclass(frozen=True)
 class Poses:
-    """What is drawn, n frames. positions_m, rotations_deg (pitch, yaw, roll), targets_m: (n, 3), the person's hip
-    point.
+    """Poses of n frames: positions_m, rotations_deg (pitch, yaw, roll), targets_m (the person's hip point), (n, 3).
 
     clearances_m: (n,) from the drone to the nearest obstacle, CLEARANCE_CAP_M at most.
     """
@@ -82,12 +81,12 @@ class Poses:
 
 @dataclass(frozen=True)
 class PerturbedTrack:
-    """The perturbed poses, and for each frame what happened.
+    """The perturbed poses and the events of each frame.
 
     drone_offsets_m, target_offsets_m, rotation_offsets_deg: (n, 3), zero where nothing was applied; the rotation offset
-    is the turn away from the person, after the camera was aimed at it anew. states: (n,) {"position", "rotation"}, each
-    none | applied | or the reason for falling back. unshifted: the same frames with their rotation events alone, which
-    a shift falls back to.
+    is the turn away from the person, after the camera was aimed at it again. states: (n,) {"position", "rotation"},
+    each none | applied | or the reason for the fallback. unshifted: the same frames with their rotation events only,
+    which a dropped shift falls back to.
     """
 
     poses: Poses
@@ -98,8 +97,8 @@ class PerturbedTrack:
     unshifted: PerturbedTrack | None = None
 
     @classmethod
-    def nothing(cls, planned: Poses) -> PerturbedTrack:
-        """Return the poses as they were planned."""
+    def unperturbed(cls, planned: Poses) -> PerturbedTrack:
+        """Return a track of the planned poses."""
         n = len(planned.positions_m)
         states = [{"position": NONE, "rotation": NONE} for _ in range(n)]
         return cls(copy.deepcopy(planned), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3)), states)
@@ -112,7 +111,7 @@ class PerturbedTrack:
         return self.states[i]["position"] == APPLIED
 
     def drop_shift(self, i: int, position: str) -> None:
-        """Take back what frame i's position event did, in place; `position` says what became of the event."""
+        """Undo the position event of frame i, in place; `position` is its new state."""
         assert self.unshifted is not None
         for mine, without in ((self, self.unshifted), (self.poses, self.unshifted.poses)):
             for name, values in vars(mine).items():
@@ -122,8 +121,7 @@ class PerturbedTrack:
 
 
 class Surroundings:
-    """What a shifted person or drone may touch: the obstacles, and the ground's height from the map's surfaces or
-    heights. Made once for a map."""
+    """Obstacles and ground heights of a map, for shifted people and drones."""
 
     def __init__(self, box_map: BoxMap) -> None:
         self.obstacles, self._ground = obstacle_index(box_map), box_map.ground
@@ -134,15 +132,15 @@ class Surroundings:
         self._plane_m = plane_z_m(box_map)
 
     def surface_z_m(self, x_m: float, y_m: float, near_z_m: float) -> float:
-        """Top of the highest surface there within STEP_UP_M of `near_z_m`; `near_z_m` itself where there is none. On a
-        slope, the ground."""
+        """Return the height of the highest surface within STEP_UP_M of `near_z_m`, or `near_z_m` where there is
+        none; on a slope, that of the ground."""
         if not self._ground.is_flat:
             return float(self._ground.height_at(np.array([[x_m, y_m]]))[0])
         over = self._slabs_at(x_m, y_m) & (np.abs(self._tops - near_z_m) <= STEP_UP_M)
         return float(self._tops[over].max()) if over.any() else near_z_m
 
     def below_ground_m(self, place_m: np.ndarray) -> float:
-        """How deep a place, (3,), lies in the ground, 0 where it does not: in or under its slabs, or under a slope."""
+        """Return the depth of a place, (3,), in the ground: in or under its slabs, or under a slope; 0 above it."""
         x_m, y_m, z_m = place_m.tolist()
         if not self._ground.is_flat:
             return max(0.0, float(self._ground.height_at(place_m[None])[0]) - z_m)
@@ -184,7 +182,7 @@ def shift_draws(
 
 
 def rng_of_shifts(seed: int, path_id: str) -> np.random.Generator:
-    """Return the generator of the perturbed flight of a walk."""
+    """Return the random generator of the perturbed track of a path."""
     return rng_for(seed, "render", f"{path_id}/{PERTURBED}")
 
 
@@ -202,11 +200,11 @@ def perturb(
     surroundings: Surroundings,
     cfg: PerturbationConfig,
     rng: np.random.Generator,
-    others: Cast = NOBODY,
+    others: DressedBystanders = NO_BYSTANDERS,
 ) -> PerturbedTrack:
-    """Perturb every frame of a flight, seen through its camera; each takes the same number of random draws."""
-    unshifted = PerturbedTrack.nothing(planned)
-    result = replace(PerturbedTrack.nothing(planned), unshifted=unshifted)
+    """Perturb every frame of a trajectory; each takes the same number of random draws."""
+    unshifted = PerturbedTrack.unperturbed(planned)
+    result = replace(PerturbedTrack.unperturbed(planned), unshifted=unshifted)
     draws = shift_draws(
         rng,
         person_radius_m=cfg.pedestrian_radius_m,
@@ -228,9 +226,9 @@ def perturb(
 
 def _shift(
     result: PerturbedTrack, planned: Poses, i: int, person_offset: np.ndarray, drone_offset: np.ndarray, camera: Camera,
-    surroundings: Surroundings, cfg: PerturbationConfig, others: Cast,
+    surroundings: Surroundings, cfg: PerturbationConfig, others: DressedBystanders,
 ) -> str:  # fmt: skip
-    """Apply one frame's position event and say so, or say why not."""
+    """Apply one frame's position event; return its state."""
     target = planned.targets_m[i] + person_offset
     feet_z = planned.targets_m[i][2] - TARGET_HEIGHT_M
     target[2] = surroundings.surface_z_m(target[0], target[1], feet_z) + TARGET_HEIGHT_M
@@ -259,7 +257,7 @@ def _shift(
 
 
 def _turn(result: PerturbedTrack, i: int, draw: ShiftDraw, camera: Camera, cfg: PerturbationConfig) -> None:
-    """Apply one frame's rotation event to whatever pose the frame has, or note why not."""
+    """Apply one frame's rotation event to the pose that the frame has, or note the reason for the fallback."""
     drone, target = result.poses.positions_m[i], result.poses.targets_m[i]
     turn = wrap_deg(_aim_deg(drone, target + draw.view_m) - _aim_deg(drone, target))
     turn = np.array([*np.clip(turn, -cfg.max_view_deg, cfg.max_view_deg), cfg.max_roll_deg * draw.roll])
@@ -274,7 +272,7 @@ def _turn(result: PerturbedTrack, i: int, draw: ShiftDraw, camera: Camera, cfg: 
 
 
 def _aim_deg(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Pitch and yaw from eye to target, (2,) degrees."""
+    """Return pitch and yaw from eye to target, (2,) degrees."""
     return np.degrees(np.array(look_at(eye, target)))
 
 

@@ -1,9 +1,9 @@
 """The second renderer, a cross-check of the default one: plain boxes, trees and figures through trimesh and
 pyrender (EGL).
 
-Slower by an order of magnitude and without shadows; what matters is that depth, kinds and ids are right. Each frame is
-drawn three times in pyrender's segmentation mode, with our own two shaders: tags, colours, and the float32 bits of the
-depth. The depth that pyrender itself gives comes from a multisampled 24-bit buffer and is wrong by centimetres at 30 m.
+It is slower by an order of magnitude and has no shadows, but depth, kinds and ids are right. Each frame is drawn three
+times in pyrender's segmentation mode, with two shaders of this package: tags, colours, and the float32 bits of the
+depth. pyrender's own depth comes from a multisampled 24-bit buffer and is wrong by centimetres at 30 m.
 """
 
 from __future__ import annotations
@@ -24,9 +24,8 @@ from cosfly.formats.weather import WeatherParams
 from cosfly.geometry.axes import rotation_matrices, rotation_matrix
 from cosfly.render import contract
 from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedBystander, PosedCar, PosedPerson
-from cosfly.render.draping import drape, is_draped, layers_of
 from cosfly.render.figure import figure_of
-from cosfly.render.solids import are_solids, solids_of
+from cosfly.render.surfaces import are_solids, drape, is_draped, layers_of, solids_of
 from cosfly.runtime.errors import EnvironmentMissing, RenderError
 
 SKY_COLOR = np.array([0.52, 0.64, 0.78])  # also the haze's, linear RGB like all colours here
@@ -40,7 +39,7 @@ COLORS = {
 }  # fmt: skip
 CAR_PAINTS = ((0.30, 0.05, 0.05), (0.05, 0.10, 0.26), (0.50, 0.50, 0.50), (0.04, 0.04, 0.045))
 
-LIMB_SHARE = (0.85, 0.85, 0.95)  # of its half sizes, that a limb fills where it does not taper
+LIMB_SHARE = (0.85, 0.85, 0.95)  # of its half sizes, that an untapered limb fills
 
 
 def _open_screen(width_px: int, height_px: int) -> Any:
@@ -68,14 +67,14 @@ def _open_screen(width_px: int, height_px: int) -> Any:
 
 
 def _keep_display(platform: Any) -> None:
-    """Let closing end this context alone: pyrender would end the display, which all contexts share."""
+    """Make closing end this context only: pyrender would end the display, which all contexts share."""
     from OpenGL.EGL import eglDestroyContext
 
     platform.delete_context = lambda: eglDestroyContext(platform._egl_display, platform._egl_context)
 
 
 class PyrenderRenderer:
-    """Draws a map as plain boxes and round crowns. Positions on the device are relative to the map's middle."""
+    """A renderer of plain boxes and round crowns. Positions on the device are relative to the map's middle."""
 
     dresses = True
 
@@ -92,10 +91,10 @@ class PyrenderRenderer:
         self._scene.add(self._mesh(*_all_boxes(box_map, self._origin, num_others, rim)))
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
-        """Nothing holds for a flight alone: there are no shadows, and no weather."""
+        """Check that no weather is asked for; there are no shadows to compute."""
         if weather is not None:
             raise RenderError(
-                "the renderer pyrender draws no weather", fix="take render.backend gl, or weather_mode off"
+                "the renderer pyrender draws no weather", fix="use render.backend gl, or weather_mode off"
             )
 
     def render(
@@ -129,7 +128,7 @@ class PyrenderRenderer:
         self._screen.delete()
 
     def _draw(self, red: int) -> np.ndarray:
-        """One picture of the scene, (h, w, 4) uint8; red chooses it, see the fragment shader."""
+        """Draw one picture of the scene, (h, w, 4) uint8; red selects it, see the fragment shader."""
         from pyrender import RenderFlags
 
         nodes = dict.fromkeys(self._scene.mesh_nodes, (red, 0, 0))
@@ -147,7 +146,7 @@ class PyrenderRenderer:
         return contract.far_as_sky(Frame(rgb, depth, kinds, ids))
 
     def _mesh(self, triangles: np.ndarray, colors: np.ndarray, tags: np.ndarray) -> Any:
-        """Make a mesh of triangles (k, 3, 3) with linear RGB (k, 3) and tags (k, 4): the sun's light is baked in."""
+        """Make a mesh of triangles (k, 3, 3) with linear RGB (k, 3) and tags (k, 4), lit by the sun."""
         import pyrender
 
         normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -164,7 +163,7 @@ def _as_byte(linear: np.ndarray) -> np.ndarray:
 
 
 def _tags(kinds: np.ndarray, ids: np.ndarray, layers: np.ndarray) -> np.ndarray:
-    """What the vertex shader is given of kind, id and layer, (n, 4) float."""
+    """Return kind, id and layer for the vertex shader, (n, 4) float."""
     ids = ids.astype(np.int64)
     return np.column_stack([kinds, ids & 255, ids >> 8, contract.LAYER_STEP * layers]).astype(np.float32)
 
@@ -172,7 +171,7 @@ def _tags(kinds: np.ndarray, ids: np.ndarray, layers: np.ndarray) -> np.ndarray:
 def _all_boxes(
     town: BoxMap, origin: np.ndarray, num_others: int, rim: BoxMap | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles, colours and tags of every box and the ground plane; crowns are ellipsoids, on stems."""
+    """Return triangles, colours and tags of every box and the ground plane; crowns are ellipsoids on stems."""
     import trimesh
 
     center, half = contract.ground_plane(town, rim)
@@ -221,7 +220,7 @@ def _all_boxes(
 
 
 def _figure(person: PosedPerson, origin: np.ndarray, instance_id: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles, colours and tags of a person, of balls, boxes and cylinders."""
+    """Return triangles, colours and tags of a person, made of balls, boxes and cylinders."""
     import trimesh
 
     ball, box = trimesh.creation.icosphere(subdivisions=2), trimesh.creation.box(extents=(2.0, 2.0, 2.0))
@@ -236,7 +235,7 @@ def _figure(person: PosedPerson, origin: np.ndarray, instance_id: int) -> tuple[
 
 
 def _car(car: PosedCar, origin: np.ndarray, instance_id: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles, colours and tags of a car of two boxes: the body up to its middle, and a shorter, narrower cabin."""
+    """Return triangles, colours and tags of a car of two boxes: the body, and a shorter, narrower cabin."""
     import trimesh
 
     length, width, height = car.half_extents_m
@@ -252,6 +251,6 @@ def _car(car: PosedCar, origin: np.ndarray, instance_id: int) -> tuple[np.ndarra
 
 
 def _standing_tags(kind: str, instance_id: int, count: int) -> np.ndarray:
-    """Tags of what stands or moves on the ground, (count, 4)."""
+    """Return the tags of something on the ground, (count, 4)."""
     tag = _tags(np.array([KINDS[kind]]), np.array([instance_id]), np.array([contract.STANDING_LAYER]))
     return np.repeat(tag, count, axis=0)

@@ -1,10 +1,9 @@
-"""The rim: what lies beyond a map, in place of a lawn without an end: fields, roads that lead out of the town, houses
-and trees that thin out, blocks on the skyline.
+"""The rim: scenery beyond a map instead of an endless lawn: fields, roads out of the town, houses and trees that thin
+out, blocks on the skyline.
 
-Scenery for renderers alone: no stage walks, plans or measures there, and its pixels are nobody's. Fields lie in the
-ground plane, under the map too where it shows that plane. What stands begins at SOLIDS_FROM_M, and no flight comes
-there. Rectangles are rows of middle and half sizes along x and y, then the half height; `town`: (2, 2) the map's low
-and high corner.
+Only renderers use it, and its pixels have no instance. Fields lie in the ground plane, also under the map where that
+plane is visible. Solid things begin at SOLIDS_FROM_M, beyond every trajectory. Rectangles are rows of middle and half
+sizes along x and y, then the half height; `town`: (2, 2) the map's low and high corner.
 """
 
 from __future__ import annotations
@@ -25,10 +24,10 @@ from cosfly.runtime.seeding import rng_for
 REACH_M = FAR_M + 60.0
 SOLIDS_FROM_M, FLIGHTS_TO_M = 80.0, 70.0  # the rest is for the shifts of the perturbed track
 LANES_M, SKYLINE_M = (8.0, 125.0, 330.0), (420.0, 820.0)  # lanes go round the town
-# Longest sides of fields, m: nearer than YARD_M to houses, beside these, and what each metre away from them adds.
+# Longest sides of fields, m: nearer than YARD_M to houses, next to these, and growth per metre of distance.
 YARD_M, PLOT_M, FIELD_M, FIELD_GROWS = 20.0, 30.0, 60.0, 0.25
 ROAD_HALF_M, FLAT_HALF_M, OVERLAP_M = 3.0, 0.25, 0.004  # of fields, so that nothing shows between them
-SUNK_M = 1.0  # what stands begins under the ground, which may slope
+SUNK_M = 1.0  # solid things begin under the ground, which may slope
 STREETS, APART_M, OUTERMOST_M = 2, 90.0, 40.0  # roads of a side; streets that end so near the outermost end lead out
 HOUSE_EVERY_M, THINS_M = 21.0, 150.0  # along roads; houses are e times fewer so far on
 CLUSTERS, BLOCKS = 6, 12  # of the skyline
@@ -36,7 +35,7 @@ CLUSTERS, BLOCKS = 6, 12  # of the skyline
 
 def rim_of(box_map: BoxMap, seed: int) -> BoxMap:
     """Return the boxes beyond a map, with ids that no box of it has: the same for the same map and seed."""
-    from scipy.spatial import cKDTree  # half a second, as in contract.py
+    from scipy.spatial import cKDTree  # takes half a second to import, as in contract.py
 
     rng = rng_for(seed, "render", f"rim/{box_map.name}")
     town = np.stack([corner[:2] for corner in box_map.bounds()])
@@ -51,7 +50,7 @@ def rim_of(box_map: BoxMap, seed: int) -> BoxMap:
     kinds[: num_flat + len(houses)] = KINDS["Buildings"]
     kinds[:num_flat] = KINDS["Roads"]
     kinds[: len(fields)] = KINDS["Terrain"]
-    # What stands, does so far enough out, on no road and in no house before it.
+    # Solid things stay if they are far enough out, on no road and in no earlier house.
     hard, standing = rows[len(fields) :][:num_hard], rows[num_flat:]
     gaps = np.abs(standing[:, None, :2] - hard[:, :2]) - standing[:, None, 2:4] - hard[:, 2:4]
     is_before = np.arange(len(standing))[:, None] + len(roads) > np.arange(num_hard)
@@ -68,21 +67,21 @@ def rim_of(box_map: BoxMap, seed: int) -> BoxMap:
 
 
 def check_outside_rim(trace: DroneTrace, box_map: BoxMap) -> None:
-    """Raise RenderError where a flight comes near to what stands in the rim, with how far out it comes."""
+    """Raise RenderError if a trajectory comes near the solid things of the rim."""
     town = np.stack([corner[:2] for corner in box_map.bounds()])
     if (away_m := float(_away_m(trace.positions_m[:, :2], town).max())) > FLIGHTS_TO_M:
         got, fix = f"{away_m:.0f} m beyond the map's bounds", "--set render.rim=false"
         expected = f"at most {FLIGHTS_TO_M:g} m: houses and trees begin at {SOLIDS_FROM_M:g} m"
-        raise RenderError("a flight comes into the rim", where=trace.path_id, got=got, expected=expected, fix=fix)
+        raise RenderError("the trajectory enters the rim", where=trace.path_id, got=got, expected=expected, fix=fix)
 
 
 def _away_m(points: np.ndarray, town: np.ndarray) -> np.ndarray:
-    """How far places, (n, 2), lie beyond the bounds, (n,)."""
+    """Return the distances of places, (n, 2), beyond the bounds, (n,)."""
     return np.linalg.norm(np.maximum(np.maximum(town[0] - points, points - town[1]), 0.0), axis=1)
 
 
 def _fields(low: np.ndarray, high: np.ndarray, built: Callable, rng: np.random.Generator) -> np.ndarray:
-    """Cut a rectangle into fields, small ones among and near houses, of which `built` finds the nearest."""
+    """Cut a rectangle into fields, small ones near houses; `built` finds the nearest house."""
     middle, size = (low + high) / 2.0, high - low
     away = float(built(middle)[0]) - size.max() / 2.0 - YARD_M
     if size.max() < (FIELD_M + FIELD_GROWS * away if away > 0.0 else PLOT_M) * rng.uniform(0.8, 1.6):
@@ -94,7 +93,7 @@ def _fields(low: np.ndarray, high: np.ndarray, built: Callable, rng: np.random.G
 
 
 def _roads(box_map: BoxMap, town: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Lanes round the town, and roads that leave it in line with the widest streets that lead out, or anywhere."""
+    """Return lanes around the town, and roads that continue its widest streets outwards, or begin anywhere."""
     streets = box_map.select(box_map.kinds == KINDS["Roads"])
     half = axis_aligned_half_extents(streets.half_extents, streets.rotations_deg)
     roads = []
@@ -122,7 +121,7 @@ def _roads(box_map: BoxMap, town: np.ndarray, rng: np.random.Generator) -> np.nd
 
 
 def _houses(roads: np.ndarray, town: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Low houses on both sides of roads, fewer far from the town."""
+    """Return low houses on both sides of roads, fewer far from the town."""
     found: list[np.ndarray] = []
     for road in np.repeat(roads, 2, axis=0):
         axis, side = int(road[3] > road[2]), (-1.0) ** len(found)
@@ -137,7 +136,7 @@ def _houses(roads: np.ndarray, town: np.ndarray, rng: np.random.Generator) -> np
 
 
 def _skyline(town: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Groups of blocks far out, the highest in the middle of theirs."""
+    """Return groups of blocks far out, the highest in the middle of each."""
     aside = rng.normal(0.0, 1.0, (CLUSTERS, BLOCKS))
     turn = rng.uniform(0.0, 2.0 * np.pi, (CLUSTERS, 1)) + 0.08 * aside
     away = rng.uniform(*SKYLINE_M, (CLUSTERS, 1)) + rng.normal(0.0, 45.0, aside.shape)
@@ -148,7 +147,7 @@ def _skyline(town: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _plants(fields: np.ndarray, houses: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Hedges and trees along one side of fields, woods, and trees in gardens."""
+    """Return hedges and trees along one side of fields, woods, and trees in gardens."""
     hedges, around = fields.copy(), rng.uniform(-1.0, 1.0, (2, len(houses), 2))
     around *= 14.0 / np.abs(around).max(axis=2, keepdims=True)
     every, across = np.arange(len(fields)), rng.integers(0, 2, len(fields))

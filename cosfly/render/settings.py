@@ -8,15 +8,15 @@ from pydantic import Field, field_validator, model_validator
 
 from cosfly.formats.frames import LEAST_FOV_DEG, MOST_FOV_DEG, DepthFormat, FrameFile, Look
 from cosfly.formats.places import folder_name
+from cosfly.render.camera import ZoomConfig
 from cosfly.render.carla_backend import CarlaRenderConfig
-from cosfly.render.lens import ZoomConfig
 from cosfly.render.perturbation import PerturbationConfig
 from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
 from cosfly.render.weather import WeatherConfig
 from cosfly.runtime.arrays import LONGEST_SIDE_PX
 from cosfly.runtime.config import Config
 
-ENGINES = ("carla", "unrealcv")  # renderers that are running somewhere
+SIMULATORS = ("carla", "unrealcv")
 
 
 class RenderConfig(WeatherConfig):
@@ -34,27 +34,26 @@ class RenderConfig(WeatherConfig):
     fovs_deg: tuple[float, ...] = Field(
         (110.0, 90.0, 60.0, 30.0),
         min_length=1,
-        description="levels of zoom: horizontal fields of view in (0, 180) degrees; one is drawn for each walk, and "
-        "both its tracks keep it; a list of one fixes it",
+        description="levels of zoom: horizontal fields of view in (0, 180) degrees; each trajectory draws one for "
+        "both its tracks; a list of one fixes it",
     )
-    zoom: ZoomConfig = Field(ZoomConfig(), description="whether a flight changes its level")
+    zoom: ZoomConfig = Field(ZoomConfig(), description="changes of the level within a trajectory")
     town: str | None = Field(
         None,
-        description="name of the town; null takes the map's. Its folder has `Town_` in front unless it begins with "
-        "`Town`",
+        description="name of the town; null takes the map's. Its folder is named `Town_<name>`, unless the name begins "
+        "with `Town`",
     )
     first_timestamp: int | None = Field(
         None,
         ge=0,
-        description="flight k of the traces becomes trajectory_<first_timestamp + k>; null makes one of map, "
-        "flights, seed and "
-        "settings, so that flights of other maps and runs have other ids",
+        description="trajectory k of the traces becomes trajectory_<first_timestamp + k>; null derives it from map, "
+        "traces, seed and settings, so that other maps and runs have other ids",
     )
     tracks: tuple[Literal["clean", "perturbed"], ...] = Field(
         ("clean", "perturbed"), min_length=1, description="which tracks to draw: ORI and aug_001"
     )
     perturbation: PerturbationConfig = Field(PerturbationConfig(), description="the perturbed track")
-    look: Look = Field(Look(), description="sun and air of flights without weather")
+    look: Look = Field(Look(), description="sun and air of trajectories without weather")
     modalities: tuple[FrameFile, ...] = Field(
         ("rgb", "depth", "instance"), min_length=1, description="which images to write; meta.json is always written"
     )
@@ -64,39 +63,39 @@ class RenderConfig(WeatherConfig):
         "public layout",
     )
     path_index: int | None = Field(
-        None, ge=0, description="draw the flight of this place in the traces alone; null: all"
+        None, ge=0, description="draw only the trajectory of this index in the traces; null: all"
     )
     frame_stride: int = Field(
         1,
         ge=1,
         le=100,
-        description="draw every so many poses of a flight; those between stand in trajectory.json. With "
-        "pedestrians.dt_s 0.1: 1 gives frames and actions at 10 Hz, 5 frames at 2 Hz with actions at 10 Hz",
+        description="draw every n-th pose; those between are in trajectory.json. With pedestrians.dt_s 0.1: 1 gives "
+        "frames and actions at 10 Hz, 5 frames at 2 Hz with actions at 10 Hz",
     )
     debug: bool = Field(
         False, description="also write debug.png: boxes, ids and distances projected over the colour picture"
     )
     rim: bool = Field(
         False,
-        description="draw fields, roads, low houses and a skyline beyond the map, in place of a lawn to the horizon; "
-        "flights must stay within 70 m of the map's bounds",
+        description="draw fields, roads, low houses and a skyline beyond the map, instead of a lawn to the horizon; "
+        "trajectories must stay within 70 m of the map's bounds",
     )
     visible_threshold: float = Field(
         0.1,
         ge=0,
         lt=1,
-        description="a target is visible if more than this share of its box is seen and one pixel of it drawn",
+        description="a target is visible if more than this share of its box is unhidden and it has at least one pixel",
     )
 
     @property
     def of_backend(self) -> Config | None:
-        """The settings of the chosen renderer alone; None where it has none."""
+        """Return the settings of the chosen renderer; None if it has none."""
         return getattr(self, self.backend, None)
 
     def recorded(self) -> dict[str, Any]:
-        """Without a rim, a flight alone, or a renderer of settings of its own, they are those of before."""
+        """Return the recorded settings, without those that are unused."""
         used = {"rim": self.rim, "path_index": self.path_index is not None}
-        used |= {name: self.backend == name for name in ENGINES}
+        used |= {name: self.backend == name for name in SIMULATORS}
         return {name: value for name, value in super().recorded().items() if used.get(name, True)}
 
     @field_validator("fovs_deg")
@@ -110,17 +109,15 @@ class RenderConfig(WeatherConfig):
 
     @model_validator(mode="after")
     def _weather_can_be_drawn(self) -> RenderConfig:
-        if self.backend in ENGINES and (self.look != Look() or self.rim):
-            raise ValueError(
-                f"backend {self.backend} has a sun, an air and a horizon of its own: leave look and rim out"
-            )
+        if self.backend in SIMULATORS and (self.look != Look() or self.rim):
+            raise ValueError(f"backend {self.backend} has its own sun, air and horizon: remove look and rim")
         if self.weather_mode == "off":
             return self
         if self.backend in ("pyrender", "unrealcv"):
-            raise ValueError(f"backend {self.backend} draws no weather: take gl or carla, or weather_mode off")
+            raise ValueError(f"backend {self.backend} draws no weather: use gl or carla, or weather_mode off")
         if self.look != Look():
             raise ValueError(
-                "look is for flights without weather: leave it out (--set 'render.look={}'), or take weather_mode off"
+                "look is for trajectories without weather: remove it (--set 'render.look={}'), or use weather_mode off"
             )
         return self
 

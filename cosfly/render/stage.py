@@ -1,6 +1,6 @@
-"""Stage 5: flights to RGB, depth and instance frames in the playback tree; the clean and the perturbed track.
+"""Stage 5: drone trajectories to RGB, depth and instance frames of a clean and a perturbed track, as a playback tree.
 
-A renderer is anything that meets `contract.Renderer`; RENDERERS names them.
+RENDERERS names the implementations of `contract.Renderer`.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from cosfly.formats.town import IDS_FILE, IDS_FORMAT, write_town_map
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import step_s
+from cosfly.render.camera import cameras_of
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
-from cosfly.render.lens import cameras_of
-from cosfly.render.person import cast_of, choose_clothes, gait_of
+from cosfly.render.person import choose_clothes, dress_bystanders, gait_of
 from cosfly.render.perturbation import PERTURBED, PerturbedTrack, Poses, Surroundings, perturb, rng_of_shifts
 from cosfly.render.rim import check_outside_rim, rim_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.track import TrackScript, Writing, check_track, render_track
-from cosfly.render.weather import coverage_of, drawn_seed, fog_hides, read_pools, told_coverage, weather_of
+from cosfly.render.weather import fog_hides, random_seed, read_pools, weather_of
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.io import CHECKSUMS, atomic_folder, inside, sha256_bytes
@@ -54,7 +54,7 @@ VARIANTS = {"clean": "ORI", "perturbed": PERTURBED}
 TRAJECTORY = "trajectory_"
 FIRST_S, SPAN_S = 1_000_000_000, 999_000_000  # seconds of ten digits, as those of the public release
 ENCODER_THREADS = 2  # of each worker, next to the drawing
-FROM_ONE_RUN = "give the others.json that was written beside the walks' path.json"
+FROM_ONE_RUN = "pass the others.json that was written together with path.json"
 
 
 def open_renderer(
@@ -67,13 +67,13 @@ def open_renderer(
     rim: BoxMap | None = None,
     settings: Config | None = None,
 ) -> Renderer:
-    """Open a renderer of the table for one map and at most so many others.
+    """Open a renderer for one map and at most `num_others` bystanders.
 
     Args:
-        settings: of this renderer alone, where it has any; None takes its defaults.
+        settings: The renderer's own, if it has any; None uses its defaults.
     """
     if name not in RENDERERS:
-        raise ConfigError("unknown renderer", where="render.backend", got=name, expected=", ".join(RENDERERS))
+        raise ConfigError("the renderer is unknown", where="render.backend", got=name, expected=", ".join(RENDERERS))
     module, _, attribute = RENDERERS[name].partition(":")
     own = {} if settings is None else {"settings": settings}
     make = getattr(importlib.import_module(module), attribute)
@@ -86,7 +86,7 @@ def renderer_of(cfg: RenderConfig, box_map: BoxMap, seed: int, num_others: int =
     return open_renderer(cfg.backend, box_map, *size_px, cfg.look, num_others, rim, cfg.of_backend)
 
 
-# --- from traces to scripts -------------------------------------------------------------------------------------------
+# --- scripts of tracks ------------------------------------------------------------------------------------------------
 
 
 def make_track_script(
@@ -100,23 +100,23 @@ def make_track_script(
     others: Sequence[Bystander] = (),
     weather: WeatherRecord | None = None,
 ) -> TrackScript:
-    """Decide everything about one flight. Both tracks of a trace share field of view, people and weather.
+    """Choose all that one track shows. Both tracks of a trajectory share field of view, people and weather.
 
     Args:
-        planned: the flight; every `frame_stride`-th of its poses is drawn. others: at the same times.
+        planned: Every `frame_stride`-th of its poses is drawn. others: At the same times.
     """
-    assert cfg.first_timestamp is not None, "`run` settles it"
+    assert cfg.first_timestamp is not None, "`run` sets it"
     trace = planned.every(cfg.frame_stride)
     looks = planned.drawn_as(number)
     before_m, step = looks.before_m[:-1], step_s(planned.time_s)
     before_s = trace.time_s[0] - step * np.arange(len(before_m), 0, -1)
-    walked = gait_of(np.vstack([before_m, trace.targets_m]), np.concatenate([before_s, trace.time_s]))
+    gait = gait_of(np.vstack([before_m, trace.targets_m]), np.concatenate([before_s, trace.time_s]))
     shared = rng_for(seed, "render", looks.path_id)
     fov_deg = float(cfg.fovs_deg[int(shared.integers(len(cfg.fovs_deg)))])
     clothes = choose_clothes(shared)
     drawn_others = [other.every(cfg.frame_stride) for other in others]
     others_rng = rng_for(seed, "render", f"{looks.path_id}/others")
-    cast = cast_of(drawn_others, trace.time_s, clothes.looks, others_rng)
+    cast = dress_bystanders(drawn_others, trace.time_s, clothes.looks, others_rng)
     lens_rng = rng_for(seed, "render", f"{looks.path_id}/zoom")
     size_px = cfg.width_px, cfg.height_px
     cameras = cameras_of(size_px, fov_deg, cfg.fovs_deg, cfg.zoom, trace.time_s, trace.segments, lens_rng)
@@ -125,7 +125,7 @@ def make_track_script(
         rng = rng_of_shifts(seed, trace.path_id)
         perturbed = perturb(poses, cameras, surroundings, cfg.perturbation, rng, cast)
     else:
-        perturbed = PerturbedTrack.nothing(poses)
+        perturbed = PerturbedTrack.unperturbed(poses)
     return TrackScript(
         town=town,
         trajectory=f"{TRAJECTORY}{cfg.first_timestamp + number}",
@@ -133,7 +133,7 @@ def make_track_script(
         cameras=cameras,
         time_s=trace.time_s,
         perturbed=perturbed,
-        gait=walked.since(len(before_m)),
+        gait=gait.since(len(before_m)),
         clothes=clothes,
         others=cast,
         look=cfg.look if weather is None else None,
@@ -169,23 +169,25 @@ def run(
     resume: Resume = "if-same",
     others: Path | None = None,
 ) -> Path:
-    """Reads `boxes_3d.json` (drawn), `step2_simplified.json` (clearance), `drone_trace.json` and, where others move,
-    `others.json`; writes the playback tree.
+    """Reads the maps `boxes_3d.json` (drawn) and `step2_simplified.json` (clearance), `drone_trace.json` and, with
+    bystanders, `others.json`; writes the playback tree.
 
-    Flights that the planner's prefilter dropped are not drawn; the manifest counts them. Gives the tree's root, `out`.
+    Trajectories that the planner dropped are not drawn; the manifest counts them. Returns the tree's root, `out`.
 
     Raises:
-        InputError: an input is missing or malformed. NothingKept: no flight is left to draw. EnvironmentMissing: no
-            renderer here.
+        InputError: If an input is missing or malformed.
+        NothingKept: If no trajectory is left to draw.
+        EnvironmentMissing: If the renderer cannot run here.
     """
     inputs = {"boxes": boxes, "simplified": simplified, "traces": traces} | ({"others": others} if others else {})
-    pools = read_pools(cfg)  # presets that cannot be are told before anything is written
+    pools = read_pools(cfg)  # before anything is written
     inputs |= cfg.pool_files()
     checked_inputs(inputs)  # before the map is read for the names of its meshes, which are inputs too
     box_map = read_boxes(boxes)
     inputs |= {f"mesh {name}": path for name, path in box_map.meshes.files().items()}
     if cfg.path_index is not None and cfg.path_index >= (num := len(read_traces(traces))):
-        raise ConfigError("no such flight", where="render.path_index", got=cfg.path_index, expected=f"below {num}")
+        what, expected = "no trajectory has this index", f"an index below {num}"
+        raise ConfigError(what, where="render.path_index", got=cfg.path_index, expected=expected)
     stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return out
@@ -198,11 +200,10 @@ def run(
         log.warning("render: %d boxes share the instance id %d: ids have 16 bits", num_shared, SHARED_ID)
     town, first_timestamp = _names(stage, cfg, box_map.name, traces, others, seed)
     cfg = cfg.model_copy(update={"first_timestamp": first_timestamp, "weather_seed": _weather_seed(stage, cfg)})
-    apart_m = {number: np.linalg.norm(trace.positions_m - trace.targets_m, axis=1) for number, trace in passed}
-    if hidden := [
-        t.path_id for n, t in passed if fog_hides(weather_of(cfg, pools, t.drawn_as(n).number), float(apart_m[n].min()))
-    ]:
-        log.warning("render: fog hides the person from end to end of %s: fly nearer, or in other weather", hidden)
+    nearest_m = {n: np.linalg.norm(trace.positions_m - trace.targets_m, axis=1).min() for n, trace in passed}
+    skies = {n: weather_of(cfg, pools, trace.drawn_as(n).number) for n, trace in passed}
+    if hidden := [trace.path_id for n, trace in passed if fog_hides(skies[n], float(nearest_m[n]))]:
+        log.warning("render: fog hides the target in all frames of %s: plan nearer, or in other weather", hidden)
     items = [_item(number, trace.every(cfg.frame_stride), track) for number, trace in passed for track in cfg.tracks]
     arguments = (cfg, boxes, simplified, traces, others, out, town, seed, min(workers, len(items)))
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="render: frames")
@@ -221,7 +222,6 @@ def run(
         num_traces_not_rendered=len(all_traces) - len(passed),
         num_boxes_sharing_an_id=num_shared,
         goals=dict(sorted(Counter(one.goal for one in made).items())),
-        **_weather_drawn(cfg, made),
     )
     return out
 
@@ -231,74 +231,47 @@ def _item(number: int, trace: DroneTrace, track: str) -> Item:
 
 
 def _passed(stage: StageFolder, traces: list[DroneTrace], chosen: int | None) -> list[tuple[int, DroneTrace]]:
-    """Return the flights that are drawn, all or the chosen one, each with its number among all."""
+    """Return the trajectories to draw, all or the chosen one, each with its number."""
     passed = [(n, trace) for n, trace in enumerate(traces) if trace.drop_reason is None and chosen in (None, n)]
     if not passed:
         tally = Tally(input=len(traces), dropped=Counter(str(trace.drop_reason) for trace in traces))
-        raise stage.nothing_kept(tally, expected="a flight that the planner kept")
+        raise stage.nothing_kept(tally, expected="a trajectory that the planner accepted")
     return passed
 
 
-def _weather_drawn(cfg: RenderConfig, made: list[_RenderedTrack]) -> dict:
-    """What the manifest says of the weather of the trajectories, nothing in runs without."""
-    if cfg.weather_mode == "off":
-        return {}
-    # Both tracks of a trajectory have the same.
-    drawn = {str(Path(one.folder).parent): (str(one.weather), str(one.time_of_day)) for one in made}
-    told = coverage_of(cfg, drawn.values())
-    log.info("render: %s", told_coverage(told))
-    return {"weather": told}
-
-
-def _weather_told(weather: WeatherRecord, seed: int) -> dict:
-    return {"weather": weather.weather_name, "time_of_day": weather.tod_name, "weather_seed": seed}
-
-
 class _RenderedTrack(BaseModel):
-    """Of what the journal holds of a flight, what is read again."""
+    """The values of a rendered track in the journal that are read again."""
 
     folder: str
     num_frames: int
     goal: str = "absent"
-    weather: str | None = None
-    time_of_day: str | None = None
     weather_seed: int | None = None
 
 
 def bystanders_by_path(others: Path | None, traces: list[DroneTrace]) -> dict[str, Bystanders]:
-    """Read the others of every flight, by the walk's id; nobody without a file."""
+    """Read the bystanders of every trajectory, by path id; an empty table without a file."""
     if others is None:
         return {}
     found = {bystanders.path_id: bystanders for bystanders in read_bystanders(others)}
     for trace in traces:
-        bystanders = found.get(trace.path_id)
-        if bystanders is None:
-            raise InputError("no others for a walk", where=f"{others}: paths", expected=trace.path_id, fix=FROM_ONE_RUN)
-        for other in bystanders.others:
-            if len(other.positions_m) != len(trace.time_s):
-                got, expected = (
-                    f"{len(other.positions_m)} places",
-                    f"{len(trace.time_s)}, one for each time of the flight",
-                )
-                raise InputError(
-                    "others of other times",
-                    where=f"{others}: {trace.path_id}",
-                    got=got,
-                    expected=expected,
-                    fix=FROM_ONE_RUN,
-                )
+        where, num_times = f"{others}: {trace.path_id}", len(trace.time_s)
+        if trace.path_id not in found:
+            raise InputError("the file has no bystanders of a path", where=where, fix=FROM_ONE_RUN)
+        if wrong := {len(other.positions_m) for other in found[trace.path_id].others} - {num_times}:
+            what, got = "bystanders have other times than the trajectory", f"{wrong.pop()} positions"
+            raise InputError(what, where=where, got=got, expected=str(num_times), fix=FROM_ONE_RUN)
     return found
 
 
-def num_others_of(companions: dict[str, Bystanders]) -> int:
-    """How many ids the others of a tree need: as many as the largest company has."""
-    return max((len(bystanders.others) for bystanders in companions.values()), default=0)
+def num_others_of(bystanders: dict[str, Bystanders]) -> int:
+    """Return how many ids the bystanders of a tree need: as many as a trajectory has at most."""
+    return max((len(one.others) for one in bystanders.values()), default=0)
 
 
 def _names(
     stage: StageFolder, cfg: RenderConfig, map_name: str, traces: Path, others: Path | None, seed: int
 ) -> tuple[str, int]:
-    """Return the town's folder and the number of the first trajectory; a tree that was begun keeps its own."""
+    """Return the town's folder and the number of the first trajectory; a resumed tree keeps its own."""
     numbers = {trace.path_id: number for number, trace in enumerate(read_traces(traces))}
     for record in stage.items():
         number = numbers.get(record.id.rpartition("/")[0])
@@ -308,27 +281,27 @@ def _names(
     town = town_folder(cfg.town or map_name)
     of_others = [] if others is None else [fingerprint(others)]
     settings = cfg.recorded()
-    del settings["depth_format"]  # flights are the same in either
+    del settings["depth_format"]  # poses are the same in either
     what = dump_json([town, seed, fingerprint(traces), settings, *of_others])
     derived = FIRST_S + int(sha256_bytes(what.encode()), 16) % SPAN_S
     return town, derived if cfg.first_timestamp is None else cfg.first_timestamp
 
 
 def _weather_seed(stage: StageFolder, cfg: RenderConfig) -> int:
-    """Return the seed of the weather; a drawn one stays what it was when the tree was begun."""
+    """Return the seed of the weather; a resumed tree keeps the one that was drawn."""
     if cfg.weather_seed >= 0:
         return cfg.weather_seed
     begun = (result_of(record, _RenderedTrack).weather_seed for record in stage.items() if isinstance(record, Kept))
-    return next((seed for seed in begun if seed is not None), None) or drawn_seed()
+    return next((seed for seed in begun if seed is not None), None) or random_seed()
 
 
 def _check_ids(traces: list[DroneTrace], path: Path) -> None:
     if twice := sorted(i for i, n in Counter(trace.path_id for trace in traces).items() if n > 1):
-        raise InputError("two flights have one id", where=path, got=twice[0], expected="unique ids")
+        raise InputError("two trajectories have the same id", where=path, got=twice[0], expected="unique ids")
 
 
 def _ids_record(box_map: BoxMap, num_others: int) -> dict:
-    """Return which box an id of `instance.png` stands for, rows of (instance id, box id), and the ids of others."""
+    """Return the content of the ids file: rows of (instance id, box id), and the ids of bystanders."""
     ids = instance_ids(box_map, num_others)
     return {
         **IDS_FORMAT.header,
@@ -352,17 +325,16 @@ def make_worker(
     seed: int,
     num_processes: int,
 ) -> Work:
-    """Open a renderer in this process and give the function that draws one (trace, track)."""
+    """Open a renderer in this process and return the function that draws one (trace, track)."""
     if num_processes > 1:
-        # Several processes share the cores already: one rasteriser thread each. Only read when the driver loads.
+        # Processes share the cores: one rasteriser thread each. The driver reads it when it loads.
         os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num_processes)))
     surroundings, all_traces = Surroundings(read_boxes(simplified)), read_traces(traces)
-    companions = bystanders_by_path(others, all_traces)
-    num_others = num_others_of(companions)
-    drawn = read_boxes(boxes)
-    renderer = renderer_of(cfg, drawn, seed, num_others)
-    pools = read_pools(cfg)
-    overlay = Overlay(drawn, instance_ids(drawn, num_others)) if cfg.debug else None
+    bystanders = bystanders_by_path(others, all_traces)
+    num_others = num_others_of(bystanders)
+    box_map, pools = read_boxes(boxes), read_pools(cfg)
+    renderer = renderer_of(cfg, box_map, seed, num_others)
+    overlay = Overlay(box_map, instance_ids(box_map, num_others)) if cfg.debug else None
     writing = Writing(tuple(cfg.modalities), cfg.visible_threshold, cfg.depth_format, overlay)
 
     def work(item: Item) -> Outcome:
@@ -370,25 +342,27 @@ def make_worker(
         trace = all_traces[number]
         check_track(trace, surroundings)
         if cfg.rim:
-            check_outside_rim(trace, drawn)
-        bystanders = companions.get(trace.path_id)
-        others = () if bystanders is None else bystanders.others
+            check_outside_rim(trace, box_map)
+        others_here = bystanders[trace.path_id].others if bystanders else ()
         weather = weather_of(cfg, pools, trace.drawn_as(number).number)
-        script = make_track_script(trace, number, track, town, surroundings, cfg, seed, others, weather)
+        weather_result = {} if weather is None else {
+            "weather": weather.weather_name, "time_of_day": weather.tod_name, "weather_seed": cfg.weather_seed
+        }  # fmt: skip
+        script = make_track_script(trace, number, track, town, surroundings, cfg, seed, others_here, weather)
         folder = out / town / script.trajectory / script.variant
         with atomic_folder(folder) as unfinished:
-            flight = render_track(renderer, script, unfinished, writing, ENCODER_THREADS)
+            made = render_track(renderer, script, unfinished, writing, ENCODER_THREADS)
         return Outcome(
             {
                 "folder": str(folder.relative_to(out)),
-                "num_frames": len(flight),
-                "fov_deg": round(flight.camera.fov_deg, 6),
-                **({} if flight.intrinsics is None else {"fovs_deg": [round(fov, 6) for fov in flight.fovs_deg]}),
-                "num_visible": int(flight.target.visible.sum()),
-                "mean_visibility": round(float(flight.target.visibility.mean()), 6),
-                "num_perturbed": int(flight.perturbation.is_perturbed.sum()),
-                "goal": flight.raw["goal"]["absent"] if flight.goal is None else "told",
-                **({} if script.weather is None else _weather_told(script.weather, cfg.weather_seed)),
+                "num_frames": len(made),
+                "fov_deg": round(made.camera.fov_deg, 6),
+                **({} if made.intrinsics is None else {"fovs_deg": [round(fov, 6) for fov in made.fovs_deg]}),
+                "num_visible": int(made.target.visible.sum()),
+                "mean_visibility": round(float(made.target.visibility.mean()), 6),
+                "num_perturbed": int(made.perturbation.is_perturbed.sum()),
+                "goal": made.raw["goal"]["absent"] if made.goal is None else "told",
+                **weather_result,
             }
         )
 

@@ -1,4 +1,4 @@
-"""One flight to one folder of the playback tree: draw, annotate, encode, write; encoding runs beside the drawing."""
+"""One track to one folder of the playback tree: draw, annotate, encode, write; encoding runs while frames are drawn."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-
-# --- whether a flight can be drawn at all: nobody stands below the ground or looks out of a wall ----------------------
 from functools import cache
 from pathlib import Path
 
@@ -16,16 +14,7 @@ import cv2
 import numpy as np
 
 from cosfly.formats import frames
-from cosfly.formats.frames import (
-    BystandersMeta,
-    Camera,
-    DepthFormat,
-    FrameFile,
-    FrameMeta,
-    Look,
-    TargetMeta,
-    frame_name,
-)
+from cosfly.formats.frames import BystandersMeta, Camera, DepthFormat, FrameFile, FrameMeta, Look, TargetMeta
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.formats.people import Appearance, Goal, People
@@ -36,16 +25,9 @@ from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import mask_box, world_from_camera
 from cosfly.geometry.goals import SeenFrame, find_says, otherwise, target_picture, words_of
 from cosfly.geometry.kernels import signed_distances
-from cosfly.render.camera import (
-    TargetView,
-    contrast_of,
-    hidden_shares,
-    legibility,
-    rendered_visibility,
-    view_target,
-)
+from cosfly.render.camera import TargetView, contrast_of, legibility, rendered_visibility, view_target
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
-from cosfly.render.person import Cast, Gait
+from cosfly.render.person import DressedBystanders, Gait
 from cosfly.render.perturbation import HIDDEN, STEP_UP_M, PerturbedTrack, Poses, Surroundings
 from cosfly.runtime.errors import RenderError
 from cosfly.runtime.io import sha256_bytes, sha256_file, storage_errors, write_checksums
@@ -53,79 +35,72 @@ from cosfly.runtime.json_io import FileFormat, write_json
 from cosfly.runtime.worker import advance
 from cosfly.viz.overlay import Overlay
 
-MOST_TRIED = 8  # frames of a flight, the first in which the target is legible
-# Two looks are told apart by so many pixels, and such a share of a person's, of so much colour difference (CIE76).
-TOLD_PX, TOLD_SHARE, TOLD_CONTRAST = 8, 0.04, 10.0
+REPORT_FORMAT = FileFormat("cosfly.perturbation_report", "1.0")
+MARGIN_M = 60.0  # shadows and sky openness are computed this far around the trajectory
+FRAMES_AHEAD = 6  # drawn but not written yet: bounds the memory (about 10 MB each)
+TOUCH_M = 0.01  # a camera this deep in a box still touches it only
+MOST_GOAL_FRAMES = 8  # the first in which the target is legible
+# Two appearances differ to the eye by so many pixels, such a share of a person's, of such a colour difference (CIE76).
+DIFFERENT_PX, DIFFERENT_SHARE, DIFFERENT_CONTRAST = 8, 0.04, 10.0
 
 
 def find_goal(
     people: People, i: int, draw: Callable[[Appearance], Frame], intrinsic: np.ndarray, rotation: np.ndarray
 ) -> Goal | None:
-    """Find what tells the target of frame i from the others that have a pixel in it.
+    """Find the words that distinguish the target of frame i from the bystanders that have a pixel in it.
 
     Args:
-        draw: the frame with a target of that look. intrinsic: (3, 3) px. rotation: (3, 3), world from camera.
+        draw: Draws the frame with a target of that appearance. intrinsic: (3, 3) px. rotation: (3, 3), world from
+            camera.
     """
     looks, frame = people.target, draw(people.target)
 
     @cache
     def differs(other: Appearance) -> bool:
-        return are_told_apart(frame, draw(other))
+        return targets_differ(frame, draw(other))
 
-    def tells(slot: str, other: Appearance) -> bool:
+    def distinguishes(slot: str, other: Appearance) -> bool:
         if slot == "figure":
             return differs(replace(looks, figure=other.figure))
         kept, worn = ((getattr(one, slot), getattr(one, f"{slot}_color")) for one in (looks, other))
-        if kept[1] and worn[1] and kept[1] != worn[1]:  # the wardrobe's colours are told apart where they are seen
+        if kept[1] and worn[1] and kept[1] != worn[1]:  # the wardrobe's colours differ wherever they are visible
             other = otherwise(looks, slot)
         return differs(replace(looks, **{name: getattr(other, name) for name in (slot, f"{slot}_color")}))
 
     seen = SeenFrame(frame.kinds, frame.ids, frame.depth, intrinsic, rotation)
-    says = find_says({PERSON_ID: looks, **people.others}, seen, tells)
+    says = find_says({PERSON_ID: looks, **people.others}, seen, distinguishes)
     return None if says is None else Goal(i, **words_of(says, looks), says=says)
 
 
-def are_told_apart(frame: Frame, other: Frame) -> bool:
-    """Return whether the target of two frames that differ in its look alone is another one to the eye."""
+def targets_differ(frame: Frame, other: Frame) -> bool:
+    """Return whether the target of two frames that differ in its appearance only looks different to the eye."""
     is_person = (frame.ids == PERSON_ID) | (other.ids == PERSON_ID)
     colors = [cv2.cvtColor(one.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[is_person] for one in (frame, other)]
-    num_px = np.count_nonzero(np.linalg.norm(colors[0] - colors[1], axis=-1) >= TOLD_CONTRAST)
-    return bool(num_px >= max(TOLD_PX, TOLD_SHARE * np.count_nonzero(is_person)))
-
-
-TOUCH_M = 0.01  # so deep in a box a camera still counts as touching it
+    num_px = np.count_nonzero(np.linalg.norm(colors[0] - colors[1], axis=-1) >= DIFFERENT_CONTRAST)
+    return bool(num_px >= max(DIFFERENT_PX, DIFFERENT_SHARE * np.count_nonzero(is_person)))
 
 
 def check_track(trace: DroneTrace, surroundings: Surroundings) -> None:
-    """Check that the camera is outside every obstacle and the person on or over the ground, in all frames of a plan."""
+    """Check that in all frames the camera is outside every obstacle and the person not below the ground."""
     depths_m, _ = signed_distances(surroundings.obstacles, trace.positions_m, 0.0)
-    inside = np.flatnonzero(depths_m < -TOUCH_M)
-    if len(inside):
-        i = int(inside[0])
-        raise RenderError(
-            "a camera inside a box", where=f"{trace.path_id}: frame {i}",
-            got=f"{-depths_m[i]:.2f} m deep; {len(inside)} of {len(depths_m)} frames",
-            expected="a camera in the open", fix="plan the flight again on this map",
-        )  # fmt: skip
     feet_m = trace.targets_m - [0.0, 0.0, TARGET_HEIGHT_M]
     below_m = np.array([surroundings.below_ground_m(place) for place in feet_m])
-    if (below_m > STEP_UP_M).any():
-        i = int(np.argmax(below_m > STEP_UP_M))
-        raise RenderError(
-            "a target under ground", where=f"{trace.path_id}: frame {i}",
-            got=f"feet {below_m[i]:.2f} m below; {int((below_m > STEP_UP_M).sum())} of {len(below_m)} frames",
-            expected="somebody who stands on the ground", fix="walk the path again on this map",
-        )  # fmt: skip
-
-
-REPORT_FORMAT = FileFormat("cosfly.perturbation_report", "1.0")
-MARGIN_M = 60.0  # shadows and sky openness are computed this far around the flight
-FRAMES_IN_FLIGHT = 6  # drawn but not written yet: bounds the memory (about 10 MB each)
+    for what, wrong, amount_m, expected, fix in (
+        ("a camera is inside a box", depths_m < -TOUCH_M, -depths_m, "a camera in the open", "plan again on this map"),
+        (
+            "the target is under the ground", below_m > STEP_UP_M, below_m, "feet on the ground",
+            "generate the pedestrian trajectory again on this map",
+        ),
+    ):  # fmt: skip
+        if wrong.any():
+            i = int(np.argmax(wrong))
+            got = f"{amount_m[i]:.2f} m deep; {np.count_nonzero(wrong)} of {len(wrong)} frames"
+            raise RenderError(what, where=f"{trace.path_id}: frame {i}", got=got, expected=expected, fix=fix)
 
 
 @dataclass(frozen=True)
 class TrackScript:
-    """All that is drawn in one flight, n frames. cameras: of each frame. source: who planned it."""
+    """All that one track shows, n frames. cameras: of each frame. source: the planner."""
 
     town: str
     trajectory: str
@@ -135,19 +110,19 @@ class TrackScript:
     perturbed: PerturbedTrack
     gait: Gait
     clothes: Clothes
-    others: Cast
+    others: DressedBystanders
     look: Look | None
     is_original: bool
     source: dict
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
-    weather: WeatherRecord | None = None  # in the place of `look`
-    between: np.ndarray | None = None  # planned poses that are not drawn (Flight.between)
+    weather: WeatherRecord | None = None  # instead of `look`
+    between: np.ndarray | None = None  # planned poses that are not drawn (`Track.between`)
 
 
 @dataclass(frozen=True)
-class TargetSight:
-    """The target in one drawn frame: its box, the box of its pixels (4,), and what `rendered_visibility` gives."""
+class SeenTarget:
+    """The target in one drawn frame: its box, the box of its pixels (4,), and the result of `rendered_visibility`."""
 
     view: TargetView
     mask_bbox_px: np.ndarray
@@ -159,7 +134,7 @@ class TargetSight:
 
 @dataclass(frozen=True)
 class Writing:
-    """How frames are written. overlay: draws `debug.png`; None writes none."""
+    """Options of the written files. overlay: draws `debug.png`; None writes none."""
 
     files: tuple[FrameFile, ...]
     visible_threshold: float
@@ -170,19 +145,19 @@ class Writing:
 def render_track(
     renderer: Renderer, script: TrackScript, folder: Path, writing: Writing, num_threads: int = 2
 ) -> Track:
-    """Draw a flight into an (unfinished) folder: frames, `trajectory.json`, `perturbation_report.json`,
+    """Draw a track into an (unfinished) folder: frames, `trajectory.json`, `perturbation_report.json`,
     `checksums.sha256`.
 
-    A shift that hides a target which is seen without it falls back: only the drawn frame can tell.
+    A shift that hides a target which is visible without it is dropped: only the drawn frame shows that.
 
     Returns:
-        The flight as it was written.
+        The track as it was written.
     """
-    script = replace(script, perturbed=copy.deepcopy(script.perturbed))  # hidden targets are noted there
+    script = replace(script, perturbed=copy.deepcopy(script.perturbed))  # dropped shifts are noted there
     poses = script.perturbed.poses
     places = np.concatenate([poses.positions_m, poses.targets_m])
-    knobs = None if script.weather is None else script.weather.params
-    renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M, knobs)
+    weather = None if script.weather is None else script.weather.params
+    renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M, weather)
     targets: list[TargetMeta] = []
     visibility: list[float] = []
     bystanders: list[dict] = []
@@ -205,57 +180,56 @@ def render_track(
                     script.perturbed.drop_shift(i, HIDDEN)
                     frame, seen = without
             visibility.append(seen.visibility)
-            told = {} if seen.others is None else {"others": seen.others.people_of(poses.targets_m[i], people)}
-            bystanders.append(told)
+            others = {} if seen.others is None else {"others": seen.others.people_of(poses.targets_m[i], people)}
+            bystanders.append(others)
             pending.append(pool.submit(_write_frame, folder, frame, annotation(script, i, seen), writing, script))
             advance()
-            while len(pending) >= FRAMES_IN_FLIGHT:
+            while len(pending) >= FRAMES_AHEAD:
                 take(pending.pop(0))
         for written in pending:
             take(written)
-    flight = _flight(script, targets, np.array(visibility), bystanders)
-    flight = _with_goal(flight, renderer, script, writing.visible_threshold)
-    write_track(folder, flight)
+    track = _track(script, targets, np.array(visibility), bystanders)
+    track = _with_goal(track, renderer, script, writing.visible_threshold)
+    write_track(folder, track)
     write_json(folder / "perturbation_report.json", _report(script.perturbed))
     made = ["trajectory.json", "perturbation_report.json"]
-    if flight.goal is not None and "rgb" in writing.files:
-        box, shown = targets[flight.goal.frame].mask_bbox_2d, frames.read_rgb(folder / frame_name(flight.goal.frame))
-        assert box is not None, "it is legible"
-        (folder / TARGET_FILE).write_bytes(frames.rgb_bytes(target_picture(shown, box)))
+    if track.goal is not None and "rgb" in writing.files:
+        box, rgb = targets[track.goal.frame].mask_bbox_2d, frames.read_rgb(folder / frames.frame_name(track.goal.frame))
+        assert box is not None, "the target is legible there"
+        (folder / TARGET_FILE).write_bytes(frames.rgb_bytes(target_picture(rgb, box)))
         made.append(TARGET_FILE)
     for name in made:
         digests[name] = sha256_file(folder / name)
     write_checksums(folder, digests)
-    return flight
+    return track
 
 
 def draw_frame(
     renderer: Renderer, script: TrackScript, i: int, poses: Poses, threshold: float
-) -> tuple[Frame, TargetSight]:
-    """Draw frame i from the given poses and see what shows of the target."""
+) -> tuple[Frame, SeenTarget]:
+    """Draw frame i from the given poses and measure how visible the target is."""
     pose, target = world_from_camera(poses.positions_m[i], poses.rotations_deg[i]), poses.targets_m[i]
     camera = script.cameras[i]
     person, others = script.gait.posed(i, target, script.clothes), script.others.posed(i)
     frame = renderer.render(pose, camera.intrinsic, person, others)
     view = view_target(target, pose, camera)
-    score, num_px = rendered_visibility(frame, target, view, pose, camera)
-    # The depth test alone would call a box visible whose person is hidden behind a thin pole: the mask must agree.
+    ids = np.array([other.instance_id for other in others], dtype=np.int64)
+    score, *hidden = rendered_visibility(frame, target, view, pose, camera, ids)
+    is_person = frame.ids == PERSON_ID
+    num_px = int(np.count_nonzero(is_person))
+    # A thin pole may hide the person and not the box: both depth and mask must show the target.
     is_visible = view.in_view and score > threshold and num_px > 0
-    told = None
-    if len(script.others):
-        ids = np.array([other.instance_id for other in others])
-        hidden = hidden_shares(frame, target, view, pose, camera, ids)
-        told = script.others.meta(i, frame, *hidden)
-    return frame, TargetSight(view, mask_box(frame.ids == PERSON_ID), score, num_px, is_visible, told)
+    bystanders = script.others.meta(i, frame, *hidden) if others else None
+    return frame, SeenTarget(view, mask_box(is_person), score, num_px, is_visible, bystanders)
 
 
-def _with_goal(flight: Track, renderer: Renderer, script: TrackScript, threshold: float) -> Track:
-    """Add the goal, of the first frame in which the target can be made out and told apart, or why there is none."""
+def _with_goal(track: Track, renderer: Renderer, script: TrackScript, threshold: float) -> Track:
+    """Add the goal, from the first frame in which the target is legible and distinct, or the reason for its absence."""
     if not renderer.dresses:
-        return replace(flight, people=None, raw=flight.raw | {"goal": {"absent": "clothes_unknown"}})
+        return replace(track, people=None, raw=track.raw | {"goal": {"absent": "clothes_unknown"}})
     poses, people = script.perturbed.poses, script.others.people(script.clothes.looks)
-    legible = [i for i in range(len(flight)) if flight.legibility_at(i)["legible"]]
-    for i in legible[:MOST_TRIED]:
+    legible = [i for i in range(len(track)) if track.legibility_at(i)["legible"]]
+    for i in legible[:MOST_GOAL_FRAMES]:
 
         def draw(looks: Appearance, i: int = i) -> Frame:
             dressed = replace(script, clothes=replace(script.clothes, looks=looks))
@@ -263,9 +237,9 @@ def _with_goal(flight: Track, renderer: Renderer, script: TrackScript, threshold
 
         rotation = world_from_camera(poses.positions_m[i], poses.rotations_deg[i])[:3, :3]
         if goal := find_goal(people, i, draw, script.cameras[i].intrinsic, rotation):
-            return replace(flight, goal=goal)
+            return replace(track, goal=goal)
         advance()
-    return replace(flight, raw=flight.raw | {"goal": {"absent": "not_told_apart" if legible else "never_legible"}})
+    return replace(track, raw=track.raw | {"goal": {"absent": "not_told_apart" if legible else "never_legible"}})
 
 
 # --- files of one frame -----------------------------------------------------------------------------------------------
@@ -274,9 +248,8 @@ def _with_goal(flight: Track, renderer: Renderer, script: TrackScript, threshold
 def _write_frame(
     folder: Path, frame: Frame, meta: FrameMeta, writing: Writing, script: TrackScript
 ) -> tuple[TargetMeta, dict[str, str]]:
-    """Encode and write one frame beside the drawing; gives the target's annotation, and file
-    name -> sha256."""
-    name, is_person = frame_name(meta.index), frame.ids == PERSON_ID
+    """Encode and write one frame, in a thread; return the target's annotation, and file name -> sha256."""
+    name, is_person = frames.frame_name(meta.index), frame.ids == PERSON_ID
     person = meta.target.model_copy(update=legibility(meta.target, contrast_of(frame.rgb, is_person)))
     meta = meta.model_copy(update={"target": person})
     makers: dict[FrameFile, Callable[[], tuple[str, bytes]]] = {
@@ -293,7 +266,7 @@ def _write_frame(
     with storage_errors(target):
         target.mkdir(parents=True, exist_ok=True)
         for file_name, data in contents.items():
-            # No fsync here: the flight's folder gets its final name only when all of it is written.
+            # No fsync here: the track's folder gets its final name only when all of it is written.
             (target / file_name).write_bytes(data)
     return person, {f"{name}/{file_name}": sha256_bytes(data) for file_name, data in contents.items()}
 
@@ -301,7 +274,8 @@ def _write_frame(
 # --- annotations ------------------------------------------------------------------------------------------------------
 
 
-def annotation(script: TrackScript, i: int, seen: TargetSight) -> FrameMeta:
+def annotation(script: TrackScript, i: int, seen: SeenTarget) -> FrameMeta:
+    """Return the content of `meta.json` of frame i."""
     perturbed, view = script.perturbed, seen.view
     return FrameMeta(
         index=i,
@@ -342,7 +316,7 @@ def _list_or_none(values: np.ndarray) -> list[float] | None:
 
 
 def _report(perturbed: PerturbedTrack) -> dict:
-    """`perturbation_report.json`: how often each event happened, and how near the drone came to an obstacle."""
+    """Return `perturbation_report.json`: counts of events, and the least clearance of the drone."""
     outcomes = {event: Counter(state[event] for state in perturbed.states) for event in ("position", "rotation")}
     return {
         **REPORT_FORMAT.header,
@@ -353,7 +327,7 @@ def _report(perturbed: PerturbedTrack) -> dict:
     }
 
 
-def _flight(script: TrackScript, targets: list[TargetMeta], visibility: np.ndarray, bystanders: list[dict]) -> Track:
+def _track(script: TrackScript, targets: list[TargetMeta], visibility: np.ndarray, bystanders: list[dict]) -> Track:
     perturbed = script.perturbed
     zooms = any(camera is not script.cameras[0] for camera in script.cameras)
     return Track(

@@ -1,4 +1,4 @@
-"""What the assets of a SimWorld city are, by their names, and what the objects of a level are by their classes."""
+"""Kinds of the assets of a SimWorld city, by name, and of the objects of a level, by class."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cosfly.runtime.io import sha256_bytes
 
 
 class Asset(NamedTuple):
-    """One family of assets: its kind, and its full size (3,) m where the size table has a placeholder."""
+    """A family of assets: its kind, and its full size (3,) m if the size table has a placeholder."""
 
     pattern: str
     kind: str
@@ -40,8 +40,8 @@ ASSETS = (
 )
 
 PEOPLE = ("*User_Agent*", "*Pedestrian*", "*Humanoid*")
-# What has bounds and is nothing that stands there: who moves, and what the engine itself puts into a level.
-NOTHING = (
+# Classes with bounds that are no part of a town: movers, and objects of the engine itself.
+NOT_TOWN = (
     *PEOPLE, "*Vehicle*", "*Robot*", "*Volume*", "*Sky*", "*Camera*", "*Pawn*", "*Character*", "*Controller*",
     "*Light", "*Manager*", "*Reflection*", "*Fog*", "*NavMesh*", "*LevelBounds*", "*WorldSettings*", "*Brush*",
 )  # fmt: skip
@@ -53,26 +53,26 @@ def asset_of(name: str) -> Asset | None:
 
 
 def kind_of(class_name: str) -> str | None:
-    """Find the kind of an object by its class: an asset's, or that which the class is named after, as Buildings_C;
-    None: it is no part of a town, or nobody knows.
+    """Return the kind of an object by its class: that of an asset, or the one in its name, as in Buildings_C.
+
+    None is no part of a town, or unknown.
     """
     if asset := asset_of(class_name):
         return asset.kind
     found = re.match(r"(?:BP_)?([A-Za-z]+)", class_name)
-    return found[1] if found and found[1] in KINDS and not is_nothing(class_name) else None
+    return found[1] if found and found[1] in KINDS and not is_no_part_of_town(class_name) else None
 
 
-def is_nothing(class_name: str) -> bool:
-    """Return whether a class is one of NOTHING."""
-    return any(fnmatchcase(class_name, pattern) for pattern in NOTHING)
+def is_no_part_of_town(class_name: str) -> bool:
+    """Return whether a class is one of NOT_TOWN."""
+    return any(fnmatchcase(class_name, pattern) for pattern in NOT_TOWN)
 
 
 def is_person(path: str) -> bool:
-    """Return whether an asset is one of people, by its path."""
+    """Return whether an asset is a person, by its path."""
     return any(fnmatchcase(path, pattern) for pattern in PEOPLE)
 
 
 def id_of(name: str) -> int:
-    """Return the id of an object's box: 48 bits of its name's hash, so that everybody who asks a level finds the
-    same."""
+    """Return the id of an object's box: 48 bits of its name's hash, the same for every client of a level."""
     return int(sha256_bytes(name.encode())[:12], 16)

@@ -1,4 +1,4 @@
-"""The way to a CARLA server: its settings, a checked connection, and errors that name host, port and version."""
+"""A checked connection to a CARLA server: its settings, and errors that name host, port and version."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ PROBE_S = 5.0  # for a server to accept a connection
 class CarlaConfig(Config):
     """A CARLA server."""
 
-    host: MayDiffer[str] = Field("127.0.0.1", min_length=1, description="where the server is")
-    port: MayDiffer[int] = Field(2000, ge=1, le=65533, description="its port of calls (-carla-rpc-port)")
-    town: str | None = Field(None, description="map to load, as Town10HD_Opt; null takes the one that is loaded")
-    timeout_s: MayDiffer[float] = Field(60.0, gt=0, description="how long the server may take to answer, s")
+    host: MayDiffer[str] = Field("127.0.0.1", min_length=1, description="address of the server")
+    port: MayDiffer[int] = Field(2000, ge=1, le=65533, description="its RPC port (-carla-rpc-port)")
+    town: str | None = Field(None, description="map to load, as Town10HD_Opt; null uses the loaded one")
+    timeout_s: MayDiffer[float] = Field(60.0, gt=0, description="time limit of an answer, s")
 
 
 @dataclass(frozen=True)
 class CarlaConnection:
-    """A client of one version with its server; `carla` is the package. Lives in one process, which it can crash."""
+    """A client with its server of the same version; `carla` is the package, which can crash its process."""
 
     carla: Any
     client: Any
@@ -38,8 +38,8 @@ class CarlaConnection:
 
     @contextlib.contextmanager
     def asking(self, what: str) -> Iterator[None]:
-        """Make an error of ours of what the client raises: `what` could not be done."""
-        with _told(what, self.endpoint, self.version):
+        """Convert errors of the client to EnvironmentMissing; `what` describes the failure."""
+        with _server_errors(what, self.endpoint, self.version):
             yield
 
 
@@ -47,16 +47,16 @@ def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:
     """Connect to the server at a port and have it load the town.
 
     Raises:
-        EnvironmentMissing: the package is not there, nobody answers, or a server of another version.
-        ConfigError: it has no such town.
+        EnvironmentMissing: If the package is missing, no server answers, or its version differs.
+        ConfigError: If the server has no such town.
     """
     try:
         import carla
     except ModuleNotFoundError as error:
         fix = 'pip install "cosfly[carla]", on Linux or Windows with Python 3.11 or 3.12'
-        raise EnvironmentMissing("the client of CARLA is not installed", got=str(error), fix=fix) from None
+        raise EnvironmentMissing("the package carla is not installed", got=str(error), fix=fix) from None
     endpoint = f"{cfg.host}:{port}"
-    with _told("no CARLA server", endpoint, "unknown"):
+    with _server_errors("no CARLA server answers", endpoint, "unknown"):
         socket.create_connection((cfg.host, port), PROBE_S).close()
         client = carla.Client(cfg.host, port)
         client.set_timeout(cfg.timeout_s)
@@ -64,9 +64,9 @@ def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:
     if version != ours:
         fix = f"run a server of {ours}: streams of other versions crash this client"
         raise EnvironmentMissing(
-            "a CARLA server of another version", where=endpoint, got=version, expected=ours, fix=fix
+            "the CARLA server has another version than the client", where=endpoint, got=version, expected=ours, fix=fix
         )
-    with _told("the world was not given", endpoint, version):
+    with _server_errors("CARLA did not return its world", endpoint, version):
         world = client.get_world()
         loaded, towns = _short(world.get_map().name), sorted({_short(name) for name in client.get_available_maps()})
         if cfg.town is not None and cfg.town != loaded:
@@ -83,10 +83,10 @@ def _short(name: str) -> str:
 
 
 @contextlib.contextmanager
-def _told(what: str, endpoint: str, version: str) -> Iterator[None]:
+def _server_errors(what: str, endpoint: str, version: str) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, OSError) as error:
-        fix = "see that a server runs there (of each of --workers one, ports 10 apart), or give it time with timeout_s"
+        fix = "check that a server runs there (one for each of --workers, ports 10 apart), or raise timeout_s"
         where = f"{endpoint} (CARLA {version})"
         raise EnvironmentMissing(what, where=where, got=str(error) or type(error).__name__, fix=fix) from None

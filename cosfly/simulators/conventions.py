@@ -1,4 +1,4 @@
-"""What CARLA and Unreal say in other words than we do: axes, pictures of depth and of tags. Converted here alone.
+"""Conventions of CARLA and Unreal, and their conversion: axes, pictures of depth and of tags.
 
 Their axes are left-handed (`cosfly.geometry.axes`); a pose is x, y, z, pitch, yaw, roll in m and degrees. Pictures are
 BGRA bytes: depth in 24 bits up to 1000 m, tags as the semantic number in red and an actor's number in green (low byte)
@@ -19,24 +19,24 @@ DEPTH_RANGE_M, DEPTH_STEPS = 1000.0, 2**24 - 1
 DEPTH_STEP_M = DEPTH_RANGE_M / DEPTH_STEPS
 ACTOR_BITS = 0xFFFF  # of an actor's number, in pictures
 CM_PER_M = 100.0
-FAR_CM = 65504.0  # the largest of half precision, in which UnrealCV's depth comes: what is farther, and the sky
+FAR_CM = 65504.0  # the largest half-precision number: UnrealCV's depth of the sky and of all beyond
 
 
 def unreal_pose(position_m: np.ndarray, rotation_deg: np.ndarray) -> list[float]:
-    """Return a pose of ours, (3,) m and (3,) pitch, yaw, roll in degrees, as x, y, z, pitch, yaw, roll of theirs."""
+    """Convert a pose, (3,) m and (3,) pitch, yaw, roll in degrees, to x, y, z, pitch, yaw, roll of Unreal."""
     return [*(mirror_positions(position_m) + 0.0).tolist(), *(mirror_rotations(rotation_deg) + 0.0).tolist()]
 
 
 def world_pose(pose: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return a pose of theirs as position, (3,) m, and rotation, (3,) degrees, of ours."""
+    """Convert a pose of Unreal to position, (3,) m, and rotation, (3,) degrees."""
     return mirror_positions(np.array(pose[:3])) + 0.0, mirror_rotations(np.array(pose[3:])) + 0.0
 
 
 def camera_rotation_deg(camera_pose: np.ndarray) -> np.ndarray:
-    """Read pitch, yaw, roll, (3,) degrees, from a world_from_camera of OpenCV axes, (4, 4)."""
+    """Return pitch, yaw, roll, (3,) degrees, of a world_from_camera of OpenCV axes, (4, 4)."""
     turn = camera_pose[:3, :3] @ BODY_FROM_CAMERA.T
     pitch = np.arctan2(turn[2, 0], np.hypot(turn[0, 0], turn[1, 0]))
-    if np.hypot(turn[0, 0], turn[1, 0]) < 1e-9:  # straight up or down: roll is none, yaw is all of the turn
+    if np.hypot(turn[0, 0], turn[1, 0]) < 1e-9:  # straight up or down: roll is 0 by convention
         return np.degrees([pitch, np.arctan2(-turn[0, 1], turn[1, 1]), 0.0])
     return np.degrees([pitch, np.arctan2(turn[1, 0], turn[0, 0]), np.arctan2(turn[2, 1], turn[2, 2])])
 

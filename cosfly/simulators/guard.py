@@ -1,8 +1,8 @@
-"""Leaves an engine's server as it was found, however the process that used it ends: normally, killed, or by a crash.
+"""A process that restores a simulator's server when its user ends: normally, killed, or by a crash.
 
-A process of its own. It starts the server, if there is a command for that, and then ends it too. Its input is lines of
-JSON: of CARLA first how the world was found, then the number of each actor that is spawned; of UnrealCV the commands
-that put the camera back. Where the input ends, so has the process that wrote it.
+It starts the server if a command is given, and then also ends it. Its input is lines of JSON: for CARLA first the
+state of the world, then the number of each spawned actor; for UnrealCV the commands that restore the camera. The end of
+the input is the end of the process that writes it.
 """
 
 from __future__ import annotations
@@ -25,47 +25,47 @@ from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.events import process_stat
 from cosfly.runtime.worker import LEFT_TO_THE_PARENT, adopt_orphans, end_with_parent, signals_held_back
 
-PATIENCE_S = 20.0  # for a server that is to be left in order
+RESTORE_S = 20.0  # time limit of a server while it is restored
 
 
 class EngineGuard:
-    """The guard, from the side of the process that it watches; engine: carla or unrealcv."""
+    """The handle of a guard in the process that it watches; engine: carla or unrealcv."""
 
-    def __init__(self, engine: str, host: str, port: int, command: str, patience_s: float) -> None:
+    def __init__(self, engine: str, host: str, port: int, command: str, timeout_s: float) -> None:
         filled = command.replace("{port}", str(port))
         words = [sys.executable, "-m", "cosfly.simulators.guard", engine, host, str(port), filled]
-        # A session of its own: Ctrl-C is not for it.
+        # In a session of its own, so that Ctrl-C does not end it.
         self._process = subprocess.Popen(words, stdin=subprocess.PIPE, text=True, start_new_session=True)
         if command:
-            _wait_for(host, port, patience_s)
+            _wait_for(host, port, timeout_s)
 
     def note(self, what: Any) -> None:
-        """Tell it how the world was found, or of an actor."""
+        """Send the state of the world, or the number of an actor."""
         assert self._process.stdin is not None
         print(json.dumps(what), file=self._process.stdin, flush=True)
 
     def close(self) -> None:
-        """Have everything put back, and wait for that."""
+        """Restore the server, and wait until that is done."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.wait()
 
 
 def values_of(thing: Any) -> dict[str, Any]:
-    """Return the plain values of the client's object, as of settings, by name."""
+    """Return the plain attributes of an object of the client, by name."""
     names = [name for name in dir(thing) if not name.startswith("_")]
     return {name: getattr(thing, name) for name in names if isinstance(getattr(thing, name), bool | int | float | None)}
 
 
 def with_values(thing: Any, values: dict[str, Any]) -> Any:
-    """Set what `values_of` gave."""
+    """Set attributes that `values_of` returned."""
     for name, value in values.items():
         setattr(thing, name, value)
     return thing
 
 
 def _wait_for(host: str, port: int, timeout_s: float) -> None:
-    """Wait until somebody listens at a port, or the time is over."""
+    """Wait until a server listens at a port, or the time is over."""
     until_s = time.monotonic() + timeout_s
     while time.monotonic() < until_s:
         try:
@@ -76,11 +76,11 @@ def _wait_for(host: str, port: int, timeout_s: float) -> None:
             return
 
 
-def _put_back_carla(host: str, port: int, found: dict[str, Any], actors: list[int]) -> None:
+def _restore_carla(host: str, port: int, found: dict[str, Any], actors: list[int]) -> None:
     import carla
 
     client = carla.Client(host, port)
-    client.set_timeout(PATIENCE_S)
+    client.set_timeout(RESTORE_S)
     world = client.get_world()
     for actor in world.get_actors(actors):
         actor.destroy()
@@ -88,18 +88,18 @@ def _put_back_carla(host: str, port: int, found: dict[str, Any], actors: list[in
     world.apply_settings(with_values(carla.WorldSettings(), found["settings"]))
 
 
-def _put_back_unrealcv(host: str, port: int, commands: list[str]) -> None:
-    from cosfly.simulators.unrealcv_client import UnrealCvConfig, connect, ours
+def _restore_unrealcv(host: str, port: int, commands: list[str]) -> None:
+    from cosfly.simulators.unrealcv_client import UnrealCvConfig, connect, spawned_by_cosfly
 
-    connection = connect(UnrealCvConfig(host=host, timeout_s=PATIENCE_S), port)
-    with connection.asking("the level was not put in order"):
-        names = ours(str(*connection.ask("vget /objects")))
+    connection = connect(UnrealCvConfig(host=host, timeout_s=RESTORE_S), port)
+    with connection.asking("UnrealCV did not restore its level"):
+        names = spawned_by_cosfly(str(*connection.ask("vget /objects")))
         connection.ask("vset /action/game/resume", *(f"vset /object/{name}/destroy" for name in names), *commands)
     connection.close()
 
 
 def _start_server(command: str) -> subprocess.Popen:
-    """Start a process that is killed with this one. In a session of its own: Ctrl-C is not for it."""
+    """Start a process that is killed with this one, in a session of its own, so that Ctrl-C does not end it."""
     with signals_held_back():
         return subprocess.Popen(
             shlex.split(command),
@@ -115,8 +115,8 @@ def _begin(parent_pid: int) -> None:
 
 
 def _end_server(server: subprocess.Popen) -> None:
-    """Kill a server and all that it started, wherever they went."""
-    if sys.platform != "linux":  # nothing tells what else it started
+    """Kill a server and all its descendants."""
+    if sys.platform != "linux":  # other systems do not list descendants
         with contextlib.suppress(ProcessLookupError):
             os.killpg(server.pid, signal.SIGKILL)
     while left := _descendants():
@@ -128,7 +128,7 @@ def _end_server(server: subprocess.Popen) -> None:
 
 
 def _descendants() -> list[int]:
-    """Return the processes below this one, without those that have ended."""
+    """Return the running descendants of this process."""
     children = defaultdict[int, list[int]](list)
     for path in Path("/proc").glob("[0-9]*"):
         if (stat := process_stat(int(path.name))) and stat[0] != b"Z":
@@ -148,11 +148,11 @@ def main(engine: str, host: str, port: str, command: str) -> None:
     elif lines:
         try:
             if engine == "carla":
-                _put_back_carla(host, int(port), lines[0], lines[1:])
+                _restore_carla(host, int(port), lines[0], lines[1:])
             else:
-                _put_back_unrealcv(host, int(port), lines[0])
-        except (RuntimeError, EnvironmentMissing) as error:  # it is gone, and with it all that there was to put back
-            print(f"{engine} at {host}:{port} was not left as it was found: {error}", file=sys.stderr)
+                _restore_unrealcv(host, int(port), lines[0])
+        except (RuntimeError, EnvironmentMissing) as error:  # the server has ended, with all that was to be restored
+            print(f"{engine} at {host}:{port} was not restored: {error}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,7 @@
-"""The way to an UnrealCV server, as SimWorld runs one: its settings, a checked connection, and errors that name host,
-port and version.
+"""A checked connection to an UnrealCV server, as SimWorld runs one: settings, and errors that name host, port, version.
 
-The client is the package `unrealcv`. What it does badly is mended here: it waits for ever for a greeting, reads on from
-a connection that is closed, and prints. A server has one client at a time.
+The client is the package `unrealcv`. This module works around its faults: it waits forever for a greeting, reads from
+closed connections, and prints. A server has one client at a time.
 """
 
 from __future__ import annotations
@@ -32,24 +31,24 @@ INSTALL = 'pip install "cosfly[unrealcv]" && pip install --no-deps "unrealcv>=1.
 class UnrealCvConfig(Config):
     """An UnrealCV server."""
 
-    host: MayDiffer[str] = Field("127.0.0.1", min_length=1, description="where the server is")
+    host: MayDiffer[str] = Field("127.0.0.1", min_length=1, description="address of the server")
     port: MayDiffer[int] = Field(9000, ge=1, le=65535, description="its port; often 9001 where 9000 is taken")
     level: str | None = Field(
-        None, pattern=r"^[\w/.-]+$", description="level to open; null takes the one that is open, as a SimWorld city"
+        None, pattern=r"^[\w/.-]+$", description="level to open; null uses the open one, as a SimWorld city"
     )
-    timeout_s: MayDiffer[float] = Field(60.0, gt=0, description="how long the server may take to answer, s")
+    timeout_s: MayDiffer[float] = Field(60.0, gt=0, description="time limit of an answer, s")
     coord_scale: float = Field(100.0, gt=0, description="Unreal's units in 1 m: centimetres")
 
 
-OURS = "COSFLY_"  # in front of the names of what is spawned here
+OURS = "COSFLY_"  # prefix of the names of spawned objects
 
 
 class NoAnswerError(Exception):
-    """The server did not answer in time, closed the connection, or answered what was not asked."""
+    """The server did not answer in time, closed the connection, or sent an unexpected answer."""
 
 
 class UnrealCvConnection:
-    """One client of one server, until an error: what comes late would be taken for the next answer."""
+    """A client of one server, unusable after an error: a late answer would be taken for the next one."""
 
     def __init__(self, cfg: UnrealCvConfig, port: int) -> None:
         self.endpoint, self.version, self.level = f"{cfg.host}:{port}", "unknown", ""
@@ -62,10 +61,10 @@ class UnrealCvConnection:
         return f"{self.endpoint} (UnrealCV {self.version})" + (f", {self.level}" if self.level else "")
 
     def ask(self, *commands: str) -> list[str | bytes]:
-        """Return the answers, in order: text, or bytes of pictures. An answer that begins with `error` is one too."""
+        """Return the answers, in order: text, also of errors, or bytes of pictures."""
         answers: list[str | bytes] = []
         for first in range(0, len(commands), MOST_AT_ONCE):
-            if self._client.ended:  # nobody reads any more, and the package would wait for ever
+            if self._client.ended:  # the package would wait forever
                 raise NoAnswerError(self._client.ended)
             try:
                 with contextlib.redirect_stdout(io.StringIO()):
@@ -74,15 +73,15 @@ class UnrealCvConnection:
                 raise NoAnswerError(f"{self._client.ended or error} ({commands[first]})") from None
         return answers
 
-    def tell(self, *commands: str) -> None:
-        """Have the server do it all."""
+    def run(self, *commands: str) -> None:
+        """Run commands; raise EnvironmentMissing if the server refuses one."""
         for command, answer in zip(commands, self.ask(*commands), strict=True):
             if is_refusal(answer):
-                what, fix = "the server refuses a command", "see that its build of UnrealCV has it"
+                what, fix = "the server refuses a command", "use a build of UnrealCV that has it"
                 raise EnvironmentMissing(what, where=self.where, got=f"{command}: {answer!r}", fix=fix)
 
     def numbers(self, answer: str | bytes, num: int) -> tuple[float, ...] | None:
-        """Read finite numbers; None: it is something else."""
+        """Read finite numbers; None is anything else."""
         words = answer.split() if isinstance(answer, str) else []
         with contextlib.suppress(ValueError):
             found = tuple(map(float, words))
@@ -95,17 +94,18 @@ class UnrealCvConnection:
 
     @contextlib.contextmanager
     def asking(self, what: str) -> Iterator[None]:
-        """Make an error of ours of a server that is silent or gone: `what` could not be done."""
-        with _told(what, self.where):
+        """Convert errors of the connection to EnvironmentMissing; `what` describes the failure."""
+        with _server_errors(what, self.where):
             yield
 
 
-def ours(names: str) -> list[str]:
-    """Of the answer to `vget /objects`, what a run of ours spawned."""
+def spawned_by_cosfly(names: str) -> list[str]:
+    """Return the objects that cosfly spawned, from the answer to `vget /objects`."""
     return [name for name in names.split() if name.startswith(OURS)]
 
 
 def is_refusal(answer: str | bytes | None) -> bool:
+    """Return whether an answer is missing or an error."""
     return not isinstance(answer, bytes) and (answer is None or answer.lstrip().lower().startswith("error"))
 
 
@@ -113,16 +113,16 @@ def connect(cfg: UnrealCvConfig, port: int) -> UnrealCvConnection:
     """Connect to the server at a port and have it open the level.
 
     Raises:
-        EnvironmentMissing: the package is not there, nobody answers, or a server that is too old.
-        ConfigError: it has no such level.
+        EnvironmentMissing: If the package is missing, no server answers, or it is too old.
+        ConfigError: If the server has no such level.
     """
-    with _told("no UnrealCV server", f"{cfg.host}:{port} (UnrealCV unknown)"):
+    with _server_errors("no UnrealCV server answers", f"{cfg.host}:{port} (UnrealCV unknown)"):
         connection = UnrealCvConnection(cfg, port)
         version, level = connection.ask("vget /unrealcv/version", "vget /level/name")
     found = re.match(r"v?(\d+)\.(\d+)(?:\.(\d+))?", str(version))
     if found is None or tuple(int(part or 0) for part in found.groups()) < LEAST_VERSION:
         expected = f"{'.'.join(map(str, LEAST_VERSION))} or newer"
-        what, fix = "an UnrealCV server of another version", "run a newer build, as SimWorld ships"
+        what, fix = "the UnrealCV server is too old", "run a newer build, as SimWorld ships"
         raise EnvironmentMissing(what, where=connection.endpoint, got=repr(version)[:80], expected=expected, fix=fix)
     connection.version, connection.level = found[0], "" if is_refusal(level) else for_terminal(str(level).strip())
     if cfg.level in (None, connection.level):
@@ -145,16 +145,16 @@ def _opened(cfg: UnrealCvConfig, port: int, connection: UnrealCvConnection) -> U
             break
         time.sleep(0.5)
     connection.close()
-    fix = "see `vget /level/name` in the level that is wanted, or leave the level out"
+    fix = "see `vget /level/name` in the wanted level, or set no level"
     raise ConfigError("the server has no such level", where=before, got=cfg.level, fix=fix)
 
 
 def _client(cfg: UnrealCvConfig, port: int) -> Any:
-    """Return a connected client of the package; None: nobody greeted it."""
+    """Return a connected client of the package; None if no server greets it."""
     try:
         import unrealcv
     except ModuleNotFoundError as error:
-        what = "the client of UnrealCV is not installed"
+        what = "the package unrealcv is not installed"
         raise EnvironmentMissing(what, got=str(error), fix=INSTALL) from None
     logging.getLogger("unrealcv").setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", message="The connected UnrealCV server")
@@ -167,8 +167,8 @@ def _client(cfg: UnrealCvConfig, port: int) -> Any:
             message = unrealcv.SocketMessage.ReceivePayload(self.sock)
             if not message:
                 is_late = time.monotonic() - since_s >= 0.9 * cfg.timeout_s
-                told = f"no answer in {cfg.timeout_s:g} s" if is_late else "the server closed the connection"
-                raise ConnectionError(told)
+                problem = f"no answer in {cfg.timeout_s:g} s" if is_late else "the server closed the connection"
+                raise ConnectionError(problem)
             return message
 
         def receive_loop_queue(self) -> None:
@@ -188,7 +188,7 @@ def _client(cfg: UnrealCvConfig, port: int) -> Any:
 
 
 def _why_not(host: str, port: int) -> str:
-    """Why no client was greeted, of which the package says nothing."""
+    """Return why no server greeted the client."""
     try:
         socket.create_connection((host, port), PROBE_S).close()
     except OSError as error:
@@ -197,9 +197,9 @@ def _why_not(host: str, port: int) -> str:
 
 
 @contextlib.contextmanager
-def _told(what: str, where: str) -> Iterator[None]:
+def _server_errors(what: str, where: str) -> Iterator[None]:
     try:
         yield
     except NoAnswerError as error:
-        fix = "see that the server runs and listens there, or give it more time with timeout_s"
+        fix = "check that the server runs and listens there, or raise timeout_s"
         raise EnvironmentMissing(what, where=where, got=str(error), fix=fix) from None

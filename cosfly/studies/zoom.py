@@ -19,7 +19,7 @@ from cosfly.formats.frames import Camera, level_name, read_rgb, rgb_bytes
 from cosfly.formats.playback import Track, read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import box_iou, intrinsic_matrix
-from cosfly.render.lens import ZoomConfig
+from cosfly.render.camera import ZoomConfig
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, write_json

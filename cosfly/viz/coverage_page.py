@@ -1,4 +1,4 @@
-"""What a run covers, for people: histograms and tables as HTML and Markdown, beside the plain run that ships."""
+"""The coverage of a run as HTML: histograms and tables, compared with the default run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TEMPLATE = "cosfly/viz/templates/coverage.html"
 
 
 def coverage_html(coverage: Coverage) -> str:
-    """Return histograms, one an axis, with where 5 % to 95 % of the frames lie, and a table for each kind of name."""
+    """Return a histogram for each axis, with the range of 90 % of the frames, and a table for each kind of name."""
     plain = default_coverage()
     histograms = [
         _histogram(axis, coverage.bins.get(name, []), plain.bins[name])
@@ -29,7 +29,7 @@ def _title(axis: Axis) -> str:
 
 
 def _skies(frames: dict[str, int]) -> dict[str, Any] | None:
-    """Return a table of frames, weather by time of day: the paper's 15 x 4, and presets of somebody's own."""
+    """Return a table of frames, weather by time of day: the paper's 15 x 4, and other presets."""
     if not frames:
         return None
     counts = {tuple(name.split(PAIR)): count for name, count in frames.items()}
@@ -44,14 +44,13 @@ def _skies(frames: dict[str, int]) -> dict[str, Any] | None:
 
 
 def ranges(coverage: Coverage) -> list[tuple[str, str, str]]:
-    """Return a row for each axis: title, 5 % to 95 % of the frames, the same of the plain run."""
+    """Return a row for each axis: title, 5 % to 95 % of the frames, the same for the default run."""
     plain = default_coverage()
     return [(_title(axis), _range(coverage, name), _range(plain, name)) for name, axis in AXES.items()]
 
 
 def shares(coverage: Coverage, kind: str) -> list[tuple[str, int, str, str]]:
-    """Return a row for each name of a kind of NAMED: name, frames, share of them, share in the plain run; empty where
-    none is known."""
+    """Return a row for each name of a kind of NAMED: name, frames, share, share in the default run."""
     counts, plain = getattr(coverage, kind), getattr(default_coverage(), kind)
     if not counts:
         return []
@@ -65,7 +64,7 @@ def _share(counts: dict[str, int], name: str) -> str:
 
 
 def _range(coverage: Coverage, name: str) -> str:
-    """Return where 5 % to 95 % of the frames lie; of a circle, how they are shared out."""
+    """Return the range of 5 % to 95 % of the frames; for a circle, the shares of its sides."""
     if name == "azimuth_deg":
         return _sides(coverage.bins.get(name, []))
     low, high = coverage.range_of(name)
@@ -81,14 +80,14 @@ def _sides(counts: list[int]) -> str:
     middles = [abs(axis.low + (k + 0.5) * axis.step) for k in range(axis.num_bins)]
     behind = sum(count for count, middle in zip(counts, middles, strict=True) if middle > 135.0) / total
     ahead = sum(count for count, middle in zip(counts, middles, strict=True) if middle < 45.0) / total
-    return f"{behind:.0%} behind, {1 - behind - ahead:.0%} beside, {ahead:.0%} in front"
+    return f"{behind:.0%} behind, {1 - behind - ahead:.0%} to the side, {ahead:.0%} in front"
 
 
-def _histogram(axis: Axis, counts: list[int], beside: list[int]) -> dict[str, Any]:
-    """Return shares of frames by bin as bars; the plain run's as a line of steps."""
-    heights = [[value / (sum(row) or 1) for value in row] for row in (counts, beside) if row]
+def _histogram(axis: Axis, counts: list[int], default: list[int]) -> dict[str, Any]:
+    """Return shares of frames by bin as bars, and those of the default run as a line of steps."""
+    heights = [[value / (sum(row) or 1) for value in row] for row in (counts, default) if row]
     top = max((max(row) for row in heights), default=0.0) or 1.0
-    filled = [k for row in (counts, beside) for k, value in enumerate(row) if value] or [0]
+    filled = [k for row in (counts, default) for k, value in enumerate(row) if value] or [0]
     first, last = min(filled), max(filled)
     step = WIDTH_PX / max(8, last - first + 1)
 

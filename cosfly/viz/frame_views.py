@@ -1,7 +1,6 @@
-"""Frames as pictures for a model or a person: one look for teachers, students, contact sheets and reports.
+"""Frames as pictures, the same for teachers, students, contact sheets and reports.
 
-`Pictures` says what a model is shown of each frame: the pictures and the sentence of its prompt come from the same
-values.
+`Pictures` defines the pictures of a prompt and the sentence that describes them.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ VIEW_FILES: dict[View, str] = {
     "middle": FILE_NAMES["rgb"],
 }
 MIDDLE = 3  # one part in so many of the width and of the height of a frame: what `middle` enlarges
-DEPTH_RANGE_M = 100.0  # dark end of the pseudo-colour; flights keep their target within a third of it
+DEPTH_RANGE_M = 100.0  # dark end of the pseudo-colour; targets are within a third of it
 PEDESTRIAN_RGB = (255, 40, 40)
 NUM_SHADES = 24
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """What a model is shown of each frame.
+    """The pictures of each frame in a prompt.
 
     views: in this order; none where no picture is sent. layout: separate is one picture per view, tiled one per frame,
     the views side by side from left to right. size_px: (width, height) of one view's picture, which pixel values of the
@@ -52,7 +51,7 @@ class Pictures:
         """Read the pictures of a frame folder, each (h, w, 3) uint8 RGB.
 
         Raises:
-            InputError: a file is missing, damaged or not of the size that the prompt names.
+            InputError: If a file is missing, damaged or of another size than the prompt says.
         """
         pictures = []
         for view in self.views:
@@ -62,22 +61,18 @@ class Pictures:
         return [np.hstack(pictures)] if pictures and self.layout == "tiled" else pictures
 
     def check_size(self, file: Path, found_px: tuple[int, int]) -> None:
-        """Check that a file of (width, height) gives pictures of `size_px`.
-
-        Raises:
-            InputError: it does not.
-        """
+        """Check that a file of (width, height) gives pictures of `size_px`."""
         if scaled_size(*found_px, max(self.size_px)) != self.size_px:
             raise InputError(
-                "a picture of another size than the prompt says",
+                "the picture has another size than the prompt says",
                 where=file,
                 got="{} x {} px".format(*found_px),
                 expected="{} x {} px, or larger and of this shape".format(*self.size_px),
-                fix="give the playback tree that was captioned",
+                fix="pass the playback tree that was captioned",
             )
 
     def sentence(self, language: Language) -> str:
-        """Return the words of a prompt for these pictures."""
+        """Return the sentence of a prompt that describes these pictures."""
         return _sentence(self, language)
 
 
@@ -136,16 +131,21 @@ def _sentence(pictures: Pictures, language: Language) -> str:
 
 
 def frame_label(number: int) -> str:
-    """Return the text before the pictures of a window's frame: answers name frames so."""
+    """Return the text before the pictures of a frame of a window; answers name frames the same way."""
     return f"t{number}:"
 
 
 def scaled_size(width_px: int, height_px: int, max_side_px: int | None) -> tuple[int, int]:
-    """Return (width, height) px of a picture scaled down to a longest side; None and a larger one keep the size."""
+    """Return (width, height) px of a picture scaled down to a longest side; None keeps the size."""
     if max_side_px is None or max_side_px >= max(width_px, height_px):
         return width_px, height_px
     scale = max_side_px / max(width_px, height_px)
     return max(1, round(width_px * scale)), max(1, round(height_px * scale))
+
+
+def spread(count: int, most: int) -> list[int]:
+    """Return at most `most` of the numbers below `count`, evenly spaced, with the first and the last."""
+    return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most)).round()})
 
 
 def read_view(
@@ -168,9 +168,9 @@ def read_view(
 
 
 def _middle(rgb: np.ndarray, max_side_px: int | None) -> np.ndarray:
-    """Cut the middle out of a picture, (h, w, 3), and give it the size that the whole would have.
+    """Return the middle of a picture, (h, w, 3), enlarged to the size that the whole would have.
 
-    Where the person is makes no difference: the camera follows, and the middle is all that is taken for granted.
+    It does not depend on the target's position, which a model must not learn from it.
     """
     height_px, width_px = rgb.shape[:2]
     part = max(1, round(width_px / MIDDLE)), max(1, round(height_px / MIDDLE))
@@ -181,10 +181,10 @@ def _middle(rgb: np.ndarray, max_side_px: int | None) -> np.ndarray:
 
 
 def _ids_of_others(frame: Path) -> list[int]:
-    """Ids of who moves beside the target, so that the target alone is red; none where the frame does not tell."""
+    """Return the ids of bystanders, so that only the target is red; none if the frame has no annotation."""
     try:
         others = read_meta(frame).others
-    except InputError:  # somebody else's tree
+    except InputError:  # a tree of other software
         return []
     return [] if others is None else [other.instance_id for other in others.others]
 
@@ -202,7 +202,7 @@ def depth_colors(depth_m: np.ndarray, range_m: float = DEPTH_RANGE_M) -> np.ndar
 
 def segmentation_colors(kinds: np.ndarray, ids: np.ndarray) -> np.ndarray:
     """Colour classes in muted, fixed tones and pedestrians in red; kinds (h, w), ids (h, w) -> (h, w, 3) RGB."""
-    # Neighbouring instances of one class differ a little, so that single buildings can be told apart.
+    # Neighbouring instances of one class differ a little, so that buildings are distinguishable.
     shades = (ids % NUM_SHADES) * 37 % NUM_SHADES
     rows = np.minimum(kinds, len(KINDS) - 1) * np.uint16(NUM_SHADES) + shades
     return np.take(_PALETTE, rows, axis=0)
@@ -217,7 +217,7 @@ def encode_picture(rgb: np.ndarray, encoding: Literal["jpeg", "png"], jpeg_quali
 
 
 def thumbnail(frame: Path, width_px: int, jpeg_quality: int = 80) -> str | None:
-    """Return `rgb.png` of a frame folder as a small JPEG in base64, for a page; None where it cannot be read."""
+    """Return `rgb.png` of a frame folder as a small JPEG in base64; None if it cannot be read."""
     try:
         rgb = read_rgb(frame)
     except InputError:
@@ -226,16 +226,14 @@ def thumbnail(frame: Path, width_px: int, jpeg_quality: int = 80) -> str | None:
 
 
 def small_jpeg(rgb: np.ndarray, width_px: int, jpeg_quality: int = 80) -> str:
-    """Return a picture, (h, w, 3) uint8 RGB, as a JPEG of a width in base64, for a page."""
+    """Return a picture, (h, w, 3) uint8 RGB, as a JPEG of a width in base64."""
     height_px = max(1, round(width_px * rgb.shape[0] / rgb.shape[1]))
     small = cv2.resize(rgb, (width_px, height_px), interpolation=cv2.INTER_AREA)
     return base64.b64encode(encode_picture(small, "jpeg", jpeg_quality)).decode("ascii")
 
 
 def _palette() -> np.ndarray:
-    """Muted tones, NUM_SHADES of each class, (29 * NUM_SHADES, 3): hues by golden-angle steps, low saturation, so that
-    only the pedestrians are vivid.
-    """
+    """Return muted tones, NUM_SHADES of each class, (29 * NUM_SHADES, 3), with vivid pedestrians only."""
     hues = (np.arange(len(KINDS)) * 111) % 180
     hsv = np.stack([hues, np.full(len(KINDS), 70), np.full(len(KINDS), 150)], axis=-1).astype(np.uint8)
     tones = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0].astype(np.int64)

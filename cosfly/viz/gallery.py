@@ -1,4 +1,4 @@
-"""Pictures of a playback tree for people: a contact sheet, an animation of one flight, one frame's four pictures."""
+"""Overviews of a playback tree: a contact sheet, an animation of one track, four pictures of a frame."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import inside, write_bytes
-from cosfly.viz.frame_views import DEPTH_RANGE_M, VIEW_FILES, read_view
+from cosfly.viz.frame_views import DEPTH_RANGE_M, VIEW_FILES, read_view, spread
 from cosfly.viz.overlay import Overlay
 from cosfly.viz.topview import add_caption, draw_text
 
 TILE_PX = (320, 180)
 NUM_RGB_TILES = 4
-MOST_ROWS = 12  # flights on one sheet
+MOST_ROWS = 12  # tracks on one sheet
 SHEET_BYTES, GIF_BYTES = 2_000_000, 4_000_000
 GIF_WIDTH_PX, GIF_FRAME_MS = 480, 250  # at the paper's 0.5 s a frame twice as fast as life
 BOX_COLOR = (255, 214, 10)
 
 
 def contact_sheet(tree: Path, out_png: Path, choice: TrackChoice = ALL_FLIGHTS) -> None:
-    """Reads a playback tree, writes one PNG below 2 MB: for each flight a few RGB frames, a depth image and a mask."""
+    """Reads a playback tree, writes a PNG below 2 MB: for each track a few RGB frames, a depth image and a mask."""
     folders = find_tracks(tree, choice)
     rows = [_row(read_track(folder, strict=False)) for folder in folders[:MOST_ROWS]]
     sheet = np.vstack([_heading(len(folders), rows[0].shape[1]), *rows])
@@ -41,14 +41,14 @@ def contact_sheet(tree: Path, out_png: Path, choice: TrackChoice = ALL_FLIGHTS) 
 def preview_gif(
     tree: Path, out_gif: Path, choice: TrackChoice = ALL_FLIGHTS, frames_per_s: float = 1000 / GIF_FRAME_MS
 ) -> None:
-    """Reads a playback tree, writes its first clean flight as an animation below 4 MB, the target's box drawn in."""
+    """Reads a playback tree, writes its first clean track as an animation below 4 MB, with the target's box."""
     folders = find_tracks(tree, choice)
-    flight = read_track(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
-    frames = _frames_with(flight, "rgb.png")
+    track = read_track(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
+    frames = _frames_with(track, "rgb.png")
     width, num = GIF_WIDTH_PX, 60
     while True:
-        chosen = [frames[i] for i in _spread(len(frames), num)]
-        data = _gif([_preview(flight, i, width) for i in chosen], round(1000 / frames_per_s))
+        chosen = [frames[i] for i in spread(len(frames), num)]
+        data = _gif([_preview(track, i, width) for i in chosen], round(1000 / frames_per_s))
         if len(data) < GIF_BYTES or num <= 4:
             break
         num = max(4, int(num * 0.9 * GIF_BYTES / len(data)))
@@ -56,15 +56,14 @@ def preview_gif(
 
 
 def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map: BoxMap | None = None) -> str:
-    """Reads a frame of a playback tree, writes it as one PNG: colours, depth, instances, and boxes with ids and
-    distances.
+    """Reads a frame of a playback tree, writes a PNG: colours, depth, instances, and boxes with ids and distances.
 
     Args:
-        frame: its folder, as `frame_in` takes it; None: the frame of the first clean flight that shows most of the
-            target.
-        box_map: what was drawn, for a frame without `debug.png`.
+        frame: Its folder, as for `frame_in`; None is the frame of the first clean track that shows most of the target.
+        box_map: The drawn map, for a frame without `debug.png`.
+
     Returns:
-        the frame's folder in the tree.
+        The frame's folder in the tree.
     """
     folder = best_frame(tree, *FRAME_FILES) if frame is None else frame_in(tree, frame)
     meta, rgb = read_meta(folder), read_rgb(folder)
@@ -75,8 +74,8 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
         debug = Overlay(box_map, ids).draw(rgb, read_instance(folder)[1], meta)
     else:
         raise InputError(
-            "a frame without debug.png", where=folder, expected="debug.png, or the map that was drawn",
-            fix="give --map boxes_3d.json, or render with --set render.debug=true",
+            "the frame has no debug.png", where=folder, expected="debug.png, or the map that was drawn",
+            fix="pass --map boxes_3d.json, or render with --set render.debug=true",
         )  # fmt: skip
     panels = [rgb, read_view(folder, "depth"), read_view(folder, "segmentation"), debug]
     titles = (
@@ -92,7 +91,7 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
 
 
 def frame_in(tree: Path, frame: str | Path) -> Path:
-    """Return the folder of a frame of a tree, which is named from the tree on, or by a path that leads into it."""
+    """Return the folder of a frame, which is named relative to the tree, or by a path into it."""
     place = Path(frame).resolve()
     if place.is_dir() and place.is_relative_to(tree.resolve()):
         return tree / place.relative_to(tree.resolve())
@@ -100,52 +99,48 @@ def frame_in(tree: Path, frame: str | Path) -> Path:
 
 
 def best_frame(tree: Path, *names: str) -> Path:
-    """Return the frame folder of a tree's first clean flight that shows most of the target and has these files."""
+    """Return the frame folder of a tree's first clean track that shows most of the target and has these files."""
     folders = find_tracks(tree)
-    flight = read_track(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
-    frames = _frames_with(flight, *names)
-    return flight.frame_folder(max(frames, key=lambda i: (np.nan_to_num(flight.target.visibility[i]), i)))
+    track = read_track(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
+    frames = _frames_with(track, *names)
+    return track.frame_folder(max(frames, key=lambda i: (np.nan_to_num(track.target.visibility[i]), i)))
 
 
 # --- pieces -----------------------------------------------------------------------------------------------------------
 
 
-def _spread(n: int, num: int) -> list[int]:
-    return sorted({int(i) for i in np.linspace(0, n - 1, min(n, num)).round()})
-
-
-def _frames_with(flight: Track, *names: str) -> list[int]:
-    frames = sorted(set(range(len(flight))) - set(flight.missing_frames(names)))
+def _frames_with(track: Track, *names: str) -> list[int]:
+    frames = sorted(set(range(len(track))) - set(track.missing_frames(names)))
     if not frames:
-        raise InputError("the flight has no frames to show", where=flight.folder, expected=", ".join(names))
+        raise InputError("the track has no frames to show", where=track.folder, expected=", ".join(names))
     return frames
 
 
-def _row(flight: Track) -> np.ndarray:
-    frames = _frames_with(flight, "rgb.png")
+def _row(track: Track) -> np.ndarray:
+    frames = _frames_with(track, "rgb.png")
     tiles = []
-    for i in (frames[k] for k in _spread(len(frames), NUM_RGB_TILES)):
-        picture = _boxed(read_rgb(flight.frame_folder(i)), flight, i)
-        tiles.append(_tile(picture, f"t = {flight.time_s[i]:.1f} s"))
+    for i in (frames[k] for k in spread(len(frames), NUM_RGB_TILES)):
+        picture = _boxed(read_rgb(track.frame_folder(i)), track, i)
+        tiles.append(_tile(picture, f"t = {track.time_s[i]:.1f} s"))
     tiles += [np.zeros_like(tiles[0])] * (NUM_RGB_TILES - len(tiles))
-    middle = flight.frame_folder(frames[len(frames) // 2])
+    middle = track.frame_folder(frames[len(frames) // 2])
     for view in ("depth", "segmentation"):
         if frame_path(middle, VIEW_FILES[view]).is_file():
             tiles.append(_tile(read_view(middle, view), view))
         else:
             tiles.append(_tile(np.zeros_like(tiles[0]), f"no {VIEW_FILES[view]}"))
     strip = np.full((22, TILE_PX[0] * len(tiles), 3), 24, np.uint8)
-    visible = f"target visible in {int(flight.target.visible.sum())} of {len(flight)} frames"
-    fov = " to ".join(dict.fromkeys(f"{fov:.0f}" for fov in flight.fovs_deg))
-    text = f"{flight.town}  {flight.trajectory}  {flight.variant}   fov {fov} deg   {visible}"
+    visible = f"target visible in {int(track.target.visible.sum())} of {len(track)} frames"
+    fov = " to ".join(dict.fromkeys(f"{fov:.0f}" for fov in track.fovs_deg))
+    text = f"{track.town}  {track.trajectory}  {track.variant}   fov {fov} deg   {visible}"
     draw_text(strip, text, 8, 15, 0.45, (235, 235, 235))
     return np.vstack([strip, np.hstack(tiles)])
 
 
-def _heading(num_flights: int, width_px: int) -> np.ndarray:
+def _heading(num_tracks: int, width_px: int) -> np.ndarray:
     strip = np.full((26, width_px, 3), 60, np.uint8)
-    shown = "" if num_flights <= MOST_ROWS else f", the first {MOST_ROWS} shown"
-    draw_text(strip, f"{num_flights} flights{shown}", 8, 18, 0.5, (255, 255, 255))
+    shown = "" if num_tracks <= MOST_ROWS else f", the first {MOST_ROWS} shown"
+    draw_text(strip, f"{num_tracks} tracks{shown}", 8, 18, 0.5, (255, 255, 255))
     return strip
 
 
@@ -155,24 +150,24 @@ def _tile(picture: np.ndarray, text: str) -> np.ndarray:
     return tile
 
 
-def _boxed(picture: np.ndarray, flight: Track, i: int) -> np.ndarray:
+def _boxed(picture: np.ndarray, track: Track, i: int) -> np.ndarray:
     """Draw the target's box if the frame has one."""
     picture = np.ascontiguousarray(picture)
-    if not np.isnan(flight.target.bbox[i]).any():
-        x0, y0, x1, y1 = (round(float(v)) for v in flight.target.bbox[i])
+    if not np.isnan(track.target.bbox[i]).any():
+        x0, y0, x1, y1 = (round(float(v)) for v in track.target.bbox[i])
         cv2.rectangle(picture, (x0, y0), (x1, y1), BOX_COLOR, max(1, picture.shape[1] // 400))
     return picture
 
 
-def _preview(flight: Track, i: int, width_px: int) -> Image.Image:
-    picture = _boxed(read_rgb(flight.frame_folder(i)), flight, i)
+def _preview(track: Track, i: int, width_px: int) -> Image.Image:
+    picture = _boxed(read_rgb(track.frame_folder(i)), track, i)
     height_px = round(width_px * picture.shape[0] / picture.shape[1])
     return Image.fromarray(cv2.resize(picture, (width_px, height_px), interpolation=cv2.INTER_AREA))
 
 
 def _gif(frames: list[Image.Image], frame_ms: int) -> bytes:
     # One palette for all frames: colours do not flicker, and undithered areas compress better.
-    sample = np.vstack([np.asarray(frames[i]) for i in _spread(len(frames), 6)])
+    sample = np.vstack([np.asarray(frames[i]) for i in spread(len(frames), 6)])
     palette = Image.fromarray(sample).quantize(128)
     frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     buffer = io.BytesIO()
@@ -183,7 +178,7 @@ def _gif(frames: list[Image.Image], frame_ms: int) -> bytes:
 
 
 def _png_below(rgb: np.ndarray, most_bytes: int) -> bytes:
-    """Encode a picture, smaller if it would be too large, with a palette."""
+    """Encode a picture with a palette, scaled down until it is small enough."""
     scale = 1.0
     while True:
         size = (round(rgb.shape[1] * scale), round(rgb.shape[0] * scale))

@@ -1,8 +1,8 @@
-"""What a frame's labels say, drawn over its colours: the 3D boxes of map, target and others, with ids and distances
+"""A frame's labels drawn over its colours: the 3D boxes of map, target and bystanders, with ids and distances
 (`debug.png`).
 
-Everything is projected again from `meta.json` and the map, nothing is taken from the picture's own shapes: where a line
-does not fit what is drawn under it, one of them is wrong.
+Everything is projected again from `meta.json` and the map, independently of the picture: a line that does not fit the
+picture shows an error in one of them.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from cosfly.geometry.axes import box_corners, rotation_matrices
 from cosfly.viz.topview import COLORS, FONT, OTHER_COLOR, Color, draw_text
 
 TARGET_COLOR, OTHERS_COLOR = (255, 214, 10), (90, 220, 255)
-LEAST_SHARE = 5e-4  # of the picture: boxes of which less is seen are left out
-MOST_LABELS = 16  # of the boxes that take most of the picture
-FAR_PX = 20_000.0  # lines are drawn so far beyond the picture
+LEAST_SHARE = 5e-4  # of the picture: smaller boxes are skipped
+MOST_LABELS = 16  # of the largest boxes
+FAR_PX = 20_000.0  # lines end this far beyond the picture
 # Pairs of corners, in the order of geometry.box_corners, that an edge of a box joins.
 _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
 
@@ -47,7 +47,7 @@ class Overlay:
         """Return the picture with boxes, ids and distances drawn in, (h, w, 3) uint8.
 
         Args:
-            rgb: (h, w, 3) uint8; ids: (h, w) of `instance.png`, which tell what of the map is seen.
+            rgb: (h, w, 3) uint8. ids: (h, w) of `instance.png`, which select the boxes.
         """
         picture = np.ascontiguousarray(rgb).copy()
         camera_pose, intrinsic = meta.drone_pose.camera_pose, np.array(meta.camera.intrinsic)
@@ -66,7 +66,7 @@ class Overlay:
         return picture
 
     def _seen(self, ids: np.ndarray) -> list[_Box]:
-        """Return the boxes that take enough of the picture, without ground, the largest last: labels on top."""
+        """Return the boxes that cover enough of the picture, without ground, the largest last."""
         found, counts = np.unique(ids, return_counts=True)
         pixels = dict(zip(found.tolist(), counts.tolist(), strict=True))
         seen = np.array([pixels.get(int(one), 0) for one in self.instance_ids.tolist()])
@@ -83,12 +83,12 @@ class Overlay:
 
 
 def _bright(color: Color) -> Color:
-    """Return a tone that stands out from a picture."""
+    """Return a lighter tone."""
     return tuple(round(255 - 0.55 * (255 - value)) for value in color)
 
 
 def _moving(meta: FrameMeta) -> list[_Box]:
-    """Return the boxes of who moves, the target last."""
+    """Return the boxes of bystanders, then of the target."""
     boxes = []
     for other in meta.others.others if meta.others else ():
         corners_m = box_corners(other.center_m, np.array(other.half_extents_m), other.heading_rad)
@@ -101,7 +101,7 @@ def _moving(meta: FrameMeta) -> list[_Box]:
 def _lines(
     corners_m: np.ndarray, camera_pose: np.ndarray, intrinsic: np.ndarray, near_m: float
 ) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Project the edges of a box, cut at the near plane; pairs of pixels, none for a box behind the camera."""
+    """Project the edges of a box, clipped at the near plane, to pairs of pixels."""
     points = (corners_m - camera_pose[:3, 3]) @ camera_pose[:3, :3]
     lines = []
     for a, b in _EDGES:
@@ -119,19 +119,20 @@ def _lines(
 
 
 class _Labels:
-    """Words at the boxes; what is added last matters most, and what would lie on another is left out."""
+    """Labels of boxes; later ones have priority, and overlapping ones are skipped."""
 
     def __init__(self, picture: np.ndarray, scale: float) -> None:
         self._picture, self._size = picture, max(0.33, 0.45 * scale)
         self._waiting: list[tuple[str, float, float, Color]] = []
 
     def add(self, text: str, x: float, y: float, color: Color) -> None:
-        """Put a text over a place, px, if that is in the picture."""
+        """Add a text over a place, px, if that is in the picture."""
         height, width = self._picture.shape[:2]
         if 0 <= x < width and -height / 2 <= y < height:
             self._waiting.append((text, x, y, color))
 
     def write(self) -> None:
+        """Draw the labels that do not overlap."""
         height, width = self._picture.shape[:2]
         taken: list[tuple[float, float, float, float]] = []
         for text, x, y, color in reversed(self._waiting):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table; the first column is words, the others are numbers."""
+    """A table of text; the first column is words, the others are numbers."""
 
     title: str
     columns: list[str]

@@ -1,6 +1,6 @@
-"""Drawing for people: a map from above, and the lines, dots and words of every overview and plot.
+"""Drawing of maps from above, and of the lines, dots and texts of overviews and plots.
 
-Places on a picture are floats, px from its top left corner, kept to a sixteenth.
+Places on a picture are floats, px from its top left corner, rounded to a sixteenth.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KIND_NAMES
 from cosfly.geometry.axes import box_corners
 
-# Softer than CARLA's palette, which is made for masks and not for eyes; RGB. Other kinds: OTHER_COLOR.
+# RGB, softer than CARLA's palette, which is made for masks. Other kinds: OTHER_COLOR.
 COLORS: dict[str, tuple[int, int, int]] = {
     "Roads": (120, 120, 126), "Sidewalks": (196, 190, 180), "RoadLines": (245, 245, 240), "Terrain": (176, 204, 146),
     "Ground": (205, 196, 170), "Water": (112, 158, 204), "Vegetation": (72, 128, 62), "Buildings": (186, 106, 84),
@@ -43,7 +43,7 @@ class TopView:
 
     @classmethod
     def around(cls, points_m: np.ndarray, longer_side_px: int, margin_m: float = 2.0) -> Self:
-        """Show all points, (n, 2 or 3) m, with a margin."""
+        """Return a window that shows all points, (n, 2 or 3) m, with a margin."""
         low, high = points_m[:, :2].min(axis=0) - margin_m, points_m[:, :2].max(axis=0) + margin_m
         scale = longer_side_px / (high - low).max()
         width, height = np.maximum(1, np.ceil((high - low) * scale)).astype(int).tolist()
@@ -56,7 +56,7 @@ class TopView:
 
 
 def draw_map(box_map: BoxMap, view: TopView) -> np.ndarray:
-    """Draw a map from above, low boxes first, the higher the lighter; (height, width, 3) uint8 RGB."""
+    """Draw a map from above, low boxes first, high ones lighter; (height, width, 3) uint8 RGB."""
     picture = np.full((*view.size_px[::-1], 3), PAPER, dtype=np.uint8)
     tops = box_map.centers[:, 2] + box_map.half_extents[:, 2]
     if not box_map.ground.is_flat:
@@ -105,10 +105,10 @@ def draw_text(
     align: float = 0.0,
     halo: Color | None = None,
 ) -> int:
-    """Write text with its baseline at y: align 0 begins at x, 0.5 is centred, 1 ends there. Gives the x of its end."""
+    """Write text with its baseline at y; return the x of its end. align: 0 begins at x, 0.5 is centred, 1 ends at x."""
     width = cv2.getTextSize(text, FONT, scale, 1)[0][0]
     left, base = round(x - align * width), round(y)
-    if halo is not None:  # of the same letters: thicker ones are a bold font in OpenCV 5, and wider
+    if halo is not None:  # of the same letters: thicker ones are wider in OpenCV 5
         for dx, dy in product((-1, 0, 1), repeat=2):
             cv2.putText(picture, text, (left + dx, base + dy), FONT, scale, halo, 1, cv2.LINE_AA)
     cv2.putText(picture, text, (left, base), FONT, scale, color, 1, cv2.LINE_AA)
@@ -130,5 +130,5 @@ def png_bytes(picture: np.ndarray) -> bytes:
 
 
 def _fixed(places: np.ndarray) -> np.ndarray:
-    """Places as whole sixteenths, int32."""
+    """Return places as whole sixteenths, int32."""
     return np.round(np.asarray(places, dtype=np.float64) * 2**FRACTION_BITS).astype(np.int32)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import base64
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -18,8 +18,8 @@ from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
 from cosfly.geometry.axes import box_corners
 from cosfly.llm.answer_text import sentences_of
 from cosfly.runtime.config import Config
-from cosfly.runtime.errors import InputError
-from cosfly.viz.frame_views import View, small_jpeg
+from cosfly.viz.frame_views import View, spread
+from cosfly.viz.page_pictures import PagePictures
 from release.columns import BOX, CAPTION, FIELDS, FRAME, LANGUAGES, POINT, TARGET_PICTURE, Column
 
 Point2 = tuple[float, float]  # x, y, m
@@ -191,60 +191,13 @@ def box_of(box: Mapping[str, Any] | None, width_px: int, height_px: int) -> tupl
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
-FRAME_BYTES, FLIGHT_BYTES = 7_000, 14_000  # what a frame takes without pictures, and a flight with its paths
-JPEG_QUALITY = 72
+FRAME_BYTES, FLIGHT_BYTES = 7_000, 14_000  # a frame without pictures, and a track with its paths
 
 
-class PagePictures:
-    """Encodes pictures until the page is full, then every frame goes without; `left_out` and `unreadable` count
-    frames.
-    """
-
-    def __init__(self, cfg: ViewerConfig, num_flights: int, num_frames: int) -> None:
-        self.cfg = cfg
-        self.left = cfg.max_mb * MB - FRAME_BYTES * num_frames - FLIGHT_BYTES * num_flights
-        self.num_frames, self.asked, self.every = max(1, num_frames), 0, 1
-        self.left_out = self.unreadable = 0
-
-    def of_frame(self, views: Mapping[View, Callable[[], np.ndarray]]) -> dict[View, str]:
-        """Return a frame's pictures; none where there is no room for them.
-
-        Args:
-            views: what reads each view as (h, w, 3) uint8 RGB; a view that cannot be read is left out.
-        """
-        number, self.asked = self.asked, self.asked + 1
-        if number % self.every:
-            self.left_out += 1
-            return {}
-        pictures: dict[View, str] = {}
-        is_damaged = False
-        for view, read in views.items():
-            try:
-                width_px = self.cfg.picture_px if view == "rgb" else self.cfg.picture_px // 2
-                pictures[view] = small_jpeg(read(), width_px, JPEG_QUALITY)
-            except InputError:
-                is_damaged = True
-        self.unreadable += is_damaged
-        size = sum(map(len, pictures.values()))
-        if number == 0 and size * self.num_frames > self.left:  # then every so many frames have pictures, everywhere
-            self.every = min(self.num_frames, -(-size * self.num_frames // max(1, self.left)))
-        if size > self.left:
-            self.left_out += 1
-            return {}
-        self.left -= size
-        return pictures
-
-    def notes(self) -> list[str]:
-        """Return what the page lacks."""
-        notes = []
-        if self.left_out:
-            notes.append(
-                f"{self.left_out:,} of {self.asked:,} shown frames have no pictures, to keep the page below "
-                f"{self.cfg.max_mb} MB"
-            )
-        if self.unreadable:
-            notes.append(f"of {self.unreadable:,} frames a picture cannot be read")
-        return notes
+def page_pictures(cfg: ViewerConfig, num_flights: int, num_frames: int) -> PagePictures:
+    """Return the encoder of a page's pictures."""
+    room = cfg.max_mb * MB - FRAME_BYTES * num_frames - FLIGHT_BYTES * num_flights
+    return PagePictures(room, num_frames, cfg.picture_px)
 
 
 # --- choice ---------------------------------------------------------------------------------------------------------
@@ -252,11 +205,6 @@ class PagePictures:
 PATH_POINTS = 240
 MOST_BOXES, MARGIN_M = 2_500, 30.0  # of one map
 Track = TypeVar("Track")
-
-
-def spread(count: int, most: int) -> list[int]:
-    """Return at most `most` of the numbers below `count`, evenly, first and last included."""
-    return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most)).round()})
 
 
 def choose_flights(flights: Sequence[Track], groups: Sequence[Hashable], most: int) -> list[Track]:

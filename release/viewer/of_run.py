@@ -20,13 +20,13 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from cosfly.viz.frame_views import VIEW_FILES, View, read_view
+from cosfly.viz.page_pictures import PagePictures
 from release.columns import Placement, caption_values, scalar_row
 from release.viewer.content import (
     PageBox,
     PageCaption,
     PageFlight,
     PageFrame,
-    PagePictures,
     ViewerConfig,
     ViewerPage,
     boxes_of,
@@ -34,6 +34,7 @@ from release.viewer.content import (
     choose_flights,
     choose_frames,
     frame_of,
+    page_pictures,
     path_of,
 )
 
@@ -89,7 +90,7 @@ def show_run(folder: Path, cfg: ViewerConfig, captions: Path | None = None) -> V
         frames[tree, place] = choose_frames(range(num_frames), kinds.get((tree.run, _key(place)), {}), cfg.frames)
     texts = _texts(trees, {(tree.run, _key(place)): set(indices) for (tree, place), indices in frames.items()})
     results = _results(trees)
-    pictures = PagePictures(cfg, len(frames), sum(map(len, frames.values())))
+    pictures = page_pictures(cfg, len(frames), sum(map(len, frames.values())))
     shown = list[PageFlight]()
     with progress_bar("viewer: frames", pictures.num_frames) as advance:
         for (tree, place), indices in frames.items():

@@ -23,6 +23,7 @@ from cosfly.runtime.io import read_text, write_bytes
 from cosfly.runtime.tables import arrow_errors, row_groups
 from cosfly.viz.frame_views import View, depth_colors, segmentation_colors
 from cosfly.viz.page import page, scripts
+from cosfly.viz.page_pictures import PagePictures
 from release.card.numbers import bounded, check_columns, check_rows, row_lists
 from release.columns import PICTURES as COLUMNS
 from release.columns import PLACE, POINT, SHORT_NAMES
@@ -30,13 +31,13 @@ from release.record import ReleaseRecord, read_record
 from release.viewer.content import (
     PageFlight,
     PageFrame,
-    PagePictures,
     ViewerConfig,
     ViewerPage,
     caption_of,
     choose_flights,
     choose_frames,
     frame_of,
+    page_pictures,
     path_of,
 )
 from release.viewer.of_run import show_run
@@ -85,7 +86,7 @@ def show_release(dataset: Path, cfg: ViewerConfig) -> ViewerPage:
     notes.append("a release holds no map: the tracks are drawn without one")
     scanned = _scan(dataset, record, chosen)
     frames = {place: choose_frames(sorted(one.places), one.kinds, cfg.frames) for place, one in scanned.items()}
-    pictures = PagePictures(cfg, len(scanned), sum(map(len, frames.values())))
+    pictures = page_pictures(cfg, len(scanned), sum(map(len, frames.values())))
     with progress_bar("viewer: frames", pictures.num_frames) as advance:
         for row in _rows(dataset, record, scanned, frames):
             scanned[place_of(row)].frames.append(_frame(row, record, pictures))

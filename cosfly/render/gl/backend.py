@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -17,15 +16,22 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import SKY_DEPTH_M, Look
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import WeatherParams
-from cosfly.render.contract import FAR_M, NEAR_M, Frame, PosedBystander, PosedPerson, check_pose, far_as_sky
-from cosfly.render.gl import meshes
+from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Frame, PosedBystander, PosedPerson, check_pose, far_as_sky
+from cosfly.render.figure import figure_of
+from cosfly.render.gl import meshes, movers
 from cosfly.render.gl import parts as part_tables
-from cosfly.render.gl.figure import MOST_CAPSULES, Body, capsules_of, draw_bystanders, make_body, placed
-from cosfly.render.gl.loose import LooseTriangles, attributes
 from cosfly.render.gl.parts import PART
-from cosfly.render.gl.programs import Programs, open_context, packed, programs_of, set_uniform, sources
+from cosfly.render.gl.programs import (
+    LooseTriangles,
+    Programs,
+    attributes,
+    open_context,
+    packed,
+    programs_of,
+    set_uniform,
+    sources,
+)
 from cosfly.render.gl.scene import build_scene
-from cosfly.render.gl.shade import Shade, shades_of
 from cosfly.render.gl.view import CameraView
 from cosfly.render.gl.weather_pass import WeatherPass, defines
 from cosfly.runtime.worker import return_freed_memory
@@ -38,25 +44,15 @@ EDGE_LEVELS, EDGE_BLUR_PX = 5, 0.62
 MESH_STRIDE = 64
 MOVER_M = 4.5  # no part of a person or a car is farther from another one
 SOFTWARE = "llvmpipe"  # draws on the processor, and interpolates where hardware snaps to a grid (scene.frag.glsl)
-# Triangles that llvmpipe may have taken and not drawn yet. It begins another list of them (36 MB) whenever one is full
-# while the last is still being drawn, and keeps every list for good: without this a process grows by a seventh over
-# thousands of frames, on a loaded machine.
+# Triangles that llvmpipe may hold back. It allocates another list of them (36 MB) whenever one is full while the last
+# is still being drawn, and never frees one: without this limit a process grows by a seventh over thousands of frames.
 MOST_WAITING = 30_000
 PATTERN_M = 720.0  # common multiple of the patterns' sizes: the scene's origin modulo this keeps coordinates small
-ORIGIN_STEP_M = 2.0 * PATTERN_M  # a flight farther off than half of this has an origin of its own
-
-
-@dataclass(frozen=True)
-class _Look:
-    """What fair weather, or any other, is drawn with."""
-
-    programs: Programs
-    sky: Any
-    weather: WeatherPass | None
+ORIGIN_STEP_M = 2.0 * PATTERN_M  # a trajectory farther off than half of this has an origin of its own
 
 
 class GlRenderer:
-    """Draws a map on EGL. One object holds one GL context, up to its end, and belongs to the thread that made it."""
+    """A renderer on EGL. One object holds one GL context and belongs to the thread that made it."""
 
     dresses = True
 
@@ -75,25 +71,21 @@ class GlRenderer:
             self._depth_program = self.context.program(*sources(("part.glsl", "depth.vert.glsl"), ("depth.frag.glsl",)))
             self._make_targets()
             self._make_meshes()
-            self._looks: dict[str | None, _Look] = {}
-            self._use_look(None)
+            self._looks: dict[str | None, tuple[Programs, Any, WeatherPass | None]] = {}
+            self._use_weather(None)
         self.prepare(*self.scene.bounds())
 
     # --- set-up ---
 
-    def _use_look(self, define: str | None) -> None:
-        """Draw from now on with the programs of fair weather (None), or of one with such defines."""
+    def _use_weather(self, define: str | None) -> None:
+        """Switch to the programs of fair weather (None), or of a weather with these defines."""
         if define not in self._looks:
-            self._looks[define] = self._make_look(define)
-        look = self._looks[define]
-        self._programs, self._sky, self._weather = look.programs, look.sky, look.weather
-
-    def _make_look(self, define: str | None) -> _Look:
-        programs = programs_of(self.context, define, snaps=not self._is_software)
-        sky = self.context.vertex_array(programs.sky, [])
-        if define is None:
-            return _Look(programs, sky, None)
-        return _Look(programs, sky, WeatherPass(self.context, self._color, self._depth, programs.rain, self.num_others))
+            programs = programs_of(self.context, define, snaps=not self._is_software)
+            weather = None
+            if define is not None:
+                weather = WeatherPass(self.context, self._color, self._depth, programs.rain, self.num_others)
+            self._looks[define] = programs, self.context.vertex_array(programs.sky, []), weather
+        self._programs, self._sky, self._weather = self._looks[define]
 
     def _make_targets(self) -> None:
         size, context = (self.width_px, self.height_px), self.context
@@ -110,7 +102,7 @@ class GlRenderer:
         self._height.filter = (self.context.NEAREST, self.context.NEAREST)  # it is smooth already, and this is faster
 
     def _make_meshes(self) -> None:
-        """Vertices and triangles of every mesh; vertex arrays are made when needed."""
+        """Upload vertices and triangles of every mesh; vertex arrays are made when needed."""
         self._meshes = [
             (self.context.buffer(mesh.vertices.tobytes()), self.context.buffer(mesh.triangles.tobytes()))
             for mesh in meshes.all_meshes()
@@ -122,7 +114,7 @@ class GlRenderer:
         self._loose = LooseTriangles(self.context, self.scene.draped), self._solids
 
     def _array(self, program: Any, mesh: int) -> tuple[Any, Any]:
-        """Vertex array and instance buffer of a program on a mesh."""
+        """Return vertex array and instance buffer of a program for a mesh."""
         if (program.glo, mesh) not in self._arrays:
             vertices, triangles = self._meshes[mesh]
             instances = self.context.buffer(reserve=PART.itemsize, dynamic=True)
@@ -137,10 +129,10 @@ class GlRenderer:
             self._arrays[program.glo, mesh] = array, instances
         return self._arrays[program.glo, mesh]
 
-    # --- what holds for a whole flight ---
+    # --- one trajectory ---
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
-        """Compute sun shadows and sky openness for an area of the world, (3,) corners, and take a flight's weather."""
+        """Compute sun shadows and sky openness for an area of the world, (3,) corners, and set the weather."""
         self._settle(np.asarray(low_m), np.asarray(high_m))
         low, high = np.asarray(low_m) - self.origin_m, np.asarray(high_m) - self.origin_m
         middle = (low + high) / 2.0
@@ -149,7 +141,7 @@ class GlRenderer:
         near = (np.abs(parts.object_centers[:, :2] - middle[:2]) < half * 2.0 + parts.object_radii[:, None]).all(axis=1)
         casting = np.flatnonzero(near & (parts.max_px > 1e8))
         with self.context:
-            self._use_look(None if weather is None else defines(weather))
+            self._use_weather(None if weather is None else defines(weather))
             for loose in self._loose:
                 loose.place(self.origin_m - self.scene.origin_m)
             if self._weather is not None and weather is not None:
@@ -157,19 +149,18 @@ class GlRenderer:
                 self._weather.prepare(weather, parts, lamps, middle, half)
             self._sun = self.look.sun_direction() if self._weather is None else self._weather.sun_direction
             centers, radii = self._solids.centers, self._solids.radii
-            beside = (np.abs(centers[:, :2] - middle[:2]) < half * 2.0 + radii[:, None]).all(axis=1)
-            centers = np.concatenate([parts.object_centers[casting], centers[beside]])
-            radii = np.concatenate([parts.object_radii[casting], radii[beside]])
+            near_solids = (np.abs(centers[:, :2] - middle[:2]) < half * 2.0 + radii[:, None]).all(axis=1)
+            centers = np.concatenate([parts.object_centers[casting], centers[near_solids]])
+            radii = np.concatenate([parts.object_radii[casting], radii[near_solids]])
             self._solids.see(None)
             self._prepare_shadow(casting, centers, radii, middle, half)
             top = float((centers[:, 2] + radii).max(initial=self.scene.plane_z_m - self.origin_m[2])) + 1.0
             self._prepare_openness(casting, top, middle, half)
 
     def _settle(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
-        """Keep the parts that a camera within these corners can see, counted from near it.
+        """Select the parts that a camera within these corners can see, and move the origin near it.
 
-        Of a city of kilometres that is little, and every frame looks through what is kept. Kilometres from its zero,
-        single precision is worth a millimetre.
+        Each frame tests all selected parts, and kilometres from the origin float32 resolves a millimetre only.
         """
         parts, zero = self.scene.parts, self.scene.origin_m
         outside = np.maximum(low_m - zero - parts.object_centers, parts.object_centers - (high_m - zero))
@@ -182,7 +173,7 @@ class GlRenderer:
     def _prepare_shadow(
         self, casting: np.ndarray, centers: np.ndarray, radii: np.ndarray, middle: np.ndarray, half: float
     ) -> None:
-        """Draw what casts shadows from the sun; centers, radii: of all of it near the middle."""
+        """Draw the shadow map of the sun; centers, radii: of the casters near the middle."""
         sun = self._sun
         side = np.cross([0.0, 0.0, 1.0], sun)
         side /= np.linalg.norm(side)
@@ -200,7 +191,7 @@ class GlRenderer:
             set_uniform(program, "shadow_texel_m", 2.2 * half / SHADOW_SIZE_PX)
 
     def _prepare_openness(self, casting: np.ndarray, top: float, middle: np.ndarray, half: float) -> None:
-        """A height map from above, blurred: what stands higher than a point darkens it. top: no caster is higher."""
+        """Draw a blurred height map from above: higher objects nearby darken a point. top: no caster is higher."""
         ground_z = self.scene.plane_z_m - self.origin_m[2]
         depth_m = top - ground_z + 10.0
         clip_from_world = np.diag([1.0 / half, 1.0 / half, -2.0 / depth_m, 1.0])
@@ -222,7 +213,7 @@ class GlRenderer:
             set_uniform(program, "height_area", np.array([*low, 0.5 / half, 0.5 / half]))
 
     def _ground_z(self, low: np.ndarray, pixel_m: float) -> np.ndarray | float:
-        """Height of the ground over the map of openness, relative to the origin: one figure where it is flat."""
+        """Return the height of the ground over the openness map, relative to the origin; a number where it is flat."""
         if self.scene.ground.is_flat:
             return self.scene.plane_z_m - self.origin_m[2]
         x, y = (low[axis] + self.origin_m[axis] + pixel_m * (np.arange(HEIGHT_SIZE_PX) + 0.5) for axis in (0, 1))
@@ -249,16 +240,16 @@ class GlRenderer:
     ) -> Frame:
         """Draw one frame, as the contract says."""
         check_pose(camera_pose, intrinsic)
-        body = None if person is None else make_body(person)
+        figure = None if person is None else figure_of(person)
         view = CameraView(
             camera_pose[:3, :3], camera_pose[:3, 3] - self.origin_m, intrinsic, self.width_px, self.height_px
         )
-        moving = [] if body is None else [placed(body, self.origin_m)]
-        moving += draw_bystanders(others, self.origin_m, view)
-        bones = self._bones(body)
-        capsules = capsules_of(others, self.origin_m, view)
+        moving = [] if figure is None else [movers.figure_parts(figure, PERSON_ID, self.origin_m)]
+        moving += movers.draw_bystanders(others, self.origin_m, view)
+        bones = np.zeros((0, 2, 4), np.float32) if figure is None else movers.bones_of(figure, self.origin_m)
+        capsules = movers.capsules_of(others, self.origin_m, view)
         has_headlights = self._weather is not None and self._weather.has_lights
-        shades = shades_of(bones, capsules, self._sun, view, has_headlights)
+        shades = movers.shades_of(bones, capsules, self._sun, view, has_headlights)
         frame_values = {} if self._weather is None else self._weather.frame_values(view.eye, camera_pose, person)
         with self.context:
             self._set_camera(self._programs.materials, view, frame_values)
@@ -276,11 +267,12 @@ class GlRenderer:
             self._draw_scene(self._programs.materials, rows, moving)
             if shades:
                 self._set_camera(self._programs.near_movers, view, frame_values)
-                self._set_person(body)
+                center = np.zeros(3) if person is None else person.hip_m - self.origin_m
+                for program in self._programs.near_movers:
+                    set_uniform(program, "person_center", center)
             for shade in shades:
                 self._draw_shaded(shade, bones, rows, moving)
-            # Clearing targets of mixed types leaves garbage: the sky's triangle writes all three wherever nothing
-            # stands.
+            # Clearing targets of mixed types leaves garbage: the sky's triangle writes all three where nothing is.
             self.context.disable(self.context.CULL_FACE)
             self._sky.render(vertices=3)
             if self._weather is not None:
@@ -295,7 +287,7 @@ class GlRenderer:
         }
 
     def _set_camera(self, programs: list[Any], view: CameraView, frame_values: dict[str, Any]) -> None:
-        """Set what holds for a frame; frame_values: of the weather, in the place of the look's."""
+        """Set the uniforms of a frame; frame_values: of the weather, instead of the look's."""
         common = {
             **self._lens(view),
             "sun_direction": self._sun,
@@ -317,27 +309,15 @@ class GlRenderer:
             for name, value in bytes_of.items():
                 set_uniform(program, name, value)
 
-    def _bones(self, body: Body | None) -> np.ndarray:
-        """Capsules of the person's shadow, relative to the origin, as `moving.capsules_of` gives those of others."""
-        bones = np.zeros((0 if body is None else len(body.bones_m), 2, 4), np.float32)
-        if body is not None:
-            bones[..., :3], bones[:, 0, 3] = body.bones_m - self.origin_m, body.bone_radii_m
-        return bones
-
-    def _set_person(self, body: Body | None) -> None:
-        center = np.zeros(3) if body is None else body.center_m - self.origin_m
-        for program in self._programs.near_movers:
-            set_uniform(program, "person_center", center)
-
     def _draw_shaded(
-        self, shade: Shade, bones: np.ndarray, rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]
+        self, shade: movers.Shade, bones: np.ndarray, rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]
     ) -> None:
-        """Draw what lies in a rectangle once more, with the shadows of those who move."""
+        """Draw a rectangle again, with the shadows of movers."""
         center, radius = shade.sphere()
         person = bones if shade.has_person else bones[:0]
         for name, count, most, capsules in (
             ("person_bones", "person_num_bones", MAX_BONES, person),
-            ("other_bones", "num_others", MOST_CAPSULES, shade.capsules),
+            ("other_bones", "num_others", movers.MOST_CAPSULES, shade.capsules),
         ):
             padded = np.zeros((most, 2, 4), np.float32)
             padded[: len(capsules)] = capsules
@@ -353,7 +333,7 @@ class GlRenderer:
         self._image.scissor = None
 
     def _draw_scene(self, programs: list[Any], rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]) -> None:
-        """Draw standing things before the ground, near before far. moving: records and meshes."""
+        """Draw the ground last, and near before far. moving: records and meshes."""
         records = np.concatenate([*(part for part, _ in moving), self._parts.records[rows]])
         groups = np.concatenate([*(_groups(part, mesh) for part, mesh in moving), self._groups[rows]])
         order = np.argsort(groups, kind="stable")
@@ -394,13 +374,13 @@ class GlRenderer:
 
 
 def _release(context: Any) -> None:
-    """Return back 0.1 GB, or 0.8 GB if every weather was drawn: most is what the driver compiled, in small pieces."""
+    """Free 0.1 GB, or 0.8 GB after every weather: most of it is what the driver compiled, in small pieces."""
     context.release()
     return_freed_memory()
 
 
 def smoothed(rgb: np.ndarray) -> np.ndarray:
-    """Soften the steps of edges in a picture, (h, w, 3) uint8, where brightness jumps; the rest stays as it is."""
+    """Soften edges in a picture, (h, w, 3) uint8, where brightness jumps."""
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     steps = cv2.absdiff(gray, cv2.GaussianBlur(gray, (3, 3), 0.8))
     _, mask = cv2.threshold(steps, EDGE_LEVELS, 255, cv2.THRESH_BINARY)
@@ -408,5 +388,5 @@ def smoothed(rgb: np.ndarray) -> np.ndarray:
 
 
 def _groups(records: np.ndarray, mesh: np.ndarray) -> np.ndarray:
-    """One number for each material and mesh, (k,)."""
+    """Return a number for each combination of material and mesh, (k,)."""
     return ((records["tag"] >> 8) & 0xFF).astype(np.int64) * MESH_STRIDE + mesh

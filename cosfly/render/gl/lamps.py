@@ -1,7 +1,6 @@
-"""Street lamps of a map: where they hang, and the light that they throw on the ground, as a map seen from above.
+"""Street lamps of a map: their places, and their light on the ground as a map from above.
 
-A map without any is lit all the same, along its streets: by lamps that throw light and are not drawn, as no box stands
-for them.
+A map without lamps is lit along its streets by lamps that are not drawn, since no box represents them.
 """
 
 from __future__ import annotations
@@ -15,26 +14,26 @@ from cosfly.geometry.axes import rotation_matrices
 from cosfly.render.gl.parts import LAMP, Parts
 
 MAP_PX = 384
-REACH_M = 45.0  # farther off a lamp gives nothing
-CROWDED = 0.4  # several lamps in one place give less than their sum: where they crowd, each is a weaker one
-BRIGHT = 0.5  # red of a lamp's glass, which tells it from its housing
+REACH_M = 45.0  # a lamp lights nothing beyond
+CROWDED = 0.4  # several lamps in one place give less than their sum
+BRIGHT = 0.5  # red of a lamp's glass; its housing is darker
 FALL_M = 5.5  # height that the fall of the light is computed for, whatever the pole's
-# Of lamps that no pole stands for: along a street, by turns on its two sides.
+# Of lamps without a pole: along a street, on alternate sides.
 STREETS = ("Roads", "Sidewalks")
 ALONG_M, APART_M, HIGH_M = 16.0, 12.0, 6.5  # from one to the next; least distance of any two; over the street
 FROM_EDGE_M = 0.5
-MOST_NEAR = 16  # lamps whose mirror images a frame has, as many as the shader has room for
+MOST_NEAR = 16  # lamps that puddles mirror, as in the shader
 
 
 def lamps_of(parts: Parts) -> np.ndarray:
-    """Places of the lit lamps, (n, 3) relative to the scene's origin."""
+    """Return the places of the lit lamps, (n, 3) relative to the scene's origin."""
     records = parts.records
     is_lamp = (((records["tag"] >> 8) & 0xFF) == LAMP) & (records["color"][:, 0] > BRIGHT)
     return records["center"][is_lamp].astype(np.float64)
 
 
 def lamps_along_streets(box_map: BoxMap) -> np.ndarray:
-    """Places of lamps along the streets of a map without any, (n, 3) m, world: the largest street's first."""
+    """Return places of lamps along the streets of a map without any, (n, 3) m, world: the largest street's first."""
     streets = box_map.select(box_map.is_any_of({KINDS[name] for name in STREETS}))
     half = streets.half_extents
     turns = rotation_matrices(np.radians(streets.rotations_deg))
@@ -57,7 +56,7 @@ def lamps_along_streets(box_map: BoxMap) -> np.ndarray:
 
 
 def lamp_map(lamps: np.ndarray, middle: np.ndarray, half_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Light of lamps over a square.
+    """Compute the light of lamps over a square.
 
     Args:
         lamps: (n, 3) m; middle: (2,) m; half_m: half the square's side.

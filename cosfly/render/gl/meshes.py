@@ -1,5 +1,4 @@
-"""Unit meshes that the built-in renderer instances: each fits into the cube [-1, 1]^3, so a part fits into its half
-sizes.
+"""Unit meshes of the built-in renderer: each fits into the cube [-1, 1]^3, so a part fits into its half sizes.
 
 Vertices are (n, 6) float32: position and unit normal. Triangles are (k, 3) int32, counter-clockwise seen from outside.
 """
@@ -17,6 +16,8 @@ BOX, BLOB_FINE, BLOB, BLOB_COARSE, CYLINDER, CONE, CABIN, ROUNDED, SPHERE, LIMB 
 
 @dataclass(frozen=True)
 class UnitMesh:
+    """Vertices (n, 6) and triangles (k, 3)."""
+
     vertices: np.ndarray
     triangles: np.ndarray
 
@@ -119,7 +120,7 @@ def blob(num_subdivisions: int) -> UnitMesh:
 
 
 def _middle(vertices: list[np.ndarray], middles: dict[tuple[int, int], int], a: int, b: int) -> int:
-    """Index of the vertex between two vertices of the unit sphere, made once."""
+    """Return the index of the vertex between two vertices of the unit sphere, made once."""
     key = (min(a, b), max(a, b))
     if key not in middles:
         between = vertices[a] + vertices[b]

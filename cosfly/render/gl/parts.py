@@ -1,5 +1,5 @@
-"""Drawable parts and how they are collected: one part is one unit mesh (meshes.py) with half sizes, a rotation, a
-colour and a material number that the shader knows. Knows nothing of OpenGL, nor of what things look like (shapes.py).
+"""Drawable parts and their builder: a part is a unit mesh (meshes.py) with half sizes, a rotation, a colour and a
+material number of the shader. Independent of OpenGL and of the shapes of things (shapes.py).
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ DRAW_ORDER = (*(m for m in range(NUM_MATERIALS) if m not in GROUND_MATERIALS), *
 PART = np.dtype(
     [("center", "3f4"), ("half", "3f4"), ("quaternion", "4f4"), ("color", "4f4"), ("tag", "u4"), ("bias", "f4")]
 )
-PART_COLUMNS = ("records", "mesh", "centers", "object_centers", "object_radii", "min_px", "max_px")  # of Parts
-# A vertex of a triangle that is no instance of a mesh: place and normal as a mesh's vertices have them, then its part.
+# A vertex of a triangle that is no instance of a mesh: place and normal as in a mesh, then its part.
 LOOSE_VERTEX = np.dtype([("position", "3f4"), ("normal", "3f4"), *((name, PART[name]) for name in PART.names or ())])
 
 FAR_PX, NEVER_PX = 14.0, 1e9  # an object of a smaller radius on the image is drawn in its simple form
@@ -51,10 +50,10 @@ class Parts:
         return len(self.records)
 
     def select(self, keep: np.ndarray) -> Parts:
-        return Parts(*(getattr(self, column)[keep] for column in PART_COLUMNS))
+        return Parts(*(column[keep] for column in vars(self).values()))
 
     def about(self, place: np.ndarray) -> Parts:
-        """Return the same parts relative to a place, (3,): single precision is best near its zero."""
+        """Return the same parts relative to a place, (3,): float32 is most precise near 0."""
         if not place.any():
             return self
         records = self.records.copy()
@@ -94,16 +93,36 @@ class Boxes:
         return replace(self, half=half, turns=turns)
 
     def chance(self, number: int) -> np.ndarray:
-        """Return a further fixed number in [0, 1) per box."""
+        """Return a further fixed number in [0, 1) for each box."""
         return chance(self.seeds, number)
 
     def pick(self, palette: np.ndarray) -> np.ndarray:
-        """Return a colour of a palette, (k, 3), per box; gives (n, 3)."""
+        """Return a colour of a palette, (k, 3), for each box, (n, 3)."""
         return palette[(self.chance(0) * len(palette)).astype(int)]
+
+
+@dataclass(frozen=True)
+class Loose:
+    """Triangles by material. vertices: (3 k,) LOOSE_VERTEX, three to a triangle, relative to the scene's origin.
+
+    things: (k,) ascending, the thing of each triangle; centers (n, 3) float64, radii (n,) of things. Without things
+    all triangles are always drawn.
+    """
+
+    vertices: dict[int, np.ndarray]
+    things: dict[int, np.ndarray]
+    centers: np.ndarray
+    radii: np.ndarray
+
+    @staticmethod
+    def all_of(vertices: dict[int, np.ndarray]) -> Loose:
+        return Loose(vertices, {}, np.zeros((0, 3)), np.zeros(0))
 
 
 @dataclass
 class PartBuilder:
+    """Parts that are collected kind by kind."""
+
     _parts: list[Parts] = field(default_factory=list)
 
     def add(
@@ -147,13 +166,13 @@ class PartBuilder:
         )
 
     def add_parts(self, parts: Parts) -> None:
-        """Add what another builder made."""
+        """Add the parts of another builder."""
         self._parts.append(parts)
 
     def finish(self) -> Parts:
-        return Parts(*(np.concatenate([getattr(p, column) for p in self._parts]) for column in PART_COLUMNS))
+        return Parts(*map(np.concatenate, zip(*(vars(parts).values() for parts in self._parts), strict=True)))
 
 
 def tags(kind: int, material: int, ids: np.ndarray) -> np.ndarray:
-    """Pack kind (bits 0-7), material (8-15) and instance id (16-31) as the shader unpacks them."""
+    """Pack kind (bits 0-7), material (8-15) and instance id (16-31), as the shader unpacks them."""
     return np.uint32(kind) | np.uint32(material << 8) | (np.asarray(ids).astype(np.uint32) << np.uint32(16))

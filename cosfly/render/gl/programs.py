@@ -1,4 +1,4 @@
-"""Programs of the default renderer: one set for each kind of weather, and how their uniforms are set."""
+"""Programs and buffers of the default renderer: one set for each kind of weather, uniforms, loose triangles."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from cosfly.render.contract import DEBIAN_PACKAGES
-from cosfly.render.gl.parts import NUM_MATERIALS
+from cosfly.render.gl.parts import LOOSE_VERTEX, NUM_MATERIALS, Loose
+from cosfly.render.gl.view import CameraView
 from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.io import read_text
 
-# Files of shaders that follow light.glsl.
+# Shader files after light.glsl.
 FAIR, WEATHER_SKY, WEATHER_SCENE = ("look.glsl",), ("weather.glsl",), ("weather.glsl", "weather_scene.glsl")
 
 
@@ -44,8 +45,8 @@ def sources(vertex: tuple[str, ...], fragment: tuple[str, ...], define: str = ""
 
 @dataclass(frozen=True)
 class Programs:
-    """What fair weather, or one with such defines, is drawn with; materials and near_movers: one for each material, the
-    latter with the shadows of those who move; rain: None in fair weather.
+    """The programs of one kind of weather. materials, near_movers: one for each material, the latter with shadows
+    of movers; rain: None in fair weather.
     """
 
     materials: list[Any]
@@ -55,7 +56,7 @@ class Programs:
 
 
 def programs_of(context: Any, define: str | None, *, snaps: bool) -> Programs:
-    """Compile programs of fair weather (None), or of one with such defines. snaps: for hardware (scene.frag.glsl)."""
+    """Compile the programs of fair weather (None), or of one with these defines. snaps: for GPUs (scene.frag.glsl)."""
     of_sky = ("light.glsl", *(FAIR if define is None else WEATHER_SKY), "sky.frag.glsl")
     of_surfaces = ("light.glsl", *(FAIR if define is None else WEATHER_SCENE), "scene.frag.glsl")
     vertex, fragment = sources(
@@ -75,13 +76,13 @@ def programs_of(context: Any, define: str | None, *, snaps: bool) -> Programs:
 
 
 def packed(value: Any) -> Any:
-    """Return the bytes of an array as a uniform has them, column by column; other values as they are."""
+    """Return the bytes of an array as a uniform, column by column; other values unchanged."""
     return np.ascontiguousarray(value.T, dtype=np.float32).tobytes() if isinstance(value, np.ndarray) else value
 
 
 def set_uniform(program: Any, name: str, value: Any) -> None:
-    """Set a uniform that the program uses, to a number, an array or its bytes."""
-    uniform = program.get(name, None)  # `in` would look through all of them
+    """Set a uniform, if the program uses it, to a number, an array or its bytes."""
+    uniform = program.get(name, None)  # `in` would search all of them
     if uniform is None:
         return  # the compiler leaves out what a material does not need
     value = packed(value)
@@ -89,3 +90,67 @@ def set_uniform(program: Any, name: str, value: Any) -> None:
         uniform.write(value)
     else:
         uniform.value = value
+
+
+class LooseTriangles:
+    """Loose triangles in buffers of one GL context; every vertex holds its part."""
+
+    def __init__(self, context: Any, loose: Loose) -> None:
+        self._context, self._loose = context, loose
+        self._buffers = {material: context.buffer(reserve=rows.nbytes) for material, rows in loose.vertices.items()}
+        self._indices = {m: context.buffer(reserve=4 * len(rows), dynamic=True) for m, rows in loose.vertices.items()}
+        numbers = np.arange(len(loose.centers) + 1)
+        self._firsts = {material: 3 * np.searchsorted(rows, numbers) for material, rows in loose.things.items()}
+        self._num_indices = dict.fromkeys(loose.vertices, 0)
+        self._arrays: dict[tuple[int, int], Any] = {}
+        self.centers, self.radii = loose.centers.astype(np.float32), loose.radii.astype(np.float32)
+        self.see(None)
+
+    def place(self, shift_m: np.ndarray) -> None:
+        """Move the origin, (3,) relative to the scene's: float32 is most precise near 0."""
+        for material, buffer in self._buffers.items():
+            vertices = self._loose.vertices[material].copy()
+            vertices["center"] -= shift_m.astype(np.float32)
+            buffer.write(vertices.tobytes())
+        self.centers = (self._loose.centers - shift_m).astype(np.float32)
+
+    def see(self, view: CameraView | None) -> None:
+        """Select what a camera may see, the nearest first; None selects everything."""
+        for material, firsts in self._firsts.items():
+            seen = np.arange(len(self.centers)) if view is None else view.shown(self.centers, self.radii)
+            counts = (firsts[1:] - firsts[:-1])[seen]
+            before = np.cumsum(counts) - counts
+            self._write(material, np.repeat(firsts[:-1][seen] - before, counts) + np.arange(counts.sum()))
+        if view is None:
+            for material in self._loose.vertices.keys() - self._firsts.keys():
+                self._write(material, np.arange(len(self._loose.vertices[material])))
+
+    def _write(self, material: int, indices: np.ndarray) -> None:
+        self._indices[material].orphan()
+        self._indices[material].write(indices.astype(np.uint32).tobytes())
+        self._num_indices[material] = len(indices)
+
+    def draw(self, program: Any, material: int) -> None:
+        """Draw the selected triangles of a material."""
+        if not self._num_indices.get(material):
+            return
+        key = program.glo, material
+        if key not in self._arrays:
+            names = tuple(f"in_{name}" for name in LOOSE_VERTEX.names or ())
+            content = attributes(program, self._buffers[material], "3f 3f 3f 3f 4f 4f 1u 1f", names)
+            self._arrays[key] = self._context.vertex_array(program, [content], index_buffer=self._indices[material])
+        self._arrays[key].render(vertices=self._num_indices[material])
+
+    def draw_all(self, program: Any) -> None:
+        """Draw every material with one program."""
+        for material in self._buffers:
+            self.draw(program, material)
+
+
+def attributes(program: Any, buffer: Any, layout: str, names: tuple[str, ...]) -> tuple:
+    """Return the buffer layout for a program: attributes that its compiler removed become padding."""
+    kinds = layout.split()
+    suffix = kinds.pop() if kinds[-1].startswith("/") else ""
+    used = [name in program for name in names]
+    padded = [kind if use else f"{4 * int(kind[:-1])}x" for kind, use in zip(kinds, used, strict=True)]
+    return (buffer, " ".join(padded) + suffix, *(name for name, use in zip(names, used, strict=True) if use))

@@ -1,4 +1,4 @@
-"""A map ready to be drawn: the parts of every box, the ground plane, surfaces on ground that slopes, and meshes."""
+"""A map ready to be drawn: the parts of every box, the ground plane, surfaces on sloping ground, and meshes."""
 
 from __future__ import annotations
 
@@ -22,20 +22,15 @@ from cosfly.render.contract import (
     seeds_of,
     with_rim,
 )
-from cosfly.render.draping import DrapedSurfaces, drape, is_draped, layers_of
 from cosfly.render.gl import meshes, parts
 from cosfly.render.gl.lamps import lamps_along_streets, lamps_of
-from cosfly.render.gl.loose import Loose
-from cosfly.render.gl.parts import GRASS, LOOSE_VERTEX, PART, Boxes, PartBuilder, Parts
+from cosfly.render.gl.parts import GRASS, LOOSE_VERTEX, PART, Boxes, Loose, PartBuilder, Parts
 from cosfly.render.gl.shapes import BUILDERS, BUILDING_COLORS, PLAIN_COLORS, TILE_COLORS, plain
-from cosfly.render.solids import Solids, are_solids, solids_of
+from cosfly.render.surfaces import DrapedSurfaces, Solids, are_solids, drape, is_draped, layers_of, solids_of
 
 # --- solids -----------------------------------------------------------------------------------------------------------
-# What meshes look like: walls with storeys and windows, flat roofs, tiles on those that slope; plain paint where a file
-# tells colours.
-#
-# The shader draws patterns in the axes of a part, so every plane of a building becomes a part of its own.
-
+# Meshes have walls with storeys and windows, flat roofs, tiles on sloping roofs; plain paint if a file has colours. The
+# shader draws patterns in the axes of a part, so every plane of a building is a part of its own.
 
 STEEP, FLAT = 0.35, 0.94  # how far up the normal of a wall points at most, and of a flat roof at least
 SAME_ANGLE_RAD, SAME_PLACE_M = np.radians(1.0), 0.1  # surfaces as near to one plane as this are one wall
@@ -43,7 +38,7 @@ THINNEST_M = 0.01
 
 
 def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.ndarray) -> Loose:
-    """Return the triangles of solids, both sides, as a shader draws them. ids: (n,) of the map's boxes."""
+    """Return the triangles of solids, both sides, for the shader. ids: (n,) of the map's boxes."""
     if not len(solids):
         return Loose.all_of({})
     normals, rows, kinds = solids.normals, solids.rows, box_map.kinds[solids.rows]
@@ -85,10 +80,10 @@ def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.
 def _planes(
     box_map: BoxMap, solids: Solids, is_wall: np.ndarray, is_flat: np.ndarray, is_house: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Axes of the part that each triangle belongs to, (k, 3, 3) part_from_world, and which part that is, (k,).
+    """Return the axes of the part of each triangle, (k, 3, 3) part_from_world, and the number of that part, (k,).
 
-    A wall: x along it, y out, z up. A slope: x along its eaves, y out, z up the slope. A flat roof: turned as its
-    house's largest wall, z up. What is no house's: the box's.
+    A wall: x along it, y out, z up. A slope: x along its eaves, y out, z up the slope. A flat roof: turned like its
+    house's largest wall, z up. Other things: the axes of the box.
     """
     normals, things = solids.normals, solids.things
     around = np.round(np.arctan2(normals[:, 1], normals[:, 0]) / SAME_ANGLE_RAD).astype(np.int64)
@@ -114,8 +109,7 @@ def _planes(
 
 
 def _main_yaws(solids: Solids, is_wall: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """Return the direction that most of each thing's walls face, (n,) in steps of SAME_ANGLE_RAD within a quarter
-    turn."""
+    """Return the main direction of each thing's walls, (n,) in steps of SAME_ANGLE_RAD within a quarter turn."""
     quarter = round(np.pi / 2 / SAME_ANGLE_RAD)
     edges = solids.corners_m[:, 1:] - solids.corners_m[:, :1]
     areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) * is_wall
@@ -125,8 +119,7 @@ def _main_yaws(solids: Solids, is_wall: np.ndarray, around: np.ndarray) -> np.nd
 
 
 def _spans(local: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Middle and half size, (k, 3) each, of all triangles of the part that a triangle belongs to; local: (k, 3, 3)
-    corners in its axes."""
+    """Return middle and half size, (k, 3) each, of the part of each triangle; local: (k, 3, 3) corners in its axes."""
     low = np.full((planes.max() + 1, 3), np.inf)
     high = -low
     np.minimum.at(low, planes, local.min(axis=1))
@@ -135,7 +128,7 @@ def _spans(local: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _paint(solids: Solids, materials: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """Linear RGB and seed, (k, 4): what the file told, or what the kind has."""
+    """Return linear RGB and seed, (k, 4): the file's colour, or the kind's."""
 
     def picked(palette: np.ndarray) -> np.ndarray:
         return palette[(chance(seeds, 0) * len(palette)).astype(int)]
@@ -145,15 +138,15 @@ def _paint(solids: Solids, materials: np.ndarray, seeds: np.ndarray) -> np.ndarr
     return np.column_stack([np.where(np.isnan(solids.colors), own, solids.colors), seeds * 0.999])
 
 
-HAS_PAINT = 2.0  # seed of a road whose map brings its own lane markings; the shader draws none on it
+HAS_PAINT = 2.0  # seed of a road on a map with its own lane markings; the shader draws none on it
 
 
 @dataclass(frozen=True)
 class Scene:
     """A map ready to be drawn. origin_m: (3,) world position of the parts' zero; plane_z_m: the ground plane, world.
 
-    draped: the surfaces on `ground`, nothing where that is flat; solids: what stands for boxes that name meshes. lamps:
-    (n, 3) relative to the parts' zero, lamps of a map that has none among its parts.
+    draped: the surfaces on `ground`, empty where that is flat; solids: the meshes of boxes. lamps: (n, 3) relative to
+    the parts' zero, lamps of a map that has none among its parts.
     """
 
     parts: Parts
@@ -165,18 +158,18 @@ class Scene:
     lamps: np.ndarray
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest place of what stands on the ground plane, (3,) each, world."""
+        """Return the lowest and highest place of things on the ground plane, (3,) each, world."""
         centers = self.parts.object_centers[:-1] if len(self.parts) > 1 else self.parts.object_centers
         centers = np.concatenate([centers, self.solids.centers])
         return centers.min(axis=0) + self.origin_m, centers.max(axis=0) + self.origin_m
 
 
 def build_scene(town: BoxMap, num_others: int = 0, rim: BoxMap | None = None) -> Scene:
-    """Turn a map and its rim into drawable parts, with a ground plane under everything; the ids of others stay free."""
+    """Convert a map and its rim to drawable parts, with a ground plane under everything."""
     origin, (box_map, all_ids) = scene_origin(town), with_rim(town, num_others, rim)
     solids, are_meshes = solids_of(box_map), are_solids(box_map)
     builder, lies = PartBuilder(), is_draped(box_map) & ~are_meshes
-    # Surfaces on a slope are made as on a plain, so that they know their neighbours, and lifted afterwards.
+    # Surfaces on a slope are built on a plane, so that they find their neighbours, and lifted afterwards.
     centers = box_map.centers - origin
     centers[lies, 2] -= box_map.ground.height_at(box_map.centers[lies])
     lying = np.zeros(len(box_map), PART)
@@ -219,8 +212,7 @@ def build_scene(town: BoxMap, num_others: int = 0, rim: BoxMap | None = None) ->
 
 
 def _loose(draped: DrapedSurfaces, origin: np.ndarray, records: np.ndarray) -> dict[int, np.ndarray]:
-    """Vertices of draped triangles by material: each is placed in its own box's axes, which shaders draw lanes and
-    kerbs in.
+    """Return the vertices of draped triangles by material, in the axes of their boxes, in which shaders draw lanes.
 
     Args:
         records: (n + 1,) PART of the map's boxes; the last is the bare ground's.

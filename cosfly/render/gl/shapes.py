@@ -1,6 +1,6 @@
-"""What a house, a tree, a car or a lamp looks like: the parts of each kind of box.
+"""The shapes of houses, trees, cars and lamps: the parts of each kind of box.
 
-Every part stays inside the box it stands for, so that what the planners know of collision and visibility stays true.
+Every part stays inside its box, so that the planners' collision and visibility checks hold.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ LEAF_COLORS = np.array(
 
 
 def _box(material: int, color: tuple[float, float, float], layer: int | None = None):
-    """The box itself, lengthwise: a ground surface in its layer, or something that stands."""
+    """Return a builder of the box itself, lengthwise: a ground surface in its layer, or a standing thing."""
 
     def build(builder: PartBuilder, boxes: Boxes) -> None:
         boxes = boxes.lengthwise()
@@ -55,7 +55,7 @@ def _box(material: int, color: tuple[float, float, float], layer: int | None = N
 
 
 def _terrain(builder: PartBuilder, boxes: Boxes) -> None:
-    """Lawns of the map, in one colour; meadows and fields of the rim."""
+    """Add lawns of the map, in one colour; meadows and fields of the rim."""
     boxes = boxes.lengthwise()
     is_rim, is_tilled = boxes.ids[:, None] == contract.NO_INSTANCE, boxes.half[:, :1] > LARGEST_MEADOW_M
     crops = np.where(is_tilled, boxes.pick(FIELD_COLORS), boxes.pick(MEADOW_COLORS))
@@ -65,20 +65,20 @@ def _terrain(builder: PartBuilder, boxes: Boxes) -> None:
 
 
 def _sidewalks(builder: PartBuilder, boxes: Boxes) -> None:
-    """Pavement; the shader draws a kerb along the open edges, which stand in the seed."""
+    """Add pavement; the shader draws a kerb along the open edges, which the seed encodes."""
     boxes = boxes.lengthwise()
     boxes = replace(boxes, seeds=_open_edges(boxes, height_share=0.0, slack_m=1.0))
     builder.add(boxes, meshes.BOX, boxes.half, parts.SIDEWALK, (0.36, 0.345, 0.32), layer=LAYERS["Sidewalks"])
 
 
 def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray:
-    """Tell beyond which edges no other box of the kind follows.
+    """Find the edges without an adjacent box of the kind.
 
     Args:
-        height_share: where along the height to look, -1 the bottom, 1 the top; slack_m: how much higher or lower it may
-            be.
+        height_share: Place along the height, -1 the bottom, 1 the top. slack_m: Tolerance of the height.
+
     Returns:
-        (n,) numbers of bits -x, +x, -y, +y; no edge in vast maps, all edges of a box alone.
+        (n,) numbers of bits -x, +x, -y, +y; 0 for more than MOST_EDGED boxes.
     """
     n, bits = len(boxes), np.zeros(len(boxes))
     reach = boxes.half + np.array([0.0, 0.0, slack_m])
@@ -99,19 +99,19 @@ def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray
 
 
 def plain(builder: PartBuilder, boxes: Boxes) -> None:
-    """Draw a box as it is, in one colour."""
+    """Add a box as it is, in one colour."""
     builder.add(boxes, meshes.BOX, boxes.half, parts.PLAIN, boxes.pick(PLAIN_COLORS))
 
 
 def _buildings(builder: PartBuilder, boxes: Boxes) -> None:
-    """Houses; the shader makes storeys, windows and a roof whose rim follows the open edges (the seed's whole part)."""
+    """Add houses; the shader draws storeys, windows and a roof rim along the open edges (the seed's whole part)."""
     colors = boxes.pick(BUILDING_COLORS)
     edged = replace(boxes, seeds=boxes.seeds * 0.999 + _open_edges(boxes, height_share=0.98, slack_m=0.0))
     builder.add(edged, meshes.BOX, boxes.half, parts.FACADE, colors)
 
 
 def _vegetation(builder: PartBuilder, boxes: Boxes) -> None:
-    """Trees, bushes, hedges and lawns, told apart by the shape of the box."""
+    """Add trees, bushes, hedges and lawns, by the shape of the box."""
     forms, crown_low = contract.plants_of(boxes.centers, boxes.half, boxes.seeds)
     leaf = boxes.pick(LEAF_COLORS) * (0.85 + 0.35 * boxes.chance(3))[:, None]
     of = {form: (boxes.select(forms == form), leaf[forms == form]) for form in range(contract.BROADLEAF + 1)}
@@ -138,7 +138,7 @@ def _bushes(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
 
 
 def _crowns(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray, crown_low: np.ndarray) -> None:
-    """Foliage from `crown_low` (n,), in units of the half height, to the top: blobs inside the inscribed ellipsoid."""
+    """Add foliage from `crown_low` (n,), in half heights, to the top: blobs inside the inscribed ellipsoid."""
     h = boxes.half
     crown_half = h * np.column_stack([np.ones(len(h)), np.ones(len(h)), (1.0 - crown_low) / 2.0])
     crown_center = h * np.column_stack([np.zeros(len(h)), np.zeros(len(h)), (1.0 + crown_low) / 2.0])
@@ -166,7 +166,7 @@ def _conifers(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
 
 
 def _stems(builder: PartBuilder, boxes: Boxes, top: np.ndarray) -> None:
-    """A stem from each box's bottom to `top` (n,), in units of the half height."""
+    """Add a stem from each box's bottom to `top` (n,), in units of the half height."""
     h, radius = boxes.half, contract.stem_radius_m(boxes.half)
     size = np.column_stack([radius, radius, h[:, 2] * (top + 1.0) / 2.0])
     offset = np.column_stack([0 * radius, 0 * radius, h[:, 2] * (top - 1.0) / 2.0])
@@ -178,20 +178,13 @@ _WHEEL_TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # 
 
 def _wheels(builder: PartBuilder, boxes: Boxes, radius: np.ndarray, along: float) -> None:
     h = boxes.half
-    thick = 0.16 * h[:, 1]
+    thick, color = 0.16 * h[:, 1], (0.02, 0.02, 0.022)
     size = np.column_stack([radius, radius, thick])
     for front in (-along, along):
         for side in (-1.0, 1.0):
             offset = np.column_stack([front * h[:, 0], side * (0.97 * h[:, 1] - thick), radius - h[:, 2]])
             builder.add(
-                boxes,
-                meshes.CYLINDER,
-                size,
-                parts.RUBBER,
-                (0.02, 0.02, 0.022),
-                offset=offset,
-                turn=_WHEEL_TURN,
-                min_px=FAR_PX,
+                boxes, meshes.CYLINDER, size, parts.RUBBER, color, offset=offset, turn=_WHEEL_TURN, min_px=FAR_PX
             )
 
 
@@ -242,7 +235,7 @@ def _pole(builder: PartBuilder, boxes: Boxes, most_m: float = 0.1) -> None:
 
 
 def _poles(builder: PartBuilder, boxes: Boxes) -> None:
-    """A pole; tall ones carry lamps at the ends of an arm where the box is wide enough for one."""
+    """Add poles; tall ones have lamps at the ends of an arm, if the box is wide enough for one."""
     boxes = boxes.lengthwise()
     is_head = boxes.half[:, 2] < boxes.half[:, 0]  # maps that keep arm and head apart from the pole
     heads = boxes.select(is_head)
@@ -283,7 +276,7 @@ def _signs(builder: PartBuilder, boxes: Boxes) -> None:
 
 
 def _bystanders(builder: PartBuilder, boxes: Boxes) -> None:
-    """People of the map stand still: trousers, coat, head."""
+    """Add standing people of the map: trousers, coat, head."""
     h = boxes.half
     coats = np.array([[0.10, 0.12, 0.20], [0.30, 0.08, 0.07], [0.12, 0.20, 0.13], [0.35, 0.30, 0.22]])
     builder.add(boxes, meshes.LIMB, h * [0.5, 0.6, 0.46], parts.CLOTH, (0.05, 0.06, 0.09), offset=h * [0, 0, -0.54])

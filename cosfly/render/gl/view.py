@@ -1,4 +1,4 @@
-"""What a camera can see of drawable parts: in the frustum, large enough, in the form for its size."""
+"""Selection of drawable parts for a camera: in the frustum, large enough, in the form for their size."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class CameraView:
     height_px: int
 
     def rows(self, parts: Parts) -> np.ndarray:
-        """Rows of the parts to draw, nearest objects first."""
+        """Return the rows of the parts to draw, nearest objects first."""
         least_px = np.maximum(parts.min_px, np.float32(SMALLEST_PX))
         rows, away = self._spheres(parts.object_centers, parts.object_radii, least_px, parts.max_px)
         return rows[np.lexsort((away, -parts.records["bias"][rows]))]
@@ -50,7 +50,7 @@ class CameraView:
         return len(self.shown(center[None], np.array([radius], np.float32))) > 0
 
     def rectangle_px(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
-        """Pixels that a hull of points, (n, 3), may cover: x0, y0, x1, y1; None where it is out of the picture."""
+        """Return the pixels that a hull of points, (n, 3), may cover: x0, y0, x1, y1; None outside the picture."""
         in_camera = self._in_camera(points)
         if in_camera[:, 2].max() <= NEAR_M:
             return None
@@ -71,8 +71,7 @@ class CameraView:
 def spheres_in_view(  # type: ignore[no-untyped-def]
     centers, radii, min_px, max_px, eye, turn, tangents, slants, focal_px
 ):
-    """Find the spheres that a camera may see, whose radius on the image lies in [min_px, max_px): one pass over all
-    that a map has.
+    """Find the spheres that a camera may see with a radius on the image in [min_px, max_px), in one pass.
 
     Args:
         centers: (k, 3) float32 m; radii, min_px, max_px: (k,) float32; eye: (3,) float32 m; turn: (3, 3) float32,

@@ -1,8 +1,6 @@
-"""What weather adds to the default renderer: its uniforms, the map of street lamps, rain over the picture, the glow of
-lights.
+"""Weather in the default renderer: uniforms, the map of street lamps, rain over the picture, the glow of lights.
 
-Programs of other than fair weather are made with what the weather needs (`programs`): who asks for no weather pays
-nothing for it. Nothing here writes depth, kinds or ids.
+Weather has programs of its own (`programs`), so that fair weather costs nothing. Depth, kinds and ids are unaffected.
 """
 
 from __future__ import annotations
@@ -21,15 +19,12 @@ from cosfly.render.gl.programs import set_uniform
 from cosfly.render.weather import fog_extinction
 
 # --- atmosphere -------------------------------------------------------------------------------------------------------
-# The six knobs of weather as the uniforms of weather.glsl: colours of sun, sky, clouds and fog, and how much of each.
-#
-# Colours are linear and already balanced for the exposure that goes with them, as an eye or a camera does it: a night
-# is some twenty times darker here than a day, and not a million times. Between the altitudes of the tables they are
-# interpolated.
-
+# The six parameters of weather as uniforms of weather.glsl: colours and amounts of sun, sky, clouds and fog. Colours
+# are linear and balanced for their exposure, as by an eye or a camera: a night is some twenty times darker than a day,
+# not a million times. They are interpolated between the altitudes of the tables.
 
 CLEAR_HAZE_M = 620.0  # air without fog, as in Look.haze_m
-MOON = np.array([-0.35, -0.62, 0.70])  # towards the moon, which is the light where the sun is down
+MOON = np.array([-0.35, -0.62, 0.70])  # towards the moon, the light while the sun is down
 LOWEST_SUN_DEG = 2.5
 MOON_DISC, SUN_DISC = 0.99993, 0.99955
 
@@ -59,18 +54,18 @@ SUN_GLOW = (
     (0, 0, 0), (0.50, 0.20, 0.10), (1.15, 0.46, 0.14), (0.9, 0.5, 0.22), (0.6, 0.45, 0.28), (0.5, 0.42, 0.3),
     (0.5, 0.43, 0.32),
 )  # fmt: skip
-# Of a sky that is all cloud: how bright, of what hue.
+# Brightness and hue of an overcast sky.
 COVERED_LEVEL = (0.030, 0.11, 0.33, 0.52, 0.72, 0.94, 1.0)
 COVERED_SKY, COVERED_GROUND = np.array([0.82, 0.86, 0.92]), np.array([0.37, 0.37, 0.36])
 COVERED_HORIZON, COVERED_ZENITH = np.array([0.66, 0.69, 0.72]), np.array([0.50, 0.53, 0.57])
-CITY_GLOW = np.array([0.030, 0.021, 0.013])  # what street lamps give back to low cloud and fog
+CITY_GLOW = np.array([0.030, 0.021, 0.013])  # light of street lamps from low clouds and fog
 EXPOSURE = (1.45, 1.30, 1.05, 0.98, 0.88, 0.78, 0.60)
-COVERED_EXPOSURE = 1.4  # times that, under a sky that is all cloud by day
+COVERED_EXPOSURE = 1.4  # factor of an overcast sky by day
 LAMP_LIGHT = np.array([0.42, 0.29, 0.16])
 
 
 def light_direction(params: WeatherParams) -> np.ndarray:
-    """Unit vector towards what casts the shadows, (3,) world: the sun, or the moon where the sun is down."""
+    """Return the unit vector towards the light that casts shadows, (3,) world: the sun, or the moon at night."""
     if params.sun_altitude_angle <= SUN_IS_DOWN_DEG:
         return MOON / np.linalg.norm(MOON)
     altitude, azimuth = np.radians([max(params.sun_altitude_angle, LOWEST_SUN_DEG), params.sun_azimuth_angle])
@@ -79,16 +74,16 @@ def light_direction(params: WeatherParams) -> np.ndarray:
 
 
 def lights_on(params: WeatherParams) -> float:
-    """How far street lamps and windows are lit, 0 to 1: by how light the sky is."""
+    """Return how bright street lamps and windows are, 0 to 1, from the light of the sky."""
     level = _at(COVERED_LEVEL, params.sun_altitude_angle) * (1.0 - 0.30 * params.precipitation / 100.0)
     return float(1.0 - _step(0.33, 0.50, float(level)))
 
 
 def uniforms(params: WeatherParams) -> dict[str, Any]:
-    """Return the uniforms that hold for a whole flight: name -> number or array."""
+    """Return the uniforms of a trajectory: name -> number or array."""
     altitude, cloud, rain = params.sun_altitude_angle, params.cloudiness / 100.0, params.precipitation / 100.0
     extinction = fog_extinction(params)
-    fogged = 1.0 - float(np.exp(-60.0 * extinction))  # of the sun's light and of what one sees of the sky
+    fogged = 1.0 - float(np.exp(-60.0 * extinction))  # of the sun's light and of the sky
     overcast = float(_step(0.55, 0.92, cloud))
     grey = max(overcast * 0.9 + 0.1 * cloud, fogged)
     direct = (1.0 - _step(0.25, 0.92, cloud)) * (1.0 - 0.92 * fogged) * (1.0 - 0.6 * rain)
@@ -133,13 +128,13 @@ def uniforms(params: WeatherParams) -> dict[str, Any]:
 
 
 def _screen_color(sky_light: np.ndarray, horizon: np.ndarray, exposure: float, lit: float) -> np.ndarray:
-    """Colour of a drop on the screen: it gathers the light of the sky, and of lamps."""
+    """Return the colour of a drop on the screen, from the light of the sky and of lamps."""
     linear = exposure * (0.75 * sky_light + 0.55 * horizon) + lit * np.array([0.13, 0.115, 0.10])
     return np.clip(linear, 0.0, 1.0) ** (1.0 / 2.2)
 
 
 def _step(low: float, high: float, value: float) -> float:
-    """Return the smooth step of shaders; low may be above high."""
+    """Return the smooth step of GLSL; low may be above high."""
     t = float(np.clip((value - low) / (high - low), 0.0, 1.0))
     return t * t * (3.0 - 2.0 * t)
 
@@ -156,17 +151,17 @@ def _mixed(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
     return a + (b - a) * share
 
 
-SOFT_M, FAINT = 0.25, 0.02  # from such a border on a shadow is drawn soft; a sun of less light throws none
+SOFT_M, FAINT = 0.25, 0.02  # wider borders of shadows are drawn soft; a fainter sun casts none
 LAMP_UNIT, DEPTH_UNIT = 2, 3
 WIND = (0.07, 0.03)  # m to the side for each m that a drop falls
-# Levels that shine beyond their place; the glow is computed in a picture so many times smaller.
+# Levels from which lights glow; the glow is computed in a picture so many times smaller.
 GLOW_FROM, GLOW_SHRINK = 208, 4
 GLOW_WIDTHS_PX = ((5.0, 0.22), (19.0, 0.16))  # of a picture of 1280 px: width, share
 
 
 def defines(params: WeatherParams) -> str:
-    """Return what a weather's programs must know, as preprocessor lines: a CPU runs both sides of every branch, so
-    what is not needed is left out."""
+    """Return the preprocessor lines of a weather's programs: a CPU runs both sides of a branch, so unneeded code is
+    not compiled."""
     values = uniforms(params)
     casts = float(values["sun_light"].max()) > FAINT
     needs = {
@@ -177,7 +172,7 @@ def defines(params: WeatherParams) -> str:
 
 
 class WeatherPass:
-    """The weather of a flight on one GL context."""
+    """The weather of a trajectory on one GL context."""
 
     def __init__(self, context: Any, color: Any, depth: Any, rain_program: Any, num_others: int) -> None:
         self._context = context
@@ -195,8 +190,10 @@ class WeatherPass:
     def prepare(
         self, params: WeatherParams, parts: Parts, unseen_lamps: np.ndarray, middle: np.ndarray, half_m: float
     ) -> None:
-        """Get ready for a flight over a square round `middle`, relative to the zero of the parts, whose lamps are lit
-        and mirrored in puddles. unseen_lamps: (n, 3), of those that only throw light."""
+        """Compute uniforms and lamp light for a square around `middle`, relative to the origin of the parts.
+
+        Lamps of the parts are lit and mirrored in puddles. unseen_lamps: (n, 3), lamps that only give light.
+        """
         self._lamps = street_lamps.lamps_of(parts)
         lit = np.concatenate([self._lamps, unseen_lamps])
         self.values, self.sun_direction = uniforms(params), light_direction(params)
@@ -209,9 +206,9 @@ class WeatherPass:
         return bool(self.values["lights_on"] > 0.0)
 
     def frame_values(self, eye: np.ndarray, camera_pose: np.ndarray, person: PosedPerson | None) -> dict[str, Any]:
-        """Return the uniforms of one frame: the flight's, lamps near the camera, and where drops fall."""
+        """Return the uniforms of one frame: the trajectory's, lamps near the camera, and the places of drops."""
         lamps, count = street_lamps.nearest_lamps(self._lamps, eye)
-        # Drops fall anew in each frame, and in the same places when it is drawn again.
+        # Drops differ from frame to frame, and are the same when a frame is drawn again.
         hip_m = np.zeros(3) if person is None else np.asarray(person.hip_m, dtype=np.float64)
         seen = np.ascontiguousarray(camera_pose, dtype=np.float64).tobytes() + hip_m.tobytes()
         return {
@@ -230,7 +227,7 @@ class WeatherPass:
         self._lamp_map.use(LAMP_UNIT)
 
     def draw_rain(self, frame_values: dict[str, Any]) -> None:
-        """Draw the drops over the colours of a finished frame; frame_values: its uniforms, the camera's among them."""
+        """Draw drops over the colours of a finished frame; frame_values: its uniforms, with the camera's."""
         if self.values["precipitation"] <= 0.0:
             return
         context = self._context
@@ -243,7 +240,7 @@ class WeatherPass:
         self._rain.render(vertices=3)
 
     def glowing(self, rgb: np.ndarray) -> np.ndarray:
-        """Let lights shine beyond their place, (h, w, 3) uint8: by night, and more in wet air."""
+        """Return the picture with the glow of lights, (h, w, 3) uint8: by night, and more in wet air."""
         if not self.has_lights:
             return rgb
         small = cv2.resize(rgb, None, fx=1 / GLOW_SHRINK, fy=1 / GLOW_SHRINK, interpolation=cv2.INTER_AREA)

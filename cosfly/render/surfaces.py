@@ -1,8 +1,7 @@
-"""Surfaces laid on ground that slopes: what both renderers draw in place of the flat ground plane and the flat slabs on
-it.
+"""Triangles that all renderers draw instead of boxes, on sloping ground and for meshes; layers of surfaces.
 
-The ground is its own triangles. Each surface is its box's outline cut out of them, so that it lies in the ground
-everywhere; which of several surfaces in one place is seen is the matter of their layers.
+Sloping ground is its own triangles. Each surface is its box's outline cut out of them, so that it lies in the ground
+everywhere; layers decide which of several surfaces in one place is visible.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ import shapely
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import GROUND_KINDS, KINDS, LAYERS
+from cosfly.geometry.axes import rotation_matrices
 from cosfly.geometry.grid import lies_off_ground
 from cosfly.render.contract import GROUND_PLANE_HALF_M, LAWN_HALF_M, STANDING_LAYER
 
@@ -32,21 +32,24 @@ class DrapedSurfaces:
 
     @property
     def normals(self) -> np.ndarray:
-        """(k, 3) unit vectors that point up."""
-        edges = self.corners_m[:, 1:] - self.corners_m[:, :1]
-        normals = np.cross(edges[:, 0], edges[:, 1])
-        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        """Return (k, 3) unit vectors that point up."""
+        return _unit_normals(self.corners_m)
+
+
+def _unit_normals(corners_m: np.ndarray) -> np.ndarray:
+    normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
 def is_draped(box_map: BoxMap) -> np.ndarray:
-    """Return which boxes lie on sloping ground, (n,) bool: not a flyover's deck, and no box of a flat map."""
+    """Return which boxes are surfaces on sloping ground, (n,) bool: not the deck of a flyover."""
     if box_map.ground.is_flat:
         return np.zeros(len(box_map), dtype=bool)
     return box_map.is_any_of(DRAPED_KINDS) & ~lies_off_ground(box_map, DRAPED_KINDS)
 
 
 def drape(box_map: BoxMap) -> DrapedSurfaces:
-    """Lay the ground and the surfaces of a map on its heights."""
+    """Return the triangles of the ground and of the surfaces on it, for a map with sloping ground."""
     ground = box_map.ground
     if ground.is_flat:
         raise ValueError("flat ground has no triangles")
@@ -72,7 +75,7 @@ def drape(box_map: BoxMap) -> DrapedSurfaces:
 
 
 def _cut(triangles: np.ndarray, frame: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Cut triangles, (n, 3, 3), to a turned rectangle; gives what is left, (k, 3, 3), corners in the same sense.
+    """Clip triangles, (n, 3, 3), to a rotated rectangle; return the parts inside, (k, 3, 3), with the same winding.
 
     Args:
         frame: (4,) middle x, y, cosine and sine of the yaw. half: (2,) half sizes, m.
@@ -100,21 +103,18 @@ def _cut(triangles: np.ndarray, frame: np.ndarray, half: np.ndarray) -> np.ndarr
 
 
 # --- layers -----------------------------------------------------------------------------------------------------------
-# Which of several surfaces in one plane is seen: the higher layer of their kinds; of one layer always the same one.
-#
-# Two roads that cross at one height are one plane for a depth buffer: rounding would decide pixel by pixel whose paint
-# and id show (Z-fighting). So surfaces that overlap in one layer get tiers in it, as few as do.
-
+# Two roads that cross at one height are one plane for a depth buffer: rounding would decide pixel by pixel which of
+# them is visible (Z-fighting). So surfaces that overlap in one layer get tiers in it, as few as suffice.
 
 SAME_HEIGHT_M = 0.005  # a layer moves the depth test by 3 mm at 30 m
 EDGE_M = 0.01  # surfaces that share no more than an edge do not fight
-# in a layer, as many as meet at a junction of SimWorld; float32 depth tells an eighth of one from the next at 50 m
+# in a layer, as many as meet at a junction of SimWorld; float32 depth resolves an eighth of a layer at 50 m
 MOST_TIERS = 8
 CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 def layers_of(box_map: BoxMap) -> np.ndarray:
-    """Return the layer of each box and, in fractions, its tier there, (n,); of two in one plane the greater is seen."""
+    """Return the layer of each box plus its tier as a fraction, (n,); of two in one plane the greater is visible."""
     table = np.full(256, STANDING_LAYER)
     table[[KINDS[name] for name in LAYERS]] = list(LAYERS.values())
     is_lawn = (box_map.kinds == KINDS["Vegetation"]) & (box_map.half_extents[:, 2] < LAWN_HALF_M)
@@ -123,17 +123,16 @@ def layers_of(box_map: BoxMap) -> np.ndarray:
 
 
 def _tiers(box_map: BoxMap, layers: np.ndarray) -> np.ndarray:
-    """Return each surface the lowest tier that is free of earlier ones, (n,) in [0, 1); beyond MOST_TIERS the
-    highest."""
+    """Return the tier of each surface, (n,) in [0, 1): the lowest without an earlier one, or the highest."""
     tiers = np.zeros(len(box_map), dtype=int)
-    for row, others in _overlaps(box_map, layers).items():  # in the map's order, so that those before have theirs
+    for row, others in _overlaps(box_map, layers).items():  # in the map's order, so that earlier ones have theirs
         free = np.setdiff1d(np.arange(MOST_TIERS), tiers[others])
         tiers[row] = free[0] if len(free) else MOST_TIERS - 1
     return tiers / (tiers.max(initial=0) + 1)
 
 
 def _overlaps(box_map: BoxMap, layers: np.ndarray) -> dict[int, list[int]]:
-    """Return of surfaces that overlap others the earlier ones in the same layer, plane and place, in order."""
+    """Return by row of a surface the earlier rows that overlap it in the same layer and plane, in order."""
     rows = np.flatnonzero((layers < STANDING_LAYER) & ~box_map.rotations_deg[:, [0, 2]].any(axis=1))
     yaws = np.radians(box_map.rotations_deg[rows, 1])[:, None]
     x, y = np.moveaxis(np.maximum(box_map.half_extents[rows, None, :2] - EDGE_M, 0.0) * CORNERS, 2, 0)
@@ -148,3 +147,59 @@ def _overlaps(box_map: BoxMap, layers: np.ndarray) -> dict[int, list[int]]:
     for row, other in zip(rows[later[is_same][order]].tolist(), rows[earlier[is_same][order]].tolist(), strict=True):
         found.setdefault(row, []).append(other)
     return found
+
+
+# --- meshes -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Solids:
+    """Triangles of meshes in the world, k of them, each on its own: corners_m (k, 3, 3), counter-clockwise from
+    outside; rows (k,) of the boxes whose id and kind they show; colors (k, 3) linear RGB, NaN for that of the
+    kind; things (k,) ascending, a number for each placed mesh.
+    """
+
+    corners_m: np.ndarray
+    rows: np.ndarray
+    colors: np.ndarray
+    things: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.corners_m)
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Return (k, 3) unit vectors that point out; 0 of a triangle without an area."""
+        return _unit_normals(self.corners_m)
+
+
+def are_solids(box_map: BoxMap) -> np.ndarray:
+    """Return which boxes are drawn as meshes, (n,) bool."""
+    return np.isin(box_map.ids, np.array(sorted(box_map.meshes.refs), dtype=np.uint64))
+
+
+def solids_of(box_map: BoxMap) -> Solids:
+    """Place the meshes of a map: each in its box, or once in the world for all boxes that name it."""
+    corners, rows, colors, counts = [np.zeros((0, 3, 3))], [], [np.zeros((0, 3))], []
+    meshes = box_map.meshes.resolved()
+    placed = set()
+    turns = rotation_matrices(np.radians(box_map.rotations_deg)) if meshes else np.zeros((0, 3, 3))
+    for row in np.flatnonzero(are_solids(box_map)):
+        ref = box_map.meshes.refs[int(box_map.ids[row])]
+        if ref in placed:
+            continue
+        mesh = meshes[ref]
+        if ref.fit == "world":
+            placed.add(ref)
+            corners.append(mesh.corners_m)
+        else:
+            low, high = mesh.corners_m.min(axis=(0, 1)), mesh.corners_m.max(axis=(0, 1))
+            stretch = 2.0 * box_map.half_extents[row] / np.where(high > low, high - low, 1.0)
+            corners.append((mesh.corners_m - (low + high) / 2.0) * stretch @ turns[row].T + box_map.centers[row])
+        colors.append(mesh.colors)
+        rows.append(row)
+        counts.append(len(mesh))
+    things = np.repeat(np.arange(len(counts)), counts)
+    return Solids(
+        np.concatenate(corners), np.repeat(np.array(rows, dtype=np.int64), counts), np.concatenate(colors), things
+    )

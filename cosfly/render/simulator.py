@@ -1,0 +1,133 @@
+"""The shared part of renderers of running simulators: settings, retries of a frame, lens, placement of movers."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.frames import Camera, Look
+from cosfly.geometry.axes import focal_px
+from cosfly.render.contract import PERSON_ID, Frame, PosedBystander, PosedCar, PosedPerson, check_pose
+from cosfly.runtime.config import Config, MayDiffer
+from cosfly.runtime.errors import EnvironmentMissing, RenderError
+from cosfly.runtime.worker import worker_place
+from cosfly.simulators.guard import EngineGuard
+
+log = logging.getLogger(__name__)
+
+TRIES = 3  # of a frame
+WALK_MPS = 1.4  # walking speed at full swing
+FIX = "read the server's log, then run the same command again: finished trajectories are kept"
+Body = PosedPerson | PosedCar
+
+
+class ServerCommand(Config):
+    """How to start the server of a simulator."""
+
+    server_command: MayDiffer[str] = Field(
+        "",
+        description="starts a server, with {port} in it, as 'CarlaUE4.sh -RenderOffScreen -carla-rpc-port={port}'; it "
+        "is started again when it dies; empty: servers run already",
+    )
+
+
+class NoPictureError(Exception):
+    """A camera did not send a picture."""
+
+
+class SimulatorRenderer(ABC):
+    """A renderer that asks a server for each frame; each worker has a server of its own."""
+
+    dresses = False  # people wear what their blueprint wears
+    engine: ClassVar[str]
+    port_step: ClassVar[int] = 1  # between the servers of two workers
+    default_settings: ClassVar[Any]
+    device: str
+    _cfg: Any
+
+    def __init__(
+        self,
+        box_map: BoxMap,
+        width_px: int,
+        height_px: int,
+        look: Look,
+        num_others: int = 0,
+        rim: BoxMap | None = None,
+        settings: Any = None,
+    ) -> None:
+        self._map, self._size_px, self._num_others = box_map, (width_px, height_px), num_others
+        self._cfg = self.default_settings() if settings is None else settings
+        self._port = self._cfg.port + self.port_step * worker_place()
+        self._open()
+
+    @abstractmethod
+    def _open(self) -> None:
+        """Start the server if a command is given, and connect."""
+
+    @abstractmethod
+    def _recover(self, problem: Exception) -> None:
+        """Get ready to draw again after a frame failed."""
+
+    @abstractmethod
+    def _frame(self, camera_pose: np.ndarray, fov_deg: float, bodies: dict[int, Body]) -> Frame:
+        """Draw one frame with these bodies, by instance id."""
+
+    def _start_guard(self) -> EngineGuard:
+        return EngineGuard(self.engine, self._cfg.host, self._port, self._cfg.server_command, self._cfg.timeout_s)
+
+    def render(
+        self,
+        camera_pose: np.ndarray,
+        intrinsic: np.ndarray,
+        person: PosedPerson | None,
+        others: Sequence[PosedBystander] = (),
+    ) -> Frame:
+        """Draw one frame, as the contract says; one that fails is drawn again after `_recover`."""
+        check_pose(camera_pose, intrinsic)
+        fov_deg = self._fov_deg_of(intrinsic)
+        bodies = ({} if person is None else {PERSON_ID: person}) | {one.instance_id: one.body for one in others}
+        problem: Exception | None = None
+        for attempt in range(1, TRIES + 1):
+            try:
+                if problem is not None:
+                    self._recover(problem)
+                return self._frame(camera_pose, fov_deg, bodies)
+            except (NoPictureError, RuntimeError, EnvironmentMissing) as error:
+                problem = error
+                log.warning("%s: a frame failed (%d of %d): %s", self.device, attempt, TRIES, error)
+        if isinstance(problem, EnvironmentMissing):
+            raise problem
+        if isinstance(problem, NoPictureError):
+            raise RenderError("a camera sends no picture", where=self.device, got=str(problem), fix=FIX)
+        raise EnvironmentMissing("the server does not answer any more", where=self.device, got=str(problem), fix=FIX)
+
+    def _fov_deg_of(self, intrinsic: np.ndarray) -> float:
+        """Return the horizontal field of view, degrees: all that a simulator knows of a lens."""
+        width, height = self._size_px
+        fov_deg = round(Camera(width, height, intrinsic).fov_deg, 6)
+        f = focal_px(width, fov_deg)
+        if not np.allclose(intrinsic, [[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]], atol=1e-3):
+            what, expected = "the simulator has no such lens", "square pixels and the principal point in the middle"
+            raise RenderError(what, where=self.device, got=str(intrinsic.tolist()), expected=expected)
+        return fov_deg
+
+
+def placement_of(body: Body, lead_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return where to put a body that is in its place `lead_s` seconds later.
+
+    Returns:
+        position, (3,) m, a person's hip or a car's bottom; rotation, (3,) degrees; (3,) unit vector ahead; walking
+        speed, m/s, 0 of a car.
+    """
+    turn_deg = np.array([0.0, np.degrees(body.heading_rad), 0.0])
+    ahead = np.array([np.cos(body.heading_rad), np.sin(body.heading_rad), 0.0])
+    if isinstance(body, PosedCar):
+        return body.center_m - [0.0, 0.0, body.half_extents_m[2]], turn_deg, ahead, 0.0
+    speed_mps = WALK_MPS * body.swing
+    return body.hip_m - ahead * speed_mps * lead_s, turn_deg, ahead, speed_mps

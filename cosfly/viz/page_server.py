@@ -1,0 +1,102 @@
+"""A web server of one page, for this machine only."""
+
+from __future__ import annotations
+
+import hmac
+import json
+import logging
+import secrets
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any, Protocol
+
+from cosfly.runtime.errors import CosflyError, EnvironmentMissing, InputError, StorageError
+
+log = logging.getLogger(__name__)
+
+HOST = "127.0.0.1"
+MOST_BYTES = 32 * 1024 * 1024  # of a request: a region of 100,000 vertices takes 4 MB
+
+
+class Site(Protocol):
+    """A page and the answers to its requests."""
+
+    def page_html(self) -> str:
+        """Return the page."""
+
+    def answer(self, name: str, data: bytes) -> bytes:
+        """Return the answer to a request; raise CosflyError as a message for the page, KeyError for unknown names."""
+
+
+class PageServer:
+    """A server of one page for this machine only, under `address`, which nobody can guess."""
+
+    def __init__(self, site: Site, port: int) -> None:
+        self.site, self.token = site, secrets.token_urlsafe(24)
+        try:
+            self.http = ThreadingHTTPServer((HOST, port), type("Handler", (_Handler,), {"server_of_page": self}))
+        except OSError as error:
+            fix = "pass another --port, or none to use a free one"
+            raise EnvironmentMissing(
+                "the port cannot be opened", where=f"{HOST}:{port}", got=error.strerror, fix=fix
+            ) from None
+        self.host = f"{HOST}:{self.http.server_address[1]}"
+        self.address = f"http://{self.host}/{self.token}/"
+
+    def serve(self) -> None:
+        """Answer requests until an interrupt."""
+        try:
+            self.http.serve_forever()
+        finally:
+            self.http.server_close()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server_of_page: PageServer
+    timeout = 30
+    server_version, sys_version = "cosfly", ""
+
+    def do_GET(self) -> None:
+        if self._name() == "":
+            self._send(200, self.server_of_page.site.page_html().encode(), "text/html; charset=utf-8")
+        else:
+            self._send(404, b"", "text/plain")
+
+    def do_POST(self) -> None:
+        """Answer the page only: other pages in a browser have another origin and do not know the token."""
+        name, length = self._name(), self.headers.get("Content-Length", "")
+        if name is None or self.headers.get("Origin") != f"http://{self.server_of_page.host}":
+            return self._send(404, b"", "text/plain")
+        if not length.isdecimal() or int(length) > MOST_BYTES:
+            expected = f"at most {MOST_BYTES} bytes"
+            return self._send_error(InputError("the request is too large", got=length, expected=expected))
+        try:
+            self._send(
+                200, self.server_of_page.site.answer(name, self.rfile.read(int(length))), "application/octet-stream"
+            )
+        except CosflyError as error:
+            self._send_error(error)
+        except KeyError:
+            self._send(404, b"", "text/plain")
+
+    def _name(self) -> str | None:
+        """Return the requested name below the address; None for another host or token."""
+        begin = f"/{self.server_of_page.token}/"
+        is_known = hmac.compare_digest(self.path[: len(begin)].encode(), begin.encode())
+        return self.path[len(begin) :] if is_known and self.headers.get("Host") == self.server_of_page.host else None
+
+    def _send_error(self, error: CosflyError) -> None:
+        status = 409 if isinstance(error, StorageError) else 400
+        self._send(status, json.dumps({"error": str(error)}).encode(), "application/json")
+
+    def _send(self, status: int, data: bytes, kind: str) -> None:
+        self.close_connection = True
+        self.send_response(status)
+        headers = {"Content-Type": kind, "Content-Length": str(len(data)), "Cache-Control": "no-store"}
+        headers |= {"Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff", "X-Frame-Options": "DENY"}
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(data)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        log.debug("answered %s", args[1] if len(args) > 1 else "")  # the address stays out of logs
