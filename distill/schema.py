@@ -67,7 +67,7 @@ class Sample(SplitMember):
     proved: float | None  # share of the answer's sentences that the geometry proves; None: none was judged
     repair: str | None  # strategy of the repair that made the answer; None: as the teacher gave it
     weight: float
-    past: tuple[float, ...] = ()  # see cosfly/geometry/blind.py; () where not known
+    past: tuple[float, ...] = ()  # see cosfly/inspection/blind_baseline.py; () where not known
     drawn_ahead: bool | None = None  # something was drawn within the label's future; None: not known
 
     @property

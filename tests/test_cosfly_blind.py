@@ -1,4 +1,4 @@
-"""cosfly/geometry/blind.py: a past without places, what was drawn after it, and deciders that beat the most frequent."""
+"""cosfly/inspection/blind_baseline.py: a past without places, what was drawn after it, and deciders that beat the most frequent."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from cosfly.formats.segments import Segment
 from cosfly.geometry.axes import rotation_matrices
-from cosfly.geometry.blind import is_drawn_ahead, past_of
+from cosfly.inspection.blind_baseline import is_drawn_ahead, past_of
 from specimens import make_flight
 
 NUM = 12

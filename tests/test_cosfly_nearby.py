@@ -8,7 +8,7 @@ from tables import each
 
 from cosfly.geometry import kernels
 from cosfly.planners.contract import PlanConfig, Scenario
-from cosfly.planners.courses import follow
+from cosfly.planners.reference_trajectory import follow
 from cosfly.planners.muco import loss, muco, nearby, step
 
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.pedestrians.walking import (
+from cosfly.pedestrians.speed_model import (
     PACES,
     arrival_times,
     resample,

@@ -18,8 +18,8 @@ from specimens_foreign import write_foreign_tree
 
 from cosfly.formats.captions import TOKENS, write_captions
 from cosfly.formats.playback import read_track
-from cosfly.geometry.blind import past_of
 from cosfly.geometry.splits import SPLITS
+from cosfly.inspection.blind_baseline import past_of
 from cosfly.runtime.errors import VerifyError
 from distill.prepare import stage
 from distill.prepare.sources import RunSource

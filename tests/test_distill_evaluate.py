@@ -14,8 +14,8 @@ from specimens_distill import make_caption, write_set
 
 from cosfly.formats.captions import TOKENS
 from cosfly.formats.predictions import Prediction
-from cosfly.geometry.blind import LEAST_WINDOWS
 from cosfly.geometry.trajectory_metrics import draw_pedestrians
+from cosfly.inspection.blind_baseline import LEAST_WINDOWS
 from cosfly.runtime.json_io import dump_json
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
 from distill.evaluation.floors import Floors, coc_of, majority

@@ -23,7 +23,7 @@ from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import walkable_ground
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.contract import PLANNERS, PlanConfig
-from cosfly.planners.intent import draw_intent
+from cosfly.planners.maneuver_plan import draw_intent
 from cosfly.planners.reacquire import finds_again, screens_of
 from cosfly.planners.stage import draw_styles_of, make_scenario, plan_trajectory, style_rng
 from cosfly.planners.styles import FOLLOW, NAMES, REACQUIRE, RETURN_HOME, TABLE

@@ -19,7 +19,7 @@ from cosfly.geometry.axes import headings_of
 from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.lanes import Lane
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, sample_goal
-from cosfly.pedestrians.walking import (
+from cosfly.pedestrians.speed_model import (
     PACES,
     STOP_GAP_MIN,
     Way,

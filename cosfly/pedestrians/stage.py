@@ -35,6 +35,7 @@ from cosfly.pedestrians.astar import route_cost
 from cosfly.pedestrians.bystanders import bystanders_of
 from cosfly.pedestrians.crossings import CROSSING, ROAD, where_walked
 from cosfly.pedestrians.lanes import Lane, lanes_of
+from cosfly.pedestrians.speed_model import PACES, arrival_times, resample, speeds_at, take_pace
 from cosfly.pedestrians.walkable import (
     Clock,
     PedestriansConfig,
@@ -43,7 +44,6 @@ from cosfly.pedestrians.walkable import (
     sample_start,
     walkable_ground,
 )  # fmt: skip
-from cosfly.pedestrians.walking import PACES, arrival_times, resample, speeds_at, take_pace
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, write_json

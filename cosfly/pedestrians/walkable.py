@@ -39,7 +39,7 @@ from cosfly.geometry.grid import (
 from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.crossings import CROSSING, ROAD, costs_of, footing_of
-from cosfly.pedestrians.walking import PACES, SLOWEST_SPEED_MPS
+from cosfly.pedestrians.speed_model import PACES, SLOWEST_SPEED_MPS
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import NoPathError, nearest
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from cosfly.formats.kinds import KINDS
 from cosfly.planners.contract import PlanConfig, Scenario, TrackingReference
-from cosfly.planners.courses import places_of, without_jumps
+from cosfly.planners.reference_trajectory import places_of, without_jumps
 from cosfly.planners.styles import REACQUIRE, Style
 
 if TYPE_CHECKING:

@@ -31,7 +31,7 @@ from cosfly.runtime.worker import Item, Outcome, Work
 
 if TYPE_CHECKING:
     from cosfly.geometry.kernels import BoxIndex
-    from cosfly.planners.intent import Intent
+    from cosfly.planners.maneuver_plan import Intent
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ COORDINATE_MAX_M = 1e6  # beyond, float32 depth and four decimals of a metre in 
 def make_scenario(walk: PedestrianTrajectory, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
     """Check a walk and give the scenario of it, with the paper's wish."""
     from cosfly.geometry.kernels import segments_hit
-    from cosfly.planners.courses import follow
+    from cosfly.planners.reference_trajectory import follow
 
     targets = walk.positions_m + np.array([0.0, 0.0, TARGET_HEIGHT_M])
     if len(targets) < 2:
@@ -77,7 +77,7 @@ def draw_styles_of(walks: Sequence[PedestrianTrajectory], cfg: PlanConfig, seed:
     """Draw the styles of the flights of a run, for each walk in order; by the first one's begin too: walks of other
     maps have the same ids.
     """
-    from cosfly.planners.intent import draw_styles
+    from cosfly.planners.maneuver_plan import draw_styles
 
     return draw_styles(walks, cfg, style_rng(walks[0], seed))
 
@@ -95,7 +95,7 @@ def plan_trajectory(
     Raises:
         NoPathError: the walk cannot be followed, or the planner's flight is not free of collisions.
     """
-    from cosfly.planners.intent import Intent, draw_intent, mirrored
+    from cosfly.planners.maneuver_plan import Intent, draw_intent, mirrored
 
     scenario = make_scenario(walk, obstacles, cfg)
     screens = obstacles if screens is None else screens
@@ -130,7 +130,7 @@ def plan_on(
     Returns:
         (n, 3), which begins with `flown_m`; from there on it keeps all limits of the settings.
     """
-    from cosfly.planners.courses import follow, going_on
+    from cosfly.planners.reference_trajectory import follow, going_on
     from cosfly.planners.foresight import plan
 
     ground_m = targets_m[:, 2] - TARGET_HEIGHT_M
@@ -159,7 +159,7 @@ def _fly(
     seed: int,
 ) -> DroneTrace:
     from cosfly.geometry.kernels import swept_distances, visibility
-    from cosfly.planners.intent import NOT_HELD, ended_by_order, tell_not_held, view_of, why_not_held
+    from cosfly.planners.maneuver_plan import NOT_HELD, ended_by_order, tell_not_held, view_of, why_not_held
 
     scenario = replace(scenario, reference=intent.reference)
     made = load_planner(cfg.planner)(scenario, obstacles, cfg, rng_for(seed, "plan", walk.path_id))

@@ -4,7 +4,7 @@ majority    the decision that train has most often; no text
 shuffled    the reference of another sample of the split
 constant    one answer of train, with the majority's decision, for every sample
 rule        a decision tree of depth two on the past's geometry, fitted on train (CART, Breiman et al. 1984); no text
-blind       a small network on the same, exact numbers, fitted on train (cosfly/geometry/blind.py); no text
+blind       a small network on the same, exact numbers, fitted on train (cosfly/inspection/blind_baseline.py); no text
 teacher     no floor but the reference itself: what it reaches in figures that are measured against the geometry
 """
 
@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from cosfly.formats.captions import TOKENS, Coc, Language
-from cosfly.geometry.blind import FITTED_ON, Decider, fit_deciders
+from cosfly.inspection.blind_baseline import FITTED_ON, Decider, fit_deciders
 from cosfly.runtime.json_io import parse_document, validated
 from cosfly.runtime.seeding import rng_for
 from distill.evaluation.scores import ScoredAnswer, number_of

@@ -13,8 +13,8 @@ from pydantic import BaseModel
 from cosfly.formats.captions import FIELDS, TOKENS, Coc, Language, SentenceState, read_captions
 from cosfly.formats.flight_scores import Figure
 from cosfly.formats.predictions import FAILED, Prediction, Split
-from cosfly.geometry.blind import DRAWN_AHEAD, FITTED_ON, LEAST_WINDOWS, LOOKS_BACK
 from cosfly.geometry.trajectory_metrics import draw_pedestrians
+from cosfly.inspection.blind_baseline import DRAWN_AHEAD, FITTED_ON, LEAST_WINDOWS, LOOKS_BACK
 from cosfly.llm.answers import read_answers
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.journal import Journal

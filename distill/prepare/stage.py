@@ -25,8 +25,8 @@ from cosfly.formats.captions import PICTURES_MARK, TOKENS, Caption, Language, Ve
 from cosfly.formats.places import TrackChoice
 from cosfly.formats.playback import read_track
 from cosfly.formats.predictions import Split
-from cosfly.geometry.blind import is_drawn_ahead, past_of
 from cosfly.geometry.splits import SPLITS
+from cosfly.inspection.blind_baseline import is_drawn_ahead, past_of
 from cosfly.llm.answer_text import parse_answer
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError

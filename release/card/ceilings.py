@@ -12,7 +12,7 @@ import numpy as np
 
 from cosfly.formats.captions import ORDERS, TOKENS
 from cosfly.formats.segments import Segment
-from cosfly.geometry.blind import FITTED_ON, LEAST_WINDOWS, fit_deciders, is_drawn_ahead, past_of
+from cosfly.inspection.blind_baseline import FITTED_ON, LEAST_WINDOWS, fit_deciders, is_drawn_ahead, past_of
 from cosfly.runtime.seeding import draws_for, rng_for
 from release.card.numbers import DIGITS, row_lists
 from release.columns import PLACE, SHORT_NAMES, WINDOW

@@ -17,8 +17,8 @@ import yaml
 
 from cosfly.formats.captions import FIELDS, TOKENS
 from cosfly.formats.frames import FrameFile
-from cosfly.geometry.blind import DRAWN_AHEAD, LEAST_WINDOWS, LOOKS_BACK
 from cosfly.geometry.coverage import NAMED
+from cosfly.inspection.blind_baseline import DRAWN_AHEAD, LEAST_WINDOWS, LOOKS_BACK
 from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.io import read_text
 from cosfly.viz.coverage_page import ranges, shares

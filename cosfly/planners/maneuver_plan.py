@@ -14,7 +14,7 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.formats.segments import FOLLOW, MISSION_KINDS, Mission, MissionKind, Segment
 from cosfly.geometry.axes import look_at
 from cosfly.planners.contract import PlanConfig, Scenario, TrackingReference
-from cosfly.planners.courses import ROUNDING_S, reference_of
+from cosfly.planners.reference_trajectory import ROUNDING_S, reference_of
 from cosfly.planners.reacquire import finds_again, reference_of_reacquire
 from cosfly.planners.styles import OTHER_SIDE, REACQUIRE, RETURN_HOME, ROWS, WHOLE, suits
 from cosfly.runtime.seeding import draw_to_quota
