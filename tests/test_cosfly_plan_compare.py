@@ -87,7 +87,7 @@ def test_the_record_is_what_the_flights_are(made):
     record = json.loads((made / "compare.json").read_text())
     manifest = json.loads((made / "manifest.json").read_text())
     assert manifest["counts"] == {"input": 3, "kept": 2, "dropped": {}, "failed": {"no_path": 1}}
-    assert record["left_out"][0]["id"] == "into_wall"
+    assert record["skipped"][0]["id"] == "into_wall"
     assert [row["id"] for row in record["scenarios"]] == ["a", "b"]
     for planner in ("track_astar", "muco"):
         traces = read_traces(made / f"drone_trace_{planner}.json")
@@ -111,8 +111,8 @@ def test_a_walk_that_one_planner_cannot_fly_is_counted(inputs, tmp_path, monkeyp
     monkeypatch.setattr(compare, "plan_trajectory", lame)
     record = json.loads(compare.run(CFG, *inputs, tmp_path / "out").read_text())
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
-    assert manifest["counts"]["dropped"] == {"no_muco_flight": 1}
-    assert {(row["id"], row["planner"]) for row in record["left_out"]} == {("into_wall", "all"), ("b", "muco")}
+    assert manifest["counts"]["dropped"] == {"no_muco_trajectory": 1}
+    assert {(row["id"], row["planner"]) for row in record["skipped"]} == {("into_wall", "all"), ("b", "muco")}
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

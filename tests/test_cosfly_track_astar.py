@@ -83,11 +83,12 @@ def exhaustive(voxels, targets, obstacles, cfg, start):
 
 @pytest.mark.parametrize("world", ["tower_behind", "corner"])
 def test_a_wide_beam_finds_the_cheapest_way(world, monkeypatch):
-    monkeypatch.setattr(TrackAStarConfig, "voxel_height_m", 8.0)
-    monkeypatch.setattr(TrackAStarConfig, "weight_smoothness", 0.0)
+    coarse = {"voxel_m": 8.0, "voxel_height_m": 8.0, "corridor_m": 28.0, "weight_smoothness": 0.0}
+    for name, value in coarse.items():
+        monkeypatch.setattr(TrackAStarConfig, name, value)
     box_map, corners = WORLDS[world]
     obstacles = kernels.obstacle_index(box_map)
-    settings = TrackAStarConfig(voxel_m=8, corridor_m=28, beam=100000)
+    settings = TrackAStarConfig(beam=100000)
     cfg = PlanConfig(altitude_max_m=40, relaxed_safety_m=3.0, track_astar=settings)
     scenario = planners.make_scenario(walk_along(world, corners), obstacles, cfg)
     scenario = first_points(scenario, 16)  # layers of three frames

@@ -44,7 +44,7 @@ def check_flight(name: str, world: str) -> None:
     obstacles = kernels.obstacle_index(replace(box_map, centers=box_map.centers + up))
     cfg = PlanConfig(planner=name)
     if (name, world) in NOT_REPAIRED:
-        with pytest.raises(NoPathError, match=f"{world}: no flight within the limits"):
+        with pytest.raises(NoPathError, match=f"{world}: no trajectory within the limits"):
             plan_trajectory(walk, obstacles, cfg, 0)
         return
     trace = plan_trajectory(walk, obstacles, cfg, 0)
@@ -128,7 +128,7 @@ def fly_low_and_straight(scenario, obstacles, cfg, rng):
 def test_a_planner_that_flies_into_a_tower_is_found_out(monkeypatch):
     monkeypatch.setitem(contract.ALL_PLANNERS, "low", f"{__name__}:fly_low_and_straight")
     box_map, corners = WORLDS["tower_behind"]
-    with pytest.raises(NoPathError, match="planner low found no flight that is free of collisions"):
+    with pytest.raises(NoPathError, match="planner low found no trajectory that is free of collisions"):
         plan_trajectory(walk_along("w", corners), kernels.obstacle_index(box_map), PlanConfig(planner="low"), 0)
 
 

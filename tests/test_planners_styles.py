@@ -23,9 +23,9 @@ from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import walkable_ground
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.contract import PLANNERS, PlanConfig
-from cosfly.planners.maneuver_plan import draw_intent
-from cosfly.planners.reacquire import finds_again, screens_of
-from cosfly.planners.stage import draw_styles_of, make_scenario, plan_trajectory, style_rng
+from cosfly.planners.maneuver_plan import draw_maneuvers
+from cosfly.planners.reacquire import finds_again
+from cosfly.planners.stage import draw_styles_of, make_scenario, plan_trajectory, screens_of, style_rng
 from cosfly.planners.styles import FOLLOW, NAMES, REACQUIRE, RETURN_HOME, TABLE
 from cosfly.render.camera import view_target
 from cosfly.runtime.config import load, shipped
@@ -107,7 +107,7 @@ def test_every_planner_flies_every_style_safely(planner, style):
 
 def test_the_default_is_the_papers_flight_and_draws_nothing():
     scenario = make_scenario(STRAIGHT, OPEN, PlanConfig())
-    intent = draw_intent([FOLLOW], scenario, OPEN, OPEN, PlanConfig(), style_rng(STRAIGHT, 0))
+    intent = draw_maneuvers([FOLLOW], scenario, OPEN, OPEN, PlanConfig(), style_rng(STRAIGHT, 0))
     assert intent.reference is scenario.reference
     assert (intent.segments, intent.mission, intent.impossible) == ((), None, None)
 

@@ -24,8 +24,8 @@ from cosfly.pedestrians.lanes import Lane, lanes_of
 from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, walkable_ground
 from cosfly.planners.contract import PlanConfig
-from cosfly.planners.reacquire import first_loss, screens_of
-from cosfly.planners.stage import plan_trajectory
+from cosfly.planners.reacquire import first_loss
+from cosfly.planners.stage import plan_trajectory, screens_of
 from cosfly.planners.styles import REACQUIRE
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.errors import InputError, NoPathError, nearest

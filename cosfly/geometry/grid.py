@@ -176,7 +176,8 @@ def _mark(
     corners[..., :2] = (corners[..., :2] - [grid.x_min_m, grid.y_min_m]) / grid.resolution_m
     is_upright = np.abs(turns[:, 2, 2]) > 1.0 - 1e-12
     touch = TOUCH_M / grid.resolution_m if touch is None else touch
-    _rasterise(corners, lows, highs, is_upright, touch, marks, found)
+    # As bytes, so that masks and kinds share one compiled function.
+    _rasterise(corners, lows, highs, is_upright, touch, marks.view(np.uint8), found.view(np.uint8))
 
 
 @njit(cache=True)

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from cosfly.runtime.compiled import njit
+from cosfly.runtime.compiled import int64, njit
 
 SQRT2 = math.sqrt(2.0)
 
@@ -58,7 +58,8 @@ def find_route(
     from_direction = np.empty(free.size, dtype=np.int8)
     origin, target = int(start[1]) * num_x + int(start[0]), int(goal[1]) * num_x + int(goal[0])
     classes = np.zeros(free.shape, dtype=np.uint8) if classes is None else classes
-    if not _search(free, origin, target, state, steps, from_direction, classes, costs):
+    least = 2 * int(costs.min())  # so that the estimate is never above the cost of a route
+    if not _search(free, origin, target, state, steps, from_direction, classes, costs, least):
         return None
     return _trace_back(from_direction, num_x, origin, target)
 
@@ -71,16 +72,15 @@ def route_cost(cells: np.ndarray) -> float:
 
 
 @njit(cache=True)
-def _search(free, origin, target, state, steps, from_direction, classes, costs):  # pragma: no cover (compiled)
+def _search(free, origin, target, state, steps, from_direction, classes, costs, least):  # pragma: no cover (compiled)
     """Run A* until the target is closed; tells whether it was reached. The arrays are (cells,), steps (cells, 2), in
     halves: a step costs what its two cells cost."""
     num_y, num_x = free.shape
     target_x, target_y = target % num_x, target // num_x
-    least = 2 * costs.min()  # so that no way to the target costs less than is estimated
     # Estimated total cost, then cost still to go: depth first in a tie.
     heap_key = np.empty((1024, 2), dtype=np.float64)
     heap_cell = np.empty(1024, dtype=np.int64)
-    size = 0
+    size = int64(0)
 
     state[origin] = _OPEN
     steps[origin, STRAIGHT] = steps[origin, DIAGONAL] = 0

@@ -20,7 +20,7 @@ from cosfly.maps.stage import load_map as load_source
 from cosfly.pedestrians.stage import make_pedestrian, walk_along
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
 from cosfly.planners.contract import PlanConfig
-from cosfly.planners.stage import plan_trajectory
+from cosfly.planners.stage import plan_trajectory, screens_of
 from cosfly.render.contract import Frame
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
@@ -88,7 +88,6 @@ def plan(
         NoPathError: There is no route, or no drone trajectory.
     """
     from cosfly.geometry.kernels import obstacle_index
-    from cosfly.planners.reacquire import screens_of
 
     walking = build(PedestriansConfig, pedestrian or {}, "plan: pedestrian")
     _check_taken(pedestrian or {}, OF_PEDESTRIAN if route_m is None else OF_PACE, "plan: pedestrian")

@@ -1,10 +1,10 @@
 """Planners side by side on the same pedestrian trajectories: `cosfly plan compare` (app:three_axis_eval).
 
-The paper's axes, as the figures of its table define them: visibility is the mean; path efficiency is the shortest mean
-length of a planner without collisions over the planner's own; smoothness is 1 / (1 + jerk RMS); safety is (1 - collision
-fraction) * clamp(least clearance / 5 m); each from the planner's means over all pedestrian trajectories. "Blocked" is
-the share of rays that are not free. The other planners are compared with the first one. Only pedestrian trajectories
-that all planners follow are compared; the others are listed with the planner that failed.
+The paper's axes, as its table's figures define them: visibility is the mean; path efficiency is the shortest mean
+length of a planner without collisions over the planner's own; smoothness is 1 / (1 + jerk RMS); safety is (1 -
+collision fraction) * clamp(least clearance / 5 m); each from the planner's means over all pedestrian trajectories.
+"Blocked" is the share of rays that are not free. The other planners are compared with the first one. Only pedestrian
+trajectories that all planners follow are compared; the others are listed with the planner that failed.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Foresight: choose for the whole walk at once the places that see it, then smooth without losing sight.
+"""Foresight: search positions that see the target over the whole trajectory at once, then smooth them.
 
-MuCO improves a flight where it is, so it stays on the blind side of a row of trees; TA*+Smooth sees both sides, but
-flies from voxel to voxel. Here dynamic programming over rings round the wished place finds the sides, with a tenth of
-the places, and a least-squares flight follows them as closely as sight and safety ask for.
+MuCO improves a trajectory locally, so it stays on the hidden side of a row of trees; TA*+Smooth sees both sides, but
+moves from voxel to voxel. Here dynamic programming over rings around the reference position finds the side, with a
+tenth of the places, and a least-squares trajectory follows them as closely as visibility and safety require.
 """
 
 from __future__ import annotations
@@ -30,36 +30,34 @@ from cosfly.planners.line_of_sight import FOOT_LOW_M, look, make_horizon
 from cosfly.planners.smoothing import smooth_trajectory, unsafe
 from cosfly.runtime.compiled import njit
 
-# --- the places that the search may choose from: rings round the walker, counted from the wished place ----------------
-
+# --- candidate places: rings around the target, counted from the reference position -----------------------------------
 
 NUM_AZIMUTHS = 36
 BETWEEN_KEYS_S, BETWEEN_KEYS_CLIMBING_S = 1.5, 3.0  # the latter lets the drone climb from one of CLIMBS to the next
-# Azimuths between one key frame and the next, against those that the wish turns by: climbing, an orbit without room can
-# stand still.
+# Azimuths between key frames relative to the turn of the reference: when climbing, a blocked orbit can stand still.
 MAX_TURN, MAX_TURN_CLIMBING = 2, 6
 
-# Rings as (steps outwards, steps up) from the wished place. Who is hidden below canopies is seen from farther off, who
-# is hidden behind a house from above; CLIMBS lead over what blocks the way.
+# Rings as (steps outwards, steps up) from the reference position. A target below canopies is seen from farther away,
+# one behind a house from above; CLIMBS lead over obstacles.
 RINGS = ((-1, 0), (0, 0), (1, 0), (2, 0), (3, 0), (4, 0), (-1, 1), (0, 1))
 CLIMBS = ((0, 2), (1, 4), (2, 7), (2, 11))
-# Of the wished distance; farther apart, the drone could not change rings between keys.
+# Of the reference distance; with larger steps the drone could not change rings between key frames.
 STEP_OUT_SHARE, STEP_OUT_MAX_M = 0.3, 8.0
 STEP_UP_M = 7.0
 
-# Costs of a place, in units of "the walker hidden for one key frame" = 1. Ways off are squared parts of the wished
-# distance. Where the bearing and the altitude are what the flight is for, 64 degrees off are as dear as the hidden
-# walker.
-BEARING_COST, ANY_BEARING_COST = 0.8, 0.007  # per rad^2 off the wished bearing; where any will do
+# Costs of a place, in units of "the target hidden for one key frame" = 1. Deviations are squared shares of the
+# reference distance. Where bearing and altitude are the purpose, a deviation of 64 degrees costs as much as a hidden
+# target.
+BEARING_COST, ANY_BEARING_COST = 0.8, 0.007  # per rad^2 off the reference bearing; where any is allowed
 HIGH_COST, ANY_BEARING_HIGH_COST = 3.2, 0.8
 NEAR_COST, FAR_COST = 0.1, 0.03
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Where the drone may be at m key frames; r rings, `NUM_AZIMUTHS` places on each.
+    """Candidate places at m key frames; r rings, `NUM_AZIMUTHS` places on each.
 
-    frames: (m,) places in the walk. places_m: (m, r, azimuths, 3). costs: (m, r, azimuths) whatever is seen from there.
+    frames: (m,) frame numbers. places_m: (m, r, azimuths, 3). costs: (m, r, azimuths) without visibility.
     links: (r, r) rings that can be reached from each, itself first, then -1. radius_max_m: of the largest ring.
     max_turn: azimuths between one key frame and the next.
     """
@@ -73,10 +71,10 @@ class Lattice:
 
 
 def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
-    """Lay the rings round the walker.
+    """Return the rings around the target.
 
     Args:
-        climbing: with places far above the wished ones, at fewer key frames.
+        climbing: Add places far above the reference, at fewer key frames.
     """
     reference, targets = scenario.reference, scenario.targets_m
     stride = max(1, round((BETWEEN_KEYS_CLIMBING_S if climbing else BETWEEN_KEYS_S) / scenario.dt_s))
@@ -97,14 +95,14 @@ def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
     turned, high = (ANY_BEARING_COST, ANY_BEARING_HIGH_COST) if reference.any_bearing else (BEARING_COST, HIGH_COST)
     aside = np.where(off > 0, FAR_COST, NEAR_COST) * off**2 + high * (STEP_UP_M * rings[:, 1] / distances_m) ** 2
     costs = aside[:, :, None] + turned * np.minimum(turns, 2.0 * np.pi - turns) ** 2
-    if len(scenario.flown_m):  # all places of the first key frame are the one where the drone is
-        places_m[0], costs[0] = scenario.flown_m[-1], 0.0
+    if len(scenario.past_m):  # all places of the first key frame are the drone's position
+        places_m[0], costs[0] = scenario.past_m[-1], 0.0
     max_turn = MAX_TURN_CLIMBING if climbing else MAX_TURN
     return Lattice(frames, places_m, costs, _links(rings), float(radii_m.max()), max_turn)
 
 
 def _links(rings: np.ndarray) -> np.ndarray:
-    """Return the rings next to each, outwards and up, (r, r): numbers, itself first, then -1."""
+    """Return the numbers of the rings next to each, outwards and up, (r, r): itself first, then -1."""
     levels = np.searchsorted(np.unique(rings[:, 1]), rings[:, 1])
     links = np.full((len(rings), len(rings)), -1)
     for ring in range(len(rings)):
@@ -116,27 +114,26 @@ def _links(rings: np.ndarray) -> np.ndarray:
 
 
 # --- search -----------------------------------------------------------------------------------------------------------
-# The cheapest sequence of places that sees the walker: dynamic programming over the key frames of a lattice.
+# The cheapest sequence of places that sees the target: dynamic programming over the key frames of a lattice.
 #
-# Each key frame is looked from once, before any way is known, so the way is the best of all, and it leaves a place
-# before the walker is hidden from there. What it costs to fly a metre is the same in one stride as in several: a jump
-# from ring to ring is what smoothing makes a gentle change of.
+# Visibility is computed once per place and key frame, so the path is the optimum, and it leaves a place before the
+# target is hidden from there. A metre costs the same in one step as in several: smoothing turns a jump from ring to
+# ring into a gentle change.
 
-
-WAY_COST = 0.02  # of a metre, where "the walker hidden for one key frame" = 1
-NEIGHBOUR_SHARE = 0.3  # of what is seen a key frame before and after: places that see only just do not last
+WAY_COST = 0.02  # of a metre, where "the target hidden for one key frame" = 1
+NEIGHBOUR_SHARE = 0.3  # weight of the visibility at the key frame before and after
 SPEED_SHARE = 0.9  # of the limit: smoothing must be able to catch up
-REACH_M = 12.0  # a box farther away than this is not asked after: two places this free have nothing between them
+REACH_M = 12.0  # boxes farther away are ignored: two places with this clearance have nothing between them
 
 
 def search_trajectory(
     scenario: Scenario, lattice: Lattice, obstacles: BoxIndex, cfg: PlanConfig, clearance_m: float
 ) -> np.ndarray | None:
-    """Search the raw flight of one walk.
+    """Search the raw trajectory.
 
     Args:
-        obstacles: at least the boxes of the map that can be near the lattice or hide the walker.
-        clearance_m: that points and the lines between them keep from all boxes.
+        obstacles: at least the boxes of the map that can be near the lattice or hide the target.
+        clearance_m: least distance of points and of the lines between them to boxes.
     Returns:
         (n, 3), straight between key frames; None if no sequence of places is free.
     """
@@ -160,7 +157,7 @@ def search_trajectory(
 
 
 def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) -> BoxIndex:
-    """Index the boxes that may be within REACH_M of a place: most end far below a drone."""
+    """Index the boxes that may be within REACH_M of a place: most boxes end far below a drone."""
     rows, aside_m = obstacles.rows, lattice.radius_max_m + REACH_M
     (low_x, low_y), (high_x, high_y) = targets_m[:, :2].min(axis=0) - aside_m, targets_m[:, :2].max(axis=0) + aside_m
     keep = rows[:, HIGH_Z] >= lattice.places_m[:, :, 0, 2].min() - REACH_M
@@ -172,10 +169,10 @@ def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) ->
 
 @njit(cache=True)
 def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps, hidden):
-    """Write the distance of each place to the nearest box, at most `reach_m`, and the hidden share of the walker, both
+    """Write the distance of each place to the nearest box, at most `reach_m`, and the hidden share of the target, both
     (m, c).
 
-    Places nearer than `clearance_m` keep what stands in `hidden`. aloft: rows of the boxes of `index` within `reach_m`
+    Places nearer than `clearance_m` keep their value of `hidden`. aloft: rows of the boxes of `index` within `reach_m`
     of places.
     """
     near = np.empty(len(aloft), dtype=np.int64)
@@ -208,10 +205,12 @@ def _cheapest(places, own, gaps, longest_m, index, clearance_m, links, num_azimu
 
     places: (m, c, 3), c = rings * azimuths. own: (m, c) cost of a place. gaps: (m, c) m. longest_m: (m,) move into each
     key frame.
-    links: (rings, r) rings that may be come from, the first -1 ends the list.
+    links: (rings, r) previous rings, the first -1 ends the list.
     """
     num_keys, num_places, one = len(places), places.shape[1], np.empty(1, dtype=np.int64)
-    cost, came_from = np.full((num_keys, num_places), np.inf), np.full((num_keys, num_places), -1, dtype=np.int64)
+    cost, came_from = np.empty((num_keys, num_places)), np.empty((num_keys, num_places), dtype=np.int64)
+    cost.fill(np.inf)
+    came_from.fill(-1)
     for key in range(num_keys):
         for c in range(num_places):
             if gaps[key, c] < clearance_m:
@@ -221,7 +220,7 @@ def _cheapest(places, own, gaps, longest_m, index, clearance_m, links, num_azimu
                 continue
             x, y, z = places[key, c, 0], places[key, c, 1], places[key, c, 2]
             ring, azimuth, best = c // num_azimuths, c % num_azimuths, np.inf
-            for trial in range(2 * max_turn + 1):  # 0, -1, 1, -2, 2: the nearest first rules most others out
+            for trial in range(2 * max_turn + 1):  # 0, -1, 1, -2, 2: the nearest first excludes most others
                 turn = (trial + 1) // 2 * (1 - 2 * (trial % 2))
                 column = (azimuth + turn) % num_azimuths
                 for link in range(links.shape[1]):
@@ -235,15 +234,17 @@ def _cheapest(places, own, gaps, longest_m, index, clearance_m, links, num_azimu
                     guess = cost[key - 1, b] + way_cost * length
                     if guess >= best or length > longest_m[key]:
                         continue
-                    # Distance changes by at most a metre per metre: where both ends are freer than this, so is the
-                    # line.
+                    # Distance changes by at most a metre per metre: with more clearance at both ends the line is free.
                     is_close = gaps[key, c] + gaps[key - 1, b] - length < 2.0 * clearance_m
                     if is_close and collect_hits(index, u, v, w, x, y, z, clearance_m, one) > 0:
                         continue
                     best, came_from[key, c] = guess, b
             cost[key, c] = best + own[key, c]
-    chosen = np.full(num_keys, -1, dtype=np.int64)
-    last = int(np.argmin(cost[num_keys - 1]))
+    chosen, last = np.empty(num_keys, dtype=np.int64), 0
+    chosen.fill(-1)
+    for c in range(num_places):
+        if cost[num_keys - 1, c] < cost[num_keys - 1, last]:
+            last = c
     if cost[num_keys - 1, last] < np.inf:
         chosen[num_keys - 1] = last
         for key in range(num_keys - 1, 0, -1):
@@ -252,10 +253,10 @@ def _cheapest(places, own, gaps, longest_m, index, clearance_m, links, num_azimu
 
 
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan one flight (the signature of `planners.contract`); nothing here is random.
+    """Plan one trajectory (the signature of `planners.contract`); nothing here is random.
 
     Raises:
-        NoPathError: no places lead along this walk.
+        NoPathError: If no free places connect start and end.
     """
     raw, start, clearance_m = raw_trajectory(scenario, obstacles, cfg)
     points, facts = smooth_trajectory(raw, scenario, obstacles, cfg, clearance_m)
@@ -263,12 +264,11 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
 
 
 def raw_trajectory(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> tuple[np.ndarray, str, float]:
-    """Return the flight to be smoothed, its kind (`wished`, `search` or `climbing search`), and the clearance that it
-    keeps, m.
+    """Return the trajectory to smooth, its kind (`wished`, `search` or `climbing search`), and its clearance, m.
 
-    Where the wished places are free and see all that they are to see, nothing is searched.
+    Where the reference is free and sees the target wherever it must, it is the trajectory (`wished`).
     """
-    requested = scenario.as_flown(scenario.reference.places_m(scenario.targets_m, scenario.ground_m))
+    requested = scenario.with_past(scenario.reference.places_m(scenario.targets_m, scenario.ground_m))
     ahead, step_m = slice(scenario.start, None), cfg.speed_max_mps * scenario.dt_s
     safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
     seen = ~scenario.reference.keeps_sight | (visibility(obstacles, requested, scenario.targets_m) == 1.0)
@@ -278,4 +278,4 @@ def raw_trajectory(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> 
         found = search_trajectory(scenario, make_lattice(scenario, climbing=climbing), obstacles, cfg, clearance_m)
         if found is not None:
             return found, "climbing search" if climbing else "search", clearance_m
-    raise scenario.no_way("no free places lead along this walk", relaxed_m)
+    raise scenario.no_path_error("no free places connect start and end", relaxed_m)

@@ -1,4 +1,4 @@
-"""Who sees the target: what can hide it, sorted by direction once a layer, so that a look tests a few boxes."""
+"""Five-ray visibility of one target from many points: boxes sorted by direction once, so that a query tests few."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from cosfly.geometry.kernels import (
     touches,
     turned,
 )
-from cosfly.runtime.compiled import njit
+from cosfly.runtime.compiled import int64, njit
 
 NUM_SECTORS = 128  # of the horizon round a target
 
@@ -35,7 +35,7 @@ ROUNDING = 1e-6
 
 
 class Horizon(NamedTuple):
-    """What can hide one target, by direction. m boxes near it.
+    """The boxes that can hide one target, by direction; m boxes near it.
 
     counts: (NUM_SECTORS,), lists: (NUM_SECTORS, m) boxes that reach into each sector. near: (m,) m, horizontal distance
     less the rays' spread. slopes: (m,) a ray that rises more than this per horizontal metre passes above. steepest:
@@ -62,7 +62,8 @@ def make_horizon(index, target, reach_m, least_slope):
     boxes, near, slopes, spans = _boxes_round(index, target, reach_m, least_slope)
     counts = np.zeros(NUM_SECTORS, dtype=np.int64)
     lists = np.empty((NUM_SECTORS, len(boxes)), dtype=np.int64)
-    steepest = np.full(NUM_SECTORS, -np.inf)
+    steepest = np.empty(NUM_SECTORS)
+    steepest.fill(-np.inf)
     for k in range(len(boxes)):
         first = int(np.floor(spans[k, 0] / (2.0 * np.pi) * NUM_SECTORS))
         last = int(np.floor(spans[k, 1] / (2.0 * np.pi) * NUM_SECTORS))
@@ -135,7 +136,7 @@ def look(index, horizon, target, x, y, z):
     # In products, so that straight above needs no division; a box round the target itself is infinitely steep.
     if horizon.counts[sector] == 0 or rise > horizon.steepest[sector] * away + 1e-9:
         return 1.0
-    blocked = 0
+    blocked = int64(0)
     for place in range(horizon.counts[sector]):
         k = horizon.lists[sector, place]
         if horizon.near[k] <= away + 1e-9 and not rise > horizon.slopes[k] * away + 1e-9:
@@ -158,16 +159,28 @@ def _blocked_rays(rows, box, x, y, z, target, blocked):
         return blocked
     u, v, w = in_box_frame(rows, box, x, y, z)
     hip_u, hip_v, hip_w = in_box_frame(rows, box, tx, ty, tz)
-    # Every ray is within RAY_SPREAD_M of the middle one: far outside the box none is blocked, deep inside all are.
-    if not touches(rows, box, hip_u, hip_v, hip_w, u, v, w, RAY_SPREAD_M):
-        return blocked
+    # Every ray is within RAY_SPREAD_M of the middle one: far outside the box none is blocked (step 0), deep inside all
+    # are (step 1). One loop, because the compiler takes seconds for each test that is written out.
     least = min(rows[box, HALF_X], rows[box, HALF_Y], rows[box, HALF_Z])
-    if least >= RAY_SPREAD_M and touches(rows, box, hip_u, hip_v, hip_w, u, v, w, -RAY_SPREAD_M):
-        return ALL_BLOCKED
-    for ray in range(5):
-        if (blocked >> ray) & 1:
+    for step in range(7):
+        grown, a, b, c = 0.0, 0.0, 0.0, 0.0
+        if step == 0:
+            grown = RAY_SPREAD_M
+        elif step == 1:
+            if least < RAY_SPREAD_M:
+                continue
+            grown = -RAY_SPREAD_M
+        elif (blocked >> (step - 2)) & 1:
             continue
-        a, b, c = turned(rows, box, RAY_OFFSETS_M[ray, 0], RAY_OFFSETS_M[ray, 1], RAY_OFFSETS_M[ray, 2])
-        if touches(rows, box, hip_u + a, hip_v + b, hip_w + c, u, v, w, 0.0):
-            blocked |= 1 << ray
+        else:
+            a, b, c = turned(
+                rows, box, RAY_OFFSETS_M[step - 2, 0], RAY_OFFSETS_M[step - 2, 1], RAY_OFFSETS_M[step - 2, 2]
+            )
+        hits = touches(rows, box, hip_u + a, hip_v + b, hip_w + c, u, v, w, grown)
+        if step == 0 and not hits:
+            return blocked
+        if step == 1 and hits:
+            return int64(ALL_BLOCKED)
+        if step > 1 and hits:
+            blocked |= 1 << (step - 2)
     return blocked

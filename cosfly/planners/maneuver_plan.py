@@ -1,4 +1,8 @@
-"""Which style a flight gets: drawn by seed from the shares of the settings, and judged when it is flown."""
+"""The manoeuvre plan of a trajectory: styles drawn from the shares of the settings, mission, camera, and checks.
+
+A trajectory holds its style where the target sees the drone within HELD_DEG of the reference position and within
+HELD_RATIO of its distance.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +18,8 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.formats.segments import FOLLOW, MISSION_KINDS, Mission, MissionKind, Segment
 from cosfly.geometry.axes import look_at
 from cosfly.planners.contract import PlanConfig, Scenario, TrackingReference
+from cosfly.planners.reacquire import finds_again, reacquire_reference
 from cosfly.planners.reference_trajectory import ROUNDING_S, reference_of
-from cosfly.planners.reacquire import finds_again, reference_of_reacquire
 from cosfly.planners.styles import OTHER_SIDE, REACQUIRE, RETURN_HOME, ROWS, WHOLE, suits
 from cosfly.runtime.seeding import draw_to_quota
 
@@ -23,21 +27,17 @@ if TYPE_CHECKING:
     from cosfly.geometry.kernels import BoxIndex
 
 
-# A flight holds its style where the walker sees it within this angle of the wished place and within this ratio of its
-# distance.
 HELD_DEG, HELD_RATIO, HELD_SHARE = 25.0, 1.4, 0.7
-
-POINTS_LEAST = 4  # of a part
-
+POINTS_LEAST = 4  # of a segment
 NO_HIDING_PLACE, NOT_FOUND_AGAIN, NOT_HELD = "no_hiding_place", "not_lost_and_found", "style_not_held"
 NO_TIME = "no_time_for_home"
 
 
 @dataclass(frozen=True)
-class Intent:
-    """What a flight is meant to be. segments: empty for the paper's flight from end to end.
+class ManeuverPlan:
+    """The styles of one trajectory. segments: empty for the paper's `follow` from end to end.
 
-    order: kind of the mission that is to end the pursuit. impossible: why the map cannot hold the style; the wish is
+    order: kind of the mission that ends the pursuit. impossible: why the map cannot hold the style; the reference is
     the paper's then.
     """
 
@@ -56,78 +56,80 @@ class Intent:
         return any(part.style == REACQUIRE for part in self.segments)
 
 
-def draw_styles(walks: Sequence[PedestrianTrajectory], cfg: PlanConfig, rng: np.random.Generator) -> list[list[str]]:
-    """Draw the styles of the parts of each flight of a run to the quota of the settings' shares.
+def draw_styles(
+    pedestrians: Sequence[PedestrianTrajectory], cfg: PlanConfig, rng: np.random.Generator
+) -> list[list[str]]:
+    """Draw the styles of the segments of each trajectory of a run to the quota of the shares.
 
-    Flights draw among themselves which takes a style that is of a whole flight, parts which styles they have. Styles
-    that suit somebody who stops and hurries, or who goes straight on, have their share of the time in the parts with
-    most of it. So a drone that changes its pace has cause to, and shares stay what they are.
+    It is drawn first which trajectories have a style of a whole trajectory. Of the other segments, styles that suit a
+    pedestrian who stops and hurries, or who goes straight on, get the segments in which that is most so, up to their
+    share of the time. So the drone has a cause to change its pace, and shares stay exact.
     """
-    others = {style: share for style, share in cfg.styles.items() if style not in WHOLE}
-    parts_share = sum(others.values())
+    parts_of = {style: share for style, share in cfg.styles.items() if style not in WHOLE}
+    parts_share = sum(parts_of.values())
     if parts_share == 0:
-        others = {FOLLOW: 1.0}  # what comes before a flight home
-    for style, other in zip([*others], mirrored([*others]), strict=True):
+        parts_of = {FOLLOW: 1.0}  # precedes `return_home`
+    for style, other in zip([*parts_of], mirrored([*parts_of]), strict=True):
         if style != other:
-            others[style] = others[other] = others[style] / 2.0
+            parts_of[style] = parts_of[other] = parts_of[style] / 2.0
     whole = {style: share for style, share in cfg.styles.items() if style in WHOLE}
-    flights_rng, parts_rng = rng.spawn(2)
-    lasts = [*islice(draw_to_quota(whole | {"": parts_share}, flights_rng), len(walks))]
-    parts = list[tuple[int, np.ndarray]]()  # flight, and points of its walk
-    for flight, (walk, last) in enumerate(zip(walks, lasts, strict=True)):
-        num_points, duration_s = len(walk.time_s), float(walk.time_s[-1])
+    whole_rng, parts_rng = rng.spawn(2)
+    lasts = [*islice(draw_to_quota(whole | {"": parts_share}, whole_rng), len(pedestrians))]
+    parts = list[tuple[int, np.ndarray]]()  # number of the pedestrian trajectory, and its points in the segment
+    for number, (pedestrian, last) in enumerate(zip(pedestrians, lasts, strict=True)):
+        num_points, duration_s = len(pedestrian.time_s), float(pedestrian.time_s[-1])
         num = round(duration_s / cfg.segment_s) if cfg.segment_s else 1
         num = 0 if last == REACQUIRE else max(1, min(num, num_points // POINTS_LEAST))
-        parts += [(flight, points) for points in np.array_split(np.arange(num_points), num)] if num else []
-    free, left, of_part = [*range(len(parts))], sum(others.values()), dict[int, str]()
+        parts += [(number, points) for points in np.array_split(np.arange(num_points), num)] if num else []
+    free, left, of_part = [*range(len(parts))], sum(parts_of.values()), dict[int, str]()
     for kind, measure in MEASURES.items():
-        styles = {style: share for style, share in others.items() if suits(style) == kind}
+        styles = {style: share for style, share in parts_of.items() if suits(style) == kind}
         if not (free and (share := sum(styles.values()))):
             continue
-        free.sort(key=lambda k: (-measure(walks[parts[k][0]], parts[k][1]), k))
+        free.sort(key=lambda k: (-measure(pedestrians[parts[k][0]], parts[k][1]), k))
         lengths = np.array([len(parts[k][1]) for k in free])
         ends = np.cumsum(lengths) - parts_rng.random() * lengths
         num, left = int((ends <= lengths.sum() * share / left).sum()), left - share
         of_part |= zip(sorted(free[:num]), draw_to_quota(styles, parts_rng), strict=False)
         free = free[num:]
-    drawn = [list[str]() for _ in walks]
-    for k, (flight, _) in enumerate(parts):
-        drawn[flight].append(of_part[k])
+    drawn = [list[str]() for _ in pedestrians]
+    for k, (number, _) in enumerate(parts):
+        drawn[number].append(of_part[k])
     return [names + ([last] if last else []) for names, last in zip(drawn, lasts, strict=True)]
 
 
-def _unevenness_mps(walk: PedestrianTrajectory, points: np.ndarray) -> float:
-    return float(np.std(walk.speeds_mps[points]))
+def _unevenness_mps(pedestrian: PedestrianTrajectory, points: np.ndarray) -> float:
+    return float(np.std(pedestrian.speeds_mps[points]))
 
 
-def _straightness(walk: PedestrianTrajectory, points: np.ndarray) -> float:
-    steps_m = np.diff(walk.positions_m[points, :2], axis=0)
+def _straightness(pedestrian: PedestrianTrajectory, points: np.ndarray) -> float:
+    steps_m = np.diff(pedestrian.positions_m[points, :2], axis=0)
     return float(np.hypot(*steps_m.sum(axis=0)) / max(float(np.hypot(*steps_m.T).sum()), 1e-9))
 
 
-# How much of what suits a style a walker does in a part of the way, in the order in which parts are given away.
-MEASURES = {"uneven": _unevenness_mps, "straight": _straightness, "": lambda walk, points: 0.0}
+# What suits a style -> its measure in a segment, in the order in which segments are assigned.
+MEASURES = {"uneven": _unevenness_mps, "straight": _straightness, "": lambda pedestrian, points: 0.0}
 
 
 def mirrored(names: Sequence[str]) -> list[str]:
-    """Turn styles of either side to the other one."""
+    """Return names in which styles of either side are turned to the other side."""
     either = {name for name, row in ROWS.items() if row.either_side}
     others = {OTHER_SIDE + name: name for name in either} | {name: OTHER_SIDE + name for name in either}
     return [others.get(name, name) for name in names]
 
 
-def draw_intent(
+def draw_maneuvers(
     names: Sequence[str], scenario: Scenario, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig,
     rng: np.random.Generator,
-) -> Intent:  # fmt: skip
-    """Draw how a flight of these styles is flown. screens: the obstacles that hide a person for certain."""
+) -> ManeuverPlan:  # fmt: skip
+    """Draw the manoeuvre plan of a trajectory of these styles. screens: obstacles that certainly hide a person."""
     num = len(scenario.targets_m)
     if names[-1] == REACQUIRE:
-        reference = reference_of_reacquire(scenario, obstacles, screens, cfg, rng)
+        reference = reacquire_reference(scenario, obstacles, screens, cfg, rng)
         segment = Segment(REACQUIRE, 0, num, keeps_sight=False)
         if reference is None:
-            return Intent(scenario.reference, (segment,), impossible=NO_HIDING_PLACE)
-        return Intent(reference, (segment,))
+            return ManeuverPlan(scenario.reference, (segment,), impossible=NO_HIDING_PLACE)
+        return ManeuverPlan(reference, (segment,))
     names, goes_home = [name for name in names if name != RETURN_HOME], names[-1] == RETURN_HOME
     cuts = np.linspace(0, num, len(names) + 1).round().astype(int).tolist()
     plain = [name.removeprefix(OTHER_SIDE) for name in names]
@@ -135,89 +137,85 @@ def draw_intent(
     is_paper = not goes_home and set(names) == {FOLLOW}
     reference = scenario.reference if is_paper else reference_of(names, scenario, obstacles, cfg, rng)
     if not goes_home:
-        return Intent(reference, () if is_paper else segments)
+        return ManeuverPlan(reference, () if is_paper else segments)
     order = MISSION_KINDS[int(rng.integers(len(MISSION_KINDS)))]
-    return Intent(reference, (*segments, Segment(RETURN_HOME, num, num, keeps_sight=False)), order=order)
+    return ManeuverPlan(reference, (*segments, Segment(RETURN_HOME, num, num, keeps_sight=False)), order=order)
 
 
-def why_not_held(intent: Intent, scenario: Scenario, positions_m: np.ndarray, seen: np.ndarray) -> str | None:
-    """Return why a flight is not what it was meant to be, None where it is.
+def why_not_held(maneuvers: ManeuverPlan, scenario: Scenario, positions_m: np.ndarray, seen: np.ndarray) -> str | None:
+    """Return why a trajectory does not hold its styles, None where it does.
 
     Args:
-        positions_m: (n, 3), as flown. seen: (n,) five-ray visibility past the screens.
+        positions_m: (n, 3). seen: (n,) five-ray visibility past the screens.
     """
-    if intent.impossible is not None or not intent.segments:
-        return intent.impossible
-    if intent.searches:
+    if maneuvers.impossible is not None or not maneuvers.segments:
+        return maneuvers.impossible
+    if maneuvers.searches:
         return None if finds_again(seen, scenario.dt_s) else NOT_FOUND_AGAIN
-    pursued = None if intent.mission is None else intent.mission.at_frame
-    return None if _is_held(intent.reference, scenario, positions_m)[:pursued].mean() >= HELD_SHARE else NOT_HELD
+    pursued = None if maneuvers.mission is None else maneuvers.mission.at_frame
+    return None if _is_held(maneuvers.reference, scenario, positions_m)[:pursued].mean() >= HELD_SHARE else NOT_HELD
 
 
 def _is_held(reference: TrackingReference, scenario: Scenario, positions_m: np.ndarray) -> np.ndarray:
-    """Tell at which frames a flight is about where it is wished, (n,) bool."""
+    """Return at which frames a trajectory is near its reference position, (n,) bool."""
     requested = reference.places_m(scenario.targets_m, scenario.ground_m) - scenario.targets_m
-    flown = positions_m - scenario.targets_m
-    wished_m, flown_m = np.linalg.norm(requested, axis=1), np.linalg.norm(flown, axis=1)
-    cosine = (requested * flown).sum(axis=1) / np.maximum(wished_m * flown_m, 1e-9)
-    ratio = np.maximum(flown_m, 1e-9) / np.maximum(wished_m, 1e-9)
+    planned = positions_m - scenario.targets_m
+    requested_m, planned_m = np.linalg.norm(requested, axis=1), np.linalg.norm(planned, axis=1)
+    cosine = (requested * planned).sum(axis=1) / np.maximum(requested_m * planned_m, 1e-9)
+    ratio = np.maximum(planned_m, 1e-9) / np.maximum(requested_m, 1e-9)
     return (cosine >= np.cos(np.radians(HELD_DEG))) & (ratio <= HELD_RATIO) & (ratio >= 1.0 / HELD_RATIO)
 
 
-def tell_not_held(
-    intent: Intent, scenario: Scenario, positions_m: np.ndarray, obstacles: BoxIndex, cfg: PlanConfig
+def describe_not_held(
+    maneuvers: ManeuverPlan, scenario: Scenario, positions_m: np.ndarray, obstacles: BoxIndex, cfg: PlanConfig
 ) -> str:
-    """Say of the part that is held least what was asked, what was flown, and what was in the way."""
+    """Describe the segment that is held least: what was requested, what was planned, and what prevented it."""
     from cosfly.geometry.kernels import signed_distances, visibility
 
-    is_held, targets, reference = (
-        _is_held(intent.reference, scenario, positions_m),
-        scenario.targets_m,
-        intent.reference,
-    )
-    part = min(
-        (part for part in intent.segments if part.keeps_sight), key=lambda part: is_held[part.begin : part.end].mean()
-    )
+    targets, reference = scenario.targets_m, maneuvers.reference
+    is_held = _is_held(reference, scenario, positions_m)
+    judged = (one for one in maneuvers.segments if one.keeps_sight)
+    part = min(judged, key=lambda one: is_held[one.begin : one.end].mean())
     span, places = slice(part.begin, part.end), reference.places_m(targets, scenario.ground_m)
     lost = ~is_held[span]
 
-    def told(flown: np.ndarray) -> str:
-        away = flown[span] - targets[span]
+    def described(positions: np.ndarray) -> str:
+        away = positions[span] - targets[span]
         bearing = np.degrees(_wrapped(np.arctan2(away[:, 1], away[:, 0]) - reference.heading_rad[span]))
-        up_m = np.median((flown[:, 2] - scenario.ground_m)[span][lost])
+        up_m = np.median((positions[:, 2] - scenario.ground_m)[span][lost])
         apart_m = np.median(np.hypot(away[:, 0], away[:, 1])[lost])
         return f"{up_m:.0f} m up, {apart_m:.0f} m away, at {np.median(bearing[lost]):.0f} deg"
 
     near = signed_distances(obstacles, places, cfg.safety_distance_m)[0] < cfg.safety_distance_m
     unseen, fast = visibility(obstacles, places, targets) == 0, np.zeros(len(places), dtype=bool)
     fast[1:] = np.linalg.norm(np.diff(places, axis=0), axis=1) > cfg.speed_max_mps * scenario.dt_s
-    causes = {f"nearer than {cfg.safety_distance_m:g} m to a box": near, "without sight": unseen, "too fast": fast}
+    causes = {f"nearer than {cfg.safety_distance_m:g} m to a box": near, "without line of sight": unseen}
+    causes["too fast to reach"] = fast
     why = [f"{found[span][lost].mean():.0%} {cause}" for cause, found in causes.items() if found[span][lost].any()]
     return (
-        f"{part.style}, {lost.mean():.0%} of frames {part.begin} to {part.end - 1}: asked {told(places)}; "
-        f"flown {told(positions_m)} (medians); because the places asked are "
-        f"{', '.join(why) or 'free, in sight and within reach, but not all the way there'}"
+        f"{part.style}, {lost.mean():.0%} of frames {part.begin} to {part.end - 1}: requested {described(places)}; "
+        f"planned {described(positions_m)} (medians); of the requested positions are "
+        f"{', '.join(why) or 'all free, in sight and within reach, but not on the way there'}"
     )
 
 
 # --- mission ----------------------------------------------------------------------------------------------------------
-# `return_home`: an order of the mission ends the pursuit; the drone breaks off, turns away and flies to where it
-# started.
+# `return_home`: an order ends the pursuit; the drone breaks off, turns away and returns to its start.
 
 
-LEAVES_MPS, HOME_MPS, HOME_MPS2 = 3.0, 6.0, 1.5  # greatest speeds, and how fast they are reached and lost
-LEAVES_M, CLIMBS_M = 6.0, 8.0  # away from the walker and up, before it turns for home, as far as there is room
+LEAVES_MPS, HOME_MPS, HOME_MPS2 = 3.0, 6.0, 1.5  # greatest speeds, and the acceleration to and from them
+LEAVES_M, CLIMBS_M = 6.0, 8.0  # away from the target and up before it turns for home, where there is room
 HOLDS_S = 3.0  # over home, at the end
-PURSUIT_LEAST = 1 / 3  # of the flight
+PURSUIT_LEAST = 1 / 3  # of the trajectory
 
 
-def ended_by_order(
-    intent: Intent, positions_m: np.ndarray, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig
-) -> tuple[Intent, np.ndarray]:
-    """End a pursuit as it was flown, (n, 3), with the way home, where the rest of the walk is just enough for it."""
-    from cosfly.planners.smoothing import within_limits
+def end_with_order(
+    maneuvers: ManeuverPlan, positions_m: np.ndarray, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig
+) -> tuple[ManeuverPlan, np.ndarray]:
+    """End a pursuit, (n, 3), with the way home, at the last frame that leaves enough time for it."""
+    from cosfly.planners.smoothing import repair_to_limits
 
-    assert intent.order is not None
+    assert maneuvers.order is not None
     num, dt_s = len(positions_m), scenario.dt_s
     at, first, in_time = num - 1, max(1, int(num * PURSUIT_LEAST)), num - round(HOLDS_S / dt_s)
     legs = _legs_home(positions_m, scenario.targets_m[-1], obstacles, cfg, dt_s)
@@ -226,26 +224,26 @@ def ended_by_order(
         legs = _legs_home(positions_m[: at + 1], scenario.targets_m[at], obstacles, cfg, dt_s)
     if at + sum(map(len, legs)) > in_time:
         whole = Segment(RETURN_HOME, 0, num, keeps_sight=False)
-        return replace(intent, impossible=NO_TIME, segments=(whole,)), positions_m
+        return replace(maneuvers, impossible=NO_TIME, segments=(whole,)), positions_m
     way = np.vstack([positions_m[: at + 1], *legs])
-    flown = np.vstack([way, np.tile(way[-1], (num - len(way), 1))])
+    positions = np.vstack([way, np.tile(way[-1], (num - len(way), 1))])
     share = np.clip((np.arange(num) - at) * dt_s / (2.0 * ROUNDING_S), 0.0, 1.0)[:, None]  # the pursuit stays
-    flown += share * (gaussian_filter1d(flown, ROUNDING_S / dt_s, axis=0, mode="nearest") - flown)
+    positions += share * (gaussian_filter1d(positions, ROUNDING_S / dt_s, axis=0, mode="nearest") - positions)
     home_m = np.round(positions_m[0], 4)
-    mission = Mission(intent.order, at, at + len(legs[0]), (float(home_m[0]), float(home_m[1]), float(home_m[2])))
-    before = tuple(Segment(p.style, p.begin, min(p.end, at)) for p in intent.segments if p.begin < at)
+    mission = Mission(maneuvers.order, at, at + len(legs[0]), (float(home_m[0]), float(home_m[1]), float(home_m[2])))
+    before = tuple(Segment(p.style, p.begin, min(p.end, at)) for p in maneuvers.segments if p.begin < at)
     segments = (*before, Segment(RETURN_HOME, at, num, keeps_sight=False))
-    reference = replace(intent.reference, keeps_sight=intent.reference.keeps_sight & (np.arange(num) < at))
-    return replace(intent, reference=reference, segments=segments, mission=mission), within_limits(
-        flown, scenario, obstacles, cfg
+    reference = replace(maneuvers.reference, keeps_sight=maneuvers.reference.keeps_sight & (np.arange(num) < at))
+    return replace(maneuvers, reference=reference, segments=segments, mission=mission), repair_to_limits(
+        positions, scenario, obstacles, cfg
     )
 
 
 def _legs_home(
     trail_m: np.ndarray, target_m: np.ndarray, obstacles: BoxIndex, cfg: PlanConfig, dt_s: float
 ) -> list[np.ndarray]:
-    """Return the way from the end of a trail (k, 3) away from the target, and then home: along the trail, but straight
-    where that is free."""
+    """Return the leg from the end of a trail (k, 3) away from the target, and the leg home along the trail, with
+    shortcuts where they are free."""
     from cosfly.geometry.kernels import segments_hit
 
     def are_free(start: np.ndarray, ends: np.ndarray) -> np.ndarray:
@@ -261,14 +259,13 @@ def _legs_home(
         left = int(np.argmax(free)) if free.any() else left - 1
         corners.append(trail_m[left])
     return [
-        _flown_along(np.stack([here, aside]), LEAVES_MPS, dt_s),
-        _flown_along(np.stack(corners), HOME_MPS, dt_s),
+        _positions_along(np.stack([here, aside]), LEAVES_MPS, dt_s),
+        _positions_along(np.stack(corners), HOME_MPS, dt_s),
     ]
 
 
-def _flown_along(corners_m: np.ndarray, most_mps: float, dt_s: float) -> np.ndarray:
-    """Return the places (k, 3), dt_s apart, of a drone that starts and stops at the ends of a polyline, without its
-    first."""
+def _positions_along(corners_m: np.ndarray, most_mps: float, dt_s: float) -> np.ndarray:
+    """Return positions (k, 3), dt_s apart, along a polyline from rest to rest, without its first point."""
     along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners_m, axis=0), axis=1))])
     speed_mps = min(most_mps, np.sqrt(HOME_MPS2 * along_m[-1]))
     seconds = along_m[-1] / max(speed_mps, 1e-9) + speed_mps / HOME_MPS2
@@ -280,19 +277,19 @@ def _flown_along(corners_m: np.ndarray, most_mps: float, dt_s: float) -> np.ndar
 
 
 # --- camera -----------------------------------------------------------------------------------------------------------
-# Where the camera looks: at the target; on the way home where the drone flies; and where nobody is seen, where it was
+# The camera looks at the target; on the way home, in the direction of motion; while the target is hidden, where it was
 # lost.
 
 
-TURNS_S = 0.8  # standard deviation of the smoothing of a turn while it searches
-HOME_PITCH_DEG, HOME_TURN_DPS = -15.0, 45.0  # how fast the view turns at most, on the way home
-STANDING_MPS = 0.5  # slower than this the direction of flight says nothing
-# While it searches the camera looks where the target would be had it gone on for a while, and to both sides of that.
+TURNS_S = 0.8  # standard deviation of the smoothing of a turn during a search
+HOME_PITCH_DEG, HOME_TURN_DPS = -15.0, 45.0  # on the way home; the greatest turn rate of the view
+STANDING_MPS = 0.5  # below this the direction of motion is undefined
+# During a search the camera looks where the target would be if it went on for a while, and to both sides of that.
 GOES_ON_S, SWEEP_DEG, SWEEP_S = 2.0, 18.0, 6.0
 
 
 def view_of(
-    intent: Intent, positions_m: np.ndarray, targets_m: np.ndarray, seen: np.ndarray, dt_s: float
+    maneuvers: ManeuverPlan, positions_m: np.ndarray, targets_m: np.ndarray, seen: np.ndarray, dt_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return pitch and yaw of the camera, (n,) each, radians.
 
@@ -300,9 +297,9 @@ def view_of(
         positions_m, targets_m: (n, 3). seen: (n,) five-ray visibility.
     """
     pitch, yaw = look_at(positions_m, targets_m)
-    if intent.mission is not None:
-        return _turned_home(pitch, yaw, positions_m, intent.mission.at_frame, dt_s)
-    if intent.searches:
+    if maneuvers.mission is not None:
+        return _turned_home(pitch, yaw, positions_m, maneuvers.mission.at_frame, dt_s)
+    if maneuvers.searches:
         return _searching(pitch, yaw, positions_m, targets_m, seen, dt_s)
     return pitch, yaw
 
@@ -310,12 +307,12 @@ def view_of(
 def _turned_home(
     pitch: np.ndarray, yaw: np.ndarray, positions_m: np.ndarray, at: int, dt_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Turn into the direction of flight from frame `at` on, no faster than a drone turns."""
-    flown, step = np.gradient(positions_m[:, :2], dt_s, axis=0), np.radians(HOME_TURN_DPS) * dt_s
+    """Turn into the direction of motion from frame `at` on, at most at HOME_TURN_DPS."""
+    velocity, step = np.gradient(positions_m[:, :2], dt_s, axis=0), np.radians(HOME_TURN_DPS) * dt_s
     pitch, yaw = pitch.copy(), yaw.copy()
     for i in range(at + 1, len(yaw)):
-        is_flying = np.hypot(*flown[i]) >= STANDING_MPS
-        wanted = np.arctan2(flown[i, 1], flown[i, 0]) if is_flying else yaw[i - 1]
+        moves = np.hypot(*velocity[i]) >= STANDING_MPS
+        wanted = np.arctan2(velocity[i, 1], velocity[i, 0]) if moves else yaw[i - 1]
         yaw[i] = yaw[i - 1] + np.clip(_wrapped(wanted - yaw[i - 1]), -step, step)
         pitch[i] = pitch[i - 1] + np.clip(np.radians(HOME_PITCH_DEG) - pitch[i - 1], -step, step)
     return pitch, _wrapped(yaw)
@@ -324,7 +321,7 @@ def _turned_home(
 def _searching(
     pitch: np.ndarray, yaw: np.ndarray, positions_m: np.ndarray, targets_m: np.ndarray, seen: np.ndarray, dt_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Look where the target was lost while nobody sees it: what the drone does not see it does not know."""
+    """Look where the target was lost while it is hidden: the drone does not know what it does not see."""
     aims, since, last = targets_m.copy(), np.zeros(len(seen)), 0
     speeds = np.gradient(targets_m, dt_s, axis=0) if len(targets_m) > 1 else np.zeros_like(targets_m)
     for i in range(len(seen)):
@@ -341,5 +338,5 @@ def _wrapped(angles: np.ndarray) -> np.ndarray:
 
 
 def _eased(angles: np.ndarray, where: np.ndarray, dt_s: float) -> np.ndarray:
-    """Smooth angles (n,) where a view is not the plain one, up to the frames before and after."""
+    """Smooth angles (n,) where the view does not look at the target."""
     return np.where(where, gaussian_filter1d(angles, TURNS_S / dt_s, mode="nearest"), angles)

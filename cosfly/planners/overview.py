@@ -1,4 +1,4 @@
-"""The top-down picture of a batch of flights: `plan.png`."""
+"""The top-down picture of a batch of trajectories: `plan.png`."""
 
 from __future__ import annotations
 
@@ -11,44 +11,44 @@ from cosfly.formats.traces import DroneTrace
 from cosfly.viz.topview import HALO, TopView, add_caption, draw_dot, draw_line, draw_map, draw_text, png_bytes
 
 MARGIN_M, SIZE_PX = 27.0, 1400
-WALK_COLOR, SIGHT_COLOR = (20, 20, 30), (70, 90, 110)
-SEEN_COLOR, HIDDEN_COLOR = np.array([20.0, 110.0, 230.0]), np.array([225.0, 30.0, 40.0])  # of flights
+PEDESTRIAN_COLOR, SIGHT_COLOR = (20, 20, 30), (70, 90, 110)
+SEEN_COLOR, HIDDEN_COLOR = np.array([20.0, 110.0, 230.0]), np.array([225.0, 30.0, 40.0])  # of drone trajectories
 FRAMES_BETWEEN_SIGHTS = 20  # a line of sight every 10 s
 
 
 def draw_pedestrians(
-    box_map: BoxMap, walks: list[PedestrianTrajectory], traces: list[DroneTrace]
+    box_map: BoxMap, pedestrians: list[PedestrianTrajectory], traces: list[DroneTrace]
 ) -> tuple[np.ndarray, TopView]:
-    """Draw the surroundings of walks and flights, pale, and the walks on them; gives the picture and where it lies."""
-    places_m = [walk.positions_m for walk in walks] + [trace.positions_m for trace in traces]
+    """Draw the pale map around trajectories and the pedestrian trajectories on it; return the picture and its view."""
+    places_m = [pedestrian.positions_m for pedestrian in pedestrians] + [trace.positions_m for trace in traces]
     view = TopView.around(np.vstack(places_m), SIZE_PX, MARGIN_M)
-    picture = (0.55 * draw_map(box_map, view) + 0.45 * 255).astype(np.uint8)  # the town steps back behind the flights
-    for walk in walks:
-        draw_line(picture, view.pixels(walk.positions_m), WALK_COLOR, 2, halo=5)
+    picture = (0.55 * draw_map(box_map, view) + 0.45 * 255).astype(np.uint8)
+    for pedestrian in pedestrians:
+        draw_line(picture, view.pixels(pedestrian.positions_m), PEDESTRIAN_COLOR, 2, halo=5)
     return picture, view
 
 
-def draw_trajectories(box_map: BoxMap, walks: list[PedestrianTrajectory], traces: list[DroneTrace]) -> bytes:
-    """Draw obstacles, walks (dark) and flights (blue where the target is seen, red where hidden).
+def draw_trajectories(box_map: BoxMap, pedestrians: list[PedestrianTrajectory], traces: list[DroneTrace]) -> bytes:
+    """Draw obstacles, pedestrian trajectories (dark) and drone trajectories (blue; red where the target is hidden).
 
     Returns:
-        PNG bytes. Dropped flights are thin; a walk without a flight ends in a cross.
+        PNG bytes. Dropped trajectories are thin; a pedestrian trajectory without a drone trajectory ends in a cross.
     """
-    picture, view = draw_pedestrians(box_map, walks, traces)
-    flown = {trace.path_id for trace in traces}
-    for walk in walks:
-        if walk.path_id not in flown:
-            end = view.pixels(walk.positions_m[-1:])[0].astype(int).tolist()
+    picture, view = draw_pedestrians(box_map, pedestrians, traces)
+    planned = {trace.path_id for trace in traces}
+    for pedestrian in pedestrians:
+        if pedestrian.path_id not in planned:
+            end = view.pixels(pedestrian.positions_m[-1:])[0].astype(int).tolist()
             cv2.drawMarker(picture, end, HIDDEN_COLOR.tolist(), cv2.MARKER_TILTED_CROSS, 16, 3, cv2.LINE_AA)
     for trace in traces:
         _draw_trajectory(picture, trace, view.pixels(trace.positions_m), view.pixels(trace.targets_m))
     num_dropped = sum(trace.drop_reason is not None for trace in traces)
-    flights = f"{len(traces)} flights (blue: sees, red: hidden), {num_dropped} dropped"
-    return png_bytes(add_caption(picture, f"{box_map.name}: {len(walks)} walks (dark), {flights}"))
+    drones = f"{len(traces)} drones (blue: target visible, red: hidden), {num_dropped} dropped"
+    return png_bytes(add_caption(picture, f"{box_map.name}: {len(pedestrians)} pedestrians (dark), {drones}"))
 
 
 def _draw_trajectory(picture: np.ndarray, trace: DroneTrace, drone: np.ndarray, target: np.ndarray) -> None:
-    """Draw one flight with a line of sight every few seconds and its id where it begins."""
+    """Draw one trajectory with a line of sight every few seconds and its id at its start."""
     for i in range(0, len(drone), FRAMES_BETWEEN_SIGHTS):
         draw_line(picture, np.stack([drone[i], target[i]]), SIGHT_COLOR)
     width = 1 if trace.drop_reason else 3
@@ -59,4 +59,4 @@ def _draw_trajectory(picture: np.ndarray, trace: DroneTrace, drone: np.ndarray, 
         draw_line(picture, drone[i : i + 2], color.tolist(), width)
     begin = drone[0].astype(int)
     draw_dot(picture, begin, 5, SEEN_COLOR.tolist())
-    draw_text(picture, trace.path_id, begin[0] + 8, begin[1] - 6, 0.5, WALK_COLOR, halo=HALO)
+    draw_text(picture, trace.path_id, begin[0] + 8, begin[1] - 6, 0.5, PEDESTRIAN_COLOR, halo=HALO)

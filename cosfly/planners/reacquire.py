@@ -1,8 +1,8 @@
-"""`reacquire`: the walker disappears behind a house or a tree, the drone searches and finds again.
+"""The style `reacquire`: the target disappears behind a house or a tree, the drone searches and finds it again.
 
-It begins low and away, where the map hides the walker for a while (a place is looked for, by chance), and goes on as
-before for a moment; then it climbs and swings behind the walker's last way until it sees. Judged by what came of it,
-not by the mean of sight.
+The drone starts low and away, at a place found at random from which the map hides the target for a while, and goes on
+for a moment; then it climbs and moves behind the target's last heading until it sees the target. The trajectory is
+judged by this outcome, not by its mean visibility.
 """
 
 from __future__ import annotations
@@ -12,39 +12,27 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cosfly.formats.kinds import KINDS
 from cosfly.planners.contract import PlanConfig, Scenario, TrackingReference
-from cosfly.planners.reference_trajectory import places_of, without_jumps
+from cosfly.planners.reference_trajectory import positions_of, without_jumps
 from cosfly.planners.styles import REACQUIRE, Style
 
 if TYPE_CHECKING:
-    from cosfly.formats.boxes import BoxMap
     from cosfly.geometry.kernels import BoxIndex
 
 TRIES = 120
-LOST_LEAST_S, LOST_MOST_S = 1.5, 15.0  # longest time without sight
-BEFORE_S, AFTER_S = 2.0, 3.0  # seen at least so long before it is lost, and at the end
+LOST_LEAST_S, LOST_MOST_S = 1.5, 15.0  # of the longest time without line of sight
+BEFORE_S, AFTER_S = 2.0, 3.0  # seen at least this long before the loss, and at the end
 SEEN = 0.5  # mean visibility that counts as seen
 WAITS_S = 4.0  # before it searches
-DEEP_LOSS_S = 5.0  # of a place that is looked for: the planner may move a little, and the walker stays hidden
-CROWN_SHARE = 1 / np.sqrt(3.0)  # of the half extents: the box within the ellipsoid within the box
-LATE_SHARE = 0.5  # of the tries that fly along the walker's own way
-FREE_SHARE = 1.0  # of the wished places that keep the safety distance
+DEEP_LOSS_S = 5.0  # required of the drawn course, so that small moves of the planner keep the target hidden
+LATE_SHARE = 0.5  # of the tries that follow the path of the target
+FREE_SHARE = 1.0  # of the reference positions that keep the safety distance
 
 
-def screens_of(box_map: BoxMap) -> BoxIndex:
-    """Index what hides a person for certain: the obstacles, but of a crown's box only the box within its ellipsoid."""
-    from cosfly.geometry.kernels import obstacle_index
-
-    is_crown = box_map.is_any_of({KINDS["Vegetation"]})
-    half_extents = np.where(is_crown[:, None], CROWN_SHARE * box_map.half_extents, box_map.half_extents)
-    return obstacle_index(replace(box_map, half_extents=half_extents))
-
-
-def reference_of_reacquire(
+def reacquire_reference(
     scenario: Scenario, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, rng: np.random.Generator
 ) -> TrackingReference | None:
-    """Look for a flight that loses the walker and finds again; None where the map hides nobody on this walk."""
+    """Return a reference that loses the target and finds it again; None where the map does not hide the target."""
     from cosfly.geometry.kernels import signed_distances, visibility
 
     targets, ground, dt_s, style = scenario.targets_m, scenario.ground_m, scenario.dt_s, cfg.style(REACQUIRE)
@@ -52,7 +40,7 @@ def reference_of_reacquire(
         course = _watching(style, scenario, rng)
         searches_m = style.ground_distance_end_m or style.ground_distance_m
         climb_m, near_m = rng.uniform(*style.climb_m), rng.uniform(*searches_m)
-        seen = visibility(screens, places_of(course, targets, ground), targets)
+        seen = visibility(screens, positions_of(course, targets, ground), targets)
         lost = first_loss(seen, dt_s, DEEP_LOSS_S)
         if lost is None:
             continue
@@ -69,22 +57,22 @@ def reference_of_reacquire(
 
 
 def _watching(style: Style, scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
-    """Draw a course, (n, 3), before the loss: at a bearing of the walker, or late along the walker's own way."""
+    """Draw a course, (n, 3), before the loss: at a bearing from the target, or behind it along its path."""
     targets, heading_rad = scenario.targets_m, scenario.reference.heading_rad
     apart_m, altitude_m = rng.uniform(*style.ground_distance_m), rng.uniform(*style.altitude_m)
     bearing, is_late = rng.uniform(-np.pi, np.pi), rng.random() < LATE_SHARE
     azimuth, aparts_m = heading_rad + bearing, np.full(len(targets), apart_m)
     if is_late:
-        walked_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(targets[:, :2], axis=0).T))])
+        along_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(targets[:, :2], axis=0).T))])
         start = -apart_m * np.array([np.cos(heading_rad[0]), np.sin(heading_rad[0])])
-        away = np.stack([np.interp(walked_m - apart_m, walked_m, targets[:, k]) for k in (0, 1)], axis=1)
-        away += np.clip(1.0 - walked_m / apart_m, 0.0, 1.0)[:, None] * start - targets[:, :2]
+        away = np.stack([np.interp(along_m - apart_m, along_m, targets[:, k]) for k in (0, 1)], axis=1)
+        away += np.clip(1.0 - along_m / apart_m, 0.0, 1.0)[:, None] * start - targets[:, :2]
         azimuth, aparts_m = np.arctan2(away[:, 1], away[:, 0]), np.hypot(away[:, 0], away[:, 1])
     return np.column_stack([azimuth, aparts_m, np.full(len(targets), altitude_m)])
 
 
 def first_loss(seen: np.ndarray, dt_s: float, least_s: float = LOST_LEAST_S) -> int | None:
-    """Return the first frame of a loss of at least `least_s` that follows a time of sight; None where there is none."""
+    """Return the first frame of a loss of at least `least_s` after visible frames; None where there is none."""
     before = max(1, round(BEFORE_S / dt_s))
     for begin, end in _hidden_runs(seen):
         if begin >= before and (end - begin) * dt_s >= least_s and seen[begin - before : begin].mean() >= SEEN:
@@ -93,7 +81,7 @@ def first_loss(seen: np.ndarray, dt_s: float, least_s: float = LOST_LEAST_S) -> 
 
 
 def finds_again(seen: np.ndarray, dt_s: float) -> bool:
-    """Return whether a walker is seen, lost, and seen at the end again; seen: (n,) five-ray visibility."""
+    """Return whether the target is visible, lost, and visible at the end; seen: (n,) five-ray visibility."""
     if first_loss(seen, dt_s) is None:
         return False
     longest_s = max(end - begin for begin, end in _hidden_runs(seen)) * dt_s

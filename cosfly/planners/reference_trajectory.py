@@ -1,6 +1,7 @@
-"""From rows of the table to a wish: the parts of a flight one after another, without jumps.
+"""Reference trajectories: the paper's, and those of manoeuvre styles, segment after segment without jumps.
 
-A course is azimuth (world, radians), distance in the plane (m) and altitude (m), a row for each frame.
+A course is azimuth (world, radians), distance in the plane (m) and altitude (m) of the drone as seen from the target, a
+row for each frame.
 """
 
 from __future__ import annotations
@@ -20,23 +21,24 @@ if TYPE_CHECKING:
     from cosfly.geometry.kernels import BoxIndex
 
 
-# How fast the wish goes from one part to the next, relative to the walker; within the drone's 10 m/s.
+# Greatest speeds of the reference relative to the target between segments; within the drone's 10 m/s.
 APART_MPS, ROUND_MPS, CLIMB_MPS = 4.0, 6.5, 3.5
-OVERSHOOT_M = 3.0  # of a drone that climbs or sinks as fast as it may, until it has turned round
-# Least and greatest speed of a distance and of a height that change all through a part.
+OVERSHOOT_M = 3.0  # of a drone that climbs or sinks at full speed, until it has turned
+# Least and greatest rate of a distance and of an altitude that change throughout a segment.
 EVEN_APART_MPS, EVEN_CLIMB_MPS = (0.8, 2.0), (1.0, 2.2)
 ROUNDING_S = 1.0  # standard deviation of the smoothing of corners
-STEADY_RAD = np.radians(20.0)  # a drone does not swing round for a walker who turns by less
+STEADY_RAD = np.radians(20.0)  # the drone ignores smaller turns of the target
 
-# Parameters are drawn anew so often, until sight less the share of places too near to a box is as good as this.
+# Parameters are drawn again, at most DRAWS times, until visibility minus the share of positions near boxes reaches
+# GOOD.
 DRAWS, GOOD = 32, 0.99
-WAY_ROUND = 0.2  # of that is the price of half the way round the walker from the part before
+WAY_ROUND = 0.2  # penalty of half a turn around the target from the previous segment
 
 
 def reference_of(
     names: list[str], scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator
 ) -> TrackingReference:
-    """Return the wish of a flight of equally long parts in these styles; the wish of `follow` is the scenario's own."""
+    """Return the reference of equally long segments in these styles; that of `follow` is the scenario's own."""
     num, paper = len(scenario.targets_m), scenario.reference
     course, paces_mps = np.empty((num, 3)), np.full(num, APART_MPS)
     cuts = np.linspace(0, num, len(names) + 1).round().astype(int).tolist()
@@ -55,7 +57,7 @@ def reference_of(
 def without_jumps(
     course: np.ndarray, scenario: Scenario, cfg: PlanConfig, paces_mps: np.ndarray | float = APART_MPS
 ) -> TrackingReference:
-    """Make a wish of a course, (n, 3): steps become ways at the speeds above and paces_mps, corners are rounded."""
+    """Return the reference of a course, (n, 3): jumps become motion at the speeds above and `paces_mps`, smoothed."""
     num, dt_s, paper = len(course), scenario.dt_s, scenario.reference
 
     def followed(values: np.ndarray, speeds_mps: np.ndarray | float) -> np.ndarray:
@@ -77,20 +79,22 @@ def without_jumps(
     )
 
 
-def places_of(course: np.ndarray, targets_m: np.ndarray, ground_m: np.ndarray) -> np.ndarray:
-    """Return the places of a course as it is drawn, jumps and all, (n, 3)."""
+def positions_of(course: np.ndarray, targets_m: np.ndarray, ground_m: np.ndarray) -> np.ndarray:
+    """Return the positions of a course with its jumps, (n, 3)."""
     away = course[:, 1:2] * np.column_stack([np.cos(course[:, 0]), np.sin(course[:, 0])])
     return np.column_stack([targets_m[:, :2] + away, ground_m + course[:, 2]])
 
 
-def going_on(scenario: Scenario, cfg: PlanConfig) -> TrackingReference:
-    """Return the wish of a flight that is to come from where the drone is (`flown_m`) to where the scenario wishes it,
-    as from one style to the next; altitudes that it comes from are no breach."""
-    paper, num_flown = scenario.reference, len(scenario.flown_m)
-    away = scenario.flown_m[-1] - scenario.targets_m[num_flown - 1]
-    altitude_m = scenario.flown_m[-1, 2] - scenario.ground_m[num_flown - 1]
+def continued_reference(scenario: Scenario, cfg: PlanConfig) -> TrackingReference:
+    """Return the reference from the drone's position (`past_m`) to the scenario's reference, as between two styles.
+
+    The altitudes at its start are within the bounds.
+    """
+    paper, num_past = scenario.reference, len(scenario.past_m)
+    away = scenario.past_m[-1] - scenario.targets_m[num_past - 1]
+    altitude_m = scenario.past_m[-1, 2] - scenario.ground_m[num_past - 1]
     course = np.column_stack([paper.heading_rad + paper.bearing_rad, paper.ground_distance_m, paper.altitude_m])
-    course[:num_flown] = [np.arctan2(away[1], away[0]), np.hypot(*away[:2]), altitude_m]
+    course[:num_past] = [np.arctan2(away[1], away[0]), np.hypot(*away[:2]), altitude_m]
     since_s = np.maximum(np.arange(len(course)) - scenario.start, 0) * scenario.dt_s
     room_m = OVERSHOOT_M - CLIMB_MPS / 2.0 * since_s
     return replace(
@@ -105,14 +109,14 @@ def _best_course(
     style: Style, part: slice, before: float | None, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig,
     rng: np.random.Generator,
 ) -> np.ndarray:  # fmt: skip
-    """Draw the parameters of a part until its places see the walker and are free, or take the best of DRAWS; (k, 3)."""
+    """Draw the course of a segment, (k, 3), that sees the target and is free, or the best of DRAWS."""
     from cosfly.geometry.kernels import signed_distances, visibility
 
     targets_m = scenario.targets_m[part]
     best, best_score = np.empty(0), -np.inf
     for _ in range(DRAWS):
         course = _course(style, scenario, part, before, rng)
-        places = places_of(course, targets_m, scenario.ground_m[part])
+        places = positions_of(course, targets_m, scenario.ground_m[part])
         is_near = signed_distances(obstacles, places, cfg.safety_distance_m)[0] < cfg.safety_distance_m
         score = float(visibility(obstacles, places, targets_m).mean()) - float(is_near.mean())
         if before is not None:
@@ -127,7 +131,7 @@ def _best_course(
 def _course(
     style: Style, scenario: Scenario, part: slice, before: float | None, rng: np.random.Generator
 ) -> np.ndarray:
-    """Draw the course of one part, (k, 3). before: azimuth where the part before ended."""
+    """Draw the course of one segment, (k, 3). before: azimuth at the end of the previous segment."""
     targets_m, heading_rad, dt_s = scenario.targets_m[part], scenario.reference.heading_rad[part], scenario.dt_s
     seconds = np.arange(len(targets_m)) * dt_s
     apart_m = _even(style.ground_distance_m, style.ground_distance_end_m, EVEN_APART_MPS, seconds, rng)
@@ -139,7 +143,7 @@ def _course(
     if style.hop_s is None:
         azimuth = _steady(heading_rad) + bearing + rng.uniform(*style.round_mps) * seconds / apart_m
         return np.column_stack([azimuth, apart_m, altitude_m])
-    # A walker who comes nearer is so far away at the end of the halt, one who leaves at its beginning.
+    # An approaching target is at this distance at the end of the halt, a leaving one at its start.
     share, places, begin = 0.5 * (1.0 + np.cos(bearing)), np.empty((len(targets_m), 2)), 0
     while begin < len(targets_m):
         end = min(begin + max(2, round(rng.uniform(*style.hop_s) / dt_s)), len(targets_m))
@@ -152,7 +156,7 @@ def _course(
 
 
 def _even(start: Range, end: Range | None, rates: Range, seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Go evenly from a value of one range to one of another, within the rates a second; who is there early stays."""
+    """Change evenly from a value of one range to one of another, within rates per second, then stay there."""
     first = rng.uniform(*start)
     if end is None:
         return np.full(len(seconds), first)
@@ -162,7 +166,7 @@ def _even(start: Range, end: Range | None, rates: Range, seconds: np.ndarray, rn
 
 
 def _steady(heading_rad: np.ndarray) -> np.ndarray:
-    """Keep a heading until the walker's differs by more than STEADY_RAD, then take that."""
+    """Keep a heading until the target's differs by more than STEADY_RAD, then take the target's."""
     kept, now = [], float(heading_rad[0])
     for heading in heading_rad.tolist():
         now = heading if abs(heading - now) > STEADY_RAD else now
@@ -179,12 +183,11 @@ def _slew(values: np.ndarray, steps_max: np.ndarray) -> np.ndarray:
     return np.array(followed)
 
 
-# --- wish -------------------------------------------------------------------------------------------------------------
-# What a flight is wished to be: the paper's, behind the walker; and the heading that wishes are counted from.
+# --- the paper's reference --------------------------------------------------------------------------------------------
 
 
 def follow(targets_m: np.ndarray, cfg: PlanConfig, dt_s: float = DT_S) -> TrackingReference:
-    """Return the paper's wish: behind the walker, the settings' height, distance and pitch throughout.
+    """Return the paper's reference: behind the target, at the settings' altitude, distance and pitch.
 
     Args:
         targets_m: (n, 3), n >= 2. dt_s: between points.
@@ -205,13 +208,12 @@ def follow(targets_m: np.ndarray, cfg: PlanConfig, dt_s: float = DT_S) -> Tracki
 
 
 def smoothed_headings(targets_m: np.ndarray, smoothing_s: float, dt_s: float = DT_S) -> np.ndarray:
-    """Walking direction of each point, radians, continuous, smoothed over time by a Gaussian.
+    """Return the target's heading at each point, (n,) radians, continuous, smoothed over time by a Gaussian.
 
     Args:
-        targets_m: (n, 3), n >= 2. smoothing_s: standard deviation; 0 takes the direction as it is. dt_s: between
-            points.
+        targets_m: (n, 3), n >= 2. smoothing_s: standard deviation; 0: none. dt_s: between points.
     Returns:
-        (n,). A walker who stands keeps the direction before; one who never moves faces east.
+        A target that stops keeps its heading; one that never moves faces east.
     """
     steps = np.diff(targets_m[:, :2], axis=0)
     moves = np.flatnonzero(np.hypot(steps[:, 0], steps[:, 1]) > 1e-6)

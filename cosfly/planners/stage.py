@@ -1,7 +1,7 @@
-"""Step 4: a drone flight for every walk.
+"""Step 4: a drone trajectory for every pedestrian trajectory.
 
-What a planner gives (contract.py) is measured, checked and filtered here, the same for all planners.
-Compiled code is imported by the functions that need it: `cosfly --help` goes without.
+The result of a planner (contract.py) is measured, checked and filtered here, in the same way for all planners.
+Compiled code is imported by the functions that need it, so that `cosfly --help` does not load it.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap, read_boxes
+from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M, PedestrianTrajectory, read_paths
 from cosfly.formats.segments import FOLLOW
 from cosfly.formats.traces import DroneTrace, write_traces
@@ -31,184 +32,186 @@ from cosfly.runtime.worker import Item, Outcome, Work
 
 if TYPE_CHECKING:
     from cosfly.geometry.kernels import BoxIndex
-    from cosfly.planners.maneuver_plan import Intent
+    from cosfly.planners.maneuver_plan import ManeuverPlan
 
 log = logging.getLogger(__name__)
 
-TRIES = 6  # of a flight that does not hold its styles: places in their ranges are drawn anew
+TRIES = 6  # of a trajectory that does not hold its styles; each draws new values from their ranges
+CROWN_SHARE = 1 / np.sqrt(3.0)  # of the half extents: the box within the ellipsoid within the box
 COORDINATE_MAX_M = 1e6  # beyond, float32 depth and four decimals of a metre in the files lose their meaning
 
 
-# --- one walk ---------------------------------------------------------------------------------------------------------
+# --- one trajectory ---------------------------------------------------------------------------------------------------
 
 
-def make_scenario(walk: PedestrianTrajectory, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
-    """Check a walk and give the scenario of it, with the paper's wish."""
+def make_scenario(pedestrian: PedestrianTrajectory, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
+    """Check a pedestrian trajectory and return its scenario, with the paper's reference trajectory."""
     from cosfly.geometry.kernels import segments_hit
     from cosfly.planners.reference_trajectory import follow
 
-    targets = walk.positions_m + np.array([0.0, 0.0, TARGET_HEIGHT_M])
+    targets = pedestrian.positions_m + np.array([0.0, 0.0, TARGET_HEIGHT_M])
+    where = pedestrian.path_id
     if len(targets) < 2:
-        raise NoPathError("a walk of one point cannot be followed", where=walk.path_id, expected="two points or more")
-    dt_s = step_s(walk.time_s)
-    uneven = np.abs(np.diff(walk.time_s) - dt_s) > 1e-3
+        raise NoPathError("the pedestrian trajectory has one point only", where=where, expected="two points or more")
+    dt_s = step_s(pedestrian.time_s)
+    uneven = np.abs(np.diff(pedestrian.time_s) - dt_s) > 1e-3
     if dt_s <= 0:
-        raise NoPathError("time does not increase", where=walk.path_id, got=f"steps of {dt_s:g} s")
+        raise NoPathError("time stamps do not increase", where=where, got=f"steps of {dt_s:g} s")
     if uneven.any():
-        where, got = f"{walk.path_id}: t[{int(np.argmax(uneven)) + 1}]", f"{np.diff(walk.time_s)[uneven][0]:g} s"
-        raise NoPathError("uneven time stamps", where=where, got=f"a step of {got}", expected=f"{dt_s:g} s, as most")
+        place, step = int(np.argmax(uneven)) + 1, np.diff(pedestrian.time_s)[uneven][0]
+        expected = f"{dt_s:g} s, the median step"
+        raise NoPathError(
+            "time stamps are uneven", where=f"{where}: t[{place}]", got=f"a step of {step:g} s", expected=expected
+        )
     if np.abs(targets).max() > COORDINATE_MAX_M:
         raise NoPathError(
-            "a coordinate is too large", where=walk.path_id, got=f"{np.abs(targets).max():g} m",
-            expected=f"at most {COORDINATE_MAX_M:g} m", fix="move the map's origin near the walks",
+            "a coordinate is too large", where=where, got=f"{np.abs(targets).max():g} m",
+            expected=f"at most {COORDINATE_MAX_M:g} m", fix="move the map's origin near the pedestrian trajectories",
         )  # fmt: skip
     hits = segments_hit(obstacles, targets[:-1], targets[1:])
     if hits.any():
         place = targets[int(np.argmax(hits))]
         raise NoPathError(
-            "the walk leads through an obstacle", where=walk.path_id,
+            "the pedestrian trajectory passes through an obstacle", where=where,
             got=f"{int(hits.sum())} steps inside a box, the first at ({place[0]:.1f}, {place[1]:.1f})",
-            fix="was it planned on this map?",
+            fix="plan on the map that the pedestrian trajectories were made for",
         )  # fmt: skip
-    return Scenario(walk.path_id, targets, np.array(walk.positions_m[:, 2]), follow(targets, cfg, dt_s), dt_s)
+    return Scenario(
+        pedestrian.path_id, targets, np.array(pedestrian.positions_m[:, 2]), follow(targets, cfg, dt_s), dt_s
+    )
 
 
-def draw_styles_of(walks: Sequence[PedestrianTrajectory], cfg: PlanConfig, seed: int) -> list[list[str]]:
-    """Draw the styles of the flights of a run, for each walk in order; by the first one's begin too: walks of other
-    maps have the same ids.
-    """
+def draw_styles_of(pedestrians: Sequence[PedestrianTrajectory], cfg: PlanConfig, seed: int) -> list[list[str]]:
+    """Draw the styles of the trajectories of a run, for each pedestrian trajectory in order."""
     from cosfly.planners.maneuver_plan import draw_styles
 
-    return draw_styles(walks, cfg, style_rng(walks[0], seed))
+    return draw_styles(pedestrians, cfg, style_rng(pedestrians[0], seed))
 
 
 def plan_trajectory(
-    walk: PedestrianTrajectory, obstacles: BoxIndex, cfg: PlanConfig, seed: int, screens: BoxIndex | None = None,
+    pedestrian: PedestrianTrajectory, obstacles: BoxIndex, cfg: PlanConfig, seed: int, screens: BoxIndex | None = None,
     styles: Sequence[str] = (),
 ) -> DroneTrace:  # fmt: skip
-    """Plan, measure and check one flight in styles drawn for it; in that of the paper instead where it fails and the
-    settings say so.
+    """Plan, measure and check one drone trajectory in given styles, or in `follow` where the settings allow that.
 
     Args:
-        screens: the obstacles that hide a person for certain, for a search; None: all do. styles: of its parts; none:
-            drawn as those of a first flight.
+        screens: Obstacles that certainly hide a person, for `reacquire`; None: all do. styles: of the segments; empty:
+            drawn as those of the first trajectory of a run.
     Raises:
-        NoPathError: the walk cannot be followed, or the planner's flight is not free of collisions.
+        NoPathError: If the pedestrian trajectory cannot be followed, or the planner's trajectory collides.
     """
-    from cosfly.planners.maneuver_plan import Intent, draw_intent, mirrored
+    from cosfly.planners.maneuver_plan import ManeuverPlan, draw_maneuvers, mirrored
 
-    scenario = make_scenario(walk, obstacles, cfg)
+    scenario = make_scenario(pedestrian, obstacles, cfg)
     screens = obstacles if screens is None else screens
-    styles = styles or draw_styles_of([walk], cfg, seed)[0]
+    styles = styles or draw_styles_of([pedestrian], cfg, seed)[0]
     for attempt in range(TRIES):
-        intent = draw_intent(styles, scenario, obstacles, screens, cfg, style_rng(walk, seed, attempt))
-        flown: DroneTrace | NoPathError
+        maneuvers = draw_maneuvers(styles, scenario, obstacles, screens, cfg, style_rng(pedestrian, seed, attempt))
+        found: DroneTrace | NoPathError
         try:
-            flown = _fly(walk, scenario, intent, obstacles, screens, cfg, seed)
+            found = _plan_once(pedestrian, scenario, maneuvers, obstacles, screens, cfg, seed)
         except NoPathError as error:
-            flown = error
-        if not intent.segments or (isinstance(flown, DroneTrace) and flown.drop_reason is None):
+            found = error
+        if not maneuvers.segments or (isinstance(found, DroneTrace) and found.drop_reason is None):
             break
-        styles = mirrored(styles)  # a wall may stand on the one side alone
-    is_last = not intent.segments or cfg.styles_fallback == "drop"
-    if isinstance(flown, DroneTrace) and (is_last or flown.drop_reason is None):
-        return flown
-    if isinstance(flown, NoPathError) and is_last:
-        raise flown
-    reason, not_held = ("no_path", None) if isinstance(flown, NoPathError) else (flown.drop_reason, flown.not_held)
-    follows = _fly(walk, scenario, Intent(scenario.reference), obstacles, screens, cfg, seed)
-    return replace(follows, instead_of=f"{intent.styles}: {reason}", not_held=not_held)
+        styles = mirrored(styles)  # a wall may block one side only
+    is_last = not maneuvers.segments or cfg.styles_fallback == "drop"
+    if isinstance(found, DroneTrace) and (is_last or found.drop_reason is None):
+        return found
+    if isinstance(found, NoPathError) and is_last:
+        raise found
+    reason, not_held = ("no_path", None) if isinstance(found, NoPathError) else (found.drop_reason, found.not_held)
+    follow = _plan_once(pedestrian, scenario, ManeuverPlan(scenario.reference), obstacles, screens, cfg, seed)
+    return replace(follow, instead_of=f"{maneuvers.styles}: {reason}", not_held=not_held)
 
 
 def plan_on(
-    path_id: str, targets_m: np.ndarray, dt_s: float, flown_m: np.ndarray, obstacles: BoxIndex, cfg: PlanConfig
+    path_id: str, targets_m: np.ndarray, dt_s: float, past_m: np.ndarray, obstacles: BoxIndex, cfg: PlanConfig
 ) -> np.ndarray:
-    """Plan a flight of the style `follow` on from where a drone is, with foresight.
+    """Continue a drone trajectory in the style `follow` from where the drone is, with foresight.
 
     Args:
-        targets_m: (n, 3) hip points of the whole walk. flown_m: (k, 3), 3 <= k < n, where the drone was at the first.
+        targets_m: (n, 3) hip points of the whole pedestrian trajectory. past_m: (k, 3), 3 <= k < n, the drone's
+            positions at the first k of them.
     Returns:
-        (n, 3), which begins with `flown_m`; from there on it keeps all limits of the settings.
+        (n, 3), which begins with `past_m` and keeps all limits of the settings after it.
+    Raises:
+        NoPathError: If no trajectory is found.
     """
-    from cosfly.planners.reference_trajectory import follow, going_on
     from cosfly.planners.foresight import plan
+    from cosfly.planners.reference_trajectory import continued_reference, follow
 
     ground_m = targets_m[:, 2] - TARGET_HEIGHT_M
-    scenario = Scenario(path_id, targets_m, ground_m, follow(targets_m, cfg, dt_s), dt_s, flown_m)
-    scenario = replace(scenario, reference=going_on(scenario, cfg))
+    scenario = Scenario(path_id, targets_m, ground_m, follow(targets_m, cfg, dt_s), dt_s, past_m)
+    scenario = replace(scenario, reference=continued_reference(scenario, cfg))
     try:
         return plan(scenario, obstacles, cfg, rng_for(0, "plan", path_id)).positions_m
     except NoPathError:
-        turning = replace(scenario, turns_round=True)
+        turning = replace(scenario, turns_back=True)
         return plan(turning, obstacles, cfg, rng_for(0, "plan", path_id)).positions_m
 
 
-def style_rng(walk: PedestrianTrajectory, seed: int, attempt: int = 0) -> np.random.Generator:
-    """Return the generator of how a flight's styles are flown, by the walk's begin too."""
-    x_m, y_m = np.round(walk.positions_m[0, :2], 2) + 0.0
-    return rng_for(seed, "style", f"{walk.path_id}/{x_m:.2f}/{y_m:.2f}" + (f"/{attempt}" if attempt else ""))
+def style_rng(pedestrian: PedestrianTrajectory, seed: int, attempt: int = 0) -> np.random.Generator:
+    """Return the random generator of a trajectory's styles; it depends on the position of the pedestrian's start,
+    because pedestrian trajectories of different maps have equal ids."""
+    x_m, y_m = np.round(pedestrian.positions_m[0, :2], 2) + 0.0
+    return rng_for(seed, "style", f"{pedestrian.path_id}/{x_m:.2f}/{y_m:.2f}" + (f"/{attempt}" if attempt else ""))
 
 
-def _fly(
-    walk: PedestrianTrajectory,
-    scenario: Scenario,
-    intent: Intent,
-    obstacles: BoxIndex,
-    screens: BoxIndex,
-    cfg: PlanConfig,
-    seed: int,
-) -> DroneTrace:
+def _plan_once(
+    pedestrian: PedestrianTrajectory, scenario: Scenario, maneuvers: ManeuverPlan, obstacles: BoxIndex,
+    screens: BoxIndex, cfg: PlanConfig, seed: int,
+) -> DroneTrace:  # fmt: skip
     from cosfly.geometry.kernels import swept_distances, visibility
-    from cosfly.planners.maneuver_plan import NOT_HELD, ended_by_order, tell_not_held, view_of, why_not_held
+    from cosfly.planners.maneuver_plan import NOT_HELD, describe_not_held, end_with_order, view_of, why_not_held
 
-    scenario = replace(scenario, reference=intent.reference)
-    made = load_planner(cfg.planner)(scenario, obstacles, cfg, rng_for(seed, "plan", walk.path_id))
+    scenario = replace(scenario, reference=maneuvers.reference)
+    made = load_planner(cfg.planner)(scenario, obstacles, cfg, rng_for(seed, "plan", pedestrian.path_id))
     positions = made.positions_m
-    if intent.order is not None:
-        intent, positions = ended_by_order(intent, positions, scenario, obstacles, cfg)
+    if maneuvers.order is not None:
+        maneuvers, positions = end_with_order(maneuvers, positions, scenario, obstacles, cfg)
     positions = np.round(positions, 4)  # measured as it is written
     targets = np.round(scenario.targets_m, 4)
     clearances, _, _ = swept_distances(obstacles, positions, CLEARANCE_CAP_M)
     if clearances.min() < cfg.relaxed_safety_m - CLEARANCE_TOLERANCE_M:
         raise NoPathError(
-            f"planner {cfg.planner} found no flight that is free of collisions", where=walk.path_id,
+            f"planner {cfg.planner} found no trajectory that is free of collisions", where=pedestrian.path_id,
             got=f"a least clearance of {clearances.min():.2f} m",
-            expected=f"{cfg.relaxed_safety_m:g} m all the way",
+            expected=f"at least {cfg.relaxed_safety_m:g} m everywhere",
         )  # fmt: skip
-    seen, judged = visibility(obstacles, positions, targets), intent.reference.keeps_sight
-    seen_past_screens = visibility(screens, positions, targets) if intent.searches else seen
-    pitch, yaw = view_of(intent, positions, targets, seen_past_screens, scenario.dt_s)
-    rotations = np.degrees(np.stack([pitch, yaw, np.zeros_like(yaw)], axis=1))
-    counted = seen[judged] if judged.any() else seen
+    seen, is_judged = visibility(obstacles, positions, targets), maneuvers.reference.keeps_sight
+    seen_past_screens = visibility(screens, positions, targets) if maneuvers.searches else seen
+    pitch, yaw = view_of(maneuvers, positions, targets, seen_past_screens, scenario.dt_s)
+    counted = seen[is_judged] if is_judged.any() else seen
     metrics = trajectory_metrics(positions, targets, counted, clearances, scenario.ground_m, scenario.dt_s)
-    reason = drop_reason(metrics, cfg, made.is_converged, is_judged_by_sight=bool(judged.any()))
-    reason = reason or why_not_held(intent, scenario, positions, seen_past_screens)
+    reason = drop_reason(metrics, cfg, made.is_converged, checks_visibility=bool(is_judged.any()))
+    reason = reason or why_not_held(maneuvers, scenario, positions, seen_past_screens)
     return DroneTrace(
-        path_id=walk.path_id,
+        path_id=pedestrian.path_id,
         planner=cfg.planner,
-        time_s=walk.time_s,
+        time_s=pedestrian.time_s,
         positions_m=positions,
-        rotations_deg=rotations,
+        rotations_deg=np.degrees(np.stack([pitch, yaw, np.zeros_like(yaw)], axis=1)),
         targets_m=targets,
         visibility=seen,
         clearances_m=clearances,
         metrics=metrics,
         solver=made.solver,
         drop_reason=reason,
-        not_held=tell_not_held(intent, scenario, positions, obstacles, cfg) if reason == NOT_HELD else None,
-        segments=intent.segments,
-        mission=intent.mission,
-        pace=walk.pace,
+        not_held=describe_not_held(maneuvers, scenario, positions, obstacles, cfg) if reason == NOT_HELD else None,
+        segments=maneuvers.segments,
+        mission=maneuvers.mission,
+        pace=pedestrian.pace,
     )
 
 
 def drop_reason(
-    metrics: dict[str, float], cfg: PlanConfig, is_converged: bool, *, is_judged_by_sight: bool = True
+    metrics: dict[str, float], cfg: PlanConfig, is_converged: bool, *, checks_visibility: bool = True
 ) -> str | None:
-    """Return why the prefilter before rendering rejects a flight, None if it passes (sec:step6, sec:dataset_stats)."""
+    """Return why the filter before rendering rejects a trajectory, None if it passes (sec:step6, sec:dataset_stats)."""
     if not is_converged:
         return "not_converged"
-    if is_judged_by_sight and metrics["five_ray_mean"] < cfg.five_ray_mean_min:
+    if checks_visibility and metrics["five_ray_mean"] < cfg.five_ray_mean_min:
         return "low_visibility"
     if metrics["accel_rms_mps2"] > cfg.accel_rms_max_mps2:
         return "high_acceleration"
@@ -220,35 +223,64 @@ def drop_reason(
 # --- stage ------------------------------------------------------------------------------------------------------------
 
 
-def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
-    """Load and index the map once; give the function that plans one walk."""
+def screens_of(box_map: BoxMap) -> BoxIndex:
+    """Index what certainly hides a person: obstacles, but only the box within the ellipsoid of a tree crown's box."""
     from cosfly.geometry.kernels import obstacle_index
-    from cosfly.planners.reacquire import screens_of
+
+    is_crown = box_map.is_any_of({KINDS["Vegetation"]})
+    half_extents = np.where(is_crown[:, None], CROWN_SHARE * box_map.half_extents, box_map.half_extents)
+    return obstacle_index(replace(box_map, half_extents=half_extents))
+
+
+def load_obstacles(simplified_map: Path) -> tuple[BoxIndex, BoxIndex]:
+    """Read a map; return its obstacles and its screens (`screens_of`)."""
+    from cosfly.geometry.kernels import obstacle_index
 
     box_map = read_boxes(simplified_map)
-    obstacles, screens = obstacle_index(box_map), screens_of(box_map)
+    return obstacle_index(box_map), screens_of(box_map)
+
+
+def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
+    """Load the map once; return the function that plans for one pedestrian trajectory."""
+    obstacles, screens = load_obstacles(simplified_map)
     warm_up(cfg)
 
     def work(item: Item) -> Outcome:
-        walk, styles = item.payload
-        trace = plan_trajectory(walk, obstacles, cfg, seed, screens, styles)
+        pedestrian, styles = item.payload
+        trace = plan_trajectory(pedestrian, obstacles, cfg, seed, screens, styles)
         return Outcome(trace.as_json(), trace.drop_reason)
 
     return work
 
 
 def warm_up(cfg: PlanConfig) -> None:
-    """Compile or load compiled code before the first walk, so that times per walk are planning times."""
+    """Compile or load compiled code before the first item, so that its time is planning time only."""
     from cosfly.geometry.kernels import index_boxes
 
-    walk = np.arange(8.0)
-    positions = np.column_stack([0.5 * walk, np.zeros(8), np.zeros(8)])
-    # One box that hides the walk from behind: the search for a start runs too.
+    steps = np.arange(8.0)
+    positions = np.column_stack([0.5 * steps, np.zeros(8), np.zeros(8)])
+    # One box hides the pedestrian from behind, so that the search for a start is compiled too.
     obstacles = index_boxes(np.array([[-10.0, 0.0, 15.0]]), np.array([[1.0, 3.0, 15.0]]), np.eye(3)[None])
-    cfg = cfg.model_copy(update={"styles": {FOLLOW: 1.0}})
-    plan_trajectory(
-        PedestrianTrajectory("warm-up", positions[:, :2], DT_S * walk, positions, np.ones(8)), obstacles, cfg, 0
-    )
+    pedestrian = PedestrianTrajectory("warm-up", positions[:, :2], DT_S * steps, positions, np.ones(8))
+    plan_trajectory(pedestrian, obstacles, cfg.model_copy(update={"styles": {FOLLOW: 1.0}}), 0)
+
+
+def read_inputs(simplified_map: Path, paths: Path) -> tuple[BoxMap, list[PedestrianTrajectory]]:
+    """Read a map and its pedestrian trajectories; raise InputError where there are none, or two with one id."""
+    box_map, pedestrians = read_boxes(simplified_map), read_paths(paths)
+    where = f"{paths}: paths"
+    if not pedestrians:
+        raise InputError("there are no pedestrian trajectories", where=where, fix="run the pedestrians stage again")
+    (path_id, count), *_ = Counter(pedestrian.path_id for pedestrian in pedestrians).most_common(1)
+    if count > 1:
+        raise InputError("a path id occurs more than once", where=where, got=path_id, expected="unique ids")
+    return box_map, pedestrians
+
+
+def make_items(pedestrians: Sequence[PedestrianTrajectory], cfg: PlanConfig, seed: int) -> list[Item]:
+    """Return the work items of a run: a pedestrian trajectory and the styles drawn for it each."""
+    styles = draw_styles_of(pedestrians, cfg, seed)
+    return [Item(own.path_id, (own, names)) for own, names in zip(pedestrians, styles, strict=True)]
 
 
 def run(
@@ -262,13 +294,16 @@ def run(
     watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
-    """Reads a simplified map and `path.json`, writes `drone_trace.json` and `plan.png`; gives the former's path.
+    """Read a simplified map and `path.json`; write `drone_trace.json` and `plan.png`.
 
-    Flights that the prefilter drops are written too, with their reason; a walk without a flight is a counted failure.
+    Trajectories that the filter drops are written too, with their reason; a pedestrian trajectory without a drone
+    trajectory is a counted failure.
 
+    Returns:
+        The path of `drone_trace.json`.
     Raises:
-        InputError: a file is not what it must be.
-        NothingKept: not one walk has a flight, or the prefilter dropped them all.
+        InputError: If an input file is invalid.
+        NothingKept: If no trajectory is found, or the filter dropped all of them.
     """
     from cosfly.planners.overview import draw_trajectories
 
@@ -277,17 +312,13 @@ def run(
     product, picture = out / "drone_trace.json", out / "plan.png"
     if stage.is_complete:
         return product
-    box_map, walks = read_boxes(simplified_map), read_paths(paths)
-    check_ids(walks, paths)
+    box_map, pedestrians = read_inputs(simplified_map, paths)
     for remark in cfg.remarks():
         log.warning("%s", remark)
-    items = [Item(w.path_id, (w, styles)) for w, styles in zip(walks, draw_styles_of(walks, cfg, seed), strict=True)]
+    items = make_items(pedestrians, cfg, seed)
     finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers, watch=watch)
-    traces, seconds = [], []
-    for record in finished.records:
-        if not isinstance(record, Failed):
-            traces.append(DroneTrace.from_json(record.result, f"{stage.path}/items.jsonl: {record.id}"))
-            seconds.append(record.seconds)
+    records = [record for record in finished.records if not isinstance(record, Failed)]
+    traces = [DroneTrace.from_json(record.result, f"{stage.path}/items.jsonl: {record.id}") for record in records]
     if not traces:
         raise stage.nothing_kept(finished.tally)
     header = {"map": box_map.name, "planner": cfg.planner, "seed": seed, "settings": cfg.recorded()}
@@ -295,13 +326,14 @@ def run(
         if trace.not_held:
             log.warning("%s: style_not_held: %s", trace.path_id, trace.not_held)
     write_traces(product, traces, header)
-    write_bytes(picture, draw_trajectories(box_map, walks, traces))
+    write_bytes(picture, draw_trajectories(box_map, pedestrians, traces))
+    seconds = [record.seconds for record in records]
     stage.finish([product, picture], finished.tally, **_facts(box_map, traces, seconds))
     return product
 
 
 def _facts(box_map: BoxMap, traces: list[DroneTrace], seconds: list[float]) -> dict:
-    """What the manifest says beyond the counts; planning times stand here and not in the product."""
+    """Return what the manifest records beyond the counts; planning times are written there and not to the product."""
     times_ms = 1000.0 * np.array(seconds)
     names = ("five_ray_mean", "clearance_min_m", "altitude_mean_m", "target_distance_mean_m", "smoothness_score")
     return {
@@ -313,7 +345,7 @@ def _facts(box_map: BoxMap, traces: list[DroneTrace], seconds: list[float]) -> d
 
 
 def _styles_flown(traces: list[DroneTrace]) -> dict:
-    """Count the parts of kept flights by style, and those that the map did not hold; nothing where all follow."""
+    """Count the segments of kept trajectories by style, and those not held; empty where all are `follow`."""
     styled = [trace for trace in traces if trace.segments or trace.instead_of]
     if not styled:
         return {}
@@ -326,12 +358,3 @@ def _styles_flown(traces: list[DroneTrace]) -> dict:
         "styles_dropped": dict(sorted(Counter(dropped).items())),
         "styles_not_held": {trace.path_id: trace.not_held for trace in styled if trace.not_held},
     }
-
-
-def check_ids(walks: list[PedestrianTrajectory], paths: Path) -> None:
-    """Raise InputError where there is no walk, or two of one id."""
-    if not walks:
-        raise InputError("there are no paths", where=f"{paths}: paths", fix="run the pedestrians stage again")
-    (path_id, count), *_ = Counter(walk.path_id for walk in walks).most_common(1)
-    if count > 1:
-        raise InputError("a path id occurs more than once", where=f"{paths}: paths", got=path_id)

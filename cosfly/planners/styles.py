@@ -1,9 +1,8 @@
-"""The table of styles: how the drone stands to the walker while a part of a flight lasts, and which decisions that
-shows.
+"""The table of manoeuvre styles: where the drone is relative to the target during a segment, and for which decisions.
 
-A row is data; `courses.py` makes a wish of it, `plan.style_ranges` can replace its ranges, and a new row needs no
-code. Labels come from the motion that was flown, not from the style. Two styles are more than a row: `reacquire` looks
-for a place where the walker disappears, `return_home` ends with a mission.
+A row is data: `reference_trajectory.py` makes a reference from it and `plan.style_ranges` can replace its ranges; a new
+row needs no code. Labels come from the planned motion, not from the style. Two styles are more than a row: `reacquire`
+needs a place where the target disappears, `return_home` ends with a mission.
 """
 
 from __future__ import annotations
@@ -15,24 +14,23 @@ from typing import Any
 from cosfly.formats.segments import FOLLOW
 
 REACQUIRE, RETURN_HOME = "reacquire", "return_home"
-ALTITUDE_LEAST_M = 8.0  # bound of every style but `follow`, unless their ranges begin lower
+ALTITUDE_LEAST_M = 8.0  # bound of every style but `follow`, unless its range begins lower
 OTHER_SIDE = "~"  # before the name of a style: the mirror image
 
-Range = tuple[float, float]  # a value is drawn evenly from it for each part of a flight
+Range = tuple[float, float]  # a value is drawn uniformly from it for each segment
 
 
 @dataclass(frozen=True)
 class Style:
-    """One row. Distances are in the plane, altitudes above the ground under the walker.
+    """One row. Distances are in the plane, altitudes above the ground under the target.
 
-    bearing_deg: of the drone as seen from the walker, counter-clockwise from the walking direction: 0 in front, 180
-    behind; None: where the part before ended, anywhere at the beginning; either_side: half of the parts are mirrored.
-    The values with `end` are reached at the end of the part, None: as at its beginning. climb_m: while it searches.
-    round_mps: speed round the walker, positive counter-clockwise. hop_s: the drone stands still, and so often takes a
-    new place, of which the bearing is that of the halt's beginning. pace_mps: how fast the distance changes on the way
-    there.
-    purpose: what it is for, in the words of the decisions. suits: "uneven", a walker who stops and hurries, which the
-    drone answers; "straight", one who goes straight on; else any.
+    purpose: labels of the decisions that the style is for. bearing_deg: of the drone as seen from the target,
+    counter-clockwise from its heading: 0 in front, 180 behind; None: as at the end of the previous segment.
+    either_side: half of the segments are mirrored. Values with `end` are reached at the end of the segment; None: as at
+    its start. climb_m: during a search. round_mps: speed around the target, positive counter-clockwise. hop_s: the
+    drone hovers this long before it takes a new position, at the bearing of the start of the halt. pace_mps: rate of
+    change of the distance between segments. suits: "uneven", a pedestrian who stops and hurries; "straight", one who
+    goes straight on; "": any.
     """
 
     purpose: tuple[str, ...]
@@ -49,8 +47,7 @@ class Style:
     suits: str = ""
 
 
-# Distances and heights keep the slant distance from 10 to 60 m. Nearer than some 8 m in the plane, a low drone would
-# have to fly faster round a bend than it can.
+# Slant distances are 10 to 60 m. Below some 8 m in the plane, a low drone could not keep up around a bend.
 TABLE: dict[str, Style] = {
     "orbit_left": Style(("circle_left",), (8.0, 17.0), (8.0, 22.0), round_mps=(-6.0, -4.0)),
     "orbit_right": Style(("circle_right",), (8.0, 17.0), (8.0, 22.0), round_mps=(4.0, 6.0)),
@@ -73,17 +70,17 @@ TABLE: dict[str, Style] = {
     "top": Style(("track_straight",), (20.0, 26.0), (50.0, 54.0), (150.0, 210.0)),
 }  # fmt: skip
 
-# Where a walker is lost behind a house or a tree, and from where the drone searches; how stands in reacquire.py.
+# Ranges of reacquire.py: where the target is lost, and from where the drone searches.
 HIDING = Style(
     ("search_to_reacquire_target",), (18.0, 42.0), (8.0, 16.0), ground_distance_end_m=(8.0, 16.0), climb_m=(12.0, 26.0)
 )
 
 NAMES = (FOLLOW, *TABLE, REACQUIRE, RETURN_HOME)
-WHOLE = (REACQUIRE, RETURN_HOME)  # take a whole flight; the others may take parts
+WHOLE = (REACQUIRE, RETURN_HOME)  # styles of whole trajectories; the others are of segments
 
 
 def suits(name: str) -> str:
-    """Return what walker a style suits, by its name."""
+    """Return what kind of pedestrian a style suits."""
     row = ROWS.get(name.removeprefix(OTHER_SIDE))
     return "" if row is None else row.suits
 
@@ -100,9 +97,9 @@ def with_ranges(row: Style, ranges: Mapping[str, Range]) -> Style:
     known = [one.name for one in fields(Style) if isinstance(getattr(row, one.name), tuple) and one.name != "purpose"]
     for name, (low, high) in ranges.items():
         if name not in known:
-            raise ValueError(f"{name} is not a range of this style; its ranges are {', '.join(known)}")
+            raise ValueError(f"{name} is not a range of this style; choose from {', '.join(known)}")
         if low > high:
-            raise ValueError(f"{name} is a least and a greatest value, got {low:g} before {high:g}")
+            raise ValueError(f"{name} must be [least, greatest], got [{low:g}, {high:g}]")
         if low <= 0 and name not in ("bearing_deg", "round_mps", "climb_m"):
             raise ValueError(f"{name} must be greater than 0, got {low:g}")
     given: dict[str, Any] = dict(ranges)

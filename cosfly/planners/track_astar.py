@@ -1,16 +1,14 @@
-"""TA*+Smooth: a search for sight on a time-layered voxel grid, then smoothing (subsec:appendix_planner_tastar).
+"""TA*+Smooth: a visibility search on a time-layered voxel grid, then smoothing (subsec:appendix_planner_tastar).
 
-The search is the paper's. The smoothing is smoothing.py, as for foresight, and not the paper's shortcuts and elastic
-band.
+The search is the paper's; the smoothing is ours (smoothing.py), not the paper's shortcuts and elastic band.
 
-The state is a voxel and a time. A layer lasts as many frames as the drone needs at its speed limit to reach all 26
+A state is a voxel and a time. A layer lasts as many frames as the drone needs at its speed limit to reach all 26
 neighbours of a voxel (two, with the paper's settings), so that no direction is dearer than another; frames between
-layers are interpolated. All states of a layer have the same way to go in time, so a best-first order by cost alone with
-a beam per layer is the whole search:
-there is no heuristic to add. The paper names the five weights but not the terms; the terms are these, per layer:
+layers are interpolated. All states of a layer have the same time left, so a best-first order by cost with a beam per
+layer needs no heuristic. The paper names the five weights but not the terms; the terms are these, per layer:
 
-    tracking    distance to the ring round the target at the wished distance and altitude, in voxels; to the wished
-                place on it where the wish is not that of the paper, to which any bearing will do
+    tracking    distance to the ring around the target at the reference distance and altitude, in voxels; to the
+                reference position on it where the bearing counts
     visibility  1 - five-ray visibility
     path        length of the move, in voxels
     safety      (1 - clearance / influence)^2 below the influence distance; below the safety distance a voxel is closed
@@ -33,11 +31,9 @@ from cosfly.planners.smoothing import smooth_trajectory
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import NoPathError
 
-# --- search -----------------------------------------------------------------------------------------------------------
-# The search of TA*+Smooth, compiled: layer by layer over voxels, the cheapest states kept. Its terms: track_astar.py.
+# --- search, compiled -------------------------------------------------------------------------------------------------
 
-
-ALTITUDE_ROUNDING_M = 1e-6  # of altitudes
+ALTITUDE_ROUNDING_M = 1e-6
 
 # The 26 neighbours of a voxel and itself.
 MOVES = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.int64)
@@ -51,8 +47,8 @@ TRACKING, VISIBILITY, PATH, SAFETY, SMOOTHNESS = range(5)
 class Voxels(NamedTuple):
     """The grid of one search. low: (3,) m, centre of voxel (0, 0, 0). shape: (3,). size: (3,) m.
 
-    columns: (nx, ny) bool, inside the corridor. Caches, filled when first asked: clearances (cells,) m, NaN is unknown;
-    edges (cells, 27): UNKNOWN, FREE or BLOCKED.
+    columns: (nx, ny) bool, inside the corridor. Caches: clearances (cells,) m, NaN is unknown; edges (cells, 27):
+    UNKNOWN, FREE or BLOCKED.
     """
 
     low: np.ndarray
@@ -66,8 +62,8 @@ class Voxels(NamedTuple):
 class Costs(NamedTuple):
     """Weights and lengths of the search; weights: (5,), places below.
 
-    ring_m, least_z, preferred_z, greatest_z: (m,) of each layer. wished: (m, 2) place in the plane that is wished at
-    each layer, NaN where any on the ring will do. sight: (m,) weight of the blocked part of the rays. start: (3,).
+    ring_m, least_z, preferred_z, greatest_z: (m,) of each layer. requested: (m, 2) reference position in the plane, NaN
+    where any on the ring is allowed. sight: (m,) weight of the blocked part of the rays. start: (3,).
     """
 
     weights: np.ndarray
@@ -84,8 +80,7 @@ class Costs(NamedTuple):
 
 @njit(cache=True)
 def search_layers(targets, reaches_m, voxels, costs, index, beam, corridor_m):
-    """Return the cell of each layer, (m,), all -1 if there is no way; the cost of the way; the number of places looked
-    from.
+    """Return the cell of each layer, (m,), all -1 if there is no path; its cost; the number of visibility queries.
 
     targets: (m, 3) hip points of the layers. reaches_m: (m,) longest move into each layer.
     """
@@ -136,7 +131,7 @@ def _move_tables(size):
 
 @njit(cache=True)
 def _first_layer(target, voxels, costs, index, corridor_m, best, came_from, came_by, touched):
-    """Put the free cells round the first target into `touched`; they cost the way from the plain start."""
+    """Put the free cells around the first target into `touched`; they cost the distance from the reference start."""
     num_y, num_z, num = voxels.shape[1], voxels.shape[2], 0
     for ix in range(voxels.shape[0]):
         for iy in range(num_y):
@@ -158,7 +153,7 @@ def _first_layer(target, voxels, costs, index, corridor_m, best, came_from, came
 def _expand(
     sources, cost_before, moved, layer, reach_m, lengths, bends, voxels, costs, index, best, came_from, came_by, touched
 ):
-    """Put the cells that can be reached into `touched`, the cheapest way there into `best`, `came_from`, `came_by`."""
+    """Put the reachable cells into `touched`, the cheapest move there into `best`, `came_from` and `came_by`."""
     num_x, num_y, num_z, num = voxels.shape[0], voxels.shape[1], voxels.shape[2], 0
     for b in range(len(sources)):
         cell = sources[b]
@@ -187,9 +182,9 @@ def _expand(
 
 @njit(cache=True)
 def _choose(touched, best, target, layer, voxels, costs, index, beam):
-    """Add the cost of being there and give the `beam` cheapest cells, their costs, and how many were looked from.
+    """Add the cost of each cell; return the `beam` cheapest cells, their costs, and the number of visibility queries.
 
-    Visibility is asked only where the cost without it is within the beam.
+    Visibility is computed only where the cost without it is within the beam.
     """
     bounds, reach_m = np.empty(len(touched)), 0.0
     for k in range(len(touched)):
@@ -197,23 +192,23 @@ def _choose(touched, best, target, layer, voxels, costs, index, beam):
         x, y, z = _place(cell, voxels)
         away = np.sqrt((x - target[0]) ** 2 + (y - target[1]) ** 2)
         reach_m, aside = max(reach_m, away), away - costs.ring_m[layer]
-        wished_x, wished_y = costs.requested[layer, 0], costs.requested[layer, 1]
-        if not np.isnan(wished_x):
-            aside = np.sqrt((x - wished_x) ** 2 + (y - wished_y) ** 2)
-        climb, gap = z - costs.preferred_z[layer], voxels.clearances[cell]  # known: the way here has asked for it
+        requested_x, requested_y = costs.requested[layer, 0], costs.requested[layer, 1]
+        if not np.isnan(requested_x):
+            aside = np.sqrt((x - requested_x) ** 2 + (y - requested_y) ** 2)
+        climb, gap = z - costs.preferred_z[layer], voxels.clearances[cell]  # known from the expansion
         near = max(0.0, 1.0 - gap / costs.influence_m)
         off = costs.weights[TRACKING] * np.sqrt(aside * aside + climb * climb) / voxels.size[0]
         bounds[k] = best[cell] + off + costs.weights[SAFETY] * near * near
     horizon = make_horizon(index, target, reach_m, 0.0)
     total, num = np.full(len(touched), np.inf), 0
     limit = np.partition(bounds, beam - 1)[beam - 1] if len(touched) > beam else np.inf
-    for k in range(len(touched)):  # those that would stay if all saw everything
+    for k in range(len(touched)):  # those within the beam if all cells saw everything
         if bounds[k] <= limit:
             total[k] = bounds[k] + costs.sight[layer] * (1.0 - _look(touched[k], voxels, index, horizon, target))
             num += 1
     if num < len(touched):
         limit = np.partition(total, beam - 1)[beam - 1]
-    for k in range(len(touched)):  # and those that are cheaper than what has turned out to be hidden
+    for k in range(len(touched)):  # and those cheaper than cells that turned out to be hidden
         if total[k] == np.inf and bounds[k] < limit:
             total[k] = bounds[k] + costs.sight[layer] * (1.0 - _look(touched[k], voxels, index, horizon, target))
             num += 1
@@ -252,10 +247,10 @@ def _place(cell, voxels):
 
 @njit(cache=True)
 def _clearance(cell, voxels, costs, index):
-    """Signed distance of a cell's centre to the nearest box, m, at most what the costs ask for."""
+    """Return the signed distance of a cell's centre to the nearest box, m, at most what the costs need."""
     if np.isnan(voxels.clearances[cell]):
         x, y, z = _place(cell, voxels)
-        # Farther than the influence matters to the edges alone: beyond this no edge needs a closer look.
+        # Beyond the influence, clearance matters to the edges only, and beyond this not even to them.
         reach_m = max(costs.influence_m, costs.safety_m + np.sqrt((voxels.size**2).sum()) / 2.0)
         voxels.clearances[cell], _ = nearest_box(index, x, y, z, reach_m)
     return voxels.clearances[cell]
@@ -275,14 +270,14 @@ def _edge_is_free(cell, there, voxels, costs, index):
     return collect_hits(index, ax, ay, az, bx, by, bz, costs.safety_m, np.empty(1, dtype=np.int64)) == 0
 
 
-MAX_CELLS = 4_000_000  # a walk of 50-100 m needs about 50 000
+MAX_CELLS = 4_000_000  # a pedestrian trajectory of 50-100 m needs about 50 000
 
 
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan one flight (the signature of `planners.contract`); nothing here is random.
+    """Plan one trajectory (the signature of `planners.contract`); nothing here is random.
 
     Raises:
-        NoPathError: the grid is too large, or no voxels lead along this walk.
+        NoPathError: If the grid is too large, or no free voxels connect start and end.
     """
     for safety_m in (cfg.safety_distance_m, cfg.relaxed_safety_m):
         found = search_trajectory(scenario, obstacles, cfg, safety_m)
@@ -290,18 +285,18 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
             raw, facts = found
             points, smoothing = smooth_trajectory(raw, scenario, obstacles, cfg, safety_m)
             return Plan(points, {"safety_m": safety_m, **facts, **smoothing})
-    raise scenario.no_way("no free voxels lead along this walk", cfg.relaxed_safety_m)
+    raise scenario.no_path_error("no free voxels connect start and end", cfg.relaxed_safety_m)
 
 
 def search_trajectory(
     scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, safety_m: float
 ) -> tuple[np.ndarray, dict] | None:
-    """Search the raw flight of one walk.
+    """Search the raw trajectory.
 
     Args:
         safety_m: least distance to obstacles of points and of the lines between them.
     Returns:
-        (n, 3) one position per target, and facts of the search; None if there is no way.
+        (n, 3) one position per target, and facts of the search; None if there is no path.
     """
     settings, targets, reference = cfg.track_astar, scenario.targets_m, scenario.reference
     voxels = make_voxels(scenario, cfg)
@@ -327,14 +322,14 @@ def search_trajectory(
 
 
 def frames_per_layer(cfg: PlanConfig, dt_s: float = DT_S) -> int:
-    """Frames that the drone needs at most to reach a neighbouring voxel."""
+    """Return the frames that the drone needs at most to reach a neighbouring voxel."""
     settings = cfg.track_astar
     diagonal_m = float(np.sqrt(2.0 * settings.voxel_m**2 + settings.voxel_height_m**2))
     return int(np.ceil(diagonal_m / (cfg.speed_max_mps * dt_s) - 1e-9))
 
 
 def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
-    """Lay the grid round a walk: the corridor in the plane, the altitude bounds above it."""
+    """Return the grid around a pedestrian trajectory: the corridor in the plane, between the altitude bounds."""
     settings, flat, reference = cfg.track_astar, scenario.targets_m[:, :2], scenario.reference
     low_xy = flat.min(axis=0) - settings.corridor_m
     num_xy = np.floor((np.ptp(flat, axis=0) + 2.0 * settings.corridor_m) / settings.voxel_m) + 1
@@ -342,8 +337,8 @@ def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
     num_z = np.floor((greatest_z.max() - least_z.min()) / settings.voxel_height_m + 1e-9) + 1
     if num_xy.prod() * num_z > MAX_CELLS:
         raise NoPathError(
-            "the walk is too long for the voxel grid", where=scenario.path_id,
-            got=f"{num_xy.prod() * num_z:.0f} voxels", expected=f"at most {MAX_CELLS}", fix="raise track_astar.voxel_m",
+            "the pedestrian trajectory is too long for the voxel grid", where=scenario.path_id,
+            got=f"{num_xy.prod() * num_z:.0f} voxels", expected=f"at most {MAX_CELLS}", fix="use another planner",
         )  # fmt: skip
     shape = np.array([*num_xy, num_z], dtype=np.int64)
     size = np.array([settings.voxel_m, settings.voxel_m, settings.voxel_height_m])
@@ -357,7 +352,7 @@ def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
 
 @njit(cache=True)
 def _corridor(low, shape, size, flat, margin_m):
-    """Return which columns are within `margin_m` of a point of the walk."""
+    """Return which columns are within `margin_m` of a point of the pedestrian trajectory."""
     inside = np.zeros((shape[0], shape[1]), dtype=np.bool_)
     for ix in range(shape[0]):
         for iy in range(shape[1]):

@@ -13,11 +13,16 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field
 
-from cosfly.formats.boxes import read_boxes
-from cosfly.formats.pedestrian_paths import read_paths
 from cosfly.planners.compare import INTERVAL_PERCENT, NUM_RESAMPLES
 from cosfly.planners.contract import PlanConfig
-from cosfly.planners.stage import check_ids, draw_styles_of, make_scenario, plan_trajectory, warm_up
+from cosfly.planners.stage import (
+    load_obstacles,
+    make_items,
+    make_scenario,
+    plan_trajectory,
+    read_inputs,
+    warm_up,
+)
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.json_io import FileFormat, write_json
 from cosfly.runtime.pool import run_items
@@ -58,13 +63,10 @@ class _Result(BaseModel):
 
 def make_worker(cfg: BeamConfig, simplified_map: Path, seed: int) -> Work:
     """Load and index the map once; return the function that plans one pedestrian at each beam."""
-    from cosfly.geometry.kernels import obstacle_index
-    from cosfly.planners.reacquire import screens_of
     from cosfly.planners.smoothing import smooth_trajectory
     from cosfly.planners.track_astar import search_trajectory
 
-    box_map = read_boxes(simplified_map)
-    obstacles, screens = obstacle_index(box_map), screens_of(box_map)
+    obstacles, screens = load_obstacles(simplified_map)
     warm_up(cfg.at_beam(PAPER_BEAM))
 
     def plan(pedestrian: Any, styles: list[str], own: PlanConfig) -> Planned:
@@ -109,10 +111,7 @@ def run(
     product = out / "beam_study.json"
     if stage.is_complete:
         return product
-    pedestrians = read_paths(paths)
-    check_ids(pedestrians, paths)
-    styles = draw_styles_of(pedestrians, cfg, seed)
-    items = [Item(one.path_id, (one, own)) for one, own in zip(pedestrians, styles, strict=True)]
+    items = make_items(read_inputs(simplified_map, paths)[1], cfg, seed)
     finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), **pool)
     if not finished.tally.kept:
         raise stage.nothing_kept(finished.tally)

@@ -35,8 +35,7 @@ from cosfly.maps.stage import load_map
 from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import walkable_ground
 from cosfly.pipeline.settings import RunConfig
-from cosfly.planners.reacquire import screens_of
-from cosfly.planners.stage import draw_styles_of, plan_trajectory
+from cosfly.planners.stage import draw_styles_of, plan_trajectory, screens_of
 from cosfly.runtime.config import load, shipped
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import simplify

@@ -1,9 +1,8 @@
 """MuCO's loss, compiled: every term with its gradient and a positive semi-definite model of its curvature.
 
 Loss of a trajectory p_0 .. p_{n-1} (subsec:appendix_planner_muco): sums over waypoints of seven weighted terms plus the
-altitude and pitch regularisers. Where the paper leaves a choice, it is made here and said at the term. The curvature is
-Gauss-Newton:
-a square w r^2 with dr/dp = a adds 2 w a a^T. It is kept as a band matrix, because a term couples at most four
+altitude and pitch regularisers. Choices that the paper leaves open are noted at the term. The curvature is
+Gauss-Newton: a square w r^2 with dr/dp = a adds 2 w a a^T. It is a band matrix, because a term couples at most four
 neighbours.
 """
 
@@ -26,9 +25,7 @@ from cosfly.geometry.kernels import (
 from cosfly.planners.muco.nearby import Nearby, hits_among, known, nearest_among, nothing_nearby, remember
 from cosfly.runtime.compiled import int64, njit
 
-# --- window of frames -------------------------------------------------------------------------------------------------
-# What the five rays see from a waypoint and its neighbours half a metre away: the difference window of MuCO's
-# visibility term.
+# --- difference window: visibility from a waypoint and its neighbours half a metre away -------------------------------
 
 
 @njit(cache=True)
@@ -76,7 +73,7 @@ TERM_NAMES = (
 )  # fmt: skip
 TRACKING, SMOOTHNESS, JERK, SAFETY, VISIBILITY, VIEW_ANGLE, PATH_LENGTH, ALTITUDE, PITCH = range(9)
 LEAST, PREFERRED, GREATEST = range(3)  # altitudes
-LOW_PITCH, WISHED_PITCH, HIGH_PITCH = range(3)
+LOW_PITCH, PREFERRED_PITCH, HIGH_PITCH = range(3)
 BELOW, ABOVE, SWING, BENEATH = range(4)  # altitude weights; the swing is the oscillation
 BAND_ROWS = 10  # jerk couples x_i with x_{i+3}, nine places on in x_0 y_0 z_0 x_1 ...
 
@@ -85,11 +82,11 @@ THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
 
 
 class Problem(NamedTuple):
-    """What stays fixed during one optimisation; n waypoints.
+    """The constants of one optimisation; n waypoints.
 
-    targets: (n, 3) m, hip points. views_rad: (n,) wished azimuth of the view. distances: (n,) m, wished. weights: (7,)
-    in the order of TERM_NAMES. altitudes: (n, 3) least, preferred, greatest z of each waypoint in the world, m.
-    pitches_rad: (n, 3) lower edge of the band, wished, upper edge. keeps_sight: (n,) bool, whether a waypoint has a
+    targets: (n, 3) m, hip points. views_rad: (n,) preferred azimuth of the view. distances: (n,) m, preferred. weights:
+    (7,) in the order of TERM_NAMES. altitudes: (n, 3) least, preferred, greatest z of each waypoint in the world, m.
+    pitches_rad: (n, 3) lower edge of the band, preferred, upper edge. keeps_sight: (n,) bool, whether a waypoint has a
     visibility term. bearing_weight: of the view's azimuth.
     altitude_weights: (4,) below the least, above the preferred, oscillation, beneath the preferred.
     """
@@ -114,13 +111,12 @@ class Problem(NamedTuple):
 
 
 class State(NamedTuple):
-    """What one evaluation writes; made once, used again.
+    """The buffers that an evaluation writes; reused.
 
     terms: (9,) the loss by term. gradient, visibility_gradient: (n, 3), the first without the second.
     band: (BAND_ROWS, 3 n) the lower band of the curvature. visibility: (n,) five-ray visibility. rough: (n,) share of
     each waypoint in the terms that have kinks and stairs, visibility and safety.
-    blockers: (k,) room for box numbers. contacts: (n, 3) unit normal of the obstacle that a waypoint touches, else
-    zero.
+    blockers: (k,) buffer of box numbers. contacts: (n, 3) unit normal of the obstacle that a waypoint touches, or zero.
     nearby: boxes remembered from earlier evaluations; states may share them.
     """
 
@@ -136,7 +132,7 @@ class State(NamedTuple):
 
 
 def make_state(num_points: int, num_boxes: int) -> State:
-    """Return empty room for evaluations."""
+    """Return buffers for evaluations."""
     return State(
         np.zeros(len(TERM_NAMES)), np.zeros((num_points, 3)), np.zeros((num_points, 3)),
         np.zeros((BAND_ROWS, 3 * num_points)), np.zeros(num_points), np.zeros(num_points),
@@ -154,7 +150,7 @@ def remember_boxes(points, problem, index, nearby):
 
 @njit(cache=True)
 def evaluate(points, problem, index, masked, state):
-    """Fill `state` for a trajectory and give its loss.
+    """Fill `state` for a trajectory and return its loss.
 
     Args:
         points: (n, 3) m. masked: (n,) bool, waypoints in a low-visibility run: their visibility and view-angle terms
@@ -173,10 +169,8 @@ def evaluate(points, problem, index, masked, state):
 
 
 # --- terms of one waypoint --------------------------------------------------------------------------------------------
-
-
-# These functions run over many waypoints each, with arrays taken out of their tuples first: handing a tuple of arrays
-# on costs an atomic count for each array, which for one waypoint is more than the arithmetic.
+# These functions loop over many waypoints and unpack arrays from their tuples first: passing a tuple of arrays costs an
+# atomic count for each array, which for one waypoint is more than the arithmetic.
 
 
 @njit(cache=True, inline="always")
@@ -198,7 +192,7 @@ def _add_square(terms, gradient, band, term, i, weight, residual, ax, ay, az, in
 
 @njit(cache=True)
 def point_terms(points, begin, end, problem, index, masked, state):
-    """Tracking, safety, view angle, altitude bounds and pitch band of waypoints [begin, end)."""
+    """Add tracking, safety, view angle, altitude bounds and pitch band of waypoints [begin, end)."""
     terms, gradient, band, rough, contacts = state.terms, state.gradient, state.band, state.rough, state.contacts
     anchors, around, num_around, rows = state.nearby.anchors, state.nearby.around, state.nearby.num_around, index.rows
     targets, views, weights = problem.targets, problem.views_rad, problem.weights
@@ -228,13 +222,13 @@ def point_terms(points, begin, end, problem, index, masked, state):
                 if gap < problem.safety_m + 0.01:
                     contacts[i, 0], contacts[i, 1], contacts[i, 2] = nx, ny, nz
 
-        # View angle: deviations, in radians, of the downward pitch from the wished (the paper: 45 degrees) and of the
-        # view's azimuth (the walking direction). Straight above the target both lose their meaning: a floor of one
-        # metre keeps their derivatives finite.
+        # View angle: deviations, in radians, of the downward pitch from the preferred one (the paper: 45 degrees) and
+        # of the view's azimuth from the heading. Straight above the target both are undefined: a floor of one metre
+        # keeps their derivatives finite.
         flat = max(np.sqrt(dx * dx + dy * dy), 1.0)
         pitch, square = np.arctan2(dz, flat), flat * flat + dz * dz
         px, py, pz = -dz * dx / flat / square, -dz * dy / flat / square, flat / square
-        off, is_free = pitch - pitches[i, WISHED_PITCH], not masked[i]
+        off, is_free = pitch - pitches[i, PREFERRED_PITCH], not masked[i]
         _add_square(terms, gradient, band, VIEW_ANGLE, i, weights[VIEW_ANGLE], off, px, py, pz, is_free)
         turn = np.arctan2(-dy, -dx) - views[i]
         turn -= 2.0 * np.pi * np.floor((turn + np.pi) / (2.0 * np.pi))
@@ -254,9 +248,9 @@ def point_terms(points, begin, end, problem, index, masked, state):
 
 @njit(cache=True)
 def visibility_terms(points, problem, index, masked, state):
-    """(1 - V)^2 of every waypoint, V the five-ray fraction averaged over the difference window: the waypoint and its
-    six neighbours at +-difference_m. The raw fraction is a staircase; the average rises in steps of 1/35 and the
-    central difference over the same window is its slope.
+    """Add (1 - V)^2 of every waypoint, V the five-ray fraction averaged over the waypoint and its six neighbours at
+    +-difference_m. The raw fraction is a staircase; the average has steps of 1/35, and the central difference over the
+    same window is its slope.
     """
     # Any ray of the window stays within this of the middle ray, at its foot and at its head.
     spread = max(RAY_SPREAD_M, problem.difference_m)
@@ -316,7 +310,7 @@ def chain_curvature(problem, state):
 
 @njit(cache=True)
 def chain_terms(points, begin, end, problem, state):
-    """Smoothness, jerk, path length and altitude oscillation of the differences that start in [begin, end).
+    """Add smoothness, jerk, path length and altitude oscillation of the differences that start in [begin, end).
 
     Adds to terms and gradient, and the path length's curvature to the band; the rest is `chain_curvature`.
     """
@@ -383,8 +377,8 @@ def _add_lengths(points, begin, end, weight, state):
 def difference_gradient(points, problem, index, masked, state, gradient):
     """The paper's gradient: central differences of +-difference_m of the terms that a waypoint takes part in.
 
-    Altitudes stay within their bounds, or the penalty below the least altitude would lift every waypoint that flies at
-    it. Writes `gradient` (n, 3), without the visibility term, whose own gradient is a difference already; `state` is
+    Altitudes stay within their bounds, or the penalty below the least altitude would lift every waypoint that is at it.
+    Writes `gradient` (n, 3), without the visibility term, whose own gradient is a difference already; `state` is
     overwritten.
     """
     state.contacts.fill(0.0)

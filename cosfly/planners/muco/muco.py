@@ -1,9 +1,9 @@
 """MuCO: one trajectory, optimised as a whole against seven terms (subsec:appendix_planner_muco).
 
-The paper's plain gradient step overshoots with its own weights: 0.05 times a curvature of several hundred is far beyond
-two, so its waypoints end up jumping to and fro by the step cap. The default step here solves the band system of the
-Gauss-Newton model instead, caps it per waypoint, projects, and is shortened until the loss falls; `step: paper` is the
-paper's optimizer as it is printed.
+The loss is the paper's. Its plain gradient step overshoots with its own weights: 0.05 times a curvature of several
+hundred is far beyond two, so its waypoints oscillate by the step cap. Our default step solves the band system of the
+Gauss-Newton model instead, caps it per waypoint, projects, and is shortened until the loss falls; then the trajectory
+is repaired to `plan.accel_max_mps2`. `step: paper` is the paper's optimizer as printed, without that limit.
 """
 
 from __future__ import annotations
@@ -16,21 +16,19 @@ from cosfly.planners.contract import MucoConfig, Plan, PlanConfig, Scenario
 from cosfly.planners.muco.loss import TERM_NAMES, Problem, make_state
 from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.planners.muco.step import STOP_REASONS, Rules, descend, descend_as_the_paper, is_feasible, project
-from cosfly.planners.smoothing import within_limits
+from cosfly.planners.smoothing import repair_to_limits
 from cosfly.runtime.compiled import njit
 
 # --- start ------------------------------------------------------------------------------------------------------------
-# Where a flight begins its life: at the wished places where that works, else the best of a coarse search round the
-# walker.
+# The start is the reference where that is free and sees the target, else the best trajectory of a coarse search.
 #
-# The wished places (the paper: 20 m behind the walker and as high) end up inside towers and behind corners. Pushing
-# each waypoint out of a tower on its own would put neighbours on opposite sides of it; the search here chooses places
-# that can be reached from each other: dynamic programming over time, places on rings round the target, edges that keep
-# their distance to boxes.
+# The reference positions (the paper: 20 m behind the target and as high) can be inside towers and behind corners.
+# Pushing each waypoint out of a tower on its own would put neighbours on opposite sides of it; the search chooses
+# places that can be reached from each other: dynamic programming over time, places on rings around the target, edges
+# that keep their distance to boxes.
 
-
-# Places tried round the target: NUM_AZIMUTHS on each ring. The first ring is the normal one, the second steeper (into
-# canyons); the others climb over what blocks the way and are tried only where the first two do not suffice.
+# Places around the target: NUM_AZIMUTHS on each ring. The first ring is the normal one, the second steeper (into
+# canyons); the others climb over obstacles and are tried only where the first two do not suffice.
 STEEP_RADIUS, STEEP_CLIMB_M = 0.6, 6.0
 NUM_CLIMBS = 5
 NUM_AZIMUTHS = 18
@@ -38,9 +36,9 @@ MAX_TURN = 3  # azimuths between one key frame and the next: 60 degrees, 21 m on
 BETWEEN_KEYS_S = 3.0
 
 # Costs of the search, in units of "the target fully hidden for one key frame" = 1.
-TURN_COST = 0.5  # looking from the side opposite to the wished one
-TURN_COST_OF_STYLES = 8.0  # where the bearing is what the flight is for: 64 degrees are as dear as the hidden target
-CLIMB_COST = 0.6  # each preferred altitude more
+TURN_COST = 0.5  # of the bearing opposite to the reference
+TURN_COST_OF_STYLES = 8.0  # where the bearing is the purpose: 64 degrees cost as much as a hidden target
+CLIMB_COST = 0.6  # per 20 m above the preferred altitude
 STEEP_COST = 0.1  # a ring other than the normal one
 MOVE_COST, MOVE_SCALE_MPS = 0.25, 3.0  # (speed / scale)^2
 
@@ -51,7 +49,7 @@ def search_start(
     """Find a free trajectory that sees the target well, by dynamic programming over key frames.
 
     Args:
-        climbing: also try places higher than the normal and the steep ring.
+        climbing: Try places above the normal and the steep ring too.
     Returns:
         (n, 3), straight between key frames, every point and segment `clearance_m` from all boxes; None if there is
         none.
@@ -93,7 +91,7 @@ def _search(places, targets, times, extra, sight, index, clearance_m, speed_max_
     """Return the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
     places: (m, c, 3), c = rings * azimuths. targets: (m, 3). times: (m,) s. extra: (rings, azimuths) cost of a place
-    whatever is seen from it. sight: (m,) bool, whether what is seen counts.
+    without visibility. sight: (m,) bool, whether visibility counts.
     """
     num_keys, num_places, num_azimuths = len(places), places.shape[1], extra.shape[1]
     blockers, one = np.empty(len(index.rows), dtype=np.int64), np.empty(1, dtype=np.int64)
@@ -128,7 +126,7 @@ def _search(places, targets, times, extra, sight, index, clearance_m, speed_max_
                 speed = np.sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2) / seconds
                 if speed <= 0.9 * speed_max_mps:
                     guesses[b] = cost[key - 1, b] + MOVE_COST * (speed / MOVE_SCALE_MPS) ** 2
-            while True:  # the cheapest way whose segment is free; most often the first one tried is
+            while True:  # the cheapest predecessor whose segment is free; most often the first
                 b = int(np.argmin(guesses))
                 if guesses[b] == np.inf:
                     break
@@ -146,22 +144,22 @@ def _search(places, targets, times, extra, sight, index, clearance_m, speed_max_
     return chosen
 
 
-# Where no step of any length lowers the loss, it changes by nothing: that is within the tolerance.
+# Where no step of any length lowers the loss, its change is 0, which is within the tolerance.
 AT_REST = ("converged", "no_step", "no_interior_waypoint")
 
 
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan one flight (the signature of `planners.contract`); nothing here is random.
+    """Plan one trajectory (the signature of `planners.contract`); nothing here is random.
 
     Raises:
-        NoPathError: no free trajectory round this walk was found.
+        NoPathError: If no free trajectory to start from is found.
     """
     problem = make_problem(scenario, cfg)
     start, kind = start_trajectory(scenario, problem, obstacles, cfg)
     points, solver = optimize(start, problem, obstacles, cfg.muco)
     del solver["loss_history"]  # for tests and plots; a product does not need it
     limits = cfg.model_copy(update={"accel_max_mps2": np.inf}) if cfg.muco.step == "paper" else cfg
-    points = within_limits(points, scenario, obstacles, limits)
+    points = repair_to_limits(points, scenario, obstacles, limits)
     return Plan(points, {"start": kind, **solver}, is_converged=solver["stopped"] in AT_REST)
 
 
@@ -169,7 +167,7 @@ def make_problem(scenario: Scenario, cfg: PlanConfig) -> Problem:
     """Bring settings and scenario into the form of the compiled loss."""
     muco, reference = cfg.muco, scenario.reference
     weights = np.array([getattr(muco, f"weight_{name}") for name in TERM_NAMES[:7]])
-    # The band stands round the settings' pitch; it goes where the wish goes.
+    # The band is relative to the settings' pitch and moves with the reference.
     shift = reference.pitch_rad - np.radians(muco.pitch_deg)
     low, high = (edge + shift for edge in np.radians(muco.pitch_band_deg))
     bounds = (reference.altitude_min_m, reference.altitude_m, reference.altitude_max_m)
@@ -195,14 +193,11 @@ def make_problem(scenario: Scenario, cfg: PlanConfig) -> Problem:
     )
 
 
-# --- start ------------------------------------------------------------------------------------------------------------
-
-
 def start_trajectory(
     scenario: Scenario, problem: Problem, obstacles: BoxIndex, cfg: PlanConfig
 ) -> tuple[np.ndarray, str]:
-    """Return a feasible trajectory to start from and its kind: `behind`, the wished places, or `search` where they are
-    blocked or blind.
+    """Return a feasible trajectory to start from and its kind: `behind`, the reference, or `search` where it is blocked
+    or does not see the target.
     """
     targets = problem.targets
     plain = scenario.reference.places_m(targets, scenario.ground_m)
@@ -217,11 +212,11 @@ def start_trajectory(
             return _rounded_off(found, problem, obstacles), "search"
     if plain_is_free:
         return plain, "behind"
-    raise scenario.no_way("no free drone trajectory round this walk", cfg.relaxed_safety_m)
+    raise scenario.no_path_error("no free trajectory to start from", cfg.relaxed_safety_m)
 
 
 def _rounded_off(found: np.ndarray, problem: Problem, obstacles: BoxIndex) -> np.ndarray:
-    """Smooth the corners of a searched trajectory as far as it stays feasible: that saves many capped steps."""
+    """Smooth the corners of a searched trajectory as far as it stays feasible, which saves many capped steps."""
     for smoothing_s in (3.0, 1.5, 0.75):
         smooth = gaussian_filter1d(found, smoothing_s / problem.dt_s, axis=0, mode="nearest")
         if project(smooth, problem, obstacles, 0, len(smooth), nothing_nearby(len(smooth))):
@@ -244,7 +239,7 @@ def optimize(start: np.ndarray, problem: Problem, obstacles: BoxIndex, cfg: Muco
     rules = Rules(*(getattr(cfg, name) for name in Rules._fields))
     state, spare = (make_state(len(points), len(obstacles.rows)) for _ in range(2))
     spare = spare._replace(nearby=state.nearby)
-    # A flight of two points has nothing to move; only its loss is wanted.
+    # A trajectory of two points has no interior waypoint; only its loss is computed.
     history = history if len(points) > 2 else history[:1]
     optimizer = descend_as_the_paper if cfg.step == "paper" else descend
     points, state, masked, num_iterations, num_tried, reason = optimizer(

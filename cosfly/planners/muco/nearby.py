@@ -1,9 +1,8 @@
-"""What an optimiser remembers between iterations: for each waypoint, the few boxes that can matter to it while it stays
-near a place.
+"""A cache of MuCO between iterations: for each waypoint, the few boxes that can matter while it stays near a place.
 
-A waypoint moves half a metre an iteration, so the boxes round it and between it and its target are the same for
-several. Answers do not depend on what is remembered: a waypoint that has left its place, or has too many boxes round
-it, is looked up in the index.
+A waypoint moves half a metre an iteration, so the boxes around it and between it and its target are the same for
+several. Results do not depend on the cache: a waypoint that has left its place, or has too many boxes around it, is
+looked up in the index.
 """
 
 from __future__ import annotations
@@ -16,14 +15,14 @@ from cosfly.geometry.kernels import collect_hits, distance_to_box, nearest_box, 
 from cosfly.runtime.compiled import njit
 
 MARGIN_M = 1.5  # three steps of the default cap; more would remember more boxes, less would look up more often
-MOVED_M = 0.9  # looked up anew beyond this, so that the trial steps of the next iteration stay within MARGIN_M
-ROOM = 32  # boxes that are remembered for a waypoint; a list longer than this is not kept
+MOVED_M = 0.9  # looked up again beyond this, so that the trial steps of the next iteration stay within MARGIN_M
+ROOM = 32  # boxes cached for a waypoint; a longer list is not cached
 
 
 class Nearby(NamedTuple):
-    """Remembered boxes of n waypoints.
+    """Cached boxes of n waypoints.
 
-    anchors: (n, 3) m, where the boxes were looked up; infinite where nothing is remembered. around, on_view: (n, ROOM)
+    anchors: (n, 3) m, where the boxes were looked up; infinite where nothing is cached. around, on_view: (n, ROOM)
     boxes within reach of the waypoint, and across the view of its target. num_around, num_on_view: (n,) how many, -1
     for more than ROOM.
     """
@@ -37,7 +36,7 @@ class Nearby(NamedTuple):
 
 @njit(cache=True)
 def nothing_nearby(num_points):
-    """Return a memory that holds nothing yet: every question goes to the index."""
+    """Return an empty cache: every query goes to the index."""
     return Nearby(
         np.full((num_points, 3), np.inf),
         np.zeros((num_points, ROOM), dtype=np.int64),
@@ -52,7 +51,7 @@ def remember(nearby, index, points, targets, reach_m, spread_m):
     """Look up the boxes of waypoints that have moved since they were looked up, in place.
 
     Args:
-        points, targets: (n, 3) m. reach_m, spread_m: greatest distance and growth of boxes that will be asked for.
+        points, targets: (n, 3) m. reach_m, spread_m: greatest distance and growth of boxes in queries.
     """
     found = np.empty(ROOM + 1, dtype=np.int64)
     for i in range(len(points)):
@@ -73,15 +72,15 @@ def remember(nearby, index, points, targets, reach_m, spread_m):
 
 @njit(cache=True)
 def _keep(found, count, boxes, i):
-    for k in range(count):  # assigning a slice would do, but the check of its shape takes the compiler seconds
+    for k in range(count):  # the shape check of a slice assignment takes the compiler seconds
         boxes[i, k] = found[k]
 
 
 @njit(cache=True, inline="always")
 def known(anchors, numbers, i, x, y, z):
-    """Number of boxes that memory holds for a place of waypoint i, -1 where the index must be asked.
+    """Return the number of cached boxes for a place of waypoint i, -1 where the index must be queried.
 
-    numbers: num_around or num_on_view. Arrays come one by one: see loss.py on the cost of tuples.
+    numbers: num_around or num_on_view. Arrays are passed one by one: see loss.py on the cost of tuples.
     """
     dx, dy, dz = x - anchors[i, 0], y - anchors[i, 1], z - anchors[i, 2]
     return numbers[i] if dx * dx + dy * dy + dz * dz <= MARGIN_M * MARGIN_M else -1
@@ -89,7 +88,7 @@ def known(anchors, numbers, i, x, y, z):
 
 @njit(cache=True)
 def nearest_among(rows, boxes, i, count, x, y, z, reach_m):
-    """The same as `nearest_box`, of boxes[i, :count] only."""
+    """Return what `nearest_box` does, of boxes[i, :count] only."""
     best, best_box = reach_m, -1
     for k in range(count):
         box = boxes[i, k]
@@ -104,7 +103,7 @@ def nearest_among(rows, boxes, i, count, x, y, z, reach_m):
 
 @njit(cache=True)
 def nearest_of(nearby, i, index, x, y, z, reach_m):
-    """The same as `nearest_box` for a place of waypoint i, from memory where that suffices."""
+    """Return what `nearest_box` does for a place of waypoint i, from the cache where possible."""
     count = known(nearby.anchors, nearby.num_around, i, x, y, z)
     if count < 0:
         return nearest_box(index, x, y, z, reach_m)
@@ -113,7 +112,7 @@ def nearest_of(nearby, i, index, x, y, z, reach_m):
 
 @njit(cache=True)
 def hits_among(rows, boxes, i, count, ax, ay, az, bx, by, bz, inflate_m, out):
-    """The same as `collect_hits`, of boxes[i, :count] only."""
+    """Return what `collect_hits` does, of boxes[i, :count] only."""
     found = 0
     for k in range(count):
         if segment_hits_box(rows, boxes[i, k], ax, ay, az, bx, by, bz, inflate_m):

@@ -1,9 +1,8 @@
 """MuCO's step, compiled: the feasible region, the projection onto it, and the search for a step that lowers the loss.
 
-The curvature that `loss.evaluate` leaves in `State.band` is solved as a band; the step is capped, projected and
-evaluated, all in one compiled call: a call from Python unpacks some forty arrays, which takes as long as a third of an
-evaluation. Loops stand where NumPy's whole-array forms would do, because the compiler takes seconds for each form that
-checks shapes.
+The curvature in `State.band` is solved as a band; the step is capped, projected and evaluated, all in one compiled
+call: a call from Python unpacks some forty arrays, which takes a third of the time of an evaluation. Loops replace
+NumPy's whole-array forms, because the compiler takes seconds for each form that checks shapes.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from cosfly.planners.muco.nearby import known, nearest_among, nearest_of
 from cosfly.runtime.compiled import boolean, int64, njit
 
 TRIES, TRIES_WITH_VISIBILITY = 10, 3  # of one step
-REST_MAX = 8  # iterations at most without the visibility slope after it has led nowhere
+REST_MAX = 8  # iterations at most without the visibility slope after it has not lowered the loss
 DAMPING_LEAST = 1e-3  # keeps the band system positive definite where no term has curvature
 DAMPING_FIRST, DAMPING_RISE, DAMPING_FALL = 5.0, 10.0, 0.5  # of a waypoint whose rough terms rise
 
@@ -39,10 +38,10 @@ class Rules(NamedTuple):
 
 @njit(cache=True)
 def hold_bounds(points, problem, contacts, band, gradient):
-    """Take out of gradient and curvature, in place, what would lead straight out of the feasible region.
+    """Remove from gradient and curvature, in place, what would lead straight out of the feasible region.
 
-    A waypoint at the least or greatest altitude that is drawn beyond it keeps its z; one that touches an obstacle and
-    is drawn into it may only slide along it. Ends of the trajectory are for the caller to leave out.
+    A waypoint at the least or greatest altitude that is pulled beyond it keeps its z; one that touches an obstacle and
+    is pulled into it may only slide along it. The caller skips the ends of the trajectory.
     """
     for i in range(len(points)):
         normal = contacts[i]
@@ -118,7 +117,7 @@ def try_step(points, steps, scale, cap_m, as_a_whole, problem, index, masked, st
 
 @njit(cache=True)
 def move(points, steps, scale, cap_m, as_a_whole, trial):
-    """Put the capped step of `try_step` into `trial`, (n, 3); give the longest of the steps as they came, m."""
+    """Put the capped step of `try_step` into `trial`, (n, 3); return the longest of the uncapped steps, m."""
     lengths, longest, last = np.empty(len(steps)), 0.0, len(points) - 1
     for i in range(len(steps)):
         lengths[i] = np.sqrt(steps[i, 0] ** 2 + steps[i, 1] ** 2 + steps[i, 2] ** 2)
@@ -136,8 +135,8 @@ def move(points, steps, scale, cap_m, as_a_whole, trial):
 def descend(points, problem, index, rules, states, history):
     """Improve a feasible trajectory, which is overwritten; its ends stay.
 
-    The visibility term is a staircase that the model does not see: where its slope leads nowhere, the step is tried
-    without it, and for 1, 2, 4 ... REST_MAX iterations it is not tried again.
+    The visibility term is a staircase that the model does not see: where its slope does not lower the loss, the step is
+    tried without it, and for 1, 2, 4 ... REST_MAX iterations it is not tried again.
 
     Args:
         points: (n, 3) m, n >= 3. states: two of `make_state`, written. history: (iterations_max + 1,) the loss before
@@ -184,8 +183,8 @@ def descend(points, problem, index, rules, states, history):
 
 @njit(cache=True)
 def descend_as_the_paper(points, problem, index, rules, states, history):
-    """The paper's optimizer: plain gradient steps by finite differences, capped per waypoint and projected, whatever
-    the loss does.
+    """Run the paper's optimizer: plain gradient steps by finite differences, capped per waypoint and projected, whether
+    or not the loss falls.
 
     A projection that cannot make the trajectory feasible stops nothing; later steps may. Converged when |change of the
     loss| is less than the tolerance, which is absolute here. Arguments and results as of `descend`; the trajectory is
@@ -302,10 +301,10 @@ def newton_step(points, loss, gradient, damping, num_tries, rules, problem, inde
 
 @njit(cache=True)
 def push_out(point, problem, index, nearby, i):
-    """Move waypoint i in place out of obstacles, within the altitude bounds; give its clearance, at most safety_m.
+    """Move waypoint i in place out of obstacles, within the altitude bounds; return its clearance, at most safety_m.
 
     Up to pushes_max times along the outward normal of the nearest box. If the nominal distance is not reached, the best
-    place seen remains (the relaxed floor is for the caller to judge).
+    place seen remains (the caller checks the relaxed floor).
     """
     best, bx, by, bz = -np.inf, point[0], point[1], point[2]
     last_x, last_y, last_z, share = 0.0, 0.0, 0.0, 1.0
@@ -318,7 +317,7 @@ def push_out(point, problem, index, nearby, i):
             break
         nx, ny, nz = normal_of_box(index.rows, box, point[0], point[1], point[2])
         if nx * last_x + ny * last_y + nz * last_z < 0.0:
-            share *= 0.5  # pushed to and fro between two obstacles: settle in the middle
+            share *= 0.5  # between two obstacles: settle in the middle
         last_x, last_y, last_z = nx, ny, nz
         shift = share * (problem.safety_m - gap + 1e-6)
         point[0] += shift * nx
@@ -330,7 +329,7 @@ def push_out(point, problem, index, nearby, i):
 
 @njit(cache=True)
 def project(points, problem, index, begin, end, nearby):
-    """Bring waypoints [begin, end) into the feasible region in place and tell whether the whole trajectory is feasible.
+    """Bring waypoints [begin, end) into the feasible region in place; return whether the whole trajectory is feasible.
 
     Order as in the paper: altitude clamp, cap of the step from the waypoint before, push-out. Feasible means: no step
     longer than the cap, every clearance at least the relaxed floor, and no segment between waypoints that touches a

@@ -1,7 +1,7 @@
 """3D A*, weighted A* and Theta* on voxels: one search, with a weight of the heuristic and, for Theta*, any angle.
 
-Sources: Hart, Nilsson and Raphael 1968; Pohl 1970 (the weight); Daniel et al. 2010 (a cell's parent is its own parent's
-where that one sees it).
+Sources: Hart, Nilsson and Raphael 1968; Pohl 1970 (the weight); Daniel et al. 2010 (a cell takes the parent of its
+neighbour where that parent sees it).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ WEIGHT = 2.0  # of weighted A*
 
 
 def along_voxels(task: Task, *, weight: float = 1.0, any_angle: bool = False) -> np.ndarray | None:
-    """Search the voxels of a task's volume, of which one holds its start; (num, 3), None if there is no way."""
+    """Search the voxels of a task's volume; return the trajectory, (num, 3), None if there is no path."""
     below = np.floor((task.start - task.low) / VOXEL_M + 1e-9).astype(np.int64)
     shape = below + np.floor((task.high - task.start) / VOXEL_M + 1e-9).astype(np.int64) + 1
     cells = np.stack(np.unravel_index(np.arange(shape.prod()), tuple(shape)), axis=1)
@@ -33,8 +33,7 @@ def along_voxels(task: Task, *, weight: float = 1.0, any_angle: bool = False) ->
 
 @njit(cache=True)
 def _search(places, shape, start, voxel_m, index, clearance_m, weight, any_angle):
-    """Return the numbers of the places of the way from `start` to the last one, the goal, (m,), none if there is
-    none."""
+    """Return the numbers of the places on the path from `start` to the last one, the goal, (m,); empty if none."""
     goal, one = len(places) - 1, np.empty(1, dtype=np.int64)
     cost, done = np.full(goal + 1, np.inf), np.zeros(goal + 1, dtype=np.bool_)
     parent = np.full(goal + 1, -1, dtype=np.int64)

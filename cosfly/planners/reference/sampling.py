@@ -1,6 +1,6 @@
-"""RRT*, PRM and B-spline PRM, by OMPL (extra `ompl`); so many samples, never so many seconds.
+"""RRT*, PRM and B-spline PRM, by OMPL (extra `ompl`), limited by numbers of samples, not by time.
 
-Sources: Karaman and Frazzoli 2011; Kavraki et al. 1996; Koyuncu and Inalhan 2008 (the vertices of PRM's way are the
+Sources: Karaman and Frazzoli 2011; Kavraki et al. 1996; Koyuncu and Inalhan 2008 (the vertices of PRM's path are the
 control points of a cubic B-spline).
 """
 
@@ -22,7 +22,7 @@ EXACT_M = 1e-6
 
 
 def sampled(task: Task, method: str, *, is_spline: bool = False) -> np.ndarray | None:
-    """Return the flight along the way that a planner of OMPL finds, (num, 3); None if it does not reach the goal."""
+    """Return the trajectory along the path that OMPL finds, (num, 3); None if it does not reach the goal."""
     base, geometric, util = load_ompl()
     util.RNG.setSeed(int(task.rng.integers(1, 2**31)))
     space, bounds = base.RealVectorStateSpace(3), base.RealVectorBounds(3)

@@ -1,8 +1,7 @@
-"""What the reference planners share: where from, where to, what is free, and the repair of what they find.
+"""The task of the generic planners: start, goal, free space, and the repair of what they find.
 
-A generic planner knows no target: it goes from the place that is wished first to the one that is wished last, in the
-time of the walk, free of boxes. Repair is `within_limits` of smoothing.py, for all alike; a flight that it cannot mend
-is none.
+A generic planner knows no target: it goes from the first reference position to the last one in the duration of the
+pedestrian trajectory, free of boxes. The repair is `repair_to_limits` of smoothing.py for all planners.
 """
 
 from __future__ import annotations
@@ -14,16 +13,16 @@ import numpy as np
 
 from cosfly.geometry.kernels import BoxIndex, normals, segments_hit, signed_distances
 from cosfly.planners.contract import Plan, PlanConfig, Planner, Scenario
-from cosfly.planners.smoothing import within_limits
+from cosfly.planners.smoothing import repair_to_limits
 
-FREE_STEP_M, FREE_REACH_M = 2.0, 40.0  # of the search for a free place near one that is not
+FREE_STEP_M, FREE_REACH_M = 2.0, 40.0  # of the search for a free place near a blocked one
 
 
 @dataclass(frozen=True)
 class Task:
-    """One way to find, from `start` to `goal`, (3,) m, between the corners `low` and `high` of a volume, (3,) m.
+    """A path to find from `start` to `goal`, (3,) m, between the corners `low` and `high` of a volume, (3,) m.
 
-    clearance_m: what boxes grow by on every side. num: points of the flight.
+    clearance_m: growth of boxes on every side. num: points of the trajectory.
     """
 
     start: np.ndarray
@@ -37,7 +36,7 @@ class Task:
     rng: np.random.Generator
 
     def hits(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Return which ways between (n, 3) points are not free, (n,) bool."""
+        """Return which segments between (n, 3) points are blocked, (n,) bool."""
         return segments_hit(self.obstacles, starts, ends, self.clearance_m)
 
     def near(self, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -50,11 +49,11 @@ class Task:
         return gaps_m, away
 
     def line(self) -> np.ndarray:
-        """Return the straight flight of even speed, (num, 3)."""
+        """Return the straight trajectory of even speed, (num, 3)."""
         return self.start + np.linspace(0.0, 1.0, self.num)[:, None] * (self.goal - self.start)
 
     def along(self, route: np.ndarray) -> np.ndarray:
-        """Return the flight of even speed along a route (m, 3), (num, 3)."""
+        """Return the trajectory of even speed along a route (m, 3), (num, 3)."""
         lengths_m = np.linalg.norm(np.diff(route, axis=0), axis=1)
         far_m = np.concatenate([[0.0], np.cumsum(lengths_m)])
         wanted_m = np.linspace(0.0, far_m[-1], self.num)
@@ -64,13 +63,11 @@ class Task:
 def make_task(
     scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator, clearance_m: float
 ) -> Task | None:
-    """Return the task of a scenario; None where no free place is near its first or last wished one."""
+    """Return the task of a scenario; None where no free place is near its first or last reference position."""
     reference, targets = scenario.reference, scenario.targets_m
     margin_m = cfg.track_astar.corridor_m
-    low_z, high_z = (
-        (scenario.ground_m + reference.altitude_min_m).max(),
-        (scenario.ground_m + reference.altitude_max_m).min(),
-    )
+    low_z = (scenario.ground_m + reference.altitude_min_m).max()
+    high_z = (scenario.ground_m + reference.altitude_max_m).min()
     low = np.array([*(targets[:, :2].min(axis=0) - margin_m), low_z])
     high = np.array([*(targets[:, :2].max(axis=0) + margin_m), high_z])
     requested = reference.places_m(targets, scenario.ground_m)[[0, -1]]
@@ -97,11 +94,11 @@ def _free_place(
 
 
 def planner(find: Callable[[Task], np.ndarray | None]) -> Planner:
-    """Make a planner (the signature of `planners.contract`) that finds a way at the nominal distance to boxes, else at
-    the relaxed one, and repairs it.
+    """Return a planner (the signature of `planners.contract`) that finds a path at the nominal distance to boxes, else
+    at the relaxed one, and repairs it.
 
     Args:
-        find: gives the flight (num, 3) of a task, or None.
+        find: Returns the trajectory, (num, 3), of a task, or None.
     """
 
     def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
@@ -110,9 +107,11 @@ def planner(find: Callable[[Task], np.ndarray | None]) -> Planner:
             found = find(task) if task else None
             if task and found is not None:
                 found = np.clip(found, task.low, task.high)
-                mended = within_limits(found, scenario, obstacles, cfg)
-                moved_m = float(np.linalg.norm(mended - found, axis=1).max())
-                return Plan(mended, {"clearance_m": clearance_m, "repaired_m": round(moved_m, 4)})
-        raise scenario.no_way("no free way leads from the first wished place to the last", cfg.relaxed_safety_m)
+                repaired = repair_to_limits(found, scenario, obstacles, cfg)
+                moved_m = float(np.linalg.norm(repaired - found, axis=1).max())
+                return Plan(repaired, {"clearance_m": clearance_m, "repaired_m": round(moved_m, 4)})
+        raise scenario.no_path_error(
+            "no free path leads from the first reference position to the last", cfg.relaxed_safety_m
+        )
 
     return plan

@@ -1,7 +1,7 @@
 """Visibility-A*: A* over the corners of grown boxes that see each other (Lozano-Perez and Wesley 1979).
 
-In three dimensions the shortest way also bends along edges; corners alone, at the heights of both ends and above each
-roof, come near it.
+In three dimensions the shortest path also bends along edges; corners at the heights of both ends and above each roof
+approximate it.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 from cosfly.geometry.kernels import HALF_X, HALF_Y, HIGH_X, HIGH_Y, HIGH_Z, LOW_X, LOW_Y, XU, YW
 from cosfly.planners.reference.task import Task, planner
 
-BEYOND_M = 0.05  # corners stand so far outside of what is closed
+BEYOND_M = 0.05  # distance of corners from the grown boxes
 MOST_CORNERS = 6000
 SIDES = np.array([(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)])
 
 
 def over_corners(task: Task) -> np.ndarray | None:
-    """Search the corners, (num, 3) along the way found, None if there is none."""
+    """Search the corners; return the trajectory, (num, 3), None if there is no path."""
     places = np.vstack([task.start, task.goal, _corners(task)])
     to_goal_m = np.linalg.norm(places - task.goal, axis=1)
     cost, parent, done = np.full(len(places), np.inf), np.full(len(places), -1), np.zeros(len(places), dtype=bool)
@@ -30,7 +30,7 @@ def over_corners(task: Task) -> np.ndarray | None:
             continue
         done[here] = True
         longer_m = cost[here] + np.linalg.norm(places - places[here], axis=1)
-        # Who cannot be on a shorter way to the goal than the one known is not looked at.
+        # Places that cannot be on a shorter path to the goal than the known one are ignored.
         open_ = np.flatnonzero(~done & (longer_m < cost) & (longer_m + to_goal_m < cost[1] + 1e-9))
         open_ = open_[~task.hits(np.broadcast_to(places[here], (len(open_), 3)), places[open_])]
         cost[open_], parent[open_] = longer_m[open_], here
@@ -45,7 +45,7 @@ def over_corners(task: Task) -> np.ndarray | None:
 
 
 def _corners(task: Task) -> np.ndarray:
-    """Return the free corners of boxes in the volume that reach up to it, (m, 3), those nearest to the line first."""
+    """Return the free corners of boxes in the volume, (m, 3), those nearest to the straight line first."""
     rows, beyond_m = task.obstacles.rows, task.clearance_m + BEYOND_M
     keep = rows[:, HIGH_Z] + task.clearance_m > task.low[2]
     keep &= (rows[:, [HIGH_X, HIGH_Y]] >= task.low[:2]).all(axis=1)
@@ -54,12 +54,10 @@ def _corners(task: Task) -> np.ndarray:
     turns = rows[:, XU:YW].reshape(-1, 5)[:, [0, 1, 3, 4]].reshape(-1, 2, 2)
     out = SIDES * (rows[:, None, [HALF_X, HALF_Y]] + beyond_m)
     xy = rows[:, None, :2] + np.einsum("kij,ksj->ksi", turns, out)
-    heights = np.stack(
-        [np.full(len(rows), task.start[2]), np.full(len(rows), task.goal[2]), rows[:, HIGH_Z] + beyond_m]
-    )
-    places = np.concatenate(
-        [np.dstack([xy, np.broadcast_to(z[:, None], xy.shape[:2])]).reshape(-1, 3) for z in heights]
-    )
+    same = np.ones(len(rows))
+    heights = (task.start[2] * same, task.goal[2] * same, rows[:, HIGH_Z] + beyond_m)
+    layers = [np.dstack([xy, np.broadcast_to(z[:, None], xy.shape[:2])]) for z in heights]
+    places = np.concatenate([layer.reshape(-1, 3) for layer in layers])
     places = np.unique(places[((places >= task.low) & (places <= task.high)).all(axis=1)], axis=0)
     places = places[~task.hits(places, places)]
     aside_m = np.linalg.norm(places - task.start, axis=1) + np.linalg.norm(places - task.goal, axis=1)
