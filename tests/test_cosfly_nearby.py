@@ -8,8 +8,8 @@ from tables import each
 
 from cosfly.geometry import kernels
 from cosfly.planners.contract import PlanConfig, Scenario
-from cosfly.planners.reference_trajectory import follow
 from cosfly.planners.muco import loss, muco, nearby, step
+from cosfly.planners.reference_trajectory import follow
 
 
 def random_boxes(rng, count, size_m=40.0):

@@ -18,7 +18,6 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.geometry.axes import headings_of
 from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.lanes import Lane
-from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, sample_goal
 from cosfly.pedestrians.speed_model import (
     PACES,
     STOP_GAP_MIN,
@@ -29,6 +28,7 @@ from cosfly.pedestrians.speed_model import (
     speeds_at,
     take_pace,
 )
+from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, sample_goal
 from cosfly.runtime.seeding import draw_by_share
 
 MOST_WAITS, WAIT_S = 10, 3.0  # who meets somebody again after so many waits is drawn anew

@@ -323,7 +323,7 @@ def text_tables(found: dict[str, Any]) -> Iterator[TextTable]:
     rows = []
     names = ("five_ray_mean", "blocked_fraction", "collision_fraction", "clearance_min_m", "length_m")
     for group, own in found["groups"].items():
-        values = [*(own["figures"][name] for name in names), PAPER_GROUPS.get(group)]
-        rows.append([group, str(own["num_planners"]), *_cells(values)])
+        cells = [*(own["figures"][name] for name in names), PAPER_GROUPS.get(group)]
+        rows.append([group, str(own["num_planners"]), *_cells(cells)])
     columns = ["visibility", "blocked", "collision", "clearance", "length", "paper: visibility"]
     yield TextTable("Groups; clearance and length in m", ["group", "planners", *columns], rows)

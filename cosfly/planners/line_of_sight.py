@@ -143,7 +143,7 @@ def look(index, horizon, target, x, y, z):
             blocked = _blocked_rays(index.rows, horizon.boxes[k], x, y, z, target, blocked)
             if blocked == ALL_BLOCKED:
                 break
-    num_free = 5
+    num_free = int64(5)
     for ray in range(5):
         num_free -= (blocked >> ray) & 1
     return num_free / 5.0

@@ -29,8 +29,8 @@ from cosfly.formats.pedestrian_paths import walk_id
 from cosfly.formats.playback import Track
 from cosfly.formats.traces import DroneTrace
 from cosfly.geometry.axes import look_at, wrap_deg
-from cosfly.inspection.blind_baseline import FITTED_ON, fit_deciders, is_drawn_ahead, past_of
 from cosfly.geometry.kernels import obstacle_index
+from cosfly.inspection.blind_baseline import FITTED_ON, fit_deciders, is_drawn_ahead, past_of
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import walkable_ground
