@@ -154,8 +154,9 @@ class Repairs(Strict):
 
 
 class Ceilings(Strict):
-    """What labels can be told without a picture (geometry/blind.py), shares of `tested` ones of `split`, fitted on
-    some of train; null where these are too few. drawn_ahead: share of `known` ones that may hang on what came later."""
+    """What labels can be told without a picture (inspection/blind_baseline.py), shares of `tested` ones of `split`,
+    fitted on some of train; null where these are too few. drawn_ahead: share of `known` ones that may hang on what came
+    later."""
 
     split: str
     fitted_on: int

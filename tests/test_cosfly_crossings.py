@@ -7,7 +7,7 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.bystanders import bystanders_of
-from cosfly.pedestrians.crossings import where_walked
+from cosfly.pedestrians.crossings import count_on_road
 from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
 from cosfly.pipeline.settings import RunConfig
@@ -54,7 +54,7 @@ def test_points_are_counted_by_where_they_are_and_which_way_they_go(way, marked,
         "p", places, np.arange(len(places)) * 0.5, np.pad(places, ((0, 0), (0, 1))), np.ones(len(places))
     )
     ground = walkable_ground(street(marked=marked).box_map(), CFG)
-    assert where_walked(walk, ground.footing, ground.grid) == counts
+    assert count_on_road(walk, ground.footing, ground.grid) == counts
 
 
 def shares(cfg: RunConfig, name: str, num_others: int = 0) -> tuple[float, float]:
@@ -65,7 +65,7 @@ def shares(cfg: RunConfig, name: str, num_others: int = 0) -> tuple[float, float
     counts = np.zeros(3)
     for k in range(walking.num_paths):
         rng = rng_for(town.seed, "pedestrians", f"path_{k:05d}")
-        walk = make_pedestrian(f"path_{k:05d}", ground, walking, rng).walk
+        walk = make_pedestrian(f"path_{k:05d}", ground, walking, rng).trajectory
         everybody = [walk.positions_m]
         if num_others:
             everybody += [other.positions_m for other in bystanders_of(walk, ground, [], walking, rng).others]
@@ -73,7 +73,7 @@ def shares(cfg: RunConfig, name: str, num_others: int = 0) -> tuple[float, float
             moves = np.r_[True, np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1) > 1e-6]
             line = walk.polyline_m if places is walk.positions_m else places[moves, :2]
             one = PedestrianTrajectory("p", line, walk.time_s, places, walk.speeds_mps)
-            counts += *where_walked(one, ground.footing, ground.grid), len(places)
+            counts += *count_on_road(one, ground.footing, ground.grid), len(places)
     return counts[0] / counts[2], counts[1] / counts[2]
 
 

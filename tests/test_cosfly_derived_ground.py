@@ -81,7 +81,7 @@ def test_people_of_a_foreign_city_of_buildings_alone_walk_on_its_pavements(share
     assert box_map.header.derived_ground < 2.0 * box_map.counts()["Buildings"]
     cfg = PedestriansConfig(road_cost=20, open_cost=3)
     ground = walkable_ground(simplify(box_map, SimplifyConfig()).box_map, cfg)
-    walks = [make_pedestrian("p", ground, cfg, rng_for(0, "pedestrians", str(k))).walk for k in range(20)]
+    walks = [make_pedestrian("p", ground, cfg, rng_for(0, "pedestrians", str(k))).trajectory for k in range(20)]
     places = np.concatenate([walk.positions_m for walk in walks])
     x, y = ground.grid.cells_at(places).T
     assert np.isin(ground.footing[y, x], [0, 1]).mean() > 0.95

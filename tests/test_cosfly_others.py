@@ -101,7 +101,7 @@ def placed():
     ground, lanes = walkable_ground(box_map, CFG), lanes_of(box_map)
     made = []
     for k in range(4):
-        walk = make_pedestrian(f"p{k}", ground, CFG, rng_for(0, "pedestrians", str(k))).walk
+        walk = make_pedestrian(f"p{k}", ground, CFG, rng_for(0, "pedestrians", str(k))).trajectory
         made.append((walk, bystanders_of(walk, ground, lanes, CFG, rng_for(0, "others", str(k)))))
     return box_map, ground, lanes, made
 

@@ -105,7 +105,7 @@ def test_the_region_of_interest_bounds_every_walk():
     ground = walkable_ground(town(), PedestriansConfig(), roi)
     assert ground.counts["cells_in_roi"] == 280 * 280 - 80 * 80
     walk = make_pedestrian("path_00000", ground, PedestriansConfig(), np.random.default_rng(0))
-    for xy in walk.walk.polyline_m:
+    for xy in walk.trajectory.polyline_m:
         assert (xy > 10).all()
         assert (xy < 150).all()
         assert not ((xy > 60) & (xy < 100)).all()
@@ -133,7 +133,7 @@ def test_people_walk_where_the_settings_say(ground, columns):
 def test_a_walk_keeps_every_promise(number, dt_s):
     cfg = PedestriansConfig(dt_s=dt_s)
     ground = walkable_ground(town(), cfg)
-    path = make_pedestrian(f"path_{number:05d}", ground, cfg, rng_for(0, "pedestrians", str(number))).walk
+    path = make_pedestrian(f"path_{number:05d}", ground, cfg, rng_for(0, "pedestrians", str(number))).trajectory
     assert 50 <= np.linalg.norm(path.polyline_m[-1] - path.polyline_m[0]) <= 100
     np.testing.assert_allclose(path.time_s, np.arange(len(path.time_s)) * dt_s)
     np.testing.assert_allclose(path.positions_m[[0, -1], :2], path.polyline_m[[0, -1]], atol=1e-9)
@@ -151,7 +151,7 @@ def test_a_walk_depends_on_its_own_random_numbers_only():
     cfg = PedestriansConfig()
     ground = walkable_ground(town(), cfg)
     texts = [
-        dump_json(make_pedestrian("p", ground, cfg, rng_for(seed, "pedestrians", name)).walk.as_json())
+        dump_json(make_pedestrian("p", ground, cfg, rng_for(seed, "pedestrians", name)).trajectory.as_json())
         for seed, name in ((0, "a"), (0, "a"), (0, "b"), (1, "a"))
     ]
     assert texts[0] == texts[1]
@@ -169,7 +169,7 @@ def test_a_detour_is_given_up_and_counted():
     ]
 
     def worst(walks):
-        lines = [w.walk.polyline_m for w in walks]
+        lines = [w.trajectory.polyline_m for w in walks]
         return max(
             np.linalg.norm(np.diff(p, axis=0), axis=1).sum() / np.linalg.norm(p[-1] - p[0]) for p in lines
         )  # fmt: skip

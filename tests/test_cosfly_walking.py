@@ -7,7 +7,7 @@ from cosfly.pedestrians.speed_model import (
     PACES,
     arrival_times,
     resample,
-    stood_s,
+    standing_time_s,
     take_pace,
 )
 
@@ -61,7 +61,7 @@ def test_stops_change_when_a_place_is_reached_and_not_which(seed, count):
     times = np.cumsum(rng.uniform(0.2, 3.0, count)) - 0.2
     stops = rng.uniform(0.0, 5.0, count) * (rng.random(count) < 0.5)
     fine_s = np.arange(0.0, times[-1] + stops.sum() + 1.0, 0.01)
-    stood = stood_s(fine_s, times, stops)
+    stood = standing_time_s(fine_s, times, stops)
     walked = fine_s - stood
     assert (np.diff(stood) >= -1e-12).all()
     assert (np.diff(walked) >= -1e-12).all(), "nobody goes back in time"

@@ -152,7 +152,7 @@ def flights_of(cfg):
         ground, paces = walkable_ground(box_map, town.pedestrians), paces_of(10, town.pedestrians.pace, town.seed)
         chances = {walk_id(k): rng_for(town.seed, "pedestrians", walk_id(k)) for k in range(len(paces))}
         walks = [
-            make_pedestrian(id_, ground, town.pedestrians, rng, pace).walk
+            make_pedestrian(id_, ground, town.pedestrians, rng, pace).trajectory
             for (id_, rng), pace in zip(chances.items(), paces, strict=True)
         ]
         obstacles, screens = kernels.obstacle_index(box_map), screens_of(box_map)

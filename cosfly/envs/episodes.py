@@ -162,7 +162,7 @@ def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisod
     cfg, town, name = TASKS[task], world.town, walk_id(number)
     planning = PlanConfig(styles={REACQUIRE: 1.0}) if task == REACQUIRES else PlanConfig()
     try:
-        walk = make_pedestrian(name, world.ground, cfg, rng_for(town.seed, "pedestrians", name)).walk
+        walk = make_pedestrian(name, world.ground, cfg, rng_for(town.seed, "pedestrians", name)).trajectory
         plan = plan_trajectory(walk, world.obstacles, planning, town.seed, world.screens)
     except NoPathError:
         return None

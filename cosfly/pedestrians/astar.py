@@ -1,10 +1,9 @@
-"""The cheapest way over a grid of free cells: exact A* with octile costs and no corner cutting.
+"""The cheapest route over a grid of free cells: exact A* with octile costs and no corner cutting.
 
 A straight step costs 1, a diagonal one sqrt 2, and a diagonal step needs both straight neighbours free (sec:step3).
-Where cells are of several classes, a step costs so much times the mean of what its two cells cost along its axis.
-Path costs are kept as two whole numbers, straight and diagonal steps weighed, so that equal costs compare as equal
-whatever the order of the steps: the result is the true optimum, not the optimum up to rounding, and ties break the same
-way everywhere.
+With several classes of cells, a step costs this times the mean cost of its two cells along its axis. Path costs are
+kept as two integers, the weighted straight and diagonal steps, so that equal costs compare as equal in any order of
+steps: the result is the true optimum, not the optimum up to rounding, and ties break the same way everywhere.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ def find_route(
     Args:
         free: (ny, nx) bool, contiguous; start, goal: (x index, y index).
         classes: (ny, nx) uint8, rows of `costs`; None: all 0. costs: (classes, 4) int64, at least 1, what a cell costs
-            along x, along y, and along the diagonals of equal and of unlike signs.
+            along x, along y, and along the diagonals of equal and of opposite signs.
     Returns:
         (k, 2) int64 cells from start to goal, both included (k is 1 if they are the same); None if there is no route.
     """
@@ -49,10 +48,10 @@ def find_route(
     num_y, num_x = free.shape
     for name, (x, y) in (("start", start), ("goal", goal)):
         if not (0 <= x < num_x and 0 <= y < num_y):
-            raise ValueError(f"{name} {(int(x), int(y))} lies off the grid of {num_x} x {num_y} cells")
+            raise ValueError(f"{name} {(int(x), int(y))} is outside the grid of {num_x} x {num_y} cells")
         if not free[y, x]:
             raise ValueError(f"{name} {(int(x), int(y))} is not a free cell")
-    # Zeroed pages come from the system untouched, so a search pays for the cells it sees and not for the grid.
+    # Zeroed pages are allocated on access, so a search pays for the cells it visits and not for the grid.
     state = np.zeros(free.size, dtype=np.uint8)
     steps = np.empty((free.size, 2), dtype=np.int32)
     from_direction = np.empty(free.size, dtype=np.int8)
@@ -73,8 +72,8 @@ def route_cost(cells: np.ndarray) -> float:
 
 @njit(cache=True)
 def _search(free, origin, target, state, steps, from_direction, classes, costs, least):  # pragma: no cover (compiled)
-    """Run A* until the target is closed; tells whether it was reached. The arrays are (cells,), steps (cells, 2), in
-    halves: a step costs what its two cells cost."""
+    """Run A* until the target is closed; return whether it was reached. The arrays are (cells,), steps (cells, 2), in
+    halves: a step costs the sum of its two cells."""
     num_y, num_x = free.shape
     target_x, target_y = target % num_x, target // num_x
     # Estimated total cost, then cost still to go: depth first in a tie.
@@ -90,7 +89,7 @@ def _search(free, origin, target, state, steps, from_direction, classes, costs, 
         cell = heap_cell[0]
         size = _pop(heap_key, heap_cell, size)
         if state[cell] == _CLOSED:
-            continue  # a dearer entry of a cell that was improved since
+            continue  # an outdated entry of a cell that was improved
         state[cell] = _CLOSED
         if cell == target:
             return True
@@ -126,7 +125,7 @@ def _search(free, origin, target, state, steps, from_direction, classes, costs, 
 
 @njit(cache=True)
 def _push(heap_key, heap_cell, size, total, to_go, cell):  # pragma: no cover (compiled)
-    """Add an entry to the heap, growing it when full; gives the arrays and the new size."""
+    """Add an entry to the heap, growing it when full; return the arrays and the new size."""
     if size == len(heap_cell):
         grown_key, grown_cell = np.empty((2 * size, 2)), np.empty(2 * size, dtype=np.int64)
         for k in range(size):
@@ -146,7 +145,7 @@ def _push(heap_key, heap_cell, size, total, to_go, cell):  # pragma: no cover (c
 
 @njit(cache=True)
 def _pop(heap_key, heap_cell, size):  # pragma: no cover (compiled)
-    """Remove the first entry of the heap; gives the new size."""
+    """Remove the first entry of the heap; return the new size."""
     size -= 1
     total, to_go, cell = heap_key[size, TOTAL], heap_key[size, TO_GO], heap_cell[size]
     place = 0
@@ -180,7 +179,7 @@ def _is_before(total, to_go, other_total, other_to_go):  # pragma: no cover (com
 
 @njit(cache=True)
 def _trace_back(from_direction, num_x, origin, target):  # pragma: no cover (compiled)
-    """Follow the directions from the target to the origin; gives the cells in walking order, (k, 2)."""
+    """Follow the directions from the target to the origin; return the cells from the origin on, (k, 2)."""
     count, cell = 1, target
     while cell != origin:
         direction = from_direction[cell]

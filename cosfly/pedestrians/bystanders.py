@@ -1,10 +1,8 @@
-"""Who else moves while a walk lasts: people on routes of their own, and cars along lanes, all clear of the walker and
-of each other.
+"""Bystanders and cars around a pedestrian trajectory, clear of the target and of each other.
 
-One after the other is placed: the walker is there already, then the people, then the cars. People pass the walker, each
-at a moment of its own that leads it near; the first is near from the start. Who would touch somebody waits a little way
-before; whom waiting does not help is drawn anew, and after some tries left out. So there may be fewer than the settings
-ask for.
+They are placed one after the other: the target first, then bystanders, then cars. Each bystander passes the target at a
+moment of its own; the first is near from the start. Where a new one would collide, it waits a little before that
+place; if waiting does not help, it is drawn again, and skipped after some tries. So there may be fewer than requested.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from cosfly.pedestrians.lanes import Lane
 from cosfly.pedestrians.speed_model import (
     PACES,
     STOP_GAP_MIN,
-    Way,
+    PacedRoute,
     arrival_times,
     menger_curvature,
     sample,
@@ -31,31 +29,31 @@ from cosfly.pedestrians.speed_model import (
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, sample_goal
 from cosfly.runtime.seeding import draw_by_share
 
-MOST_WAITS, WAIT_S = 10, 3.0  # who meets somebody again after so many waits is drawn anew
-KEEP_BACK_M = {"Pedestrians": 1.5, "Car": 7.0}  # way from where one waits to where one would have met
-TURN_S = 2.0  # people who are at the end of their route stand so long, and walk back
-PASS_M = (1.5, 7.0)  # how near to where the walker is then
-OPPOSITE_TRIES = 6  # ends of a route that are tried for the one most opposite to the other end
-GOLDEN = 0.618034  # moments k * GOLDEN % 1 are spread evenly, however many there are
-OWN_SPEED = (0.8, 1.2)  # of a person's speeds, beside those of the same pace
+MOST_WAITS, WAIT_S = 10, 3.0  # after this many waits it is drawn again
+KEEP_BACK_M = {"Pedestrians": 1.5, "Car": 7.0}  # distance from the place of waiting to that of the collision
+TURN_S = 2.0  # stop of bystanders at the end of their route, before they walk back
+PASS_M = (1.5, 7.0)  # distance from the target when it is passed
+OPPOSITE_TRIES = 6  # second ends of a route that are drawn, for the one most opposite to the first end
+GOLDEN = 0.618034  # moments k * GOLDEN % 1 are spread evenly for any number of them
+OWN_SPEED = (0.8, 1.2)  # factor on the speeds of the pace
 CAR_SPEED_MPS = 8.0  # 30 km/h
-CAR_SIDEWAYS_MPS2, CAR_FORWARD_MPS2 = 2.0, 2.0  # what is comfortable in a curve, and along the way
+CAR_SIDEWAYS_MPS2, CAR_FORWARD_MPS2 = 2.0, 2.0  # comfortable accelerations in a curve, and along the route
 SHORTEST_DRIVE_M = 15.0
-CHORD_M = 1.0  # a car's heading is that of a piece of its way, so long ahead and behind
+CHORD_M = 1.0  # a car's heading is that of the chord from this far behind to this far ahead
 
 
 @dataclass(frozen=True)
 class Trip:
-    """What one does: kind of BUILDS, way with its stops, limits_mps (k,): the speeds where nobody is in the way;
-    head_start_s: how long one has been on the way when the walk begins."""
+    """The route of a bystander or car with its stops. kind: of BUILDS. limits_mps: (k,) speeds without obstructions.
+    head_start_s: time on the route before the pedestrian trajectory begins."""
 
     kind: str
-    way: Way
+    route: PacedRoute
     limits_mps: np.ndarray
     head_start_s: float = 0.0
 
     def moved(self, time_s: np.ndarray, heights: Ground) -> Bystander:
-        """Where the course leads at each time."""
+        """Return the positions and headings at each time."""
         positions_m = self._at(self.along_m(time_s))
         if self.kind == "Car":
             ahead, behind = (self._at(self.along_m(time_s) + sign * CHORD_M) for sign in (1.0, -1.0))
@@ -65,30 +63,29 @@ class Trip:
         return Bystander(self.kind, np.column_stack([positions_m, heights.height_at(positions_m)]), headings_rad)
 
     def along_m(self, time_s: np.ndarray) -> np.ndarray:
-        """How far along the way one is at each time, (n,) m."""
-        speeds_mps = np.where(self.way.stops_s > 0, 0.0, self.limits_mps)
+        """Return the distance along the route at each time, (n,) m."""
+        speeds_mps = np.where(self.route.stops_s > 0, 0.0, self.limits_mps)
         if self.kind == "Car":
-            speeds_mps = braked(speeds_mps, self.way.along_m)
-        line = np.column_stack([self.way.along_m, np.zeros(len(speeds_mps))])
-        return sample(line, speeds_mps, arrival_times(line, speeds_mps), self.way.stops_s, time_s + self.head_start_s)[
-            0
-        ][:, 0]
+            speeds_mps = braked(speeds_mps, self.route.along_m)
+        line = np.column_stack([self.route.along_m, np.zeros(len(speeds_mps))])
+        times_s, now_s = arrival_times(line, speeds_mps), time_s + self.head_start_s
+        return sample(line, speeds_mps, times_s, self.route.stops_s, now_s)[0][:, 0]
 
     def waiting(self, before_m: float) -> Trip:
-        """Return the same with a stop of WAIT_S, or a longer one, at least KEEP_BACK_M before a place of the way."""
-        at = max(0, int(np.searchsorted(self.way.along_m, before_m - KEEP_BACK_M[self.kind], side="right")) - 1)
+        """Return the trip with a stop of WAIT_S, or a longer one, at least KEEP_BACK_M before a place of the route."""
+        at = max(0, int(np.searchsorted(self.route.along_m, before_m - KEEP_BACK_M[self.kind], side="right")) - 1)
         near = slice(max(0, at - STOP_GAP_MIN + 1), at + STOP_GAP_MIN)
-        stops_s = self.way.stops_s.copy()
+        stops_s = self.route.stops_s.copy()
         stops_s[near.start + int(np.argmax(stops_s[near])) if stops_s[near].any() else at] += WAIT_S
-        return replace(self, way=replace(self.way, stops_s=stops_s))
+        return replace(self, route=replace(self.route, stops_s=stops_s))
 
     def _at(self, along_m: np.ndarray) -> np.ndarray:
-        known_m = self.way.along_m
-        return np.column_stack([np.interp(along_m, known_m, self.way.polyline_m[:, k]) for k in (0, 1)])
+        known_m = self.route.along_m
+        return np.column_stack([np.interp(along_m, known_m, self.route.polyline_m[:, k]) for k in (0, 1)])
 
 
 def braked(limits_mps: np.ndarray, along_m: np.ndarray) -> np.ndarray:
-    """Lower speeds at waypoints, (k,), so that none asks for more than CAR_FORWARD_MPS2 before or behind it."""
+    """Lower speeds at waypoints, (k,), so that accelerations along the route are at most CAR_FORWARD_MPS2."""
     speeds = limits_mps.copy()
     gains = 2.0 * CAR_FORWARD_MPS2 * np.diff(along_m)
     for k in range(len(gains)):
@@ -98,50 +95,51 @@ def braked(limits_mps: np.ndarray, along_m: np.ndarray) -> np.ndarray:
     return speeds
 
 
-# --- one company ------------------------------------------------------------------------------------------------------
-
-
 def bystanders_of(
-    walk: PedestrianTrajectory,
+    target: PedestrianTrajectory,
     ground: WalkableGround,
     lanes: list[Lane],
     cfg: PedestriansConfig,
     rng: np.random.Generator,
 ) -> Bystanders:
-    """Place the others of one walk."""
-    there = [Bystander("Pedestrians", walk.positions_m, headings_of(walk.positions_m, walk.time_s))]
+    """Place the bystanders and cars around one pedestrian trajectory."""
+    placed = [Bystander("Pedestrians", target.positions_m, headings_of(target.positions_m, target.time_s))]
     for kind, wanted in (("Pedestrians", cfg.others), ("Car", cfg.traffic)):
         for number in range(wanted):
             for _ in range(cfg.num_retries + 1):
                 is_car = kind == "Car"
-                course = draw_drive(walk, lanes, cfg, rng) if is_car else draw_stroll(walk, number, ground, cfg, rng)
-                other = None if course is None else without_meeting(course, walk.time_s, there, ground.heights)
+                trip = (
+                    draw_car_trip(target, lanes, cfg, rng)
+                    if is_car
+                    else draw_bystander_trip(target, number, ground, cfg, rng)
+                )
+                other = None if trip is None else avoid_collisions(trip, target.time_s, placed, ground.heights)
                 if other is not None:
-                    there.append(replace(other, is_look_alike=not is_car and number < cfg.look_alikes))
+                    placed.append(replace(other, is_look_alike=not is_car and number < cfg.look_alikes))
                     break
-    return Bystanders(walk.path_id, there[1:])
+    return Bystanders(target.path_id, placed[1:])
 
 
-def without_meeting(course: Trip, time_s: np.ndarray, there: list[Bystander], heights: Ground) -> Bystander | None:
-    """Move along a course and wait for those who are there already; None where that does not help."""
+def avoid_collisions(trip: Trip, time_s: np.ndarray, placed: list[Bystander], heights: Ground) -> Bystander | None:
+    """Return the motion of a trip that waits for those already placed; None where waiting does not help."""
     for _ in range(MOST_WAITS + 1):
-        other = course.moved(time_s, heights)
-        met = np.flatnonzero(np.min([gaps_m(other, one) for one in there], axis=0) < 0.0)
+        other = trip.moved(time_s, heights)
+        met = np.flatnonzero(np.min([gaps_m(other, one) for one in placed], axis=0) < 0.0)
         if len(met) == 0:
             return other
-        before_m = float(course.along_m(time_s[met[:1] + 1])[0])
-        if met[0] == 0 and before_m < KEEP_BACK_M[course.kind]:
+        before_m = float(trip.along_m(time_s[met[:1] + 1])[0])
+        if met[0] == 0 and before_m < KEEP_BACK_M[trip.kind]:
             return None
-        course = course.waiting(before_m)
+        trip = trip.waiting(before_m)
     return None
 
 
-def draw_stroll(
-    walk: PedestrianTrajectory, number: int, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator
+def draw_bystander_trip(
+    target: PedestrianTrajectory, number: int, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator
 ) -> Trip | None:
-    """Draw a person's route that passes the walker, there and back for as long as the walk lasts; None without one."""
-    moment_s = number * GOLDEN % 1.0 * float(walk.time_s[-1])
-    x, y = ground.grid.cells_at(walk.positions_m[int(np.searchsorted(walk.time_s, moment_s))])
+    """Draw a bystander's route that passes the target, back and forth for the duration; None if there is none."""
+    moment_s = number * GOLDEN % 1.0 * float(target.time_s[-1])
+    x, y = ground.grid.cells_at(target.positions_m[int(np.searchsorted(target.time_s, moment_s))])
     low, high = np.array(PASS_M) / cfg.resolution_m
     place = sample_goal(ground, (int(x), int(y)), low, high, rng)
     if place is None:
@@ -153,61 +151,61 @@ def draw_stroll(
         return None
     pair = ends[0], min(ends[1:], key=lambda end: end @ ends[0] / np.linalg.norm(end))
     legs = [ground.route(place, (int(x), int(y))) for x, y in pair + np.array(place)]
-    route = np.concatenate([legs[0][:0:-1], legs[1]])
+    cells = np.concatenate([legs[0][:0:-1], legs[1]])
     pace = PACES[draw_by_share(cfg.pace, rng)]
-    way = take_pace(ground.grid.centers_of(route), pace, rng)
-    course = Trip("Pedestrians", way, speeds_at(way, pace, cfg, rng) * rng.uniform(*OWN_SPEED))
-    while course.along_m(3.0 * walk.time_s[-1:])[0] >= course.way.along_m[-1]:
-        course = and_back(course)
-    times_s = moment_s + np.arange(0.0, walk.time_s[-1], walk.time_s[1])
-    apart_m = course.moved(times_s, ground.heights).positions_m[:, :2] - ground.grid.centers_of(np.array(place))
+    route = take_pace(ground.grid.centers_of(cells), pace, rng)
+    trip = Trip("Pedestrians", route, speeds_at(route, pace, cfg, rng) * rng.uniform(*OWN_SPEED))
+    while trip.along_m(3.0 * target.time_s[-1:])[0] >= trip.route.along_m[-1]:
+        trip = with_return(trip)
+    times_s = moment_s + np.arange(0.0, target.time_s[-1], target.time_s[1])
+    apart_m = trip.moved(times_s, ground.heights).positions_m[:, :2] - ground.grid.centers_of(np.array(place))
     away_m = np.linalg.norm(apart_m, axis=1)
-    return replace(course, head_start_s=float(times_s[np.argmin(away_m)]) - moment_s)
+    return replace(trip, head_start_s=float(times_s[np.argmin(away_m)]) - moment_s)
 
 
-def and_back(course: Trip) -> Trip:
-    """Return the same, and back to its start after a stop: at its end, or where it stops just before."""
-    way = course.way
-    stops_s = np.concatenate([way.stops_s, way.stops_s[-2::-1]])
-    end = len(way.stops_s) - 1
-    if not stops_s[max(0, end - STOP_GAP_MIN + 1) : end].any():  # between two stops side by side nobody gets on
+def with_return(trip: Trip) -> Trip:
+    """Return the trip with the route back to its start, after a stop at its end or just before."""
+    route = trip.route
+    stops_s = np.concatenate([route.stops_s, route.stops_s[-2::-1]])
+    end = len(route.stops_s) - 1
+    if not stops_s[max(0, end - STOP_GAP_MIN + 1) : end].any():  # a piece between two stops would have no speed
         stops_s[end] = TURN_S
-    back = Way(np.concatenate([way.polyline_m, way.polyline_m[-2::-1]]), stops_s)
-    return replace(course, way=back, limits_mps=np.concatenate([course.limits_mps, course.limits_mps[-2::-1]]))
+    back = PacedRoute(np.concatenate([route.polyline_m, route.polyline_m[-2::-1]]), stops_s)
+    return replace(trip, route=back, limits_mps=np.concatenate([trip.limits_mps, trip.limits_mps[-2::-1]]))
 
 
-def draw_drive(
-    walk: PedestrianTrajectory, lanes: list[Lane], cfg: PedestriansConfig, rng: np.random.Generator
+def draw_car_trip(
+    target: PedestrianTrajectory, lanes: list[Lane], cfg: PedestriansConfig, rng: np.random.Generator
 ) -> Trip | None:
-    """Draw a drive that begins near a walk and lasts as long, or up to a dead end; None where no lane is near."""
-    place_m = walk.polyline_m[rng.integers(len(walk.polyline_m))]
+    """Draw a car's route that starts nearby and lasts as long, or up to a dead end; None where no lane is near."""
+    place_m = target.polyline_m[rng.integers(len(target.polyline_m))]
     near = [k for k, lane in enumerate(lanes) if lane.distance_m(place_m) < cfg.others_reach_m]
     if not near:
         return None
     number = near[rng.integers(len(near))]
     begin = int(rng.integers(len(lanes[number].points_m) - 1))
     pieces = [lanes[number].points_m[begin:]]
-    length_m, needed_m = 0.0, CAR_SPEED_MPS * float(walk.time_s[-1])
+    length_m, needed_m = 0.0, CAR_SPEED_MPS * float(target.time_s[-1])
     while length_m < needed_m and lanes[number].onward:
         onward = lanes[number].onward
-        # Who may turn stays near the walk: traffic that leaves the picture for good is of no use to it.
+        # Turns prefer lanes near the trajectory, because traffic that leaves the view is of no use.
         weights = np.exp([-lanes[k].distance_m(place_m) / cfg.others_reach_m for k, _ in onward])
         number, curve = onward[int(rng.choice(len(onward), p=weights / weights.sum()))]
         pieces += [curve, lanes[number].points_m]
         length_m += len(curve) + len(lanes[number].points_m)  # a metre from point to point
-    way = Way.without_stops(np.concatenate(pieces))
-    if way.along_m[-1] < SHORTEST_DRIVE_M:
+    route = PacedRoute.without_stops(np.concatenate(pieces))
+    if route.along_m[-1] < SHORTEST_DRIVE_M:
         return None
-    curvatures = np.maximum(menger_curvature(way.polyline_m), 1e-6)
+    curvatures = np.maximum(menger_curvature(route.polyline_m), 1e-6)
     limits_mps = np.minimum(CAR_SPEED_MPS * rng.uniform(*OWN_SPEED), np.sqrt(CAR_SIDEWAYS_MPS2 / curvatures))
     limits_mps[-1] = 0.0
-    return Trip("Car", way, limits_mps)
+    return Trip("Car", route, limits_mps)
 
 
 def gaps_m(one: Bystander, two: Bystander) -> np.ndarray:
-    """How far the discs of two are apart in each step of time, (n - 1,) m, negative where they overlap.
+    """Return the gap between the discs of two at each time step, (n - 1,) m, negative where they overlap.
 
-    Between two times both go straight on, so the nearest place within a step is that of the origin to a segment.
+    Between two times both move straight, so the nearest place within a step is that of the origin to a segment.
     """
     apart = one.discs_m[:, :, None] - two.discs_m[:, None]  # (n, d, e, 2)
     start, along = apart[:-1], np.diff(apart, axis=0)

@@ -1,13 +1,15 @@
-"""What walkers have under their feet, cell by cell, and where a carriageway is crossed.
+"""The footing of each cell: pavement, open ground, carriageway or crossing.
 
-A crossing, wherever cosfly speaks of one, is
+A crossing is
 
-- where a map marks crossings: carriageway under its stripes, whichever way one goes there. Stripes are paint that is
-  MARKED_M wide in every direction once gaps below GAP_M are closed, which neither dashes nor edge lines are;
-- where a map marks none: a way straight across, from pavement to pavement along that of the grid's four axes (two
-  diagonals among them) along which they are nearest, at most ACROSS_SHARE of what is carriageway at right angles to it.
+- in a map that marks crossings: carriageway under its stripes, in any direction. Stripes are paint that is MARKED_M
+wide
+  in every direction once gaps below GAP_M are closed, unlike dashes and edge lines;
+- in other maps: carriageway straight across, from pavement to pavement along the grid axis (of four, with the
+diagonals)
+  along which they are nearest, at most ACROSS_SHARE as wide as the carriageway at right angles to it.
 
-So a street is crossed and not walked along, and a junction without marks is gone round.
+So routes cross a street and do not run along it, and avoid a junction without marks.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from cosfly.runtime.compiled import njit
 MARKED_M, GAP_M = 2.0, 2.0
 ACROSS_SHARE = 0.5
 
-# What a cell is to a walker; ROAD + 1 + axis: carriageway that is crossed along an axis.
+# Footings of a cell; ROAD + 1 + axis: carriageway that may be crossed along an axis.
 PAVED, OPEN, CROSSING, ROAD = range(4)
 AXES = np.array([[1, 0], [0, 1], [1, 1], [-1, 1]])  # cells; the order of astar.py's directions
 NUM_FOOTINGS = ROAD + 1 + len(AXES)
@@ -35,7 +37,7 @@ PAINT = KINDS["RoadLines"]
 
 
 def footing_of(box_map: BoxMap, grid: OccupancyGrid) -> np.ndarray:
-    """Return what each cell of a grid is to a walker, by the topmost ground there, (ny, nx) uint8."""
+    """Return the footing of each cell of a grid, by its topmost ground, (ny, nx) uint8."""
     footing = OF_KIND[surface_kinds(box_map, GROUND_KINDS - {PAINT}, like=grid)]
     is_road = footing == ROAD
     if not is_road.any():
@@ -52,7 +54,7 @@ def footing_of(box_map: BoxMap, grid: OccupancyGrid) -> np.ndarray:
 
 
 def _morphed(mask: np.ndarray, operation: int, width_m: float, grid: OccupancyGrid) -> np.ndarray:
-    """Close gaps below a width, or remove what is narrower, by a disc."""
+    """Apply a morphological operation with a disc of a width."""
     size = 2 * max(1, round(width_m / 2 / grid.resolution_m)) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     return cv2.morphologyEx(mask.view(np.uint8), operation, disc).view(bool)
@@ -89,19 +91,19 @@ def _mark_ways_across(is_road, is_paved, footing):  # pragma: no cover (compiled
 
 
 def costs_of(open_cost: int, road_cost: int) -> np.ndarray:
-    """What a step of one cell costs over each footing along each axis, (NUM_FOOTINGS, axes) int64, at least 1."""
+    """Return the cost of a step of one cell on each footing along each axis, (NUM_FOOTINGS, axes) int64, at least 1."""
     costs = np.ones((NUM_FOOTINGS, len(AXES)), dtype=np.int64)
     costs[OPEN], costs[ROAD:] = open_cost, road_cost
     costs[ROAD + 1 + np.arange(len(AXES)), np.arange(len(AXES))] = 1
     return costs
 
 
-def where_walked(walk: PedestrianTrajectory, footing: np.ndarray, grid: OccupancyGrid) -> tuple[int, int]:
-    """Count a walk's points on carriageway away from crossings, and on crossings."""
-    steps = np.diff(walk.polyline_m, axis=0)
-    middles = walk.polyline_m[:-1] + steps / 2
-    nearest = np.argmin(np.linalg.norm(walk.positions_m[:, None, :2] - middles, axis=2), axis=1)
-    x, y = grid.cells_at(walk.positions_m).T
+def count_on_road(path: PedestrianTrajectory, footing: np.ndarray, grid: OccupancyGrid) -> tuple[int, int]:
+    """Count a trajectory's points on carriageway away from crossings, and on crossings."""
+    steps = np.diff(path.polyline_m, axis=0)
+    middles = path.polyline_m[:-1] + steps / 2
+    nearest = np.argmin(np.linalg.norm(path.positions_m[:, None, :2] - middles, axis=2), axis=1)
+    x, y = grid.cells_at(path.positions_m).T
     under = footing[y, x].astype(np.int64)
     directions = np.round(np.degrees(np.arctan2(steps[:, 1], steps[:, 0])) / 45.0).astype(np.int64)[nearest] % 4
     is_across = under == ROAD + 1 + np.array([0, 2, 1, 3])[directions]

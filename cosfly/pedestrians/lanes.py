@@ -1,7 +1,7 @@
-"""Where cars can drive: the lanes of a map's straight roads, and the curves from lane to lane at its junctions.
+"""The lanes of a map's straight roads, and the curves from lane to lane at its junctions.
 
-A map knows its roads as boxes alone. A box of Roads that is longer than wide is a street; streets that cross, or that
-reach each other over road, meet in a junction. Maps whose roads are patches have no lanes, and nobody drives there.
+A map's roads are boxes. A box of Roads that is longer than wide is a street; streets that cross, or that reach each
+other over road, meet in a junction. Maps whose roads are patches have no lanes and no cars.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ import numpy as np
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KINDS
 
-LONG = 1.5  # a street's box is this many times as long as wide; others are crossings and patches
-REACH = 2.0  # widths that a street is followed beyond its box, over other boxes of road, to the next junction
+LONG = 1.5  # least ratio of length to width of a street's box; others are crossings and patches
+REACH = 2.0  # widths that a street extends beyond its box, over other boxes of road, to the next junction
 NARROWEST_M = 5.0  # of a carriageway with two lanes
 STEP_M = 1.0  # between points along lanes and curves
-CLEAR_M = 1.1  # from the middle of a lane to what stands there: half a car, and a hand
-CAR_MIDDLE_M = 1.2  # over the ground: where what stands there is looked for
-LANE_SHARES = (0.25, 0.15, 0.08)  # of the width, from the middle line to a lane's: nearer to it where cars are parked
+CLEAR_M = 1.1  # from the middle of a lane to obstacles: half a car, and a margin
+CAR_MIDDLE_M = 1.2  # height above the ground at which obstacles are looked for
+LANE_SHARES = (0.25, 0.15, 0.08)  # of the width, from the middle line to the lane; smaller where cars are parked
 SHORTEST_LANE_M = 8.0
-BEFORE_CURVE_M = 1.5  # a curve begins so far before the crossing carriageway
+BEFORE_CURVE_M = 1.5  # from the start of a curve to the crossing carriageway
 SAME_PLACE_M = 3.0
 
-IsFree = Callable[[np.ndarray], bool]  # can a car drive through all of these places, (n, 2) m
+IsFree = Callable[[np.ndarray], bool]  # whether a car can pass all of these positions, (n, 2) m
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Street:
     direction: np.ndarray
     length_m: float
     width_m: float
-    reach_m: tuple[float, float]  # how far road goes on before 0 and after length_m
+    reach_m: tuple[float, float]  # how far the road extends before 0 and after length_m
 
     def at(self, along_m: float) -> np.ndarray:
         return self.start_m + along_m * self.direction
@@ -48,18 +48,18 @@ class Street:
 
 @dataclass
 class Lane:
-    """One way between two junctions: points_m (k, 2); onward: lanes that it leads to, with the curves there, (j, 2)."""
+    """A lane between two junctions: points_m (k, 2); onward: the next lanes, with the curves to them, (j, 2)."""
 
     points_m: np.ndarray
     onward: list[tuple[int, np.ndarray]] = field(default_factory=list)
 
     def distance_m(self, place_m: np.ndarray) -> float:
-        """From a place, (2,), to the nearest point."""
+        """Return the distance from a position, (2,), to the nearest point."""
         return float(np.linalg.norm(self.points_m - place_m, axis=1).min())
 
 
 def lanes_of(box_map: BoxMap) -> list[Lane]:
-    """Find the lanes of a map on which nothing stands; empty where it has no straight roads."""
+    """Return the lanes of a map without obstacles; empty where it has no straight roads."""
     from cosfly.geometry.kernels import obstacle_index, signed_distances
 
     roads = box_map.select(box_map.kinds == KINDS["Roads"])
@@ -68,9 +68,8 @@ def lanes_of(box_map: BoxMap) -> list[Lane]:
 
     def is_free(points_m: np.ndarray) -> bool:
         places = np.column_stack([points_m, box_map.ground.height_at(points_m) + CAR_MIDDLE_M])
-        return bool(
-            _on_road(roads, points_m).all() and (signed_distances(obstacles, places, CLEAR_M)[0] >= CLEAR_M).all()
-        )
+        is_clear = signed_distances(obstacles, places, CLEAR_M)[0] >= CLEAR_M
+        return bool(_on_road(roads, points_m).all() and is_clear.all())
 
     junctions, stations = _junctions(streets)
     lanes: list[Lane] = []
@@ -92,11 +91,10 @@ def lanes_of(box_map: BoxMap) -> list[Lane]:
 
 
 def _streets(roads: BoxMap) -> list[Street]:
-    """Streets of the boxes of road; a box that lies within a longer one of the same direction is part of it."""
+    """Return the streets of the boxes of road."""
     streets = []
-    for center, half, rotation in zip(
-        roads.centers[:, :2], roads.half_extents[:, :2], roads.rotations_deg, strict=True
-    ):
+    rows = roads.centers[:, :2], roads.half_extents[:, :2], roads.rotations_deg
+    for center, half, rotation in zip(*rows, strict=True):
         yaw = np.radians(rotation[1]) + (np.pi / 2.0 if half[1] > half[0] else 0.0)
         direction = np.array([np.cos(yaw), np.sin(yaw)])
         long, short = half.max(), half.min()
@@ -110,7 +108,7 @@ def _streets(roads: BoxMap) -> list[Street]:
 
 
 def _reach_m(roads: BoxMap, end_m: np.ndarray, direction: np.ndarray, most_m: float) -> float:
-    """How far road goes on from the end of a street."""
+    """Return how far the road extends from the end of a street."""
     steps = np.arange(STEP_M, most_m, STEP_M)
     is_road = _on_road(roads, end_m + steps[:, None] * direction)
     return float(np.argmin(is_road) if not is_road.all() else len(steps)) * STEP_M
@@ -128,14 +126,14 @@ def _on_road(roads: BoxMap, points_m: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Junction:
-    """Where streets meet: place_m (2,); width_m of the widest."""
+    """A meeting of streets: place_m (2,); width_m of the widest."""
 
     place_m: np.ndarray
     width_m: float
 
 
 def _junctions(streets: list[Street]) -> tuple[list[Junction], list[list[tuple[float, int]]]]:
-    """Junctions, and the stations of each street in order: (m along it, junction), -1 for an end that meets nothing."""
+    """Return junctions, and the stations of each street in order: (m along it, junction), -1 for a dead end."""
     junctions: list[Junction] = []
     stations: list[dict[int, float]] = [{} for _ in streets]
     for (i, one), (j, two) in combinations(enumerate(streets), 2):
@@ -156,7 +154,7 @@ def _junctions(streets: list[Street]) -> tuple[list[Junction], list[list[tuple[f
 
 
 def _number_of(place_m: np.ndarray, width_m: float, junctions: list[Junction]) -> int:
-    """Return the junction at a place, made or widened in the list."""
+    """Return the number of the junction at a place, which is added or widened in the list."""
     for number, known in enumerate(junctions):
         if np.linalg.norm(known.place_m - place_m) < SAME_PLACE_M:
             junctions[number] = Junction(known.place_m, max(width_m, known.width_m))
@@ -174,12 +172,12 @@ class _Way:
     last: tuple[float, int]
 
     def leads_to(self, after: _Way) -> bool:
-        """Return whether one gets onto another way at its end; nobody turns on the spot."""
+        """Return whether another way continues this one; cars do not turn on the spot."""
         is_back = after.street is self.street and after.last == self.first
         return self.last[1] >= 0 and after.first[1] == self.last[1] and not is_back
 
     def line(self, junctions: list[Junction], is_free: IsFree) -> np.ndarray | None:
-        """Return its lane, on the right, as far from the middle as nothing stands there, (k, 2) m; None if blocked."""
+        """Return its lane on the right, as far from the middle as it is free, (k, 2) m; None if blocked."""
         sign = np.sign(self.last[0] - self.first[0])
         (start, end) = (
             along + toward * sign * (junctions[number].width_m / 2.0 + BEFORE_CURVE_M if number >= 0 else 3.0)
@@ -196,7 +194,7 @@ class _Way:
 
 
 def _meeting(one: Street, two: Street) -> tuple[float, float] | None:
-    """Where two streets meet, m along each; None where they do not reach each other."""
+    """Return where two streets meet, m along each; None where they do not reach each other."""
     sine = _cross(one.direction, two.direction)
     apart = two.start_m - one.start_m
     if abs(sine) > 0.2:
@@ -207,10 +205,10 @@ def _meeting(one: Street, two: Street) -> tuple[float, float] | None:
 
 
 def _in_line(one: Street, two: Street) -> tuple[float, float]:
-    """Where the gap between two streets in one line has its middle, m along each; else infinity."""
+    """Return the middle of the gap between two streets in one line, m along each; else infinity."""
     ends = np.array([(two.at(along) - one.start_m) @ one.direction for along in (0.0, two.length_m)])
-    beside_m = abs(_cross(one.direction, two.start_m - one.start_m))
-    if beside_m > SAME_PLACE_M or (ends.min() < one.length_m and ends.max() > 0.0):
+    aside_m = abs(_cross(one.direction, two.start_m - one.start_m))
+    if aside_m > SAME_PLACE_M or (ends.min() < one.length_m and ends.max() > 0.0):
         return np.inf, np.inf
     after = ends.min() >= one.length_m
     middle = float(one.length_m + ends.min() if after else ends.max()) / 2.0

@@ -1,7 +1,4 @@
-"""How a person walks along a route: slower round corners, with a little unrest, sampled at equal times (sec:step3).
-
-Pure arithmetic on polylines; which route is walked is stage.py's affair.
-"""
+"""The speed model of pedestrians: paces, stops, curvature, jitter, and sampling at equal times (sec:step3)."""
 
 from __future__ import annotations
 
@@ -18,11 +15,11 @@ if TYPE_CHECKING:
 
 
 CURVATURE_EPSILON_M3 = 1e-6  # eq:menger: below this product of lengths three points have no curvature
-SLOWEST_SPEED_MPS = 0.05  # a walk must arrive: eq:speed alone allows 0, and then a step that takes for ever
+SLOWEST_SPEED_MPS = 0.05  # eq:speed alone allows 0, with which a pedestrian would never arrive
 
 
 def menger_curvature(polyline_m: np.ndarray) -> np.ndarray:
-    """Curvature at the waypoints of a polyline (eq:menger).
+    """Return the curvature at the waypoints of a polyline (eq:menger).
 
     Args:
         polyline_m: (k, 2) m.
@@ -51,14 +48,13 @@ def speed_profile(
     min_speed_mps: float = 0.0,
     max_speed_mps: float = 1.6,
 ) -> np.ndarray:
-    """Speeds at waypoints (eq:speed).
+    """Return speeds at waypoints (eq:speed).
 
     Args:
-        curvatures: (k,) 1/m.
-        curvature_gain_m: alpha; jitter: beta.
+        curvatures: (k,) 1/m. curvature_gain_m: alpha. jitter: beta.
     Returns:
-        (k,) m/s within the range, whose lower end is never below SLOWEST_SPEED_MPS. With the defaults eq:speed gives at
-        least 0.067 m/s (a right angle of two 0.5 m steps), so that the guard changes nothing.
+        (k,) m/s within the range, whose lower end is at least SLOWEST_SPEED_MPS. With the defaults eq:speed gives at
+        least 0.067 m/s (a right angle of two 0.5 m steps), so that this bound has no effect.
     """
     unrest = 1.0 + jitter * rng.uniform(-1.0, 1.0, size=len(curvatures))
     speeds_mps = cruise_speed_mps / (1.0 + curvature_gain_m * curvatures) * unrest
@@ -66,11 +62,11 @@ def speed_profile(
 
 
 def arrival_times(polyline_m: np.ndarray, speeds_mps: np.ndarray) -> np.ndarray:
-    """Times at the waypoints, (k,) s from 0: each piece takes its length over the mean of its two speeds."""
+    """Return the times at waypoints, (k,) s from 0: a piece takes its length over the mean of its two speeds."""
     lengths_m = np.linalg.norm(np.diff(polyline_m, axis=0), axis=1)
     means_mps = 0.5 * (speeds_mps[1:] + speeds_mps[:-1])
     if not (means_mps > 0).all():
-        raise ValueError("a piece without speed takes for ever")
+        raise ValueError("a piece has speed 0 at both ends, so its end is never reached")
     return np.concatenate([[0.0], np.cumsum(lengths_m / means_mps)])
 
 
@@ -79,12 +75,12 @@ def resample(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sample a timed polyline at equal steps.
 
-    Within a piece the speed changes evenly from one waypoint's to the next one's: the motion for which a piece takes
-    its length over the mean of its speeds. The last sample is the goal, reached within the last step.
+    Within a piece the speed changes evenly from one waypoint to the next. The last sample is the goal, reached within
+    the last step.
 
     Args:
-        polyline_m: (k, 2) m, k at least 2, no two neighbours equal; speeds_mps: (k,); times_s: (k,) from arrival_times,
-            which knows no stops; stops_s: (k,) how long the person stands at each waypoint, whose speed is 0 there.
+        polyline_m: (k, 2) m, k at least 2, no two neighbours equal. speeds_mps: (k,), 0 at stops. times_s: (k,) from
+            `arrival_times`, without stops. stops_s: (k,) duration of the stop at each waypoint.
     Returns:
         time_s (n,) = 0, step, 2 step ...; positions_m (n, 2); speeds_mps (n,).
     """
@@ -97,41 +93,35 @@ def sample(
     polyline_m: np.ndarray, speeds_mps: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray, time_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return positions (n, 2) and speeds (n,) at any times, (n,) s, of a timed polyline; after its end, the end."""
-    now_s = np.minimum(time_s - stood_s(time_s, times_s, stops_s), times_s[-1])
+    now_s = np.minimum(time_s - standing_time_s(time_s, times_s, stops_s), times_s[-1])
     piece = np.clip(np.searchsorted(times_s, now_s, side="right") - 1, 0, len(times_s) - 2)
     duration_s = times_s[piece + 1] - times_s[piece]
-    since_s = now_s - times_s[piece]
+    elapsed_s = now_s - times_s[piece]
     from_mps, to_mps = speeds_mps[piece], speeds_mps[piece + 1]
-    walked_m = from_mps * since_s + 0.5 * (to_mps - from_mps) / duration_s * since_s**2
+    moved_m = from_mps * elapsed_s + 0.5 * (to_mps - from_mps) / duration_s * elapsed_s**2
     along_m = polyline_m[piece + 1] - polyline_m[piece]
-    share = np.clip(walked_m / np.linalg.norm(along_m, axis=1), 0.0, 1.0)
-    return polyline_m[piece] + share[:, None] * along_m, from_mps + (to_mps - from_mps) * since_s / duration_s
+    share = np.clip(moved_m / np.linalg.norm(along_m, axis=1), 0.0, 1.0)
+    return polyline_m[piece] + share[:, None] * along_m, from_mps + (to_mps - from_mps) * elapsed_s / duration_s
 
 
-def stood_s(time_s: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray) -> np.ndarray:
-    """How long the person has stood still until each time, (n,) s; times_s, stops_s: (k,) as for `resample`."""
+def standing_time_s(time_s: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray) -> np.ndarray:
+    """Return the total duration of stops until each time, (n,) s; times_s, stops_s: (k,) as for `resample`."""
     at = np.flatnonzero(stops_s)
     begins_s = times_s[at] + np.cumsum(stops_s[at]) - stops_s[at]
     return np.clip(time_s[:, None] - begins_s, 0.0, stops_s[at]).sum(axis=1)
 
 
 # --- paces ------------------------------------------------------------------------------------------------------------
-# At which pace people go: one row a profile, and what it makes of a route: the way that is walked, and where it stands
-# still.
-#
-# Arithmetic on polylines; walking.py gives the way its times.
-
-
-STOP_GAP_MIN = 2  # waypoints from one stop to the next: between two neighbours that are both stops nobody gets on
+STOP_GAP_MIN = 2  # waypoints from one stop to the next: a piece between two stops would have no speed
 
 
 @dataclass(frozen=True)
 class Pace:
-    """One profile; ranges are drawn from evenly.
+    """One row of the table of paces; values are drawn uniformly from ranges.
 
-    hurries: cruises at `hurry_speed_mps`. stop_every_m: way from one stop to the next, none without. stop_s: how long a
-    stop is.
-    turn_at: share of the route at which the person turns, never without; back: share of that way that is walked back.
+    hurries: cruises at `hurry_speed_mps`. stop_every_m: distance between stops; None: no stops. stop_s: duration of a
+    stop. turn_at: share of the route at which the pedestrian turns back; None: never. back: share of the route so far
+    that is walked back.
     """
 
     hurries: bool = False
@@ -141,56 +131,56 @@ class Pace:
     back: tuple[float, float] = (0.0, 0.0)
 
 
-# Stops are long enough for a drone to come to rest, and for a window of five frames before and after it did.
+# Stops are long enough for a drone to come to rest, with a window of five frames before and after.
 PACES = {
     PLAIN_PACE: Pace(),
     "stop_and_look": Pace(stop_every_m=(15.0, 35.0), stop_s=(5.0, 12.0)),
     "hurry": Pace(hurries=True),
-    # What a drone that follows has cause to slow down, hover and speed up for.
+    # Makes a following drone slow down, hover and speed up.
     "fits_and_starts": Pace(hurries=True, stop_every_m=(8.0, 14.0), stop_s=(3.0, 5.0)),
     "turn_back": Pace(turn_at=(0.45, 0.75), back=(0.5, 0.9), stop_s=(1.0, 4.0)),
 }
 
 
 @dataclass(frozen=True)
-class Way:
-    """What a pace makes of a route: polyline_m (k, 2); stops_s (k,), how long the person stands at each waypoint."""
+class PacedRoute:
+    """A route after a pace is applied: polyline_m (k, 2); stops_s (k,), duration of the stop at each waypoint."""
 
     polyline_m: np.ndarray
     stops_s: np.ndarray
 
     @cached_property
     def along_m(self) -> np.ndarray:
-        """Length of the way to each waypoint, (k,) m."""
+        """Return the distance along the route to each waypoint, (k,) m."""
         return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.polyline_m, axis=0), axis=1))])
 
     @classmethod
-    def without_stops(cls, polyline_m: np.ndarray) -> Way:
+    def without_stops(cls, polyline_m: np.ndarray) -> PacedRoute:
         return cls(polyline_m, np.zeros(len(polyline_m)))
 
 
-def take_pace(route_m: np.ndarray, pace: Pace, rng: np.random.Generator) -> Way:
-    """Go a route, (k, 2) m, at a pace. Nobody stops at its ends; two points are gone as they are."""
+def take_pace(route_m: np.ndarray, pace: Pace, rng: np.random.Generator) -> PacedRoute:
+    """Apply a pace to a route, (k, 2) m. There are no stops at its ends; a route of two points is unchanged."""
     if len(route_m) < 3:
-        return Way.without_stops(route_m)
+        return PacedRoute.without_stops(route_m)
     turn = len(route_m) - 1
-    way_m = route_m
+    polyline_m = route_m
     if pace.turn_at is not None:
         turn = int(np.clip(round(rng.uniform(*pace.turn_at) * turn), 1, turn))
         num_back = max(1, round(rng.uniform(*pace.back) * turn))
-        way_m = np.concatenate([route_m[: turn + 1], route_m[turn - num_back : turn][::-1]])
-    way = Way.without_stops(way_m)
+        polyline_m = np.concatenate([route_m[: turn + 1], route_m[turn - num_back : turn][::-1]])
+    route = PacedRoute.without_stops(polyline_m)
     if pace.turn_at is not None:
-        way.stops_s[turn] = rng.uniform(*pace.stop_s)
+        route.stops_s[turn] = rng.uniform(*pace.stop_s)
     if pace.stop_every_m is not None:
-        _add_stops(way, pace.stop_every_m, pace.stop_s, rng)
-    return way
+        _add_stops(route, pace.stop_every_m, pace.stop_s, rng)
+    return route
 
 
-def speeds_at(way: Way, pace: Pace, cfg: PedestriansConfig, rng: np.random.Generator) -> np.ndarray:
-    """Speeds at the waypoints of a way that is gone at a pace, (k,) m/s, 0 where it stops."""
+def speeds_at(route: PacedRoute, pace: Pace, cfg: PedestriansConfig, rng: np.random.Generator) -> np.ndarray:
+    """Return the speeds at the waypoints of a paced route, (k,) m/s, 0 at stops."""
     speeds_mps = speed_profile(
-        menger_curvature(way.polyline_m),
+        menger_curvature(route.polyline_m),
         rng,
         cruise_speed_mps=cfg.hurry_speed_mps if pace.hurries else cfg.cruise_speed_mps,
         curvature_gain_m=cfg.curvature_gain_m,
@@ -198,17 +188,19 @@ def speeds_at(way: Way, pace: Pace, cfg: PedestriansConfig, rng: np.random.Gener
         min_speed_mps=cfg.min_speed_mps,
         max_speed_mps=max(cfg.max_speed_mps, cfg.hurry_speed_mps) if pace.hurries else cfg.max_speed_mps,
     )
-    speeds_mps[way.stops_s > 0] = 0.0
+    speeds_mps[route.stops_s > 0] = 0.0
     return speeds_mps
 
 
-def _add_stops(way: Way, every_m: tuple[float, float], stop_s: tuple[float, float], rng: np.random.Generator) -> None:
-    """Put stops on a way, in place."""
-    along_m = way.along_m
+def _add_stops(
+    route: PacedRoute, every_m: tuple[float, float], stop_s: tuple[float, float], rng: np.random.Generator
+) -> None:
+    """Add stops to a route, in place."""
+    along_m = route.along_m
     next_m, first = rng.uniform(*every_m), 1
     while next_m < along_m[-1]:
         waypoint = max(int(np.searchsorted(along_m, next_m)), first)
         if waypoint >= len(along_m) - 1:
             return
-        way.stops_s[waypoint] = rng.uniform(*stop_s)
+        route.stops_s[waypoint] = rng.uniform(*stop_s)
         next_m, first = along_m[waypoint] + rng.uniform(*every_m), waypoint + STOP_GAP_MIN

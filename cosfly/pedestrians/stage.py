@@ -1,17 +1,13 @@
-"""Stage `pedestrians`: walks over the free ground of a simplified map (Step 3 of the paper, sec:step3).
+"""Stage `pedestrians`: trajectories over the free ground of a simplified map (Step 3 of the paper, sec:step3).
 
 Grid, projection, inflation, connectivity, sampling, A* and report follow each other as in the paper. Speed follows the
-literal formulas on the A* polyline, one waypoint per cell, so that curvature slows a walk in the one or two steps next
-to a corner only:
-means of 1.05 to 1.17 m/s at a cruising speed of 1.2 where streets run along the axes, 0.83 m/s in an old town that lies
-askew (22 corners in 100 m). Leaving collinear waypoints out first would carry a corner's low speed over the straight
-piece behind it (0.92 instead of 1.07 m/s on the same 40 routes of a test town).
+literal formulas on the A* polyline, one waypoint per cell, so that curvature slows a pedestrian only in the one or two
+steps next to a corner: mean speeds are 1.05 to 1.17 m/s at a cruising speed of 1.2 where streets run along the axes,
+and 0.83 m/s in an old town whose streets do not (22 corners in 100 m). Without collinear waypoints, the low speed of a
+corner would extend over the straight segment behind it (0.92 instead of 1.07 m/s on the same 40 routes of a test town).
 
-Two guards of ours are on by default, and a setting turns each off: `ground` keeps walks on what the map knows as ground
-(a city model is empty, not free, outside its data), `max_detour` gives up ends that are near each other only across a
-canal.
-
-This module simplifies no map and knows nothing of drones. How people walk is in walking.py.
+Two guards of ours are on by default, and a setting turns each off: `ground` keeps trajectories on known ground (a city
+model is empty, not free, outside its data), `max_detour` rejects ends that are close to each other only across a canal.
 """
 
 from __future__ import annotations
@@ -33,7 +29,7 @@ from cosfly.formats.roi import read_roi
 from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.astar import route_cost
 from cosfly.pedestrians.bystanders import bystanders_of
-from cosfly.pedestrians.crossings import CROSSING, ROAD, where_walked
+from cosfly.pedestrians.crossings import CROSSING, ROAD, count_on_road
 from cosfly.pedestrians.lanes import Lane, lanes_of
 from cosfly.pedestrians.speed_model import PACES, arrival_times, resample, speeds_at, take_pace
 from cosfly.pedestrians.walkable import (
@@ -53,9 +49,230 @@ from cosfly.runtime.seeding import draw_by_share, rng_for
 from cosfly.runtime.worker import Item, Outcome, Work
 from cosfly.viz.topview import INK, TopView, draw_dot, draw_line, draw_text, png_bytes
 
+log = logging.getLogger(__name__)
+
+STAGE = "pedestrians"
+REPORT_FORMAT = FileFormat("cosfly.pedestrians_report", "1.0")
+RETRY_REASONS = ("no_goal", "detour")
+
+
+# --- one trajectory ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PedestrianResult:
+    """A trajectory with the pairs of ends rejected, by reason, and the seconds of the steps."""
+
+    trajectory: PedestrianTrajectory
+    retries: dict[str, int]
+    seconds: dict[str, float]
+
+
+def make_pedestrian(
+    path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, pace: str | None = None
+) -> PedestrianResult:
+    """Make one trajectory: draw its ends, find the route, apply a pace, sample it.
+
+    Args:
+        pace: None: drawn by its share.
+    Raises:
+        NoPathError: If every pair of ends is rejected.
+    """
+    clock = Clock()
+    pace_rng = rng.spawn(1)[0]  # a child takes no draw from its parent: shares of paces change no route
+    route_m, retries = _draw_route(path_id, ground, cfg, rng, clock)
+    with clock("report"):
+        trajectory = follow_route(path_id, route_m, ground.heights, cfg, rng, pace_rng, pace)
+    return PedestrianResult(trajectory, retries, clock.seconds)
+
+
+def follow_route(
+    path_id: str, route_m: np.ndarray, heights: Ground, cfg: PedestriansConfig, rng: np.random.Generator,
+    pace_rng: np.random.Generator, pace: str | None = None,
+) -> PedestrianTrajectory:  # fmt: skip
+    """Return the trajectory along a route, (k, 2) m, at a pace; None: one that is drawn by its share."""
+    name = pace or draw_by_share(cfg.pace, pace_rng)
+    route = take_pace(route_m, PACES[name], pace_rng)
+    waypoint_mps = speeds_at(route, PACES[name], cfg, rng)
+    times_s = arrival_times(route.polyline_m, waypoint_mps)
+    time_s, positions_m, speeds_mps = resample(route.polyline_m, waypoint_mps, times_s, cfg.dt_s, route.stops_s)
+    on_ground = np.column_stack([positions_m, heights.height_at(positions_m)])
+    return PedestrianTrajectory(path_id, route.polyline_m, time_s, on_ground, speeds_mps, name)
+
+
+def _draw_route(
+    path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, clock: Clock
+) -> tuple[np.ndarray, dict[str, int]]:
+    """Draw pairs of ends until one is accepted; return its route, (k, 2) m, and the rejected pairs by reason."""
+    limits = cfg.min_distance_m / cfg.resolution_m, cfg.max_distance_m / cfg.resolution_m
+    retries = dict.fromkeys(RETRY_REASONS, 0)
+    for _ in range(cfg.num_retries + 1):
+        with clock("sample"):
+            start = sample_start(ground, rng)
+            goal = sample_goal(ground, start, *limits, rng)
+        if goal is None:
+            retries["no_goal"] += 1
+            continue
+        with clock("astar"):
+            cells = ground.route(start, goal)
+        if cfg.max_detour and route_cost(cells) > cfg.max_detour * np.hypot(*(cells[-1] - cells[0])):
+            retries["detour"] += 1
+            continue
+        return ground.grid.centers_of(cells), retries
+    raise NoPathError(
+        "every pair of ends was rejected",
+        where=path_id,
+        got=f"{retries['no_goal']} starts without a goal, {retries['detour']} detours in {cfg.num_retries + 1} tries",
+        expected=f"a cell {cfg.min_distance_m:g} to {cfg.max_distance_m:g} m away in the same walkable area",
+        fix="lower min_distance_m, raise max_distance_m, max_detour or num_retries, or widen the region of interest",
+    )
+
+
+class _PedestrianRecord(BaseModel):
+    """The journal entry of a trajectory."""
+
+    path: dict[str, Any]
+    retries: dict[str, int]
+    seconds: dict[str, float]
+    bystanders: dict[str, Any] = {}  # where there are bystanders or cars
+
+
+def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround, lanes: list[Lane]) -> Work:
+    """Return the function that makes one trajectory, and its bystanders and cars where the settings ask for them."""
+
+    def work(item: Item) -> Outcome:
+        made = make_pedestrian(item.item_id, ground, cfg, rng_for(seed, STAGE, item.item_id), item.payload)
+        result = {"path": made.trajectory.as_json(), "retries": made.retries, "seconds": made.seconds}
+        if cfg.has_others:
+            rng = rng_for(seed, STAGE, f"{item.item_id}/others")
+            result["bystanders"] = bystanders_of(made.trajectory, ground, lanes, cfg, rng).as_json()
+        return Outcome(result)
+
+    return work
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+def report(
+    ground: WalkableGround, paths: list[PedestrianTrajectory], retries: list[dict[str, int]], failed: dict[str, int]
+) -> dict:
+    """Return `pedestrians_report.json`: equal inputs give equal bytes, so times are written to the manifest."""
+    rows: list[dict[str, Any]] = []
+    for path, rejected in zip(paths, retries, strict=True):
+        length_m = float(np.linalg.norm(np.diff(path.polyline_m, axis=0), axis=1).sum())
+        duration_s = float(path.time_s[-1])
+        on_road, on_crossings = count_on_road(path, ground.footing, ground.grid)
+        rows.append(
+            {
+                "id": path.path_id,
+                **pace_field(path.pace),
+                "cells": len(path.polyline_m),
+                "length_m": round(length_m, 3),
+                "straight_m": round(float(np.linalg.norm(path.polyline_m[-1] - path.polyline_m[0])), 3),
+                "points": len(path.time_s),
+                "on_carriageway": on_road,
+                "on_crossings": on_crossings,
+                "duration_s": duration_s,
+                "mean_speed_mps": round(length_m / duration_s, 4),
+                "retries": rejected,
+            }
+        )
+    sums = {key: sum(row[key] for row in rows) for key in ("points", "on_carriageway", "on_crossings")}
+    total_m, total_s = (sum(row[key] for row in rows) for key in ("length_m", "duration_s"))
+    total = {
+        "paths": len(rows),
+        "cells": sum(row["cells"] for row in rows),
+        **sums,
+        "on_carriageway_share": round(sums["on_carriageway"] / sums["points"], 4),
+        "length_m": round(total_m, 3),
+        "duration_s": total_s,
+        "mean_speed_mps": round(total_m / total_s, 4),
+        "retries": {reason: sum(rejected[reason] for rejected in retries) for reason in RETRY_REASONS},
+    }
+    return {**REPORT_FORMAT.header, "ground": ground.counts, "paths": rows, "failed": failed, "total": total}
+
+
+def _write_bystanders(path: Path, records: list[dict], header: dict, cfg: PedestriansConfig) -> dict[str, dict]:
+    """Write `others.json`; return how many were requested and placed, by kind, with a warning where some are
+    missing."""
+    items = [Bystanders.from_json(record, f"{path.parent}: items.jsonl") for record in records]
+    write_bystanders(path, items, header)
+    counts = {}
+    for kind, per_item in (("Pedestrians", cfg.others), ("Car", cfg.traffic)):
+        wanted = per_item * len(items)
+        placed = sum(other.kind == kind for bystanders in items for other in bystanders.others)
+        counts[kind] = {"wanted": wanted, "placed": placed}
+        if placed < wanted:
+            log.warning("pedestrians: only %d of %d bystanders of kind %s could be placed", placed, wanted, kind)
+    return counts
+
+
+def run(
+    cfg: PedestriansConfig,
+    simplified_map: Path,
+    out: Path,
+    *,
+    seed: int = 0,
+    workers: int = 0,
+    watch: Watch = Watch(),
+    resume: Resume = "if-same",
+    roi: Path | None = None,
+) -> Path:
+    """Read `step2_simplified.json` (and a region of interest); write `path.json`, a report and `paths.png`, and
+    `others.json` where there are bystanders or cars.
+
+    Args:
+        roi: `roi_polygon.json`; None: the whole map.
+    Returns:
+        The path of `path.json`.
+    Raises:
+        NoPathError: If nothing is walkable.
+        NothingKept: If no trajectory can be made; single failures are counted.
+    """
+    inputs = {"map": simplified_map} | ({"roi": roi} if roi else {})
+    settings = cfg.all_values()
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
+    product = out / "path.json"
+    if stage.is_complete:
+        return product
+    clock = Clock()
+    with clock("read"):
+        box_map = read_boxes(simplified_map)
+        region = read_roi(roi) if roi else None
+    ground = walkable_ground(box_map, cfg, region, where=simplified_map, roi_where=roi or "", clock=clock)
+    items = [Item(walk_id(k), pace) for k, pace in enumerate(paces_of(cfg.num_paths, cfg.pace, seed))]
+    # Workers need the labels only; sending the rest takes time.
+    lean = replace(ground, inflated=ground.grid, is_in_roi=None)
+    lanes = lanes_of(box_map) if cfg.traffic else []
+    inputs_of = (cfg, seed, lean, lanes)
+    finished = run_items(stage, items, make_worker, inputs_of, workers=workers, watch=watch, label="trajectories")
+    if not finished.tally.kept:
+        raise stage.nothing_kept(finished.tally)
+    results = [result_of(record, _PedestrianRecord) for record in finished.kept]
+    paths = [PedestrianTrajectory.from_json(result.path, f"{out}: items.jsonl") for result in results]
+    for result in results:
+        for step, taken_s in result.seconds.items():
+            clock.add(step, taken_s)
+    outputs = [product, out / "pedestrians_report.json", out / "paths.png"]
+    with clock("report"):
+        retries = [result.retries for result in results]
+        summary = report(ground, paths, retries, dict(sorted(finished.tally.failed.items())))
+        write_paths(product, paths, {"map": box_map.name, "seed": seed, "settings": settings})
+        if cfg.has_others:
+            header = {"map": box_map.name, "seed": seed, "dt_s": cfg.dt_s}
+            outputs.append(out / BYSTANDERS_FILE)
+            summary["others"] = _write_bystanders(outputs[-1], [result.bystanders for result in results], header, cfg)
+        write_json(out / "pedestrians_report.json", summary)
+        share = summary["total"]["on_carriageway_share"]
+        log.info("%.1f %% of the points are on carriageway away from crossings", 100 * share)
+        write_bytes(out / "paths.png", draw_overview(ground, paths))
+    seconds = {step: round(value, 4) for step, value in clock.seconds.items()}
+    stage.finish(outputs, finished.tally, ground=ground.counts, total=summary["total"], seconds_by_step=seconds)
+    return product
+
+
 # --- overview ---------------------------------------------------------------------------------------------------------
-# The pedestrian stage from above: obstacles, region of interest, usable ground and every walk, for a look before going
-# on.
 
 
 LONGER_SIDE_PX = 1600
@@ -70,7 +287,7 @@ LEGEND = (("obstacle", OBSTACLE), ("safety margin", MARGIN), ("free, not used", 
 
 
 def draw_overview(ground: WalkableGround, paths: list[PedestrianTrajectory]) -> bytes:
-    """Draw the ground and the walks; a ring is a start, a dot a goal, and north is up; PNG bytes."""
+    """Draw the ground and the trajectories, north up; a ring is a start, a dot a goal; return PNG bytes."""
     picture, view = _ground_picture(ground)
     thickness = max(1, round(LONGER_SIDE_PX / 600))
     if ground.is_in_roi is not None:
@@ -94,7 +311,7 @@ def path_color(number: int) -> tuple[int, int, int]:
 
 
 def _ground_picture(ground: WalkableGround) -> tuple[np.ndarray, TopView]:
-    """Paint the cells, north up; gives the picture and where it lies."""
+    """Paint the cells, north up; return the picture and its view."""
     grid = ground.grid
     num_x, num_y = grid.size
     scale = LONGER_SIDE_PX / max(num_x, num_y)
@@ -108,7 +325,7 @@ def _ground_picture(ground: WalkableGround) -> tuple[np.ndarray, TopView]:
     width, height = max(1, round(num_x * scale)), max(1, round(num_y * scale))
     picture = cv2.resize(cells, (width, height), interpolation=cv2.INTER_NEAREST if scale >= 1 else cv2.INTER_AREA)
     per_m = scale / grid.resolution_m
-    # A cell's colour fills its pixels; a place is 0 in the middle of the first pixel.
+    # A cell's colour fills its pixels; coordinates are 0 in the middle of the first pixel.
     view = TopView(grid.x_min_m + 0.5 / per_m, grid.y_min_m + (height - 0.5) / per_m, per_m, (width, height))
     return picture, view
 
@@ -126,240 +343,9 @@ def _legend(width_px: int, pixels_per_m: float, has_roi: bool, num_paths: int) -
     draw_dot(strip, np.array([x + 8, 32]), 7, INK, 2)
     x = draw_text(strip, "start", x + 24, y) + 16
     draw_dot(strip, np.array([x + 8, 32]), 6, INK)
-    x = draw_text(strip, f"goal of {num_paths} walks", x + 24, y) + 32
+    x = draw_text(strip, f"goal of {num_paths} trajectories", x + 24, y) + 32
     bar_m = next(m for m in (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1) if m * pixels_per_m < 220 or m == 1)
     end = x + round(bar_m * pixels_per_m)
     draw_line(strip, np.array([[x, 32], [end, 32]]), INK, 2)
     draw_text(strip, f"{bar_m} m", end + 10, y)
     return strip
-
-
-log = logging.getLogger(__name__)
-
-STAGE = "pedestrians"
-REPORT_FORMAT = FileFormat("cosfly.pedestrians_report", "1.0")
-RETRY_REASONS = ("no_goal", "detour")
-
-
-# --- one walk ---------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class PedestrianResult:
-    """A walk and what it took: pairs of ends given up by reason, and the seconds of the steps."""
-
-    walk: PedestrianTrajectory
-    retries: dict[str, int]
-    seconds: dict[str, float]
-
-
-def make_pedestrian(
-    path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, pace: str | None = None
-) -> PedestrianResult:
-    """Make one walk: draw its ends, find the route, take it at a pace, sample it.
-
-    Args:
-        pace: None: drawn by its share.
-    Raises:
-        NoPathError: no pair of ends served.
-    """
-    clock = Clock()
-    pace_rng = rng.spawn(1)[0]  # a child takes no draw from its parent: shares of paces move no route
-    route_m, retries = _draw_route(path_id, ground, cfg, rng, clock)
-    with clock("report"):
-        walk = walk_along(path_id, route_m, ground.heights, cfg, rng, pace_rng, pace)
-    return PedestrianResult(walk, retries, clock.seconds)
-
-
-def walk_along(
-    path_id: str,
-    route_m: np.ndarray,
-    heights: Ground,
-    cfg: PedestriansConfig,
-    rng: np.random.Generator,
-    pace_rng: np.random.Generator,
-    pace: str | None = None,
-) -> PedestrianTrajectory:
-    """Walk a route, (k, 2) m, at a pace, or one that is drawn, and sample it."""
-    name = pace or draw_by_share(cfg.pace, pace_rng)
-    way = take_pace(route_m, PACES[name], pace_rng)
-    waypoint_mps = speeds_at(way, PACES[name], cfg, rng)
-    times_s = arrival_times(way.polyline_m, waypoint_mps)
-    time_s, positions_m, speeds_mps = resample(way.polyline_m, waypoint_mps, times_s, cfg.dt_s, way.stops_s)
-    on_ground = np.column_stack([positions_m, heights.height_at(positions_m)])
-    return PedestrianTrajectory(path_id, way.polyline_m, time_s, on_ground, speeds_mps, name)
-
-
-def _draw_route(
-    path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, clock: Clock
-) -> tuple[np.ndarray, dict[str, int]]:
-    """Draw ends until a pair serves; gives its route, (k, 2) m, and the pairs given up by reason."""
-    limits = cfg.min_distance_m / cfg.resolution_m, cfg.max_distance_m / cfg.resolution_m
-    retries = dict.fromkeys(RETRY_REASONS, 0)
-    for _ in range(cfg.num_retries + 1):
-        with clock("sample"):
-            start = sample_start(ground, rng)
-            goal = sample_goal(ground, start, *limits, rng)
-        if goal is None:
-            retries["no_goal"] += 1
-            continue
-        with clock("astar"):
-            cells = ground.route(start, goal)
-        if cfg.max_detour and route_cost(cells) > cfg.max_detour * np.hypot(*(cells[-1] - cells[0])):
-            retries["detour"] += 1
-            continue
-        return ground.grid.centers_of(cells), retries
-    raise NoPathError(
-        "no pair of ends serves",
-        where=path_id,
-        got=f"{retries['no_goal']} starts without a goal, {retries['detour']} detours in {cfg.num_retries + 1} tries",
-        expected=f"a cell {cfg.min_distance_m:g} to {cfg.max_distance_m:g} m off in the same walkable area",
-        fix="lower min_distance_m, raise max_distance_m, max_detour or num_retries, or widen the region of interest",
-    )
-
-
-class _PedestrianRecord(BaseModel):
-    """What the journal holds of a walk."""
-
-    path: dict[str, Any]
-    retries: dict[str, int]
-    seconds: dict[str, float]
-    bystanders: dict[str, Any] = {}  # where others are wanted
-
-
-def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround, lanes: list[Lane]) -> Work:
-    """Worker factory: gives the function that makes one walk, and its company where the settings ask for one."""
-
-    def work(item: Item) -> Outcome:
-        made = make_pedestrian(item.item_id, ground, cfg, rng_for(seed, STAGE, item.item_id), item.payload)
-        result = {"path": made.walk.as_json(), "retries": made.retries, "seconds": made.seconds}
-        if cfg.has_others:
-            rng = rng_for(seed, STAGE, f"{item.item_id}/others")
-            result["company"] = bystanders_of(made.walk, ground, lanes, cfg, rng).as_json()
-        return Outcome(result)
-
-    return work
-
-
-# --- the stage --------------------------------------------------------------------------------------------------------
-
-
-def report(
-    ground: WalkableGround, paths: list[PedestrianTrajectory], retries: list[dict[str, int]], failed: dict[str, int]
-) -> dict:
-    """Sum up the stage for `pedestrians_report.json`: equal inputs give equal bytes, so times are in the manifest."""
-    lines: list[dict[str, Any]] = []
-    for path, given_up in zip(paths, retries, strict=True):
-        length_m = float(np.linalg.norm(np.diff(path.polyline_m, axis=0), axis=1).sum())
-        walked_s = float(path.time_s[-1])
-        on_road, on_crossings = where_walked(path, ground.footing, ground.grid)
-        lines.append(
-            {
-                "id": path.path_id,
-                **pace_field(path.pace),
-                "cells": len(path.polyline_m),
-                "length_m": round(length_m, 3),
-                "straight_m": round(float(np.linalg.norm(path.polyline_m[-1] - path.polyline_m[0])), 3),
-                "points": len(path.time_s),
-                "on_carriageway": on_road,
-                "on_crossings": on_crossings,
-                "duration_s": walked_s,
-                "mean_speed_mps": round(length_m / walked_s, 4),
-                "retries": given_up,
-            }
-        )
-    total_m = sum(line["length_m"] for line in lines)
-    total_s = sum(line["duration_s"] for line in lines)
-    return {
-        **REPORT_FORMAT.header,
-        "ground": ground.counts,
-        "paths": lines,
-        "failed": failed,
-        "total": {
-            "paths": len(lines),
-            "cells": sum(line["cells"] for line in lines),
-            **(sums := {key: sum(line[key] for line in lines) for key in ("points", "on_carriageway", "on_crossings")}),
-            "on_carriageway_share": round(sums["on_carriageway"] / sums["points"], 4),
-            "length_m": round(total_m, 3),
-            "duration_s": total_s,
-            "mean_speed_mps": round(total_m / total_s, 4),
-            "retries": {reason: sum(given_up[reason] for given_up in retries) for reason in RETRY_REASONS},
-        },
-    }
-
-
-def _write_companies(path: Path, lines: list[dict], header: dict, cfg: PedestriansConfig) -> dict[str, dict[str, int]]:
-    """Write `others.json`; count who was wanted and who found a place, by kind, and warn if some are missing."""
-    companions = [Bystanders.from_json(line, f"{path.parent}: items.jsonl") for line in lines]
-    write_bystanders(path, companions, header)
-    counts = {}
-    for kind, wanted in (("Pedestrians", cfg.others), ("Car", cfg.traffic)):
-        placed = sum(other.kind == kind for bystanders in companions for other in bystanders.others)
-        counts[kind] = {"wanted": wanted * len(companions), "placed": placed}
-        if placed < wanted * len(companions):
-            log.warning("pedestrians: %d of %d others of kind %s found a place", placed, wanted * len(companions), kind)
-    return counts
-
-
-def run(
-    cfg: PedestriansConfig,
-    simplified_map: Path,
-    out: Path,
-    *,
-    seed: int = 0,
-    workers: int = 0,
-    watch: Watch = Watch(),
-    resume: Resume = "if-same",
-    roi: Path | None = None,
-) -> Path:
-    """Read `step2_simplified.json` (and a region of interest), write `path.json`, a report and `paths.png`; with
-    others, `others.json`.
-
-    Args:
-        roi: `roi_polygon.json`; None lets people walk on the whole map.
-    Returns:
-        the path of `path.json`.
-    Raises:
-        NoPathError: nothing is walkable. NothingKept: not one walk could be made; a walk that fails alone is counted.
-    """
-    inputs = {"map": simplified_map} | ({"roi": roi} if roi else {})
-    settings = cfg.all_values()
-    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
-    product = out / "path.json"
-    if stage.is_complete:
-        return product
-    clock = Clock()
-    with clock("read"):
-        box_map = read_boxes(simplified_map)
-        region = read_roi(roi, cfg.roi_vertices) if roi else None
-    ground = walkable_ground(box_map, cfg, region, where=simplified_map, roi_where=roi or "", clock=clock)
-    items = [Item(walk_id(k), pace) for k, pace in enumerate(paces_of(cfg.num_paths, cfg.pace, seed))]
-    # Workers need the labels only; the rest would cost time to send.
-    lean = replace(ground, inflated=ground.grid, is_in_roi=None)
-    lanes = lanes_of(box_map) if cfg.traffic else []
-    finished = run_items(
-        stage, items, make_worker, (cfg, seed, lean, lanes), workers=workers, watch=watch, label="walks"
-    )
-    if not finished.tally.kept:
-        raise stage.nothing_kept(finished.tally)
-    results = [result_of(record, _PedestrianRecord) for record in finished.kept]
-    paths = [PedestrianTrajectory.from_json(result.path, f"{out}: items.jsonl") for result in results]
-    for result in results:
-        for step, taken_s in result.seconds.items():
-            clock.add(step, taken_s)
-    outputs = [product, out / "pedestrians_report.json", out / "paths.png"]
-    with clock("report"):
-        retries = [result.retries for result in results]
-        summary = report(ground, paths, retries, dict(sorted(finished.tally.failed.items())))
-        write_paths(product, paths, {"map": box_map.name, "seed": seed, "settings": settings})
-        if cfg.has_others:
-            header = {"map": box_map.name, "seed": seed, "dt_s": cfg.dt_s}
-            outputs.append(out / BYSTANDERS_FILE)
-            summary["others"] = _write_companies(outputs[-1], [result.bystanders for result in results], header, cfg)
-        write_json(out / "pedestrians_report.json", summary)
-        share = summary["total"]["on_carriageway_share"]
-        log.info("%.1f %% of the walked points are on carriageway away from crossings", 100 * share)
-        write_bytes(out / "paths.png", draw_overview(ground, paths))
-    seconds = {step: round(value, 4) for step, value in clock.seconds.items()}
-    stage.finish(outputs, finished.tally, ground=ground.counts, total=summary["total"], seconds_by_step=seconds)
-    return product

@@ -1,7 +1,6 @@
-"""Where people can walk on a map, and which cells serve as the ends of a walk (sec:step3).
+"""The settings of the pedestrian stage, the walkable ground of a map, and the sampling of ends (sec:step3).
 
-The settings of the pedestrian stage; its grid, projection, inflation and connectivity. The arithmetic on cells is in
-grid.py.
+Grid, projection, inflation and connectivity follow the paper; the arithmetic on cells is in geometry/grid.py.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from pydantic import Field, field_validator, model_validator
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import GROUND_KINDS, PAVED_KINDS
 from cosfly.formats.pedestrian_paths import PLAIN_PACE
-from cosfly.formats.roi import MOST_VERTICES, Roi
+from cosfly.formats.roi import Roi
 from cosfly.geometry.axes import DT_S
 from cosfly.geometry.grid import (
     SURFACE_REACH_M,
@@ -40,84 +39,76 @@ from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.crossings import CROSSING, ROAD, costs_of, footing_of
 from cosfly.pedestrians.speed_model import PACES, SLOWEST_SPEED_MPS
-from cosfly.runtime.config import Config, MayDiffer
-from cosfly.runtime.errors import NoPathError, nearest
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import InputError, NoPathError, nearest
 
 log = logging.getLogger(__name__)
 
-# Surfaces of a map without paved ones are trusted down to this share of its free cells: below, they are lawns between
-# unnamed streets.
+# Least share of surfaces in the free cells of a map without paved ones; below, they are lawns between unnamed streets.
 SURFACE_SHARE_MIN = 0.5
-OFF_GROUND_SHARE_MAX = 0.1  # a flyover and a few stray kerbs are no slope
-ROI_SHARE_MIN = 0.5  # of a region of interest that lies on the map: below, it is hardly of this map
+OFF_GROUND_SHARE_MAX = 0.1  # more ground boxes off the header's ground indicate a slope
+ROI_SHARE_MIN = 0.5  # of a region of interest that lies on the map; below, it belongs to another map
 SLOPE_MAX = 0.58  # rise over run, 30 degrees: as steep as stairs
 
 
 class PedestriansConfig(Config):
     """Settings of the pedestrian stage; the defaults are the paper's (tab:ped_params, eq:speed)."""
 
-    num_paths: int = Field(20, ge=1, le=100_000, description="walks to make")
+    num_paths: int = Field(20, ge=1, le=100_000, description="pedestrian trajectories to make")
     resolution_m: float = Field(0.5, gt=0, le=10, description="side of a grid cell, m")
     human_height_m: ClassVar[float] = 2.0  # boxes that reach between the ground and this height block, m
-    safety_radius_m: float = Field(0.5, ge=0, le=50, description="how far walkers stay off obstacles, m; 0 is off")
+    safety_radius_m: float = Field(
+        0.5, ge=0, le=50, description="distance that pedestrians keep from obstacles, m; 0: none"
+    )
     min_distance_m: float = Field(50.0, gt=0, description="least straight distance from start to goal, m")
     max_distance_m: float = Field(100.0, gt=0, le=2000, description="greatest straight distance from start to goal, m")
-    min_component_cells: int = Field(4000, ge=1, description="connected free areas of fewer cells are not used")
-    num_retries: int = Field(5, ge=0, description="new ends tried for a walk whose first ends do not serve")
-    max_detour: float = Field(
-        3.0, ge=0, description="ends whose route is this many times longer than straight do not serve; 0 is off"
-    )
+    min_component_cells: int = Field(4000, ge=1, description="smallest connected free area that is used, cells")
+    num_retries: int = Field(5, ge=0, description="further pairs of ends tried where the first pair is rejected")
+    max_detour: float = Field(3.0, ge=0, description="longest route, times the straight distance; 0: no limit")
     ground: Literal["anywhere", "surfaces", "paved"] = Field(
         "surfaces",
-        description="where people walk: anywhere in the map's bounds, on any ground box (anywhere, where a map has no "
-        "streets and ground boxes under less than half of it), or on streets and squares",
+        description="walkable ground: anywhere; surfaces: on any ground box (anywhere, if a map has no streets, and "
+        "ground boxes under less than half of it); paved: streets and squares",
     )
     road_cost: int = Field(
         1,
         ge=1,
         le=100,
-        description="what a metre of carriageway away from crossings costs a route, in metres of pavement; over 1 "
-        "walks begin and end off the carriageway too; 1: all ground costs alike, as in the paper",
+        description="cost of a metre of carriageway away from crossings, in metres of pavement; above 1 no trajectory "
+        "starts or ends on the carriageway; 1: all ground costs the same, as in the paper",
     )
-    open_cost: int = Field(
-        1, ge=1, le=100, description="what a metre of lawn and other open ground costs a route, in metres of pavement"
-    )
-    cruise_speed_mps: float = Field(1.2, gt=0, description="speed on straight ground, m/s")
-    curvature_gain_m: float = Field(5.0, ge=0, description="alpha of eq:speed, m: how much corners slow; 0 is off")
-    speed_jitter: float = Field(0.15, ge=0, lt=1, description="beta of eq:speed: random share of speed; 0 is off")
-    min_speed_mps: float = Field(0.0, ge=0, description="speeds are raised to this, m/s (never below 0.05)")
-    max_speed_mps: ClassVar[float] = 1.6  # speeds are cut to this, m/s
+    open_cost: int = Field(1, ge=1, le=100, description="cost of a metre of open ground, in metres of pavement")
+    cruise_speed_mps: ClassVar[float] = 1.2  # speed on straight ground, m/s
+    curvature_gain_m: ClassVar[float] = 5.0  # alpha of eq:speed, m
+    speed_jitter: ClassVar[float] = 0.15  # beta of eq:speed: random share of the speed
+    min_speed_mps: ClassVar[float] = 0.0  # least speed, m/s
+    max_speed_mps: ClassVar[float] = 1.6  # greatest speed, m/s
     pace: dict[str, float] = Field(
-        {PLAIN_PACE: 1.0}, description=f"share of the walks at each pace, drawn to a quota: {', '.join(PACES)}"
+        {PLAIN_PACE: 1.0}, description=f"share of each pace, drawn to a quota: {', '.join(PACES)}"
     )
-    hurry_speed_mps: float = Field(
-        1.6, ge=SLOWEST_SPEED_MPS, description="cruising speed of who hurries, m/s; cut to it or max_speed_mps"
-    )
-    others: int = Field(0, ge=0, le=500, description="other people who walk about during each walk; 0: nobody")
+    hurry_speed_mps: float = Field(1.6, ge=SLOWEST_SPEED_MPS, description="cruising speed of paces that hurry, m/s")
+    others: int = Field(0, ge=0, le=500, description="bystanders around each pedestrian trajectory")
     look_alikes: int = Field(
         0,
         ge=0,
         le=500,
-        description="how many of the others wear what the walker does but for one thing: hard negatives",
+        description="number of the bystanders whose clothes differ from the target's in one thing: hard distractors",
     )
     traffic: int = Field(
-        0, ge=0, le=500, description="cars that drive about during each walk, where the map has straight roads; 0: none"
+        0, ge=0, le=500, description="cars around each pedestrian trajectory, where the map has straight roads"
     )
-    roi_vertices: MayDiffer[int] = Field(
-        MOST_VERTICES, ge=3, description="most vertices of a region of interest; more are refused"
-    )
-    others_reach_m: ClassVar[float] = 40.0  # how near to a walk its others keep, m
+    others_reach_m: ClassVar[float] = 40.0  # greatest distance of bystanders and cars from the trajectory, m
     dt_s: float = Field(
         DT_S,
         ge=0.05,
         le=5,
-        description="time step of walks, and with them of flights, frames and windows (dt), s; counts of frames "
-        "(caption.window, plan.muco.low_visibility_frames) and the thresholds of labels are for 0.5",
+        description="time step of trajectories, frames and windows (dt), s; counts of frames (caption.window) and the "
+        "thresholds of labels are for 0.5",
     )
 
     @property
     def has_others(self) -> bool:
-        """Whether anybody else is to move while a walk lasts."""
+        """Return whether there are bystanders or cars."""
         return self.others + self.traffic > 0
 
     @field_validator("pace")
@@ -125,11 +116,11 @@ class PedestriansConfig(Config):
     def _paces_are_known(cls, pace: dict[str, float]) -> dict[str, float]:
         for name, share in pace.items():
             if name not in PACES:
-                raise ValueError(f"{name!r} is no pace{nearest(name, PACES)}; there are {', '.join(PACES)}")
+                raise ValueError(f"pace {name!r} does not exist{nearest(name, PACES)}; choose from {', '.join(PACES)}")
             if share < 0:
-                raise ValueError(f"the share of {name} is {share:g}: a share is not negative")
+                raise ValueError(f"the share of {name} must not be negative, got {share:g}")
         if not sum(pace.values()) > 0:
-            raise ValueError("the shares must add up to something positive")
+            raise ValueError("the shares of the paces must add up to more than 0")
         return pace
 
     @model_validator(mode="after")
@@ -137,12 +128,10 @@ class PedestriansConfig(Config):
         wrong = []
         if self.min_distance_m >= self.max_distance_m:
             wrong.append(f"min_distance_m {self.min_distance_m} is not below max_distance_m {self.max_distance_m}")
-        if self.min_speed_mps > self.max_speed_mps:
-            wrong.append(f"min_speed_mps {self.min_speed_mps} is above max_speed_mps {self.max_speed_mps}")
         if self.look_alikes > self.others:
-            wrong.append(f"look_alikes {self.look_alikes} is above others {self.others}, of whom they are")
+            wrong.append(f"look_alikes {self.look_alikes} is above others {self.others}, which include them")
         if 0 < self.max_detour < 1:
-            wrong.append(f"max_detour {self.max_detour} is below 1: no route is shorter than straight; 0 is off")
+            wrong.append(f"max_detour {self.max_detour} is below 1, but no route is shorter than straight; 0: no limit")
         if wrong:
             raise ValueError("; ".join(wrong))
         return self
@@ -150,13 +139,11 @@ class PedestriansConfig(Config):
 
 @dataclass(frozen=True)
 class WalkableGround:
-    """Where people may walk.
+    """The walkable ground of a map.
 
-    grid: the obstacles before inflation. inflated: after it. parts: (ny, nx) int32, equal numbers where a walk from one
-    cell
-    to the other exists, 0 where nobody walks: obstacles, outside the region of interest, steep ground, small
-    components.
-    footing: (ny, nx) uint8, crossings.py. heights: of the ground. costs: of footings, for routes.
+    grid: the obstacles before inflation. inflated: after it. parts: (ny, nx) int32, equal numbers where a route from
+    one cell to the other exists, 0 where nobody walks: obstacles, outside the region of interest, steep ground, small
+    components. footing: (ny, nx) uint8, crossings.py. heights: of the ground. costs: of footings, for routes.
     """
 
     grid: OccupancyGrid
@@ -170,17 +157,17 @@ class WalkableGround:
 
     @cached_property
     def walkable(self) -> np.ndarray:
-        """(ny, nx) bool."""
+        """Return the walkable cells, (ny, nx) bool."""
         return self.parts > 0
 
     @cached_property
     def may_end(self) -> np.ndarray:
-        """Where walks may begin and end, (ny, nx) bool: off the carriageway, if that costs more than pavement."""
+        """Return the cells where trajectories may start and end, (ny, nx) bool: no carriageway of a higher cost."""
         return self.walkable & ((self.footing < CROSSING) | (self.costs[ROAD] == 1).all())
 
     @cached_property
     def row_ends(self) -> np.ndarray:
-        """(ny,) int64: how many cells there are where walks may end, up to the end of each row."""
+        """Return the number of cells of `may_end` up to the end of each row, (ny,) int64."""
         return np.cumsum(np.count_nonzero(self.may_end, axis=1))
 
     def route(self, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
@@ -215,14 +202,14 @@ def walkable_ground(
     roi_where: str | Path = "region of interest",
     clock: Clock | None = None,
 ) -> WalkableGround:
-    """Find the ground that the settings allow walks on.
+    """Return the walkable ground of a map.
 
-    Components are 8-connected, as in the paper, and those below `min_component_cells` are left out. A walk that never
-    cuts a corner cannot pass between two cells that touch by a corner only, so an 8-connected component may hold
-    several parts; both ends of a walk are to be drawn from one part, and then a route always exists.
+    Components are 8-connected, as in the paper, and those below `min_component_cells` are not used. A route that never
+    cuts a corner cannot pass between two cells that touch at a corner only, so an 8-connected component may hold
+    several parts; both ends of a route are drawn from one part, so that it exists.
 
     Args:
-        where, roi_where: the files to name in an error.
+        where, roi_where: The files to name in an error.
     """
     clock = clock or Clock()
     with clock("grid"):
@@ -231,7 +218,7 @@ def walkable_ground(
         grid = occupancy(box_map, height_m=cfg.human_height_m, like=empty)
         is_in_roi = None if roi is None else roi_mask(grid, roi)
     if roi is not None:
-        _check_roi(roi, box_map, roi_where)
+        check_roi(roi, box_map, roi_where)
     with clock("inflate"):
         inflated = inflate(grid, cfg.safety_radius_m)
         free = ~inflated.occupied
@@ -266,10 +253,10 @@ def walkable_ground(
         )
     if not ground.row_ends[-1]:
         raise NoPathError(
-            "all walkable ground is carriageway",
+            "all walkable ground is carriageway, where no trajectory may start or end",
             where=where,
             got=f"{counts['cells_used']} walkable cells, all Roads",
-            expected="pavements, squares or paths (Sidewalks, Ground) for the ends of walks",
+            expected="pavements, squares or paths (Sidewalks, Ground)",
             fix="set road_cost to 1",
         )
     return ground
@@ -289,16 +276,14 @@ def _steep(ground: Ground, grid: OccupancyGrid) -> np.ndarray | None:
 
 
 def _surface(box_map: BoxMap, ground: str, grid: OccupancyGrid, free: np.ndarray) -> np.ndarray | None:
-    """Return where there is ground as the settings want it; None for everywhere, also if the map does not say where its
-    ground is.
+    """Return the cells with ground as the settings want it; None for all cells, also where the map's ground is unknown.
 
-    It does not if it has no ground boxes, or neither streets nor squares and other ground under a small part of it
-    only. What lies outside a city model's data has no obstacles either: without ground boxes below, nobody could tell
-    it from a square.
+    It is unknown without ground boxes, or with neither streets nor squares and other ground under a small part of the
+    map. What lies outside a city model's data has no obstacles either: without ground boxes it looks like a square.
 
     Args:
         ground: `anywhere` in the map's bounds; over any ground box (`surfaces`); over PAVED_KINDS only (`paved`). free:
-            (ny, nx) bool.
+            (ny, nx) bool, cells without obstacles.
     """
     if ground == "anywhere":
         return None
@@ -306,12 +291,11 @@ def _surface(box_map: BoxMap, ground: str, grid: OccupancyGrid, free: np.ndarray
     num_off, num_all = _count(lies_off_ground(box_map, GROUND_KINDS)), _count(box_map.is_any_of(GROUND_KINDS))
     if num_off > OFF_GROUND_SHARE_MAX * num_all:
         log.warning(
-            "%s: %d of %d ground boxes lie more than %g m over or under the ground of its header: nobody walks there. "
-            "Does it slope? Then the header needs heights (ground)",
-            box_map.name, num_off, num_all, SURFACE_REACH_M,
+            "%s: %d of %d ground boxes lie more than %g m off the ground of its header and are not walkable; "
+            "if the map slopes, its header needs heights (ground)", box_map.name, num_off, num_all, SURFACE_REACH_M,
         )  # fmt: skip
     if found is None:
-        log.warning("%s has no ground boxes: people walk wherever nothing stands", box_map.name)
+        log.warning("%s has no ground boxes: people walk wherever there is no obstacle", box_map.name)
         return None
     paved = surface(box_map, PAVED_KINDS, like=grid)
     if ground == "paved":
@@ -320,7 +304,7 @@ def _surface(box_map: BoxMap, ground: str, grid: OccupancyGrid, free: np.ndarray
     if paved is None and num_found < SURFACE_SHARE_MIN * num_free:
         log.warning(
             "%s has no boxes of Roads, Sidewalks or Ground, and other ground under %d of %d free cells only: people "
-            "walk wherever nothing stands",
+            "walk wherever there is no obstacle",
             box_map.name, num_found, num_free,
         )  # fmt: skip
         return None
@@ -330,7 +314,7 @@ def _surface(box_map: BoxMap, ground: str, grid: OccupancyGrid, free: np.ndarray
 def _parts_of_large_components(
     free: np.ndarray, min_component_cells: int, counts: dict[str, Any], where: str | Path
 ) -> np.ndarray:
-    """Label what a walk can reach within the large components; adds the component counts."""
+    """Label the parts of the large components; add the component counts."""
     components, sizes = connected_parts(free, 8)
     is_large = sizes >= min_component_cells
     if not is_large.any():
@@ -348,17 +332,15 @@ def _parts_of_large_components(
     return parts
 
 
-def share_on_map(roi: Roi, box_map: BoxMap) -> float:
-    """Return the share of a region that lies within a map's bounds."""
+def check_roi(roi: Roi, box_map: BoxMap, where: str | Path, *, refuse: bool = False) -> None:
+    """Warn if most of a region lies outside the map; raise InputError instead where `refuse`."""
+    roi.check_map(box_map, where)
     low, high = box_map.bounds()
     region = roi.region()
-    return shapely.intersection(region, shapely.box(*low[:2], *high[:2])).area / max(region.area, 1e-9)
-
-
-def _check_roi(roi: Roi, box_map: BoxMap, where: str | Path) -> None:
-    """Warn if most of a region lies outside the map."""
-    roi.check_map(box_map, where)
-    inside = share_on_map(roi, box_map)
+    inside = shapely.intersection(region, shapely.box(*low[:2], *high[:2])).area / max(region.area, 1e-9)
+    if refuse and inside < ROI_SHARE_MIN:
+        what, got = "the region of interest belongs to another map or other axes", f"{inside:.0%} of it on this map"
+        raise InputError(what, where=where, got=got, expected=f"at least {ROI_SHARE_MIN:.0%}")
     if 0.0 < inside < ROI_SHARE_MIN:
         log.warning("%s: %.0f %% of the region of interest lies outside the map", where, 100 * (1 - inside))
 
@@ -366,34 +348,27 @@ def _check_roi(roi: Roi, box_map: BoxMap, where: str | Path) -> None:
 def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | Path) -> None:
     if counts["cells_walkable"]:
         return
-    if counts["cells_free"] and counts["cells_in_roi"] is None:
-        raise NoPathError(
-            "no free cell lies on the ground that the settings want",
-            where=where,
-            got=f"{counts['cells_free']} free cells, {counts['cells_with_surface']} cells with such ground",
-            fix="set ground to surfaces or anywhere",
-        )
-    if counts["cells_free"]:
-        raise NoPathError(
-            "the region of interest leaves no walkable cell",
-            where=roi_where,
-            got=f"{counts['cells_in_roi']} of the map's {counts['cells']} cells inside, none of them free ground",
-            fix="draw it over free ground of this map, in the map's world metres",
-        )
-    raise NoPathError(
-        "the map leaves no walkable cell",
-        where=where,
-        got=f"{counts['cells_occupied']} of {counts['cells']} cells occupied by {counts['boxes_in_the_way']} boxes",
-        expected="free ground between the boxes",
-        fix="lower safety_radius_m, or check that ground boxes have a ground type (Roads, Sidewalks, Terrain, Ground)",
-    )
+    if not counts["cells_free"]:
+        what, got = "the map has no walkable cell", f"{counts['cells_occupied']} of {counts['cells']} cells occupied"
+        expected = "free ground between the boxes"
+        fix = "lower safety_radius_m, or give ground boxes a ground type (Roads, Sidewalks, Terrain, Ground)"
+    elif counts["cells_in_roi"] is None:
+        what, got = "no free cell lies on the requested ground", f"{counts['cells_free']} free cells"
+        expected = "a free cell on such ground"
+        fix = "set ground to surfaces or anywhere"
+    else:
+        where, what = roi_where, "the region of interest has no walkable cell"
+        got = f"{counts['cells_in_roi']} of the map's {counts['cells']} cells inside, none of them free ground"
+        expected = "a region in the map's world metres"
+        fix = "draw it over free ground of this map"
+    raise NoPathError(what, where=where, got=got, expected=expected, fix=fix)
 
 
-# --- ends of a walk ---------------------------------------------------------------------------------------------------
+# --- ends of a trajectory ---------------------------------------------------------------------------------------------
 
 
 def sample_start(ground: WalkableGround, rng: np.random.Generator) -> tuple[int, int]:
-    """Draw one cell where walks may begin (x index, y index), every one equally likely."""
+    """Draw one cell of `may_end`, (x index, y index), uniformly."""
     drawn = int(rng.integers(ground.row_ends[-1]))
     y = int(np.searchsorted(ground.row_ends, drawn, side="right"))
     columns = np.flatnonzero(ground.may_end[y])
@@ -403,8 +378,7 @@ def sample_start(ground: WalkableGround, rng: np.random.Generator) -> tuple[int,
 def sample_goal(
     ground: WalkableGround, start: tuple[int, int], min_cells: float, max_cells: float, rng: np.random.Generator
 ) -> tuple[int, int] | None:
-    """Draw a cell where walks may end, of the start's part, at a straight distance within [min_cells, max_cells],
-    every one equally likely.
+    """Draw a cell of `may_end` in the start's part, at a straight distance within [min_cells, max_cells], uniformly.
 
     Returns:
         (x index, y index), or None if there is no such cell.

@@ -17,7 +17,7 @@ from cosfly.formats.traces import DroneTrace
 from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps.stage import SOURCES, MapsConfig
 from cosfly.maps.stage import load_map as load_source
-from cosfly.pedestrians.stage import make_pedestrian, walk_along
+from cosfly.pedestrians.stage import follow_route, make_pedestrian
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_trajectory, screens_of
@@ -97,10 +97,10 @@ def plan(
         box_map = simplify(box_map, SimplifyConfig()).box_map
     rng = rng_for(seed, "pedestrians", "path_00000")
     if route_m is None:
-        person = make_pedestrian("path_00000", walkable_ground(box_map, walking), walking, rng).walk
+        person = make_pedestrian("path_00000", walkable_ground(box_map, walking), walking, rng).trajectory
     else:
         route_m = _checked_route(route_m)
-        person = walk_along("path_00000", route_m, box_map.ground, walking, rng, rng.spawn(1)[0])
+        person = follow_route("path_00000", route_m, box_map.ground, walking, rng, rng.spawn(1)[0])
     return plan_trajectory(person, obstacle_index(box_map), cfg, seed, screens_of(box_map))
 
 

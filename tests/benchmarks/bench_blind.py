@@ -51,7 +51,9 @@ def flights_of(cfg: RunConfig, name: str) -> Iterator[DroneTrace]:
     town = cfg.of_town(name)
     box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map
     ground, ids = walkable_ground(box_map, town.pedestrians), map(walk_id, range(town.pedestrians.num_paths))
-    walks = [make_pedestrian(id_, ground, town.pedestrians, rng_for(town.seed, "pedestrians", id_)).walk for id_ in ids]
+    walks = [
+        make_pedestrian(id_, ground, town.pedestrians, rng_for(town.seed, "pedestrians", id_)).trajectory for id_ in ids
+    ]
     obstacles, screens = obstacle_index(box_map), screens_of(box_map)
     for walk, styles in zip(walks, draw_styles_of(walks, town.plan, town.seed), strict=True):
         trace = plan_trajectory(walk, obstacles, town.plan, town.seed, screens, styles)

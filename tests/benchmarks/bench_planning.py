@@ -100,7 +100,7 @@ def walking(maps: dict[str, BoxMap]) -> None:
             whole_ms, _ = scenes.cpu_ms(lambda f=Path(folder): run(WALKS, f / "map.json", f / "out"))
         graph, ours_ms, peer_ms, worst = octile_graph(ground.walkable), [], [], 0.0
         for walk in walks[:5]:
-            ends = ground.grid.cells_at(walk.walk.polyline_m[[0, -1]])
+            ends = ground.grid.cells_at(walk.trajectory.polyline_m[[0, -1]])
             ms, cells = scenes.cpu_ms(lambda ends=ends, ground=ground: find_route(ground.walkable, ends[0], ends[1]))
             ours_ms.append(ms)
             source, goal = (int(y * ground.walkable.shape[1] + x) for x, y in ends)

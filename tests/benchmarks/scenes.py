@@ -71,7 +71,7 @@ def walks_on(box_map: BoxMap, **settings: Any) -> list[PedestrianTrajectory]:
     cfg = PedestriansConfig(**{"num_paths": NUM_WALKS, "min_distance_m": 75.0, **settings})
     ground = walkable_ground(box_map, cfg)
     names = [f"path_{k:05d}" for k in range(cfg.num_paths)]
-    return [make_pedestrian(name, ground, cfg, rng_for(SEED, "pedestrians", name)).walk for name in names]
+    return [make_pedestrian(name, ground, cfg, rng_for(SEED, "pedestrians", name)).trajectory for name in names]
 
 
 def moved(walk: PedestrianTrajectory, shift_m: np.ndarray) -> PedestrianTrajectory:
