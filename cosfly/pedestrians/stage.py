@@ -47,7 +47,7 @@ from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Resume, StageFolder, result_of
 from cosfly.runtime.seeding import draw_by_share, rng_for
 from cosfly.runtime.worker import Item, Outcome, Work
-from cosfly.viz.topview import INK, TopView, draw_dot, draw_line, draw_text, png_bytes
+from cosfly.viz.topview import PAPER, TopView, add_caption, draw_dot, draw_line, png_bytes
 
 log = logging.getLogger(__name__)
 
@@ -274,16 +274,11 @@ def run(
 
 # --- overview ---------------------------------------------------------------------------------------------------------
 
-
 LONGER_SIDE_PX = 1600
-STRIP_PX = 64  # legend below the map
-
-# RGB
+# RGB of cells and of the outline of the region of interest
 OBSTACLE, MARGIN, UNUSED, USED = (74, 76, 84), (158, 158, 164), (232, 228, 218), (190, 219, 238)
-ON_ROAD, ON_CROSSING = (203, 201, 214), (246, 226, 150)
-ROI_LINE, PAPER = (226, 120, 20), (252, 251, 247)
-LEGEND = (("obstacle", OBSTACLE), ("safety margin", MARGIN), ("free, not used", UNUSED), ("walkable", USED),
-          ("carriageway", ON_ROAD), ("crossing", ON_CROSSING))  # fmt: skip
+ON_ROAD, ON_CROSSING, ROI_LINE = (203, 201, 214), (246, 226, 150), (226, 120, 20)
+CAPTION = "dark: obstacles, grey: margin, blue: walkable, violet: carriageway, yellow: crossings, orange: region"
 
 
 def draw_overview(ground: WalkableGround, paths: list[PedestrianTrajectory]) -> bytes:
@@ -300,12 +295,11 @@ def draw_overview(ground: WalkableGround, paths: list[PedestrianTrajectory]) -> 
         draw_dot(picture, line[0], 7, PAPER)
         draw_dot(picture, line[0], 7, color, thickness)
         draw_dot(picture, line[-1], 6, color)
-    legend = _legend(picture.shape[1], view.pixels_per_m, ground.is_in_roi is not None, len(paths))
-    return png_bytes(np.vstack([picture, legend]))
+    return png_bytes(add_caption(picture, f"{len(paths)} trajectories, a ring is a start; {CAPTION}"))
 
 
 def path_color(number: int) -> tuple[int, int, int]:
-    """Return a strong RGB colour, neighbours far apart on the colour circle (golden ratio)."""
+    """Return a strong RGB colour; neighbours are far apart on the colour circle (golden ratio)."""
     red, green, blue = colorsys.hsv_to_rgb((0.02 + number * 0.618034) % 1.0, 0.85, (0.62, 0.85)[number % 2])
     return round(red * 255), round(green * 255), round(blue * 255)
 
@@ -328,24 +322,3 @@ def _ground_picture(ground: WalkableGround) -> tuple[np.ndarray, TopView]:
     # A cell's colour fills its pixels; coordinates are 0 in the middle of the first pixel.
     view = TopView(grid.x_min_m + 0.5 / per_m, grid.y_min_m + (height - 0.5) / per_m, per_m, (width, height))
     return picture, view
-
-
-def _legend(width_px: int, pixels_per_m: float, has_roi: bool, num_paths: int) -> np.ndarray:
-    strip = np.full((STRIP_PX, width_px, 3), PAPER, dtype=np.uint8)
-    x, y = 16, 38
-    for name, color in LEGEND:
-        cv2.rectangle(strip, (x, 22), (x + 20, 42), color, -1)
-        cv2.rectangle(strip, (x, 22), (x + 20, 42), INK, 1)
-        x = draw_text(strip, name, x + 30, y) + 24
-    if has_roi:
-        draw_line(strip, np.array([[x, 32], [x + 26, 32]]), ROI_LINE, 3)
-        x = draw_text(strip, "region of interest", x + 36, y) + 24
-    draw_dot(strip, np.array([x + 8, 32]), 7, INK, 2)
-    x = draw_text(strip, "start", x + 24, y) + 16
-    draw_dot(strip, np.array([x + 8, 32]), 6, INK)
-    x = draw_text(strip, f"goal of {num_paths} trajectories", x + 24, y) + 32
-    bar_m = next(m for m in (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1) if m * pixels_per_m < 220 or m == 1)
-    end = x + round(bar_m * pixels_per_m)
-    draw_line(strip, np.array([[x, 32], [end, 32]]), INK, 2)
-    draw_text(strip, f"{bar_m} m", end + 10, y)
-    return strip

@@ -54,15 +54,13 @@ def make_scenario(pedestrian: PedestrianTrajectory, obstacles: BoxIndex, cfg: Pl
     if len(targets) < 2:
         raise NoPathError("the pedestrian trajectory has one point only", where=where, expected="two points or more")
     dt_s = step_s(pedestrian.time_s)
-    uneven = np.abs(np.diff(pedestrian.time_s) - dt_s) > 1e-3
-    if dt_s <= 0:
-        raise NoPathError("time stamps do not increase", where=where, got=f"steps of {dt_s:g} s")
-    if uneven.any():
-        place, step = int(np.argmax(uneven)) + 1, np.diff(pedestrian.time_s)[uneven][0]
-        expected = f"{dt_s:g} s, the median step"
+    uneven = np.abs(np.diff(pedestrian.time_s) - max(dt_s, 0.0)) > 1e-3
+    if dt_s <= 0 or uneven.any():
+        place = int(np.argmax(uneven)) + 1
         raise NoPathError(
-            "time stamps are uneven", where=f"{where}: t[{place}]", got=f"a step of {step:g} s", expected=expected
-        )
+            "time stamps do not increase in equal steps", where=f"{where}: t[{place}]",
+            got=f"a step of {np.diff(pedestrian.time_s)[place - 1]:g} s", expected=f"{abs(dt_s):g} s, the median",
+        )  # fmt: skip
     if np.abs(targets).max() > COORDINATE_MAX_M:
         raise NoPathError(
             "a coordinate is too large", where=where, got=f"{np.abs(targets).max():g} m",
