@@ -1,1 +1,1 @@
-"""Geometry of boxes, cells, flights and frames."""
+"""Geometry of boxes, cells, trajectories and frames."""

@@ -1,4 +1,4 @@
-"""Frames, poses and projection: the one place where the project's convention for space stands.
+"""Frames, poses and projection: the project's conventions for space.
 
 World: right-handed, metres, +x East, +y North, +z up. Files carry degrees, kernels take radians and say so in the name.
 `yaw` is counter-clockwise from +x, `pitch` positive nose-up, `roll` positive right-side-down;
@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import numpy as np
 
-DT_S = 0.5  # the paper's time step (2 Hz); `pedestrians.dt_s` sets another, and all take it from the walks
+DT_S = 0.5  # the paper's time step (2 Hz); `pedestrians.dt_s` sets another for all stages
 
 # Maps OpenCV camera coordinates to body coordinates: forward = z, left = -x, up = -y.
 BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-STANDS_MPS = 0.05  # who is slower goes nowhere
+STANDS_MPS = 0.05  # below this speed there is no heading
 CORNER_SIGNS = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, 8).T
 
 
@@ -47,7 +47,7 @@ def rotation_matrices(rotations_rad: np.ndarray) -> np.ndarray:
 
 
 def axis_aligned_half_extents(half_extents: np.ndarray, rotations_deg: np.ndarray) -> np.ndarray:
-    """Half sizes of the axis-aligned boxes round rotated boxes.
+    """Return the half sizes of the axis-aligned boxes around rotated boxes.
 
     Args:
         half_extents: (n, 3) m; rotations_deg: (n, 3) pitch, yaw, roll.
@@ -66,7 +66,7 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def focal_px(width_px: int, fov_deg: float) -> float:
-    """Focal length in pixels of a horizontal field of view (eq:focal)."""
+    """Return the focal length in pixels of a horizontal field of view (eq:focal)."""
     return width_px / (2.0 * np.tan(np.radians(fov_deg) / 2.0))
 
 
@@ -112,7 +112,7 @@ def box_corners(center: np.ndarray, half_extents: np.ndarray, yaw_rad: float = 0
 
 
 def mask_box(mask: np.ndarray) -> np.ndarray:
-    """Return the box round a mask (h, w) bool: (4,) xmin, ymin, xmax, ymax px, at pixel borders; NaN without pixels."""
+    """Return the box around a mask (h, w) bool: (4,) xmin, ymin, xmax, ymax px at pixel borders, or NaN."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return np.full(4, np.nan)
@@ -120,7 +120,7 @@ def mask_box(mask: np.ndarray) -> np.ndarray:
 
 
 def box_iou(one: np.ndarray, two: np.ndarray) -> float:
-    """Intersection over union of two boxes, (4,) xmin, ymin, xmax, ymax; 0 when both are empty."""
+    """Return the intersection over union of two boxes, (4,) xmin, ymin, xmax, ymax; 0 when both are empty."""
     sides = np.minimum(one[2:], two[2:]) - np.maximum(one[:2], two[:2])
     shared = float(np.prod(np.clip(sides, 0, None)))
     union = float(np.prod(one[2:] - one[:2]) + np.prod(two[2:] - two[:2])) - shared
@@ -128,17 +128,17 @@ def box_iou(one: np.ndarray, two: np.ndarray) -> float:
 
 
 def wrap_deg(angle_deg: np.ndarray | float) -> np.ndarray | float:
-    """Bring angles of any shape, degrees, to [-180, 180)."""
+    """Return angles of any shape, degrees, in [-180, 180)."""
     return (np.asarray(angle_deg) + 180.0) % 360.0 - 180.0
 
 
 def mirror_positions(positions_m: np.ndarray) -> np.ndarray:
-    """Change (..., 3) positions between right-handed and CARLA axes: y changes sign."""
+    """Convert (..., 3) positions between right-handed and CARLA axes: y changes sign."""
     return np.asarray(positions_m, dtype=np.float64) * np.array([1.0, -1.0, 1.0])
 
 
 def mirror_rotations(rotations_deg: np.ndarray) -> np.ndarray:
-    """Change (..., 3) pitch, yaw, roll between right-handed and CARLA axes: yaw changes sign."""
+    """Convert (..., 3) pitch, yaw, roll between right-handed and CARLA axes: yaw changes sign."""
     return np.asarray(rotations_deg, dtype=np.float64) * np.array([1.0, -1.0, 1.0])
 
 
@@ -146,17 +146,17 @@ def mirror_rotations(rotations_deg: np.ndarray) -> np.ndarray:
 
 
 def step_s(time_s: np.ndarray) -> float:
-    """Return the time step of even time stamps, (n,) s; DT_S where there is one."""
+    """Return the time step of even time stamps, (n,) s; DT_S for a single one."""
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else DT_S
 
 
 def headings_of(positions_m: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-    """Return which way somebody goes at each time, (n,) rad counter-clockwise from +x.
+    """Return the heading of a motion at each time, (n,) rad counter-clockwise from +x.
 
     Args:
         positions_m: (n, 2 or more), n >= 2; time_s: (n,), increasing.
     Returns:
-        Central differences. Below STANDS_MPS the last direction stays, at first the one to come; else east.
+        Central differences. Below STANDS_MPS the last heading is kept, at the start the first one; without any, east.
     """
     velocity = np.gradient(positions_m[:, :2], time_s, axis=0)
     moves = np.linalg.norm(velocity, axis=1) > STANDS_MPS

@@ -1,8 +1,8 @@
-"""The ground as cells: which ones a person can stand on, and which of those hang together.
+"""The ground as cells: occupancy, surfaces, inflation, regions and connected components.
 
-Boxes become occupied cells (Step 3 of the paper), occupied cells grow by a safety radius, a region of interest cuts out
-what is left, and connected parts of it are labelled. Nothing here samples or searches; see the rooms `pedestrians` and
-`simplify`. Arrays are indexed [y_index, x_index]; cell (x_index, y_index) covers one square of `resolution_m`.
+Boxes become occupied cells (Step 3 of the paper), occupied cells grow by a safety radius, a region of interest selects
+free cells, and connected components of them are labelled. Arrays are indexed [y_index, x_index]; cell
+(x_index, y_index) covers one square of `resolution_m`.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from cosfly.runtime.errors import InputError
 
 RESOLUTION_M = 0.5  # tab:ped_params
 HUMAN_HEIGHT_M = 2.0  # tab:ped_params
-TOUCH_M = 1e-6  # maps are written to a micrometre: a face that enters a cell by less only touches it
-MIN_HALF_EXTENT_M = 2 * TOUCH_M  # a wall without thickness still blocks the cells it stands in
+TOUCH_M = 1e-6  # maps are written to a micrometre: a smaller overlap is no overlap
+MIN_HALF_EXTENT_M = 2 * TOUCH_M  # so that a wall without thickness blocks its cells
 SURFACE_REACH_M = 1.0  # kerbs, lawns and carriageways differ by less; a flyover lies higher
-MAX_CELLS = 400_000_000  # 10 km x 10 km at 0.5 m; more is a stray box, or a resolution too fine for the memory
+MAX_CELLS = 400_000_000  # 10 km x 10 km at 0.5 m; more indicates a stray box, or a resolution too fine for the memory
 
 WATER = KINDS["Water"]
 _LAYER_OF = np.zeros(256, dtype=np.int64)
@@ -50,7 +50,7 @@ class OccupancyGrid:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Cells along x and along y, as in "a 1238 x 1013 grid"."""
+        """Return the numbers of cells along x and along y, as in "a 1238 x 1013 grid"."""
         return self.occupied.shape[1], self.occupied.shape[0]
 
     def cells_at(self, points_m: np.ndarray) -> np.ndarray:
@@ -68,7 +68,7 @@ class OccupancyGrid:
 
 
 def empty_grid(box_map: BoxMap, resolution_m: float = RESOLUTION_M) -> OccupancyGrid:
-    """Return a free grid over the bounds of all boxes, whatever their kind."""
+    """Return a free grid over the bounds of all boxes of any kind."""
     if len(box_map) == 0:
         raise ValueError("a grid needs at least one box")
     if not resolution_m > 0:
@@ -83,11 +83,11 @@ def empty_grid(box_map: BoxMap, resolution_m: float = RESOLUTION_M) -> Occupancy
 
 
 def blocks_walking(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M) -> np.ndarray:
-    """Return which boxes stand in a person's way, (n,) bool.
+    """Return which boxes block a person, (n,) bool.
 
-    A box does if it reaches into the interval from the ground to `height_m` above it; touching an end of the interval
-    does not count. Where the ground slopes, the interval is that of all the ground under the box. Surfaces
-    (GROUND_KINDS) never do; water does whatever its height, for nobody walks on it.
+    A box blocks if it reaches into the interval from the ground to `height_m` above it; touching an end of the interval
+    does not count. On a slope the interval is that of all the ground under the box. Surfaces (GROUND_KINDS) never
+    block; water always does.
     """
     mins, maxs = box_map.mins, box_map.maxs
     lowest, highest = box_map.ground.range_under(mins, maxs)
@@ -102,17 +102,15 @@ def occupancy(
     height_m: float = HUMAN_HEIGHT_M,
     like: OccupancyGrid | None = None,
 ) -> OccupancyGrid:
-    """Mark the cells that boxes stand on.
+    """Return the grid whose cells under boxes are occupied.
 
-    The rule is conservative: a cell is occupied if the part of a box between the ground and `height_m` covers any of
-    its area, however little (more than TOUCH_M deep). Boxes are rasterised exactly as they are turned, not as their
-    axis-aligned bounds.
+    A cell is occupied if the part of a box between the ground and `height_m` overlaps it by more than TOUCH_M. Boxes
+    are rasterised exactly with their rotation, not as their axis-aligned bounds.
 
     Args:
-        like: take this grid's cells instead of the map's own bounds (its occupied cells and `resolution_m` are
-            ignored), so that two maps can be compared; what lies outside is left out.
-    Returns:
-        a grid, (ny, nx).
+        like: Use this grid's cells instead of the map's own bounds and `resolution_m`, so that two maps can be
+        compared;
+            boxes outside are ignored.
     Source: Step 3 of the paper (sec:step3).
     """
     grid = empty_grid(box_map, resolution_m) if like is None else replace(like, occupied=np.zeros_like(like.occupied))
@@ -131,12 +129,12 @@ def lies_off_ground(box_map: BoxMap, kinds: Collection[int]) -> np.ndarray:
 
 
 def surface(box_map: BoxMap, kinds: Collection[int] = GROUND_KINDS, *, like: OccupancyGrid) -> np.ndarray | None:
-    """Tell over which cells of a grid the map has ground to stand on.
+    """Return over which cells of a grid the map has ground.
 
     Args:
-        kinds: what counts as ground; a box does if its top lies within SURFACE_REACH_M of the ground under its middle.
+        kinds: of ground; a box counts if its top lies within SURFACE_REACH_M of the ground under its middle.
     Returns:
-        (ny, nx) bool, cells that such a box overlaps; None if the map holds no such box, so that it does not say.
+        (ny, nx) bool, cells that such a box overlaps; None if the map has no such box.
     """
     boxes = box_map.select(box_map.is_any_of(kinds) & ~lies_off_ground(box_map, kinds))
     if len(boxes) == 0:
@@ -147,10 +145,10 @@ def surface(box_map: BoxMap, kinds: Collection[int] = GROUND_KINDS, *, like: Occ
 
 
 def surface_kinds(box_map: BoxMap, kinds: Collection[int], *, like: OccupancyGrid) -> np.ndarray:
-    """Tell the kind of the topmost ground in the middle of each cell, (ny, nx) uint8; 0 where there is none.
+    """Return the kind of the topmost ground in the middle of each cell, (ny, nx) uint8; 0 where there is none.
 
     Args:
-        kinds: as for `surface`; of those in one plane, to a centimetre, that of the higher layer.
+        kinds: as for `surface`; of kinds in one plane, to a centimetre, the higher layer counts.
     """
     boxes = box_map.select(box_map.is_any_of(kinds) & ~lies_off_ground(box_map, kinds))
     tops_m = np.round(boxes.maxs[:, 2] - boxes.ground.height_at(boxes.centers), 2)
@@ -197,7 +195,7 @@ def _rasterise(corners, lows, highs, is_upright, touch, marks, cells):  # pragma
 
 @njit(cache=True)
 def _slice_points(corners, box, low, high, points):  # pragma: no cover (compiled)
-    """Collect points whose hull is the footprint of a box between two heights: corners inside, and edges cut."""
+    """Collect points whose hull is the footprint of a box between two heights: corners inside and cut edges."""
     count = 0
     for k in range(8):
         if low <= corners[box, k, 2] <= high:
@@ -228,7 +226,7 @@ def _fill_hull(points, count, touch, mark, cells):  # pragma: no cover (compiled
     bottom, top = np.inf, -np.inf
     for i in range(count):
         bottom, top = min(bottom, points[i, 1]), max(top, points[i, 1])
-    # Limits are cut as floats: far points do not fit an integer.
+    # Limits are clipped as floats: far points do not fit an integer.
     first, stop_row = int(max(0.0, np.floor(bottom + touch))), int(max(0.0, min(float(num_y), np.ceil(top - touch))))
     for row in range(first, stop_row):
         low, high = row + touch, row + 1.0 - touch
@@ -251,14 +249,10 @@ def _fill_hull(points, count, touch, mark, cells):  # pragma: no cover (compiled
 
 
 def compare(one: OccupancyGrid, other: OccupancyGrid) -> tuple[float, float]:
-    """Compare two grids over the same cells.
-
-    Returns:
-        equal cells / all cells, and intersection / union of the occupied ones (IoU), 1 where there is none.
-    """
+    """Return equal cells / all cells of two grids, and the IoU of their occupied cells, 1 where there are none."""
     same = (one.x_min_m, one.y_min_m, one.resolution_m) == (other.x_min_m, other.y_min_m, other.resolution_m)
     if not same or one.occupied.shape != other.occupied.shape:
-        raise ValueError("the grids do not cover the same cells; make one `like` the other")
+        raise ValueError("the grids do not cover the same cells; make one of them with `like`")
     union = int(np.count_nonzero(one.occupied | other.occupied))
     intersection = int(np.count_nonzero(one.occupied & other.occupied))
     return 1.0 - (union - intersection) / one.occupied.size, intersection / union if union else 1.0
@@ -268,7 +262,7 @@ def compare(one: OccupancyGrid, other: OccupancyGrid) -> tuple[float, float]:
 
 
 def inflate(grid: OccupancyGrid, radius_m: float) -> OccupancyGrid:
-    """Grow the occupied cells by an exact disc.
+    """Return the grid whose occupied cells are grown by an exact disc.
 
     A cell becomes occupied if its centre lies within `radius_m` of the centre of an occupied one: at 0.5 m cells, 0.5 m
     adds the four straight neighbours, and 1.0 m is the circular element of two cells of app:simworld:step4.
@@ -298,7 +292,7 @@ def connected_parts(free: np.ndarray, connectivity: int) -> tuple[np.ndarray, np
 
     Args:
         free: (ny, nx) bool; connectivity: 8 (the paper's components) or 4. A search that never cuts a corner moves
-            exactly within 4-connected parts: each of its diagonal steps has two straight ones beside it.
+            exactly within 4-connected parts: each of its diagonal steps has two straight neighbours.
     Returns:
         labels (ny, nx) int32, 0 where not free; sizes (num_labels,) int64 in cells, sizes[0] = 0.
     """

@@ -1,8 +1,8 @@
 """Compiled geometry of many oriented boxes: distance, outward normal, blocked segments, five-ray visibility.
 
-`BoxIndex` sorts boxes into square cells of the xy plane, so that a query looks at the few boxes near it. Functions
-whose names say `..._box` or that take single coordinates are for other compiled code; those that take arrays check
-their arguments. Nothing here runs in parallel: the stages spread items over processes.
+`BoxIndex` sorts boxes into square cells of the xy plane, so that a query tests the few boxes near it. Functions that
+take single coordinates are for other compiled code; those that take arrays check their arguments. Nothing here runs in
+parallel: the stages distribute items over processes.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from cosfly.geometry.axes import rotation_matrices
 from cosfly.runtime.compiled import njit
 
 CELL_M = 8.0  # about the influence radius of obstacles: a distance query looks at nine cells
-MAX_CELLS = 1 << 18  # a map with a stray box a thousand kilometres away must not fill the memory
+MAX_CELLS = 1 << 18  # bounds the memory for a map with a stray box far away
 
-# Nothing to fly into and nothing that hides a person: what people stand on, water, and labels without a body.
+# Kinds that neither collide nor hide a person: surfaces, water, and labels without a body.
 NO_OBSTACLE_KINDS = GROUND_KINDS | {KINDS["Water"], KINDS["Sky"]}
 
 # Ends of the five rays relative to the target's hip point, m (subsec:appendix_planner_tastar).
 RAY_OFFSETS_M = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.8], [0.0, 0.0, -0.6], [0.3, 0.0, 0.0], [-0.3, 0.0, 0.0]])
 RAY_SPREAD_M = 0.8  # the longest of the offsets
-CORNER = 3.0**0.5  # so many times what a turned box grows by, its corners come out of its extent at most
+CORNER = 3.0**0.5  # times the growth of a rotated box: the largest growth of its axis-aligned bounds
 
 
 # Columns of BoxIndex.rows; u, v, w are the axes of a box's own frame: x = XU u + XV v + XW w + CENTER_X. Places in
@@ -84,10 +84,9 @@ def index_boxes(
 
 
 def obstacle_index(box_map: BoxMap) -> BoxIndex:
-    """Index the boxes of a map that a drone can hit or that can hide a person (NO_OBSTACLE_KINDS left out).
+    """Index the boxes of a map that a drone can hit or that can hide a person (all but NO_OBSTACLE_KINDS).
 
-    Ground that slopes is among them, as solid boxes after the map's own: a hillside can be flown into, and can hide
-    somebody.
+    Sloping ground is included as solid boxes after the map's own: a hillside can collide and hide a person.
     """
     solid = box_map.select(~box_map.is_any_of(NO_OBSTACLE_KINDS))
     boxes = solid.centers, solid.half_extents, rotation_matrices(np.radians(solid.rotations_deg))
@@ -120,8 +119,7 @@ def _fill_cells(first, last, shape):
 # --- one box ----------------------------------------------------------------------------------------------------------
 
 
-# Single numbers of a row are read, not slices: a slice costs two atomic reference counts, more than the arithmetic
-# around it.
+# Single numbers of a row are read, not slices: a slice costs two atomic reference counts, more than the arithmetic.
 
 
 @njit(cache=True, inline="always")
@@ -142,7 +140,7 @@ def turned(rows, box, dx, dy, dz):
 
 @njit(cache=True)
 def distance_to_box(rows, box, x, y, z):
-    """Signed distance of a point to a box, m: negative inside (depth below the nearest face)."""
+    """Return the signed distance of a point to a box, m: negative inside (depth below the nearest face)."""
     u, v, w = in_box_frame(rows, box, x, y, z)
     qx, qy, qz = abs(u) - rows[box, HALF_X], abs(v) - rows[box, HALF_Y], abs(w) - rows[box, HALF_Z]
     deepest = max(qx, qy, qz)
@@ -154,7 +152,7 @@ def distance_to_box(rows, box, x, y, z):
 
 @njit(cache=True, inline="always")
 def squared_gap(rows, box, x, y, z):
-    """Squared distance of a point to the axis-aligned bounds of a box, m^2: the box itself is no nearer."""
+    """Return the squared distance of a point to the axis-aligned bounds of a box, m^2; the box is no nearer."""
     dx = max(rows[box, LOW_X] - x, 0.0, x - rows[box, HIGH_X])
     dy = max(rows[box, LOW_Y] - y, 0.0, y - rows[box, HIGH_Y])
     dz = max(rows[box, LOW_Z] - z, 0.0, z - rows[box, HIGH_Z])
@@ -163,7 +161,7 @@ def squared_gap(rows, box, x, y, z):
 
 @njit(cache=True)
 def normal_of_box(rows, box, x, y, z):
-    """Unit vector away from a box at a point: from the nearest surface point, inside out through the nearest face.
+    """Return the unit vector away from a box at a point: from the nearest surface point or, inside, face.
 
     A tie between faces goes to the first axis, a point in the middle plane to the positive side.
     """
@@ -270,8 +268,7 @@ def nearest_box(index, x, y, z, reach_m):
     if len(index.rows) == 0:
         return best, best_box
     num_x, num_y = index.shape[0], index.shape[1]
-    # The grid is convex: the distance from the nearest point of the grid is a lower bound of the distance from outside
-    # it.
+    # The grid is convex: from outside, the distance from its nearest point is a lower bound.
     gx = min(max((x - index.grid[ORIGIN_X]) / index.grid[CELL], 0.0), float(num_x))
     gy = min(max((y - index.grid[ORIGIN_Y]) / index.grid[CELL], 0.0), float(num_y))
     cx, cy = min(int(gx), num_x - 1), min(int(gy), num_y - 1)
@@ -299,7 +296,7 @@ def nearest_box(index, x, y, z, reach_m):
 
 @njit(cache=True)
 def collect_hits(index, ax, ay, az, bx, by, bz, inflate_m, out):
-    """Put the boxes that a segment touches, grown by `inflate_m`, into `out` and give their number.
+    """Put the boxes that a segment touches, grown by `inflate_m`, into `out` and return their number.
 
     Stops when `out` is full, so an `out` of length 1 asks: is there any?
     """
@@ -356,10 +353,10 @@ def free_rays(index, boxes, num_boxes, x, y, z, target):
 
 
 def signed_distances(index: BoxIndex, points: np.ndarray, reach_m: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distance to the nearest box for many points.
+    """Return the signed distance to the nearest box for many points.
 
     Args:
-        points: (n, 3) m. reach_m: boxes farther away are not looked for.
+        points: (n, 3) m. reach_m: boxes farther away are ignored.
     Returns:
         (n,) m, at most reach_m, and (n,) the nearest box, -1 where there is none in reach (k == 0 too).
     """
@@ -410,13 +407,13 @@ def _segments_hit(index, starts, ends, inflate_m):
 
 
 def swept_distances(index: BoxIndex, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least distance to the boxes on the straight way from each point to the next, the last point's its own.
+    """Return the least distance to boxes on the segment from each point to the next; at the last point, its own.
 
     Args:
-        points: (n, 3) m. reach_m: boxes farther away are not looked for.
+        points: (n, 3) m. reach_m: boxes farther away are ignored.
     Returns:
-        (n,) m, at most reach_m, negative only where an end of the way is inside a box, 0 where the way goes through
-        one; (n,) the share of the way where that is; (n,) the box, -1 where none is in reach.
+        (n,) m, at most reach_m, negative only where an end of the segment is inside a box, 0 where it passes through
+        one; (n,) the share of the segment where that is; (n,) the box, -1 where none is in reach.
     """
     return _swept_distances(index, _points(points, "points"), float(reach_m))
 
@@ -442,10 +439,10 @@ def _swept_distances(index, points, reach_m):
 
 
 def visibility(index: BoxIndex, drones: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Five-ray visibility of each target from each drone.
+    """Return the five-ray visibility of each target from each drone.
 
-    A box that holds a ray's end blocks the ray, whatever the direction: a person inside a solid box is hidden, and the
-    renderer shows it so. Ground slabs are no obstacles (`obstacle_index`), so standing on one hides nobody.
+    A box that contains an end of a ray blocks it: a person inside a solid box is hidden, as in the renderer. Flat
+    ground is no obstacle (`obstacle_index`), so standing on it hides nobody.
 
     Args:
         drones, targets: (n, 3) m; a target is a hip point.

@@ -1,9 +1,7 @@
-"""One frame seen from another: points of a depth image carried through both poses into the next picture, and what is
-found there.
+"""Reprojection of one frame into another: points of a depth image, moved through both poses, and what is found there.
 
-What stands still has the depth that the poses give it from both places, and the same instance. So depth, masks, poses,
-intrinsics and times bear witness against each other, whatever a file says of them. Colours say nothing: light, weather,
-zoom and renderers change them.
+A static surface has the depth that the poses imply from both positions, and the same instance. So depth, masks, poses,
+intrinsics and times check each other. Colours are not used: light, weather, zoom and renderers change them.
 """
 
 from __future__ import annotations
@@ -15,29 +13,25 @@ import numpy as np
 from cosfly.runtime.compiled import njit
 
 COLUMNS, GRID_ROWS = 64, 36  # points are taken at the middle of so many cells
-NEAR_M, FAR_M = 0.3, 999.0  # beyond stands the sky
-LEAST_SEEN = 150  # points, for a share of them to mean something
-LEAST_PLANES = 30  # points, for their depth to say something
+NEAR_M, FAR_M = 0.3, 999.0  # beyond is the sky
+LEAST_SEEN = 150  # points; a share of fewer is not reported
+LEAST_PLANES = 30  # points; the depth error of fewer is not reported
 LEAST_SHIFTED = 12  # points of a thing
 SHARED_ID = 65534  # of several things: docs/files.md
 MOVING = np.zeros(256, np.bool_)  # kinds of pixels that may be elsewhere in the next frame
 MOVING[[12, 13, 14, 15, 16, 17, 18, 19, 21]] = True  # people, riders, vehicles, what is dynamic (CARLA 0.9.16)
-# Kinds of surfaces that people and cars stand on, and water. Maps lay them on each other in one plane (two roads at
-# their crossing), where a renderer's rounding decides pixel by pixel whose id shows: of these the kind alone tells what
-# is seen.
+# Kinds of surfaces that people and cars stand on, and water. Maps have several in one plane (two roads at their
+# crossing), where a renderer's rounding decides the id pixel by pixel, so only their kind is compared.
 FLAT = np.zeros(256, np.bool_)
 FLAT[[1, 2, 10, 23, 24, 25, 27]] = True
-# Depth of a surface that is seen slantwise changes within a pixel; half a pixel of a 45 degree slope at 50 m and 500 px
-# is 0.05 m.
+# The depth of an inclined surface changes within a pixel: by 0.05 m for half a pixel of 45 degrees at 50 m and 500 px.
 TOLERANCE_SHARE, TOLERANCE_M = 0.02, 0.1
 
 
 @dataclass(frozen=True)
 class View:
     """A frame. depth (h, w) float32 m; instance (h, w, 3) uint8 as in `instance.png`, or (0, 0, 3) where there is none;
-    rotation:
-    world_from_camera (3, 3); position_m (3,).
-    """
+    rotation: world_from_camera (3, 3); position_m (3,)."""
 
     depth: np.ndarray
     instance: np.ndarray
@@ -47,13 +41,12 @@ class View:
 
 @dataclass(frozen=True)
 class Agreement:
-    """What became of the points. seen: those that lie in the other picture; of them have the depth that stands there
-    (agree), lie behind it (hidden), or before it, where nothing is (through). same: of those that agree, the same
-    instance, of flat ground the same kind. planes: of those that agree, on planes there; error: median of these, as a
-    share of the depth; error_flat, error_standing: of those of them that are ground and that are not; NaN: too few.
-    shifted: points of one thing that is farther there, as most of it is; renamed: of one that has its depth there and
-    another id, as most of it has; 0 where there is none. seen_back, through_back: the same of the other's points in the
-    first.
+    """Counts of reprojected points. seen: points within the other picture; of these, agree: with its depth, hidden:
+    behind it, through: in front of it, where nothing is. same: of those that agree, with the same instance, on flat
+    ground the same kind. planes: of those that agree, on planes; error: their median depth error, as a share of the
+    depth; error_flat, error_standing: of those on ground and of the others; NaN: too few.
+    shifted: points of one instance most of which is farther there; renamed: of one most of which has its depth there
+    and another id; 0: none. seen_back, through_back: the same of the other frame's points in this one.
     """
 
     seen: int
@@ -72,9 +65,9 @@ class Agreement:
 
     @property
     def gone(self) -> float:
-        """Share of what one of the two shows and the other looks through, 0 to 1. However far apart frames are, of one
-        world it is 0: what is not there any more, from there, is hidden by what is nearer, and that by something else
-        from here.
+        """Return the share of points of one frame that the other frame looks through, 0 to 1.
+
+        In a static world it is 0 for any two frames: a point that is not visible there is hidden by something nearer.
         """
         both = ((self.through, self.seen), (self.through_back, self.seen_back))
         return max((through / seen for through, seen in both if seen >= LEAST_SEEN), default=0.0)
@@ -83,19 +76,18 @@ class Agreement:
 def compare_views(
     one: View, other: View, intrinsics: np.ndarray, others_intrinsics: np.ndarray | None = None
 ) -> Agreement:
-    """Carry the grid's points of one frame into another.
+    """Reproject the grid's points of one frame into another and back.
 
     Args:
-        intrinsics: (4,) fx, fy, cx, cy of both. others_intrinsics: those of the other, where the camera zoomed between
-            them.
+        intrinsics: (4,) fx, fy, cx, cy of both. others_intrinsics: of the other, where the camera zoomed in between.
     """
     intrinsics = intrinsics.astype(np.float64)
     others = intrinsics if others_intrinsics is None else others_intrinsics.astype(np.float64)
     turn, shift = other.rotation.T @ one.rotation, other.rotation.T @ (one.position_m - other.position_m)
-    counts, errors, standing, firm, moved, renamed = _carry(
+    counts, errors, standing, firm, moved, renamed = _reproject(
         one.depth, one.instance, other.depth, other.instance, intrinsics, others, turn, shift, MOVING, FLAT
     )
-    back = _carry(
+    back = _reproject(
         other.depth, other.instance, one.depth, one.instance, others, intrinsics, turn.T, -turn.T @ shift, MOVING, FLAT
     )[0]
     seen, agree, hidden, through, same = counts.tolist()
@@ -111,14 +103,14 @@ def _error_of(errors: np.ndarray) -> float:
 
 
 def median_of(values: np.ndarray) -> float:
-    """Return what `np.median` does of numbers, in a quarter of its time for few."""
+    """Return the median; for few numbers it takes a quarter of the time of `np.median`."""
     middle = len(values) // 2
     found = np.partition(values, (middle - 1, middle))
     return float(found[middle] if len(values) % 2 else (found[middle - 1] + found[middle]) / 2.0)
 
 
 def _most_of_one(firm: np.ndarray, odd: np.ndarray) -> int:
-    """Return the points of the thing most of whose points are odd. firm, odd: ids at points well inside one thing."""
+    """Return the number of odd points of the instance that is mostly odd. firm, odd: ids at points well inside one."""
     if len(odd) < LEAST_SHIFTED:
         return 0
     counts = np.bincount(odd, minlength=SHARED_ID + 1)
@@ -129,10 +121,9 @@ def _most_of_one(firm: np.ndarray, odd: np.ndarray) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, moving, flat):  # type: ignore
-    """Counts (5,), errors (k,) and which of them are of no flat ground; of points among nothing but their own thing its
-    id, of those with its depth and of those that are farther; of points with its depth among nothing but one other
-    thing their own id."""
+def _reproject(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, moving, flat):  # type: ignore
+    """Return counts (5,), errors (k,) and which of them are not on flat ground, and ids at points well inside one
+    instance: of those with their own depth and id, those that are farther, and those with another id there."""
     height, width = depth_a.shape
     others_height, others_width = depth_b.shape
     has_ids = inst_a.shape[0] > 0 and inst_b.shape[0] > 0
@@ -149,7 +140,7 @@ def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, mo
             d = float(depth_a[v, u])
             if not (d > 0.0 and d < FAR_M) or (has_ids and moving[inst_a[v, u, 0]]):
                 continue
-            s, t, z = _carried_point(u, v, d, intrinsics, others, turn, shift)
+            s, t, z = _reprojected(u, v, d, intrinsics, others, turn, shift)
             if not (s > 1.5 and t > 1.5 and s < others_width - 2.5 and t < others_height - 2.5):
                 continue
             column, row = int(s), int(t)
@@ -187,8 +178,8 @@ def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, mo
 
 
 @njit(cache=True, nogil=True)
-def _carried_point(u, v, d, intrinsics, others, turn, shift):  # type: ignore[no-untyped-def]
-    """Where the middle of pixel (u, v) at depth d comes out in the other picture, px, and its depth, m; or NaN."""
+def _reprojected(u, v, d, intrinsics, others, turn, shift):  # type: ignore[no-untyped-def]
+    """Return the reprojection of pixel (u, v) at depth d into the other picture, px, and its depth, m; or NaN."""
     x, y = (u + 0.5 - intrinsics[2]) / intrinsics[0] * d, (v + 0.5 - intrinsics[3]) / intrinsics[1] * d
     z = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * d + shift[2]
     if z < NEAR_M:
@@ -200,9 +191,9 @@ def _carried_point(u, v, d, intrinsics, others, turn, shift):  # type: ignore[no
 
 @njit(cache=True, nogil=True)
 def _around(depth, instance, row, column, z, inst_a, v, u, has_ids, moving, flat):  # type: ignore[no-untyped-def]
-    """What nine pixels say of a point at depth z, of the thing at (v, u) of `inst_a`: least distance in depth, least
-    depth beyond it; is it nearer than all; does one show its thing, or a surface that may show in its place; does none
-    show who moves; do all show its thing; do all show one."""
+    """Compare nine pixels with a point at depth z, of the instance at (v, u) of `inst_a`. Return the least distance in
+    depth, the least depth beyond it, and whether the point is nearer than all, one shows its instance (or kind of flat
+    ground), none shows a moving kind, all show its instance, and all show one instance."""
     best, least, is_through, is_same, is_free, is_whole, is_one = 1e9, 1e9, True, not has_ids, True, has_ids, has_ids
     for y in range(row - 1, row + 2):
         for x in range(column - 1, column + 2):
@@ -226,9 +217,9 @@ def _around(depth, instance, row, column, z, inst_a, v, u, has_ids, moving, flat
 
 @njit(cache=True, nogil=True)
 def _error_on_plane(depth, s, t, z):  # type: ignore[no-untyped-def]
-    """How far the depth between four pixels is from z, as a share of it; NaN where they are not of one plane.
+    """Return the error of the depth between four pixels against z, as a share of it; NaN where they are not one plane.
 
-    Of a plane 1 / depth is linear in the picture, so that between four pixels it is exact.
+    On a plane 1 / depth is linear in the picture, so that between four pixels it is exact.
     """
     x, y = int(np.floor(s - 0.5)), int(np.floor(t - 0.5))
     a, b = s - 0.5 - x, t - 0.5 - y

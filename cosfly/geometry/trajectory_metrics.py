@@ -1,4 +1,4 @@
-"""Figures of a flight: dynamics by discrete differentiation, distances, visibility (sec:step6)."""
+"""Trajectory metrics: dynamics by discrete differentiation, distances, visibility (sec:step6)."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from cosfly.geometry.axes import DT_S
 
 ACCEL_SCALE_MPS2, JERK_SCALE_MPS3 = 5.0, 10.0  # eq:smoothness_score
 
-# Bounds of a flight (sec:step6), for the prefilter of `plan` and again for `inspect`.
+# Bounds of a trajectory (sec:step6), for the filter of `plan` and for `inspect`.
 FIVE_RAY_MEAN_MIN, ACCEL_RMS_MAX_MPS2, JERK_RMS_MAX_MPS3 = 0.40, 5.0, 10.0
 
-# Distances to obstacles (tab:drone_params): what a plan and a shifted frame keep, and the floor where a plan cannot.
+# Distances to obstacles (tab:drone_params): of plans and perturbed frames, and the floor where a plan cannot keep it.
 SAFETY_DISTANCE_M, RELAXED_SAFETY_M = 3.0, 2.5
-CLEARANCE_CAP_M = 100.0  # a product holds finite numbers: obstacles farther away than this count as this far
+CLEARANCE_CAP_M = 100.0  # of clearances in files, which hold finite numbers
 CLEARANCE_TOLERANCE_M = 1e-3  # files keep a tenth of a millimetre
 
 
 def derivative_rms(positions_m: np.ndarray, order: int, dt_s: float = DT_S) -> float:
-    """Root mean square of the length of a discrete derivative of a path.
+    """Return the root mean square of the length of a discrete derivative of a path.
 
     Args:
         positions_m: (n, 3). order: 1 speed (m/s), 2 acceleration (m/s^2), 3 jerk (m/s^3).
     Returns:
-        0 for a path of `order` points or fewer: it has no such difference.
+        0 for a path of at most `order` points, which has no such difference.
     """
     differences = np.diff(_path(positions_m), n=order, axis=0)
     if dt_s <= 0:
@@ -33,12 +33,12 @@ def derivative_rms(positions_m: np.ndarray, order: int, dt_s: float = DT_S) -> f
 
 
 def accel_rms(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
-    """RMS acceleration of waypoints, (n, 3) m, in m/s^2."""
+    """Return the RMS acceleration of waypoints, (n, 3) m, in m/s^2."""
     return derivative_rms(positions_m, 2, dt_s)
 
 
 def jerk_rms(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
-    """RMS jerk of waypoints, (n, 3) m, in m/s^3."""
+    """Return the RMS jerk of waypoints, (n, 3) m, in m/s^3."""
     return derivative_rms(positions_m, 3, dt_s)
 
 
@@ -48,12 +48,12 @@ def smoothness_score(accel_rms_mps2: float, jerk_rms_mps3: float) -> float:
 
 
 def length_m(positions_m: np.ndarray) -> float:
-    """Length of the polyline through (n, 3) points."""
+    """Return the length of the polyline through (n, 3) points."""
     return float(_steps_m(positions_m).sum())
 
 
 def speed_max_mps(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
-    """Largest mean speed between neighbours of waypoints, (n, 3) m, in m/s; 0 for one point."""
+    """Return the largest speed between neighbouring waypoints, (n, 3) m, in m/s; 0 for one point."""
     return float(_steps_m(positions_m).max(initial=0.0)) / dt_s
 
 
@@ -65,7 +65,7 @@ def trajectory_metrics(
     ground_m: np.ndarray,
     dt_s: float,
 ) -> dict[str, float]:
-    """All figures of one flight, JSON-able, rounded to what a reader can use.
+    """Return all metrics of one trajectory as JSON, rounded to four decimals.
 
     Args:
         positions_m, targets_m: (n, 3). visibility, clearances_m, ground_m: (n,). Altitudes are counted from the ground.

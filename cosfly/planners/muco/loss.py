@@ -375,7 +375,7 @@ def _add_lengths(points, begin, end, weight, state):
 
 @njit(cache=True)
 def difference_gradient(points, problem, index, masked, state, gradient):
-    """The paper's gradient: central differences of +-difference_m of the terms that a waypoint takes part in.
+    """Compute the paper's gradient: central differences of +-difference_m of the terms that a waypoint takes part in.
 
     Altitudes stay within their bounds, or the penalty below the least altitude would lift every waypoint that is at it.
     Writes `gradient` (n, 3), without the visibility term, whose own gradient is a difference already; `state` is
