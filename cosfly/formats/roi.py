@@ -86,7 +86,7 @@ def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Ro
         raise InputError("no polygon", where=f"{path}: points_world", expected="at least three points")
     num_vertices = sum(len(ring) for polygon in roi.rings() for ring in (polygon.points_world, *polygon.holes))
     if num_vertices > most_vertices:
-        fix = "simplify it, or raise pedestrians.roi_vertices if you trust it"
+        fix = "simplify its rings"
         raise over_limit(path, f"{num_vertices:,} vertices", f"{most_vertices:,}", fix)
     for number, polygon in enumerate(roi.rings()):
         for ring in (polygon.points_world, *polygon.holes):

@@ -35,12 +35,9 @@ __all__ = ["BoxMap", "DroneTrace", "Frame", "load_map", "plan", "read_captions",
 
 # Settings that a function uses; it refuses the others of the section.
 OF_PEDESTRIAN = PedestriansConfig.model_fields.keys() - {
-    *("num_paths", "others", "look_alikes", "traffic", "roi_vertices")
+    *("num_paths", "others", "look_alikes", "traffic")
 }
-OF_PACE = {
-    "cruise_speed_mps", "curvature_gain_m", "speed_jitter", "min_speed_mps", "pace", "hurry_speed_mps",
-    "dt_s",
-}  # fmt: skip
+OF_PACE = {"pace", "hurry_speed_mps", "dt_s"}
 OF_PICTURE = {"backend", "look", "rim", *WeatherConfig.model_fields}
 STEP_S = 0.5  # between the places of `render_frames`, for the person's stride
 FILE_SETTING = {"simworld": "world", "cityjson": "path", "boxes": "path"}  # of a source: which setting names its file
