@@ -34,9 +34,7 @@ from cosfly.simplify.passes import SimplifyConfig, simplify
 __all__ = ["BoxMap", "DroneTrace", "Frame", "load_map", "plan", "read_captions", "render_frames"]
 
 # Settings that a function uses; it refuses the others of the section.
-OF_PEDESTRIAN = PedestriansConfig.model_fields.keys() - {
-    *("num_paths", "others", "look_alikes", "traffic")
-}
+OF_PEDESTRIAN = PedestriansConfig.model_fields.keys() - {*("num_paths", "others", "look_alikes", "traffic")}
 OF_PACE = {"pace", "hurry_speed_mps", "dt_s"}
 OF_PICTURE = {"backend", "look", "rim", *WeatherConfig.model_fields}
 STEP_S = 0.5  # between the places of `render_frames`, for the person's stride
