@@ -153,15 +153,20 @@ def plan_benchmark(
 
     TA*+Smooth is the paper's search with our smoothing, MuCO the paper's objective with our step."""
     from cosfly.planners import benchmark
+    from cosfly.planners.contract import title_of
     from cosfly.runtime.config import build
     from cosfly.runtime.console import console
+    from cosfly.runtime.json_io import read_object
 
     settings = job.cfg.plan.model_dump() | {"scenarios": scenarios} | ({"planners": planner} if planner else {})
     cfg = build(benchmark.BenchmarkConfig, settings, "plan benchmark")
     product = benchmark.run(cfg, map_, paths, out, seed=job.cfg.seed, **job.worker_options)
-    table, *_ = benchmark.text_tables(benchmark.read_benchmark(product))
+    found = read_object(product, what=benchmark.FORMAT.what)
+    table = next(benchmark.text_tables(found))
     narrow = [[row[k] for k in (0, 1, 5, 6, 7)] for row in (table.columns, *table.rows)]  # fits eighty columns
     options.print_table(console, narrow[0], narrow[1:], title=table.title)
+    for name, note in found["notes"].items():
+        console.print(f"{title_of(name)}: {note}")
     console.print(f"all tables: {out / 'benchmark.md'}")
     typer.echo(product)
 
