@@ -11,7 +11,7 @@ from cosfly.formats.places import sample_id
 from cosfly.formats.playback import read_track
 from cosfly.formats.predictions import Split
 from cosfly.formats.tracks import find_tracks
-from cosfly.llm.student_chat import FrameLook, Taught, write_taught
+from cosfly.llm.student_chat import FrameFormat, ChatFormat, write_chat_format
 from cosfly.runtime.json_io import write_json
 from cosfly.runtime.run_dir import fingerprint
 from distill.prepare import stage as prepare
@@ -104,9 +104,9 @@ def make_captions(path: Path, tree: Path) -> list[Caption]:
 
 
 ADAPTER_PIXELS = 64 * 64
-TEACHING = Taught.model_validate({
+TEACHING = ChatFormat.model_validate({
     "prompts": {"en": {"system": "You fly.", "user": "Five frames."}}, "num_frames": 5, "max_pixels": ADAPTER_PIXELS,
-    "looks": [FrameLook(views=("rgb",), size_px=(64, 36), depth_range_m=100.0)],
+    "looks": [FrameFormat(views=("rgb",), size_px=(64, 36), depth_range_m=100.0)],
 })  # fmt: skip
 
 
@@ -132,5 +132,5 @@ def make_adapter(base: Path, folder: Path, **changes) -> Path:
                 tensor.mul_(0.02)
     student.model.save_pretrained(folder)
     write_json(folder / ADAPTER_FACTS, adapter_facts(student, ADAPTER_PIXELS, base))
-    write_taught(folder, TEACHING)
+    write_chat_format(folder, TEACHING)
     return folder

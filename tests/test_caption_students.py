@@ -18,7 +18,7 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.students import as_taught
 from cosfly.formats.captions import Caption, read_captions
-from cosfly.llm.student_chat import TAUGHT, read_taught, write_taught
+from cosfly.llm.student_chat import CHAT_FORMAT_FILE, read_chat_format, write_chat_format
 from cosfly.runtime.errors import ConfigError
 from distill.inference import stage as infer
 from distill.schema import Sample, open_split
@@ -36,7 +36,7 @@ def place(tmp_path_factory) -> Path:
     captions = run(CaptionConfig.model_validate({"image": {"max_side_px": SIDE_PX}}), tree, root / "rules")
     prepared(tree, captions, root / "set", modalities=("rgb", "depth"))
     (root / "trained" / "adapter").mkdir(parents=True)
-    write_taught(root / "trained" / "adapter", taught_by(open_split(root / "set", "train"), MAX_PIXELS))
+    write_chat_format(root / "trained" / "adapter", taught_by(open_split(root / "set", "train"), MAX_PIXELS))
     return root
 
 
@@ -111,20 +111,20 @@ def test_unlabelled_flights_are_captioned_and_marked(place, tmp_path):
         assert caption.verdict in ("CONSISTENT", "SOFT_CONFLICT", "ABSTAIN")
         assert caption.checks.sentences is not None
         assert caption.zh is not None
-        assert caption.picture_px == read_taught(place / "trained").looks[0].size_px
+        assert caption.picture_px == read_chat_format(place / "trained").looks[0].size_px
     told = (tmp_path / "out" / "stage.json").read_text()
     assert str(place) not in json.dumps(json.loads(told)["config"])
 
 
 def taught_otherwise(place: Path, folder: Path, **changes: Any) -> Path:
     folder.mkdir()
-    value = json.loads((place / "trained" / "adapter" / TAUGHT).read_text())
-    (folder / TAUGHT).write_text(json.dumps(value | changes))
+    value = json.loads((place / "trained" / "adapter" / CHAT_FORMAT_FILE).read_text())
+    (folder / CHAT_FORMAT_FILE).write_text(json.dumps(value | changes))
     return folder
 
 
 def test_another_version_of_the_prompt_is_refused(place, tmp_path):
-    taught = json.loads((place / "trained" / "adapter" / TAUGHT).read_text())
+    taught = json.loads((place / "trained" / "adapter" / CHAT_FORMAT_FILE).read_text())
     english = taught["prompts"]["en"]
     for number, changed in enumerate([
         {"system": english["system"] + " Be brief.", "user": english["user"]},

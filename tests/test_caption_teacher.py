@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import socket
+import time
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -143,34 +145,32 @@ def test_no_command_takes_a_url_that_cannot_be_asked_or_holds_a_secret(tmp_path,
     assert not list(tmp_path.rglob("*"))
 
 
-# --- the throttle ---
+# --- the limit on concurrency ---
 
 
-class Clock:
-    now_s = 0.0
-
-    def __call__(self) -> float:
-        return self.now_s
-
-
-def test_the_throttle_ramps_halves_and_recovers():
-    clock = Clock()
-    throttle = Throttle(64, clock)
-    assert throttle.limit == 8
-    for _ in range(8):
-        throttle.succeeded()
-    assert throttle.limit == 24  # tripled by one round of answers
-    clock.now_s = 1.0
-    throttle.was_busy(given_s=0.5, retry_after_s=None)
-    throttle.was_busy(given_s=0.5, retry_after_s=None)  # sent before the decrease: says nothing new
-    assert throttle.limit == 12
-    for _ in range(12):
-        throttle.succeeded()
-    assert 12.9 < throttle.limit <= 13.0  # one more per round from now on
+def test_the_limit_on_concurrency_halves_and_recovers():
+    limit = ConcurrencyLimit(64)
+    now_s = time.monotonic()
+    limit.was_busy(sent_s=now_s, retry_after_s=None)
+    limit.was_busy(sent_s=now_s, retry_after_s=None)  # sent before the decrease: does not count again
+    assert limit.limit == 32
+    for _ in range(32):
+        limit.succeeded()
+    assert 32.9 < limit.limit <= 33.0  # one more per round
     for _ in range(20):
-        clock.now_s += 1.0
-        throttle.was_busy(given_s=clock.now_s, retry_after_s=None)
-    assert throttle.limit == 1.0
+        limit.was_busy(sent_s=float("inf"), retry_after_s=None)
+    assert limit.limit == 1.0
     for _ in range(10_000):
-        throttle.succeeded()
-    assert throttle.limit == 64
+        limit.succeeded()
+    assert limit.limit == 64
+
+
+def test_a_retry_after_holds_every_request():
+    async def start_s() -> float:
+        limit = ConcurrencyLimit(2)
+        limit.was_busy(sent_s=time.monotonic(), retry_after_s=0.2)
+        begun_s = time.monotonic()
+        async with limit.slot():
+            return time.monotonic() - begun_s
+
+    assert asyncio.run(start_s()) >= 0.19

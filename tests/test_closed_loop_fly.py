@@ -16,7 +16,7 @@ from cosfly.formats.captions import read_captions
 from cosfly.formats.playback import read_track
 from cosfly.formats.pursuits import PURSUITS, Pursuit, read_pursuit
 from cosfly.formats.tracks import find_tracks
-from cosfly.llm.student_chat import write_taught
+from cosfly.llm.student_chat import write_chat_format
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
 from distill.student.random_student import make_tiny_student
@@ -152,7 +152,7 @@ def student(tmp_path_factory) -> Path:
     captions = caption_tree(CaptionConfig(), tree, root / "captions")
     prepared(tree, captions, root / "set", modalities=("rgb",))
     make_tiny_student(root / "model")
-    write_taught(root / "model", taught_by(open_split(root / "set", "train"), 64 * 64))
+    write_chat_format(root / "model", taught_by(open_split(root / "set", "train"), 64 * 64))
     return root / "model"
 
 

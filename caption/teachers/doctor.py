@@ -116,7 +116,7 @@ class _Examination:
         found = self.client.read(response, is_structured=schema is not None)
         if isinstance(found, Refusal):
             fix = "" if found.kind == "unknown" else f"; {found.meaning.fix}"
-            return _Probe(None, found.said + fix, found)
+            return _Probe(None, found.summary + fix, found)
         if isinstance(found, str):
             return _Probe(None, found)
         return _Probe(found, "", None, thoughts_of(read_body(response.body)))

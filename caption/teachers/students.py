@@ -26,11 +26,11 @@ from cosfly.llm.client import EndpointConfig
 from cosfly.llm.contract import Request
 from cosfly.llm.student_chat import (
     IMAGE_ENCODING,
+    ChatFormat,
     SentPicture,
     StudentEndpointConfig,
-    Taught,
     picture_to_send,
-    read_taught,
+    read_chat_format,
     student_request,
 )
 from cosfly.runtime.errors import ConfigError, TeacherError
@@ -46,7 +46,7 @@ def as_taught(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:
     folder = cfg.student.folder
     if folder is None:
         return cfg
-    taught = read_taught(folder)
+    taught = read_chat_format(folder)
     check_prompts(taught, folder, vocabulary)
     views, ranges = {look.views for look in taught.looks}, {look.depth_range_m for look in taught.looks}
     sides = {max(look.size_px) for look in taught.looks}
@@ -73,7 +73,7 @@ def as_taught(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:
     })  # fmt: skip
 
 
-def check_prompts(taught: Taught, folder: Path, vocabulary: Vocabulary) -> None:
+def check_prompts(taught: ChatFormat, folder: Path, vocabulary: Vocabulary) -> None:
     """Check that prompts are written today as they were for the student."""
     if "en" not in taught.prompts:
         raise ConfigError("the student was taught no English", where=folder, got=", ".join(taught.prompts))
@@ -90,7 +90,7 @@ def check_prompts(taught: Taught, folder: Path, vocabulary: Vocabulary) -> None:
             )  # fmt: skip
 
 
-def _is_of_template(user: str, language: Language, taught: Taught, template: Template) -> bool:
+def _is_of_template(user: str, language: Language, taught: ChatFormat, template: Template) -> bool:
     told = {"num_frames": re.escape(str(taught.num_frames)), "pictures": "|".join(
         re.escape(Pictures(look.views, look.size_px, "separate",
         look.depth_range_m).sentence(language)) for look in taught.looks
@@ -114,7 +114,7 @@ class TaughtStudent:
             cfg: as `as_taught` gives it.
         """
         assert cfg.student.folder is not None
-        self.taught = read_taught(cfg.student.folder)
+        self.taught = read_chat_format(cfg.student.folder)
         self._sampling: EndpointConfig = cfg.endpoint
         self.terms = Terms("prose", (), has_mirror="zh" in self.taught.prompts, is_translated=False)
 

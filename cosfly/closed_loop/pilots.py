@@ -36,7 +36,7 @@ from cosfly.llm.answer_text import parse_answer
 from cosfly.llm.answers import Answer as BookAnswer
 from cosfly.llm.answers import AnswerBook
 from cosfly.llm.contract import NoAnswer
-from cosfly.llm.student_chat import TAUGHT
+from cosfly.llm.student_chat import CHAT_FORMAT_FILE
 from cosfly.runtime.errors import CosflyError
 from cosfly.runtime.seeding import rng_for
 from distill.inference.stage import InferConfig, Inputs, local_answers
@@ -226,7 +226,7 @@ def _taught_folder(cfg: FlyConfig) -> Path | None:
     place = Path(cfg.student.partition(":")[2])
     if cfg.engine == "transformers":
         return cfg.adapter or place
-    return cfg.as_student or (place if cfg.engine == "vllm" and (place / TAUGHT).is_file() else None)
+    return cfg.as_student or (place if cfg.engine == "vllm" and (place / CHAT_FORMAT_FILE).is_file() else None)
 
 
 class LocalPilot(AskedPilot):

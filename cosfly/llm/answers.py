@@ -1,13 +1,15 @@
-"""Every answer, kept before anything is derived from it; nothing answered is asked twice.
+"""The journal of answers: each is written before anything is derived from it, and nothing is asked twice.
 
-One folder keeps the answers of one asker, in one journal a flight: `answers/<flight>.jsonl`. One process writes it. An
-answer is handed to the system as it arrives, so a killed process loses none; a thread waits for the disk, once for all
-answers that arrived meanwhile. In memory are only flights that are being worked on.
+A folder has one journal per track, `answers/<track>.jsonl`, written by one process. An answer is handed to the
+system as
+it arrives, so a killed process loses none; a thread waits for the disk, once for all answers that arrived meanwhile.
+Only tracks in progress are in memory.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import re
 import time
@@ -36,21 +38,8 @@ MOST_OPEN_FILES = 64
 _PLAIN_NAME = re.compile(r"\w[\w.+-]*")
 
 
-def journal_name(flight: str) -> str:
-    """Return the file name of a flight's journal: its own name where that is a plain one, else one made from its
-    digest."""
-    is_plain = _PLAIN_NAME.fullmatch(flight) is not None and len(flight.encode()) <= 200
-    return f"{flight if is_plain else f'flight-{sha256_bytes(flight.encode())}'}.jsonl"
-
-
-Count = Annotated[int, Field(strict=True, ge=0, le=10**15)]  # of all runs into a folder
-
-
 class Answer(BaseModel):
-    """A line of a journal: what an engine answered.
-
-    usage: empty where a server does not count.
-    """
+    """A line of a journal. usage: empty if the server reports none."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
@@ -59,7 +48,7 @@ class Answer(BaseModel):
     purpose: str
     model: str = ""
     text: str
-    usage: dict[CountName, Annotated[Count, Field(le=MOST_TOKENS)]]
+    usage: dict[CountName, Annotated[int, Field(strict=True, ge=0, le=MOST_TOKENS)]]
     structured: str = ""
     finish_reason: str | None = None
     latency_s: float = Field(0.0, ge=0)
@@ -67,12 +56,13 @@ class Answer(BaseModel):
 
     @property
     def reply(self) -> Reply:
+        """The reply that was recorded."""
         usage = Usage(**self.usage) if self.usage else None
         return Reply(self.text, usage, self.structured, self.finish_reason, is_kept=True)
 
 
 def answer_key(model: str, request: Request) -> str:
-    """Hash image bytes, prompt, model and sampling: what an answer depends on."""
+    """Return the digest of what an answer depends on: image bytes, prompt, model and sampling."""
     texts = [
         message
         if isinstance(message["content"], str)
@@ -84,102 +74,99 @@ def answer_key(model: str, request: Request) -> str:
 
 
 def read_answers(journal: Journal) -> Iterator[Answer]:
-    """Yield the answers of a journal; InputError where a line cannot be used."""
+    """Yield the answers of a journal; raises InputError for an unusable line."""
     return journal.read_as(Answer.model_validate)
 
 
+def journal_name(track: str) -> str:
+    """Return the file name of a track's journal: the track's name if it is a plain file name, else its digest."""
+    is_plain = _PLAIN_NAME.fullmatch(track) is not None and len(track.encode()) <= 200
+    return f"{track if is_plain else f'flight-{sha256_bytes(track.encode())}'}.jsonl"
+
+
 @dataclass
-class _Flight:
-    """One flight's journal and its answers by key."""
+class _TrackAnswers:
+    """The journal of one track, and its answers by key."""
 
     journal: Journal
     answers: dict[str, Answer]
 
 
 class AnswerBook:
-    """The journals of one folder. Use as a context manager; all methods run on one event loop."""
+    """The journals of one folder, a context manager. All methods run on one event loop."""
 
     def __init__(self, folder: Path) -> None:
-        """Count what the journals of earlier runs hold."""
+        """Count the answers of earlier runs."""
         self.folder = folder
-        self.totals: Counter[str] = Counter()  # answers, prompt_tokens, completion_tokens: of all runs into this folder
+        self.totals: Counter[str] = Counter()  # answers, prompt_tokens, completion_tokens of all runs into this folder
         for path in sorted(folder.glob("*.jsonl")):
             for answer in read_answers(Journal(path)):
                 self._count(answer)
-        self._flights: dict[str, _Flight] = {}
-        self._waiting: list[tuple[Journal, asyncio.Future]] = []  # for the disk
-        self._disk = ThreadPoolExecutor(1, "journal")
-        self._syncing: asyncio.Task | None = None
+        self._tracks: dict[str, _TrackAnswers] = {}
+        self._disk, self._disk_lock = ThreadPoolExecutor(1, "journal"), asyncio.Lock()
+        self._unsynced = set[Journal]()
+        self._disk_error: CosflyError | OSError | None = None
 
-    def get(self, flight: str, key: str) -> Answer | None:
-        return self._open(flight).answers.get(key)
+    def get(self, track: str, key: str) -> Answer | None:
+        """Return the recorded answer of a key."""
+        return self._open(track).answers.get(key)
 
-    def latency_s(self, flight: str, sample_id: str) -> float:
-        """Return the time that the answers about one window took, one after the other."""
-        kept = self._open(flight).answers.values()
-        return sum(answer.latency_s for answer in kept if answer.sample_id == sample_id)
+    def latency_s(self, track: str, sample_id: str) -> float:
+        """Return the total time of the answers about one window."""
+        return sum(one.latency_s for one in self._open(track).answers.values() if one.sample_id == sample_id)
 
-    async def put(self, flight: str, answer: Answer) -> None:
-        """Write an answer to the disk; it is there when this returns.
-
-        Raises:
-            StorageError: the disk is full or not writable.
-        """
-        opened = self._open(flight)
+    async def put(self, track: str, answer: Answer) -> None:
+        """Write an answer, and wait until it is on the disk; raises StorageError if the disk is full or not
+        writable."""
+        opened = self._open(track)
         opened.journal.append(answer.model_dump(mode="json"), sync=False)
         opened.answers[answer.key] = answer
         self._count(answer)
-        on_disk = asyncio.get_running_loop().create_future()
-        self._waiting.append((opened.journal, on_disk))
-        if self._syncing is None or self._syncing.done():
-            self._syncing = asyncio.create_task(self._sync())
-        await on_disk
+        self._unsynced.add(opened.journal)
+        async with self._disk_lock:
+            if self._disk_error is not None:  # a later sync may succeed without the lost lines
+                raise self._disk_error
+            if opened.journal in self._unsynced:  # else synced by another answer that waited
+                await self._sync()
 
-    def forget(self, flight: str) -> None:
-        """Drop a flight that was worked on from memory; its journal stays."""
-        if (opened := self._flights.pop(flight, None)) is not None:
+    async def _sync(self) -> None:
+        batch, self._unsynced = self._unsynced, set()
+        try:
+            await asyncio.get_running_loop().run_in_executor(self._disk, _sync_all, batch)
+        except asyncio.CancelledError:
+            self._unsynced |= batch
+            raise
+        except (CosflyError, OSError) as error:
+            self._disk_error = error
+            raise
+        if len(self._tracks) > MOST_OPEN_FILES:  # the next line opens its file again
+            for journal in batch - self._unsynced:
+                journal.close()
+
+    def forget(self, track: str) -> None:
+        """Remove a finished track from memory; its journal stays on the disk."""
+        if (opened := self._tracks.pop(track, None)) is not None:
             opened.journal.close()
 
-    def _open(self, flight: str) -> _Flight:
-        if flight not in self._flights:
-            journal = Journal(self.folder / journal_name(flight))
-            self._flights[flight] = _Flight(journal, {answer.key: answer for answer in read_answers(journal)})
+    def _open(self, track: str) -> _TrackAnswers:
+        if track not in self._tracks:
+            journal = Journal(self.folder / journal_name(track))
+            self._tracks[track] = _TrackAnswers(journal, {answer.key: answer for answer in read_answers(journal)})
             if journal.num_damaged:
-                log.warning("%s: %d damaged lines are left out", journal.path, journal.num_damaged)
-        return self._flights[flight]
+                log.warning("%s: %d damaged lines are skipped", journal.path, journal.num_damaged)
+        return self._tracks[track]
 
     def _count(self, answer: Answer) -> None:
         self.totals["answers"] += 1
         self.totals.update(answer.usage)
-
-    async def _sync(self) -> None:
-        loop = asyncio.get_running_loop()
-        while self._waiting:
-            batch, self._waiting = self._waiting, []
-            journals = {journal for journal, _ in batch}
-            error: CosflyError | OSError | None = None
-            try:
-                await loop.run_in_executor(self._disk, _sync_all, journals)
-            except (CosflyError, OSError) as found:  # a disk that is full or gone: every window that waits is told
-                error = found
-            for _, on_disk in batch:
-                if on_disk.done():
-                    continue
-                if error is None:
-                    on_disk.set_result(None)
-                else:
-                    on_disk.set_exception(error)
-            if len(self._flights) > MOST_OPEN_FILES:  # the next line opens its file again
-                for journal in journals - {journal for journal, _ in self._waiting}:
-                    journal.close()
 
     def __enter__(self) -> AnswerBook:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._disk.shutdown(wait=True)
-        for flight in list(self._flights):
-            self.forget(flight)
+        for track in list(self._tracks):
+            self.forget(track)
 
 
 def _sync_all(journals: set[Journal]) -> None:
@@ -188,56 +175,48 @@ def _sync_all(journals: set[Journal]) -> None:
 
 
 class KeptAnswers:
-    """Gives an answer from the book, or has the engine make it, within the budget, and keeps it."""
+    """An engine with a journal and a budget: recorded answers are reused, new ones are recorded."""
 
     def __init__(
         self, engine: Engine, book: AnswerBook | None, budget: Budget | None = None, only: frozenset[str] | None = None
     ) -> None:
         """
         Args:
-            book: None keeps nothing. budget: None sets no limit.
-            only: sample ids that may be asked about; None: all. Of the others only what the book holds is given.
+            book: None records nothing. budget: None sets no limit.
+            only: sample ids about which the engine may be asked; None: all. Others get recorded answers only.
         """
         self.engine, self.book, self.budget, self.only = engine, book, budget, only
         self._asking: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()  # key -> held while it is asked
 
-    async def ask(self, request: Request, flight: str, sample_id: str, purpose: str) -> Reply:
-        """
+    async def ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
+        """Return the recorded answer, or ask the engine.
+
         Raises:
-            NoAnswer: there is none. BudgetSpent: one more request might pass a limit. TeacherError: none will be
-            answered.
+            NoAnswer: This request gets no answer.
+            BudgetSpent: The request might exceed a limit.
+            TeacherError: No request will be answered.
         """
         key = answer_key(self.engine.model, request)
         lock = self._asking.setdefault(key, asyncio.Lock())
-        async with lock:  # two windows may ask the same: the second takes the answer of the first
-            known = None if self.book is None else self.book.get(flight, key)
-            is_again = self.only is not None and sample_id in self.only  # perhaps by a server with a larger context
-            if known is not None and not (is_again and known.finish_reason == CONTEXT_FULL):
+        async with lock:  # of two equal requests the second takes the answer of the first
+            known = None if self.book is None else self.book.get(track, key)
+            is_retried = self.only is not None and sample_id in self.only  # perhaps by a server with a larger context
+            if known is not None and not (is_retried and known.finish_reason == CONTEXT_FULL):
                 return known.reply
-            if self.only is not None and sample_id not in self.only:
+            if self.only is not None and not is_retried:
                 raise NoAnswer("not_asked", "this run asks about other windows only")
-            if self.budget is None:
-                return await self._make(key, request, flight, sample_id, purpose)
-            async with self.budget.request(len(request.digests)):
-                reply = await self._make(key, request, flight, sample_id, purpose)
-            self.budget.note(reply.usage, self.engine.where, len(request.digests))
+            num_pictures = len(request.digests)
+            async with self.budget.request(num_pictures) if self.budget else contextlib.nullcontext():
+                start_s = time.monotonic()
+                reply = await self.engine.answer(request)
+                latency_s = round(time.monotonic() - start_s, 3)
+                if self.book is not None:
+                    answer = Answer(
+                        key=key, sample_id=sample_id, purpose=purpose, model=self.engine.model, text=reply.text,
+                        usage=reply.usage.model_dump() if reply.usage else {}, structured=reply.structured,
+                        finish_reason=reply.finish_reason, latency_s=latency_s, time=round(time.time(), 3),
+                    )  # fmt: skip
+                    await self.book.put(track, answer)  # on the disk before anything is derived from it
+            if self.budget is not None:
+                self.budget.note(reply.usage, self.engine.where, num_pictures)
             return reply
-
-    async def _make(self, key: str, request: Request, flight: str, sample_id: str, purpose: str) -> Reply:
-        start_s = time.monotonic()
-        reply = await self.engine.answer(request)
-        if self.book is not None:
-            answer = Answer(
-                key=key,
-                sample_id=sample_id,
-                purpose=purpose,
-                model=self.engine.model,
-                text=reply.text,
-                usage=reply.usage.model_dump() if reply.usage else {},
-                structured=reply.structured,
-                finish_reason=reply.finish_reason,
-                latency_s=round(time.monotonic() - start_s, 3),
-                time=round(time.time(), 3),
-            )
-            await self.book.put(flight, answer)  # on the disk before anything is derived from it
-        return reply

@@ -1,6 +1,6 @@
-"""What is asked of a language model and what it gives: the contract of every engine.
+"""The contract of every engine: requests to a language model, and its replies.
 
-An engine knows no captions, journals or budgets: it is started, answers requests, many at once, and is closed.
+An engine knows no captions, journals or budgets: it is started, answers many requests at once, and is closed.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import Any, Literal, Protocol
 from cosfly.formats.captions import Usage
 
 CountName = Literal["prompt_tokens", "completion_tokens"]
-MOST_TOKENS = 10_000_000  # of one answer: the longest context of any model that is served
+MOST_TOKENS = 10_000_000  # of one answer: longer than the context of any model
 
 
 @dataclass(frozen=True)
 class Request:
-    """One conversation and how it is sampled, in plain values.
+    """One conversation and its sampling.
 
-    messages: chat messages, pictures as data URLs. digests: sha256 of the pictures' bytes, in their order. schema: of
-    the answer. sampling: temperature, max_tokens, seed and whatever else stands in a request beside model and messages.
+    messages: chat messages, pictures as data URLs. digests: sha256 of the pictures' bytes, in order. schema: JSON
+    schema of the answer. sampling: temperature, max_tokens, seed and further fields of the request.
     """
 
     messages: list[dict]
@@ -33,10 +33,10 @@ class Request:
 
 @dataclass(frozen=True)
 class Reply:
-    """One answer. `structured` says how its shape was enforced: json_schema, plain, or native (written by rules).
+    """One answer.
 
-    usage: None where the server does not tell. finish_reason: the server's word, or CONTEXT_FULL. is_kept: it was given
-    before, and kept.
+    structured: how its form was enforced, json_schema, plain, or native (written by rules). usage: None if not
+    reported. finish_reason: the server's, or CONTEXT_FULL. is_kept: read from the journal.
     """
 
     text: str
@@ -47,8 +47,8 @@ class Reply:
 
 
 class NoAnswer(Exception):
-    """A request got no answer; `cause` is a word for the tally, `detail` what was said. `is_final`: it was refused, so
-    asking the same again would not help. `fix`: what would."""
+    """A request without an answer. cause: as tallies count it. detail: the server's message. is_final: the request was
+    refused, so repeating it does not help. fix: what helps."""
 
     def __init__(self, cause: str, detail: str, *, is_final: bool = False, fix: str = "") -> None:
         super().__init__(f"{cause}: {detail}")
@@ -59,19 +59,20 @@ SECONDS_BETWEEN_WARNINGS = 10.0
 
 
 class Troubles:
-    """Tries that failed, for those who watch a run. `last`: what was said; None once an answer came after it."""
+    """Failed tries, for the progress display. last: the last error; None after an answer."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.num = 0
         self.last: str | None = None
-        self.answered_s = clock()  # the last answer's time
+        self.answered_s = clock()  # time of the last answer
         self._clock, self._warned_s = clock, float("-inf")
 
     def answered(self) -> None:
+        """Record an answer."""
         self.last, self.answered_s = None, self._clock()
 
     def failed(self, detail: str) -> bool:
-        """Note a try; tells whether it is time for a line in the log."""
+        """Record a failed try; return whether it is time for a line in the log."""
         self.num, self.last = self.num + 1, detail
         if self._clock() - self._warned_s < SECONDS_BETWEEN_WARNINGS:
             return False
@@ -85,34 +86,26 @@ class Troubles:
 
 
 class Engine(Protocol):
-    """What answers requests: a server, or a model in this process. `close` is called whatever came of `start`."""
+    """A server, or a model in this process. `close` is called even if `start` failed."""
 
     @property
     def kind(self) -> Literal["endpoint", "vllm"]: ...
 
-    where: str  # its address, for messages; holds no secret
-    model: str  # the model's name; known once it is started
+    where: str  # address for messages, without secrets
+    model: str  # the model's name; known after `start`
 
     async def start(self) -> None:
-        """Get ready.
-
-        Raises:
-            TeacherError, EnvironmentMissing, ConfigError: it cannot be used.
-        """
+        """Start; raises TeacherError, EnvironmentMissing or ConfigError if the engine cannot be used."""
 
     async def answer(self, request: Request) -> Reply:
-        """Answer one request.
-
-        Raises:
-            NoAnswer: this one gets none. TeacherError: none will.
-        """
+        """Answer one request; raises NoAnswer for this request, and TeacherError if none will be answered."""
 
     async def close(self) -> None: ...
 
 
 @asynccontextmanager
 async def started(engine: Engine) -> AsyncIterator[None]:
-    """Start an engine and close it at the end."""
+    """Start an engine, and close it at the end."""
     try:
         await engine.start()
         yield

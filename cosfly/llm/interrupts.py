@@ -1,4 +1,4 @@
-"""Ctrl-C while many requests are in flight: once ends them in order, twice ends the process at once."""
+"""Ctrl-C while requests are in flight: the first cancels them in order, the second ends the process."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ AT_ONCE = b"error: interrupted at once; what was answered is kept: run the same 
 
 
 def run_until_interrupted(main: Coroutine[Any, Any, Result]) -> Result:
-    """Run a coroutine to its end, as `asyncio.run` does.
+    """Run a coroutine as `asyncio.run` does, but end the process at a second Ctrl-C.
 
-    The library's own second Ctrl-C breaks into what ends the tasks, which then speak of themselves for pages; journals
-    bear an end at any moment, so ours ends the process.
+    asyncio's second Ctrl-C interrupts the cancelled tasks and prints a traceback of each; journals survive an end at
+    any time.
 
     Raises:
-        KeyboardInterrupt: after the first Ctrl-C, when everything is ended.
+        KeyboardInterrupt: After the first Ctrl-C, once all tasks have ended.
     """
     count = 0
 
@@ -41,11 +41,11 @@ def run_until_interrupted(main: Coroutine[Any, Any, Result]) -> Result:
         try:
             return await main
         finally:
-            if count == 0:  # else it stays until the last task has ended
+            if count == 0:  # otherwise it stays until the last task has ended
                 loop.remove_signal_handler(signal.SIGINT)
 
     if threading.current_thread() is not threading.main_thread():
-        return asyncio.run(main)  # nobody interrupts it
+        return asyncio.run(main)
     try:
         return asyncio.run(guarded())
     except asyncio.CancelledError:

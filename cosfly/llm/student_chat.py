@@ -1,8 +1,4 @@
-"""A student's chat: the one renderer for those who train it, run it, serve it and ask it.
-
-A student answers well only what it was taught, so its prompt, the order of its pictures and their pixels come from here
-alone.
-"""
+"""A student's chat: prompt, order of pictures and their pixels, the same in training, inference and serving."""
 
 from __future__ import annotations
 
@@ -27,11 +23,11 @@ from cosfly.viz.frame_views import View, encode_picture, frame_label
 
 IMAGE_ENCODING: Literal["png"] = "png"
 IMAGE_PART: dict[str, Any] = {"type": "image"}  # a picture as chat templates know it
-MAX_ANSWER_TOKENS = 512  # unless told otherwise: an answer as long as is taught, and a half more
+MAX_ANSWER_TOKENS = 512  # 1.5 times the longest answer in training
 
 
 class StudentEndpointConfig(EndpointConfig):
-    """How a student is asked: greedily and without thinking, as it was taught."""
+    """Sampling of a student: greedy and without thinking, as in training."""
 
     temperature: ClassVar[float] = 0.0  # type: ignore[misc]
     top_p: ClassVar[float] = 1.0
@@ -43,10 +39,10 @@ class StudentEndpointConfig(EndpointConfig):
 
 
 def chat_messages(prompt: Prompt, frames: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """Return the chat of a sample: the system text, then each frame's pictures under its name, and the question.
+    """Return the chat of a sample: system text, each frame's pictures after its name, question.
 
     Args:
-        frames: the parts that stand for the pictures of each frame, oldest first; a frame without any is not named.
+        frames: the picture parts of each frame, oldest first; a frame without pictures is not named.
     """
     content: list[dict[str, Any]] = []
     for number, pictures in enumerate(frames):
@@ -58,18 +54,14 @@ def chat_messages(prompt: Prompt, frames: Sequence[Sequence[dict[str, Any]]]) ->
 
 @dataclass(frozen=True)
 class SentPicture:
-    """A picture as a part of a request, and the sha256 of its bytes."""
+    """A picture as part of a request, and the sha256 of its bytes."""
 
     part: dict[str, Any]
     digest: str
 
 
 def picture_to_send(rgb: np.ndarray, max_pixels: int) -> SentPicture:
-    """Encode a picture, (h, w, 3) uint8 RGB, without loss; larger ones are made smaller.
-
-    Args:
-        max_pixels: most pixels that stay; 0: all.
-    """
+    """Encode a picture, (h, w, 3) uint8 RGB, without loss, scaled down to `max_pixels`; 0: not scaled."""
     data = encode_picture(_bounded(rgb, max_pixels), IMAGE_ENCODING, 0)
     url = f"data:image/{IMAGE_ENCODING};base64,{base64.b64encode(data).decode('ascii')}"
     return SentPicture({"type": "image_url", "image_url": {"url": url}}, sha256_bytes(data))
@@ -78,12 +70,7 @@ def picture_to_send(rgb: np.ndarray, max_pixels: int) -> SentPicture:
 def student_request(
     prompt: Prompt, frames: Sequence[Sequence[SentPicture]], schema: dict, sampling: EndpointConfig, seed: int = 0
 ) -> Request:
-    """Return what an engine is asked.
-
-    Args:
-        frames: the pictures of each frame, oldest first.
-        schema: of the answer; `answer_schema(language=...)` for a free one.
-    """
+    """Return a request to an engine. frames: the pictures of each frame, oldest first. schema: of the answer."""
     messages = chat_messages(prompt, [[picture.part for picture in pictures] for pictures in frames])
     return sampling.request(messages, [picture.digest for pictures in frames for picture in pictures], schema, seed)
 
@@ -97,14 +84,13 @@ def _bounded(picture: np.ndarray, max_pixels: int) -> np.ndarray:
     return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC))
 
 
-# --- what a student was taught ----------------------------------------------------------------------------------------
+# --- the chat format of training --------------------------------------------------------------------------------------
 
-TAUGHT, TAUGHT_FORMAT = "cosfly_student.json", FileFormat("cosfly.student", "1.0", "student")
+CHAT_FORMAT_FILE, CHAT_FORMAT = "cosfly_student.json", FileFormat("cosfly.student", "1.0", "student")
 
 
-class FrameLook(BaseModel):
-    """How frames were shown: their views in this order, (width, height) of each picture, and the dark end of those of
-    depth."""
+class FrameFormat(BaseModel):
+    """The pictures of a frame: their views in order, width and height of each, and the far end of depth pictures."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -113,50 +99,46 @@ class FrameLook(BaseModel):
     depth_range_m: float = Field(gt=0, allow_inf_nan=False)
 
 
-class Taught(BaseModel):
-    """`cosfly_student.json`, beside a student's weights: what its chats looked like when it was taught.
+class ChatFormat(BaseModel):
+    """`cosfly_student.json`, next to a student's weights: the form of its chats in training.
 
-    prompts: of each language that it was taught, one of the questions, whose words tell the version of all. num_frames:
-    of a window.
-    looks: of all training samples, sorted. max_pixels: most that its image processor kept of a picture.
+    prompts: one question per language. num_frames: of a window. looks: picture formats of all training samples, sorted.
+    max_pixels: limit of its image processor.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     prompts: dict[Language, Prompt] = Field(min_length=1)
     num_frames: int = Field(ge=1)
-    looks: list[FrameLook] = Field(min_length=1)
+    looks: list[FrameFormat] = Field(min_length=1)
     max_pixels: int = Field(ge=1)
 
 
-def write_taught(folder: Path, taught: Taught) -> None:
-    write_model(folder / TAUGHT, taught, TAUGHT_FORMAT)
+def write_chat_format(folder: Path, taught: ChatFormat) -> None:
+    """Write `cosfly_student.json` into the folder of a student's weights."""
+    write_model(folder / CHAT_FORMAT_FILE, taught, CHAT_FORMAT)
 
 
-def read_taught(folder: Path) -> Taught:
-    """Read what a student was taught, from the folder of its weights or the output folder that they stand in."""
+def read_chat_format(folder: Path) -> ChatFormat:
+    """Read `cosfly_student.json` from the folder of a student's weights or the output directory above it."""
     place = _place_of(folder)
-    return read_model(place / TAUGHT, Taught, TAUGHT_FORMAT, tree=place)
+    return read_model(place / CHAT_FORMAT_FILE, ChatFormat, CHAT_FORMAT, tree=place)
 
 
 def student_files(folder: Path) -> dict[str, Path]:
-    """Return what decides who a student is, what it was taught and its weights, for the inputs of a stage: name ->
-    path.
-
-    A server tells a name only, and under one name may serve another student tomorrow.
-    """
+    """Return the files that identify a student, chat format and weights, as inputs of a stage: name -> path."""
     place = _place_of(folder)
-    return {f"student/{path.name}": path for path in (place / TAUGHT, *sorted(place.glob("*.safetensors")))}
+    return {f"student/{path.name}": path for path in (place / CHAT_FORMAT_FILE, *sorted(place.glob("*.safetensors")))}
 
 
 def _place_of(folder: Path) -> Path:
     places = [folder, folder / "adapter", folder / "model"]
-    place = next((place for place in places if (place / TAUGHT).is_file()), None)
+    place = next((place for place in places if (place / CHAT_FORMAT_FILE).is_file()), None)
     if place is None:
         raise InputError(
-            "nothing here says what the student was taught",
+            f"the folder contains no {CHAT_FORMAT_FILE}, which describes the student's training",
             where=folder,
-            expected=f"{TAUGHT} in it, in adapter/ or in model/",
-            fix="give what cosfly distill train or merge wrote",
+            expected=f"{CHAT_FORMAT_FILE} in it, in adapter/ or in model/",
+            fix="pass the output of cosfly distill train or merge",
         )
     return place

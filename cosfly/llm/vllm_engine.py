@@ -1,7 +1,7 @@
 """Engine `vllm`: vLLM in this process, over a model folder (extra `vllm`).
 
-Run with vLLM 0.26 (docs/teachers.md has the figures). vLLM has a thread of its own: a request joins while others are
-answered (`LLM.enqueue_chat`, `LLMEngine.step`), and one that it refuses costs only itself.
+Tested with vLLM 0.26 (docs/teachers.md has the figures). vLLM runs in its own thread: requests join while others are
+answered (`LLM.enqueue_chat`, `LLMEngine.step`), and a refused request does not affect others.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
 
 INSTALL = 'pip install "cosfly[vllm]" on a machine with an accelerator'
-ADDED_PER_STEP = 8  # requests handed over between two looks at what is finished
-FINISHED = ("stop", "length")  # what the engine says of an answer; others are its own failures
+ADDED_PER_STEP = 8  # requests added between two steps
+FINISHED = ("stop", "length")  # finish reasons of an answer; others are failures of the engine
 
 
 class VllmConfig(Config):
@@ -37,7 +37,7 @@ class VllmConfig(Config):
 
 
 class VllmEngine:
-    """vLLM on its thread. Requests may come at any time; at most `batch` of them are in vLLM."""
+    """vLLM in its own thread. Requests may arrive at any time; at most `batch` of them are in vLLM."""
 
     kind: Literal["vllm"] = "vllm"
 
@@ -46,13 +46,12 @@ class VllmEngine:
     ) -> None:
         """
         Args:
-            sampling: whether a schema is enforced, and the sampling that is tried before the model is loaded.
-            num_images: most pictures of one request. settings: section that `vllm` and `endpoint` stand in, for
-            messages.
+            sampling: sampling settings, checked before the model is loaded.
+            num_images: most pictures of one request. settings: section of `vllm` and `endpoint`, for messages.
         """
         if not (folder / "config.json").is_file():
             raise InputError(
-                "not a model folder", where=folder, expected="a folder with config.json", fix="check --teacher"
+                "this is not a model folder", where=folder, expected="a folder with config.json", fix="check --teacher"
             )
         self.folder, self.model, self.where = folder, folder.name, f"vllm:{folder}"
         self.cfg, self.sampling, self.num_images, self.settings = cfg, sampling, num_images, settings
@@ -63,33 +62,30 @@ class VllmEngine:
         self._broken: TeacherError | None = None
 
     async def start(self) -> None:
-        """Load vLLM and serve; see `load` for what it raises."""
+        """Load vLLM and serve; raises as `load`."""
         llm = await asyncio.get_running_loop().run_in_executor(self._thread, self.load)
         self._thread.submit(self._serve, llm)
 
     async def answer(self, request: Request) -> Reply:
-        """
-        Raises:
-            NoAnswer: vLLM refuses this request. TeacherError: it is broken and will answer nothing.
-        """
+        """Answer one request; raises NoAnswer if vLLM refuses it, and TeacherError if vLLM is broken."""
         answered: Future[Reply] = Future()
         self._new.put((request, answered))
         return await asyncio.wrap_future(answered)
 
     async def close(self) -> None:
-        """End the thread and vLLM; what is still asked stays without an answer."""
+        """End the thread and vLLM; open requests stay unanswered."""
         self._is_closing = True
         self._new.put(None)
         await asyncio.get_running_loop().run_in_executor(None, self._thread.shutdown)
-        gc.collect()  # its processes and memory go with its last reference
+        gc.collect()  # its processes and memory are freed with its last reference
 
     # --- on the thread ---
 
     def load(self) -> Any:
-        """Start vLLM."""
+        """Start vLLM; raises EnvironmentMissing or ConfigError if it cannot be used."""
         if importlib.util.find_spec("vllm") is None:
             raise EnvironmentMissing("the vLLM engine is not installed", where=self.where, fix=INSTALL)
-        os.environ.setdefault("VLLM_NO_USAGE_STATS", "1")  # else it reports to its makers
+        os.environ.setdefault("VLLM_NO_USAGE_STATS", "1")  # no telemetry
         try:
             from vllm import LLM
 
@@ -99,7 +95,7 @@ class VllmEngine:
                 where = f"{self.settings}.endpoint"
                 raise ConfigError("vLLM refuses the sampling settings", where=where, got=_one_line(error)) from None
             return LLM(**self.arguments())
-        except TypeError as error:  # an argument that LLM does not have
+        except TypeError as error:  # an unknown argument of LLM
             where = f"{self.settings}.vllm.engine"
             raise ConfigError("vLLM refuses an argument", where=where, got=_one_line(error)) from None
         except (ImportError, RuntimeError, ValueError, OSError) as error:
@@ -111,10 +107,13 @@ class VllmEngine:
         cfg = self.cfg
         arguments: dict[str, Any] = {
             "model": str(self.folder),
-            "limit_mm_per_prompt": {"image": self.num_images, "video": 0},  # without the 0, room is kept for a video
+            "limit_mm_per_prompt": {
+                "image": self.num_images,
+                "video": 0,
+            },  # without the 0, memory is reserved for a video
             "gpu_memory_utilization": 0.9,
-            # Free whitespace between fields lets a model pad for ever and slows decoding several times. vLLM forbids it
-            # only where the backend is named; "auto" is refused.
+            # Free whitespace lets a model pad without end and slows decoding several times. vLLM forbids it only for a
+            # named backend; "auto" is refused.
             "structured_outputs_config": {"backend": "xgrammar", "disable_any_whitespace": True},
         }
         if cfg.max_model_len is not None:
@@ -122,7 +121,7 @@ class VllmEngine:
         return arguments | cfg.engine
 
     def parameters(self, request: Request) -> Any:
-        """Return vLLM's own parameters of a request."""
+        """Return a request's parameters for vLLM."""
         from vllm import SamplingParams
         from vllm.sampling_params import StructuredOutputsParams
 
@@ -139,11 +138,11 @@ class VllmEngine:
             try:
                 if self._open and not self._is_closing:
                     self._step(llm)
-            except Exception as error:  # of this thread nobody else hears: who waits for an answer would wait for ever
+            except Exception as error:  # else those who wait would wait forever
                 self._break(error)
 
     def _take(self) -> list[tuple[Request, Future[Reply]]]:
-        """Return requests that came meanwhile; waits for one where there is nothing else to do."""
+        """Return new requests; waits for one if there is nothing else to do."""
         taken: list[tuple[Request, Future[Reply]]] = []
         while len(taken) < min(ADDED_PER_STEP, self.cfg.batch - len(self._open)):
             try:
@@ -164,10 +163,10 @@ class VllmEngine:
             [name] = llm.enqueue_chat(
                 [request.messages], [self.parameters(request)], use_tqdm=False, chat_template_kwargs=template
             )
-            self._open[str(name).partition("-")[0]] = answered  # vLLM adds a random part that outputs do not have
-        except (ValueError, RuntimeError) as error:  # what vLLM raises for a prompt that it cannot take
+            self._open[str(name).partition("-")[0]] = answered  # vLLM adds a random suffix that outputs lack
+        except (ValueError, RuntimeError) as error:  # of a prompt that vLLM cannot process
             answered.set_exception(NoAnswer("engine", _one_line(error), is_final=True))
-        except Exception as error:  # the process behind vLLM is gone, or a bug: no request will be answered
+        except Exception as error:  # its process has ended, or a bug: no request will be answered
             self._break(error, answered)
 
     def _step(self, llm: Any) -> None:
@@ -181,10 +180,10 @@ class VllmEngine:
 
     def _break(self, error: Exception, *more: Future[Reply]) -> None:
         self._broken = TeacherError(
-            "the vLLM engine broke",
+            "the vLLM engine failed",
             where=self.where,
             got=f"{type(error).__name__}: {_one_line(error)}",
-            fix="its messages above tell why; run the same command again: nothing answered is asked twice",
+            fix="read its messages above, then run the same command again: recorded answers are reused",
         )
         for answered in (*more, *self._open.values()):
             answered.set_exception(self._broken)
@@ -192,7 +191,7 @@ class VllmEngine:
 
 
 def read_output(output: Any, structured: str) -> Reply:
-    """Read a `vllm.RequestOutput`."""
+    """Return the reply of a `vllm.RequestOutput`."""
     completion = output.outputs[0]
     usage = Usage(prompt_tokens=len(output.prompt_token_ids or ()), completion_tokens=len(completion.token_ids))
     return Reply(completion.text, usage, structured, completion.finish_reason)

@@ -1,4 +1,4 @@
-"""One exchange with an HTTP server, in bounded time and memory whatever it sends."""
+"""HTTP exchanges in bounded time and memory, whatever the server sends."""
 
 from __future__ import annotations
 
@@ -20,43 +20,40 @@ HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
 
 
 def check_url(url: str) -> None:
-    """Check that a URL can be asked, and holds no secret: it is written into `run.yaml` and shown in messages.
+    """Check that a URL is usable and contains no secret, since it is written to `run.yaml` and shown in messages.
 
     Raises:
-        ValueError: says what is wrong, and nothing of the URL that may be a secret.
+        ValueError: Says what is wrong, without parts of the URL that may be secret.
     """
     shown = "" if "@" in url else f", got {re.split('[?#]', url)[0][:200]!r}"
     if not re.match(r"https?://", url, re.IGNORECASE):
         raise ValueError(f"a URL must begin with http:// or https://{shown}")
     if re.search(r"[\s\x00-\x1f\x7f]", url):
-        raise ValueError(f"a URL must not hold blanks{shown}")
+        raise ValueError(f"a URL must not contain blanks{shown}")
     if re.search("[@?#]", url):
-        what = "a URL must hold no user, password, query or fragment, since it is written down"
-        raise ValueError(f"{what}; a key goes into the environment variable {KEY_VARIABLE}{shown}")
+        what = "a URL must not contain a user, password, query or fragment, since it is recorded"
+        raise ValueError(f"{what}; set the key in the environment variable {KEY_VARIABLE}{shown}")
     try:
         parts = httpx.URL(url)
         host = parts.host
-        parts.raw_host.decode("ascii").encode("idna")  # as the system's resolver will
+        parts.raw_host.decode("ascii").encode("idna")  # as the resolver does
     except (httpx.InvalidURL, ValueError) as error:
-        raise ValueError(f"not a URL that can be asked{shown} ({' '.join(str(error).split())[:100]})") from None
+        raise ValueError(f"not a usable URL{shown} ({' '.join(str(error).split())[:100]})") from None
     if not host or "%" in host:
-        raise ValueError(f"a URL must name a host{shown}")
+        raise ValueError(f"a URL must contain a host name{shown}")
     if parts.port is not None and not 0 < parts.port < 65_536:
         raise ValueError(f"the port must be from 1 to 65535{shown}")
 
 
 def base_url(url: str) -> str:
-    """Return the API root of whatever form of URL a user has: host, host/v1, or the whole chat-completions path."""
+    """Return the API root of a URL given as host, host/v1 or the full chat-completions path."""
     root = url.rstrip("/").removesuffix("/chat/completions").rstrip("/")
     return root if re.search(r"/v\d+(beta)?(/openai)?$", root) else f"{root}/v1"
 
 
 @dataclass(frozen=True)
 class Response:
-    """What a server answered. body: of one that is longer than the limit its beginning (`is_cut`).
-
-    retry_after_s: how long it asks to wait; None where it does not say so in seconds.
-    """
+    """A server's response. body: cut at the size limit (`is_cut`). retry_after_s: None if not given in seconds."""
 
     status: int
     body: bytes
@@ -65,46 +62,45 @@ class Response:
 
 
 class Connections:
-    """A connection to each request in flight, each in a client of its own.
+    """One connection per request in flight, each in its own client.
 
-    One pool of 64 connections looks through all of them at every request, and all at each of those, which takes longer
-    than to send fifteen pictures.
+    httpx searches a pool of 64 connections at every request, which takes longer than sending fifteen pictures.
     """
 
     def __init__(self, key: str, *, timeout_s: float, most_bytes: int) -> None:
         """
         Args:
-            key: sent with each request; "": none.
-            timeout_s: of one exchange. most_bytes: of one answer.
+            key: API key sent with each request; "": none.
+            timeout_s: limit of one exchange. most_bytes: limit of one body.
         """
         if not (key.isascii() and key.isprintable()):  # an error of httpx would quote it
-            raise TeacherError("the key holds what no header can, perhaps the end of a line", where=KEY_VARIABLE)
+            what = "the API key contains a character that no header can contain, perhaps a line break"
+            raise TeacherError(what, where=KEY_VARIABLE, fix="check the environment variable")
         self._headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._timeout_s, self._most_bytes = timeout_s, most_bytes
         self._free = [self._connect()]
 
     async def close(self) -> None:
-        """Close all; none may be in use."""
+        """Close all connections; none may be in use."""
         for connection in self._free:
             await connection.aclose()
 
     async def exchange(self, url: str, content: bytes | None = None) -> Response:
-        """Send one request, a POST where it has a content, and read its answer. Redirects are not followed: the key
-        stays here.
+        """Send one request, a POST if it has a content, and read the response. Redirects are not followed.
 
         Raises:
-            TimeoutError: it was not all there in time, from the first byte sent to the last one read, however steadily
-            it dripped. httpx.RequestError: no connection, or it broke; or what came is compressed.
+            TimeoutError: The response was not complete in time.
+            httpx.RequestError: The connection failed, or the body is compressed.
         """
         method = "GET" if content is None else "POST"
-        with self._connection() as connection, _url_errors():
+        with self._connection() as connection, _invalid_redirects():
             async with (
                 asyncio.timeout(self._timeout_s),
                 connection.stream(method, url, content=content, headers=HEADERS) as response,
             ):
                 encoding, body = response.headers.get("content-encoding", "identity"), bytearray()
                 if encoding.strip().lower() not in ("", "identity"):
-                    raise httpx.DecodingError(f"compressed with {encoding[:40]!r}, which was not asked for")
+                    raise httpx.DecodingError(f"compressed with {encoding[:40]!r}, which was not requested")
                 async for piece in response.aiter_raw():
                     body += piece
                     if len(body) > self._most_bytes:  # the rest stays unread, and the connection is closed
@@ -115,7 +111,7 @@ class Connections:
 
     @contextlib.contextmanager
     def _connection(self) -> Iterator[httpx.AsyncClient]:
-        """Lend the connection that was used last, or a new one where all are in use."""
+        """Yield the connection that was used last, or a new one if all are in use."""
         connection = self._free.pop() if self._free else self._connect()
         try:
             yield connection
@@ -132,17 +128,17 @@ class Connections:
 
 
 @contextlib.contextmanager
-def _url_errors() -> Iterator[None]:
-    """Name what httpx raises of an address that is none, that of a redirect too, which it reads and does not follow."""
+def _invalid_redirects() -> Iterator[None]:
+    """Convert the errors of invalid addresses: httpx reads those of redirects, too."""
     try:
         yield
     except (httpx.InvalidURL, UnicodeError) as error:
-        raise httpx.UnsupportedProtocol(f"no address: {type(error).__name__}") from None
+        raise httpx.UnsupportedProtocol(f"invalid address: {type(error).__name__}") from None
 
 
 @functools.cache
 def _tls() -> ssl.SSLContext:
-    """Read the certificates, once: it takes longer than a request."""
+    """Read the certificates once: it takes longer than a request."""
     try:
         return httpx.create_ssl_context()
     except OSError as error:
@@ -151,7 +147,7 @@ def _tls() -> ssl.SSLContext:
 
 
 def retry_after_s(header: str) -> float | None:
-    """Read the seconds of a Retry-After; None where it holds none."""
+    """Return the seconds of a Retry-After header, None if it contains none."""
     try:
         wait_s = float(header)
     except ValueError:

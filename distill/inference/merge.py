@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
-from cosfly.llm.student_chat import TAUGHT
+from cosfly.llm.student_chat import CHAT_FORMAT_FILE
 from cosfly.runtime.config import Config
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
@@ -138,8 +138,8 @@ def _copy_settings(model: Path, adapter: Path, out: Path) -> None:
     files = {path for pattern in COPIED for path in model.glob(pattern) if path.is_file()}
     for path in sorted(files, key=lambda path: path.name):
         shutil.copyfile(path, out / path.name)  # a hub's cache holds links, of which the content counts
-    if (adapter / TAUGHT).is_file():
-        shutil.copyfile(adapter / TAUGHT, out / TAUGHT)
+    if (adapter / CHAT_FORMAT_FILE).is_file():
+        shutil.copyfile(adapter / CHAT_FORMAT_FILE, out / CHAT_FORMAT_FILE)
 
 
 def _read_tensors(path: Path) -> tuple[dict[str, str] | None, dict[str, Any]]:

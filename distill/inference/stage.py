@@ -18,7 +18,13 @@ from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.answers import Answer, AnswerBook, KeptAnswers, answer_key
 from cosfly.llm.client import STOP_AFTER_FAILURES, ChatClient
 from cosfly.llm.contract import Engine, NoAnswer, Request, started
-from cosfly.llm.student_chat import TAUGHT, StudentEndpointConfig, picture_to_send, read_taught, student_request
+from cosfly.llm.student_chat import (
+    CHAT_FORMAT_FILE,
+    StudentEndpointConfig,
+    picture_to_send,
+    read_chat_format,
+    student_request,
+)
 from cosfly.llm.vllm_engine import VllmConfig, VllmEngine
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.console import Advance, progress_bar
@@ -164,7 +170,7 @@ class Inputs:
         if self.adapter is not None:
             return read_adapter_facts(self.adapter, Path(self.model)).max_pixels
         folder = Path(self.model)
-        return read_taught(folder).max_pixels if (folder / TAUGHT).is_file() else 0
+        return read_chat_format(folder).max_pixels if (folder / CHAT_FORMAT_FILE).is_file() else 0
 
     @property
     def name(self) -> str:

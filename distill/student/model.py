@@ -16,7 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from cosfly.llm.student_chat import TAUGHT
+from cosfly.llm.student_chat import CHAT_FORMAT_FILE
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.runtime.json_io import read_json
 from distill.student.kernels import fuse_norms, look_at_equal_sizes_at_once, use_kernels_for
@@ -143,7 +143,7 @@ def weight_files(folder: Path) -> dict[str, Path]:
     weights = sorted(folder.glob("*.safetensors"))
     if not weights:
         raise InputError("no weights", where=folder, expected="*.safetensors", fix="download the whole model folder")
-    settings = ("config.json", "tokenizer.json", "tokenizer_config.json", "preprocessor_config.json", TAUGHT)
+    settings = ("config.json", "tokenizer.json", "tokenizer_config.json", "preprocessor_config.json", CHAT_FORMAT_FILE)
     files = [folder / name for name in (*settings, "chat_template.jinja")]
     return {f"model/{path.name}": path for path in (*files, *weights) if path.is_file()}
 

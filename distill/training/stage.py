@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.formats.captions import Language, Prompt
-from cosfly.llm.student_chat import FrameLook, Taught, write_taught
+from cosfly.llm.student_chat import ChatFormat, FrameFormat, write_chat_format
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.io import atomic_folder
 from cosfly.runtime.json_io import write_json
@@ -30,23 +30,25 @@ from distill.training.ranks import Ranks, joined
 from distill.training.settings import FEATURE_MEMORY_GB, STAGE, TrainConfig
 
 
-def taught_by(samples: Iterable[Sample], max_pixels: int) -> Taught:
+def taught_by(samples: Iterable[Sample], max_pixels: int) -> ChatFormat:
     """Return what samples teach.
 
     Args:
         max_pixels: most that the student's image processor keeps of a picture.
     """
     prompts: dict[Language, Prompt] = {}
-    looks: set[FrameLook] = set()
+    looks: set[FrameFormat] = set()
     lengths: set[int] = set()
     for sample in samples:
         prompts.setdefault(sample.language, sample.prompt)
-        looks.add(FrameLook(views=sample.views, size_px=sample.picture_px, depth_range_m=sample.depth_range_m))
+        looks.add(FrameFormat(views=sample.views, size_px=sample.picture_px, depth_range_m=sample.depth_range_m))
         lengths.add(len(sample.frames))
     if len(lengths) != 1:
         raise InputError("a training set of windows of different lengths", got=f"{sorted(lengths)} frames")
     ordered = sorted(looks, key=lambda look: (look.views, look.size_px, look.depth_range_m))
-    return Taught(prompts=dict(sorted(prompts.items())), num_frames=lengths.pop(), looks=ordered, max_pixels=max_pixels)
+    return ChatFormat(
+        prompts=dict(sorted(prompts.items())), num_frames=lengths.pop(), looks=ordered, max_pixels=max_pixels
+    )
 
 
 ADAPTER, MODEL, STUDENT, PREFLIGHT = "adapter", "model", "student", "preflight.json"
@@ -163,7 +165,7 @@ def run(
 
 def _lesson(
     cfg: TrainConfig, dataset: Path, trees: dict[str, Path], base: Path, out: Path, seed: int, ranks: Ranks
-) -> tuple[Lesson, Taught]:
+) -> tuple[Lesson, ChatFormat]:
     samples, validation = open_split(dataset, "train"), open_split(dataset, "val")
     chosen = choose_over_all(validation, cfg.validation_samples, rng_for(seed, STAGE, "validation"))
     if not samples:
@@ -197,7 +199,13 @@ def _nothing_to_learn(out: Path, census: Census) -> Exception:
 
 
 def _write_product(
-    lesson: Lesson, progress: Progress, taught: Taught, product: Path, base: Path, base_name: str, stage: StageFolder
+    lesson: Lesson,
+    progress: Progress,
+    taught: ChatFormat,
+    product: Path,
+    base: Path,
+    base_name: str,
+    stage: StageFolder,
 ) -> None:
     student, cfg, census = lesson.student, lesson.cfg, lesson.census
     facts = adapter_facts(student, int(student.image_processor.size["longest_edge"]), base)
@@ -207,7 +215,7 @@ def _write_product(
             write_json(partial / ADAPTER_FACTS, facts)
         else:
             write_model_folder(student, partial, base)
-        write_taught(partial, taught)
+        write_chat_format(partial, taught)
     num_unreadable = len(progress.unreadable)
     dropped = census.skipped + Counter({UNREADABLE: num_unreadable})
     tally = Tally(input=census.num_samples, kept=len(census) - num_unreadable, dropped=dropped)
