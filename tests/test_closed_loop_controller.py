@@ -10,9 +10,9 @@ from tables import each
 from caption.schema import FutureMotion
 from caption.truth.actions import TABLE, Motion, Thresholds, measure
 from cosfly.closed_loop.controller import Controller, read_controls
-from cosfly.closed_loop.pilots import PilotAnswer
+from cosfly.closed_loop.engines import EngineDecision
 from cosfly.closed_loop.settings import CONTROLLER_FILE, Drone
-from cosfly.closed_loop.stage import OpenFlight
+from cosfly.closed_loop.stage import OpenEpisode
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory
 from cosfly.formats.captions import TOKENS
 from cosfly.planners.contract import PlanConfig
@@ -74,8 +74,8 @@ def test_a_decision_that_is_flown_for_its_horizon_shows_what_its_own_rule_asks_f
 @each("command", [(99.0, 0, 0, 0, 0), (0, 0, 0, float("nan"), 0), (0, 0)])
 def test_a_command_that_cannot_be_flown_is_the_students_failure_and_the_drone_hovers(begin, command):
     flight, controller, moment = begin()
-    under_way = OpenFlight("path_00000", flight, controller, deque([moment]))
-    under_way.step(PilotAnswer("ok", command=np.array(command)))
+    under_way = OpenEpisode("path_00000", flight, controller, deque([moment]))
+    under_way.step(EngineDecision("ok", command=np.array(command)))
     [frame] = under_way.frames
     assert (frame.answer, frame.action, frame.command[:4]) == ("invalid", None, (0, 0, 0, 0))
     assert under_way.moments[-1].index == moment.index + 1

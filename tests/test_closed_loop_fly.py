@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from commands import invoke
 from specimens_distill import prepared
-from tables import each
 from teacher_server import TeacherServer
 
 from caption.run.stage import run as caption_tree
 from caption.schema import CaptionConfig
 from cosfly.formats.captions import read_captions
+from cosfly.formats.episodes import EPISODES, Episode, read_episode
 from cosfly.formats.playback import read_track
-from cosfly.formats.pursuits import PURSUITS, Pursuit, read_pursuit
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.student_chat import write_chat_format
 from distill.prepare.stage import PrepareConfig, make_sample
@@ -34,11 +33,8 @@ SHORT = "--workers 1 --set fly.most_decisions=6 --set fly.tree=false"
 
 
 @pytest.fixture(scope="module")
-def town(built_once) -> Path:
-    return built_once("closed_loop_town", make_town)
-
-
-def make_town(root: Path) -> None:
+def town(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("town")
     for words in (
         f"maps {TINY} --out {root}/maps",
         f"simplify {TINY.replace('--seed 4', '')} --map {root}/maps/boxes_3d.json --out {root}/simplify",
@@ -46,12 +42,13 @@ def make_town(root: Path) -> None:
     ):
         done = invoke(words)
         assert done.exit_code == 0, done.output
+    return root
 
 
-def fly(town: Path, out: Path, more: str) -> dict[str, Pursuit]:
+def fly(town: Path, out: Path, more: str) -> dict[str, Episode]:
     done = attempt(town, out, more)
     assert done.exit_code == 0, (done.output, done.exception)
-    return {path.stem: read_pursuit(path) for path in sorted((out / PURSUITS).glob("*.json"))}
+    return {path.stem: read_episode(path) for path in sorted((out / EPISODES).glob("*.json"))}
 
 
 def attempt(town: Path, out: Path, more: str):
@@ -62,13 +59,12 @@ def attempt(town: Path, out: Path, more: str):
 # --- what is flown ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(town, tmp_path):
     flown = fly(town, tmp_path, "--workers 2 --set fly.most_decisions=12 --student rules")
     assert len(flown) == 3
-    for pursuit in flown.values():
-        assert (pursuit.engine, pursuit.num_lead, len(pursuit.decisions)) == ("rules", 20, 12)
-        assert all(frame.answer == "ok" and frame.words and frame.action for frame in pursuit.decisions)
+    for record in flown.values():
+        assert (record.engine, record.num_lead, len(record.decisions)) == ("rules", 20, 12)
+        assert all(frame.answer == "ok" and frame.words and frame.action for frame in record.decisions)
     simple, traces = f"{town}/simplify/step2_simplified.json", f"{tmp_path}/drone_trace.json"
     for words in (
         f"inspect {TINY} --workers 1 --map {simple} --traces {traces} --data {tmp_path}/render --out {tmp_path}/inspect",
@@ -85,17 +81,16 @@ def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(t
     for folder in find_tracks(tmp_path / "render"):
         flight = read_track(folder)
         assert flight.source["algorithm"].startswith("flown by rules")
-        pursuit = flown[flight.source["scenario_id"]]
-        assert np.allclose(flight.positions_m, [frame.pose[:3] for frame in pursuit.frames], atol=1e-3)
-        assert list(flight.target.visible) == [frame.visible for frame in pursuit.frames]
-        decided |= {f"{flight.flight_id}_frame_{i:05d}": frame.action for i, frame in enumerate(pursuit.frames)}
+        record = flown[flight.source["scenario_id"]]
+        assert np.allclose(flight.positions_m, [frame.pose[:3] for frame in record.frames], atol=1e-3)
+        assert list(flight.target_visible) == [frame.visible for frame in record.frames]
+        decided |= {f"{flight.flight_id}_frame_{i:05d}": frame.action for i, frame in enumerate(record.frames)}
     asked = [caption for caption in captions if decided[caption.sample_id] is not None and caption.repair is None]
     assert asked
     same = [caption.en.flight_decision == decided[caption.sample_id] for caption in asked if caption.en]
     assert np.mean(same) == 1.0
 
 
-@pytest.mark.slow
 def test_the_ceiling_sees_more_than_chance_and_all_is_the_same_however_many_fly_at_once(town, tmp_path):
     seen = {}
     for student, alone in (("planner", False), ("random", True)):
@@ -108,24 +103,37 @@ def test_the_ceiling_sees_more_than_chance_and_all_is_the_same_however_many_fly_
     assert seen["random"] < seen["planner"]
 
 
+def test_a_policy_of_ones_own_flies_as_a_student_that_decides_the_same(town, tmp_path, monkeypatch):
+    code = "class Ahead:\n    def reset(self, goal, seed): pass\n    def act(self, seen): return 'track_straight'\n"
+    (tmp_path / "own.py").write_text(code)
+    monkeypatch.chdir(tmp_path)
+    flown = fly(town, tmp_path / "policy", f"{SHORT} --policy own:Ahead")
+    same = fly(town, tmp_path / "floor", f"{SHORT} --student track_straight")
+    for one, other in zip(flown.values(), same.values(), strict=True):
+        assert (one.engine, one.student) == ("policy", "own:Ahead")
+        assert [f.command for f in one.frames] == [f.command for f in other.frames]
+    assert "--policy" in attempt(town, tmp_path / "both", f"{SHORT} --policy own:Ahead --student rules").output
+    assert "own:Missing" in str(attempt(town, tmp_path / "none", f"{SHORT} --policy own:Missing").exception)
+
+
 # --- answers that are none --------------------------------------------------------------------------------------------
 
 ONE = "--set caption.endpoint.max_tries=1 --set fly.side_by_side=3"
 
 
-@each(
+@pytest.mark.parametrize(
     ("fault", "answer"),
     [("wrong_decision", "invalid"), ("wrong_shape", "unreadable"), ("empty_choices", "none")],
 )
 def test_what_a_model_answers_wrong_is_its_own_failure_and_the_flight_goes_on(town, tmp_path, fault, answer):
     with TeacherServer(lambda number, body: fault) as server:
         flown = fly(town, tmp_path, f"{SHORT} {ONE} --student {server.url}")
-    for pursuit in flown.values():
-        assert {frame.answer for frame in pursuit.decisions} == {answer}
-        assert len(pursuit.decisions) == 6
-        assert all(frame.command[:4] == (0, 0, 0, 0) and frame.action is None for frame in pursuit.decisions)
-        assert all(frame.words for frame in pursuit.decisions)
-        assert pursuit.engine == "endpoint"
+    for record in flown.values():
+        assert {frame.answer for frame in record.decisions} == {answer}
+        assert len(record.decisions) == 6
+        assert all(frame.command[:4] == (0, 0, 0, 0) and frame.action is None for frame in record.decisions)
+        assert all(frame.words for frame in record.decisions)
+        assert record.engine == "endpoint"
 
 
 def test_a_model_is_asked_about_all_flights_at_once_and_nothing_twice(town, tmp_path):
@@ -135,7 +143,7 @@ def test_a_model_is_asked_about_all_flights_at_once_and_nothing_twice(town, tmp_
         assert len(server.bodies) == 3 * 6
         first = server.bodies[0]
         assert json.loads(first)["messages"][1]["content"][1]["type"] == "image_url"
-        for path in (tmp_path / "manifest.json", tmp_path / "items.jsonl", *(tmp_path / PURSUITS).glob("*.json")):
+        for path in (tmp_path / "manifest.json", tmp_path / "items.jsonl", *(tmp_path / EPISODES).glob("*.json")):
             path.unlink()
         again = fly(town, tmp_path, f"{SHORT} {ONE} --student {server.url}")
         assert len(server.bodies) == 3 * 6
@@ -156,12 +164,21 @@ def student(tmp_path_factory) -> Path:
     return root / "model"
 
 
+def test_a_student_in_this_process_answers_all_flights_as_one_batch(town, tmp_path, student):
+    few = "--set distill.infer.max_new_tokens=4 --set distill.infer.device=cpu --set fly.most_decisions=2"
+    flown = fly(town, tmp_path, f"{SHORT} {few} --student transformers:{student}")
+    for record in flown.values():
+        assert record.engine == "transformers"
+        assert {frame.answer for frame in record.decisions} == {"unreadable"}  # of four tokens
+        assert all(frame.words is not None and frame.answer_s > 0 for frame in record.decisions)
+
+
 def test_a_student_is_asked_with_the_very_prompts_that_it_was_taught_with(town, tmp_path, student):
     with TeacherServer() as server:
         more = f"--workers 1 --set fly.most_decisions=8 --student {server.url} --as-student {student}"
         flown = fly(town, tmp_path, more)
         bodies = [json.loads(body) for body in server.bodies]
-    assert {frame.answer for pursuit in flown.values() for frame in pursuit.decisions} == {"ok"}
+    assert {frame.answer for record in flown.values() for frame in record.decisions} == {"ok"}
     asked = {(body["messages"][0]["content"], body["messages"][1]["content"][-1]["text"]) for body in bodies}
     assert len(asked) == 24
     assert {len([c for c in body["messages"][1]["content"] if c["type"] == "image_url"]) for body in bodies} == {5}

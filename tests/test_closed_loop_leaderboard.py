@@ -5,9 +5,9 @@ import json
 from commands import invoke
 from test_closed_loop_measures import flight
 
-from cosfly.closed_loop.measures import score_pursuits
-from cosfly.formats.flight_scores import SCORE, SCORE_FORMAT
-from cosfly.formats.pursuits import pursuit_file, write_pursuit
+from cosfly.closed_loop.measures import score_episodes
+from cosfly.formats.episode_scores import SCORE, SCORE_FORMAT
+from cosfly.formats.episodes import episode_file, write_episode
 from cosfly.runtime.json_io import write_model
 
 GOOD, BAD = "1111111111", "1111100000"
@@ -18,8 +18,8 @@ def folder(root, name, seen, *, student=None, **columns):
     flights = [flight(one, walk=f"path_{k}", **columns) for k, one in enumerate(seen)]
     flights = [one.model_copy(update={"student": student or name}) for one in flights]
     for one in flights:
-        write_pursuit(pursuit_file(root / name, one.episode), one)
-    write_model(root / name / SCORE, score_pursuits(flights), SCORE_FORMAT)
+        write_episode(episode_file(root / name, one.episode), one)
+    write_model(root / name / SCORE, score_episodes(flights), SCORE_FORMAT)
     return root / name
 
 

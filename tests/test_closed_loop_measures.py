@@ -1,11 +1,11 @@
 """Figures of closed-loop flights: small records that can be counted by hand, and sums that add up."""
 
+import numpy as np
 import pytest
-from tables import each
-from test_formats_pursuits import frame, pursuit
+from test_formats_episodes import frame, record
 
-from cosfly.closed_loop.measures import MEASURES, measure, score_pursuits
-from cosfly.formats.flight_scores import SCORE, SCORE_FORMAT, read_score
+from cosfly.closed_loop.measures import MEASURES, measure, score_episodes
+from cosfly.formats.episode_scores import SCORE, SCORE_FORMAT, read_score
 from cosfly.runtime.json_io import write_model
 
 
@@ -19,7 +19,7 @@ def flight(seen="", *, walk="path_0", ended="finished", num_walk_frames=None, **
             more.pop("action", None), more.pop("answer", None)
         frames.append(frame(0.5 + 0.5 * i, answer, visible=one == "1", **more))
     num = num_walk_frames or len(seen)
-    return pursuit(frames=tuple(frames), walk=walk, episode=walk, ended=ended, num_walk_frames=num)
+    return record(frames=tuple(frames), walk=walk, episode=walk, ended=ended, num_walk_frames=num)
 
 
 def of(one):
@@ -34,7 +34,7 @@ def test_a_flight_that_is_counted_by_hand():
     assert (found["success"], found["left"], found["crashed"]) == (0, 1, 0)
 
 
-@each(
+@pytest.mark.parametrize(
     ("seen", "more", "success"),
     [
         ("1111", {}, 1),
@@ -63,16 +63,28 @@ def test_decisions_near_misses_and_failures_are_counted():
     assert crash["near_misses_pmin"] == pytest.approx(1 / (5 * 0.5 / 60), rel=1e-3)  # the last one was no miss
 
 
+def test_even_motion_has_no_jerk_and_a_turn_across_north_none_of_yaw():
+    poses = [(float(i), 0, 20, -43, (170 + 5 * i + 180) % 360 - 180, 0) for i in range(9)]
+    frames = tuple(frame(0.5 * i, "end" if i == 8 else "ok", pose=pose) for i, pose in enumerate(poses))
+    found = of(record(frames=frames, num_walk_frames=8))
+    assert found["jerk_rms_mps3"] == pytest.approx(0, abs=1e-6)
+    assert found["yaw_jerk_rms_degps3"] == pytest.approx(0, abs=1e-6)
+    poses[4] = (5.0, *poses[4][1:])  # one pose is 1 m ahead: third differences 1, -3, 3, -1 of six
+    frames = tuple(frame(0.5 * i, "end" if i == 8 else "ok", pose=pose) for i, pose in enumerate(poses))
+    jerk = of(record(frames=frames, num_walk_frames=8))["jerk_rms_mps3"]
+    assert jerk == pytest.approx(np.sqrt(20 / 6) / 0.5**3, rel=1e-3)
+
+
 def test_a_score_adds_up_is_read_as_written_and_marks_towns_that_were_trained_on(tmp_path):
     flights = [flight("11" * (k + 1), walk=f"path_{k}") for k in range(4)] + [flight("10000", walk="path_9")]
-    score = score_pursuits(flights, trained_on=["Town_8"])
+    score = score_episodes(flights, trained_on=["Town_8"])
     assert score.figures["success"].value == 4 / 5
     assert score.figures["in_view"].value == (2 + 4 + 6 + 8 + 1) / (2 + 4 + 6 + 8 + 5)
     assert score.figures["success"].low <= 4 / 5 <= score.figures["success"].high
     for kind, groups in score.by.items():
         assert sum(figures["success"].count for figures in groups.values()) == len(flights), kind
     assert list(score.by["training"]) == ["never trained on"]
-    assert list(score_pursuits(flights, trained_on=["Town_7"]).by["training"]) == ["trained on"]
+    assert list(score_episodes(flights, trained_on=["Town_7"]).by["training"]) == ["trained on"]
     assert set(score.figures) == set(MEASURES)
     write_model(tmp_path / SCORE, score, SCORE_FORMAT)
     assert read_score(tmp_path) == score

@@ -31,7 +31,7 @@ def test_where_it_erred_the_planner_goes_on_and_what_is_made_is_captioned(town, 
     done = relabel(town, tmp_path / "flown", tmp_path / "made", "--set fly.relabel.round=2")
     assert done.exit_code == 0, (done.output, done.exception)
     counts = json.loads((tmp_path / "made/manifest.json").read_text())["counts"]
-    looked_at = sum(len(range(0, len(pursuit.decisions), 8)) for pursuit in flown.values())
+    looked_at = sum(len(range(0, len(record.decisions), 8)) for record in flown.values())
     assert counts["input"] == looked_at
     assert counts["kept"] + sum(counts["dropped"].values()) + sum(counts["failed"].values()) == looked_at
     assert counts["kept"] >= 1
@@ -39,10 +39,10 @@ def test_where_it_erred_the_planner_goes_on_and_what_is_made_is_captioned(town, 
     assert len(flights) == counts["kept"]
     for flight in flights:
         name, _, number = flight.source["scenario_id"].rpartition("_f")
-        i, pursuit = int(number), flown[name]
-        assert flight.source["algorithm"] == f"replanned from frame {i} of {pursuit.student}, round 2"
+        i, record = int(number), flown[name]
+        assert flight.source["algorithm"] == f"replanned from frame {i} of {record.student}, round 2"
         assert len(flight) == FRAMES + 10
-        own = [frame.pose[:3] for frame in pursuit.frames[i - FRAMES + 1 : i + 1]]
+        own = [frame.pose[:3] for frame in record.frames[i - FRAMES + 1 : i + 1]]
         assert np.allclose(flight.positions_m[:FRAMES], own, atol=1e-3)  # what it saw; then the planner
         assert np.linalg.norm(np.diff(flight.positions_m, axis=0), axis=1).max() <= 10 * 0.5 * 1.2
     captions = list(read_captions(tmp_path / "made/caption/captions.jsonl"))

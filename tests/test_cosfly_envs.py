@@ -17,7 +17,7 @@ import cosfly.envs
 from cosfly.closed_loop.policy import MOST_LATE, Policy
 from cosfly.envs.episodes import HELD_OUT, TASKS, TRAINING, read_list
 from cosfly.envs.follow import FULL_REWARD_M, NO_REWARD_M, reward_of
-from cosfly.formats.pursuits import read_pursuit
+from cosfly.formats.episodes import read_episode
 from cosfly.runtime.config import read_yaml
 from cosfly.runtime.errors import InputError
 
@@ -193,14 +193,14 @@ def ask(follow, tmp_path, monkeypatch):
     (tmp_path / "own.py").write_text(POLICIES)
     monkeypatch.chdir(tmp_path)
     follow.reset(seed=0)
-    outlook = SimpleNamespace(flight=follow._flight, moments=[follow._now])
+    observation = SimpleNamespace(simulation=follow._simulation, moments=[follow._now])
 
     def answers(name, limit_s=60.0, first_s=None):
         policy = Policy(f"own:{name}", first_s or limit_s, 0)
         found = []
         try:
             for one in ["a", "a", "a", "a", "b"]:
-                found.append(policy.decide([SimpleNamespace(**vars(outlook), episode=one)])[0])
+                found.append(policy.decide([SimpleNamespace(**vars(observation), episode=one)])[0])
                 (tmp_path / "go").touch()
                 policy._limit_s = limit_s
             return found
@@ -241,7 +241,7 @@ def test_a_whole_list_gives_records_and_a_score(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "out"
     invoke("fly", "--env", FOLLOW, "--policy", "own:Word", "--out", out, "--workers", "2")
-    records = [read_pursuit(path) for path in sorted((out / "pursuits").glob("*.json"))]
+    records = [read_episode(path) for path in sorted((out / "episodes").glob("*.json"))]
     assert len(records) == 20
     assert {frame.answer for one in records for frame in one.decisions} == {"invalid"}
     assert json.loads((out / "score.json").read_text())["list_sha256"] == read_list(FOLLOW)[2]

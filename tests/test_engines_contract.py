@@ -360,7 +360,7 @@ def test_a_prompt_that_the_engine_refuses_costs_only_its_window(stand_in, tree, 
 def test_an_engine_that_dies_ends_the_run_in_one_line_and_the_next_goes_on(stand_in, tree, model, tmp_path):
     cfg = vllm_settings(model, vllm={"batch": 2})
     stand_in.dies_after = 4
-    with pytest.raises(TeacherError, match=r"engine broke.*EngineDeadError"):
+    with pytest.raises(TeacherError, match=r"engine failed.*EngineDeadError"):
         run(cfg, tree, tmp_path / "out")
     num_asked = len(stand_in.asked)
     stand_in.dies_after = None

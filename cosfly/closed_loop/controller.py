@@ -1,7 +1,7 @@
-"""From a decision to a command, by a table with one row for each action (controller.yaml).
+"""The controller: turns a decision into a command, by a table with one row per action (controller.yaml).
 
-Knows what a drone knows of itself: its pose, the place it took off from and its height there; never the person's place.
-The camera keeps its aim: the place ahead, at a hip's height, that it looked at when the flight began.
+It knows what a drone knows of itself, its pose, home position and height, but never the target's position. The camera
+keeps its aim: the point ahead, at hip height, at which it looked when the episode began.
 """
 
 from __future__ import annotations
@@ -23,41 +23,45 @@ from cosfly.runtime.errors import ConfigError
 from cosfly.runtime.json_io import FileFormat
 
 CONTROLLER_FORMAT = FileFormat("cosfly.controller", "1.0", "controller")
-AIM_MOST_M = 100.0  # a camera that looks at the horizon has no place ahead
+AIM_MOST_M = 100.0  # distance of the aim of a camera that looks at the horizon
 
 
 class Control(Config):
-    """One row; what the words mean stands at the top of the file."""
+    """One row of the table; the head of controller.yaml explains the fields."""
 
     ahead_mps: float = Field(0.0, ge=-20, le=20, description="velocity ahead")
     left_mps: float = Field(0.0, ge=-20, le=20, description="velocity to the left")
     up_mps: float = Field(0.0, ge=-20, le=20, description="velocity upwards")
     with_pace: bool = Field(False, description="the pace is added to ahead_mps")
-    pace_step_mps: float = Field(0.0, ge=-20, le=20, description="change of the pace, for good")
+    pace_step_mps: float = Field(0.0, ge=-20, le=20, description="lasting change of the pace")
     stops: bool = Field(False, description="the pace becomes 0")
     yaw_rate_degps: float = Field(0.0, ge=-180, le=180, description="turn, positive to the left")
-    turn: Literal["rate", "orbit", "search", "home"] = Field("rate", description="what the drone turns by")
-    source: str = Field(min_length=1, description="where the figures are from")
+    turn: Literal["rate", "orbit", "search", "home"] = Field("rate", description="how the drone turns")
+    source: str = Field(min_length=1, description="source of the figures")
 
 
 class ControlTable(Config):
-    """The whole file."""
+    """The file of the table."""
 
-    schema_: str = Field(alias="schema", pattern=f"^{CONTROLLER_FORMAT.schema}$", description="which file it is")
-    schema_version: str = Field(pattern=f"^{re.escape(CONTROLLER_FORMAT.version)}$", description="version of this form")
-    actions: dict[str, Control] = Field(min_length=1, description="token -> what it is flown as")
+    schema_: str = Field(alias="schema", pattern=f"^{CONTROLLER_FORMAT.schema}$", description="format of the file")
+    schema_version: str = Field(
+        pattern=f"^{re.escape(CONTROLLER_FORMAT.version)}$", description="version of the format"
+    )
+    actions: dict[str, Control] = Field(min_length=1, description="action -> command")
 
 
 def read_controls(path: Path, tokens: tuple[str, ...]) -> dict[str, Control]:
-    """Read a table that has a row for each token."""
+    """Read a table, which needs a row for each token."""
     found = build(ControlTable, read_yaml(path), path).actions
     if lacking := [token for token in tokens if token not in found]:
-        raise ConfigError("a decision that nothing is flown as", where=path, got=", ".join(lacking), fix="add its row")
+        raise ConfigError(
+            "decisions without a row in the table", where=path, got=", ".join(lacking), fix="add the rows"
+        )
     return found
 
 
 class Controller:
-    """The controller of one flight."""
+    """The controller of one episode."""
 
     def __init__(self, controls: dict[str, Control], drone: Drone, start: Moment) -> None:
         self.controls, self.drone = controls, drone
@@ -68,7 +72,7 @@ class Controller:
         self._side = 1.0
 
     def command(self, action: str | None, now: Moment) -> np.ndarray:
-        """Return what is flown, (5,) as ACTION; None, where no decision came, hovers and keeps the pace in mind."""
+        """Return the command of a decision, (5,) as ACTION; without a decision the drone hovers and keeps its pace."""
         row = self.controls[action] if action is not None else Control(source="hovers")
         self.pace_mps = 0.0 if row.stops else max(0.0, self.pace_mps + row.pace_step_mps)
         self.pace_mps = min(self.pace_mps, self.drone.speed_max_mps)

@@ -1,6 +1,6 @@
-"""Students side by side, of the folders of `cosfly fly`: `leaderboard.json` and a page that stands alone.
+"""`cosfly leaderboard`: compares students by folders of `cosfly fly`; writes `leaderboard.json` and a page.
 
-Only students that were to fly the same episodes are in one table.
+A table contains only students with the same episodes.
 """
 
 from __future__ import annotations
@@ -12,19 +12,12 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from cosfly.closed_loop.measures import (
-    MEASURES,
-    SHARES,
-    draws_of,
-    figures_of,
-    ratios,
-    score_flights,
-    walk_sums,
-)
-from cosfly.closed_loop.settings import FLOORS
-from cosfly.formats.flight_scores import Figure, Score, read_score
+from cosfly.closed_loop.measures import MEASURES, SHARES, figures_of, score_measured
+from cosfly.closed_loop.settings import BASELINES
+from cosfly.formats.episode_scores import Score, read_score
+from cosfly.formats.episodes import episode_file, read_episode
+from cosfly.formats.figures import Figure
 from cosfly.formats.playback import read_track
-from cosfly.formats.pursuits import Pursuit, pursuit_file, read_pursuit
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
@@ -42,7 +35,7 @@ BOARD_FORMAT = FileFormat("cosfly.leaderboard", "1.0", "leaderboard")
 
 
 class LeaderboardConfig(Config):
-    """`cosfly leaderboard`: nothing is set in files."""
+    """Settings of `cosfly leaderboard`, given as options."""
 
     rounds: bool = False
 
@@ -52,8 +45,7 @@ class _Strict(BaseModel):
 
 
 class Standing(_Strict):
-    """One student in a table. gain: of a round, its figures less those of the round before on the same draws of
-    walks."""
+    """One student of a table. gain: of a round, the change of its figures from the round before."""
 
     name: str
     role: Literal["student", "floor", "ceiling"]
@@ -62,7 +54,7 @@ class Standing(_Strict):
 
 
 class StudentTable(_Strict):
-    """episodes: of each folder what was to be flown; the same of all students."""
+    """Students with the same episodes. episodes: digest of each folder's episodes."""
 
     episodes: tuple[str, ...]
     standings: tuple[Standing, ...]
@@ -74,116 +66,103 @@ class Leaderboard(_Strict):
     tables: tuple[StudentTable, ...]
 
 
-Flown = dict[Path, Score]  # the folders of one student
+StudentFolders = dict[Path, Score]  # the folders of one student
 
 
 def run(
     cfg: LeaderboardConfig, folders: Sequence[tuple[str, Path]], out: Path, *, seed: int = 0, resume: Resume = "if-same"
 ) -> Path:
-    """Read folders of `cosfly fly`, each with a name or ""; write `leaderboard.json` and `leaderboard.html`, whose path
-    is given.
+    """Read named folders of `cosfly fly`; write `leaderboard.json` and `leaderboard.html`, and return the page's path.
+
+    Args:
+        folders: name and folder; "" names it after its student.
 
     Raises:
-        InputError: two folders of one name hold the same episode.
+        InputError: Two folders of one name contain the same episode.
     """
-    inputs = {f"{number}/{name}": folder for number, (name, folder) in enumerate(folders)}
-    flown: dict[str, Flown] = {}
+    students: dict[str, StudentFolders] = {}
     for name, folder in folders:
         score = read_score(folder)
-        own = flown.setdefault(name or score.student, {})
-        known = {(flight.town, flight.episode) for other in own.values() for flight in other.flights}
-        if twice := [flight for flight in score.flights if (flight.town, flight.episode) in known]:
-            what, got = "two folders of one name hold the same episode", f"{twice[0].town}, {twice[0].episode}"
+        own = students.setdefault(name or score.student, {})
+        known = {(one.town, one.episode) for other in own.values() for one in other.flights}
+        if twice := [one for one in score.flights if (one.town, one.episode) in known]:
+            what, got = "two folders of one name contain the same episode", f"{twice[0].town}, {twice[0].episode}"
             raise InputError(what, where=f"{name or score.student}: {folder}", got=got, fix="name them: NAME=DIR")
         own[folder] = score
+    inputs = {f"{number}/{name}": folder for number, (name, folder) in enumerate(folders)}
     stage = StageFolder.open(out, "leaderboard", config=cfg, inputs=inputs, seed=seed, resume=resume)
     path, record = out / "leaderboard.html", out / "leaderboard.json"
     if not stage.is_complete:
-        board = Leaderboard(tables=tuple(tables_of(flown, cfg, seed)))
+        board = Leaderboard(tables=tuple(tables_of(students, cfg, seed)))
         write_model(record, board, BOARD_FORMAT)
-        write_bytes(path, page_of(board, flown).encode())
+        write_bytes(path, page_of(board, students).encode())
         stage.finish([record, path], Tally(input=len(folders), kept=len(folders)))
     return path
 
 
-def tables_of(flown: Mapping[str, Flown], cfg: LeaderboardConfig, seed: int) -> list[StudentTable]:
-    """Put those that were to fly the same into one table each, the best first, or rounds in their order."""
+def tables_of(students: Mapping[str, StudentFolders], cfg: LeaderboardConfig, seed: int) -> list[StudentTable]:
+    """Return one table for each set of episodes, sorted by success, or by round."""
     groups: dict[tuple[str, ...], list[Standing]] = {}
-    for name, own in flown.items():
+    for name, own in students.items():
         scores = list(own.values())
         digests, first = tuple(sorted(score.episodes_sha256 for score in scores)), scores[0]
-        role: Any = "floor" if first.engine in FLOORS else "ceiling" if first.engine == "planner" else "student"
+        role: Any = "floor" if first.engine in BASELINES else "ceiling" if first.engine == "planner" else "student"
         towns = [score.trained_on for score in scores]
-        together = score_flights(
-            [flight for score in scores for flight in score.flights], first.student, first.engine,
-            sha256_bytes(" ".join(digests).encode()), seed=seed,
+        merged = score_measured(
+            [one for score in scores for one in score.flights], seed, student=first.student, engine=first.engine,
+            episodes_sha256=sha256_bytes(" ".join(digests).encode()),
             list_sha256=first.list_sha256 if len(scores) == 1 else None,
             trained_on=None if None in towns else sorted({town for known in towns for town in known or ()}),
         )  # fmt: skip
-        group = groups.setdefault(digests, [])
-        gain = gains(group[-1].score, together, seed) if cfg.rounds and group else None
-        group.append(Standing(name=name, role=role, score=together, gain=gain))
+        group, gain = groups.setdefault(digests, []), None
+        if cfg.rounds and group:
+            gain = figures_of(merged.flights, rng_for(seed, "leaderboard", "gains"), group[-1].score.flights)
+        group.append(Standing(name=name, role=role, score=merged, gain=gain))
     if not cfg.rounds:
         for group in groups.values():
             group.sort(key=lambda one: [-(one.score.figures[name].value or 0.0) for name in ("success", "in_view")])
     return [StudentTable(episodes=digests, standings=tuple(group)) for digests, group in groups.items()]
 
 
-def gains(before: Score, after: Score, seed: int) -> dict[str, Figure]:
-    """Return by how much figures changed from one to another who flew the same walks."""
-    (walks, one), (_, other) = (walk_sums(score.flights, list(MEASURES)) for score in (before, after))
-    draws = draws_of(len(walks), rng_for(seed, "leaderboard", "gains"))
-    return figures_of(ratios(draws, other) - ratios(draws, one), [len(walks)] * len(MEASURES), len(walks))
-
-
 # --- the page ---------------------------------------------------------------------------------------------------------
 
 
 def shown(name: str, figure: Figure, *, signed: bool = False) -> str:
-    """Return a figure with its interval in words."""
+    """Return a figure with its interval as text."""
     sign, digits = "+" if signed else "", ".1%" if name in SHARES else ".2f"
     return shown_as(f"{{:{sign}{digits}}}", figure)
 
 
-Pursuits = dict[tuple[str, str], tuple[Pursuit, Path]]  # by town and episode, and the folder of each
-
-
-def page_of(board: Leaderboard, flown: Mapping[str, Flown]) -> str:
-    """Return the page; a student whose folders have no flights any more is shown by its figures alone."""
-    drawn = []
+def page_of(board: Leaderboard, students: Mapping[str, StudentFolders]) -> str:
+    """Return the page; a student whose episodes were deleted has figures but no pictures."""
+    tables = []
     for table in board.tables:
-        standings = table.standings
         groups = {
-            words: {one.name: one.score.figures[measure] for one in standings}
-            for measure, words in (("success", "success"), ("in_view", "person seen"))
+            words: {one.name: one.score.figures[measure] for one in table.standings}
+            for measure, words in (("success", "success"), ("in_view", "target visible"))
         }
-        strips = [strip for one in standings for strip in _strips(one, _pursuits(flown[one.name]))]
-        drawn.append({"table": table, "chart": bars(groups), "strips": strips})
+        strips = [strip for one in table.standings for strip in _strips(one, students[one.name])]
+        tables.append({"table": table, "chart": bars(groups), "strips": strips})
     return page(
-        "cosfly/closed_loop/leaderboard.html", title="Closed loop", style=STYLE, tables=drawn, measures=MEASURES,
+        "cosfly/closed_loop/leaderboard.html", title="Closed loop", style=STYLE, tables=tables, measures=MEASURES,
         headline=HEADLINE, shown=shown, colors=COLORS, width_px=STRIP_PX,
     )  # fmt: skip
 
 
-def _pursuits(own: Flown) -> Pursuits:
-    flights = [(folder, flight) for folder, score in own.items() for flight in score.flights]
-    paths = [(folder, flight, pursuit_file(folder, flight.episode)) for folder, flight in flights]
-    return {(one.town, one.episode): (read_pursuit(path), folder) for folder, one, path in paths if path.is_file()}
-
-
-def _strips(one: Standing, own: Pursuits) -> list[dict[str, Any]]:
-    """Return the best and the worst flight of a student, by how much of the walk shows the person: frames and words."""
-    shares = {(f.town, f.episode): f.sums["in_view"][0] / f.sums["in_view"][1] for f in one.score.flights}
-    ranked, found = sorted(shares, key=lambda key: (shares[key], key[1])), []
+def _strips(standing: Standing, own: StudentFolders) -> list[dict[str, Any]]:
+    """Return frames of the episodes with the largest and smallest share of frames with a visible target."""
+    places = {(one.town, one.episode): folder for folder, score in own.items() for one in score.flights}
+    shares = {(one.town, one.episode): one.sums["in_view"] for one in standing.score.flights}
+    ranked, strips = sorted(shares, key=lambda key: (shares[key][0] / shares[key][1], key[1])), []
     for title, key in (("best", ranked[-1]), ("worst", ranked[0])):
-        if key not in own:
+        path, tree = episode_file(places[key], key[1]), places[key] / "render"
+        if not path.is_file():
             continue
-        pursuit, folder = own[key]
-        tree = folder / "render"
-        drawn = (read_track(path) for path in find_tracks(tree)) if tree.is_dir() else ()
-        flight = next((one for one in drawn if one.source.get("scenario_id") == pursuit.walk), None)
-        places = np.unique(np.linspace(pursuit.num_lead, len(pursuit.frames) - 1, STRIP_FRAMES).astype(int)).tolist()
-        frames = [(pursuit.frames[i], flight and thumbnail(flight.frame_folder(i), STRIP_PX)) for i in places]
-        whose = f"{one.name}: {title}: {', '.join(key)}"
-        found.append({"title": whose, "ended": pursuit.ended, "seen": shares[key], "frames": frames})
-    return found
+        record = read_episode(path)
+        tracks = (read_track(folder) for folder in find_tracks(tree)) if tree.is_dir() else ()
+        track = next((one for one in tracks if one.source.get("scenario_id") == record.walk), None)
+        chosen = np.unique(np.linspace(record.num_lead, len(record.frames) - 1, STRIP_FRAMES).astype(int)).tolist()
+        frames = [(record.frames[i], track and thumbnail(track.frame_folder(i), STRIP_PX)) for i in chosen]
+        name, seen = f"{standing.name}: {title}: {', '.join(key)}", shares[key][0] / shares[key][1]
+        strips.append({"title": name, "ended": record.ended, "seen": seen, "frames": frames})
+    return strips

@@ -1,10 +1,11 @@
-"""What flights of the closed loop are worth: figures of their records (cosfly/formats/pursuits.py). No file.
+"""The measures of closed-loop episodes, computed from their records (cosfly/formats/episodes.py). Writes no file.
 
-Success, as ours: the flight came to its walk's end, the person was seen within the last LOSS_S, and the drone ended
-within BAND_M of it. EVT-Bench (TrackVLA, its public code) asks for the same at the episode's end, facing the target at
-1 to 3 m, and ends an episode at a collision or after 20 steps beyond 4 m; DAT's success rate is the share of time that
-the target is visible (our `in_view`). UAV-Track VLA reports 61.76 % success and 269.65 tracked frames on far
-pedestrians in CARLA; how it defines them is not told where we could read, so its numbers are no yardstick for ours.
+Success is our definition: the drone followed to the end of the pedestrian trajectory, the target was visible within the
+last LOSS_S, and the drone ended within BAND_M of it. EVT-Bench (TrackVLA, its public code) requires the same at the
+episode's end, facing the target at 1 to 3 m, and ends an episode at a collision or after 20 steps beyond 4 m; DAT's
+success rate is the share of time with a visible target (our `in_view`). UAV-Track VLA reports 61.76 % success and
+269.65
+tracked frames on far pedestrians in CARLA without a definition that we could find, so the figures are not comparable.
 """
 
 from __future__ import annotations
@@ -12,78 +13,84 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from itertools import groupby, pairwise
+from typing import Any
 
 import numpy as np
 
-from cosfly.formats.flight_scores import Figure, FlightScore, Score
-from cosfly.formats.pursuits import Pursuit
-from cosfly.geometry.trajectory_metrics import RELAXED_SAFETY_M, derivative_rms, draw_pedestrians, figure_of_draws
+from cosfly.formats.episode_scores import EpisodeScore, Score
+from cosfly.formats.episodes import Episode
+from cosfly.formats.figures import Figure, draw_pedestrians, figure_of_draws
+from cosfly.geometry.trajectory_metrics import RELAXED_SAFETY_M, derivative_rms
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.seeding import rng_for
 
-LOSS_S = 2.0  # unseen for so long the person is lost; for less it is hidden by a tree or a lamp
+LOSS_S = 2.0  # the target is lost if not visible for so long; a tree or a lamp hides it for less
 BAND_M = (5.0, 40.0)  # over ground: a quarter and twice of what plans keep (plan.behind_distance_m)
-NEAR_MISS_M = RELAXED_SAFETY_M  # what a plan never goes below
-TURNS_DEGPS = {"straight": 3.0, "bends": 6.0, "turns": np.inf}  # mean turn of who walks, up to
-HIDDEN = {"open": 0.02, "partly hidden": 0.2, "hidden": 1.0}  # share that hides the person from right behind, up to
+NEAR_MISS_M = RELAXED_SAFETY_M  # least clearance of any plan
+TURNS_DEGPS = {"straight": 3.0, "bends": 6.0, "turns": np.inf}  # mean turn of the target, up to
+HIDDEN = {
+    "open": 0.02,
+    "partly hidden": 0.2,
+    "hidden": 1.0,
+}  # share of frames that hide the target from a drone right behind, up to
 GROUPS = ("map", "pace", "turn", "occlusion", "training")
 RESAMPLES, CONFIDENCE = 2000, 0.95
 
-# Name -> words; each is a sum over flights by another one (FlightScore.sums).
+# Name -> description; each is the ratio of two sums over episodes (EpisodeScore.sums).
 MEASURES = {
     "success": "success",
-    "in_view": "person seen, of all frames of the walks",
-    "in_picture": "person in the picture, hidden or not",
-    "tracked_frames": "frames that show the person, a flight",
+    "in_view": "target visible, share of all frames of the pedestrian trajectories",
+    "in_picture": "target in the picture, hidden or not",
+    "tracked_frames": "frames with a visible target, per episode",
     "kept_s": "time to the first loss, crash or the end, s",
-    "lost": f"flights that lose the person for {LOSS_S:g} s",
-    "reacquired": "losses after which it is found again",
-    "reacquire_s": "time until it is, s",
+    "lost": f"episodes that lose the target for {LOSS_S:g} s",
+    "reacquired": "losses after which the target is found again",
+    "reacquire_s": "time until it is found, s",
     "distance_m": "distance over ground, m",
     "in_band": f"frames at {BAND_M[0]:g} to {BAND_M[1]:g} m",
-    "height_m": "height over the person's ground, m",
-    "crashed": "flights that crash",
-    "left": "flights that leave the map",
-    "near_misses_pmin": f"times nearer than {NEAR_MISS_M:g} m to something, a minute",
+    "height_m": "height over the target's ground, m",
+    "crashed": "episodes that end in a crash",
+    "left": "episodes that leave the map",
+    "near_misses_pmin": f"times nearer than {NEAR_MISS_M:g} m to an obstacle, per minute",
     "jerk_rms_mps3": "RMS jerk, m/s^3",
     "yaw_jerk_rms_degps3": "RMS jerk of yaw, deg/s^3",
-    "changes_pmin": "changes of decision, a minute",
-    "no_decision": "decisions that did not come, or were none",
+    "changes_pmin": "changes of decision, per minute",
+    "no_decision": "decisions that were missing or invalid",
     "decision_s": "time of a decision, s",
 }
 SHARES = {"success", "in_view", "in_picture", "lost", "reacquired", "in_band", "crashed", "left", "no_decision"}
 
 
-def measure(pursuit: Pursuit, trained_on: Iterable[str] | None = None) -> FlightScore:
-    """Measure one flight. trained_on: towns that its student was trained on, None where nobody knows.
+def measure(record: Episode, trained_on: Iterable[str] | None = None) -> EpisodeScore:
+    """Measure one episode. trained_on: towns of the student's training, None if unknown.
 
-    Frames that a flight did not come to count as frames that do not show the person.
+    Frames after an early end count as frames without a visible target.
     """
-    flown, decisions, dt_s = pursuit.flown, pursuit.decisions, pursuit.dt_s
+    flown, decisions, dt_s = record.flown, record.decisions, record.dt_s
     num, minutes = len(flown), len(flown) * dt_s / 60.0
-    longest = max(1, round(LOSS_S / dt_s))
+    loss_frames = max(1, round(LOSS_S / dt_s))
     runs = [(is_seen, len(list(run))) for is_seen, run in groupby(frame.visible for frame in flown)]
     begins = np.cumsum([0, *(count for _, count in runs)])[:-1].tolist()
     losses = [
-        (begin, count) for (seen, count), begin in zip(runs, begins, strict=True) if not seen and count >= longest
+        (begin, count) for (seen, count), begin in zip(runs, begins, strict=True) if not seen and count >= loss_frames
     ]
     found = [count for begin, count in losses if begin + count < num]
-    last_seen = not runs[-1][0] and runs[-1][1] >= longest
+    is_lost = not runs[-1][0] and runs[-1][1] >= loss_frames
     in_band = [BAND_M[0] <= frame.distance_m <= BAND_M[1] for frame in flown]
-    success = pursuit.ended == "finished" and not last_seen and in_band[-1]
+    success = record.ended == "finished" and not is_lost and in_band[-1]
     close = [frame.clearance_m < NEAR_MISS_M for frame in decisions]
-    near = sum(is_close for is_close, _ in groupby(close)) - (pursuit.ended == "crashed" and close[-1])
-    poses = np.array([frame.pose for frame in pursuit.frames[pursuit.num_lead :]])
+    near = sum(is_close for is_close, _ in groupby(close)) - (record.ended == "crashed" and close[-1])
+    poses = np.array([frame.pose for frame in record.frames[record.num_lead :]])
     yaw_deg = np.degrees(np.unwrap(np.radians(poses[:, 4])))
     actions = [frame.action for frame in decisions if frame.action is not None]
     times = [frame.answer_s for frame in decisions if frame.answer_s is not None]
     answers = Counter(frame.answer for frame in decisions)
     sums = {
         "success": (success, 1),
-        "in_view": (sum(frame.visible for frame in flown), pursuit.num_walk_frames),
-        "in_picture": (sum(frame.in_view for frame in flown), pursuit.num_walk_frames),
+        "in_view": (sum(frame.visible for frame in flown), record.num_walk_frames),
+        "in_picture": (sum(frame.in_view for frame in flown), record.num_walk_frames),
         "tracked_frames": (sum(frame.visible for frame in flown), 1),
         "kept_s": ((losses[0][0] if losses else num) * dt_s, 1),
         "lost": (bool(losses), 1),
@@ -92,8 +99,8 @@ def measure(pursuit: Pursuit, trained_on: Iterable[str] | None = None) -> Flight
         "distance_m": (sum(frame.distance_m for frame in flown), num),
         "in_band": (sum(in_band), num),
         "height_m": (sum(frame.height_m for frame in flown), num),
-        "crashed": (pursuit.ended == "crashed", 1),
-        "left": (pursuit.ended == "left", 1),
+        "crashed": (record.ended == "crashed", 1),
+        "left": (record.ended == "left", 1),
         "near_misses_pmin": (near, minutes),
         "jerk_rms_mps3": (derivative_rms(poses[:, :3], 3, dt_s), 1),
         "yaw_jerk_rms_degps3": (derivative_rms(np.column_stack([yaw_deg, np.zeros((len(poses), 2))]), 3, dt_s), 1),
@@ -102,15 +109,15 @@ def measure(pursuit: Pursuit, trained_on: Iterable[str] | None = None) -> Flight
         "decision_s": (sum(times), len(times)),
     }
     towns = None if trained_on is None else set(trained_on)
-    training = "unknown" if towns is None else "trained on" if pursuit.town in towns else "never trained on"
-    style = pursuit.style
-    return FlightScore(
-        episode=pursuit.episode, town=pursuit.town, walk=f"{pursuit.map_sha256[:12]}/{pursuit.walk}",
+    training = "unknown" if towns is None else "trained on" if record.town in towns else "never trained on"
+    style = record.style
+    return EpisodeScore(
+        episode=record.episode, town=record.town, walk=f"{record.map_sha256[:12]}/{record.walk}",
         groups={
-            "map": pursuit.town, "pace": style.pace, "turn": _group(style.turn_degps, TURNS_DEGPS),
+            "map": record.town, "pace": style.pace, "turn": _group(style.turn_degps, TURNS_DEGPS),
             "occlusion": _group(style.hidden_share, HIDDEN), "training": training,
         },
-        ended=pursuit.ended, answers=dict(sorted(answers.items())),
+        ended=record.ended, answers=dict(sorted(answers.items())),
         sums={name: (round(float(a), 4), round(float(b), 4)) for name, (a, b) in sums.items()},
     )  # fmt: skip
 
@@ -119,84 +126,71 @@ def _group(value: float, ends: dict[str, float]) -> str:
     return next(name for name, end in ends.items() if value <= end)
 
 
-def episode_digest(one: Pursuit) -> str:
-    """Name what was to be flown: the map, the camera and the beginning of a flight, which no student decides."""
-    begin = [[frame.pose, frame.target_m] for frame in one.frames[: one.num_lead + 1]]
-    told = [one.map_sha256, one.walk, one.episode, one.list_sha256, one.num_walk_frames, one.dt_s, one.camera_px]
-    return sha256_bytes(dump_json([*told, one.fov_deg, begin]).encode())
+def episode_digest(one: Episode) -> str:
+    """Return the digest of an episode's task: map, camera and lead frames, which no student decides."""
+    lead = [[frame.pose, frame.target_m] for frame in one.frames[: one.num_lead + 1]]
+    task = [one.map_sha256, one.walk, one.episode, one.list_sha256, one.num_walk_frames, one.dt_s, one.camera_px]
+    return sha256_bytes(dump_json([*task, one.fov_deg, lead]).encode())
 
 
-def score_pursuits(pursuits: Iterable[Pursuit], *, trained_on: Sequence[str] | None = None, seed: int = 0) -> Score:
-    """Score the flights of one student, in any order."""
-    flights, digests, whose = [], [], set()
-    for one in pursuits:
-        flights.append(measure(one, trained_on))
+def score_episodes(records: Iterable[Episode], *, trained_on: Sequence[str] | None = None, seed: int = 0) -> Score:
+    """Score the episodes of one student, in any order."""
+    measured, digests, students = [], [], set()
+    for one in records:
+        measured.append(measure(one, trained_on))
         digests.append(episode_digest(one))
-        whose.add((one.student, one.engine, one.list_sha256 or ""))
-    if len(whose) != 1:
-        got = "; ".join(" ".join(filter(None, words)) for words in sorted(whose)[:3]) or "no flight"
-        raise InputError("no flights of one student on one list of episodes", where="pursuits", got=got)
-    (student, engine, listed), digest = whose.pop(), sha256_bytes(dump_json(sorted(digests)).encode())
-    flights.sort(key=lambda flight: (flight.town, flight.episode))
-    return score_flights(flights, student, engine, digest, list_sha256=listed or None, trained_on=trained_on, seed=seed)
-
-
-def score_flights(
-    flights: Sequence[FlightScore],
-    student: str,
-    engine: str,
-    episodes_sha256: str,
-    *,
-    list_sha256: str | None = None,
-    trained_on: Sequence[str] | None = None,
-    seed: int = 0,
-) -> Score:
-    """Score flights that were measured, of one map or several."""
-    by = {
-        kind: {
-            group: figures_of_flights([f for f in flights if f.groups[kind] == group], seed)
-            for group in sorted({f.groups[kind] for f in flights})
-        }
-        for kind in GROUPS
-    }
-    return Score(
-        student=student, engine=engine, episodes_sha256=episodes_sha256, list_sha256=list_sha256,
-        trained_on=None if trained_on is None else tuple(trained_on), confidence=CONFIDENCE, resamples=RESAMPLES,
-        figures=figures_of_flights(flights, seed), by=by, flights=tuple(flights),
+        students.add((one.student, one.engine, one.list_sha256 or ""))
+    if len(students) != 1:
+        got = "; ".join(" ".join(filter(None, words)) for words in sorted(students)[:3]) or "no episode"
+        raise InputError("these are not episodes of one student on one list", where="episodes", got=got)
+    (student, engine, listed), digest = students.pop(), sha256_bytes(dump_json(sorted(digests)).encode())
+    measured.sort(key=lambda one: (one.town, one.episode))
+    return score_measured(
+        measured, seed, student=student, engine=engine, episodes_sha256=digest, list_sha256=listed or None,
+        trained_on=trained_on,
     )  # fmt: skip
 
 
-def walk_sums(flights: Sequence[FlightScore], names: Sequence[str]) -> tuple[list[str], np.ndarray]:
-    """Return the walks, and what their flights add to some figures: (walks, figures, 2)."""
-    walks = sorted({flight.walk for flight in flights})
-    sums = np.zeros((len(walks), len(names), 2))
-    for flight in flights:
-        sums[walks.index(flight.walk)] += [flight.sums[name] for name in names]
-    return walks, sums
+def score_measured(measured: Sequence[EpisodeScore], seed: int, **about: Any) -> Score:
+    """Score measured episodes, of one map or several. about: the fields of Score that are not computed here."""
+    groups = {kind: sorted({one.groups[kind] for one in measured}) for kind in GROUPS}
+    by = {
+        kind: {
+            name: figures_of([one for one in measured if one.groups[kind] == name], _score_rng(seed)) for name in names
+        }
+        for kind, names in groups.items()
+    }
+    figures = figures_of(measured, _score_rng(seed))
+    return Score(**about, confidence=CONFIDENCE, resamples=RESAMPLES, figures=figures, by=by, flights=tuple(measured))
 
 
-def ratios(draws: np.ndarray, sums: np.ndarray) -> np.ndarray:
-    """Return figures on draws of walks, (draws, figures), NaN of nothing; draws: (draws, walks) how often each."""
-    totals = np.tensordot(draws, sums, axes=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(totals[..., 1] > 0, totals[..., 0] / totals[..., 1], np.nan)
+def _score_rng(seed: int) -> np.random.Generator:
+    return rng_for(seed, "score", "draws")
 
 
-def draws_of(num_walks: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw walks, (1 + RESAMPLES, walks) how often each; the first has each once, as they were flown."""
-    return np.vstack([np.ones(num_walks), draw_pedestrians(num_walks, RESAMPLES, rng)])
-
-
-def figures_of(drawn: np.ndarray, counts: Sequence[int], num_walks: int) -> dict[str, Figure]:
-    """Return all figures of their values on `draws_of` walks, (draws, figures); counts: what each is of."""
+def figures_of(
+    measured: Sequence[EpisodeScore], rng: np.random.Generator, before: Sequence[EpisodeScore] | None = None
+) -> dict[str, Figure]:
+    """Return all figures with intervals by bootstrap over pedestrian trajectories; with `before`, their changes."""
+    walks = sorted({one.walk for one in measured})
+    draws = np.vstack([np.ones(len(walks)), draw_pedestrians(len(walks), RESAMPLES, rng)])  # the first: each once
+    drawn, counts = (
+        _ratios(draws, measured, walks),
+        [sum(one.sums[name][1] > 0 for one in measured) for name in MEASURES],
+    )
+    if before is not None:
+        drawn, counts = drawn - _ratios(draws, before, walks), [len(walks)] * len(MEASURES)
     return {
-        name: figure_of_draws(float(drawn[0, k]), drawn[1:, k], counts[k], num_walks, CONFIDENCE)
+        name: figure_of_draws(float(drawn[0, k]), drawn[1:, k], counts[k], len(walks), CONFIDENCE)
         for k, name in enumerate(MEASURES)
     }
 
 
-def figures_of_flights(flights: Sequence[FlightScore], seed: int = 0) -> dict[str, Figure]:
-    """Return all figures of some flights with their intervals, by bootstrap over walks."""
-    walks, sums = walk_sums(flights, list(MEASURES))
-    drawn = ratios(draws_of(len(walks), rng_for(seed, "score", "draws")), sums)
-    return figures_of(drawn, [sum(flight.sums[name][1] > 0 for flight in flights) for name in MEASURES], len(walks))
+def _ratios(draws: np.ndarray, measured: Sequence[EpisodeScore], walks: list[str]) -> np.ndarray:
+    """Return the figures of each draw, (draws, figures), NaN if undefined. draws: (draws, walks), how often each."""
+    sums = np.zeros((len(walks), len(MEASURES), 2))
+    for one in measured:
+        sums[walks.index(one.walk)] += [one.sums[name] for name in MEASURES]
+    totals = np.tensordot(draws, sums, axes=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(totals[..., 1] > 0, totals[..., 0] / totals[..., 1], np.nan)

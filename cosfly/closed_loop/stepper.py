@@ -1,7 +1,7 @@
-"""One flight in closed loop: a command moves the drone, and what it then sees is drawn. No student, no file.
+"""The simulation of one closed-loop episode: a command moves the drone, and the renderer draws what it then sees.
 
-The drone is a point with inertia: it reaches a commanded velocity as fast as its acceleration allows, turns and tilts
-its camera likewise. That is a stabilised multicopter as its autopilot presents it, without wind.
+The drone is a point with inertia: velocity, yaw and camera pitch reach the commanded values within its limits.
+That is a stabilised multicopter as its autopilot presents it, without wind.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import numpy as np
 from cosfly.closed_loop.settings import Drone
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.bystanders import Bystander
+from cosfly.formats.episodes import Ended
 from cosfly.formats.frames import TargetMeta
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.places import town_folder
-from cosfly.formats.pursuits import Ended
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.weather import WeatherParams
 from cosfly.geometry.axes import step_s, wrap_deg
@@ -31,27 +31,27 @@ from cosfly.render.stage import make_track_script, renderer_of
 from cosfly.render.track import annotation, draw_frame
 from cosfly.render.weather import read_pools, weather_of
 
-RATE_HZ = 20.0  # of the autopilot, which follows a command
-LEAVES_M = 100.0  # beyond the map's bounds
-AREA_M, AREA_STEP_M = 420.0, 200.0  # lit at once, and how far apart the middles of such areas are
+RATE_HZ = 20.0  # of the autopilot
+LEAVES_M = 100.0  # beyond the map's bounds the drone has left
+AREA_M, AREA_STEP_M = 420.0, 200.0  # size and spacing of the areas that are lit at once
 
 
 def as_drawn(cfg: RenderConfig, seed: int) -> RenderConfig:
-    """Return the settings of what a student sees, and of its tree: no weather is drawn that is not the seed's."""
+    """Return the render settings of an episode and its tree: the clean track, with the seed's weather."""
     return cfg.model_copy(
         update={"tracks": ("clean",), "weather_seed": cfg.weather_seed if cfg.weather_seed >= 0 else seed}
     )
 
 
 class Airspace:
-    """A map to fly in: what draws it, and what can be hit. One a process, used from one thread."""
+    """A map with its renderer and obstacles. One per process, used from one thread."""
 
     def __init__(
         self, cfg: RenderConfig, boxes: BoxMap, simplified: BoxMap, *, seed: int = 0, num_others: int = 0
     ) -> None:
         """
         Args:
-            boxes: that are drawn. simplified: that are flown among. num_others: as the renderer takes it.
+            boxes: are drawn. simplified: are obstacles. num_others: bystanders, as the renderer counts them.
         """
         self.cfg, self.seed = as_drawn(cfg, seed).model_copy(update={"first_timestamp": cfg.first_timestamp or 0}), seed
         self.renderer, self.pools = renderer_of(cfg, boxes, seed, num_others), read_pools(cfg)
@@ -61,13 +61,12 @@ class Airspace:
 
     @staticmethod
     def area_of(targets_m: np.ndarray) -> tuple[float, float]:
-        """Return the middle of the area that a walk is lit with, of a grid: neighbours share it, and none looks
-        otherwise for those that are flown beside it."""
+        """Return the grid centre of the area that is lit for a trajectory: neighbours share it."""
         x, y = np.round(targets_m.mean(axis=0)[:2] / AREA_STEP_M) * AREA_STEP_M + 0.0
         return float(x), float(y)
 
     def light(self, targets_m: np.ndarray, weather: WeatherParams | None) -> None:
-        """Have the renderer ready for a walk."""
+        """Prepare the renderer for a pedestrian trajectory."""
         middle = np.array(self.area_of(targets_m))
         wanted = (*middle, None if weather is None else weather.model_dump_json())
         if wanted != self._lit:
@@ -76,7 +75,7 @@ class Airspace:
             self._lit = wanted
 
     def has_left(self, position_m: np.ndarray) -> bool:
-        """Return whether a drone is far out of the map."""
+        """Return whether a drone is LEAVES_M outside the map."""
         low, high = self.bounds_m
         outside = np.maximum(low - position_m, position_m - high)[:2]
         return bool((outside > LEAVES_M).any())
@@ -84,8 +83,8 @@ class Airspace:
 
 @dataclass(frozen=True)
 class Moment:
-    """One frame of a flight. position_m, rotation_deg (pitch, yaw, roll), velocity_mps: (3,) world. target: as
-    `meta.json` has it; target_m: its hip, (3,). clearance_m: the least since the frame before."""
+    """One frame of an episode. position_m, rotation_deg (pitch, yaw, roll), velocity_mps: (3,) world. target: as in
+    `meta.json`; target_m: its hip, (3,). clearance_m: the least since the previous frame."""
 
     index: int
     time_s: float
@@ -94,21 +93,20 @@ class Moment:
     velocity_mps: np.ndarray
     target_m: np.ndarray
     target: TargetMeta
-    bystanders: dict[str, float | None]  # of other people, as `OthersMeta.people_of`; empty where nobody else moves
+    bystanders: dict[str, float | None]  # as `BystandersMeta.people_of`; empty without bystanders
     frame: Frame
     clearance_m: float
     height_m: float  # over the ground under the target
 
     @property
     def distance_m(self) -> float:
-        """From the drone to the target, over ground."""
+        """Distance from drone to target, over ground."""
         return float(np.hypot(*(self.position_m - self.target_m)[:2]))
 
 
 class ClosedLoopTrajectory:
-    """One flight after one walk. `reset` gives the frames of the plan with which it begins, `step` flies a command for
-    one time step of the walk and gives what is seen then; `ended` tells how it ended, None while it goes on. `script`:
-    what is drawn, cameras and clothes among it."""
+    """One episode behind one pedestrian. `reset` returns the lead frames, `step` flies a command for one time step and
+    returns the next frame; `ended`: how the episode ended, None before. `script`: what is drawn."""
 
     def __init__(
         self,
@@ -123,16 +121,16 @@ class ClosedLoopTrajectory:
     ) -> None:
         """
         Args:
-            planned: a plan for the walk: its first frames are flown, of the others the person's way is taken. number:
-                of the walk, for its weather. num_lead: frames of the plan, 2 or more. lost_s: ends after so long
-                without sight; 0: never.
+            planned: a plan; its first num_lead frames (2 or more) are flown, the others give the target's positions.
+            number: of the trajectory, for its weather.
+            lost_s: the episode ends after so long without a visible target; 0: never.
         """
         if not 2 <= num_lead < len(planned.time_s):
             raise ValueError(f"num_lead must be 2 to {len(planned.time_s) - 1}, not {num_lead}")
         self.airspace, self.planned, self.drone = airspace, planned, drone
         self.num_lead, self.lost_s, self.dt_s = num_lead, lost_s, step_s(planned.time_s)
         weather = weather_of(airspace.cfg, airspace.pools, number)
-        plain = replace(planned, segments=(), mission=None)  # parts and orders are the plan's, not this flight's
+        plain = replace(planned, segments=(), mission=None)  # segments and mission describe the plan only
         self.script = make_track_script(
             plain, number, "clean", airspace.town, airspace.surroundings, airspace.cfg, airspace.seed, others, weather
         )
@@ -140,7 +138,7 @@ class ClosedLoopTrajectory:
 
     @property
     def place(self) -> tuple[str, str, str]:
-        """Town, trajectory and track, as a playback tree names them."""
+        """Town, trajectory and track of the playback tree."""
         return self.script.town, self.script.trajectory, self.script.variant
 
     def _begin(self) -> None:
@@ -155,23 +153,23 @@ class ClosedLoopTrajectory:
         self.yaw_rate_degps = float(turned_deg) / self.dt_s
 
     def reset(self) -> tuple[Moment, ...]:
-        """Begin, anew where it was flown; gives the frames of the plan, of which the last is the present one."""
+        """Start from the beginning; return the lead frames, of which the last is the present one."""
         self._begin()
         steps = np.diff(self.poses.positions_m[: self.num_lead], axis=0) / self.dt_s
         velocities = [steps[0], *steps]
         return tuple(self._drawn(i, velocities[i], float(self.poses.clearances_m[i])) for i in range(self.num_lead))
 
     def step(self, command: np.ndarray) -> Moment:
-        """Fly a command, (5,) as ACTION in the level axes of the present frame, until the next frame."""
+        """Fly a command, (5,) as ACTION in the level axes of the present frame; return the next frame."""
         if self.ended is not None or (problem := self.drone.problem_of(command)):
-            raise ValueError(f"the flight has ended: {self.ended}" if self.ended else problem)
-        places, yaw_deg, pitch_deg = self._way(np.asarray(command, dtype=np.float64))
+            raise ValueError(f"the episode has ended: {self.ended}" if self.ended else problem)
+        places, yaw_deg, pitch_deg = self._path(np.asarray(command, dtype=np.float64))
         i = self.index + 1
         gaps, _, _ = swept_distances(self.airspace.surroundings.obstacles, places, CLEARANCE_CAP_M)
         over_ground = places[:, 2] - self.airspace.ground.height_at(places)
-        gaps = np.minimum(gaps[:-1], np.minimum(over_ground[:-1], over_ground[1:]))  # of each part of the way
+        gaps = np.minimum(gaps[:-1], np.minimum(over_ground[:-1], over_ground[1:]))  # of each part of the path
         hits = np.flatnonzero(gaps < self.drone.radius_m)
-        end = int(hits[0]) if len(hits) else len(places) - 1  # it stops before the part that touches
+        end = int(hits[0]) if len(hits) else len(places) - 1  # the drone stops before the part that touches
         clearance_m = min(float(gaps[: end + 1].min()), self.script.others.distance_m(i, places[end]))
         self.index = i
         self.poses.positions_m[i], self.poses.rotations_deg[i] = places[end], [pitch_deg, yaw_deg, 0.0]
@@ -188,8 +186,8 @@ class ClosedLoopTrajectory:
             self.ended = "lost"
         return moment
 
-    def _way(self, command: np.ndarray) -> tuple[np.ndarray, float, float]:
-        """Return the places on the way of one step, (k + 1, 3), and yaw and pitch at its end, degrees."""
+    def _path(self, command: np.ndarray) -> tuple[np.ndarray, float, float]:
+        """Return the positions within one step, (k + 1, 3), and yaw and pitch at its end, degrees."""
         place, (pitch_deg, yaw_deg, _) = self.poses.positions_m[self.index], self.poses.rotations_deg[self.index]
         num, drone = max(1, round(self.dt_s * RATE_HZ)), self.drone
         part_s, yaw_rad = self.dt_s / num, np.radians(yaw_deg)

@@ -1,6 +1,6 @@
-"""Gymnasium environments in which a policy follows a person: `import cosfly.envs`, then `gymnasium.make(ENV)`.
+"""Gymnasium environments in which a policy follows a pedestrian: `import cosfly.envs`, then `gymnasium.make(ENV)`.
 
-They draw, move and judge as `cosfly fly` does, and need neither a GPU nor a simulator.
+They render, simulate and measure as `cosfly fly` does, and need neither a GPU nor a simulator.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Episodes of the benchmark: in which town, after which walk, from where; all made in the process, no file is left.
+"""Episodes of the benchmark: town, pedestrian trajectory and start, all computed in the process without files.
 
-A town is a preset and a seed. Those of HELD_OUT are for tests alone: no configuration of ours and no training episode
-has one of these seeds.
+A town is a preset and a seed. The seeds of HELD_OUT are for tests only: no configuration and no training episode uses
+them.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ EPISODES_FILE = Path(__file__).with_name("episodes.json")
 EPISODES_FORMAT = FileFormat("cosfly.episodes", "1.0", "episodes")
 SIZE_PX, FOV_DEG = (640, 360), 60.0  # of the camera of the lists
 NUM_DECISIONS = 80  # 40 s
-LEAD_FRAMES = 21  # of the plan, as `fly.lead_frames`
-AFTER_LOSS = 3  # frames without sight before a policy takes over
-TURNED_DEG = (60.0, 300.0)  # by which a drone looks away that begins so
-TRIES = 40  # walks, until one can be an episode
+LEAD_FRAMES = 21  # of the plan, as in `fly.lead_frames`
+AFTER_LOSS = 3  # frames without visibility before a policy takes over
+TURNED_DEG = (60.0, 300.0)  # initial turn away from the target
+TRIES = 40  # pedestrian trajectories until one can be an episode
 PACE = {"walk": 0.4, "stop_and_look": 0.2, "hurry": 0.1, "fits_and_starts": 0.2, "turn_back": 0.1}
 _ALONE = PedestriansConfig(ground="paved", road_cost=20, pace=PACE, hurry_speed_mps=2.0)
 
-# Environment -> who walks about.
+# Environment -> pedestrians and traffic.
 TASKS = {
     "cosfly/Follow-v0": _ALONE,
     "cosfly/Distracted-v0": _ALONE.model_copy(update={"others": 8, "look_alikes": 3, "traffic": 2}),
@@ -73,34 +73,34 @@ TRAINING = tuple(
 
 
 class EpisodeLists(Record):
-    """The file of lists: environment -> list -> episodes, each a town and the number of its walk."""
+    """The file of lists: environment -> list -> episodes, each a town and the number of a trajectory."""
 
     lists: dict[str, dict[str, tuple[tuple[str, int], ...]]]
 
 
 def read_list(name: str) -> tuple[str, tuple[tuple[str, int], ...], str]:
-    """Return environment, episodes and digest of a list, `cosfly/Follow-v0/test`, or of an environment's `test`."""
+    """Return environment, episodes and digest of a list such as `cosfly/Follow-v0/test`; `test` is the default."""
     env, _, listed = name.partition("-v0")
     env, listed = f"{env}-v0", listed.strip("/") or "test"
     known = read_model(EPISODES_FILE, EpisodeLists, EPISODES_FORMAT).lists
     if env not in known:
-        what = f"there is no such environment{nearest(name, known)}"
+        what = f"unknown environment{nearest(name, known)}"
         raise InputError(what, where="--env", got=name, expected=", ".join(known))
     if listed not in known[env]:
-        what = "there is no such list of episodes"
-        raise InputError(what, where=f"--env {env}", got=listed, expected=", ".join(known[env]))
+        raise InputError("unknown list", where=f"--env {env}", got=listed, expected=", ".join(known[env]))
     episodes = known[env][listed]
-    told = [env, [[HELD_OUT[town].model_dump(), number] for town, number in episodes], SIZE_PX, FOV_DEG, NUM_DECISIONS]
-    return env, episodes, sha256_bytes(dump_json(told).encode())
+    task = [env, [[HELD_OUT[town].model_dump(), number] for town, number in episodes], SIZE_PX, FOV_DEG, NUM_DECISIONS]
+    return env, episodes, sha256_bytes(dump_json(task).encode())
 
 
 def episode_id(town: str, number: int) -> str:
+    """Return the id of an episode in records."""
     return f"{town}_{walk_id(number)}"
 
 
 @dataclass(frozen=True)
 class BenchmarkWorld:
-    """A town, made: as it is drawn, as it is flown in, where people walk and cars drive."""
+    """A town: boxes that are drawn, obstacles, walkable ground and lanes."""
 
     town: BenchmarkTown
     boxes: BoxMap
@@ -125,7 +125,7 @@ class BenchmarkWorld:
 
 @lru_cache(maxsize=16)
 def world_of(town: BenchmarkTown) -> BenchmarkWorld:
-    """Make a town; the last ones are kept."""
+    """Build a town; the last ones are cached."""
     boxes = load(SyntheticConfig(name=town.name, preset=town.preset), town.seed)
     flown = simplify(boxes, SimplifyConfig()).box_map
     ground = walkable_ground(flown, _ALONE, where=town.name)
@@ -134,8 +134,7 @@ def world_of(town: BenchmarkTown) -> BenchmarkWorld:
 
 @dataclass(frozen=True)
 class BenchmarkEpisode:
-    """What is to be flown: a plan, whose first num_lead frames are flown before a policy takes over, and who else is
-    there."""
+    """A plan, of which num_lead frames are flown before a policy takes over, and the bystanders."""
 
     task: str
     world: BenchmarkWorld
@@ -149,16 +148,16 @@ class BenchmarkEpisode:
         return episode_id(self.world.town.name, self.number)
 
     def begins_well(self, now: Moment) -> bool:
-        """Return whether the first frame is as the task has it: the person is in sight, or is to be found again."""
+        """Return whether the first frame fits the task: the target is visible, or must be found again."""
         return now.target.visible != (self.task == REACQUIRES)
 
-    def flight(self, airspace: Airspace) -> ClosedLoopTrajectory:
-        """Open it."""
+    def simulation(self, airspace: Airspace) -> ClosedLoopTrajectory:
+        """Open the episode."""
         return ClosedLoopTrajectory(airspace, self.plan, number=self.number, num_lead=self.num_lead, others=self.others)
 
 
 def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisode | None:
-    """Make an episode of a walk of a town; None where the walk, or its plan, cannot be one."""
+    """Return the episode of a town's trajectory; None if the trajectory or its plan is unsuitable."""
     cfg, town, name = TASKS[task], world.town, walk_id(number)
     planning = PlanConfig(styles={REACQUIRE: 1.0}) if task == REACQUIRES else PlanConfig()
     try:

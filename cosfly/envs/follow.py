@@ -1,4 +1,4 @@
-"""The environment: after a person who walks through a town. Observations hold what a real drone has, and no more."""
+"""The environment: follow a pedestrian through a town. Observations contain only what a real drone has."""
 
 from __future__ import annotations
 
@@ -27,14 +27,16 @@ from cosfly.render.contract import FAR_M
 from cosfly.runtime.errors import ConfigError, InputError
 
 GOAL_CHARACTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ -,"
-# Of the distance between drone and person: all of the reward up to the first, none beyond the second.
+# Distance from drone to target with full reward, and with none.
 FULL_REWARD_M, NO_REWARD_M = 35.0, 70.0
 CRASH_REWARD = -10.0
 
 
 def reward_of(now: Moment, ended: str | None) -> float:
-    """Return what a step is worth: 1 where the frame shows the person from up to FULL_REWARD_M, falling to 0 at
-    NO_REWARD_M; 0 where it does not; a crash CRASH_REWARD. No step but a crash costs anything, so an end never pays."""
+    """Return the reward of a step: 1 for a visible target within FULL_REWARD_M, falling to 0 at NO_REWARD_M.
+
+    Only a crash, CRASH_REWARD, is negative, so an early end never pays.
+    """
     if ended == "crashed":
         return CRASH_REWARD
     away_m = float(np.linalg.norm(now.position_m - now.target_m))
@@ -42,10 +44,10 @@ def reward_of(now: Moment, ended: str | None) -> float:
 
 
 class FollowEnv(gymnasium.Env):
-    """One drone, one person, one time step of 0.5 s a step.
+    """One drone and one pedestrian; a step is 0.5 s.
 
-    action: of `decisions` the number of one of the seventeen in the order of the table; of `velocities` (5,) as
-    ACTION, in the level axes of the drone; ground speeds beyond the drone's greatest are scaled down to it.
+    action: with `decisions` the number of one of the seventeen actions in table order; with `velocities` (5,) as
+    ACTION, in the level axes of the drone, with ground speed limited to the drone's greatest.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012
@@ -62,13 +64,12 @@ class FollowEnv(gymnasium.Env):
     ) -> None:
         """
         Args:
-            actions: decisions or velocities. episodes: train draws a town and a walk, else the name of a list, of which
-                reset takes options["episode"], or draws. size_px: width and height of the pictures.
-        Raises:
-            ConfigError, InputError: there is no such kind of action, or no such list.
+            actions: decisions or velocities.
+            episodes: train draws a town and a trajectory; otherwise the name of a list, from which reset takes
+                options["episode"], or draws. size_px: width and height of the pictures.
         """
         if actions not in ("decisions", "velocities"):
-            raise ConfigError("no such actions", where=task, got=actions, expected="decisions or velocities")
+            raise ConfigError("unknown kind of actions", where=task, got=actions, expected="decisions or velocities")
         self.task, self.size_px, self.has_depth, self.render_mode = task, (size_px[0], size_px[1]), depth, render_mode
         self.listed = None if episodes == "train" else read_list(f"{task}/{episodes}")[1]
         self.drone, self.tokens = Drone(), TOKENS
@@ -84,74 +85,74 @@ class FollowEnv(gymnasium.Env):
         if depth:
             seen["depth"] = spaces.Box(0.0, FAR_M, (height_px, width_px), np.float32)
         self.observation_space = spaces.Dict(seen)
-        self._space: Airspace | None = None
+        self._airspace: Airspace | None = None
         self._episode: BenchmarkEpisode | None = None
-        self._flight: ClosedLoopTrajectory | None = None
+        self._simulation: ClosedLoopTrajectory | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
-        """Begin an episode: of the list the one of options["episode"], counted from 0; else one that is drawn."""
+        """Start an episode: the one of options["episode"] in the list, counted from 0, or a random one."""
         super().reset(seed=seed)
         wanted = (options or {}).get("episode")
         if self.listed is not None:
             k = int(self.np_random.integers(len(self.listed))) if wanted is None else wanted
             if not isinstance(k, int) or not 0 <= k < len(self.listed):
                 expected = f"0 to {len(self.listed) - 1}"
-                raise InputError("no such episode", where=self.task, got=repr(k)[:40], expected=expected)
+                raise InputError("the list has no such episode", where=self.task, got=repr(k)[:40], expected=expected)
             town, number = self.listed[k]
             if not self._begin(episode_of(self.task, world_of(HELD_OUT[town]), number)):
-                raise InputError("an episode that cannot be flown", where=f"{self.task}: {town}", got=str(number))
+                raise InputError("the episode cannot be flown", where=f"{self.task}: {town}", got=str(number))
         else:
             world = world_of(TRAINING[int(self.np_random.integers(len(TRAINING)))])
             numbers = self.np_random.integers(100_000, size=TRIES).tolist()
             if not any(self._begin(episode_of(self.task, world, number)) for number in numbers):
-                raise InputError("no walk of a town can be an episode", where=self.task, got=world.town.name)
-        assert self._flight is not None
-        return observe(self._flight, self._now, depth=self.has_depth), self._info()
+                raise InputError("no trajectory of the town can be an episode", where=self.task, got=world.town.name)
+        assert self._simulation is not None
+        return observe(self._simulation, self._now, depth=self.has_depth), self._info()
 
     def _begin(self, episode: BenchmarkEpisode | None) -> bool:
-        """Begin an episode; False where it cannot be one."""
+        """Start an episode; return whether it is suitable."""
         if episode is None:
             return False
-        if self._space is None or self._episode is None or self._episode.world is not episode.world:
+        if self._airspace is None or self._episode is None or self._episode.world is not episode.world:
             self.close()
-            self._space = episode.world.airspace(self.task, self.size_px)
-        self._episode, self._flight = episode, episode.flight(self._space)
-        self._now = self._flight.reset()[-1]
+            self._airspace = episode.world.airspace(self.task, self.size_px)
+        self._episode, self._simulation = episode, episode.simulation(self._airspace)
+        self._now = self._simulation.reset()[-1]
         self._controller = Controller(self._controls, self.drone, self._now)
         return episode.begins_well(self._now)
 
     def step(self, action: Any) -> tuple[dict, float, bool, bool, dict]:
-        """Fly an action for 0.5 s. terminated: crashed or out of the map; truncated: the episode's time is over."""
-        if self._flight is None or self._flight.ended is not None:
-            raise InputError("no episode is under way", where=self.task, fix="call reset first")
+        """Fly an action for 0.5 s. terminated: crashed or left the map; truncated: the episode is over."""
+        if self._simulation is None or self._simulation.ended is not None:
+            raise InputError("no episode is open", where=self.task, fix="call reset first")
         if not self.action_space.contains(action):
             got, expected = repr(action)[:120], repr(self.action_space)
-            raise InputError("an action outside its bounds", where=self.task, got=got, expected=expected)
+            raise InputError("the action is outside its bounds", where=self.task, got=got, expected=expected)
         if isinstance(self.action_space, spaces.Discrete):
             command = self._controller.command(self.tokens[int(action)], self._now)
         else:
             command = self.drone.within_speed(np.asarray(action, dtype=np.float64))
-        self._now = self._flight.step(command)
-        ended = self._flight.ended
-        seen = observe(self._flight, self._now, depth=self.has_depth)
+        self._now = self._simulation.step(command)
+        ended = self._simulation.ended
+        seen = observe(self._simulation, self._now, depth=self.has_depth)
         return seen, reward_of(self._now, ended), ended in ("crashed", "left"), ended == "finished", self._info()
 
     def _info(self) -> dict[str, Any]:
-        """Measures of the present frame, which a policy is not to look at."""
+        """Return measures of the present frame, which a policy must not use."""
         now, target = self._now, self._now.target
         return {
             "episode": self._episode.name if self._episode else "",
-            "ended": (self._flight.ended if self._flight else None) or "",
+            "ended": (self._simulation.ended if self._simulation else None) or "",
             "in_view": target.in_view, "visible": target.visible, "visibility": target.visibility,
             "distance_m": now.distance_m, "height_m": now.height_m, "clearance_m": now.clearance_m,
         }  # fmt: skip
 
     def render(self) -> np.ndarray | None:
         """Return the present frame, (h, w, 3) uint8."""
-        return self._now.frame.rgb.copy() if self.render_mode == "rgb_array" and self._flight else None
+        return self._now.frame.rgb.copy() if self.render_mode == "rgb_array" and self._simulation else None
 
     def close(self) -> None:
         """Close the renderer."""
-        if self._space is not None:
-            self._space.renderer.close()
-        self._space = self._flight = None
+        if self._airspace is not None:
+            self._airspace.renderer.close()
+        self._airspace = self._simulation = None

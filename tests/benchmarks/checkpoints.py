@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.closed_loop import stage
-from cosfly.closed_loop.measures import score_pursuits
-from cosfly.closed_loop.pilots import Outlook, PilotAnswer, open_pilot
+from cosfly.closed_loop.measures import score_episodes
+from cosfly.closed_loop.pilots import Observation, EngineDecision, open_engine
 from cosfly.formats.captions import TOKENS, read_captions
 from cosfly.formats.flight_scores import SCORE, SCORE_FORMAT
-from cosfly.formats.pursuits import PURSUITS, read_pursuit
+from cosfly.formats.pursuits import EPISODES, read_episode
 from cosfly.formats.traces import read_traces
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners import stage as planning
@@ -45,11 +45,11 @@ class Checkpoint:
 
     def __init__(self, pilot: Any, noise: float, without: tuple[str, ...]) -> None:
         self.name, self.num_frames = pilot.name, pilot.num_frames
-        self._pilot, self._noise, self._without = pilot, noise, without
+        self._engine, self._noise, self._without = pilot, noise, without
 
-    def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
-        answers = self._pilot.decide(outlooks)
-        items = [f"{outlook.episode}/{outlook.moments[-1].index}" for outlook in outlooks]
+    def decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:
+        answers = self._engine.decide(observations)
+        items = [f"{observation.episode}/{observation.moments[-1].index}" for observation in observations]
         given = (self._noise, self._without)
         return [replace(a, action=replaced(a.action, item, *given)) for a, item in zip(answers, items, strict=True)]
 
@@ -76,13 +76,13 @@ def main() -> None:
         out = given.out / name
         if (out / SCORE).is_file():
             continue
-        (out / PURSUITS).mkdir(parents=True, exist_ok=True)
-        stage.open_pilot = lambda *args, how=(noise, without): Checkpoint(open_pilot(*args), *how)
+        (out / EPISODES).mkdir(parents=True, exist_ok=True)
+        stage.open_engine = lambda *args, how=(noise, without): Checkpoint(open_engine(*args), *how)
         stage.make_worker(whole, given.map, given.simplified, plans, None, out, 0, 1)(Item("all", numbers))
         flown = [
-            read_pursuit(path).model_copy(update={"student": name}) for path in sorted((out / PURSUITS).glob("*.json"))
+            read_episode(path).model_copy(update={"student": name}) for path in sorted((out / EPISODES).glob("*.json"))
         ]
-        write_model(out / SCORE, score_pursuits(flown), SCORE_FORMAT)
+        write_model(out / SCORE, score_episodes(flown), SCORE_FORMAT)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Who decides in closed loop: students that are asked as in captions, the rules, two floors and a ceiling.
+"""Decision engines: prompted models, the rules, two baselines and an upper bound.
 
-All get the last frames of several flights and give a decision for each. What goes wrong with one is its student's
-failure: it is told as its answer, and the flight goes on.
+An engine gets the last frames of several episodes and returns a decision for each. An error in one of them is recorded
+as the student's failure, and the episode goes on.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from caption.teachers.prompts import Question, make_question
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import first_budget, open_teacher
 from caption.writing.contract import Draft, more_fields
-from cosfly.closed_loop.settings import FLOORS, FlyConfig
+from cosfly.closed_loop.settings import BASELINES, FlyConfig
 from cosfly.closed_loop.stepper import ClosedLoopTrajectory, Moment
-from cosfly.formats.captions import TOKENS
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.answer_text import parse_answer
+from cosfly.formats.episodes import MOST_WORDS, Answer
 from cosfly.formats.frames import BYSTANDER_COLUMNS, FILE_NAMES, depth_file, frame_name, instance_bytes, rgb_bytes
+from cosfly.formats.motion import in_axes_of
 from cosfly.formats.places import sample_id
-from cosfly.formats.pursuits import MOST_WORDS, Answer
 from cosfly.geometry.axes import wrap_deg
-from cosfly.geometry.motion import in_axes_of
-from cosfly.llm.answer_text import parse_answer
 from cosfly.llm.answers import Answer as BookAnswer
 from cosfly.llm.answers import AnswerBook
 from cosfly.llm.contract import NoAnswer
@@ -42,13 +42,13 @@ from cosfly.runtime.seeding import rng_for
 from distill.inference.stage import InferConfig, Inputs, local_answers
 from distill.schema import Sample
 
-NO_SET = "decision_not_in_closed_set"  # of answers that can be read and decide nothing that there is
+NO_SET = "decision_not_in_closed_set"  # of readable answers with an unknown decision
 FILES = frozenset({*FILE_NAMES.values()})
 
 
 @dataclass(frozen=True)
-class PilotAnswer:
-    """What a student answered. command: of one that commands, (5,) as ACTION."""
+class EngineDecision:
+    """A student's decision. command: of one that returns commands, (5,) as ACTION."""
 
     answer: Answer
     action: str | None = None
@@ -58,81 +58,80 @@ class PilotAnswer:
 
 
 @dataclass(frozen=True)
-class Outlook:
-    """A flight up to now: its last frames, oldest first."""
+class Observation:
+    """The last frames of an episode, oldest first."""
 
     episode: str
-    flight: ClosedLoopTrajectory
+    simulation: ClosedLoopTrajectory
     moments: Sequence[Moment]
 
 
-class Pilot(Protocol):
-    """name: in records. num_frames: that it is shown, at most. `decide` gives a decision for each flight."""
+class DecisionEngine(Protocol):
+    """An engine. name: in records. num_frames: most frames of an observation. `decide`: one decision for each."""
 
     name: str
     num_frames: int
 
-    def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]: ...
+    def decide(self, observations: Sequence[Observation]) -> list[EngineDecision]: ...
 
 
-def open_pilot(cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed: int, answers: Path) -> Pilot:
-    """Open who the settings name. answers: a folder, where those of a model are kept.
+def open_engine(cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed: int, answers: Path) -> DecisionEngine:
+    """Open the student of the settings. answers: folder of a model's answer journal.
 
     Raises:
-        ConfigError, InputError, TeacherError, EnvironmentMissing: it cannot be used.
+        ConfigError, InputError, TeacherError, EnvironmentMissing: The student cannot be used.
     """
     if cfg.student == "planner":
-        return Ceiling()
-    if cfg.student in FLOORS:
-        return Floor(cfg.student, seed)
-    if cfg.engine == "transformers":
-        return LocalPilot(cfg, caption, infer, seed, answers)
+        return PlannerEngine()
+    if cfg.student in BASELINES:
+        return BaselineEngine(cfg.student, seed)
     if cfg.engine == "policy":
         from cosfly.closed_loop.policy import Policy
 
         return Policy(cfg.student.partition(":")[2], cfg.answer_limit_s, seed)
-    return AskedPilot(cfg, caption, infer, seed, answers)
+    kind = LocalEngine if cfg.engine == "transformers" else PromptedEngine
+    return kind(cfg, caption, infer, seed, answers)
 
 
-class Floor:
-    """Decides without looking: always the same, or by chance."""
+class BaselineEngine:
+    """A baseline that sees nothing: a fixed or a random decision."""
 
     num_frames = 1
 
     def __init__(self, name: str, seed: int) -> None:
         self.name, self._seed = name, seed
 
-    def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
+    def decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:
         if self.name != "random":
-            return [PilotAnswer("ok", self.name)] * len(outlooks)
-        items = (f"{outlook.episode}/{outlook.moments[-1].index}" for outlook in outlooks)
-        return [PilotAnswer("ok", str(rng_for(self._seed, "fly", item).choice(TOKENS))) for item in items]
+            return [EngineDecision("ok", self.name)] * len(observations)
+        items = (f"{observation.episode}/{observation.moments[-1].index}" for observation in observations)
+        return [EngineDecision("ok", str(rng_for(self._seed, "fly", item).choice(TOKENS))) for item in items]
 
 
-class Ceiling:
-    """Flies the plan, which knew the whole walk: from wherever it is to the plan's next pose."""
+class PlannerEngine:
+    """The upper bound: flies from any pose to the next pose of the plan, which knows the whole trajectory."""
 
     name, num_frames = "planner", 1
 
-    def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
-        return [PilotAnswer("ok", command=self.to_next(one.flight, one.moments[-1])) for one in outlooks]
+    def decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:
+        return [EngineDecision("ok", command=self.to_next(one.simulation, one.moments[-1])) for one in observations]
 
     @staticmethod
-    def to_next(flight: ClosedLoopTrajectory, now: Moment) -> np.ndarray:
-        """Return the command that leads to the plan's next pose, or as near as the drone's bounds allow."""
-        planned, i = flight.planned, now.index + 1
-        velocity = in_axes_of(now.rotation_deg[1], planned.positions_m[i] - now.position_m) / flight.dt_s
-        turn_degps = float(wrap_deg(planned.rotations_deg[i, 1] - now.rotation_deg[1])) / flight.dt_s
-        command = flight.drone.within_speed(np.array([*velocity, turn_degps, planned.rotations_deg[i, 0]]))
-        return np.clip(command, *flight.drone.bounds)
+    def to_next(simulation: ClosedLoopTrajectory, now: Moment) -> np.ndarray:
+        """Return the command that leads to the plan's next pose, or as near as the drone's limits allow."""
+        planned, i, dt_s, drone = simulation.planned, now.index + 1, simulation.dt_s, simulation.drone
+        velocity = in_axes_of(now.rotation_deg[1], planned.positions_m[i] - now.position_m) / dt_s
+        turn_degps = float(wrap_deg(planned.rotations_deg[i, 1] - now.rotation_deg[1])) / dt_s
+        command = drone.within_speed(np.array([*velocity, turn_degps, planned.rotations_deg[i, 0]]))
+        return np.clip(command, *drone.bounds)
 
 
-class AskedPilot:
-    """Is asked as a teacher is (caption/teachers): the rules, a model behind an endpoint or in vLLM; one that was
-    taught (`caption.student.folder`) with the prompts and pictures that it was taught with. All flights at once."""
+class PromptedEngine:
+    """A student that is asked as a teacher (caption/teachers): the rules, a model behind an endpoint or in vLLM. A
+    trained one (`caption.student.folder`) gets the prompts and pictures of its training. All episodes at once."""
 
     def __init__(self, cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed: int, answers: Path) -> None:
-        folder = _taught_folder(cfg)
+        folder = _training_folder(cfg)
         update: dict[str, Any] = {"teacher": "rules" if cfg.engine == "transformers" else cfg.student}
         if folder is not None:
             update["student"] = caption.student.model_copy(update={"folder": folder})
@@ -148,41 +147,42 @@ class AskedPilot:
         self._teacher = self._runner.run(opened.__aenter__())
         self.name = self._teacher.record.model
 
-    def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
-        return self._runner.run(self._decide(outlooks))
+    def decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:
+        """Ask about all episodes at once."""
+        return self._runner.run(self._decide(observations))
 
-    async def _decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
-        return await asyncio.gather(*(self._ask(self._question(outlook)) for outlook in outlooks))
+    async def _decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:
+        return await asyncio.gather(*(self._ask(self._question(observation)) for observation in observations))
 
-    async def _ask(self, question: Question) -> PilotAnswer:
+    async def _ask(self, question: Question) -> EngineDecision:
         begun_s = time.monotonic()
         try:
             reply = await asyncio.wait_for(self._teacher.ask(question), self.limit_s)
         except TimeoutError:
-            return PilotAnswer("late", answer_s=time.monotonic() - begun_s)
+            return EngineDecision("late", answer_s=time.monotonic() - begun_s)
         except (NoAnswer, CosflyError) as error:
             if isinstance(error, CosflyError) and error.fatal:
                 raise
-            return PilotAnswer("none", words=str(error)[:MOST_WORDS])
-        is_timed = not (self._is_rules or reply.is_kept)  # rules take no time, and records are the same each time
+            return EngineDecision("none", words=str(error)[:MOST_WORDS])
+        is_timed = not (self._is_rules or reply.is_kept)  # so that the records of rules are always the same
         answer_s = time.monotonic() - begun_s if is_timed else None
         return self._read(reply.text, question, answer_s, reply.finish_reason)
 
-    def _read(self, text: str, question: Question, answer_s: float | None, finish_reason: str | None) -> PilotAnswer:
-        """Make a decision of an answer: its words are the reasons with their slots filled, or the text as it came."""
+    def _read(self, text: str, question: Question, answer_s: float | None, finish_reason: str | None) -> EngineDecision:
+        """Return the decision of an answer. Its words are the reasons with their slots filled, or the raw text."""
         more = {} if self.cfg.student.folder is not None else more_fields(question.way)
         parsed = parse_answer(text, more=tuple(more), finish_reason=finish_reason, optional=question.way.optional)
         if parsed.coc is None:
-            return PilotAnswer(
+            return EngineDecision(
                 "invalid" if parsed.reason == NO_SET else "unreadable", None, text[:MOST_WORDS], answer_s
             )
         draft = question.way.read(parsed, question.facts)
         coc = draft.coc if isinstance(draft, Draft) else parsed.coc
         words = f"{coc.critical_components} {coc.reasoning_trace}"[:MOST_WORDS]
-        return PilotAnswer("ok", parsed.coc.flight_decision, words, answer_s)
+        return EngineDecision("ok", parsed.coc.flight_decision, words, answer_s)
 
-    def _question(self, outlook: Outlook) -> Question:
-        flight, moments = outlook.flight, outlook.moments
+    def _question(self, observation: Observation) -> Question:
+        place, moments = observation.simulation.place, observation.moments
         targets = [moment.target for moment in moments]
         bystanders = [[moment.bystanders.get(BYSTANDER_COLUMNS[k]) for k in (0, 1, 4)] for moment in moments]
         frames = observed_frames(
@@ -196,20 +196,19 @@ class AskedPilot:
             np.array([bool(target.legible) for target in targets]),
             *np.array(bystanders, dtype=np.float64).T,
         )
-        folders = [self._folder(flight, moment) for moment in moments]
-        place, indices = flight.place, tuple(moment.index for moment in moments)
+        folders = [self._folder(place, moment) for moment in moments]
+        indices = tuple(moment.index for moment in moments)
         name = sample_id(f"{place[1]}_{place[2]}", indices[-1])
         height_px, width_px, _ = moments[-1].frame.rgb.shape
         files = (FILES,) * len(folders)
         window = ObservedWindow(name, *place, indices, width_px, height_px, frames, tuple(folders), files)
         return make_question(window, self.cfg.image, self.cfg.writing, self.vocabulary)
 
-    def _folder(self, flight: ClosedLoopTrajectory, moment: Moment) -> Path:
-        """Return the folder of a frame, written for whoever looks at pictures; those that nobody asks for any more
-        go."""
-        if self._is_rules:  # which look at none
+    def _folder(self, place: tuple[str, str, str], moment: Moment) -> Path:
+        """Write a frame for the student, remove the oldest one, and return the frame's folder."""
+        if self._is_rules:  # see no pictures
             return Path()
-        above = Path(self._scratch.name, *flight.place)
+        above = Path(self._scratch.name, *place)
         folder, frame = above / frame_name(moment.index), moment.frame
         if not folder.is_dir():
             shutil.rmtree(above / frame_name(max(moment.index - self.cfg.window.num_frames, 0)), ignore_errors=True)
@@ -221,33 +220,33 @@ class AskedPilot:
         return folder
 
 
-def _taught_folder(cfg: FlyConfig) -> Path | None:
-    """Return the folder that says how a student was taught, if one does."""
+def _training_folder(cfg: FlyConfig) -> Path | None:
+    """Return the folder with a student's chat format, if there is one."""
     place = Path(cfg.student.partition(":")[2])
     if cfg.engine == "transformers":
         return cfg.adapter or place
     return cfg.as_student or (place if cfg.engine == "vllm" and (place / CHAT_FORMAT_FILE).is_file() else None)
 
 
-class LocalPilot(AskedPilot):
-    """A student in this process (distill/inference), all flights as one batch."""
+class LocalEngine(PromptedEngine):
+    """A student in this process (distill/inference); all episodes are one batch."""
 
     def _open(self, cfg: FlyConfig, infer: InferConfig, seed: int) -> None:
         model, trees = Path(cfg.student.partition(":")[2]), {"": Path(self._scratch.name)}
         inputs = Inputs((), trees, model, cfg.adapter)
         self._local, self.name = local_answers(infer, inputs, self._book), inputs.name
 
-    async def _decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
+    async def _decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:
         begun_s = time.monotonic()
-        questions = [self._question(outlook) for outlook in outlooks]
+        questions = [self._question(observation) for observation in observations]
         found = [one async for one in self._local.answers(map(self._sample, questions), lambda count, told="": None)]
-        answer_s = time.monotonic() - begun_s  # all have waited for the batch
+        answer_s = time.monotonic() - begun_s  # of the whole batch
         if answer_s > self.limit_s:
-            return [PilotAnswer("late", answer_s=answer_s)] * len(found)
+            return [EngineDecision("late", answer_s=answer_s)] * len(found)
         return [
             self._read(one.found.text, question, answer_s if one.is_new else None, one.found.finish_reason)
             if isinstance(one.found, BookAnswer)
-            else PilotAnswer("none", words=one.found.message[:MOST_WORDS])
+            else EngineDecision("none", words=one.found.message[:MOST_WORDS])
             for one, question in zip(found, questions, strict=True)
         ]
 

@@ -1,0 +1,137 @@
+"""`episodes/<episode>.json`: the record of one closed-loop episode (`cosfly fly`), frame by frame.
+
+Each frame has the visibility of the target, the student's answer to it, and the command flown from it to the next.
+World axes: right-handed, metres, degrees.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, FiniteFloat, NonNegativeInt, model_validator
+
+from cosfly.formats.motion import ACTION
+from cosfly.runtime.documents import FileFormat, Record, read_model
+from cosfly.runtime.store import write_model
+
+EPISODES = "episodes"  # folder of the records
+EPISODE_FORMAT = FileFormat("cosfly.episode", "1.0", "episode")
+MOST_WORDS = 4000  # characters of an answer that are kept
+
+# lead: a frame of the plan, before the first decision. late: no answer within the limit; unreadable: not in the
+# requested
+# form; invalid: an unknown decision or an invalid command; none: no answer. After an answer that is not ok the drone
+# hovers. end: the last frame, without a decision.
+Answer = Literal["lead", "ok", "late", "unreadable", "invalid", "none", "end"]
+# finished: flown to the end of the pedestrian trajectory; crashed: an obstacle or the ground came within the drone's
+# radius; lost: the target was not visible for `fly.lost_s`; left: the drone flew out of the map's bounds.
+Ended = Literal["finished", "crashed", "lost", "left"]
+
+_Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+_Least = Annotated[FiniteFloat, Field(ge=0)]
+
+
+class EpisodeFrame(Record):
+    """One frame. command: as ACTION (cosfly/formats/motion.py), None in the last. answer_s: time of the decision.
+    words: the student's reasons, or its raw answer if unreadable.
+
+    in_view: some of the target's box is in the picture; visible: and enough of it is not hidden, `visibility` its
+    share; num_pixels: of the target. distance_m: drone to hip over ground; height_m: drone over the target's ground;
+    clearance_m: least distance to an obstacle or the ground until the next frame; speed_mps: of the drone. pose:
+    x, y, z, pitch, yaw, roll of the camera. target_m: the hip.
+    """
+
+    time_s: FiniteFloat
+    answer: Answer
+    action: str | None = None
+    command: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] | None = None
+    answer_s: _Least | None = None
+    words: str | None = Field(None, max_length=MOST_WORDS)
+    in_view: bool
+    visible: bool
+    visibility: Annotated[FiniteFloat, Field(ge=0, le=1)]
+    num_pixels: NonNegativeInt
+    distance_m: _Least
+    height_m: FiniteFloat
+    clearance_m: FiniteFloat
+    speed_mps: _Least
+    pose: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+    target_m: _Triple
+
+
+class PathDifficulty(Record):
+    """How hard a pedestrian trajectory is to follow. turn_degps: mean turn. hidden_share: share of frames that hide the
+    target from a drone right behind, at the initial distance and height."""
+
+    pace: str
+    turn_degps: _Least
+    hidden_share: Annotated[FiniteFloat, Field(ge=0, le=1)]
+
+
+class Episode(Record):
+    """The record of an episode. episode: its id, unique in a folder. walk: the pedestrian trajectory. list_sha256:
+    of the benchmark's list, None for own trajectories. controller_sha256: of the table of commands, None if the student
+    returns commands. num_walk_frames: frames after the lead frames in the whole trajectory; an early end has fewer."""
+
+    episode: str = Field(min_length=1)
+    student: str
+    engine: str
+    town: str
+    map_sha256: str
+    walk: str
+    seed: int
+    style: PathDifficulty
+    dt_s: Annotated[FiniteFloat, Field(gt=0)]
+    camera_px: tuple[int, int]
+    fov_deg: Annotated[FiniteFloat, Field(gt=0, lt=180)]
+    drone_radius_m: _Least
+    list_sha256: str | None = None
+    controller_sha256: str | None = None
+    ended: Ended
+    num_walk_frames: int = Field(ge=1)
+    frames: tuple[EpisodeFrame, ...] = Field(min_length=2)
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        answers, times_s = [frame.answer for frame in self.frames], [frame.time_s for frame in self.frames]
+        if "end" in answers[:-1] or answers[-1] != "end" or "lead" in answers[self.num_lead :]:
+            raise ValueError("frames are `lead`, then decisions, then one `end`")
+        if any(later <= earlier for earlier, later in pairwise(times_s)):
+            raise ValueError("times must increase")
+        if any((frame.command is None) != (frame.answer == "end") for frame in self.frames):
+            raise ValueError(f"all frames but the last have a command, {', '.join(ACTION)}")
+        if len(self.flown) > self.num_walk_frames:
+            raise ValueError(f"{len(self.flown)} frames of a trajectory of {self.num_walk_frames}")
+        return self
+
+    @property
+    def num_lead(self) -> int:
+        """The number of frames before the first decision."""
+        return next((i for i, frame in enumerate(self.frames) if frame.answer != "lead"), len(self.frames))
+
+    @property
+    def flown(self) -> tuple[EpisodeFrame, ...]:
+        """The frames after the first decision."""
+        return self.frames[self.num_lead + 1 :]
+
+    @property
+    def decisions(self) -> tuple[EpisodeFrame, ...]:
+        """The frames with a decision."""
+        return self.frames[self.num_lead : -1]
+
+
+def episode_file(folder: Path, episode: str) -> Path:
+    """Return the path of an episode's record in an output directory of `cosfly fly`."""
+    return folder / EPISODES / f"{episode}.json"
+
+
+def write_episode(path: Path, record: Episode) -> None:
+    """Write the record of an episode atomically."""
+    write_model(path, record, EPISODE_FORMAT)
+
+
+def read_episode(path: Path) -> Episode:
+    """Read the record of an episode; raises as `read_model`."""
+    return read_model(path, Episode, EPISODE_FORMAT, tree=path.parent)
