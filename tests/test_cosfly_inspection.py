@@ -35,7 +35,7 @@ from cosfly.geometry.axes import mask_box
 from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.inspection import frames
 from cosfly.inspection.files import check_recorded
-from cosfly.inspection.frames import check_others
+from cosfly.inspection.frames import check_bystanders
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
 from cosfly.inspection.track import check_plan, is_shifted
@@ -567,7 +567,7 @@ def test_others_keep_clear_of_drone_and_person(workplace, beside, shift_m, codes
     place_m = (flight.positions_m if beside == "drone" else flight.targets_m)[3] + np.array(shift_m)
     other = other_at(place_m, "Vegetation" if beside == "kind" else "Pedestrians")
     told = BystandersMeta(target_hidden_by_others=0.25, target_hidden_by_map=0.0, others=[other])
-    check_others(flight, {3: told, 4: told.model_copy(update={"others": []})}, 2.5, report, metrics)
+    check_bystanders(flight, {3: told, 4: told.model_copy(update={"others": []})}, 2.5, report, metrics)
     assert {issue.code for issue in report.issues} == codes
     assert (metrics["num_others"], metrics["occluded_by_others_share"], metrics["hidden_by_others_max"]) == (
         1,

@@ -1,1 +1,1 @@
-"""Step 6: measure, accept, review or reject every flight."""
+"""Step 6: measure, accept, review or reject every track."""

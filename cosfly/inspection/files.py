@@ -1,6 +1,6 @@
-"""Checks on the files of one flight: are they all there, of the right kind and size, and those that were recorded?
+"""Checks of the files of one track: presence, kind, size, and the recorded digests.
 
-They judge nothing: findings go into a Report; the thresholds that make a flight acceptable stand in flight.py.
+Findings go into a Report; the thresholds of acceptance are in track.py.
 """
 
 from __future__ import annotations
@@ -18,64 +18,61 @@ from cosfly.runtime.io import CHECKSUMS, read_checksums, sha256_bytes, sha256_fi
 from cosfly.runtime.worker import advance
 
 
-def check_files(flight: Track, report: Report) -> dict[int, FrameMeta | None]:
-    """Check that every frame has its files, of the right size and type by their headers, and no frame stands alone.
+def check_files(track: Track, report: Report) -> dict[int, FrameMeta | None]:
+    """Check by the headers that every frame has its files, of the right size and type.
 
-    A flight may lack a kind of file altogether that its checksums do not list, as one of somebody else does:
-    `meta.json` is cosfly's own, and public readers ask for `rgb.png` alone. One of cosfly's lacks what was not drawn
-    (`render.modalities`).
+    A tree of another program may lack a kind of file, such as `meta.json`, if its checksums list none.
 
     Returns:
-        of each frame that is complete so far its annotation, None in a tree without.
+        The annotation of each complete frame, None in a tree without annotations.
     """
-    assert flight.folder is not None
-    tree = tree_of_track(flight.folder)
-    size = (flight.camera.width_px, flight.camera.height_px)
+    assert track.folder is not None
+    tree = tree_of_track(track.folder)
+    size = (track.camera.width_px, track.camera.height_px)
     complete: dict[int, FrameMeta | None] = {}
-    absent = [name for name in FRAME_FILES[1:] if not _has_any(flight, name)]
-    absent = [] if absent and _lists(flight, absent) else absent
+    absent = [name for name in FRAME_FILES[1:] if not _has_any(track, name)]
+    absent = [] if absent and _lists(track, absent) else absent
     names = [name for name in FRAME_FILES if name not in absent]
     for name in absent:
         report.add(
-            "note", "not_in_this_tree", f"{FRAMES_DIR}/*/{name}", "no such file", "one a frame, in cosfly's trees"
+            "note", "not_in_this_tree", f"{FRAMES_DIR}/*/{name}", "no such file", "one per frame in cosfly's trees"
         )
-    for i in range(len(flight)):
-        problems_before, meta = len(report.issues), None
+    for i in range(len(track)):
+        num_issues, meta = len(report.issues), None
         for name in names:
-            path = frame_path(flight.frame_folder(i), name)
+            path = frame_path(track.frame_folder(i), name)
             where = f"{frame_name(i)}/{path.name}"
             if not path.is_file():
                 report.error("missing_file", where, "no such file", "one file per frame and modality")
             elif name == "meta.json":
-                meta = _check_meta(flight, i, report)
+                meta = _check_meta(track, i, report)
             else:
                 _check_header(path, size, tree, where, report)
-        if len(report.issues) == problems_before:
+        if len(report.issues) == num_issues:
             complete[i] = meta
-    known = {Path(frame_name(i)).name for i in range(len(flight))}
-    frames = flight.folder / FRAMES_DIR
+    known = {Path(frame_name(i)).name for i in range(len(track))}
+    frames = track.folder / FRAMES_DIR
     for stray in sorted(p.name for p in frames.iterdir() if p.name not in known) if frames.is_dir() else []:
         report.warn("stray_frame", f"{FRAMES_DIR}/{stray}", "no point of this index", f"{len(known)} frames")
     return complete
 
 
-def _lists(flight: Track, names: Collection[str]) -> bool:
-    """Return whether the checksums of a flight list a file of these names; where they cannot be read, they may."""
-    assert flight.folder is not None
-    if not (flight.folder / CHECKSUMS).is_file():
-        return False
+def _has_any(track: Track, name: str) -> bool:
+    return any(frame_path(track.frame_folder(i), name).exists() for i in range(len(track)))
+
+
+def _lists(track: Track, names: Collection[str]) -> bool:
+    """Return whether a track's checksums list files of these names, or cannot be read."""
+    assert track.folder is not None
     try:
-        return any(public_name(listed.rpartition("/")[2]) in names for listed in read_checksums(flight.folder))
+        listed = read_checksums(track.folder) if (track.folder / CHECKSUMS).is_file() else {}
     except InputError:
         return True
-
-
-def _has_any(flight: Track, name: str) -> bool:
-    return any(frame_path(flight.frame_folder(i), name).exists() for i in range(len(flight)))
+    return any(public_name(name.rpartition("/")[2]) in names for name in listed)
 
 
 def _check_header(path: Path, size: tuple[int, int], tree: Path, where: str, report: Report) -> None:
-    """Check type and (width, height) of a picture or a depth image, by its header."""
+    """Check type and (width, height) of a picture or a depth image by its header."""
     is_depth = path.suffix == ".npy"
     expected = f"float32 ({size[1]}, {size[0]})" if is_depth else f"a PNG of {size[0]} x {size[1]} px"
     try:
@@ -89,10 +86,10 @@ def _check_header(path: Path, size: tuple[int, int], tree: Path, where: str, rep
         report.error("wrong_format", where, found, expected)
 
 
-def _check_meta(flight: Track, i: int, report: Report) -> FrameMeta | None:
+def _check_meta(track: Track, i: int, report: Report) -> FrameMeta | None:
     where = f"{frame_name(i)}/meta.json"
     try:
-        meta = read_meta(flight.frame_folder(i))
+        meta = read_meta(track.frame_folder(i))
     except InputError as error:
         report.error("broken_annotation", where, error.got, "a frame annotation")
         return None
@@ -102,56 +99,57 @@ def _check_meta(flight: Track, i: int, report: Report) -> FrameMeta | None:
 
 
 class Checksums:
-    """The digests that `checksums.sha256` lists, each compared once: with a file that is read anyway, or at the end."""
+    """The digests in `checksums.sha256`, each compared once: when a file is read anyway, or at the end."""
 
-    def __init__(self, flight: Track, report: Report, *, is_wanted: bool) -> None:
-        self._flight, self._report = flight, report
-        self._open = _listed(flight, report) if is_wanted else {}
+    def __init__(self, track: Track, report: Report, *, is_wanted: bool) -> None:
+        self._track, self._report = track, report
+        self._open = self._listed() if is_wanted else {}
+
+    def _listed(self) -> dict[str, str]:
+        folder = self._track.folder
+        assert folder is not None
+        if not (folder / CHECKSUMS).is_file():
+            self._report.add("note", "no_checksums", CHECKSUMS, "no such file", "digests of the track's files")
+            return {}
+        try:
+            return read_checksums(folder)
+        except InputError as error:
+            self._report.error("checksum", CHECKSUMS, error.got or error.what, "lines of sha256sum")
+            return {}
 
     def compare(self, name: str, data: bytes) -> None:
-        """Compare the bytes of a file, whose name is relative to the flight's folder."""
+        """Compare the content of a file; its name is relative to the track's folder."""
         digest = self._open.pop(name, None)
         if digest is not None and sha256_bytes(data) != digest:
-            self._tell(name)
+            _report_changed(name, CHECKSUMS, self._report)
 
-    def compare_others(self) -> None:
-        """Read the files whose bytes nobody brought."""
-        assert self._flight.folder is not None
+    def compare_rest(self) -> None:
+        """Read and compare the files that were not compared yet."""
+        assert self._track.folder is not None
         for name, digest in self._open.items():
             advance()
-            path = self._flight.folder / name
-            if not path.is_file():
-                self._report.error("missing_file", name, "no such file", f"a file, listed in {CHECKSUMS}")
-            elif sha256_file(path) != digest:
-                self._tell(name)
-
-    def _tell(self, name: str) -> None:
-        self._report.error("checksum", name, "other bytes", f"the digest in {CHECKSUMS}")
+            _compare_file(self._track.folder / name, name, digest, CHECKSUMS, self._report)
 
 
-def _listed(flight: Track, report: Report) -> dict[str, str]:
-    assert flight.folder is not None
-    if not (flight.folder / CHECKSUMS).is_file():
-        report.add("note", "no_checksums", CHECKSUMS, "no such file", "digests of the flight's files")
-        return {}
-    try:
-        return read_checksums(flight.folder)
-    except InputError as error:
-        report.error("checksum", CHECKSUMS, error.got or error.what, "lines of sha256sum")
-        return {}
+def _compare_file(path: Path, name: str, digest: str, listed_in: str, report: Report) -> None:
+    if not path.is_file():
+        report.error("missing_file", name, "no such file", f"a file, listed in {listed_in}")
+    elif sha256_file(path) != digest:
+        _report_changed(name, listed_in, report)
 
 
-def check_recorded(flight: Track, root: Path, recorded: Mapping[str, str], report: Report) -> None:
-    """Compare a flight's own records with its tree's manifest, `recorded`: path in the tree -> sha256."""
-    assert flight.folder is not None
+def _report_changed(name: str, listed_in: str, report: Report) -> None:
+    report.error("checksum", name, "other bytes", f"the digest in {listed_in}")
+
+
+def check_recorded(track: Track, root: Path, recorded: Mapping[str, str], report: Report) -> None:
+    """Compare a track's own records with its tree's manifest. recorded: path in the tree -> sha256."""
+    assert track.folder is not None
     for name in ("trajectory.json", CHECKSUMS) if recorded else ():
-        path = flight.folder / name
+        path = track.folder / name
         digest = recorded.get(path.relative_to(root).as_posix())
-        if digest is None and name == "trajectory.json":
-            report.error(
-                "not_of_this_tree", name, "no such entry in the tree's manifest", "a flight that was made with it"
-            )
-        elif digest is not None and not path.is_file():
-            report.error("missing_file", name, "no such file", "a file, listed in the tree's manifest")
-        elif digest is not None and sha256_file(path) != digest:
-            report.error("checksum", name, "other bytes", "the digest in the tree's manifest")
+        if digest is not None:
+            _compare_file(path, name, digest, "the tree's manifest", report)
+        elif name == "trajectory.json":
+            got, expected = "no such entry in the tree's manifest", "a track that was made with it"
+            report.error("not_of_this_tree", name, got, expected)

@@ -1,10 +1,8 @@
-"""All pixels of one frame, unpacked once and looked at once: what surfaces look like, which ids fight for them, where
-people are.
+"""Figures of all pixels of one frame: surfaces without texture, Z-fighting, and the place of pedestrians.
 
-It judges nothing. A missing texture shows in two ways: the magenta that engines paint in its stead, or a large surface
-whose pixels are all of one colour. Where two surfaces lie in one plane, rounding decides pixel by pixel which is drawn
-(Z-fighting): their ids alternate over a depth that runs on as that of one plane. It counts where it shows, in colours
-or in kinds.
+A missing texture shows as the magenta of many engines, or as a large surface of one colour. Where two surfaces lie in
+one plane, rounding decides which is drawn at each pixel (Z-fighting): their ids alternate over the depth of one plane.
+It counts if colours or kinds differ.
 """
 
 from __future__ import annotations
@@ -25,22 +23,21 @@ NO_DEPTH.flags.writeable = False
 NO_IDS = np.empty((0, 0, 3), np.uint8)
 NUM_IDS = 1 << 16
 PERSON, NOTHING, SKY = KINDS["Pedestrians"], KINDS["NONE"], KINDS["Sky"]
-SHARED_ID = 65534  # stands for all boxes beyond the ids that fit (docs/files.md): its neighbours tell nothing
-MAGENTA_LEAST, MAGENTA_MOST = 200, 60  # red and blue at least, green at most; no light or haze makes that of a surface
-DARK = 16  # grey levels: below, night leaves one colour of many
-SHORTEST_RUN_PX = 3  # of an id: as much or less is a stripe that rounding made
-# Of a plane 1 / depth is linear in the picture, so that two surfaces fight only where both lie on that line; 1 cm at 30
-# m.
+SHARED_ID = 65534  # of all boxes beyond the range of ids (docs/files.md)
+MAGENTA_LEAST, MAGENTA_MOST = 200, 60  # red and blue at least, green at most
+DARK = 16  # grey levels: below, surfaces have one colour at night
+SHORTEST_RUN_PX = 3  # of an id: longer runs are no stripes of rounding
+# 1 / depth of a plane is linear in the picture, so surfaces fight only on that line. The tolerance is 1 cm at 30 m.
 PLANE_SHARE = 3e-4
 GRAINLESS = 0.9  # share of equal neighbours on all other surfaces
-# Of red, green and blue together: more than the grain of one surface; two of one kind and colour fight unseen.
+# Sum over red, green and blue: more than the grain of one surface.
 VISIBLE_STEP = 60
-LEAST_PAIRS = 400  # neighbouring pixels of a surface, for a share of them to mean something
+LEAST_PAIRS = 400  # neighbouring pixels of a surface that is judged
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A frame's pictures. colours, instance: (h, w, 3) uint8; depth: (h, w) float32 m; the last two may be empty."""
+    """A frame. colours, instance: (h, w, 3) uint8; depth: (h, w) float32 m; the last two may be empty."""
 
     colours: np.ndarray
     depth: np.ndarray
@@ -49,11 +46,11 @@ class Picture:
 
 @dataclass(frozen=True)
 class PixelFigures:
-    """What the pixels of a frame show.
+    """Figures of a frame.
 
-    flat: share of the picture of the largest surface that is of one colour where others have grain, 0 of none;
-    flat_kind: its kind. magenta, fighting: shares of the picture. person_box: round all pixels of people, without those
-    left out: (4,) xmin, ymin, xmax, ymax px; None: no such pixel.
+    flat: share of the picture of the largest surface of one colour, 0 if there is none or all surfaces are so;
+    flat_kind: its kind. magenta, fighting: shares of the picture. person_box: box of pedestrian pixels that are no
+    bystander's, (4,) xmin, ymin, xmax, ymax px, or None.
     """
 
     flat: float
@@ -64,43 +61,39 @@ class PixelFigures:
 
 
 def unpack(files: dict[str, bytes], where: Path) -> Picture:
-    """Unpack the files of a frame, by their names; depth and `instance.png` may be absent.
-
-    Raises:
-        InputError: one is damaged, of another size than `rgb.png`, or no picture of a playback tree; names it.
-    """
+    """Decode the files of a frame, by name; depth and `instance.png` are optional. Raises InputError for an
+    invalid one."""
     colours = colours_of(files["rgb.png"], where / "rgb.png")
     instance = colours_of(files["instance.png"], where / "instance.png") if "instance.png" in files else NO_IDS
     depth_name = next((name for name in files if public_name(name) == DEPTH_NPY), DEPTH_NPY)
     depth = depth_values(memoryview(files[depth_name]), where / depth_name) if depth_name in files else NO_DEPTH
-    depth.flags.writeable = False  # the compiled checks are compiled for such, once
+    depth.flags.writeable = False  # the kernels are compiled for read-only arrays only
     for name, values in (("instance.png", instance), (depth_name, depth)):
         if values.size and values.shape[:2] != colours.shape[:2]:
             got, expected = ("{1} x {0} px".format(*found.shape) for found in (values, colours))
-            raise InputError("of another size than rgb.png", where=where / name, got=got, expected=expected)
+            raise InputError("the size differs from rgb.png", where=where / name, got=got, expected=expected)
     return Picture(colours, depth, instance)
 
 
-def look_at(picture: Picture, left_out: np.ndarray, flat_share: float) -> PixelFigures:
-    """Look at all pixels of a frame.
+def measure_pixels(picture: Picture, is_bystander: np.ndarray, flat_share: float) -> PixelFigures:
+    """Return the figures of a frame.
 
     Args:
-        left_out: (65536,) bool, ids of people who are not the target. flat_share: so many neighbours of one colour make
-            a surface flat.
+        is_bystander: (65536,) bool, by id. flat_share: share of equal neighbours in a surface of one colour.
     """
     num_pixels = picture.colours.shape[0] * picture.colours.shape[1]
     if not picture.instance.size:
         red, green, blue = (picture.colours[..., k] for k in range(3))
         magenta = (red >= MAGENTA_LEAST) & (blue >= MAGENTA_LEAST) & (green <= MAGENTA_MOST)
         return PixelFigures(0.0, 0, float(magenta.mean()), 0.0, None)
-    all_pairs, all_equal, all_bright, kinds, counts, box = _look(
-        picture.colours, picture.instance, picture.depth, left_out
+    all_pairs, all_equal, all_bright, kinds, counts, box = _measure(
+        picture.colours, picture.instance, picture.depth, is_bystander
     )
-    ids = np.unique(np.append(np.flatnonzero(all_pairs), 0))  # few of all; 0 also where there is none
+    ids = np.unique(np.append(np.flatnonzero(all_pairs), 0))  # few of all, and 0
     pairs, equal, bright = all_pairs[ids], all_equal[ids], all_bright[ids]
     candidates = (pairs >= LEAST_PAIRS) & (equal >= flat_share * pairs) & (bright >= DARK * pairs)
     largest = int(np.argmax(np.where(candidates, pairs, 0)))
-    # A renderer that draws all surfaces without grain misses no texture.
+    # A renderer without grain on any surface misses no texture.
     others_equal, others = int(equal.sum() - equal[largest]), int(pairs.sum() - pairs[largest])
     is_judged = bool(candidates[largest]) and others_equal < GRAINLESS * others
     flat = float(pairs[largest]) / num_pixels if is_judged else 0.0
@@ -110,7 +103,7 @@ def look_at(picture: Picture, left_out: np.ndarray, flat_share: float) -> PixelF
 
 @njit(cache=True, nogil=True)
 def _is_plane(depth, y0, x0, y1, x1):  # type: ignore[no-untyped-def]
-    """Return whether the depth between two pixels of a row or a column is that of one plane."""
+    """Return whether the depth between two pixels of a row or column is that of a plane."""
     first, last = float(depth[y0, x0]), float(depth[y1, x1])
     if not (INVALID_DEPTH_M < first < SKY_DEPTH_M and INVALID_DEPTH_M < last < SKY_DEPTH_M):
         return False
@@ -127,7 +120,7 @@ def _is_plane(depth, y0, x0, y1, x1):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _differs(colours, instance, y0, x0, y1, x1):  # type: ignore[no-untyped-def]
-    """Return whether an eye or a mask of kinds tells two pixels apart."""
+    """Return whether colour or kind of two pixels differ visibly."""
     step = np.int64(0)
     for c in range(3):
         step += abs(np.int64(colours[y0, x0, c]) - np.int64(colours[y1, x1, c]))
@@ -136,39 +129,37 @@ def _differs(colours, instance, y0, x0, y1, x1):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _pack(row, tones, codes, shades):  # type: ignore[no-untyped-def]
-    """Write each pixel of a row as one number, kind lowest and red lowest.
-
-    Its places are unsigned, here and in `_look`: of others numba looks whether they count from the end.
-    """
+    """Pack each pixel of a row into one number, kind and red lowest. Unsigned indices avoid numba's wraparound
+    checks."""
     for x in range(np.uint64(len(row))):
         codes[x] = np.int32(row[x, 0]) | np.int32(row[x, 1]) << 8 | np.int32(row[x, 2]) << 16
         shades[x] = np.uint32(tones[x, 0]) | np.uint32(tones[x, 1]) << 8 | np.uint32(tones[x, 2]) << 16
 
 
 @njit(cache=True, nogil=True)
-def _look(colours, instance, depth, left_out):  # type: ignore[no-untyped-def]
-    """Of each id: pairs of neighbours in a row, those of one colour, sum of their green, its kind. Counts: magenta,
-    fighting. Box of people."""
+def _measure(colours, instance, depth, is_bystander):  # type: ignore[no-untyped-def]
+    """Return by id the pairs of neighbours in a row, those of one colour, their sum of green, and the kind; the
+    counts of magenta and fighting pixels; the box of pedestrians that are no bystanders."""
     height, width = instance.shape[:2]
     has_depth = depth.shape[0] > 0
     pairs, equal, bright = np.zeros(NUM_IDS, np.int64), np.zeros(NUM_IDS, np.int64), np.zeros(NUM_IDS, np.int64)
     kinds, counts = np.zeros(NUM_IDS, np.uint8), np.zeros(2, np.int64)
     box = np.array([1 << 30, 1 << 30, -1, -1], np.int64)
-    # Of the run of a column that goes on, and of the two before it: id and first row.
+    # Id and first row of the current run of each column, and of the two before it.
     ids, firsts = np.full((3, width), -1, np.int32), np.zeros((3, width), np.int32)
     codes, shades = np.full(width + 1, -1, np.int32), np.empty(width, np.uint32)
     one, size, byte = np.uint64(1), np.uint64(width), np.uint32(255)
     for y in range(height):
         _pack(instance[y], colours[y], codes, shades)
         first = np.uint64(0)
-        id1, id2, id3 = np.int64(-1), np.int64(-1), np.int64(-1)  # of the three runs before this one
+        id1, id2, id3 = np.int64(-1), np.int64(-1), np.int64(-1)  # of the three previous runs
         first1, first2 = np.int64(0), np.int64(0)
         while first < size:
             code, end = np.int64(codes[first]), first + one
-            while codes[end] == code:  # -1 stands behind the row
+            while codes[end] == code:  # -1 follows the row
                 end += one
             begin, kind, number = np.int64(first), code & 255, code >> 8
-            if kind == PERSON and not left_out[number]:
+            if kind == PERSON and not is_bystander[number]:
                 box[0], box[1] = min(box[0], begin), min(box[1], y)
                 box[2], box[3] = max(box[2], np.int64(end)), max(box[3], y + 1)
             if kind not in (NOTHING, SKY):
@@ -185,7 +176,7 @@ def _look(colours, instance, depth, left_out):  # type: ignore[no-untyped-def]
                 bright[number] += light
                 counts[0] += pink
             if has_depth:
-                # Runs 3, 2, 1 and this: A, B, A, B, of which the two in the middle are short.
+                # Runs 3, 2, 1 and this one: A, B, A, B, with short ones in the middle.
                 if (
                     code == id2
                     and id1 == id3
@@ -193,7 +184,7 @@ def _look(colours, instance, depth, left_out):  # type: ignore[no-untyped-def]
                     and first1 - first2 <= SHORTEST_RUN_PX
                     and number != SHARED_ID
                     and id1 >> 8 != SHARED_ID
-                    and (code | id1) >> 8 != 0  # far fields are narrow stripes, all of them nobody's
+                    and (code | id1) >> 8 != 0  # distant fields are narrow stripes without an id
                     and _is_plane(depth, y, first2 - 1, y, begin)
                     and _differs(colours, instance, y, first1 - 1, y, first1)
                     and _differs(colours, instance, y, begin - 1, y, begin)

@@ -1,4 +1,4 @@
-"""`report.html` of the inspection: one self-contained page (no script, no network) for the person who decides."""
+"""`report.html` of the inspection: one self-contained page, without scripts, for the reviewer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from cosfly.formats.inspection import RESULTS, Inspection, TrackInspection
 from cosfly.formats.playback import STATES
-from cosfly.inspection.view import PLOTS, TrackView, in_question
+from cosfly.inspection.view import PLOTS, TrackView, frames_of_issues
 from cosfly.runtime.io import read_text
 from cosfly.viz.coverage_page import coverage_html
 from cosfly.viz.page import fragment, page
@@ -37,19 +37,19 @@ OPENING_PICTURES = 4
 
 
 def report_html(name: str, inspection: Inspection, views: Mapping[str, TrackView], page_mb: float) -> str:
-    """Return the page. Flights that need a look come first, and are the last to lose their pictures.
+    """Return the page. Tracks that need a decision come first, and keep their pictures longest.
 
     Args:
-        name: of the run. views: pictures and curves by flight folder, of which as many are shown as the page may hold.
+        name: of the run. views: pictures and curves by track folder, as many as `page_mb` allows.
     """
-    order = sorted(inspection.flights, key=lambda f: (-RESULTS.index(f.result), f.folder))
+    order = sorted(inspection.flights, key=lambda track: (-RESULTS.index(track.result), track.folder))
     is_covered = inspection.coverage is not None and inspection.coverage.frames
-    accepted = [flight for flight in inspection.flights if flight.result == "accepted"] or inspection.flights
+    accepted = [track for track in inspection.flights if track.result == "accepted"] or inspection.flights
     shown = [
-        views[flight.folder].pictures[1] for flight in sorted(accepted, key=lambda f: f.track) if flight.folder in views
+        views[one.folder].pictures[1] for one in sorted(accepted, key=lambda one: one.track) if one.folder in views
     ]
     counts = {
-        state: sum(int(flight.metrics.get(f"frames_{state.replace(' ', '_')}") or 0) for flight in inspection.flights)
+        state: sum(int(track.metrics.get(f"frames_{state.replace(' ', '_')}") or 0) for track in inspection.flights)
         for state in STATES
     }
     total = sum(counts.values())
@@ -71,28 +71,28 @@ def report_html(name: str, inspection: Inspection, views: Mapping[str, TrackView
 
 
 def cards(flights: list[TrackInspection], views: Mapping[str, TrackView], page_mb: float) -> dict[str, Any]:
-    """Return what the page shows of flights: a row for each that opens, and how many lack pictures for its size."""
+    """Return the cards of tracks, and how many have no pictures because of the page's size."""
     parts, size, left_out = list[str](), 0, 0
-    for flight in flights:
-        card = _card(flight, views.get(flight.folder))
-        if flight.folder in views and size + len(card) > page_mb * MB:
-            card, left_out = _card(flight, None), left_out + 1
+    for track in flights:
+        card = _card(track, views.get(track.folder))
+        if track.folder in views and size + len(card) > page_mb * MB:
+            card, left_out = _card(track, None), left_out + 1
         size += len(card)
         parts.append(card)
     return {"style": STYLE, "columns": COLUMNS, "cards": parts, "left_out": left_out, "page_mb": page_mb}
 
 
-def _card(flight: TrackInspection, view: TrackView | None) -> str:
-    issues = [issue for issue in flight.issues if issue.severity != "note"]
+def _card(track: TrackInspection, view: TrackView | None) -> str:
+    issues = [issue for issue in track.issues if issue.severity != "note"]
     plots = [] if view is None else [plot for name in PLOTS if (plot := _plot(name, view)) is not None]
     return fragment(
-        "cosfly/inspection/card.html", flight=flight, columns=COLUMNS, issues=issues, view=view, plots=plots,
-        asked=in_question(flight.issues, int(flight.metrics.get("num_frames") or 0)),
+        "cosfly/inspection/card.html", track=track, columns=COLUMNS, issues=issues, view=view, plots=plots,
+        asked=frames_of_issues(track.issues, int(track.metrics.get("num_frames") or 0)),
     )  # fmt: skip
 
 
 def _plot(name: str, view: TrackView) -> dict[str, Any] | None:
-    """Return a curve over time and its range; a gap where a value is unknown. None where all are."""
+    """Return a curve over time and its range, with gaps for unknown values; None if all are unknown."""
     title, unit, span = PLOTS[name]
     values, time_s = view.curves.get(name, []), view.time_s
     known = [value for value in values if value is not None]

@@ -1,4 +1,4 @@
-"""The thresholds of the inspection, each with why it is where it is."""
+"""The thresholds of the inspection, with their reasons."""
 
 from __future__ import annotations
 
@@ -17,39 +17,29 @@ from cosfly.runtime.config import Config
 
 Share = Annotated[float, Field(ge=0, le=1)]
 
+POSE_TOLERANCE_M = 1e-3  # distance allowed between a track's pose and its plan
+ROTATION_TOLERANCE_DEG = 0.01
+REPROJECTION_TOLERANCE_PX = 0.5  # distance allowed between the recorded and the projected target
+DRONE_SPEED_MAX_MPS = 25.0  # a faster step between two frames is a teleport
+TARGET_SPEED_MAX_MPS = 10.0
+# Beyond these values a track goes to review.
+TRACK_QUALITY_MIN = 0.25  # mean IoU of projected box and mask
+INVALID_DEPTH_MAX = 0.01  # share of invalid depth pixels in a frame
+FLAT_SURFACE_MAX = 0.01  # share of a picture of a surface of one colour (a missing texture); rendered ones have grain
+MAGENTA_MAX = 1e-3  # share of a picture in the magenta of missing textures; renders have none
+Z_FIGHTING_MAX = 1e-3  # share of pixels that alternate between surfaces of a plane; renders of three maps: 1.2e-4
+JUMP_GONE_MAX = 0.02  # share of static surface that is missing in the next or previous frame; renders have 0
 
-POSE_TOLERANCE_M = 1e-3  # distance allowed between a flight's pose and its plan, m
-ROTATION_TOLERANCE_DEG = 0.01  # turn allowed between a flight's pose and its plan
-REPROJECTION_TOLERANCE_PX = 0.5  # distance allowed between the recorded and the projected target, px
-DRONE_SPEED_MAX_MPS = 25.0  # a faster step between two frames is a teleport, m/s
-TARGET_SPEED_MAX_MPS = 10.0  # the same for the person, m/s
-TRACK_QUALITY_MIN = 0.25  # mean IoU of projected box and mask below this goes to review
 MASK_VISIBILITY_MIN = 0.5  # a frame at least this visible must show pedestrian pixels at the target's box
-INVALID_DEPTH_MAX = 0.01  # share of invalid depth pixels above this in any frame goes to review
-# a surface of one colour that fills more of a picture goes to review (a missing texture); drawn ones have grain,
-# rounding and light
-FLAT_SURFACE_MAX = 0.01
-# a surface is of one colour where so many of its neighbouring pixels are equal; renders of three maps have at most
-# 0.95
-FLAT_PAIRS_MIN = 0.99
-# share of a picture in the magenta that engines paint for a missing texture; more goes to review; renders have none
-MAGENTA_MAX = 1e-3
-# share of pixels that alternate every 3 px or less between two surfaces in one plane, of other kinds or colours; more
-# goes to review; renders of three maps have at most 1.2e-4
-Z_FIGHTING_MAX = 1e-3
-# share of what stood still in this frame or the one before and is looked through in the other; more goes to review;
-# renders have 0
-JUMP_GONE_MAX = 0.02
-THUMBNAIL_PX = 240  # width of the pictures in report.html, px
-# size of report.html beyond which flights are listed without pictures, map and plots, accepted
-# ones first, MB; a flight takes 0.06
-PAGE_MB = 25.0
+FLAT_PAIRS_MIN = 0.99  # share of equal neighbours in a surface of one colour; renders of three maps have at most 0.95
+THUMBNAIL_PX = 240  # width of the pictures in report.html
+PAGE_MB = 25.0  # size of report.html beyond which tracks have no pictures, accepted ones first; a track takes 0.06
 
 
 class InspectConfig(Config):
-    """Thresholds of the inspection. An error rejects a flight, a warning routes it to manual review."""
+    """Thresholds of the inspection. An error rejects a track, a warning sends it to review."""
 
-    flights: TrackChoice = Field(TrackChoice(), description="which flights of the tree")
+    flights: TrackChoice = Field(TrackChoice(), description="tracks of the tree")
     accel_rms_max_mps2: float = Field(
         ACCEL_RMS_MAX_MPS2, gt=0, description="planned RMS acceleration above this rejects, m/s^2"
     )
@@ -57,14 +47,16 @@ class InspectConfig(Config):
     smoothness_min: Share = Field(0.5, description="smoothness score S below this goes to review; 0 turns the rule off")
     five_ray_mean_min: Share = Field(
         FIVE_RAY_MEAN_MIN,
-        description="mean five-ray visibility of the flight's poses below this rejects; 0 turns the rule off",
+        description="mean five-ray visibility of the poses below this rejects; 0 turns the rule off",
     )
     clearance_min_m: float = Field(
-        RELAXED_SAFETY_M, ge=0, description="a drone nearer than this to an obstacle rejects, m; 0: only one inside"
+        RELAXED_SAFETY_M,
+        ge=0,
+        description="a smaller distance of the drone to an obstacle rejects, m; 0: only inside one",
     )
     check_pixels: Literal["all", "sample", "none"] = Field(
         "all",
-        description="decode every frame, an even sample, or none (then only names, headers and poses are checked)",
+        description="decode all frames, an even sample, or none (then only names, headers and poses are checked)",
     )
-    pixel_sample: ClassVar[int] = 16  # frames per flight that check_pixels: sample decodes
+    pixel_sample: ClassVar[int] = 16  # frames per track of check_pixels=sample
     check_checksums: bool = Field(True, description="read every file and compare it with checksums.sha256")

@@ -1,8 +1,6 @@
-"""Step 6, `cosfly inspect`: measure every flight, accept it, route it to a person, or reject it (sec:step6).
+"""Step 6, `cosfly inspect`: measures every track and accepts it, sends it to review, or rejects it (sec:step6).
 
-Reads `step2_simplified.json`, `drone_trace.json` and the playback tree, writes `inspect.json` and a self-contained
-`report.html`. Changes nothing in the tree. The folder is not called `inspect`: a file of that name would hide the
-standard library's.
+Changes nothing in the tree. The package is not called `inspect`, which would hide the standard library's module.
 """
 
 from __future__ import annotations
@@ -43,7 +41,7 @@ log = logging.getLogger(__name__)
 
 
 def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None, data: Path) -> Work:
-    """Worker factory: give the function that inspects one flight folder."""
+    """Open map and plans in this process; return the function that inspects one track."""
     from cosfly.geometry.kernels import obstacle_index
 
     box_map = None if simplified is None else read_boxes(simplified)
@@ -72,135 +70,113 @@ def run(
     watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
-    """Read the simplified map, the plans and the playback tree, write `inspect.json` and `report.html`; give the
+    """Read the simplified map, the plans and the playback tree; write `inspect.json` and `report.html`. Return the
     former's path.
 
     Args:
-        simplified, traces: `step2_simplified.json`, `drone_trace.json`; None for a tree of somebody else: nothing is
-            held against them.
+        simplified, traces: `step2_simplified.json`, `drone_trace.json`; None for a tree of another program.
+
     Raises:
-        NothingKept: every flight was rejected; both files are there and say why.
+        NothingKept: Every track was rejected; both files are written and give the reasons.
     """
     given = {"simplified": simplified, "traces": traces, "data": data}
     inputs = {name: path for name, path in given.items() if path is not None}
-    # Flights of the tree that were changed since are found one by one, and rejected.
+    # Tracks that were changed since are found one by one, and rejected.
     stage = StageFolder.open(out, "inspect", config=cfg, inputs=inputs, seed=0, resume=resume, audited=("data",))
     product = out / "inspect.json"
     if stage.is_complete:
         return product
     planned = None if traces is None else read_traces(traces)
     names = [folder.relative_to(data).as_posix() for folder in find_tracks(data, cfg.flights)]
-    every = cfg.check_pixels == "all"  # then a frame is a step
+    every = cfg.check_pixels == "all"  # then the progress bar counts frames
     items = [Item(name, name, num_steps=_num_frames(data / name) if every else None) for name in names]
-    arguments, label = (cfg, simplified, traces, data), "inspect: frames" if every else "inspect: flights"
+    arguments, label = (cfg, simplified, traces, data), "inspect: frames" if every else "inspect: tracks"
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label=label)
     inspection, views = assemble(finished, planned, cfg, data)
     write_inspection(product, inspection)
     write_bytes(out / "report.html", report_html(run_name(out), inspection, views, PAGE_MB).encode())
     stage.finish([product, out / "report.html"], finished.tally, funnel=inspection.funnel.model_dump(mode="json"))
-    _tell_review(inspection.funnel.flights, out)
+    _log_review(inspection.funnel.flights, out)
     return product
 
 
-def _tell_review(flights: TrackFunnel, out: Path) -> None:
-    """Return which flights wait for a person: loudly where no other is left, so that a release would be empty."""
-    if flights.review:
-        level = logging.INFO if flights.accepted else logging.WARNING
-        reasons = ", ".join(f"{code} {count}" for code, count in flights.reasons.items())
+def _log_review(counts: TrackFunnel, out: Path) -> None:
+    """Log how many tracks wait for review, as a warning if none is accepted, since a release would be empty."""
+    if counts.review:
+        reasons = ", ".join(f"{code} {count}" for code, count in counts.reasons.items())
         log.log(
-            level,
-            "inspect: %d of %d flights wait for a person (%s): %s",
-            flights.review,
-            flights.inspected,
-            reasons,
-            how_to_decide(out),
-        )
+            logging.INFO if counts.accepted else logging.WARNING,
+            "inspect: %d of %d tracks wait for a person (%s): %s",
+            counts.review, counts.inspected, reasons, how_to_decide(out),
+        )  # fmt: skip
 
 
 def _num_frames(folder: Path) -> int:
-    """About how many frames a flight has, for the progress bar: its folders are counted, nothing is read."""
+    """Return about how many frames a track has, for the progress bar, by its frame folders."""
     return max(1, sum(1 for _ in (folder / FRAMES_DIR).glob("frame_*")))
 
 
 def assemble(
     finished: ItemOutcomes, planned: list[DroneTrace] | None, cfg: InspectConfig, data: Path
 ) -> tuple[Inspection, dict[str, TrackView]]:
-    """Put the outcomes of all flights together: the inspection, and the report's material by flight folder."""
-    flights: list[TrackInspection] = []
+    """Merge the outcomes of all tracks: the inspection, and the report's views by track folder."""
+    tracks: list[TrackInspection] = []
     views: dict[str, TrackView] = {}
     covered: list[Coverage] = []
     for outcome in finished.records:
         if isinstance(outcome, Failed):
-            flights.append(_unreadable(outcome, planned or [], data))
+            tracks.append(_unreadable(outcome, planned or [], data))
         else:
             inspected = result_of(outcome, InspectedTrack)
-            flights.append(inspected.record)
+            tracks.append(inspected.record)
             views[outcome.id] = inspected.view
             if inspected.record.result == "accepted":
                 covered.append(inspected.coverage)
-    flights = _with_twins_trace(flights)
-    funnel = Funnel(trajectories=_trajectory_funnel(flights, planned), flights=_flight_funnel(flights))
+    # The funnel counts an unreadable track at the plan of its twin.
+    trace_ids = {Path(track.folder).parent: track.trace_id for track in tracks if track.trace_id is not None}
+    tracks = [
+        track.model_copy(update={"trace_id": track.trace_id or trace_ids.get(Path(track.folder).parent)})
+        for track in tracks
+    ]
+    funnel = Funnel(trajectories=_trajectory_funnel(tracks, planned), flights=_track_funnel(tracks))
     funnel.trajectories.check()
     settings, coverage = cfg.model_dump(mode="json"), Coverage.total(covered)
-    return Inspection(settings=settings, funnel=funnel, coverage=coverage, flights=flights), views
+    return Inspection(settings=settings, funnel=funnel, coverage=coverage, flights=tracks), views
 
 
 def _unreadable(outcome: Failed, planned: list[DroneTrace], data: Path) -> TrackInspection:
-    """Return the record of a flight whose inspection failed: rejected, for the reason that the error names."""
+    """Return the record of a track whose inspection failed: rejected, for the reason of the error."""
     town, trajectory, variant = ("", "", *outcome.id.split("/"))[-3:]
     report = Report()
-    report.error("unreadable", outcome.id, outcome.message.replace(f"{data}/", ""), "a flight that can be read")
+    report.error("unreadable", outcome.id, outcome.message.replace(f"{data}/", ""), "a track that can be read")
+    try:
+        found = trace_id(read_track(data / outcome.id, strict=False))
+    except InputError:
+        found = ""
     return TrackInspection(
-        town=town, trajectory=trajectory, variant=variant, folder=outcome.id,
-        trace_id=_planned_id(data / outcome.id, planned), result="rejected", issues=report.issues, metrics={},
+        town=town, trajectory=trajectory, variant=variant, folder=outcome.id, result="rejected", metrics={},
+        trace_id=found if any(trace.path_id == found for trace in planned) else None, issues=report.issues,
     )  # fmt: skip
 
 
-def _planned_id(folder: Path, planned: list[DroneTrace]) -> str | None:
-    """Name the plan of a flight whose inspection failed; None where it cannot be read."""
-    try:
-        found = trace_id(read_track(folder, strict=False))
-    except InputError:
-        return None
-    return found if any(trace.path_id == found for trace in planned) else None
-
-
-def _with_twins_trace(flights: list[TrackInspection]) -> list[TrackInspection]:
-    """Return an unreadable flight the trace of its twin, so that the funnel counts it there."""
-    known = {Path(flight.folder).parent: flight.trace_id for flight in flights if flight.trace_id is not None}
-    return [
-        flight.model_copy(update={"trace_id": flight.trace_id or known.get(Path(flight.folder).parent)})
-        for flight in flights
-    ]
-
-
-def _trajectory_funnel(flights: list[TrackInspection], planned: list[DroneTrace] | None) -> TrajectoryFunnel:
-    """Count planned trajectories on their way; of an original and its perturbed twin the worse one decides.
-
-    Without plans those that are there count as planned.
-    """
-    counts = count_trajectories(flights, planned=planned is not None)
-    rendered = {flight.trace_id for flight in flights}
+def _trajectory_funnel(tracks: list[TrackInspection], planned: list[DroneTrace] | None) -> TrajectoryFunnel:
+    """Count planned trajectories by outcome; the worse track of a trajectory decides. Without plans all are planned."""
+    counts = count_trajectories(tracks, planned=planned is not None)
+    rendered = {track.trace_id for track in tracks}
     dropped = Counter(
-        str(t.drop_reason) for t in planned or [] if t.drop_reason is not None and t.path_id not in rendered
+        trace.drop_reason for trace in planned or [] if trace.drop_reason is not None and trace.path_id not in rendered
     )
     num_planned = counts["rendered"] if planned is None else len(planned)
+    not_rendered = num_planned - dropped.total() - counts["rendered"]
     return TrajectoryFunnel(
-        planned=num_planned,
-        dropped=dict(sorted(dropped.items())),
-        not_rendered=num_planned - sum(dropped.values()) - counts["rendered"],
-        **counts,
+        planned=num_planned, dropped=dict(sorted(dropped.items())), not_rendered=not_rendered, **counts
     )
 
 
-def _flight_funnel(flights: list[TrackInspection]) -> TrackFunnel:
-    results = Counter(flight.result for flight in flights)
-    reasons = Counter(flight.reason for flight in flights if flight.reason is not None)
+def _track_funnel(tracks: list[TrackInspection]) -> TrackFunnel:
+    results = Counter(track.result for track in tracks)
+    reasons = Counter(track.reason for track in tracks if track.reason is not None)
     return TrackFunnel(
-        inspected=len(flights),
-        accepted=results["accepted"],
-        review=results["review"],
-        rejected=results["rejected"],
-        without_trace=sum(flight.trace_id is None for flight in flights),
-        reasons=dict(sorted(reasons.items())),
-    )
+        inspected=len(tracks), accepted=results["accepted"], review=results["review"], rejected=results["rejected"],
+        without_trace=sum(track.trace_id is None for track in tracks), reasons=dict(sorted(reasons.items())),
+    )  # fmt: skip

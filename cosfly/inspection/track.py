@@ -1,6 +1,6 @@
-"""What the inspection finds out about one flight: its checks of plan, poses and motion, its record (sec:step6).
+"""The inspection of one track: its plan, poses, motion and frames, and its record (sec:step6).
 
-The poses that were drawn are measured against the map themselves: a perturbed flight is not its plan.
+The rendered poses are measured against the map: those of a perturbed track are not the plan's.
 """
 
 from __future__ import annotations
@@ -13,17 +13,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel
 
+from cosfly.formats.coverage import Coverage, coverage_of
 from cosfly.formats.frames import LEGIBLE_HEIGHT_PX
-from cosfly.formats.inspection import Result as FlightResult
-from cosfly.formats.inspection import TrackInspection
+from cosfly.formats.inspection import Result, TrackInspection
 from cosfly.formats.issues import Report
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.playback import STATES, Track, read_track
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.tracks import read_twin
-from cosfly.formats.weather import preset_token
 from cosfly.geometry.axes import project, step_s, world_from_camera, wrap_deg
-from cosfly.geometry.coverage import Coverage, axis_values
 from cosfly.geometry.trajectory_metrics import (
     CLEARANCE_CAP_M,
     CLEARANCE_TOLERANCE_M,
@@ -33,7 +31,7 @@ from cosfly.geometry.trajectory_metrics import (
     smoothness_score,
 )
 from cosfly.inspection.files import Checksums, check_files, check_recorded
-from cosfly.inspection.frames import FrameNumbers, check_frames, check_others, choose_frames, others_told, target_box
+from cosfly.inspection.frames import bystanders_of_frames, check_bystanders, check_frames, choose_frames, target_box
 from cosfly.inspection.settings import (
     DRONE_SPEED_MAX_MPS,
     INVALID_DEPTH_MAX,
@@ -57,11 +55,14 @@ TIME_TOLERANCE_S = 1e-3
 
 
 class InspectedTrack(BaseModel):
-    """A flight's record, and what the report draws of it; so it stands in `items.jsonl`."""
+    """A track's record, view and coverage, as in `items.jsonl`."""
 
     record: TrackInspection
     view: TrackView
     coverage: Coverage
+
+
+Metrics = dict[str, float | int | None]
 
 
 def inspect_track(
@@ -73,88 +74,66 @@ def inspect_track(
     cfg: InspectConfig,
     recorded: Mapping[str, str],
 ) -> InspectedTrack:
-    """Check one flight folder.
+    """Check one track folder.
 
     Args:
-        traces: the plans by id; None where nobody here planned the flight.
-        box_map, obstacles: the map, and what of it is in the way; None where there is none.
-        recorded: sha256 by path of what the tree's manifest lists; empty where it has none.
+        traces: plans by id; None if the tree has none.
+        box_map, obstacles: the map and its obstacles; None if there is no map.
+        recorded: sha256 by path of the tree's manifest; empty if there is none.
     """
     report = Report()
-    flight = _read(folder, report)
-    trace = None if traces is None else traces.get(trace_id(flight))
-    metrics: dict[str, float | int | None] = {"num_frames": len(flight)}
+    track = _read(folder, report)
+    trace = None if traces is None else traces.get(trace_id(track))
+    metrics: Metrics = {"num_frames": len(track)}
     if traces is not None and trace is None:
-        got = f"no trace {trace_id(flight)!r}"
-        report.warn("no_trace", "trajectory.json: source.scenario_id", got, "the id of a planned flight")
+        got = f"no trace {trace_id(track)!r}"
+        report.warn("no_trace", "trajectory.json: source.scenario_id", got, "the id of a plan")
     if trace is not None:
         check_plan(trace, cfg, report, metrics)
-        check_poses(flight, trace, cfg, report)
-    clearance_m = None if obstacles is None else check_surroundings(flight, obstacles, cfg, report, metrics)
-    check_shifts(flight, report, metrics)
-    if not flight.is_original:
-        counts = Counter(flight.states)
+        check_poses(track, trace, report)
+    clearance_m = None if obstacles is None else check_surroundings(track, obstacles, cfg, report, metrics)
+    check_shifts(track, report, metrics)
+    if not track.is_original:
+        counts = Counter(track.states)
         metrics.update({f"frames_{state.replace(' ', '_')}": counts[state] for state in STATES})
-    check_motion(flight, cfg, report)
-    check_projection(flight, cfg, report)
-    check_recorded(flight, root, recorded, report)
-    frames = _check_frames(flight, cfg, report, metrics)
-    _rendered_metrics(flight, frames, cfg, report, metrics)
+    check_motion(track, report)
+    check_projection(track, report)
+    check_recorded(track, root, recorded, report)
+    _check_frames(track, cfg, report, metrics)
     issues = report.merged()
-    result: FlightResult = "rejected" if report.num("error") else "review" if report.num("warning") else "accepted"
-    record = TrackInspection(
-        town=flight.town,
-        trajectory=flight.trajectory,
-        variant=flight.variant,
-        is_original=flight.is_original,
-        folder=folder.relative_to(root).as_posix(),
-        sha256=_digest(folder),
-        trace_id=trace.path_id if trace else None,
-        result=result,
-        issues=issues,
-        metrics={name: None if value is None else round(value, 4) for name, value in metrics.items()},
-    )
-    view = draw_track(flight, _heights_m(flight), clearance_m, box_map, THUMBNAIL_PX, report.issues)
-    return InspectedTrack(record=record, view=view, coverage=coverage_of(flight))
-
-
-def _digest(folder: Path) -> str | None:
-    """Return the digest of a flight's files; None where its checksums cannot be read, which `check_checksums`
-    reports."""
+    result: Result = "rejected" if report.num("error") else "review" if report.num("warning") else "accepted"
     try:
-        return digest_of(folder_digests(folder))
-    except InputError:
-        return None
+        sha256 = digest_of(folder_digests(folder))
+    except InputError:  # reported by `Checksums`
+        sha256 = None
+    record = TrackInspection(
+        town=track.town, trajectory=track.trajectory, variant=track.variant, is_original=track.is_original,
+        folder=folder.relative_to(root).as_posix(), sha256=sha256, trace_id=trace.path_id if trace else None,
+        result=result, issues=issues,
+        metrics={name: None if value is None else round(value, 4) for name, value in metrics.items()},
+    )  # fmt: skip
+    view = draw_track(track, _heights_m(track), clearance_m, box_map, THUMBNAIL_PX, report.issues)
+    return InspectedTrack(record=record, view=view, coverage=coverage_of(track))
 
 
-def coverage_of(flight: Track) -> Coverage:
-    """Count the frames of a flight."""
-    box = flight.target.bbox if flight.target.mask_bbox is None else flight.target.mask_bbox
-    offsets_m = flight.positions_m - flight.targets_m
-    heights_px, heading_deg = box[:, 3] - box[:, 1], flight.target_headings_deg
-    values = axis_values(offsets_m, heading_deg, heights_px, flight.target.visibility, TARGET_HEIGHT_M)
-    weather, time = (name and preset_token(name) for name in flight.weather.values())
-    return Coverage.of(values, flight.styles, [flight.pace] * len(flight), skies=[(weather, time)] * len(flight))
-
-
-def trace_id(flight: Track) -> str:
-    """Return the id of the plan that a flight says it was rendered from."""
-    return str(flight.source.get("scenario_id", ""))
+def trace_id(track: Track) -> str:
+    """Return the id of the plan in a track's record."""
+    return str(track.source.get("scenario_id", ""))
 
 
 def _read(folder: Path, report: Report) -> Track:
-    """Read a flight strictly; if only the layout is broken, read on and report what is."""
+    """Read a track strictly; if only its layout is broken, report that and continue."""
     try:
         return read_track(folder)
     except InputError as error:
-        flight = read_track(folder, strict=False)  # raises when poses or times are unusable
+        track = read_track(folder, strict=False)  # raises if poses or times are unusable
         where = str(error.where).replace(f"{folder}/", "")
         report.error("layout", where, error.got or error.what, error.expected or "the strict layout")
-        return flight
+        return track
 
 
-def check_plan(trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: dict) -> None:
-    """Judge the planned trajectory: smoothness, and what the prefilter said."""
+def check_plan(trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: Metrics) -> None:
+    """Check the smoothness of the plan and the result of its prefilter."""
     dt_s = step_s(trace.time_s)
     accel, jerk = accel_rms(trace.positions_m, dt_s), jerk_rms(trace.positions_m, dt_s)
     score = smoothness_score(accel, jerk)
@@ -171,36 +150,37 @@ def check_plan(trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: d
 
 
 def check_surroundings(
-    flight: Track, obstacles: BoxIndex, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
+    track: Track, obstacles: BoxIndex, cfg: InspectConfig, report: Report, metrics: Metrics
 ) -> np.ndarray:
-    """Measure the poses of a flight against the map: clearance of the drone, five-ray visibility, a person in an
-    obstacle; gives the first, (n,) m: of the way to the next pose, of the poses alone where shifts moved them.
+    """Measure the poses against the map: clearance of the drone, five-ray visibility, a target in an obstacle.
+
+    Returns:
+        (n,) clearance, metres: on the path to the next pose, or of the poses only in a perturbed track.
     """
     from cosfly.geometry.kernels import signed_distances, swept_distances, visibility
 
-    gaps_m = signed_distances(obstacles, flight.positions_m, CLEARANCE_CAP_M)[0]
-    if flight.is_original:
-        way_m = flight.positions_m[:, None]
-        if flight.between is not None:  # what was not drawn was flown: no straight line from frame to frame
-            between_m = flight.between[..., :3]
-            way_m = np.concatenate([way_m, np.where(np.isnan(between_m), way_m, between_m)], axis=1)
-        swept_m = swept_distances(obstacles, way_m.reshape(-1, 3), CLEARANCE_CAP_M)[0]
-        gaps_m = swept_m.reshape(len(flight), -1).min(axis=1)
+    gaps_m = signed_distances(obstacles, track.positions_m, CLEARANCE_CAP_M)[0]
+    if track.is_original:
+        path_m = track.positions_m[:, None]
+        if track.between is not None:  # frames that were not rendered
+            between_m = track.between[..., :3]
+            path_m = np.concatenate([path_m, np.where(np.isnan(between_m), path_m, between_m)], axis=1)
+        swept_m = swept_distances(obstacles, path_m.reshape(-1, 3), CLEARANCE_CAP_M)[0]
+        gaps_m = swept_m.reshape(len(track), -1).min(axis=1)
     metrics.update(clearance_min_m=float(gaps_m.min()))
     for i in np.flatnonzero((gaps_m < cfg.clearance_min_m - CLEARANCE_TOLERANCE_M) | (gaps_m <= 0)):
         code, where = "collision" if gaps_m[i] <= 0 else "clearance", f"trajectory.json: points[{i}].drone_pose"
         report.error(code, where, f"{gaps_m[i]:.2f} m", f"at least {cfg.clearance_min_m:g} m to every obstacle")
-    known = np.flatnonzero(~np.isnan(flight.targets_m).any(axis=1))
+    known = np.flatnonzero(~np.isnan(track.targets_m).any(axis=1))
     if not len(known):
         return gaps_m
-    inside, _ = signed_distances(obstacles, flight.targets_m[known], 0.0)
+    inside, _ = signed_distances(obstacles, track.targets_m[known], 0.0)
     for i in known[inside < 0]:
-        report.error(
-            "collision", f"trajectory.json: points[{i}].target.world_location", "in an obstacle", "free ground"
-        )
-    judged = known[flight.keeps_sight[known]]
+        where = f"trajectory.json: points[{i}].target.world_location"
+        report.error("collision", where, "in an obstacle", "free ground")
+    judged = known[track.keeps_sight[known]]
     rows = judged if len(judged) else known
-    five_ray = float(visibility(obstacles, flight.positions_m[rows], flight.targets_m[rows]).mean())
+    five_ray = float(visibility(obstacles, track.positions_m[rows], track.targets_m[rows]).mean())
     metrics.update(five_ray_mean=five_ray)
     if len(judged) and five_ray < cfg.five_ray_mean_min:
         expected = f"a mean of at least {cfg.five_ray_mean_min:g}"
@@ -208,100 +188,86 @@ def check_surroundings(
     return gaps_m
 
 
-def check_shifts(flight: Track, report: Report, metrics: dict[str, float | int | None]) -> None:
-    """Find the frames of a perturbed flight whose shift hides a target which the clean flight beside it shows."""
+def check_shifts(track: Track, report: Report, metrics: Metrics) -> None:
+    """Find frames of a perturbed track whose shift hides a target that is visible in the clean track."""
     try:
-        twin = read_twin(flight)
+        twin = read_twin(track)
     except VerifyError as error:
-        expected = "a clean flight of the same frames beside it"
-        report.warn("no_twin", "trajectory.json", f"{error.what} ({error.got})", expected)
+        report.warn("no_twin", "trajectory.json", f"{error.what} ({error.got})", "a clean track of the same frames")
         return
     if twin is None:
         return
-    is_hidden = is_shifted(flight) & twin.target.visible & ~flight.target.visible
+    is_hidden = is_shifted(track) & twin.target_visible & ~track.target_visible
     metrics.update(num_hidden_by_shift=int(is_hidden.sum()))
     for i in np.flatnonzero(is_hidden):
         where = f"trajectory.json: points[{i}].target.visible"
-        report.warn("hidden_by_shift", where, "false, and true in the clean flight", "a shift that falls back")
+        report.warn("hidden_by_shift", where, "false, and true in the clean track", "no shift that hides the target")
 
 
-def is_shifted(flight: Track) -> np.ndarray:
-    """Return where drone or person were moved from their plan, (n,) bool; an offset that no file tells counts."""
-    return (flight.perturbation.drone_m != 0).any(axis=1) | (flight.perturbation.target_m != 0).any(axis=1)
+def is_shifted(track: Track) -> np.ndarray:
+    """Return where drone or target were shifted from the plan, (n,) bool; an unknown offset counts as a shift."""
+    return (track.drone_offsets_m != 0).any(axis=1) | (track.target_offsets_m != 0).any(axis=1)
 
 
-def check_poses(flight: Track, trace: DroneTrace, cfg: InspectConfig, report: Report) -> None:
-    """Check that a flight, its recorded perturbation taken off, is the plan.
+def check_poses(track: Track, trace: DroneTrace, report: Report) -> None:
+    """Check that a track without its recorded perturbation is the plan.
 
-    Where a perturbation shifted drone or person, the camera was aimed anew, so only the positions can be compared
-    there.
+    A shifted drone or target changes the aim of the camera, so rotations are compared in other frames only.
     """
-    num_planned = -(-len(trace.time_s) // flight.motion.poses_a_frame)
-    if len(flight) < num_planned:
-        got, expected = f"{len(flight)} frames", f"{num_planned} planned ones"
+    num_planned = -(-len(trace.time_s) // track.motion.poses_a_frame)
+    if len(track) < num_planned:
+        got, expected = f"{len(track)} frames", f"{num_planned} planned ones"
         report.warn("shorter_than_planned", "trajectory.json: points", got, expected)
-    row = np.searchsorted(trace.time_s, flight.time_s - TIME_TOLERANCE_S).clip(max=len(trace.time_s) - 1)
-    off_time = np.abs(trace.time_s[row] - flight.time_s) > TIME_TOLERANCE_S
+    row = np.searchsorted(trace.time_s, track.time_s - TIME_TOLERANCE_S).clip(max=len(trace.time_s) - 1)
+    off_time = np.abs(trace.time_s[row] - track.time_s) > TIME_TOLERANCE_S
     for i in np.flatnonzero(off_time):
         where = f"trajectory.json: points[{i}].timing.trace_timestamp"
-        report.error("pose_differs", where, f"{flight.time_s[i]:.3f} s", "a time of the plan")
-    shifts = flight.perturbation
-    turns = wrap_deg(flight.rotations_deg - shifts.rotation_deg - trace.rotations_deg[row])
+        report.error("pose_differs", where, f"{track.time_s[i]:.3f} s", "a time of the plan")
+    turns = wrap_deg(track.rotations_deg - track.rotation_offsets_deg - trace.rotations_deg[row])
+    moved_m = track.positions_m - track.drone_offsets_m - trace.positions_m[row]
+    target_moved_m = track.targets_m - track.target_offsets_m - trace.targets_m[row]
     checks = (
-        (
-            "drone_pose",
-            flight.positions_m - flight.perturbation.drone_m - trace.positions_m[row],
-            POSE_TOLERANCE_M,
-            "m",
-        ),
-        ("drone_pose", np.where(is_shifted(flight)[:, None], 0.0, turns), ROTATION_TOLERANCE_DEG, "deg"),
-        (
-            "target.world_location",
-            flight.targets_m - flight.perturbation.target_m - trace.targets_m[row],
-            POSE_TOLERANCE_M,
-            "m",
-        ),
+        ("drone_pose", moved_m, POSE_TOLERANCE_M, "m"),
+        ("drone_pose", np.where(is_shifted(track)[:, None], 0.0, turns), ROTATION_TOLERANCE_DEG, "deg"),
+        ("target.world_location", target_moved_m, POSE_TOLERANCE_M, "m"),
     )
     for name, difference, tolerance, unit in checks:
         distance = np.abs(np.asarray(difference)).max(axis=1)
         for i in np.flatnonzero((distance > tolerance) & ~off_time):
             where, expected = f"trajectory.json: points[{i}].{name}", f"the plan within {tolerance:g} {unit}"
-            report.error("pose_differs", where, f"{distance[i]:.4f} {unit} beside the plan", expected)
+            report.error("pose_differs", where, f"{distance[i]:.4f} {unit} from the plan", expected)
 
 
-def check_motion(flight: Track, cfg: InspectConfig, report: Report) -> None:
-    """Find teleports: steps between frames that nothing flies or walks. Recorded perturbations are taken off."""
-    drone_offsets_m, target_offsets_m = (
-        np.nan_to_num(flight.perturbation.drone_m),
-        np.nan_to_num(flight.perturbation.target_m),
-    )
+def check_motion(track: Track, report: Report) -> None:
+    """Find teleports: impossible steps between frames, without the recorded perturbations."""
+    drone_offsets_m, target_offsets_m = np.nan_to_num(track.drone_offsets_m), np.nan_to_num(track.target_offsets_m)
     limits = (
-        ("drone_pose", flight.positions_m - drone_offsets_m, DRONE_SPEED_MAX_MPS),
-        ("target.world_location", flight.targets_m - target_offsets_m, TARGET_SPEED_MAX_MPS),
+        ("drone_pose", track.positions_m - drone_offsets_m, DRONE_SPEED_MAX_MPS),
+        ("target.world_location", track.targets_m - target_offsets_m, TARGET_SPEED_MAX_MPS),
     )
     for name, positions_m, limit_mps in limits:
-        speeds = np.linalg.norm(np.diff(positions_m, axis=0), axis=1) / np.diff(flight.time_s)
+        speeds = np.linalg.norm(np.diff(positions_m, axis=0), axis=1) / np.diff(track.time_s)
         for i in np.flatnonzero(speeds > limit_mps):
             where = f"trajectory.json: points[{i + 1}].{name}"
             report.error("teleport", where, f"{speeds[i]:.1f} m/s", f"at most {limit_mps:g} m/s")
 
 
-def check_projection(flight: Track, cfg: InspectConfig, report: Report) -> None:
+def check_projection(track: Track, report: Report) -> None:
     """Check the recorded pixel, box and depth of the target against pose, intrinsics and target position."""
-    for i in range(len(flight)):
+    for i in range(len(track)):
         point = f"trajectory.json: points[{i}].target"
-        if np.isnan(flight.targets_m[i]).any():
-            if flight.target.in_view[i]:
+        if np.isnan(track.targets_m[i]).any():
+            if track.target_in_view[i]:
                 report.error("target_missing", f"{point}.world_location", "null", "a position: the target is in view")
             continue
-        pose = world_from_camera(flight.positions_m[i], flight.rotations_deg[i])
-        uv, depth_m = project(flight.targets_m[i : i + 1], pose, flight.camera_at(i).intrinsic)
-        box = target_box(flight, i)
+        pose = world_from_camera(track.positions_m[i], track.rotations_deg[i])
+        uv, depth_m = project(track.targets_m[i : i + 1], pose, track.camera_at(i).intrinsic)
+        box = target_box(track, i)
         recorded = (
-            ("image_uv", flight.target.uv[i], uv[0], REPROJECTION_TOLERANCE_PX, "px"),
-            # Another's person is of another size than ours.
-            ("bbox_2d", flight.target.bbox[i] if flight.is_ours else box, box, 2 * REPROJECTION_TOLERANCE_PX, "px"),
-            ("depth", flight.target.depth_m[i : i + 1], depth_m, 0.01, "m"),
+            ("image_uv", track.target_uv[i], uv[0], REPROJECTION_TOLERANCE_PX, "px"),
+            # The target of another program has another size.
+            ("bbox_2d", track.target_bbox[i] if track.is_ours else box, box, 2 * REPROJECTION_TOLERANCE_PX, "px"),
+            ("depth", track.target_depth_m[i : i + 1], depth_m, 0.01, "m"),
         )
         for name, found, expected, tolerance, unit in recorded:
             if np.isnan(found).any() or np.isnan(expected).any():
@@ -309,50 +275,41 @@ def check_projection(flight: Track, cfg: InspectConfig, report: Report) -> None:
             distance = float(np.abs(found - expected).max())
             if distance > tolerance:
                 limit = f"the projection of the target within {tolerance:g} {unit}"
-                report.error("projection_differs", f"{point}.{name}", f"{distance:.2f} {unit} beside it", limit)
-        if flight.target.in_view[i] and np.isnan(flight.target.uv[i]).any():
+                report.error("projection_differs", f"{point}.{name}", f"{distance:.2f} {unit} from it", limit)
+        if track.target_in_view[i] and np.isnan(track.target_uv[i]).any():
             report.error("target_missing", f"{point}.image_uv", "null", "a pixel: the target is in view")
 
 
-def _check_frames(
-    flight: Track, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
-) -> FrameNumbers:
-    metas = check_files(flight, report)
-    told = others_told(flight, metas)
-    check_others(flight, told, cfg.clearance_min_m, report, metrics)
-    checksums = Checksums(flight, report, is_wanted=cfg.check_checksums)
+def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Metrics) -> None:
+    """Check files and pixels; the visibility of rendered frames is measured but never rejects (sec:dataset_stats)."""
+    metas = check_files(track, report)
+    bystanders = bystanders_of_frames(track, metas)
+    check_bystanders(track, bystanders, cfg.clearance_min_m, report, metrics)
+    checksums = Checksums(track, report, is_wanted=cfg.check_checksums)
     chosen = choose_frames(list(metas), cfg.check_pixels, cfg.pixel_sample)
-    numbers = check_frames(flight, chosen, told, checksums, cfg, report)
-    checksums.compare_others()
-    return numbers
-
-
-def _rendered_metrics(
-    flight: Track, frames: FrameNumbers, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
-) -> None:
-    """Add what the rendered frames say; rendered visibility describes, it never rejects (sec:dataset_stats)."""
-    known = flight.target.visibility[~np.isnan(flight.target.visibility)]
+    frames = check_frames(track, chosen, bystanders, checksums, report)
+    checksums.compare_rest()
+    known = track.visibility[~np.isnan(track.visibility)]
     quality = float(np.mean(frames.track_ious)) if frames.track_ious else None
     invalid = max(frames.invalid_depth_shares, default=None)
-    told, heights_px = (
-        flight.target.legible,
-        (flight.target.bbox[:, 3] - flight.target.bbox[:, 1])[flight.target.in_view],
-    )
+    legible = track.target_legible
+    heights_px = (track.target_bbox[:, 3] - track.target_bbox[:, 1])[track.target_in_view]
+    is_small = None if legible is None or not len(heights_px) else heights_px < LEGIBLE_HEIGHT_PX
     metrics.update(
         num_frames_checked=frames.num_checked,
         num_frames_compared=frames.num_compared,
-        length_m=length_m(flight.positions_m),
-        height_mean_m=float(np.nanmean(_heights_m(flight))) if not np.isnan(flight.targets_m).all() else None,
+        length_m=length_m(track.positions_m),
+        height_mean_m=float(np.nanmean(_heights_m(track))) if not np.isnan(track.targets_m).all() else None,
         rendered_visibility_mean=float(known.mean()) if len(known) else None,
-        visible_share=float(flight.target.visible.mean()),
-        legible_share=None if told is None else float(told.mean()),
-        small_share=None if told is None or not len(heights_px) else float((heights_px < LEGIBLE_HEIGHT_PX).mean()),
-        in_view_share=float(flight.target.in_view.mean()),
-        perturbed_share=float(flight.perturbation.is_perturbed.mean()),
+        visible_share=float(track.target_visible.mean()),
+        legible_share=None if legible is None else float(legible.mean()),
+        small_share=None if is_small is None else float(is_small.mean()),
+        in_view_share=float(track.target_in_view.mean()),
+        perturbed_share=float(track.is_perturbed.mean()),
         track_quality=quality,
         invalid_depth_share_max=invalid,
     )
-    if not flight.target.visible.any():
+    if not track.target_visible.any():
         report.warn("never_visible", "trajectory.json: points[].target.visible", "false everywhere", "a target")
     if quality is not None and quality < TRACK_QUALITY_MIN:
         report.warn("track_quality", "instance.png", f"IoU {quality:.3f}", f"at least {TRACK_QUALITY_MIN}")
@@ -361,6 +318,6 @@ def _rendered_metrics(
         report.warn("invalid_depth", "depth.npy", f"{invalid:.3f} of a frame", expected)
 
 
-def _heights_m(flight: Track) -> np.ndarray:
-    """Height of the drone over the person's feet, (n,) m."""
-    return flight.positions_m[:, 2] - (flight.targets_m[:, 2] - TARGET_HEIGHT_M)
+def _heights_m(track: Track) -> np.ndarray:
+    """Return the height of the drone over the target's feet, (n,) m."""
+    return track.positions_m[:, 2] - (track.targets_m[:, 2] - TARGET_HEIGHT_M)

@@ -1,8 +1,7 @@
-"""What the pages show of one flight: pictures, curves over its time, and its way on the map."""
+"""The view of one track on pages: pictures, curves over time, and its path on the map."""
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Sequence
 from typing import Annotated
@@ -12,32 +11,31 @@ from pydantic import BaseModel, Field, FiniteFloat, model_validator
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.issues import Issue, sort_key
-from cosfly.formats.playback import Track, read_track
+from cosfly.formats.playback import Track
+from cosfly.formats.tracks import read_tracks_beside
 from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M
-from cosfly.runtime.errors import InputError
 from cosfly.viz.frame_views import small_jpeg, thumbnail
 from cosfly.viz.topview import INK, PAPER, TopView, draw_dot, draw_line, draw_map, draw_text
 
 CURVE_POINTS = 160
-# Of a flight's curves: title, unit, what the axis shows at least.
+# Curve -> title, unit, least range of the axis.
 PLOTS: dict[str, tuple[str, str, tuple[float | None, float | None]]] = {
-    "altitude_m": ("height over the person", "m", (0.0, None)),
-    "distance_m": ("distance to the person", "m", (0.0, None)),
+    "altitude_m": ("height over the target", "m", (0.0, None)),
+    "distance_m": ("distance to the target", "m", (0.0, None)),
     "visibility": ("visibility in the frame", "", (0.0, 1.0)),
     "clearance_m": (f"clearance, up to {CLEARANCE_CAP_M:g} m", "m", (0.0, None)),
     "speed_mps": ("speed", "m/s", (0.0, None)),
 }
-OF_FRAME = re.compile(r"(?:frame_|points\[|frame )(\d+)")  # in the place of a finding
+OF_FRAME = re.compile(r"(?:frame_|points\[|frame )(\d+)")  # in `where` of a finding
 BETWEEN_FRAMES = ("temporal_jump", "frozen_frame", "teleport")
 PLAN_PX, MARGIN_M = 300, 12.0
-DRONE, PERSON, BESIDE = (35, 100, 220), (235, 120, 20), (150, 80, 190)  # RGB
+DRONE, TARGET, OTHER_TRACK = (35, 100, 220), (235, 120, 20), (150, 80, 190)  # RGB
 JPEG = Annotated[str, Field(pattern=r"^[A-Za-z0-9+/=]*$")]
 
 
 class TrackView(BaseModel):
-    """Curves with gaps by their names in PLOTS, three frames (those in question before the first, the middle and the
-    last), and the map, as JPEGs in base64; None of what there is not. frames: which those are; absent in inspections of
-    before."""
+    """Curves by their names in PLOTS, with gaps; three frames and the map as JPEGs in base64, None if missing.
+    frames: the indices of the three: those of findings, then the first, the middle and the last."""
 
     time_s: list[FiniteFloat] = []
     curves: dict[str, list[FiniteFloat | None]] = {}
@@ -53,42 +51,42 @@ class TrackView(BaseModel):
 
 
 def draw_track(
-    flight: Track,
+    track: Track,
     heights_m: np.ndarray,
     clearance_m: np.ndarray | None,
     box_map: BoxMap | None,
     width_px: int,
     issues: Sequence[Issue] = (),
 ) -> TrackView:
-    """Return what a page shows of a flight.
+    """Return the view of a track.
 
     Args:
-        heights_m: (n,) of the drone over the person. clearance_m: (n,) to obstacles; None where there is no map.
-            width_px: of the pictures. issues: what was found, which the pictures show.
+        heights_m: (n,) of the drone over the target. clearance_m: (n,) to obstacles; None without a map.
+        width_px: of the pictures. issues: findings whose frames are shown.
     """
-    rows = np.unique(np.linspace(0, len(flight) - 1, CURVE_POINTS).round().astype(int))
-    speeds_mps = np.full(len(flight), np.nan)
-    speeds_mps[1:] = np.linalg.norm(np.diff(flight.positions_m, axis=0), axis=1) / np.diff(flight.time_s)
+    rows = np.unique(np.linspace(0, len(track) - 1, CURVE_POINTS).round().astype(int))
+    speeds_mps = np.full(len(track), np.nan)
+    speeds_mps[1:] = np.linalg.norm(np.diff(track.positions_m, axis=0), axis=1) / np.diff(track.time_s)
     curves = {
         "altitude_m": heights_m,
-        "distance_m": np.linalg.norm(flight.positions_m - flight.targets_m, axis=1),
-        "visibility": flight.target.visibility,
+        "distance_m": np.linalg.norm(track.positions_m - track.targets_m, axis=1),
+        "visibility": track.visibility,
         "clearance_m": clearance_m,
         "speed_mps": speeds_mps,
     }
-    usual = [0, len(flight) // 2, len(flight) - 1]
-    chosen = sorted((in_question(issues, len(flight)) + usual)[: len(usual)])
+    usual = [0, len(track) // 2, len(track) - 1]
+    chosen = sorted((frames_of_issues(issues, len(track)) + usual)[: len(usual)])
     return TrackView(
-        time_s=[round(float(at_s), 2) for at_s in flight.time_s[rows]],
+        time_s=[round(float(at_s), 2) for at_s in track.time_s[rows]],
         curves={name: _numbers(values[rows]) for name, values in curves.items() if values is not None},
-        pictures=[thumbnail(flight.frame_folder(i), width_px) for i in chosen],
-        plan=draw_plan(flight, box_map, _read_tracks_beside(flight)),
+        pictures=[thumbnail(track.frame_folder(i), width_px) for i in chosen],
+        plan=draw_plan(track, box_map, read_tracks_beside(track)),
         frames=chosen,
     )
 
 
-def in_question(issues: Sequence[Issue], num_frames: int) -> list[int]:
-    """Return the frames that findings are about, of the worst first; of a jump the one before too."""
+def frames_of_issues(issues: Sequence[Issue], num_frames: int) -> list[int]:
+    """Return the frames of findings, the worst first; of a jump also the previous frame."""
     found: dict[int, None] = {}
     for issue in sorted(issues, key=sort_key):
         named = OF_FRAME.search(issue.where) if issue.severity != "note" else None
@@ -101,15 +99,12 @@ def _numbers(values: np.ndarray) -> list[float | None]:
     return [round(float(value), 3) if np.isfinite(value) else None for value in values]
 
 
-def draw_plan(flight: Track, box_map: BoxMap | None, beside: Sequence[Track] = ()) -> str:
-    """Draw the ways of drone and person on the map from above, or on paper where there is none; a JPEG in base64.
-
-    Args:
-        beside: the other tracks of the trajectory.
-    """
-    person_m = flight.targets_m[~np.isnan(flight.targets_m).any(axis=1)]
+def draw_plan(track: Track, box_map: BoxMap | None, beside: Sequence[Track] = ()) -> str:
+    """Draw the paths of drone and target on the map from above; return a JPEG in base64. beside: the other tracks
+    of the trajectory."""
+    person_m = track.targets_m[~np.isnan(track.targets_m).any(axis=1)]
     others_m = [other.positions_m for other in beside]
-    view = TopView.around(np.concatenate([flight.positions_m, person_m, *others_m]), PLAN_PX, MARGIN_M)
+    view = TopView.around(np.concatenate([track.positions_m, person_m, *others_m]), PLAN_PX, MARGIN_M)
     if box_map is None:
         picture = np.full((*view.size_px[::-1], 3), PAPER, dtype=np.uint8)
     else:
@@ -117,33 +112,23 @@ def draw_plan(flight: Track, box_map: BoxMap | None, beside: Sequence[Track] = (
         low, high = np.array([view.west_m, view.north_m - height_m]), np.array([view.west_m + width_m, view.north_m])
         is_near = ((box_map.maxs[:, :2] >= low) & (box_map.mins[:, :2] <= high)).all(axis=1)
         picture = draw_map(box_map.select(np.flatnonzero(is_near)), view)
-    for points_m, color in ((person_m, PERSON), (flight.positions_m, DRONE)):
+    for points_m, color in ((person_m, TARGET), (track.positions_m, DRONE)):
         if len(points_m):
             places = view.pixels(points_m)
             draw_line(picture, places, color, 2, halo=4)
             draw_dot(picture, places[0], 5, color)
             draw_dot(picture, places[-1], 5, color, 2)
     for points_m in others_m:
-        draw_line(picture, view.pixels(points_m), BESIDE)
+        draw_line(picture, view.pixels(points_m), OTHER_TRACK)
     _draw_scale(picture, view)
     return small_jpeg(picture, picture.shape[1])
 
 
 def _draw_scale(picture: np.ndarray, view: TopView) -> None:
-    """Draw a bar of a round number of metres, at most a third of the width."""
+    """Draw a scale bar of a round number of metres, at most a third of the width."""
     third_m = picture.shape[1] / 3.0 / view.pixels_per_m
     power = 10.0 ** np.floor(np.log10(third_m))
     metres = power * max(k for k in (1.0, 2.0, 5.0) if k * power <= third_m)
     y = picture.shape[0] - 8.0
     draw_line(picture, np.array([[8.0, y], [8.0 + metres * view.pixels_per_m, y]]), INK, 2, halo=5)
     draw_text(picture, f"{metres:g} m", 8.0, y - 6.0, 0.4, halo=(255.0, 255.0, 255.0))
-
-
-def _read_tracks_beside(flight: Track) -> list[Track]:
-    """Read the other tracks of a trajectory, skipping unreadable ones."""
-    found = list[Track]()
-    if flight.folder is not None:
-        for path in sorted(flight.folder.parent.glob("[!.]*/trajectory.json")):
-            with contextlib.suppress(InputError):
-                found += [read_track(path.parent, strict=False)] if path.parent != flight.folder else []
-    return found
