@@ -11,7 +11,7 @@ from cosfly.formats.places import sample_id
 from cosfly.formats.playback import read_track
 from cosfly.formats.predictions import Split
 from cosfly.formats.tracks import find_tracks
-from cosfly.llm.student_chat import FrameFormat, ChatFormat, write_chat_format
+from cosfly.llm.student_chat import ChatFormat, FrameFormat, write_chat_format
 from cosfly.runtime.json_io import write_json
 from cosfly.runtime.run_dir import fingerprint
 from distill.prepare import stage as prepare

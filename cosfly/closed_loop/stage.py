@@ -236,11 +236,11 @@ def finish_episodes(
         outputs.append(stage.path / TRACES)
     score = score_episodes(map(read_episode, files), trained_on=fly.trained_on, seed=seed)
     write_model(stage.path / SCORE, score, SCORE_FORMAT)
-    ended = Counter[str](flight.ended for flight in score.flights)
-    decisions = sum(sum(flight.answers.values()) for flight in score.flights)
+    ended = Counter[str](one.ended for one in score.flights)
+    decisions = sum(sum(one.answers.values()) for one in score.flights)
     stage.finish(outputs, tally, flown=dict(sorted(ended.items())) | {"decisions": decisions})
     log.info(
-        "fly: %s: the person in view in %.1f %%, seen in %.1f %% of the walks; %s; %d decisions",
+        "fly: %s: target in the picture in %.1f %%, visible in %.1f %% of the frames; %s; %d decisions",
         fly.student, *(100 * (score.figures[name].value or 0.0) for name in ("in_picture", "in_view")),
         ", ".join(f"{count} {how}" for how, count in sorted(ended.items())), decisions,
     )  # fmt: skip

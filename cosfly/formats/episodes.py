@@ -13,8 +13,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, FiniteFloat, NonNegativeInt, model_validator
 
 from cosfly.formats.motion import ACTION
-from cosfly.runtime.documents import FileFormat, Record, read_model
-from cosfly.runtime.store import write_model
+from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
 EPISODES = "episodes"  # folder of the records
 EPISODE_FORMAT = FileFormat("cosfly.episode", "1.0", "episode")

@@ -124,7 +124,7 @@ def check_bystanders(
                 report.error("clearance", f"trajectory.json: points[{i}].drone_pose", got, expected)
             if bystander.gap_to_person_m(track.targets_m[i]) < -CLEARANCE_TOLERANCE_M:
                 where = f"trajectory.json: points[{i}].target.world_location"
-                report.error("collision", where, f"in {line.instance_id}", "a person who touches nobody")
+                report.error("collision", where, f"in {line.instance_id}", "no contact")
     if frames:
         hidden = np.array([frame.target_hidden_by_others for frame in frames.values()])
         metrics.update(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, Field, FiniteFloat, model_validator
+from pydantic import BaseModel, Field, FiniteFloat
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.issues import Issue, sort_key
@@ -42,12 +42,6 @@ class TrackView(BaseModel):
     pictures: list[JPEG | None] = Field([None, None, None], min_length=3, max_length=3)
     plan: JPEG | None = None
     frames: list[int] = []
-
-    @model_validator(mode="after")
-    def _curves_have_their_times(self) -> TrackView:
-        if wrong := [name for name, values in self.curves.items() if len(values) != len(self.time_s)]:
-            raise ValueError(f"{wrong[0]} has {len(self.curves[wrong[0]])} values at {len(self.time_s)} times")
-        return self
 
 
 def draw_track(
@@ -99,11 +93,11 @@ def _numbers(values: np.ndarray) -> list[float | None]:
     return [round(float(value), 3) if np.isfinite(value) else None for value in values]
 
 
-def draw_plan(track: Track, box_map: BoxMap | None, beside: Sequence[Track] = ()) -> str:
-    """Draw the paths of drone and target on the map from above; return a JPEG in base64. beside: the other tracks
+def draw_plan(track: Track, box_map: BoxMap | None, others: Sequence[Track] = ()) -> str:
+    """Draw the paths of drone and target on the map from above; return a JPEG in base64. others: the other tracks
     of the trajectory."""
     person_m = track.targets_m[~np.isnan(track.targets_m).any(axis=1)]
-    others_m = [other.positions_m for other in beside]
+    others_m = [other.positions_m for other in others]
     view = TopView.around(np.concatenate([track.positions_m, person_m, *others_m]), PLAN_PX, MARGIN_M)
     if box_map is None:
         picture = np.full((*view.size_px[::-1], 3), PAPER, dtype=np.uint8)

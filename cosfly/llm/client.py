@@ -59,8 +59,7 @@ class EndpointConfig(Config):
     max_tries: MayDiffer[int] = Field(6, ge=1, description="tries of one request when the server is busy or fails")
     json_schema: bool = Field(True, description="ask the server to enforce the answer's JSON schema")
     extra_body: dict[str, Any] = Field(
-        default_factory=dict,
-        description="further fields of the request, for instance chat_template_kwargs; null removes a field",
+        default_factory=dict, description="further request fields, such as chat_template_kwargs; null removes a field"
     )
 
     def request(self, messages: list[dict], digests: list[str], schema: dict, seed: int) -> Request:

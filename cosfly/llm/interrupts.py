@@ -23,32 +23,31 @@ def run_until_interrupted(main: Coroutine[Any, Any, Result]) -> Result:
     Raises:
         KeyboardInterrupt: After the first Ctrl-C, once all tasks have ended.
     """
-    count = 0
+    if threading.current_thread() is not threading.main_thread():
+        return asyncio.run(main)
+    is_interrupted = False
 
     async def guarded() -> Result:
         task, loop = asyncio.current_task(), asyncio.get_running_loop()
 
         def interrupt() -> None:
-            nonlocal count
-            count += 1
-            if count > 1:
+            nonlocal is_interrupted
+            if is_interrupted:
                 os.write(2, AT_ONCE)
                 os._exit(130)
             assert task is not None
-            task.cancel()
+            is_interrupted = task.cancel()
 
         loop.add_signal_handler(signal.SIGINT, interrupt)
         try:
             return await main
         finally:
-            if count == 0:  # otherwise it stays until the last task has ended
+            if not is_interrupted:  # otherwise it stays until the last task has ended
                 loop.remove_signal_handler(signal.SIGINT)
 
-    if threading.current_thread() is not threading.main_thread():
-        return asyncio.run(main)
     try:
         return asyncio.run(guarded())
     except asyncio.CancelledError:
-        if count:
+        if is_interrupted:
             raise KeyboardInterrupt from None
         raise

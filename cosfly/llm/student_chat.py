@@ -62,7 +62,12 @@ class SentPicture:
 
 def picture_to_send(rgb: np.ndarray, max_pixels: int) -> SentPicture:
     """Encode a picture, (h, w, 3) uint8 RGB, without loss, scaled down to `max_pixels`; 0: not scaled."""
-    data = encode_picture(_bounded(rgb, max_pixels), IMAGE_ENCODING, 0)
+    height_px, width_px = rgb.shape[:2]
+    scale = math.sqrt(max_pixels / (width_px * height_px))
+    if max_pixels and scale < 1.0:
+        size = (max(1, int(width_px * scale)), max(1, int(height_px * scale)))
+        rgb = np.asarray(Image.fromarray(rgb).resize(size, Image.Resampling.BICUBIC))
+    data = encode_picture(rgb, IMAGE_ENCODING, 0)
     url = f"data:image/{IMAGE_ENCODING};base64,{base64.b64encode(data).decode('ascii')}"
     return SentPicture({"type": "image_url", "image_url": {"url": url}}, sha256_bytes(data))
 
@@ -73,15 +78,6 @@ def student_request(
     """Return a request to an engine. frames: the pictures of each frame, oldest first. schema: of the answer."""
     messages = chat_messages(prompt, [[picture.part for picture in pictures] for pictures in frames])
     return sampling.request(messages, [picture.digest for pictures in frames for picture in pictures], schema, seed)
-
-
-def _bounded(picture: np.ndarray, max_pixels: int) -> np.ndarray:
-    height_px, width_px = picture.shape[:2]
-    scale = math.sqrt(max_pixels / (width_px * height_px))
-    if max_pixels == 0 or scale >= 1.0:
-        return picture
-    size = (max(1, int(width_px * scale)), max(1, int(height_px * scale)))
-    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC))
 
 
 # --- the chat format of training --------------------------------------------------------------------------------------

@@ -107,10 +107,7 @@ class VllmEngine:
         cfg = self.cfg
         arguments: dict[str, Any] = {
             "model": str(self.folder),
-            "limit_mm_per_prompt": {
-                "image": self.num_images,
-                "video": 0,
-            },  # without the 0, memory is reserved for a video
+            "limit_mm_per_prompt": {"image": self.num_images, "video": 0},  # else memory is reserved for a video
             "gpu_memory_utilization": 0.9,
             # Free whitespace lets a model pad without end and slows decoding several times. vLLM forbids it only for a
             # named backend; "auto" is refused.

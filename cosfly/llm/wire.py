@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import functools
 import math
 import re
 import ssl
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import httpx
@@ -92,13 +90,14 @@ class Connections:
             TimeoutError: The response was not complete in time.
             httpx.RequestError: The connection failed, or the body is compressed.
         """
-        method = "GET" if content is None else "POST"
-        with self._connection() as connection, _invalid_redirects():
+        method, body = "GET" if content is None else "POST", bytearray()
+        connection = self._free.pop() if self._free else self._connect()
+        try:
             async with (
                 asyncio.timeout(self._timeout_s),
                 connection.stream(method, url, content=content, headers=HEADERS) as response,
             ):
-                encoding, body = response.headers.get("content-encoding", "identity"), bytearray()
+                encoding = response.headers.get("content-encoding", "identity")
                 if encoding.strip().lower() not in ("", "identity"):
                     raise httpx.DecodingError(f"compressed with {encoding[:40]!r}, which was not requested")
                 async for piece in response.aiter_raw():
@@ -108,13 +107,8 @@ class Connections:
                 is_cut = len(body) > self._most_bytes
                 wait_s = retry_after_s(response.headers.get("retry-after", ""))
                 return Response(response.status_code, bytes(body[: self._most_bytes]), is_cut, wait_s)
-
-    @contextlib.contextmanager
-    def _connection(self) -> Iterator[httpx.AsyncClient]:
-        """Yield the connection that was used last, or a new one if all are in use."""
-        connection = self._free.pop() if self._free else self._connect()
-        try:
-            yield connection
+        except (httpx.InvalidURL, UnicodeError) as error:  # also of the address of a redirect
+            raise httpx.UnsupportedProtocol(f"invalid address: {type(error).__name__}") from None
         finally:
             self._free.append(connection)
 
@@ -125,15 +119,6 @@ class Connections:
         except (httpx.InvalidURL, ValueError, ImportError) as error:
             where = "HTTP_PROXY, HTTPS_PROXY, ALL_PROXY"
             raise TeacherError("the proxy cannot be used", where=where, got=type(error).__name__) from None
-
-
-@contextlib.contextmanager
-def _invalid_redirects() -> Iterator[None]:
-    """Convert the errors of invalid addresses: httpx reads those of redirects, too."""
-    try:
-        yield
-    except (httpx.InvalidURL, UnicodeError) as error:
-        raise httpx.UnsupportedProtocol(f"invalid address: {type(error).__name__}") from None
 
 
 @functools.cache
