@@ -30,11 +30,8 @@ LOSS_S = 2.0  # the target is lost if not visible for so long; a tree or a lamp 
 BAND_M = (5.0, 40.0)  # over ground: a quarter and twice of what plans keep (plan.behind_distance_m)
 NEAR_MISS_M = RELAXED_SAFETY_M  # least clearance of any plan
 TURNS_DEGPS = {"straight": 3.0, "bends": 6.0, "turns": np.inf}  # mean turn of the target, up to
-HIDDEN = {
-    "open": 0.02,
-    "partly hidden": 0.2,
-    "hidden": 1.0,
-}  # share of frames that hide the target from a drone right behind, up to
+# Share of frames that hide the target from a drone right behind, up to.
+HIDDEN = {"open": 0.02, "partly hidden": 0.2, "hidden": 1.0}
 GROUPS = ("map", "pace", "turn", "occlusion", "training")
 RESAMPLES, CONFIDENCE = 2000, 0.95
 
@@ -153,13 +150,13 @@ def score_episodes(records: Iterable[Episode], *, trained_on: Sequence[str] | No
 
 def score_measured(measured: Sequence[EpisodeScore], seed: int, **about: Any) -> Score:
     """Score measured episodes, of one map or several. about: the fields of Score that are not computed here."""
-    groups = {kind: sorted({one.groups[kind] for one in measured}) for kind in GROUPS}
-    by = {
-        kind: {
-            name: figures_of([one for one in measured if one.groups[kind] == name], _score_rng(seed)) for name in names
+    by: dict[str, dict[str, dict[str, Figure]]] = {}
+    for kind in GROUPS:
+        groups = {
+            name: [one for one in measured if one.groups[kind] == name]
+            for name in sorted({one.groups[kind] for one in measured})
         }
-        for kind, names in groups.items()
-    }
+        by[kind] = {name: figures_of(group, _score_rng(seed)) for name, group in groups.items()}
     figures = figures_of(measured, _score_rng(seed))
     return Score(**about, confidence=CONFIDENCE, resamples=RESAMPLES, figures=figures, by=by, flights=tuple(measured))
 
@@ -174,10 +171,8 @@ def figures_of(
     """Return all figures with intervals by bootstrap over pedestrian trajectories; with `before`, their changes."""
     walks = sorted({one.walk for one in measured})
     draws = np.vstack([np.ones(len(walks)), draw_pedestrians(len(walks), RESAMPLES, rng)])  # the first: each once
-    drawn, counts = (
-        _ratios(draws, measured, walks),
-        [sum(one.sums[name][1] > 0 for one in measured) for name in MEASURES],
-    )
+    drawn = _ratios(draws, measured, walks)
+    counts = [sum(one.sums[name][1] > 0 for one in measured) for name in MEASURES]
     if before is not None:
         drawn, counts = drawn - _ratios(draws, before, walks), [len(walks)] * len(MEASURES)
     return {
