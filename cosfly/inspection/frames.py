@@ -5,7 +5,7 @@ Findings go into a Report, numbers into FrameNumbers; the thresholds of acceptan
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -154,17 +154,8 @@ class FrameNumbers:
     invalid_depth_shares: list[float] = field(default_factory=list)
 
 
-def choose_frames(indices: list[int], setting: str, num_sample: int) -> list[int]:
-    """Return the frames to decode: all, none, or `num_sample` evenly spread with both ends."""
-    if setting == "none" or not indices:
-        return []
-    if setting == "all" or num_sample >= len(indices):
-        return indices
-    return [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, num_sample).round().astype(int))]
-
-
 def check_frames(
-    track: Track, indices: list[int], bystanders: Mapping[int, BystandersMeta], checksums: Checksums, report: Report
+    track: Track, indices: Iterable[int], bystanders: Mapping[int, BystandersMeta], checksums: Checksums, report: Report
 ) -> FrameNumbers:
     """Decode frames, each file once; compare colour, depth and mask with each other, the poses and the previous
     frame."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated
 
 from pydantic import Field
 
@@ -54,9 +54,4 @@ class InspectConfig(Config):
         ge=0,
         description="a smaller distance of the drone to an obstacle rejects, m; 0: only inside one",
     )
-    check_pixels: Literal["all", "sample", "none"] = Field(
-        "all",
-        description="decode all frames, an even sample, or none (then only names, headers and poses are checked)",
-    )
-    pixel_sample: ClassVar[int] = 16  # frames per track of check_pixels=sample
     check_checksums: bool = Field(True, description="read every file and compare it with checksums.sha256")

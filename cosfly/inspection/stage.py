@@ -88,9 +88,8 @@ def run(
         return product
     planned = None if traces is None else read_traces(traces)
     names = [folder.relative_to(data).as_posix() for folder in find_tracks(data, cfg.flights)]
-    every = cfg.check_pixels == "all"  # then the progress bar counts frames
-    items = [Item(name, name, num_steps=_num_frames(data / name) if every else None) for name in names]
-    arguments, label = (cfg, simplified, traces, data), "inspect: frames" if every else "inspect: tracks"
+    items = [Item(name, name, num_steps=_num_frames(data / name)) for name in names]
+    arguments, label = (cfg, simplified, traces, data), "inspect: frames"
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label=label)
     inspection, views = assemble(finished, planned, cfg, data)
     write_inspection(product, inspection)

@@ -31,7 +31,7 @@ from cosfly.geometry.trajectory_metrics import (
     smoothness_score,
 )
 from cosfly.inspection.files import Checksums, check_files, check_recorded
-from cosfly.inspection.frames import bystanders_of_frames, check_bystanders, check_frames, choose_frames, target_box
+from cosfly.inspection.frames import bystanders_of_frames, check_bystanders, check_frames, target_box
 from cosfly.inspection.settings import (
     DRONE_SPEED_MAX_MPS,
     INVALID_DEPTH_MAX,
@@ -286,8 +286,7 @@ def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Met
     bystanders = bystanders_of_frames(track, metas)
     check_bystanders(track, bystanders, cfg.clearance_min_m, report, metrics)
     checksums = Checksums(track, report, is_wanted=cfg.check_checksums)
-    chosen = choose_frames(list(metas), cfg.check_pixels, cfg.pixel_sample)
-    frames = check_frames(track, chosen, bystanders, checksums, report)
+    frames = check_frames(track, metas, bystanders, checksums, report)
     checksums.compare_rest()
     known = track.visibility[~np.isnan(track.visibility)]
     quality = float(np.mean(frames.track_ious)) if frames.track_ious else None
