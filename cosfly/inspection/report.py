@@ -57,29 +57,28 @@ def report_html(name: str, inspection: Inspection, views: Mapping[str, TrackView
         (state, counts[state], f"{counts[state] / max(total, 1):.1%}", f"{paper:.0%}")
         for state, paper in STATES.items()
     ]
+    cards, size, num_without_pictures = list[str](), 0, 0
+    for track in order:
+        card = _card(track, views.get(track.folder))
+        if track.folder in views and size + len(card) > page_mb * MB:
+            card, num_without_pictures = _card(track, None), num_without_pictures + 1
+        size += len(card)
+        cards.append(card)
     return page(
         "cosfly/inspection/report.html",
-        **cards(order, views, page_mb),
         title=name,
+        style=STYLE,
         inspection=inspection,
         results=RESULTS,
+        columns=COLUMNS,
+        cards=cards,
+        num_without_pictures=num_without_pictures,
+        page_mb=page_mb,
         pictures=[one for one in shown if one][:OPENING_PICTURES],
         states=states,
         num_perturbable=total,
         coverage=coverage_html(inspection.coverage) if is_covered and inspection.coverage else None,
     )
-
-
-def cards(flights: list[TrackInspection], views: Mapping[str, TrackView], page_mb: float) -> dict[str, Any]:
-    """Return the cards of tracks, and how many have no pictures because of the page's size."""
-    parts, size, left_out = list[str](), 0, 0
-    for track in flights:
-        card = _card(track, views.get(track.folder))
-        if track.folder in views and size + len(card) > page_mb * MB:
-            card, left_out = _card(track, None), left_out + 1
-        size += len(card)
-        parts.append(card)
-    return {"style": STYLE, "columns": COLUMNS, "cards": parts, "left_out": left_out, "page_mb": page_mb}
 
 
 def _card(track: TrackInspection, view: TrackView | None) -> str:
