@@ -41,7 +41,7 @@ def test_a_record_is_read_as_it_was_written_and_tells_lead_and_decisions_apart(t
     [
         ({"frames": [{"time_s": 0.5}]}, "missing|required"),
         ({"ended": "tired"}, "finished"),
-        ({"num_walk_frames": 1}, "2 frames of a walk of 1"),
+        ({"num_walk_frames": 1}, "2 frames of a trajectory of 1"),
         ({"colour": "red"}, "[Ee]xtra"),
     ],
 )
