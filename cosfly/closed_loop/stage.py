@@ -201,7 +201,10 @@ Inputs = tuple[Path, Path, Path, Path | None]  # boxes, simplified, plans, bysta
 def _fly_all(stage: StageFolder, cfg: ClosedLoopConfig, inputs: Inputs, seed: int, workers: int, watch: Watch) -> None:
     traces, num = read_traces(inputs[2]), 1 if cfg.fly.asks_model else workers
     reasons = [trace.drop_reason or (len(trace.time_s) <= cfg.fly.lead_frames and "too_short") for trace in traces]
-    numbers, dropped = [n for n, reason in enumerate(reasons) if not reason], Counter(filter(None, reasons))
+    numbers, dropped = (
+        [n for n, reason in enumerate(reasons) if not reason],
+        Counter(str(one) for one in reasons if one),
+    )
     if not numbers:
         expected = f"an accepted plan of more than fly.lead_frames={cfg.fly.lead_frames} frames"
         raise stage.nothing_kept(Tally(input=len(traces), dropped=dropped), expected=expected)
