@@ -20,8 +20,7 @@ from teacher_server import TeacherServer
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from cosfly.formats.captions import read_captions
-from cosfly.llm.client import KEY_VARIABLE
-from cosfly.llm.throttle import Throttle
+from cosfly.llm.client import KEY_VARIABLE, ConcurrencyLimit
 from cosfly.runtime.errors import CosflyError, NothingKept, TeacherError
 
 KEEP = {"hard_conflict": "keep"}

@@ -26,13 +26,13 @@ from caption.teachers.teacher import first_budget, open_teacher
 from caption.writing.contract import Draft, more_fields
 from cosfly.closed_loop.settings import BASELINES, FlyConfig
 from cosfly.closed_loop.stepper import ClosedLoopTrajectory, Moment
-from cosfly.formats.actions import TOKENS
-from cosfly.formats.answer_text import parse_answer
+from cosfly.formats.captions import TOKENS
 from cosfly.formats.episodes import MOST_WORDS, Answer
 from cosfly.formats.frames import BYSTANDER_COLUMNS, FILE_NAMES, depth_file, frame_name, instance_bytes, rgb_bytes
-from cosfly.formats.motion import in_axes_of
 from cosfly.formats.places import sample_id
 from cosfly.geometry.axes import wrap_deg
+from cosfly.geometry.motion import in_axes_of
+from cosfly.llm.answer_text import parse_answer
 from cosfly.llm.answers import Answer as BookAnswer
 from cosfly.llm.answers import AnswerBook
 from cosfly.llm.contract import NoAnswer

@@ -23,11 +23,11 @@ import numpy as np
 
 from cosfly.closed_loop.engines import EngineDecision, Observation
 from cosfly.closed_loop.stepper import ClosedLoopTrajectory, Moment
-from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import TOKENS
 from cosfly.formats.episodes import MOST_WORDS, Answer
-from cosfly.formats.goals import SLOTS, words_of
-from cosfly.formats.motion import in_axes_of
 from cosfly.geometry.axes import wrap_deg
+from cosfly.geometry.goals import SLOTS, words_of
+from cosfly.geometry.motion import in_axes_of
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.worker import end_with_parent
 

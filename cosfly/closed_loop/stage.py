@@ -23,14 +23,14 @@ from cosfly.closed_loop.engines import EngineDecision, Observation, open_engine
 from cosfly.closed_loop.measures import score_episodes
 from cosfly.closed_loop.settings import FlyConfig
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, Moment, as_drawn
-from cosfly.formats.actions import TOKENS
 from cosfly.formats.boxes import read_boxes
+from cosfly.formats.captions import TOKENS
 from cosfly.formats.episode_scores import SCORE, SCORE_FORMAT
 from cosfly.formats.episodes import Episode, EpisodeFrame, PathDifficulty, episode_file, read_episode, write_episode
-from cosfly.formats.motion import PlannedMotion
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.geometry.axes import headings_of, step_s
 from cosfly.geometry.kernels import BoxIndex, obstacle_index, visibility
+from cosfly.geometry.motion import PlannedMotion
 from cosfly.geometry.trajectory_metrics import trajectory_metrics
 from cosfly.planners import stage as planning
 from cosfly.planners.contract import PlanConfig

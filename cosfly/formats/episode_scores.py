@@ -13,10 +13,18 @@ from typing import Annotated, Self
 from pydantic import Field, FiniteFloat, NonNegativeInt, model_validator
 
 from cosfly.formats.episodes import Answer, Ended
-from cosfly.formats.figures import Figure
 from cosfly.runtime.json_io import FileFormat, Record, read_model
 
 SCORE, SCORE_FORMAT = "score.json", FileFormat("cosfly.score", "1.0", "score")
+
+
+class Figure(Record):
+    """A figure over `count` samples with its interval; all None if unknown."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+    count: int
 
 
 class EpisodeScore(Record):

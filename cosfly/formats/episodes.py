@@ -12,7 +12,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, NonNegativeInt, model_validator
 
-from cosfly.formats.motion import ACTION
+from cosfly.geometry.motion import ACTION
 from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
 EPISODES = "episodes"  # folder of the records
@@ -33,7 +33,7 @@ _Least = Annotated[FiniteFloat, Field(ge=0)]
 
 
 class EpisodeFrame(Record):
-    """One frame. command: as ACTION (cosfly/formats/motion.py), None in the last. answer_s: time of the decision.
+    """One frame. command: as ACTION (cosfly/geometry/motion.py), None in the last. answer_s: time of the decision.
     words: the student's reasons, or its raw answer if unreadable.
 
     in_view: some of the target's box is in the picture; visible: and enough of it is not hidden, `visibility` its

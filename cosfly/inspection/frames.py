@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cosfly.formats.bystanders import BUILDS, Bystander, distances_to_boxes_m
+from cosfly.formats.bystanders import BUILDS, Bystander
 from cosfly.formats.frames import (
     DEPTH_NPY,
     FILE_NAMES,
@@ -29,6 +29,7 @@ from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.places import tree_of_track
 from cosfly.formats.playback import Track
 from cosfly.geometry.axes import box_corners, box_iou, mask_box, project, world_from_camera
+from cosfly.geometry.kernels import distances_to_boxes_m
 from cosfly.geometry.reprojection import LEAST_SEEN, Agreement, View, compare_views
 from cosfly.geometry.trajectory_metrics import CLEARANCE_TOLERANCE_M
 from cosfly.inspection.files import Checksums
@@ -254,7 +255,7 @@ def _check_mask(
 ) -> None:
     """Compare pedestrian pixels with the target's projected and recorded box, and with its depth."""
     box = target_box(track, i)
-    visibility = track.visibility[i]
+    visibility = track.target.visibility[i]
     if np.isnan(box).any() or not visibility > 0:
         return
     where, region = f"{frame_name(i)}/instance.png", None
@@ -273,13 +274,13 @@ def _check_mask(
         return
     found = mask_box(region) + corner
     numbers.track_ious.append(pixels_iou(box, found))
-    if track.target_mask_bbox is not None:
-        recorded = track.target_mask_bbox[i]
+    if track.target.mask_bbox is not None:
+        recorded = track.target.mask_bbox[i]
         # A pole may cut the target into parts: its box lies between this part and all pedestrian pixels. NaN fails.
         if not (_encloses(recorded, found) and _encloses(np.array(people), recorded)):
             place = f"trajectory.json: points[{i}].target.mask_bbox_2d"
             report.error("mask_disagrees", place, str(recorded.tolist()), f"the box of the pixels, {found.tolist()}")
-    expected_m = float(track.target_depth_m[i])
+    expected_m = float(track.target.depth_m[i])
     found_m = float(np.median(picture.depth[y0:y1, x0:x1][region]))
     if np.isfinite(expected_m) and abs(found_m - expected_m) > SURFACE_TOLERANCE_M:
         expected = f"{expected_m:.2f} m (target.depth) within {SURFACE_TOLERANCE_M:.1f} m"

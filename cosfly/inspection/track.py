@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.formats.coverage import Coverage, coverage_of
 from cosfly.formats.frames import LEGIBLE_HEIGHT_PX
 from cosfly.formats.inspection import Result, TrackInspection
 from cosfly.formats.issues import Report
@@ -21,7 +20,9 @@ from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.playback import STATES, Track, read_track
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.tracks import read_twin
+from cosfly.formats.weather import preset_token
 from cosfly.geometry.axes import project, step_s, world_from_camera, wrap_deg
+from cosfly.geometry.coverage import Coverage, axis_values
 from cosfly.geometry.trajectory_metrics import (
     CLEARANCE_CAP_M,
     CLEARANCE_TOLERANCE_M,
@@ -116,6 +117,16 @@ def inspect_track(
     return InspectedTrack(record=record, view=view, coverage=coverage_of(track))
 
 
+def coverage_of(track: Track) -> Coverage:
+    """Count the frames of a track."""
+    box = track.target.bbox if track.target.mask_bbox is None else track.target.mask_bbox
+    offsets_m = track.positions_m - track.targets_m
+    heights_px, heading_deg = box[:, 3] - box[:, 1], track.target_headings_deg
+    values = axis_values(offsets_m, heading_deg, heights_px, track.target.visibility, TARGET_HEIGHT_M)
+    weather, time = (name and preset_token(name) for name in track.weather.values())
+    return Coverage.of(values, track.styles, [track.pace] * len(track), skies=[(weather, time)] * len(track))
+
+
 def trace_id(track: Track) -> str:
     """Return the id of the plan in a track's record."""
     return str(track.source.get("scenario_id", ""))
@@ -197,7 +208,7 @@ def check_shifts(track: Track, report: Report, metrics: Metrics) -> None:
         return
     if twin is None:
         return
-    is_hidden = is_shifted(track) & twin.target_visible & ~track.target_visible
+    is_hidden = is_shifted(track) & twin.target.visible & ~track.target.visible
     metrics.update(num_hidden_by_shift=int(is_hidden.sum()))
     for i in np.flatnonzero(is_hidden):
         where = f"trajectory.json: points[{i}].target.visible"
@@ -206,7 +217,7 @@ def check_shifts(track: Track, report: Report, metrics: Metrics) -> None:
 
 def is_shifted(track: Track) -> np.ndarray:
     """Return where drone or target were shifted from the plan, (n,) bool; an unknown offset counts as a shift."""
-    return (track.drone_offsets_m != 0).any(axis=1) | (track.target_offsets_m != 0).any(axis=1)
+    return (track.perturbation.drone_m != 0).any(axis=1) | (track.perturbation.target_m != 0).any(axis=1)
 
 
 def check_poses(track: Track, trace: DroneTrace, report: Report) -> None:
@@ -223,9 +234,9 @@ def check_poses(track: Track, trace: DroneTrace, report: Report) -> None:
     for i in np.flatnonzero(off_time):
         where = f"trajectory.json: points[{i}].timing.trace_timestamp"
         report.error("pose_differs", where, f"{track.time_s[i]:.3f} s", "a time of the plan")
-    turns = wrap_deg(track.rotations_deg - track.rotation_offsets_deg - trace.rotations_deg[row])
-    moved_m = track.positions_m - track.drone_offsets_m - trace.positions_m[row]
-    target_moved_m = track.targets_m - track.target_offsets_m - trace.targets_m[row]
+    turns = wrap_deg(track.rotations_deg - track.perturbation.rotation_deg - trace.rotations_deg[row])
+    moved_m = track.positions_m - track.perturbation.drone_m - trace.positions_m[row]
+    target_moved_m = track.targets_m - track.perturbation.target_m - trace.targets_m[row]
     checks = (
         ("drone_pose", moved_m, POSE_TOLERANCE_M, "m"),
         ("drone_pose", np.where(is_shifted(track)[:, None], 0.0, turns), ROTATION_TOLERANCE_DEG, "deg"),
@@ -240,7 +251,10 @@ def check_poses(track: Track, trace: DroneTrace, report: Report) -> None:
 
 def check_motion(track: Track, report: Report) -> None:
     """Find teleports: impossible steps between frames, without the recorded perturbations."""
-    drone_offsets_m, target_offsets_m = np.nan_to_num(track.drone_offsets_m), np.nan_to_num(track.target_offsets_m)
+    drone_offsets_m, target_offsets_m = (
+        np.nan_to_num(track.perturbation.drone_m),
+        np.nan_to_num(track.perturbation.target_m),
+    )
     limits = (
         ("drone_pose", track.positions_m - drone_offsets_m, DRONE_SPEED_MAX_MPS),
         ("target.world_location", track.targets_m - target_offsets_m, TARGET_SPEED_MAX_MPS),
@@ -257,17 +271,17 @@ def check_projection(track: Track, report: Report) -> None:
     for i in range(len(track)):
         point = f"trajectory.json: points[{i}].target"
         if np.isnan(track.targets_m[i]).any():
-            if track.target_in_view[i]:
+            if track.target.in_view[i]:
                 report.error("target_missing", f"{point}.world_location", "null", "a position: the target is in view")
             continue
         pose = world_from_camera(track.positions_m[i], track.rotations_deg[i])
         uv, depth_m = project(track.targets_m[i : i + 1], pose, track.camera_at(i).intrinsic)
         box = target_box(track, i)
         recorded = (
-            ("image_uv", track.target_uv[i], uv[0], REPROJECTION_TOLERANCE_PX, "px"),
+            ("image_uv", track.target.uv[i], uv[0], REPROJECTION_TOLERANCE_PX, "px"),
             # The target of another program has another size.
-            ("bbox_2d", track.target_bbox[i] if track.is_ours else box, box, 2 * REPROJECTION_TOLERANCE_PX, "px"),
-            ("depth", track.target_depth_m[i : i + 1], depth_m, 0.01, "m"),
+            ("bbox_2d", track.target.bbox[i] if track.is_ours else box, box, 2 * REPROJECTION_TOLERANCE_PX, "px"),
+            ("depth", track.target.depth_m[i : i + 1], depth_m, 0.01, "m"),
         )
         for name, found, expected, tolerance, unit in recorded:
             if np.isnan(found).any() or np.isnan(expected).any():
@@ -276,7 +290,7 @@ def check_projection(track: Track, report: Report) -> None:
             if distance > tolerance:
                 limit = f"the projection of the target within {tolerance:g} {unit}"
                 report.error("projection_differs", f"{point}.{name}", f"{distance:.2f} {unit} from it", limit)
-        if track.target_in_view[i] and np.isnan(track.target_uv[i]).any():
+        if track.target.in_view[i] and np.isnan(track.target.uv[i]).any():
             report.error("target_missing", f"{point}.image_uv", "null", "a pixel: the target is in view")
 
 
@@ -288,11 +302,11 @@ def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Met
     checksums = Checksums(track, report, is_wanted=cfg.check_checksums)
     frames = check_frames(track, metas, bystanders, checksums, report)
     checksums.compare_rest()
-    known = track.visibility[~np.isnan(track.visibility)]
+    known = track.target.visibility[~np.isnan(track.target.visibility)]
     quality = float(np.mean(frames.track_ious)) if frames.track_ious else None
     invalid = max(frames.invalid_depth_shares, default=None)
-    legible = track.target_legible
-    heights_px = (track.target_bbox[:, 3] - track.target_bbox[:, 1])[track.target_in_view]
+    legible = track.target.legible
+    heights_px = (track.target.bbox[:, 3] - track.target.bbox[:, 1])[track.target.in_view]
     is_small = None if legible is None or not len(heights_px) else heights_px < LEGIBLE_HEIGHT_PX
     metrics.update(
         num_frames_checked=frames.num_checked,
@@ -300,15 +314,15 @@ def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Met
         length_m=length_m(track.positions_m),
         height_mean_m=float(np.nanmean(_heights_m(track))) if not np.isnan(track.targets_m).all() else None,
         rendered_visibility_mean=float(known.mean()) if len(known) else None,
-        visible_share=float(track.target_visible.mean()),
+        visible_share=float(track.target.visible.mean()),
         legible_share=None if legible is None else float(legible.mean()),
         small_share=None if is_small is None else float(is_small.mean()),
-        in_view_share=float(track.target_in_view.mean()),
-        perturbed_share=float(track.is_perturbed.mean()),
+        in_view_share=float(track.target.in_view.mean()),
+        perturbed_share=float(track.perturbation.is_perturbed.mean()),
         track_quality=quality,
         invalid_depth_share_max=invalid,
     )
-    if not track.target_visible.any():
+    if not track.target.visible.any():
         report.warn("never_visible", "trajectory.json: points[].target.visible", "false everywhere", "a target")
     if quality is not None and quality < TRACK_QUALITY_MIN:
         report.warn("track_quality", "instance.png", f"IoU {quality:.3f}", f"at least {TRACK_QUALITY_MIN}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Sequence
 from typing import Annotated
@@ -11,9 +12,9 @@ from pydantic import BaseModel, Field, FiniteFloat
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.issues import Issue, sort_key
-from cosfly.formats.playback import Track
-from cosfly.formats.tracks import read_tracks_beside
+from cosfly.formats.playback import Track, read_track
 from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M
+from cosfly.runtime.errors import InputError
 from cosfly.viz.frame_views import small_jpeg, thumbnail
 from cosfly.viz.topview import INK, PAPER, TopView, draw_dot, draw_line, draw_map, draw_text
 
@@ -64,7 +65,7 @@ def draw_track(
     curves = {
         "altitude_m": heights_m,
         "distance_m": np.linalg.norm(track.positions_m - track.targets_m, axis=1),
-        "visibility": track.visibility,
+        "visibility": track.target.visibility,
         "clearance_m": clearance_m,
         "speed_mps": speeds_mps,
     }
@@ -74,9 +75,19 @@ def draw_track(
         time_s=[round(float(at_s), 2) for at_s in track.time_s[rows]],
         curves={name: _numbers(values[rows]) for name, values in curves.items() if values is not None},
         pictures=[thumbnail(track.frame_folder(i), width_px) for i in chosen],
-        plan=draw_plan(track, box_map, read_tracks_beside(track)),
+        plan=draw_plan(track, box_map, _other_tracks(track)),
         frames=chosen,
     )
+
+
+def _other_tracks(track: Track) -> list[Track]:
+    """Read the other tracks of a trajectory, skipping unreadable ones."""
+    found = list[Track]()
+    if track.folder is not None:
+        for path in sorted(track.folder.parent.glob("[!.]*/trajectory.json")):
+            with contextlib.suppress(InputError):
+                found += [read_track(path.parent, strict=False)] if path.parent != track.folder else []
+    return found
 
 
 def frames_of_issues(issues: Sequence[Issue], num_frames: int) -> list[int]:

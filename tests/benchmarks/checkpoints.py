@@ -18,10 +18,10 @@ from typing import Any
 
 from cosfly.closed_loop import stage
 from cosfly.closed_loop.measures import score_episodes
-from cosfly.closed_loop.pilots import Observation, EngineDecision, open_engine
+from cosfly.closed_loop.pilots import EngineDecision, Observation, open_engine
 from cosfly.formats.captions import TOKENS, read_captions
-from cosfly.formats.flight_scores import SCORE, SCORE_FORMAT
-from cosfly.formats.pursuits import EPISODES, read_episode
+from cosfly.formats.episode_scores import SCORE, SCORE_FORMAT
+from cosfly.formats.episodes import EPISODES, read_episode
 from cosfly.formats.traces import read_traces
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners import stage as planning
