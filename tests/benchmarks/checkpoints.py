@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.closed_loop import stage
+from cosfly.closed_loop.engines import EngineDecision, Observation, open_engine
 from cosfly.closed_loop.measures import score_episodes
-from cosfly.closed_loop.pilots import EngineDecision, Observation, open_engine
 from cosfly.formats.captions import TOKENS, read_captions
 from cosfly.formats.episode_scores import SCORE, SCORE_FORMAT
 from cosfly.formats.episodes import EPISODES, read_episode
