@@ -184,6 +184,6 @@ def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisod
     others = tuple[Bystander, ...]()
     if cfg.has_others:
         rng = rng_for(town.seed, "pedestrians", f"{name}/others")
-        there = bystanders_of(path, world.ground, world.lanes, cfg, rng).others
+        there = bystanders_of(walk, world.ground, world.lanes, cfg, rng).others
         others = tuple(replace(o, positions_m=o.positions_m[:end], headings_rad=o.headings_rad[:end]) for o in there)
     return BenchmarkEpisode(task, world, number, plan, num_lead, others)

@@ -160,10 +160,10 @@ class ChatClient:
         """
         attempt, deadline_s = 0, float("inf")
         while True:
-            async with self._slot():
-                given_s = time.monotonic()
-                deadline_s = min(deadline_s, given_s + TOTAL_TIMEOUT_S)
-                found = await self._attempt(request, given_s)
+            async with self.concurrency.slot():
+                sent_s = time.monotonic()
+                deadline_s = min(deadline_s, sent_s + TOTAL_TIMEOUT_S)
+                found = await self._attempt(request, sent_s)
             if isinstance(found, Reply):
                 self.troubles.answered()
                 return found
@@ -176,8 +176,8 @@ class ChatClient:
                 action = "giving up" if is_last or is_late else "trying again"
                 log.warning("%s: %s; %s, failed tries so far: %d", self.where, found.detail, action, self.troubles.num)
             if is_late:
-                words = f"no answer within {TOTAL_TIMEOUT_S:g} s; the last: {found.detail}"
-                raise NoAnswer("total_timeout", words)
+                detail = f"no answer within {TOTAL_TIMEOUT_S:g} s; the last error: {found.detail}"
+                raise NoAnswer("total_timeout", detail)
             if is_last:
                 raise NoAnswer(found.cause, found.detail)
             await asyncio.sleep(pause_s)
@@ -218,12 +218,9 @@ class ChatClient:
         if refusal.meaning.ends_run:
             raise self._error(refusal.meaning.what, got=refusal.summary, fix=refusal.meaning.fix)
         if refusal.may_pass:
-            # Where nobody can wait as long as that, this request is given up and the others are not held.
-            is_long = wait_s is not None and wait_s > TOTAL_TIMEOUT_S
-            if status in BUSY_STATUS:
-                self.throttle.was_busy(given_s, None if is_long else wait_s)
-            else:
-                self.throttle.failed()
+            is_long = wait_s is not None and wait_s > TOTAL_TIMEOUT_S  # gives up this request, holds no other
+            if refusal.status in BUSY_STATUS:
+                self.concurrency.was_busy(sent_s, None if is_long else wait_s)
             asked = f" (asks to wait {wait_s:.0f} s)" if is_long else ""
             return Failure(f"http_{refusal.status}", refusal.summary + asked, wait_s)
         if refusal.kind != "content":
