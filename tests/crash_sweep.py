@@ -174,7 +174,7 @@ SHORT = {  # what commands have in common
     "traces": "{base}/plan/drone_trace.json",
     "tree": "{base}/render",
     "release": "{base}/release/dataset",
-    "towns": "--set 'towns={one: {}, two: {maps: {synthetic: {parked_share: 0.0}}}}'",
+    "towns": "--set 'towns={one: {}, two: {maps: {synthetic: {size_m: 120}}}}'",
     "three": "--map {maps} --simplified {simple} --traces {traces} {tiny}",
     "asked": "--teacher {teacher} --set caption.endpoint.concurrency=1 --no-check {tiny}",
     "set": "--dataset {students}/set --data {students}/tree",

@@ -82,6 +82,19 @@ def test_outlines_and_points_of_geojson(tmp_path):
     assert_allclose(box_map.maxs[box_map.kinds == 1][0], [120, -4, 0])
 
 
+def test_longitude_and_latitude_become_metres(tmp_path):
+    """At 52 degrees north a degree of latitude is 111,267 m, one of longitude 68,677 m (tables of WGS 84)."""
+    ring = [[4.0, 52.0], [4.001, 52.0], [4.001, 52.001], [4.0, 52.001], [4.0, 52.0]]
+    text = collection(feature("Polygon", [ring], type="Buildings", height_m=9))
+    with pytest.raises(InputError, match=r"not in m;.*maps\.boxes\.units=degrees"):
+        loaded(tmp_path, text, ".geojson")
+    with pytest.raises(InputError, match="not in degrees"):
+        loaded(tmp_path, text.replace("52.001", "58.001"), ".geojson", units="degrees")
+    box_map = loaded(tmp_path, text, ".geojson", units="degrees")
+    size = sorted(box_map.half_extents[0, :2] * 2)
+    assert_allclose(size, [68.677, 111.267], rtol=2e-4)
+
+
 def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
     write_boxes(tmp_path / "own.json", town())
     box_map = load(BoxesConfig(path=tmp_path / "own.json", name="Mine", licence="mit"))
@@ -97,7 +110,7 @@ def test_all_that_is_wrong_with_a_table_is_told(tmp_path, subtests):
             (PLAIN.replace(",yaw_deg", ",yaw_dge"), r"unknown column 'yaw_dge' \(did you mean 'yaw_deg'\?\)"),
             (PLAIN.replace("type,x_m", "name,x"), r"unknown column 'x'.*no column type.*no column x_m"),
             (PLAIN.replace("height_m,yaw_deg", "height_m,z_m"), "column z_m occurs twice"),
-            (PLAIN.replace(",12,8,8,30", ",12,8,8"), "line 2: 8 cells, where the first line has 9"),
+            (PLAIN.replace(",12,8,8,30", ",12,8,8"), "line 2: 8 cells, but 9 in the first line"),
             (PLAIN.replace("12,8,8,30", '"12,5",8,8,30'), r"length_m is not a finite number: '12,5'"),
             (PLAIN.replace("12,8,8,30", "-12,8,8,30").replace("4,4,6,0", "4,4,nan,0"),
              r"line 2: length_m is not more than 0; line 3: height_m is not a finite number: 'nan'"),

@@ -13,6 +13,7 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KINDS
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.stage import MapsConfig, load_map
+from cosfly.runtime.errors import InputError
 
 Model = dict
 
@@ -59,31 +60,6 @@ def document(model: Model) -> bytes:
 # --- forms: each says the same as city() ---
 
 
-def in_metres(model: Model, version: str) -> Model:
-    """Up to 1.0: vertices as they are, levels of detail as numbers."""
-    model = copy.deepcopy(model) | {"version": version}
-    del model["transform"]
-    model["vertices"] = [[c / 1000 for c in vertex] for vertex in model["vertices"]]
-    for value in model["CityObjects"].values():
-        for geometry in value.get("geometry", []):
-            geometry["lod"] = float(geometry["lod"])
-    return model
-
-
-def v08(model: Model) -> Model:
-    model = in_metres(model, "0.8")
-    part = model["CityObjects"]["part"]
-    part["parent"] = part.pop("parents")[0]
-    model["metadata"] = {"crs": {"epsg": 7415}, "bbox": [80, 40, 2, 140, 56, 14]}
-    return model
-
-
-def v10_with_a_group(model: Model) -> Model:
-    model = in_metres(model, "1.0")
-    model["CityObjects"]["quarter"] = {"type": "CityObjectGroup", "members": ["house", "other"]}
-    return model
-
-
 def v11_with_a_group(model: Model) -> Model:
     model = copy.deepcopy(model) | {"version": "1.1"}
     model["CityObjects"]["quarter"] = {"type": "CityObjectGroup", "children": ["house", "other"]}
@@ -107,16 +83,13 @@ def in_a_composite(model: Model) -> Model:
     return model
 
 
-def with_a_template(model: Model, version: str) -> Model:
+def with_a_template(model: Model) -> Model:
     """The second house is an instance of a template of half its size, from its own low corner."""
-    model = copy.deepcopy(model) if version >= "1.1" else in_metres(model, version)
-    model["version"] = version
+    model = copy.deepcopy(model)
     _, shell = prism(0.0, 0.0, 0.0)
     corners = [[x, y, z] for z in (0.0, 3.0) for x, y in ((0.0, 0.0), (5.0, 0.0), (5.0, 3.0), (0.0, 3.0))]
-    lod = "1.2" if version >= "1.1" else 1.2
-    model["geometry-templates"] = {
-        "templates": [{"type": "Solid", "lod": lod, "boundaries": [shell]}], "vertices-templates": corners,
-    }  # fmt: skip
+    template = {"type": "Solid", "lod": "1.2", "boundaries": [shell]}
+    model["geometry-templates"] = {"templates": [template], "vertices-templates": corners}
     matrix = [2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1]
     instance = {"type": "GeometryInstance", "template": 0, "boundaries": [8], "transformationMatrix": matrix}
     model["CityObjects"]["other"]["geometry"] = [instance]
@@ -150,14 +123,10 @@ def _renumbered(value: list | int, used: list[int]) -> list | int:
 FORMS: dict[str, Callable[[Model], bytes]] = {
     "2.0 printed over many lines": lambda m: json.dumps(m, indent=2).encode(),
     "2.0 with an outline": lambda m: document(with_an_outline(m)),
-    "2.0 with a template": lambda m: document(with_a_template(m, "2.0")),
+    "2.0 with a template": lambda m: document(with_a_template(m)),
     "1.1 with a group": lambda m: document(v11_with_a_group(m)),
     "1.1 gzipped, a composite": lambda m: gzip.compress(document(in_a_composite(m)), mtime=0),
-    "1.0 with a group": lambda m: document(v10_with_a_group(m)),
-    "1.0 with a template": lambda m: document(with_a_template(m, "1.0")),
-    "1.0.3 compressed": lambda m: document(copy.deepcopy(m) | {"version": "1.0.3"}),
-    "0.9": lambda m: document(in_metres(m, "0.9")),
-    "0.8": lambda m: document(v08(m)),
+    "1.1.3": lambda m: document(copy.deepcopy(m) | {"version": "1.1.3"}),
     "sequence 1.1": lambda m: sequence(m | {"version": "1.1"}),
     "sequence with CR LF": lambda m: sequence(m, "\r\n"),
     "sequence with blank lines": lambda m: sequence(m, "\n\n"),
@@ -171,7 +140,6 @@ FORMS: dict[str, Callable[[Model], bytes]] = {
 LEFT_OUT = {
     "2.0 with an outline": {"outline_of_parts": 1},
     "1.1 with a group": {"no_geometry": 1, "group": 1},
-    "1.0 with a group": {"no_geometry": 1, "group": 1},
     "sequence that repeats a feature": {"no_geometry": 1, "repeated_id": 1},
 }
 
@@ -200,10 +168,10 @@ def test_every_form_of_a_city_model_gives_the_same_map(tmp_path: Path, subtests)
     assert "outline_of_parts" not in load(tmp_path, document(model)).header.dropped_objects, "parts are not in the file"
 
 
-def instance(change: Callable[[dict], object]) -> bytes:
-    model = with_a_template(city(), "2.0")
-    change(model["CityObjects"]["other"]["geometry"][0])
-    return document(model)
+def test_an_older_city_model_is_refused_with_the_command_that_upgrades_it(tmp_path: Path):
+    for version in ("0.8", "1.0", "3.0", None):
+        with pytest.raises(InputError, match=r"version.*1\.1 or 2\.0.*cjio OLD upgrade"):
+            load(tmp_path, document(city() | {"version": version}))
 
 
 @pytest.mark.slow

@@ -78,9 +78,8 @@ def test_the_census_town_has_the_papers_counts_and_simplifies_to_a_few_thousand(
 
 @each(
     ("given", "words"),
-    [({"preset": "rivers"}, "did you mean 'river'"), ({"blocks": {"markt": 1}}, "did you mean 'market'"),
-     ({"blocks": {"park": -1, "market": 2}}, "negative"), ({"blocks": {"park": 0}}, "more than 0"),
-     ({"preset": ["park"]}, "valid string"), ({"num_blocks": 4, "unevenness": 0.5}, "raise size_m")],
+    [({"preset": "rivers"}, "did you mean 'river'"), ({"preset": ["park"]}, "valid string"),
+     ({"num_blocks": 6}, "raise size_m")],
 )  # fmt: skip
 def test_a_wrong_town_is_a_config_error(given, words):
     with pytest.raises(ConfigError, match=words):
@@ -124,7 +123,7 @@ def test_unreal_axes_become_right_handed_metres(tmp_path: Path):
 
 def test_an_asset_without_a_size_is_an_error_or_counted(tmp_path: Path):
     cfg = write_world(tmp_path, node("BP_Building_01_C", 0, 0), node("BP_Building_99_C", 9000, 0))
-    with pytest.raises(InputError, match=r"without a size.*BP_Building_99_C.*unknown=drop"):
+    with pytest.raises(InputError, match=r"has no size.*BP_Building_99_C.*unknown=drop"):
         simworld(cfg)
     cfg = cfg.model_copy(update={"unknown": "drop"})
     assert simworld(cfg).header.dropped_objects == {"unknown_asset": 1}

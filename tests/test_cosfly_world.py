@@ -16,11 +16,9 @@ from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import read_json, read_model
 from cosfly.runtime.run_dir import read_manifest
-from cosfly.worldgen.objects import OBJECTS
-from cosfly.worldgen.plan import PLAN_FORMAT, NamedObject, WorldPlan
+from cosfly.worldgen.plan import OBJECTS, PLAN_FORMAT, NamedObject, WorldPlan
 from cosfly.worldgen.rules import plan_by_rules
-from cosfly.worldgen.settings import WorldConfig
-from cosfly.worldgen.stage import check_world, run
+from cosfly.worldgen.stage import WorldConfig, check_world, run
 from cosfly.worldgen.town import build
 
 PROMPTS = list(csv.DictReader(Path(__file__).with_name("world_prompts.tsv").open(), delimiter="\t"))
@@ -37,7 +35,7 @@ def test_a_prompt_gives_a_valid_world_with_each_named_object(row):
     plan = by_rules(row["prompt"])
     town = build(plan, "W", 0)
     assert [one for one in check_world(town, plan) if not one["is_met"]] == []
-    assert town.left_out == []
+    assert town.not_placed == []
     named = set(filter(None, row["objects"].split(",")))
     assert {one.name for one in town.placed} == named
     for name in named:
@@ -49,7 +47,7 @@ def test_a_prompt_gives_a_valid_world_with_each_named_object(row):
 
 def test_a_world_read_by_the_importer_is_the_one_that_was_laid_out(tmp_path):
     cfg = WorldConfig(prompt="a small village with a hospital, a church and a lawn")
-    world = SimWorldConfig(world=run(cfg, tmp_path / "w", seed=3), stand_m=0.0)
+    world = SimWorldConfig(world=run(cfg, tmp_path / "w", seed=3))
     found = load_map(MapsConfig(source="simworld", simworld=world))
     town = build(plan_by_rules(cfg.prompt, 3)[0], cfg.name, 3)
     expected = town.boxes
@@ -84,7 +82,7 @@ def test_any_plan_that_can_be_gives_a_world_and_says_what_it_lacks():
         except ValidationError:
             continue
         town = build(plan, "W", 0)
-        assert len(town.placed) + len(town.left_out) == 10
+        assert len(town.placed) + len(town.not_placed) == 10
         checks = {one["check"]: one["is_met"] for one in check_world(town, plan)}
         assert checks["overlapping buildings"]
 
@@ -101,7 +99,7 @@ def test_what_a_prompt_says_there_is_none_of_is_not_there():
 
 @each("prompt", ["asdf qwer zxcv", "一个带喷泉的小村庄", "42"])
 def test_a_prompt_of_which_nothing_can_be_read_is_refused_in_words(prompt):
-    with pytest.raises(InputError, match=r"nothing that the rules can read.*expected English.*--planner URL"):
+    with pytest.raises(InputError, match=r"no word that the rules know.*expected English.*--planner URL"):
         by_rules(prompt)
 
 
@@ -133,7 +131,7 @@ def test_a_models_plan_is_followed_and_its_trace_kept(tmp_path):
     assert trace["usage"]
     placement = read_json(out / "placement.json", what="placement")
     assert [one["name"] for one in placement["placed"]] == ["statue"]
-    assert [one["name"] for one in placement["left_out"]] == ["unicorn", "unicorn"]
+    assert [one["name"] for one in placement["not_placed"]] == ["unicorn", "unicorn"]
     (body,) = planned_by.bodies
     assert "statue" in body["messages"][0]["content"]
     assert body["seed"] == 0

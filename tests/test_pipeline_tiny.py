@@ -259,7 +259,7 @@ def test_two_workers_give_the_same_products(base, tmp_path, stage):
 TOWNS = """
 towns={
   one: {maps: {synthetic: {size_m: 150, num_blocks: 1}}},
-  two: {maps: {synthetic: {size_m: 160, num_blocks: 1, parked_share: 0.0}}, pedestrians: {num_paths: 1}},
+  two: {maps: {synthetic: {size_m: 160, num_blocks: 1, preset: village}}, pedestrians: {num_paths: 1}},
 }"""
 
 

@@ -54,7 +54,7 @@ MAPS = {
      ["maps.source=cityjson", "maps.cityjson.path=DATA/tudelft-3dbag/extension.city.jsonl.gz",
       "pedestrians.ground=anywhere"]),
     "town": (None, []),
-    "uneven": (None, ["maps.synthetic.unevenness=0.2"]),
+    "uneven": (None, ["maps.synthetic.preset=village"]),
     "river": (None, ["maps.synthetic.preset=river"]),
     "towers": (None, ["maps.synthetic.preset=towers"]),
     "park_styles": (None,

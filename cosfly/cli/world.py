@@ -21,7 +21,7 @@ app = typer.Typer()
     "world",
     f"seed {WORKERS} resume",
     planner=Short("world.planner", "Language model that plans the world; none: embedded rules.", metavar="URL"),
-    model=Short("world.endpoint.model", "Name of the language model."),
+    model=Short("world.model", "Name of the language model."),
 )
 def world(
     job: Job,

@@ -1,4 +1,4 @@
-"""A growing list of upright boxes that ends as a BoxMap: what every map source writes into."""
+"""The list of upright boxes that every map source fills, and that becomes a BoxMap."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Pair = Sequence[float] | np.ndarray  # x and y
 
 
 class BoxList:
-    """Collects upright boxes in world metres; ids are given in the order of adding, from 1."""
+    """A growing list of upright boxes in world metres, with ids from 1 in the order of adding."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[float, ...]] = []  # center 3, half extent 3, yaw_deg
@@ -25,7 +25,7 @@ class BoxList:
     def add(self, kind: str, center_xy: Pair, size_xy: Pair, low_m: float, high_m: float, yaw_deg: float = 0.0) -> None:
         """Add a box by its footprint (full sizes before turning, m) and its height interval."""
         if size_xy[0] <= 0 or size_xy[1] <= 0 or high_m <= low_m:
-            raise ValueError(f"an empty box: {kind}, {size_xy}, {low_m} to {high_m} m")
+            raise ValueError(f"the box is empty: {kind}, {size_xy}, {low_m} to {high_m} m")
         center = (float(center_xy[0]), float(center_xy[1]), (low_m + high_m) / 2)
         self._rows.append((*center, size_xy[0] / 2, size_xy[1] / 2, (high_m - low_m) / 2, float(yaw_deg)))
         self._kinds.append(KINDS[kind])

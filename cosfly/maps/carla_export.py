@@ -1,9 +1,9 @@
 """The town of a running CARLA server: `get_environment_objects` of every label, as boxes (sec:step1).
 
-The client can crash, so it lives in a process of its own. A building is several boxes there, as intended. What else is
-known of such exports is counted and told: labels without objects, objects twice, ids twice, boxes of no size, and one
-huge box round all of the terrain or the vegetation; and roads without anything beside them, as on large maps, of which
-the server has only the tiles around the spectator in memory.
+The client can crash, so it runs in its own process. A building is several boxes, as intended. Known defects of such
+exports are counted and reported: labels without objects, repeated objects and ids, boxes without a size, one huge box
+around all of the terrain or the vegetation; and roads without objects along them, as on large maps, where the server
+has only the tiles around the spectator in memory.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from cosfly.simulators.conventions import world_pose
 
 log = logging.getLogger(__name__)
 
-HUGE_KINDS, SLAB_M = ("Terrain", "Vegetation"), 2.0  # what is lower is ground to stand on
-ROAD_STEP_M, BESIDE_M = 25.0, 60.0  # of points on roads, and how near a box counts as beside one
-SLOPE_M = 1.0  # roads of heights that differ more are no flat ground
+HUGE_KINDS, SLAB_M = ("Terrain", "Vegetation"), 2.0  # lower ones are ground
+ROAD_STEP_M, ALONG_M = 25.0, 60.0  # between points on roads; how near a box must be to count as along one
+SLOPE_M = 1.0  # roads with a larger range of heights are not on flat ground
 
 
 class CarlaMapConfig(CarlaConfig):
@@ -38,9 +38,9 @@ class CarlaMapConfig(CarlaConfig):
 
     name: str | None = Field(None, min_length=1, description="map name; null takes the town's")
     licence: LicenceId = Field("cc-by-4.0", description="licence, as the hub spells it; goes into every release")
-    credits: str = Field("CARLA Simulator, Computer Vision Center", description="who must be named: the town's makers")
+    credits: str = Field("CARLA Simulator, Computer Vision Center", description="attribution: the town's makers")
     ground_z_m: float | None = Field(None, description="height of the ground, m; null takes the roads' median top")
-    # terrain or vegetation longer than this both ways is left out and counted, m; low slabs stay
+    # terrain or vegetation longer than this both ways is dropped and counted, m; low slabs stay
     huge_m: ClassVar[float] = 150.0
 
     def inputs(self) -> dict:
@@ -49,7 +49,7 @@ class CarlaMapConfig(CarlaConfig):
 
 @dataclass
 class CarlaTown:
-    """What the server told, in its own axes. rows: label's name, id, name of the object, and 9 numbers of its box."""
+    """Answers of a server, in its own axes. rows: label's name, id, name of the object, and 9 numbers of its box."""
 
     town: str
     version: str
@@ -59,9 +59,9 @@ class CarlaTown:
 
 
 def ask(cfg: CarlaConfig) -> CarlaTown:
-    """Ask the server for everything; in a process of its own."""
+    """Ask the server for all objects and road points; runs in its own process."""
     connection = connect(cfg, cfg.port)
-    told = CarlaTown(connection.town, connection.version)
+    answers = CarlaTown(connection.town, connection.version)
     labels = connection.carla.CityObjectLabel.names.items()
     with connection.asking("the objects were not given"):
         for name, label in sorted(labels, key=lambda pair: int(pair[1])):
@@ -69,35 +69,35 @@ def ask(cfg: CarlaConfig) -> CarlaTown:
                 continue
             objects = connection.world.get_environment_objects(label)
             if not objects:
-                told.empty_labels.append(name)
+                answers.empty_labels.append(name)
             for one in objects:
                 place, half, turn = one.bounding_box.location, one.bounding_box.extent, one.bounding_box.rotation
                 box = (place.x, place.y, place.z, half.x, half.y, half.z, turn.pitch, turn.yaw, turn.roll)
-                told.rows.append((name, one.id, one.name, box))
+                answers.rows.append((name, one.id, one.name, box))
         for waypoint in connection.world.get_map().generate_waypoints(ROAD_STEP_M):
             place = waypoint.transform.location
-            told.road_points_m.append((place.x, place.y, place.z))
-    return told
+            answers.road_points_m.append((place.x, place.y, place.z))
+    return answers
 
 
 def load(cfg: CarlaMapConfig, seed: int) -> BoxMap:
     """Return the town's boxes; the seed changes nothing."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
-            told = pool.submit(ask, cfg).result()
+            answers = pool.submit(ask, cfg).result()
         except BrokenProcessPool:
-            what, fix = "the client of CARLA crashed", "see that the server is CARLA 0.9.16, then try again"
+            what, fix = "the client of CARLA crashed", "check that the server is CARLA 0.9.16, then try again"
             raise EnvironmentMissing(what, where=f"{cfg.host}:{cfg.port}", fix=fix) from None
-    return box_map_of(told, cfg)
+    return box_map_of(answers, cfg)
 
 
-def box_map_of(told: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
-    """Make a map of what a server told; what is left out is counted in the header."""
-    where = f"{cfg.host}:{cfg.port} (CARLA {told.version}), {told.town}"
+def box_map_of(answers: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
+    """Return a map of a server's answers; the header counts dropped objects."""
+    where = f"{cfg.host}:{cfg.port} (CARLA {answers.version}), {answers.town}"
     dropped, seen, ids, num_repeated = Counter[str](), set(), set[int](), 0
     centers, halves, turns, kinds = [], [], [], []
     numbers = list[int]()
-    for label, number, name, box in told.rows:
+    for label, number, name, box in answers.rows:
         key = (label, *np.round(box, 3).tolist())
         if reason := _unfit(label, np.array(box), cfg) or ("duplicate" if key in seen else ""):
             dropped[reason] += 1
@@ -115,28 +115,28 @@ def box_map_of(told: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
         numbers.append(number)
     if not numbers:
         expected = "objects of get_environment_objects"
-        raise InputError("the town has no objects", where=where, got=f"{len(told.rows)}", expected=expected)
+        raise InputError("the town has no objects", where=where, got=f"{len(answers.rows)}", expected=expected)
     header = MapHeader(
-        name=cfg.name or told.town,
-        source=MapSource(tool="CARLA", version=told.version, file=told.town),
+        name=cfg.name or answers.town,
+        source=MapSource(tool="CARLA", version=answers.version, file=answers.town),
         licence=cfg.licence,
         credits=cfg.credits,
         extent_sources={"engine": len(numbers)},
-        num_objects=len(told.rows),
+        num_objects=len(answers.rows),
         dropped_objects=dict(dropped),
-        empty_labels=told.empty_labels,
+        empty_labels=answers.empty_labels,
         repeated_ids=num_repeated,
     )
     box_map = make_box_map(centers, halves, turns, kinds, numbers, header)
     tops_m = box_map.maxs[box_map.kinds == KINDS["Roads"], 2]
     ground_z_m = cfg.ground_z_m if cfg.ground_z_m is not None else float(np.median(tops_m)) if len(tops_m) else 0.0
     box_map = make_box_map(centers, halves, turns, kinds, numbers, header.model_copy(update={"ground_z_m": ground_z_m}))
-    _tell(told, box_map, where, tops_m)
+    _report(answers, box_map, where, tops_m)
     return box_map
 
 
 def _unfit(label: str, box: np.ndarray, cfg: CarlaMapConfig) -> str:
-    """Why a box tells nothing; "" if it does."""
+    """Return why a box is dropped; "" if it is kept."""
     if not np.isfinite(box).all():
         return "not finite"
     if (box[3:6] <= 0).sum() > 1 or (box[3:6] < 0).any():
@@ -145,23 +145,23 @@ def _unfit(label: str, box: np.ndarray, cfg: CarlaMapConfig) -> str:
     return "huge" if is_huge else ""
 
 
-def _tell(told: CarlaTown, box_map: BoxMap, where: str, tops_m: np.ndarray) -> None:
-    """Return what is known to be odd in such exports, where it is so."""
+def _report(answers: CarlaTown, box_map: BoxMap, where: str, tops_m: np.ndarray) -> None:
+    """Log the known defects of such exports."""
     header = box_map.header
-    if told.empty_labels:
-        log.info("%s: no objects of %s", where, ", ".join(told.empty_labels))
+    if answers.empty_labels:
+        log.info("%s: no objects of %s", where, ", ".join(answers.empty_labels))
     if header.dropped_objects:
-        log.warning("%s: left out: %s", where, header.dropped_objects)
+        log.warning("%s: dropped: %s", where, header.dropped_objects)
     if num := header.model_extra and header.model_extra["repeated_ids"]:
-        log.warning("%s: %d objects had the id of another and got one of their own", where, num)
+        log.warning("%s: %d objects repeated an id and got a new one", where, num)
     if len(tops_m) and np.ptp(tops_m) > SLOPE_M:
-        what = "%s: roads lie %.1f to %.1f m high, and the map's ground is flat at %.1f m: walks there leave the road"
+        what = "%s: roads are %.1f to %.1f m high, and the map's ground is flat at %.1f m: pedestrians leave the roads"
         log.warning(what, where, tops_m.min(), tops_m.max(), header.ground_z_m)
-    roads_m = [world_pose((*place, 0.0, 0.0, 0.0))[0][:2] for place in told.road_points_m]
+    roads_m = [world_pose((*place, 0.0, 0.0, 0.0))[0][:2] for place in answers.road_points_m]
     low_m, high_m = box_map.mins[:, :2], box_map.maxs[:, :2]
     gaps_m = [np.maximum(low_m - place, place - high_m).max(axis=1).min() for place in roads_m]
-    if num := sum(gap > BESIDE_M for gap in gaps_m):
+    if num := sum(gap > ALONG_M for gap in gaps_m):
         what = (
             "%s: %d of %d places on roads have no object within %.0f m: on a large map only tiles near the spectator do"
         )
-        log.warning(what, where, num, len(roads_m), BESIDE_M)
+        log.warning(what, where, num, len(roads_m), ALONG_M)

@@ -1,8 +1,8 @@
-"""Ground for a map that has buildings and no streets: pavement along facades, asphalt between near buildings, lawn
+"""Ground for a map of buildings without streets: pavement along facades, asphalt between near buildings, lawn
 elsewhere.
 
-It is derived from the buildings alone and knows nothing of the place: the map's header counts its boxes
-(`derived_ground`) and its credits say so, which every product and release repeats.
+It is derived from the buildings alone: the map's header counts its boxes (`derived_ground`), and its credits, which
+every product and release repeats, say so.
 """
 
 from __future__ import annotations
@@ -18,17 +18,16 @@ from cosfly.geometry.grid import blocks_walking
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.footprints import Rectangle, cover, polygons_of, rectangle_polygon, united
 
-PAVEMENT_M = 2.5  # walkers keep half a metre off walls
-NEAR_M = 25.0  # between facades that are no farther apart lies asphalt
-NARROW_M = 4.0  # narrower asphalt is none: what is left in corners
-VERGE_M = 10.0  # of lawn round the map
-SLAB_M, LAWN_TOP_M = 0.3, -0.1  # asphalt and pavement lie in the ground's plane, where layers tell what is seen
+PAVEMENT_M = 2.5  # pedestrians keep half a metre from walls
+NEAR_M = 25.0  # asphalt lies between facades up to this far apart
+NARROW_M = 4.0  # narrower asphalt is a leftover of corners
+VERGE_M = 10.0  # of lawn around the map
+SLAB_M, LAWN_TOP_M = 0.3, -0.1  # asphalt and pavement lie in the ground's plane
 CREDITS = "Streets, pavements and lawn are derived by cosfly from the buildings, not mapped."
 
 
 def with_derived_ground(box_map: BoxMap) -> BoxMap:
-    """Return a map with derived ground; the same map if it has streets, pavements or squares, or nothing stands on
-    it."""
+    """Return a map with derived ground; the same map if it has streets, pavements or squares, or no buildings."""
     standing = box_map.select(blocks_walking(box_map) & (box_map.kinds == KINDS["Buildings"]))
     if len(standing) == 0 or box_map.is_any_of(PAVED_KINDS).any():
         return box_map
@@ -54,9 +53,9 @@ def with_derived_ground(box_map: BoxMap) -> BoxMap:
     derived.centers[:, 2] += box_map.ground.height_at(derived.centers)
     derived.ids[:] = np.setdiff1d(np.arange(1, len(box_map) + len(derived) + 1), box_map.ids)[: len(derived)]
     header = box_map.header
-    told = {
+    update = {
         "derived_ground": len(derived),
         "added_boxes": header.added_boxes + len(derived),
         "credits": f"{header.credits.rstrip('. ')}. {CREDITS}".removeprefix(". "),
     }
-    return replace(box_map.joined(derived), header=header.model_copy(update=told))
+    return replace(box_map.joined(derived), header=header.model_copy(update=update))

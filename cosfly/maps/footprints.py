@@ -1,4 +1,4 @@
-"""Polygons to oriented rectangles, cut in two, again and again, until the rectangle round a piece is nearly full."""
+"""Polygons to oriented rectangles: a polygon is cut in two until the rectangle around each piece is nearly full."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from shapely.geometry.base import BaseGeometry
 
 from cosfly.runtime.io import over_limit
 
-MIN_AREA_M2 = 0.02  # smaller pieces are what rounding leaves of a cut
-PAIRS_AT_ONCE = 1_000_000  # of edges that are compared before the count is looked at
-MAX_DEPTH = 16  # 65,536 pieces of one polygon: past any real object
+MIN_AREA_M2 = 0.02  # smaller pieces are rounding errors of a cut
+MOST_CROSSINGS = 500  # of an outline with itself; 1,000 take a second to resolve
+PAIRS_AT_ONCE = 1_000_000  # of edges that are compared between two looks at the count
+MAX_DEPTH = 16  # 65,536 pieces of one polygon: more than any real object has
 
-CUT_SHARES = (0.25, 0.4, 0.5, 0.6, 0.75)  # where houses are tried to be cut: few boxes and little empty area in them
+CUT_SHARES = (0.25, 0.4, 0.5, 0.6, 0.75)  # where houses may be cut
 
 Share = tuple[float, float]
 
@@ -30,14 +31,14 @@ class Rectangle(NamedTuple):
 
 
 def polygons_of(geometry: BaseGeometry) -> list[Polygon]:
-    """Return the polygons with an area in any geometry; lines and points fall away."""
+    """Return the polygons with an area in any geometry."""
     if isinstance(geometry, Polygon):
         return [geometry] if geometry.area > MIN_AREA_M2 else []
     return [part for child in getattr(geometry, "geoms", ()) for part in polygons_of(child)]
 
 
 def oriented_rectangle(polygon: Polygon) -> Rectangle:
-    """Return the smallest rectangle round a polygon; one side of it lies along a side of the convex hull."""
+    """Return the smallest rectangle around a polygon; one of its sides lies along a side of the convex hull."""
     hull = np.asarray(polygon.convex_hull.exterior.coords)
     edges = np.diff(hull, axis=0)
     angles = np.unique(np.round(np.mod(np.arctan2(edges[:, 1], edges[:, 0]), np.pi / 2), 9))
@@ -52,7 +53,7 @@ def oriented_rectangle(polygon: Polygon) -> Rectangle:
 
 
 def rectangle_polygon(rectangle: Rectangle, along: Share = (-0.5, 0.5), across: Share = (-0.5, 0.5)) -> Polygon:
-    """Return a rectangle, or a part of it in shares of its sizes from the middle, as a polygon; may reach out of it."""
+    """Return a rectangle, or a part of it in shares of its sizes from the middle, as a polygon."""
     yaw = np.radians(rectangle.yaw_deg)
     x = np.array([np.cos(yaw), np.sin(yaw)]) * rectangle.size[0]
     y = np.array([-np.sin(yaw), np.cos(yaw)]) * rectangle.size[1]
@@ -68,16 +69,17 @@ def cover(
     max_size_m: float = np.inf,
     shares: Sequence[float] = (0.5,),
 ) -> list[Rectangle]:
-    """Cover a polygon, holes left out, with oriented rectangles.
+    """Cover a polygon, but not its holes, with oriented rectangles.
 
     A piece is done when its rectangle's longer side is at most `min_size_m`, or at most `max_size_m` and the piece
-    fills it to `min_fill`. Else it is cut across the longer side, at the share (and, with more than one share given,
-    across the side) that leaves the least empty area.
+    fills it to `min_fill`. Otherwise it is cut across the longer side, at the share (with several shares: across the
+    side and at the share) that leaves the least empty area.
 
     Args:
         polygon: valid. shares: where to try to cut, from 0 to 1 along a side.
+
     Returns:
-        rectangles that together cover the polygon, apart from pieces below MIN_AREA_M2.
+        Rectangles that together cover the polygon, except pieces below MIN_AREA_M2.
     """
     if not 0 < min_fill <= 1 or not min_size_m > 0 or not all(0 < share < 1 for share in shares):
         raise ValueError(f"min_fill {min_fill}, min_size_m {min_size_m}, shares {shares}")
@@ -116,15 +118,15 @@ def _cut(piece: Polygon, rectangle: Rectangle, shares: Sequence[float]) -> list[
     return best[1]
 
 
-def check_outline(polygon: Polygon, where: str, most: int) -> None:
-    """Refuse an outline that crosses itself so often that mending it would take minutes and gigabytes."""
-    if not polygon.is_valid and num_crossings(polygon, most) > most:
-        fix = "mend it, or raise maps.cityjson.polygon_crossings if you trust the file"
-        raise over_limit(where, "an outline that crosses itself", f"{most:,} crossings", fix)
+def check_outline(polygon: Polygon, where: str) -> None:
+    """Reject an outline with so many crossings that making it valid would take minutes and gigabytes."""
+    if not polygon.is_valid and num_crossings(polygon) > MOST_CROSSINGS:
+        fix = "correct the outline"
+        raise over_limit(where, "an outline that crosses itself", f"{MOST_CROSSINGS:,} crossings", fix)
 
 
-def num_crossings(polygon: Polygon, most: int) -> int:
-    """Count the pairs of edges, not neighbours in a ring, that meet; stops soon after `most`."""
+def num_crossings(polygon: Polygon) -> int:
+    """Count the pairs of edges, not neighbours in a ring, that meet; stop soon after MOST_CROSSINGS."""
     edges, before, first = [], [], 0
     for ring in (polygon.exterior, *polygon.interiors):
         corners = np.asarray(ring.coords)[:, :2]
@@ -139,7 +141,7 @@ def num_crossings(polygon: Polygon, most: int) -> int:
         one, other = tree.query(lines[start : start + step], predicate="intersects")
         one = one + start
         count += int(((one < other) & (previous[one] != other) & (previous[other] != one)).sum())
-        if count > most:
+        if count > MOST_CROSSINGS:
             break
     return count
 

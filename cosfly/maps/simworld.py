@@ -1,11 +1,10 @@
 """A SimWorld city: the world file of its generator, with the table of asset sizes.
 
-The source is Unreal's: centimetres, left-handed, y to the right, yaw clockwise; it is converted here and nowhere else.
-A box stands with its foot at the node's location, its size is the table's full size times the node's scale. What the
-source does not hold: street furniture has placeholder cubes in the size table, so ASSETS gives plausible sizes (counted
-as `default`); roads have no size, so carriageway and pavement come from what stands beside them (counted as `road`).
-A world that names its own surfaces, as `cosfly world` writes it (nodes such as Sidewalks_C, named after a kind), is
-taken at its word: nothing is added to it.
+The source is Unreal's: centimetres, left-handed, y to the right, yaw clockwise. A box has its foot at the node's
+location; its size is the table's full size times the node's scale. The source lacks sizes of street furniture
+(placeholder cubes in the size table), so ASSETS has plausible ones (counted as `default`), and widths of roads, so
+carriageway and pavement follow from the objects along them (counted as `road`). A world that names its own surfaces, as
+`cosfly world` writes it (nodes such as Sidewalks_C, named after a kind), is read as it is: nothing is added or moved.
 `header.extent_sources` holds the counts.
 """
 
@@ -14,7 +13,7 @@ from __future__ import annotations
 import itertools
 import logging
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, field_validator
@@ -33,15 +32,17 @@ log = logging.getLogger(__name__)
 
 LEAST_M = 1e-3  # no object is smaller
 M_PER_CM = 0.01
-PLACEHOLDER_CM = 256.0  # the size table gives this cube to every asset that was never measured
+ROAD_LENGTH_M = 200.0  # of a road piece: the generator's default
+STAND_M = 0.3  # boxes with their foot at most this high reach down to the ground
+PLACEHOLDER_CM = 256.0  # side of the cube that the size table has for assets without a measured size
 PAVEMENT_TOP_M, ROAD_TOP_M, PAINT_TOP_M, BASE_TOP_M, SLAB_M = 0.0, -0.06, -0.03, -0.12, 0.3
-BESIDE_ROAD_M = 60.0  # what stands farther from every centre line says nothing about the road
+BESIDE_ROAD_M = 60.0  # objects farther from every centre line do not count for the width of roads
 KERB_M = 0.5  # from the kerb to the middle of the row of street furniture
 ROAD_SHARE_OF_FRONT = 0.43  # carriageway half width / distance of the fronts, where no furniture marks the kerb
-DEFAULT_FRONT_M = 27.0  # where no building stands along a road: the generator's usual distance
+DEFAULT_FRONT_M = 27.0  # the generator's usual distance, for roads without buildings
 MAP_MARGIN_M = 10.0
 ROAD_PIECES = "BP_Road*"  # of ASSETS: pieces without a size
-SURFACE_NODE = "Sidewalks_C"  # a world with such states its own surfaces
+SURFACE_NODE = "Sidewalks_C"  # only worlds with their own surfaces have it
 
 
 class SimWorldConfig(Config):
@@ -50,19 +51,13 @@ class SimWorldConfig(Config):
     name: str = Field("SimWorld", min_length=1, description="map name, the head of the playback tree's folder names")
     world: Path | None = Field(None, description="world file, progen_world.json")
     sizes: list[Path] = Field(
-        [], description="asset size table or a list, the first with an asset counts; none: Bbox.json beside the world"
+        [], description="asset size tables; the first that has an asset counts; none: Bbox.json next to the world"
     )
-    tool: str = Field("SimWorld city generator", description="tool and version that made the world, for the records")
     licence: LicenceId = Field("apache-2.0", description="licence, as the hub spells it; goes into every release")
-    credits: str = Field("SimWorld, maitrix-org and contributors", description="who must be named: the world's makers")
-    road_length_m: ClassVar[float] = 200.0  # length of a road piece, m: the generator's default
+    credits: str = Field("SimWorld, maitrix-org and contributors", description="attribution: the world's makers")
     unknown: Literal["error", "drop"] = Field(
-        "error", description="what an asset without a kind or a size is: an error, or left out and counted"
+        "error", description="assets without a kind or a size: an error, or dropped and counted"
     )
-    stand_m: float = Field(
-        0.3, ge=0.0, description="boxes whose foot is at most this high reach down to the ground, m; 0: left floating"
-    )
-    paint: bool = Field(True, description="add centre dashes to the roads, which the source does not hold")
 
     @field_validator("sizes", mode="before")
     @classmethod
@@ -72,20 +67,19 @@ class SimWorldConfig(Config):
     def inputs(self) -> dict[str, Path]:
         if self.world is None:
             fix = "--set maps.simworld.world=FILE"
-            raise ConfigError("no file is given", where="maps.simworld.world", expected="a path", fix=fix)
-        if self.world.is_dir():  # its size table would be looked for beside the folder
-            raise InputError("a folder, not a world", where=self.world, expected="a world file of SimWorld, JSON")
-        for number, path in enumerate(self.size_tables()):
+            raise ConfigError("no world file is set", where="maps.simworld.world", expected="a path", fix=fix)
+        if self.world.is_dir():  # its size table would be looked for next to the folder
+            what, expected = "the world is a folder", "a world file of SimWorld, JSON"
+            raise InputError(what, where=self.world, expected=expected)
+        tables = self.sizes or [self.world.parent / "Bbox.json"]
+        for path in tables:
             if not path.is_file():
-                raise InputError(
-                    "there is no asset size table", where=path, expected="SimWorld's Bbox.json",
-                    fix=f"--set maps.simworld.sizes=FILE (now {f'entry {number}' if self.sizes else 'beside it'})",
-                )  # fmt: skip
-        return {"world": self.world, **{f"sizes_{k}": path for k, path in enumerate(self.size_tables())}}
+                what, fix = "the asset size table is missing", "set it with --set maps.simworld.sizes=FILE"
+                raise InputError(what, where=path, expected="SimWorld's Bbox.json", fix=fix)
+        return {"world": self.world, **{f"sizes_{k}": path for k, path in enumerate(tables)}}
 
-    def size_tables(self) -> list[Path]:
-        assert self.world is not None
-        return self.sizes or [self.world.parent / "Bbox.json"]
+
+Positive = Annotated[FiniteFloat, Field(gt=0)]
 
 
 class _Vector(BaseModel):
@@ -94,16 +88,22 @@ class _Vector(BaseModel):
     z: FiniteFloat
 
 
+class _Size(BaseModel):
+    x: Positive
+    y: Positive
+    z: Positive
+
+
 class _Orientation(BaseModel):
-    pitch: FiniteFloat
+    pitch: FiniteFloat = Field(ge=0, le=0)  # tilted objects are no upright boxes
     yaw: FiniteFloat
-    roll: FiniteFloat
+    roll: FiniteFloat = Field(ge=0, le=0)
 
 
 class _Properties(BaseModel):
     location: _Vector
     orientation: _Orientation
-    scale: _Vector
+    scale: _Size
 
 
 class _Node(BaseModel):
@@ -112,8 +112,15 @@ class _Node(BaseModel):
     properties: _Properties
 
 
-class _Size(BaseModel):
-    bbox: _Vector
+class _World(BaseModel):
+    nodes: list[_Node] = Field(min_length=1)
+
+
+class _Asset(BaseModel):
+    bbox: _Size
+
+
+_SizeTable = dict[str, dict[str, _Asset]]  # group (buildings, elements, details) -> asset -> size, cm
 
 
 class Centerline(NamedTuple):
@@ -137,32 +144,38 @@ class Centerline(NamedTuple):
 
 def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
     """Read a SimWorld city; the seed changes nothing."""
-    cfg.inputs()
-    assert cfg.world is not None
-    nodes = _read_nodes(cfg.world)
-    sizes = read_sizes(cfg.size_tables())
+    world, *tables = cfg.inputs().values()
+    nodes = validated(_World, read_json(world, what="SimWorld world"), world).nodes
+    sizes = read_sizes(tables)
+    has_surfaces = any(node.instance_name == SURFACE_NODE for node in nodes)
+    stand_m = 0.0 if has_surfaces else STAND_M
     boxes, sources, dropped, road_nodes = BoxList(), {"road": 0, "bbox": 0, "engine": 0, "default": 0}, 0, []
     for node in nodes:
-        asset = _asset(node.instance_name)
+        asset = asset_of(node.instance_name)
+        if asset is None and (kind := kind_of(node.instance_name)):  # a world of ours names nodes after kinds
+            asset = Asset(node.instance_name, kind)
         if asset is not None and asset.pattern == ROAD_PIECES:
             road_nodes.append(node)
             continue
         size = sizes.get(node.instance_name)
         if asset is None or size is None:
-            dropped += _unknown(cfg, node, "kind" if asset is None else "size")
+            _check_unknown(cfg, node, "kind" if asset is None else "size")
+            dropped += 1
             continue
-        sources[_add_node(boxes, cfg, node, asset, size)] += 1
+        sources[_add_node(boxes, node, asset, size, stand_m, world)] += 1
     widths: dict = {}
     num_asset_boxes = len(boxes)
-    if SURFACE_NODE not in {node.instance_name for node in nodes}:
-        lines = _centerlines(cfg, road_nodes)
+    if not has_surfaces:
+        lines = [_centerline(node) for node in road_nodes]
         widths = _add_roads(boxes, lines)
         sources["road"] = widths.pop("num_boxes")
         num_asset_boxes = len(boxes)
-        _add_unsourced(boxes, cfg, lines, widths)
+        _add_ground_and_paint(boxes, lines, widths)
     header = MapHeader(
         name=cfg.name,
-        source=MapSource(tool=cfg.tool, version="world file", file=cfg.world.name),
+        source=MapSource(
+            tool="cosfly world" if has_surfaces else "SimWorld city generator", version="world file", file=world.name
+        ),
         licence=cfg.licence,
         credits=cfg.credits,
         ground_z_m=0.0,
@@ -175,86 +188,42 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
     return boxes.box_map(header)
 
 
-# --- reading ----------------------------------------------------------------------------------------------------------
-
-
-def _asset(name: str) -> Asset | None:
-    """Find an asset by its name, or the kind that a node of a world of ours is named after."""
-    kind = None if (asset := asset_of(name)) else kind_of(name)
-    return Asset(name, kind) if kind else asset
-
-
-def _group(value: object, name: str, kind: type, path: Path):
-    group = value.get(name) if isinstance(value, dict) else None
-    if not isinstance(group, kind) or not group:
-        expected = f"{'a list' if kind is list else 'an object'} that is not empty"
-        raise InputError(f"holds no {name}", where=f"{path}: {name}", got=type(group).__name__, expected=expected)
-    return group
-
-
-def _read_nodes(path: Path) -> list[_Node]:
-    nodes = []
-    for number, value in enumerate(_group(read_json(path, what="SimWorld world"), "nodes", list, path)):
-        name = value.get("id", "?") if isinstance(value, dict) else "?"
-        where = f"{path}: nodes[{number}] ({name})"
-        node = validated(_Node, value, where)
-        scale, turn = node.properties.scale, node.properties.orientation
-        if min(scale.x, scale.y, scale.z) <= 0:
-            got = str([scale.x, scale.y, scale.z])
-            raise InputError("a scale is not positive", where=f"{where}: properties.scale", got=got)
-        if turn.pitch or turn.roll:
-            where, got = f"{where}: properties.orientation", f"pitch {turn.pitch}, roll {turn.roll}"
-            raise InputError("a tilted object", where=where, got=got, expected="0 and 0")
-        nodes.append(node)
-    return nodes
-
-
 def read_sizes(paths: list[Path]) -> dict[str, np.ndarray]:
-    """Return full sizes in cm by asset name; groups (buildings, elements, details) are joined."""
+    """Return full sizes in cm by asset name; the groups and tables are joined, and the first entry counts."""
     sizes: dict[str, np.ndarray] = {}
     for path in paths:
-        table = read_json(path, what="asset size table")
-        if not isinstance(table, dict) or not table:
-            raise InputError("not an asset size table", where=path, expected="an object of groups of assets")
-        for group in table:
-            for name, value in _group(table, group, dict, path).items():
-                where = f"{path}: {group}.{name}"
-                box = validated(_Size, value, where).bbox
-                if min(box.x, box.y, box.z) <= 0:
-                    raise InputError("a size is not positive", where=f"{where}: bbox", got=str([box.x, box.y, box.z]))
-                sizes.setdefault(name, np.array([box.x, box.y, box.z]))
+        for group in validated(_SizeTable, read_json(path, what="asset size table"), path).values():
+            for name, asset in group.items():
+                sizes.setdefault(name, np.array([asset.bbox.x, asset.bbox.y, asset.bbox.z]))
     return sizes
 
 
-def _unknown(cfg: SimWorldConfig, node: _Node, what: str) -> int:
-    """Count an asset that cannot be placed, or stop because of it."""
+def _check_unknown(cfg: SimWorldConfig, node: _Node, what: str) -> None:
+    """Report an asset that cannot be placed, as an error or in the log."""
     if cfg.unknown == "error":
-        to_size, to_kinds = (
-            "a size table that has it to maps.simworld.sizes",
-            "it to ASSETS in cosfly/simulators/assets.py",
-        )
+        fix = "add it to ASSETS in cosfly/simulators/assets.py"
+        if what == "size":
+            fix = "add a size table with it to maps.simworld.sizes"
         raise InputError(
-            f"an asset without a {what}", where=f"{cfg.world}: {node.id}.instance_name", got=node.instance_name,
-            fix=f"add {to_size if what == 'size' else to_kinds}, or leave such out: --set maps.simworld.unknown=drop",
+            f"an asset has no {what}", where=f"{cfg.world}: {node.id}.instance_name", got=node.instance_name,
+            fix=f"{fix}, or drop such assets with --set maps.simworld.unknown=drop",
         )  # fmt: skip
-    log.warning("%s: %s has no %s and is left out", node.id, node.instance_name, what)
-    return 1
+    log.warning("%s: %s has no %s and is dropped", node.id, node.instance_name, what)
 
 
-def _add_node(boxes: BoxList, cfg: SimWorldConfig, node: _Node, asset: Asset, size_cm: np.ndarray) -> str:
-    """Add one object; gives the source of its extent."""
+def _add_node(boxes: BoxList, node: _Node, asset: Asset, size_cm: np.ndarray, stand_m: float, world: Path) -> str:
+    """Add one object; return the source of its extent."""
     location, scale = node.properties.location, node.properties.scale
     is_placeholder = asset.default_size_m is not None and bool((size_cm == PLACEHOLDER_CM).all())
     size = np.array(asset.default_size_m) if is_placeholder else size_cm * M_PER_CM
     size = size * [scale.x, scale.y, scale.z]
     if not LEAST_M <= size.min() <= size.max() <= LARGEST:
         raise InputError(
-            "the size of an object cannot be", where=f"{cfg.world}: {node.id}",
-            got=f"{size.tolist()} m, of size and scale", expected=f"{LEAST_M:g} m or more",
-            fix="mend its scale, or its asset's size in the table",
+            "the size of an object is out of range", where=f"{world}: {node.id}", got=f"{size.tolist()} m",
+            expected=f"{LEAST_M:g} m or more", fix="correct its scale, or its asset's size in the table",
         )  # fmt: skip
     foot = location.z * M_PER_CM
-    low = 0.0 if 0 < foot <= cfg.stand_m else foot
+    low = 0.0 if 0 < foot <= stand_m else foot
     xy = (location.x * M_PER_CM, -location.y * M_PER_CM)  # Unreal's y points right
     boxes.add(asset.kind, xy, size[:2], low, foot + size[2], -node.properties.orientation.yaw)
     return "default" if is_placeholder else "bbox"
@@ -263,23 +232,20 @@ def _add_node(boxes: BoxList, cfg: SimWorldConfig, node: _Node, asset: Asset, si
 # --- roads ------------------------------------------------------------------------------------------------------------
 
 
-def _centerlines(cfg: SimWorldConfig, nodes: list[_Node]) -> list[Centerline]:
-    """Centre lines in world metres, from the road pieces: a location is a piece's middle, x its direction.
+def _centerline(node: _Node) -> Centerline:
+    """Return a road piece's centre line, world metres: its location is the piece's middle, x its direction.
 
-    The roads.json beside a world is not read: in the city that SimWorld ships it holds 7 roads, two of them nowhere in
-    the world, and the world holds 10.
+    The roads.json of a world is not read: in the city that SimWorld ships it holds 7 roads, two of them nowhere in the
+    world, and the world holds 10.
     """
-    lines = []
-    for node in nodes:
-        turn = -np.radians(node.properties.orientation.yaw)
-        middle = np.array([node.properties.location.x, -node.properties.location.y]) * M_PER_CM
-        half = np.array([np.cos(turn), np.sin(turn)]) * cfg.road_length_m / 2
-        lines.append(Centerline(middle - half, middle + half))
-    return lines
+    turn = -np.radians(node.properties.orientation.yaw)
+    middle = np.array([node.properties.location.x, -node.properties.location.y]) * M_PER_CM
+    half = np.array([np.cos(turn), np.sin(turn)]) * ROAD_LENGTH_M / 2
+    return Centerline(middle - half, middle + half)
 
 
 def _distances_m(points: np.ndarray, lines: list[Centerline]) -> np.ndarray:
-    """Distance of (n, 2) points to the nearest centre line, (n,)."""
+    """Return the distances of (n, 2) points to the nearest centre line, (n,)."""
     best = np.full(len(points), np.inf)
     for line in lines:
         along = np.clip((points - line.start) @ line.direction, 0.0, line.length_m)
@@ -288,9 +254,9 @@ def _distances_m(points: np.ndarray, lines: list[Centerline]) -> np.ndarray:
 
 
 def _half_widths(boxes: BoxList, lines: list[Centerline]) -> tuple[float, float]:
-    """Half the carriageway's width, and the distance of the fronts from the centre line, m.
+    """Return half the carriageway's width, and the distance of the fronts from the centre line, m.
 
-    Both are what nearly all objects keep clear of (tenth percentile): fronts from the nearest points of buildings, the
+    Both are distances that nearly all objects keep (tenth percentile): fronts from the nearest points of buildings, the
     kerb from the middles of street furniture.
     """
     box_map = boxes.box_map()
@@ -298,7 +264,7 @@ def _half_widths(boxes: BoxList, lines: list[Centerline]) -> tuple[float, float]
     fronts = [DEFAULT_FRONT_M]
     rows = np.flatnonzero(kinds == "Buildings")
     if len(rows):
-        edges = np.concatenate([_outline(box_map, int(row)) for row in rows])
+        edges = np.concatenate([_outline_points(box_map, int(row)) for row in rows])
         nearest = _distances_m(edges, lines).reshape(len(rows), -1).min(axis=1)
         fronts = nearest[nearest < BESIDE_ROAD_M].tolist() or fronts
     front = float(np.percentile(fronts, 10))
@@ -308,8 +274,8 @@ def _half_widths(boxes: BoxList, lines: list[Centerline]) -> tuple[float, float]
     return round(max(kerb, 2.0), 2), round(max(front, kerb + 1.0), 2)
 
 
-def _outline(box_map: BoxMap, row: int) -> np.ndarray:
-    """Points along a footprint's edges, (n, 2)."""
+def _outline_points(box_map: BoxMap, row: int) -> np.ndarray:
+    """Return points along a footprint's edges, (n, 2)."""
     corners = box_corners(box_map.centers[row], box_map.half_extents[row], np.radians(box_map.rotations_deg[row, 1]))
     ring = corners[[0, 2, 6, 4, 0], :2]
     shares = np.linspace(0.0, 1.0, 25)[:, None]
@@ -339,7 +305,7 @@ def _add_roads(boxes: BoxList, lines: list[Centerline]) -> dict:
 
 
 def _add_junction(boxes: BoxList, place: np.ndarray, arms: list[np.ndarray], kerb: float, front: float) -> None:
-    """The crossing square, pavement at its four corners, and pavement across the sides that no road leaves by."""
+    """Add the crossing square, pavement at its four corners, and pavement across the sides without a road."""
     x = arms[0]
     y = np.array([-x[1], x[0]])
     yaw = float(np.degrees(np.arctan2(x[1], x[0])))
@@ -359,12 +325,10 @@ def _slab(boxes: BoxList, kind: str, middle: np.ndarray, size: tuple[float, floa
     boxes.add(kind, middle, size, top - SLAB_M, top, yaw_deg)
 
 
-def _add_unsourced(boxes: BoxList, cfg: SimWorldConfig, lines: list[Centerline], widths: dict) -> None:
-    """Add the ground below everything, and paint: neither is in the source."""
+def _add_ground_and_paint(boxes: BoxList, lines: list[Centerline], widths: dict) -> None:
+    """Add the ground below everything, and centre dashes: neither is in the source."""
     low, high = boxes.box_map().bounds()
     boxes.add_span("Terrain", low[:2] - MAP_MARGIN_M, high[:2] + MAP_MARGIN_M, BASE_TOP_M - SLAB_M, BASE_TOP_M)
-    if not cfg.paint:
-        return
     for line in lines:
         for at in np.arange(widths["carriageway_m"], line.length_m - widths["carriageway_m"], 9.0):
             place = line.start + (at + 1.5) * line.direction

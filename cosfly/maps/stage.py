@@ -27,6 +27,8 @@ from cosfly.viz.topview import TopView, draw_map, png_bytes
 
 log = logging.getLogger(__name__)
 
+PICTURE_PX = 1200  # longer side of the overview picture
+
 SOURCES: dict[str, Callable[[Any, int], BoxMap]] = {
     "synthetic": synthetic.load, "simworld": simworld.load, "cityjson": cityjson.load,
     "boxes": boxfile.load, "carla": carla_export.load, "unrealcv": unrealcv_export.load,
@@ -47,21 +49,20 @@ class MapsConfig(Config):
     unrealcv: UnrealCvMapConfig = Field(
         default_factory=UnrealCvMapConfig, description="the level of a running UnrealCV server, as SimWorld's"
     )
-    picture_px: int = Field(1200, ge=200, le=8000, description="longer side of the overview picture, px")
 
     @property
     def licence(self) -> str:
-        """What the chosen source says of its licence, for the map's header."""
+        """The licence of the chosen source, for the map's header."""
         return getattr(self, self.source).licence
 
     def recorded(self) -> dict[str, Any]:
-        """Only the chosen source counts for resumption: the settings of the others change nothing."""
+        """Return the settings that count for resumption: those of the chosen source, not of the others."""
         others = SOURCES.keys() - {self.source}
         return {name: value for name, value in super().recorded().items() if name not in others}
 
 
 def load_map(cfg: MapsConfig, *, seed: int = 0, follow_links: bool = False) -> BoxMap:
-    """Read or build the map that the settings name; its meshes are read when they are drawn."""
+    """Read or build the map of the chosen source; its meshes are read when they are drawn."""
     box_map = SOURCES[cfg.source](getattr(cfg, cfg.source), seed)
     meshes = box_map.meshes
     if follow_links and meshes.folder is not None:
@@ -70,12 +71,13 @@ def load_map(cfg: MapsConfig, *, seed: int = 0, follow_links: bool = False) -> B
 
 
 def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same", follow_links: bool = False) -> Path:
-    """Reads the source's files, if it has any; writes `boxes_3d.json` and the overview `map.png`.
+    """Read the source's files, if it has any; write `boxes_3d.json` and the overview `map.png`.
 
     Args:
-        follow_links: meshes are read through links that lead out of the map's folder.
+        follow_links: also read meshes through links that lead out of the map's folder.
+
     Raises:
-        InputError: a file is malformed, or nothing in it says where the ground is: no later stage could tell.
+        InputError: If a file is malformed, or does not contain the height of the ground.
     """
     inputs = getattr(cfg, cfg.source).inputs()
     stage = StageFolder.open(out, "maps", config=cfg, inputs=inputs, seed=seed, resume=resume)
@@ -85,16 +87,14 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same"
     box_map = load_map(cfg, seed=seed, follow_links=follow_links)
     check_ground(box_map, next(iter(inputs.values()), product))
     write_boxes(product, box_map)
-    beside = unrealcv_export.write_beside(box_map, out) if cfg.source == "unrealcv" else []
-    beside += [out / MESHES_FILE] if box_map.meshes.refs else []
-    view = TopView.around(np.stack(box_map.bounds()), cfg.picture_px)
+    outputs = [product, out / "map.png"] + [out / MESHES_FILE] * bool(box_map.meshes.refs)
+    if cfg.source == "unrealcv":
+        outputs += unrealcv_export.write_objects(box_map, out)
+    view = TopView.around(np.stack(box_map.bounds()), PICTURE_PX)
     write_bytes(out / "map.png", png_bytes(draw_map(box_map, view)))
     dropped = box_map.header.dropped_objects
     num_objects = len(box_map) if box_map.header.num_objects is None else box_map.header.num_objects
     tally = Tally(input=num_objects, kept=num_objects - sum(dropped.values()), dropped=dropped)
     log.info("%d boxes of %d objects", len(box_map), num_objects)
-    meshes = [out / MESHES_FILE] if box_map.meshes.refs else []
-    stage.finish(
-        [product, *meshes, *beside, out / "map.png"], tally, num_boxes=len(box_map), counts_by_kind=box_map.counts()
-    )
+    stage.finish(outputs, tally, num_boxes=len(box_map), counts_by_kind=box_map.counts())
     return product

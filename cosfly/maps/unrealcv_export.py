@@ -1,9 +1,9 @@
 """The objects of a running UnrealCV server's level as boxes (app:simworld, step 2).
 
-Where a box's size comes from is counted, as the paper does: `road`, bounds of a road; `bbox`, a table of sizes of
-assets, if one is given; `engine`, bounds of anything else; `default`, nothing was told, so that it is the plausible
-size of its asset or a cube of 1 m. Bounds are along the world's axes; of a turned object the box that has these bounds
-is found again. An id is made of the object's name, so that pictures of the same level find the box (`id_of`).
+The sources of sizes are counted, as in the paper: `road`, bounds of a road; `bbox`, a table of asset sizes; `engine`,
+bounds of any other object; `default`, no answer: the plausible size of its asset or a cube of 1 m. Bounds are along the
+world's axes; of a turned object the box with these bounds is computed. An id is derived from the object's name, so that
+pictures of the same level refer to the box (`id_of`).
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from cosfly.simulators.unrealcv_client import UnrealCvConfig, UnrealCvConnection
 
 log = logging.getLogger(__name__)
 
-QUESTIONS = {"uclass_name": 0, "location": 3, "rotation": 3, "bounds": 6, "scale": 3}  # and how many numbers they give
+QUESTIONS = {"uclass_name": 0, "location": 3, "rotation": 3, "bounds": 6, "scale": 3}  # number of values of each answer
 SOURCES = ("road", "bbox", "engine", "default")
-LEAST_M = 0.01  # bounds of an object that has none
+LEAST_M = 0.01  # smaller bounds are none
 CUBE_M = 1.0
-SKEWED = 0.2  # cosine of twice a yaw, below which bounds do not tell the sides of what is turned
-SIDECAR, VIEWER = "boxes_meta.json", "boxes.html"
+SKEWED = 0.2  # cosine of twice a yaw, below which the sides of a turned box do not follow from its bounds
+OBJECTS_FILE, VIEWER = "boxes_meta.json", "boxes.html"
 MOST_PAGE_MB = 200.0
 
 
@@ -43,10 +43,10 @@ class UnrealCvMapConfig(UnrealCvConfig):
 
     name: str | None = Field(None, min_length=1, description="map name; null takes the level's")
     licence: LicenceId = Field("apache-2.0", description="licence, as the hub spells it; goes into every release")
-    credits: str = Field("SimWorld, maitrix-org and contributors", description="who must be named: the level's makers")
+    credits: str = Field("SimWorld, maitrix-org and contributors", description="attribution: the level's makers")
     sizes: list[Path] = Field([], description="asset size tables of SimWorld, the first with an asset counts")
     ground_z_m: float | None = Field(None, description="height of the ground, m; null takes the roads' median top")
-    # what is longer both ways and higher than 2 m is left out and counted, m: landscapes
+    # objects longer than this both ways and higher than 2 m, landscapes, are dropped and counted, m
     huge_m: ClassVar[float] = 150.0
     most_default: float | None = Field(
         None, ge=0, le=1, description="largest share of boxes of a `default` size; more fail the export; null: any"
@@ -58,14 +58,14 @@ class UnrealCvMapConfig(UnrealCvConfig):
 
 @dataclass(frozen=True)
 class LevelMap(BoxMap):
-    """A map, and of each box the object that it is of: name, class, and where its size comes from."""
+    """A map, and for each box its object: name, class, and source of its size."""
 
     objects: tuple[tuple[str, str, str], ...] = ()
 
 
 @dataclass(frozen=True)
 class _Object:
-    """What the server told of one object; numbers in its own units and axes, None where it told none."""
+    """Answers about one object; numbers in the server's units and axes, None where it has none."""
 
     name: str
     class_name: str
@@ -95,9 +95,9 @@ def _asked(connection: UnrealCvConnection) -> Iterator[_Object]:
 
 
 def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, version: str, level: str) -> LevelMap:
-    """Make a map of what a server told; what is left out is counted in the header."""
+    """Return a map of a server's answers; the header counts dropped objects."""
     sizes = read_sizes(cfg.sizes) if cfg.sizes else {}
-    dropped, rows, kinds, told = Counter[str](), [], [], []
+    dropped, rows, kinds, kept = Counter[str](), [], [], []
     for one in objects:
         kind = kind_of(one.class_name)
         box, source = _box(one, kind, sizes, cfg)
@@ -107,21 +107,21 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
         assert box is not None
         rows.append(box)
         kinds.append(KINDS[kind or "Other"])
-        told.append((one.name, one.class_name, source))
-    counts = {source: sum(row[2] == source for row in told) for source in SOURCES}
+        kept.append((one.name, one.class_name, source))
+    counts = {source: sum(row[2] == source for row in kept) for source in SOURCES}
     if not rows:
         raise InputError("the level has no objects", where=where, got=f"{len(objects)}", expected="vget /objects")
     share = counts["default"] / len(rows)
     if cfg.most_default is not None and share > cfg.most_default:
-        classes = Counter(row[1] for row in told if row[2] == "default").most_common(5)
+        classes = Counter(row[1] for row in kept if row[2] == "default").most_common(5)
         raise InputError(
-            "too many boxes of a default size: the server tells no bounds of them", where=where,
+            "too many boxes have a default size, because the server knows no bounds of them", where=where,
             got=f"{share:.1%}: {', '.join(f'{name} ({num})' for name, num in classes)}",
             expected=f"at most {cfg.most_default:.1%} (maps.unrealcv.most_default)",
-            fix="give their sizes in a table (maps.unrealcv.sizes), or mend the assets' bounds",
+            fix="add a table with their sizes to maps.unrealcv.sizes, or correct the assets' bounds",
         )  # fmt: skip
     boxes = np.array(rows)
-    is_road = np.array([row[2] == "road" for row in told])
+    is_road = np.array([row[2] == "road" for row in kept])
     tops_m = boxes[is_road, 2] + boxes[is_road, 5]
     ground_z_m = cfg.ground_z_m if cfg.ground_z_m is not None else float(np.median(tops_m)) if len(tops_m) else 0.0
     header = MapHeader(
@@ -136,9 +136,9 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
     )
     log.info("%s: sizes from %s", where, counts)
     if dropped:
-        log.warning("%s: left out: %s", where, dict(dropped))
-    plain = make_box_map(boxes[:, :3], boxes[:, 3:6], boxes[:, 6:], kinds, [id_of(row[0]) for row in told], header)
-    return LevelMap(**vars(plain), objects=tuple(told))
+        log.warning("%s: dropped: %s", where, dict(dropped))
+    plain = make_box_map(boxes[:, :3], boxes[:, 3:6], boxes[:, 6:], kinds, [id_of(row[0]) for row in kept], header)
+    return LevelMap(**vars(plain), objects=tuple(kept))
 
 
 def _unfit(one: _Object, kind: str | None, box: np.ndarray | None, source: str, cfg: UnrealCvMapConfig) -> str:
@@ -154,7 +154,7 @@ def _unfit(one: _Object, kind: str | None, box: np.ndarray | None, source: str, 
 def _box(
     one: _Object, kind: str | None, sizes: dict[str, np.ndarray], cfg: UnrealCvMapConfig
 ) -> tuple[np.ndarray | None, str]:
-    """Centre, half sizes and rotation of ours, (9,), of an object, and the source of its size."""
+    """Return centre, half sizes and rotation, (9,) in world axes, of an object, and the source of its size."""
     turn = one.rotation or (0.0, 0.0, 0.0)
     if one.bounds is not None and one.class_name not in sizes:
         low, high = np.reshape(one.bounds, (2, 3)) / cfg.coord_scale
@@ -175,7 +175,7 @@ def _box(
 
 
 def _unturned(half_m: np.ndarray, rotation_deg: tuple[float, ...]) -> tuple[np.ndarray, bool]:
-    """Half sizes of a box whose bounds these are, and whether it is turned about the vertical; else the bounds' own."""
+    """Return half sizes of the turned box with these bounds and True; if there is none, the bounds' own and False."""
     pitch, yaw, roll = rotation_deg
     c, s = abs(np.cos(np.radians(yaw))), abs(np.sin(np.radians(yaw)))
     if max(abs(pitch), abs(roll)) > 1e-3 or abs(c * c - s * s) < SKEWED:
@@ -184,12 +184,9 @@ def _unturned(half_m: np.ndarray, rotation_deg: tuple[float, ...]) -> tuple[np.n
     return (np.array([x, y, half_m[2]]), True) if min(x, y) > LEAST_M / 2 else (half_m, False)
 
 
-# --- beside the map ---------------------------------------------------------------------------------------------------
-
-
-def write_beside(box_map: BoxMap, out: Path) -> list[Path]:
-    """Write what is known of each box's object, and the page to look at the map; gives both paths."""
-    from cosfly.viz import scene_page  # it reads flights and frames too, which `maps` has no use for
+def write_objects(box_map: BoxMap, out: Path) -> list[Path]:
+    """Write the object of each box, and the page that shows the map; return both paths."""
+    from cosfly.viz import scene_page  # imported here: it also reads trajectories and frames
 
     assert isinstance(box_map, LevelMap)
     header = box_map.header
@@ -203,5 +200,5 @@ def write_beside(box_map: BoxMap, out: Path) -> list[Path]:
         "counts_by_kind": box_map.counts(), "num_objects": header.num_objects,
         "dropped_objects": header.dropped_objects, "objects": objects,
     }  # fmt: skip
-    write_json(out / SIDECAR, sidecar, indent=None)
-    return [out / SIDECAR, scene_page.run(out / "boxes_3d.json", out / VIEWER, max_mb=MOST_PAGE_MB)]
+    write_json(out / OBJECTS_FILE, sidecar, indent=None)
+    return [out / OBJECTS_FILE, scene_page.run(out / "boxes_3d.json", out / VIEWER, max_mb=MOST_PAGE_MB)]

@@ -19,7 +19,7 @@ from cosfly.runtime.config import Config, build
 from cosfly.runtime.errors import ConfigError
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig
-from cosfly.worldgen.settings import WorldConfig
+from cosfly.worldgen.stage import WorldConfig
 from distill.evaluation.stage import EvaluateConfig
 from distill.inference.stage import InferConfig
 from distill.prepare.dual_track import DualTrackConfig

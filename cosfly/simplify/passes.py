@@ -4,9 +4,9 @@ prune_nested.
 Two rules of the paper lose more than they should on real maps, so each has a guard, on by default, that a setting turns
 off. *merge* replaces a cluster by its enclosing axis-aligned box: rows of houses that stand askew would swallow the
 street between them, so a cluster that fills too little of that box is halved until its parts fill enough (`min_fill`,
-`min_canopy_fill`; 0 is the paper's rule). *crop_tree* keeps the full footprint below the cut, so that nobody walks
-below a tree, although that is what the cut is for:
-`trunk: stem` leaves stems instead (`trunk: full` is the paper's rule). The report holds the walkable area of both.
+`min_canopy_fill`; 0 is the paper's rule). *crop_tree* keeps the full footprint below the cut, so that
+pedestrians cannot walk below a tree, which is the purpose of the cut: `trunk: stem` leaves stems instead (`trunk: full`
+is the paper's rule). The report holds the walkable area of both.
 
 The paper's SimWorld runs simplify otherwise (app:simworld:step3); its variants are settings: `merge_by: center`,
 `crop_strategy: adaptive`, `below_ground: clip`, `nested_tolerance_m: 1e-6`.
@@ -32,7 +32,7 @@ from cosfly.runtime.config import Config
 # Clusters come from union-find over the pairs that a sweep meets, never over all pairs.
 
 
-CLOSED_GAP_M = 1.0  # twice the safety radius of a person (tab:ped_params): nobody walks through
+CLOSED_GAP_M = 1.0  # twice the safety radius of a person (tab:ped_params): pedestrians cannot walk through
 FILL_CELLS = 64  # a cluster's fill is measured on at most FILL_CELLS x FILL_CELLS cells: 1.6 % a cell along each axis
 
 
@@ -46,15 +46,15 @@ class MergeRule(NamedTuple):
 def merge(
     box_map: BoxMap, rules: dict[int, MergeRule], groups: np.ndarray | None = None, *, by_center: bool = False
 ) -> BoxMap:
-    """Replace clusters of neighbours of one kind by enclosing axis-aligned boxes; what is alone keeps its rotation.
+    """Replace clusters of neighbours of one kind by enclosing axis-aligned boxes; single boxes keep their rotation.
 
     A cluster whose members, gaps of CLOSED_GAP_M between them closed, cover less than `min_fill` of the enclosing
     footprint is halved at the median of its longer side, again and again; a `min_fill` of 0 never halves.
 
     Args:
         rules: kind -> rule; other kinds stay.
-        groups: (n,) bool, boxes of different groups are no neighbours; None: one group.
-        by_center: neighbours are boxes whose centres, not faces, lie within the gap on every axis.
+        groups: (n,) bool, boxes of different groups are not neighbours; None: one group.
+        by_center: neighbours are boxes with centres, not faces, within the gap on every axis.
     Source: sec:step2, "Merging adjacent boxes"; by centres: app:simworld:step3; the guard is ours.
     """
     mins, maxs = box_map.mins, box_map.maxs
@@ -86,7 +86,7 @@ def merge(
 
 
 def clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:
-    """Label boxes that hang together by gaps of at most `gap_m` on every axis.
+    """Return clusters of boxes with gaps of at most `gap_m` on every axis.
 
     Args:
         mins, maxs: (n, 3) m.
@@ -106,7 +106,7 @@ def clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:
 
 @njit(cache=True)
 def _sweep_clusters(mins, maxs, order, axis, gap_m):  # pragma: no cover (compiled)
-    """Union-find over the pairs that a sweep along one axis meets; the root is the lowest row."""
+    """Return the lowest row of each box's cluster, by union-find over the pairs that a sweep along one axis meets."""
     parent = np.arange(len(order))
     for i in range(len(order)):
         a = order[i]
@@ -156,7 +156,7 @@ def _halve_sparse(
 
 @njit(cache=True)
 def _halve(order, starts, rectangles, mins, maxs, min_fill, labels):  # pragma: no cover (compiled)
-    """Halve clusters, which are runs of `order`, and give the labels of the parts."""
+    """Return labels after halving clusters, which are runs of `order`."""
     stack = np.empty((128, 2), dtype=np.int64)  # halves are at most 64 deep
     for cluster in range(len(starts) - 1):
         stack[0, 0], stack[0, 1] = starts[cluster], starts[cluster + 1]
@@ -193,7 +193,7 @@ def _halve(order, starts, rectangles, mins, maxs, min_fill, labels):  # pragma: 
 
 @njit(cache=True)
 def fill_share(rectangles, low, high):  # pragma: no cover (compiled)
-    """Share of a rectangle's area that turned rectangles cover, by cell centres."""
+    """Return the share of a rectangle's area that turned rectangles cover, by cell centres."""
     size = high - low
     if size[0] <= 0.0 or size[1] <= 0.0:
         return 1.0
@@ -220,16 +220,6 @@ def fill_share(rectangles, low, high):  # pragma: no cover (compiled)
 VEGETATION = KINDS["Vegetation"]
 
 
-class MergeGaps(Config):
-    """Largest gap on every axis between boxes that count as neighbours, m; null: this kind is not merged."""
-
-    Vegetation: float | None = Field(2.0, ge=0.0, description="canopy parts of simulators stand closer than this, m")
-    Buildings: float | None = Field(5.0, ge=0.0, description="wall segments of one building stand closer than this, m")
-    Walls: ClassVar[float | None] = None  # free-standing walls, m; null: not merged
-    Fences: ClassVar[float | None] = None  # fences, m; null: not merged
-    Static: ClassVar[float | None] = None  # street furniture, m; null: not merged
-
-
 class SimplifyConfig(Config):
     """The four passes of Step 2."""
 
@@ -237,7 +227,11 @@ class SimplifyConfig(Config):
     merge_by: Literal["gap", "center"] = Field(
         "gap", description="neighbours: boxes with gaps below merge_gap_m on every axis, or centres so near (SimWorld)"
     )
-    merge_gap_m: MergeGaps = Field(default_factory=MergeGaps, description="neighbourhood by kind")
+    # Largest gap on every axis between neighbours by kind, m; None: kinds that are not merged. Canopy parts of
+    # simulators are closer than 2 m, wall segments of one building closer than 5 m.
+    merge_gap_m: ClassVar[dict[str, float | None]] = {
+        "Vegetation": 2.0, "Buildings": 5.0, "Walls": None, "Fences": None, "Static": None,
+    }  # fmt: skip
     min_fill: float = Field(
         0.85, ge=0.0, le=1.0, description="least share of a merged footprint that members cover; 0: the paper's rule"
     )
@@ -249,19 +243,18 @@ class SimplifyConfig(Config):
         "fixed", description="fixed: split at cut_height_m; adaptive: cut tall vegetation into low pieces (SimWorld)"
     )
     cut_height_m: ClassVar[float] = 2.0  # height over the ground of the split, m
-    lift_m: float = Field(0.5, ge=0.0, description="how far the canopy is lifted over the cut, m")
+    lift_m: ClassVar[float] = 0.5  # how far the canopy is lifted over the cut, m
     trunk: Literal["stem", "full"] = Field("stem", description="below the cut: stems, or full footprints (paper)")
     stem_radius_m: ClassVar[float] = 0.25  # half width of a stem, m
-    split_z_m: float = Field(5.0, gt=0.0, description="adaptive: height over the ground of the lowest cut, m")
-    adaptive_height_m: float = Field(5.0, gt=0.0, description="adaptive: vegetation higher than this is cut, m")
-    cell_size_m: float = Field(0.5, gt=0.0, description="adaptive: width of what stands below the lowest cut, m")
-    crop_below_ground: bool = Field(True, description="drop boxes, surfaces apart, whose top lies below the ground")
+    split_z_m: ClassVar[float] = 5.0  # adaptive: height over the ground of the lowest cut, m
+    adaptive_height_m: ClassVar[float] = 5.0  # adaptive: higher vegetation is cut, m
+    cell_size_m: ClassVar[float] = 0.5  # adaptive: width of the stem below the lowest cut, m
+    crop_below_ground: bool = Field(True, description="drop boxes, except surfaces, with their top below the ground")
     below_ground: Literal["drop", "clip"] = Field(
-        "drop", description="clip: also cut off what a box has below the ground (SimWorld); drop: leave boxes whole"
+        "drop", description="clip: also cut off the part of a box below the ground (SimWorld); drop: leave boxes whole"
     )
     prune_nested: bool = Field(True, description="drop boxes inside another of the same kind")
     nested_tolerance_m: float = Field(0.01, ge=0.0, description="how far a nested box may stick out, m")
-    picture_px: int = Field(1000, ge=200, le=8000, description="longer side of each half of the picture, px")
 
 
 @dataclass(frozen=True)
@@ -295,36 +288,33 @@ def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplification:
     if cfg.prune_nested:
         result = prune_nested(result, cfg.nested_tolerance_m)
         passes.append(("prune_nested", result.counts()))
-    told = {
-        "passes": [SimplifyPass(name=name, counts=counts) for name, counts in passes],
-        "simplify": {name: value for name, value in cfg.all_values().items() if name != "picture_px"},
-    }
-    header = box_map.header.model_copy(update=told)
+    records = [SimplifyPass(name=name, counts=counts) for name, counts in passes]
+    header = box_map.header.model_copy(update={"passes": records, "simplify": cfg.all_values()})
     return Simplification(replace(result, header=header, meshes=Meshes()), passes)
 
 
 def _merge_rules(cfg: SimplifyConfig) -> dict[int, MergeRule]:
-    gaps = {KINDS[name]: gap for name, gap in cfg.merge_gap_m.all_values().items() if gap is not None}
+    gaps = {KINDS[name]: gap for name, gap in cfg.merge_gap_m.items() if gap is not None}
     return {
         kind: MergeRule(gap, cfg.min_canopy_fill if kind == VEGETATION else cfg.min_fill) for kind, gap in gaps.items()
     }
 
 
 def _merge_groups(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
-    """Groups that never merge, (n,): with stems, bushes and hedges must not vanish below the cut of a tree; what is
-    built over a passage or an arcade, not on what stands below, must not close it."""
+    """Return groups that never merge, (n,) bool: with stems, bushes and hedges must not vanish below the cut of a tree;
+    a box over a passage or an arcade, and not on a box below, must not close it."""
     cut_m = _ground_z_m(box_map) + cfg.cut_height_m
     mins, maxs = box_map.mins, box_map.maxs
-    is_plant, stands = box_map.kinds == VEGETATION, mins[:, 2] <= cut_m
+    is_plant, is_low = box_map.kinds == VEGETATION, mins[:, 2] <= cut_m
     outlines = shapely.box(*mins[:, :2].T, *maxs[:, :2].T)
-    above, below = shapely.STRtree(outlines[stands]).query(outlines, predicate="covered_by")
-    is_built_over = ~stands & ~is_plant
-    is_built_over[above[box_map.kinds[above] == box_map.kinds[stands][below]]] = False
+    above, below = shapely.STRtree(outlines[is_low]).query(outlines, predicate="covered_by")
+    is_built_over = ~is_low & ~is_plant
+    is_built_over[above[box_map.kinds[above] == box_map.kinds[is_low][below]]] = False
     return is_built_over | (is_plant & (maxs[:, 2] > cut_m) & _has_stems(cfg))
 
 
 def _ground_z_m(box_map: BoxMap) -> np.ndarray:
-    """Height of the ground under the middle of each box, (n,) m."""
+    """Return the height of the ground under the middle of each box, (n,) m."""
     return box_map.ground.height_at(box_map.centers)
 
 
@@ -336,7 +326,7 @@ def _has_stems(cfg: SimplifyConfig) -> bool:
 
 
 def _feet(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
-    """Where trees stand, (k, 4): x, y and half widths of a stem for every vegetation box that spans the cut height.
+    """Return (k, 4): x, y and half widths of a stem for every vegetation box that spans the cut height.
 
     Taken before the merge, because a merged grove still has one stem for each of its trees.
     """
@@ -344,19 +334,19 @@ def _feet(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
     ground_z_m = _ground_z_m(box_map)
     cut = ground_z_m + cfg.cut_height_m
     rows = np.flatnonzero((box_map.kinds == VEGETATION) & (mins < cut) & (maxs > cut))
-    # A box that hangs above the ground is a part of a crown, not a tree that stands, unless it comes down to a metre.
+    # A box that hangs above the ground is a part of a crown, not a tree, unless it comes down to a metre.
     rows = rows[mins[rows] <= ground_z_m[rows] + 1.0]
     half = np.minimum(box_map.half_extents[rows, :2].min(axis=1), cfg.stem_radius_m)
     return np.column_stack([box_map.centers[rows, :2], half, half])
 
 
 def crop_tree(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray, feet: np.ndarray | None) -> BoxMap:
-    """Split vegetation that spans the cut height into what stands on the ground and a lifted canopy.
+    """Split vegetation that spans the cut height into trunks on the ground and a lifted canopy.
 
     Boxes wholly below the cut (bushes, hedges) and wholly above it stay as they are, so a second pass changes nothing.
 
     Args:
-        used_ids: ids that new boxes may not take. feet: (k, 4) stems to stand below the canopies; None: full
+        used_ids: ids that new boxes may not take. feet: (k, 4) stems below the canopies; None: full
             footprints.
     Source: sec:step2, "Crop tree operation"; stems are ours.
     """
@@ -451,11 +441,11 @@ def _free_ids(used: np.ndarray, count: int) -> np.ndarray:
 
 
 def crop_below_ground(box_map: BoxMap, *, clip: bool = False) -> BoxMap:
-    """Drop boxes whose top face lies below the ground; surfaces stay (sec:step2, "Below-ground removal").
+    """Drop boxes with their top face below the ground; surfaces stay (sec:step2, "Below-ground removal").
 
     Args:
-        clip: also cut off what upright boxes, surfaces apart, have below the ground; what only just reaches it goes too
-            (app:simworld:step3). A tilted box has no lower part that is a box, and stays whole.
+        clip: also cut off the parts of upright boxes, except surfaces, below the ground, and drop boxes that only just
+            reach it (app:simworld:step3). A tilted box has no lower part that is a box, and stays whole.
     """
     ground_z_m = _ground_z_m(box_map)
     is_surface = box_map.is_any_of(SURFACE_KINDS)

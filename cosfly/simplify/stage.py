@@ -17,6 +17,7 @@ from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.simplify.passes import Simplification, SimplifyConfig, simplify
 from cosfly.viz.topview import TopView, add_caption, draw_map, png_bytes
 
+PICTURE_PX = 1000  # longer side of each half of the picture
 SAFETY_RADIUS_M = 0.5  # tab:ped_params; for the walkable area in the report
 REPORT_FORMAT = FileFormat("cosfly.simplify_report", "1.0")
 
@@ -70,7 +71,7 @@ def report(raw: BoxMap, result: Simplification, cfg: SimplifyConfig) -> dict:
 
 
 def _compare_trunks(raw: BoxMap, cfg: SimplifyConfig) -> dict:
-    """What either rule for trunks leaves people to walk on; empty where these rules are not used."""
+    """Return the walkable area of both rules for trunks; empty if neither is used."""
     if not (cfg.crop_tree and cfg.crop_strategy == "fixed"):
         return {}
     results = {trunk: simplify(raw, cfg.model_copy(update={"trunk": trunk})) for trunk in ("stem", "full")}
@@ -80,7 +81,7 @@ def _compare_trunks(raw: BoxMap, cfg: SimplifyConfig) -> dict:
 
 
 def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same") -> Path:
-    """Reads `boxes_3d.json`; writes `step2_simplified.json`, `simplify_report.json` and `simplify.png`."""
+    """Read `boxes_3d.json`; write `step2_simplified.json`, `simplify_report.json` and `simplify.png`."""
     stage = StageFolder.open(out, "simplify", config=cfg, inputs={"maps": maps}, seed=0, resume=resume)
     product = out / "step2_simplified.json"
     if stage.is_complete:
@@ -93,20 +94,20 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same
     write_boxes(product, result.box_map)
     facts = report(raw, result, cfg)
     write_json(out / "simplify_report.json", facts)
-    write_bytes(out / "simplify.png", _picture(raw, result.box_map, facts, cfg.picture_px))
+    write_bytes(out / "simplify.png", _picture(raw, result.box_map, facts))
     log.info("%d boxes become %d", len(raw), len(result.box_map))
     tally = Tally(input=1, kept=1)
     stage.finish([product, out / "simplify_report.json", out / "simplify.png"], tally, num_boxes=facts["num_boxes"])
     return product
 
 
-def _picture(raw: BoxMap, simplified: BoxMap, facts: dict, size_px: int) -> bytes:
+def _picture(raw: BoxMap, simplified: BoxMap, facts: dict) -> bytes:
     """Draw obstacles at walking height before and after, side by side."""
-    view = TopView.around(np.stack(raw.bounds()), size_px)
+    view = TopView.around(np.stack(raw.bounds()), PICTURE_PX)
     halves = []
     for title, box_map in (("raw", raw), ("simplified", simplified)):
         shown = box_map.select(box_map.is_any_of(SURFACE_KINDS) | blocks_walking(box_map))
         area = facts["grid"][f"{title}_walkable_m2"]
-        text = f"{title}: {len(box_map)} boxes, {area:.0f} m2 walkable (drawn: what stands below 2 m)"
+        text = f"{title}: {len(box_map)} boxes, {area:.0f} m2 walkable (drawn: boxes below 2 m)"
         halves.append(add_caption(draw_map(shown, view), text))
     return png_bytes(np.hstack(halves))

@@ -5,32 +5,75 @@ Source: app:simworld:step1, the structured high-level plan.
 
 from __future__ import annotations
 
-from typing import Self
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from cosfly.maps.synthetic import MIN_BLOCK_M, SyntheticConfig
-from cosfly.maps.town_blocks import LotsConfig
+from cosfly.maps.synthetic import MIN_BLOCK_M, VERGE_M, TownPlan
+from cosfly.maps.town_blocks import Lots, Range
+from cosfly.runtime.config import read_yaml
 from cosfly.runtime.json_io import FileFormat, Record
-from cosfly.worldgen.objects import OBJECTS, Object, assets
 
 PLAN_FORMAT = FileFormat("cosfly.world_plan", "1", "plan of a world")
 
-Range = tuple[float, float]
 OPEN_SHARE = 0.45  # of an open block that objects may fill
-SPACE_M = 4.0  # round each object
+SPACE_M = 4.0  # around each object
 EDGE_M = 14.0  # of an open block, both sides together, that belongs to its trees
 
 
+class Object(Record):
+    """An object that a prompt can name; objects.yaml explains the fields.
+
+    parts: kind, middle x y, size x y, low and high end of each box, m.
+    """
+
+    name: str
+    parts: tuple[tuple[str, float, float, float, float, float, float], ...] = ()
+    where: Literal["open", "quay", "water", "layout"] = "open"
+    words: tuple[str, ...] = ()
+    asset: str | None = None
+    least_scale: float = 1.0
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Full size of the footprint, centred at its middle; on a quay without the parts over the water."""
+        parts = [part for part in self.parts if self.where == "open" or part[5] < 3.0]
+        return (
+            2 * max(abs(x) + wide / 2 for _, x, _, wide, _, _, _ in parts),
+            2 * max(abs(y) + deep / 2 for _, _, y, _, deep, _, _ in parts),
+        )
+
+
+@cache
+def assets() -> dict[str, tuple[float, ...]]:
+    """Return SimWorld's buildings and trees: name -> full size at yaw 0, m."""
+    sizes = read_yaml(Path(__file__).with_name("assets.yaml"))
+    return {f"BP_{name}_C": tuple(map(float, size)) for name, size in sizes.items()}
+
+
+def _objects() -> dict[str, Object]:
+    table: dict[str, dict[str, Any]] = read_yaml(Path(__file__).with_name("objects.yaml"))
+    for value in table.values():
+        if "asset" in value:
+            x, y, z = assets()[value["asset"]]
+            value["parts"] = [("Buildings", 0.0, 0.0, x, y, 0.0, z)]
+    return {name: Object(name=name, **value) for name, value in table.items()}
+
+
+OBJECTS = _objects()
+
+
 class NamedObject(Record):
-    """So many of an object of the table."""
+    """An object of the table, and how many of it."""
 
     name: str = Field(description="a name of the object table")
     count: int = Field(1, ge=1, le=60)
 
 
 class WorldPlan(BaseModel):
-    """What a world shall be. Lengths in m, ranges from low to high; all that is measured afterwards has a range."""
+    """Properties of a world. Lengths in m; what is measured afterwards has a range, from low to high."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -57,7 +100,7 @@ class WorldPlan(BaseModel):
     not_in_table: list[str] = Field([], max_length=100, description="what it names and the object table lacks")
 
     @model_validator(mode="after")
-    def _can_be(self) -> Self:
+    def _is_possible(self) -> Self:
         limits = {"footprint_m": (6.0, 120.0), "heights_m": (3.0, 450.0), "building_share": (0.0, 0.8)}
         for name, (least, most) in (limits | {"trees_per_ha": (0.0, 400.0)}).items():
             low, high = getattr(self, name)
@@ -71,63 +114,61 @@ class WorldPlan(BaseModel):
             raise ValueError(f"{what}: raise block_m, or lower unevenness or setback_m")
         return self
 
+    def known_objects(self) -> list[tuple[Object, int]]:
+        """Return the named objects of the table with their counts; of a name that occurs twice, the sum."""
+        counts: dict[str, int] = {}
+        for named in self.objects:
+            counts[named.name] = counts.get(named.name, 0) + named.count
+        return [(OBJECTS[name], count) for name, count in counts.items() if name in OBJECTS]
 
-def objects_of(plan: WorldPlan) -> list[tuple[Object, int]]:
-    """Return the objects that a plan names and the table has, with their counts; of a name twice, the sum."""
-    counts: dict[str, int] = {}
-    for wanted in plan.objects:
-        counts[wanted.name] = counts.get(wanted.name, 0) + wanted.count
-    return [(OBJECTS[name], count) for name, count in counts.items() if name in OBJECTS]
+    def unknown_objects(self) -> list[str]:
+        """Return the named objects that the table lacks, an entry for each."""
+        unknown = [named.name for named in self.objects if named.name not in OBJECTS for _ in range(named.count)]
+        return unknown + self.not_in_table
 
 
-def unknown_objects(plan: WorldPlan) -> list[str]:
-    """Return what a plan names and no table has, an entry for each."""
-    return [one.name for one in plan.objects if one.name not in OBJECTS for _ in range(one.count)] + plan.not_in_table
-
-
-def town_settings(plan: WorldPlan, name: str) -> SyntheticConfig:
-    """Return the town generator's settings for a plan: open blocks enough, and large enough, for its objects."""
+def town_plan(plan: WorldPlan) -> TownPlan:
+    """Return the town generator's plan: with open blocks enough, and large enough, for the objects."""
     block_m, along = plan.block_m, plan.blocks_along
-    placed = [(one, count) for one, count in objects_of(plan) if one.where == "open"]
-    for one, _ in placed:
-        block_m = max(block_m, min(max(one.size_m[:2]) * one.least_scale + EDGE_M + 4.0, 150.0))
+    placed = [(thing, count) for thing, count in plan.known_objects() if thing.where == "open"]
+    for thing, _ in placed:
+        block_m = max(block_m, min(max(thing.size_m) * thing.least_scale + EDGE_M + 4.0, 150.0))
     narrowest = block_m * (1.0 - plan.unevenness) / (1.0 + plan.unevenness)
     room = OPEN_SHARE * (narrowest - EDGE_M) ** 2
     needed = sum(
-        count * (one.size_m[0] * one.least_scale + SPACE_M) * (one.size_m[1] * one.least_scale + SPACE_M)
-        for one, count in placed
+        count * (thing.size_m[0] * thing.least_scale + SPACE_M) * (thing.size_m[1] * thing.least_scale + SPACE_M)
+        for thing, count in placed
     )
     num_open = max(plan.plazas + plan.greens, int(-(-needed // room)))
     while num_open > along**2 // 2 and along < 9:
         along += 1
     plazas = max(plan.plazas, num_open - plan.greens)
-    verge_m, streets = 10.0, along * plan.street_m + max(plan.avenue_m, plan.river_m)
     kind = "lanes" if plan.lanes else "lots"
     shares = {kind: float(along**2 - plazas - plan.greens), "plaza": float(plazas), "green": float(plan.greens)}
-    return SyntheticConfig(
-        name=name, size_m=block_m * along + streets + 2 * verge_m, num_blocks=along, street_m=plan.street_m,
+    streets_m = along * plan.street_m + max(plan.avenue_m, plan.river_m)
+    return TownPlan(
+        size_m=block_m * along + streets_m + 2 * VERGE_M, num_blocks=along, street_m=plan.street_m,
         boulevard_m=plan.avenue_m, unevenness=plan.unevenness, center="plaza" if plazas else None,
         blocks={block: share for block, share in shares.items() if share > 0}, river_m=plan.river_m,
-        bridges=plan.bridges, shore_m=plan.shore_m, verge_m=verge_m, parked_share=plan.parked_share, tree_parts=False,
+        bridges=plan.bridges, shore_m=plan.shore_m, parked_share=plan.parked_share, tree_parts=False,
         tree_share=0.0 if plan.trees_per_ha[1] < 3 else 0.4 if plan.trees_per_ha[1] < 25 else 0.9,
-        lots=LotsConfig(
+        lots=Lots(
             footprints_m=_footprints(plan), heights_m=plan.heights_m, gap_m=plan.gap_m, setback_m=plan.setback_m,
             fall_m=0.5 * (block_m + plan.street_m) * along if plan.high_center else 0.0,
         ),
     )  # fmt: skip
 
 
-def _footprints(plan: WorldPlan) -> list[tuple[float, float]]:
-    """SimWorld's own footprints within a plan's range; where it has fewer than four, all of them scaled into it."""
+def _footprints(plan: WorldPlan) -> tuple[Range, ...]:
+    """Return SimWorld's own footprints within a plan's range; if fewer than four, all of them scaled into it."""
     low, high = plan.footprint_m
-    sizes = [(x, y) for name, (x, y, _) in assets().items() if name.startswith("BP_Building")]
+    sizes = [(size[0], size[1]) for name, size in assets().items() if name.startswith("BP_Building")]
     fitting = [size for size in sizes if low <= min(size) and max(size) <= high]
     if len(fitting) >= 4:
-        return fitting
+        return tuple(fitting)
     slim = sorted(size for size in sizes if max(size) / min(size) < 2.2)
-    shares = [k / (len(slim) - 1) for k in range(len(slim))]
-    longest = [low + (high - low) * share for share in shares]
-    return [
+    longest = [low + (high - low) * k / (len(slim) - 1) for k in range(len(slim))]
+    return tuple(
         (round(x * side / max(x, y), 1), round(max(low * 0.6, y * side / max(x, y)), 1))
         for (x, y), side in zip(slim, longest, strict=True)
-    ]
+    )
