@@ -26,7 +26,9 @@ FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (
 
 def draw(found: dict[str, Any], planned: dict[str, PlannedItem], box_map: BoxMap) -> dict[str, bytes]:
     """Return the figures, file name -> PNG; those of TA*+Smooth against MuCO only where both found trajectories."""
-    pictures = {"axes_bars.png": _bars(found), "axes_pairs.png": _pairs(found)}
+    primary = [p for p in found["axes"] if p not in PAPER or PAPER[p].axes_mean is not None]  # the paper's seven, ours
+    pictures = {"axes_radar.png": _radar(found, primary or list(found["axes"]))}
+    pictures |= {"axes_bars.png": _bars(found), "axes_pairs.png": _pairs(found)}
     if found["deltas"]:
         pictures |= {"deltas.png": _deltas(found), "trajectories_3d.png": _trajectories(found, planned, box_map)}
     return pictures
@@ -46,6 +48,20 @@ def _png(figure: Any) -> bytes:
     file = io.BytesIO()
     figure.savefig(file, format="png", metadata={"Software": None})
     return file.getvalue()
+
+
+def _radar(found: dict[str, Any], planners: list[str]) -> bytes:
+    """Draw the four axes as polygons (fig:appendix_h_alg3d_measured)."""
+    figure = _figure(8.0, 9.0)
+    axes, angles = figure.add_subplot(projection="polar"), np.arange(len(AXES)) * 2.0 * np.pi / len(AXES)
+    for planner in planners:
+        scores = found["axes"][planner]["scores"]
+        style = {"edgecolor": _color(planner), "lw": 2.0, "label": f"{title_of(planner)}: mean {scores['mean']:.3f}"}
+        axes.fill(angles, [scores[name] for name in AXES], facecolor="none", **style)
+    axes.set_xticks(angles, [name.replace("_", " ") for name in AXES])
+    axes.set_ylim(0.0, 1.0)
+    figure.legend(loc="outside lower center", ncols=3)
+    return _png(figure)
 
 
 def _bars(found: dict[str, Any]) -> bytes:

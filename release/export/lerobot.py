@@ -331,7 +331,7 @@ def _size(release: Release) -> tuple[int, int]:
 
 
 @dataclass(frozen=True)
-class Episode:
+class ExportedEpisode:
     """One episode of a unit: its number, its flight, rows [start, stop) of that, the number of its first frame in the
     whole.
     """
@@ -343,11 +343,11 @@ class Episode:
     index: int
 
 
-def _episodes(unit: ExportUnit) -> Iterator[Episode]:
+def _episodes(unit: ExportUnit) -> Iterator[ExportedEpisode]:
     number, index = unit.extra.episode, unit.extra.index
     for flight in unit.flights:
         for start, stop in runs_of(flight):
-            yield Episode(number, flight, start, stop, index)
+            yield ExportedEpisode(number, flight, start, stop, index)
             number, index = number + 1, index + stop - start
 
 
@@ -365,7 +365,11 @@ def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -
 
 
 def _tables(
-    release: Release, episode: Episode, layout: Layout, features: dict[str, LeRobotFeature], about: list[dict[str, Any]]
+    release: Release,
+    episode: ExportedEpisode,
+    layout: Layout,
+    features: dict[str, LeRobotFeature],
+    about: list[dict[str, Any]],
 ) -> Iterator[pa.Table]:
     """Yield an episode's rows, a row group of the release at a time; at its end `about` has what the records say of
     it.
@@ -410,7 +414,7 @@ def _tables(
     )  # fmt: skip
 
 
-def _pictures(release: Release, episode: Episode) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+def _pictures(release: Release, episode: ExportedEpisode) -> Iterator[tuple[int, list[dict[str, Any]]]]:
     """Yield an episode's rows with pictures alone, and the number of the first of them in the episode."""
     columns = ["sample_id", *(PICTURES[file].name for file in release.modalities)]
     at = 0
