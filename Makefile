@@ -38,7 +38,7 @@ audit: $(TOOLS)/.installed $(VENV)/.installed-dev  ## Known weaknesses of what t
 sbom: $(TOOLS)/.installed $(VENV)/.installed  ## sbom.json (CycloneDX): every package of this environment, with versions and licences
 	$(TOOLS)/bin/cyclonedx-py environment $(BIN)/python --pyproject pyproject.toml --of JSON -o sbom.json
 
-lock: $(TOOLS)/.installed  ## What the container installs, anew: the newest versions that pyproject.toml allows, pinned with hashes
+lock: $(TOOLS)/.installed  ## Packages of the container: the newest versions that pyproject.toml allows, pinned with hashes
 	$(TOOLS)/bin/pip-compile --quiet --upgrade --generate-hashes --strip-extras --allow-unsafe --build-deps-for wheel --extra pyrender \
 	  --no-emit-index-url --no-emit-find-links --no-emit-trusted-host -o $(PINNED) pyproject.toml
 

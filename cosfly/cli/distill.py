@@ -92,7 +92,7 @@ def distill_infer(
     adapter: Annotated[Path | None, Option(help="Adapter folder; none: the base model alone.")] = None,
     data: options.Trees = None,
 ) -> None:
-    """Let the student answer the samples of a split; resume where it stopped."""
+    """Run a student on the samples of a split; resume where it stopped."""
     from distill.inference import stage as infer
 
     trees = job.trees(data)

@@ -157,7 +157,7 @@ class BoxMap:
         return self.centers + axis_aligned_half_extents(self.half_extents, self.rotations_deg)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Low and high corner of all boxes, (3,) each."""
+        """Return the low and high corners of all boxes, (3,) each."""
         return self.mins.min(axis=0), self.maxs.max(axis=0)
 
     def select(self, index: np.ndarray) -> BoxMap:
@@ -174,7 +174,7 @@ class BoxMap:
         return np.isin(self.kinds, np.array(sorted(kinds), dtype=np.uint8))
 
     def counts(self) -> dict[str, int]:
-        """Boxes by kind name, largest first."""
+        """Return the number of boxes by kind name, largest first."""
         numbers, counts = np.unique(self.kinds, return_counts=True)
         order = sorted(zip(counts.tolist(), numbers.tolist(), strict=True), key=lambda pair: (-pair[0], pair[1]))
         return {KIND_NAMES[number]: count for count, number in order}
@@ -252,7 +252,7 @@ class _Boxes(BaseModel):
 def write_boxes(path: Path, box_map: BoxMap) -> None:
     """Write boxes in the paper's fields (tab:boxes_schema), one box a line; meshes in `meshes.glb` next to them."""
     check_boxes(box_map, path)
-    refs = box_map.meshes.beside(path.parent).refs
+    refs = box_map.meshes.relative_to(path.parent).refs
     columns = {name: np.round(getattr(box_map, name), 6) for name in ("centers", "half_extents", "rotations_deg")}
     box_map = replace(box_map, **columns)  # so that min and max agree with what is read back
     mins, maxs = box_map.mins, box_map.maxs

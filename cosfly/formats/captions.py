@@ -286,7 +286,7 @@ class Caption(BaseModel):
         return Evidence(slots=self.slots, problems=problems, contradicted=self.checks.contradicted or [])
 
     def coverage(self, language: Language) -> float | None:
-        """Share of a language's sentences that are proved; None where none was judged."""
+        """Return the share of a language's sentences that are supported; None if none was checked."""
         states = (self.checks.sentences or {}).get(language)
         return states.count("proved") / len(states) if states else None
 

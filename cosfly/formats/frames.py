@@ -98,7 +98,7 @@ class Look(Config):
     exposure: float = Field(0.82, gt=0, le=10, description="brightness of the picture, a factor; 1 is neutral")
 
     def sun_direction(self) -> np.ndarray:
-        """Unit vector towards the sun, (3,)."""
+        """Return the unit vector towards the sun, (3,)."""
         azimuth, elevation = np.radians([self.sun_azimuth_deg, self.sun_elevation_deg])
         return np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
 

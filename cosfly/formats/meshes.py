@@ -275,7 +275,7 @@ class Meshes:
             raise too_many(self.folder or "map", num_drawn)
         return found
 
-    def beside(self, folder: Path) -> Meshes:
+    def relative_to(self, folder: Path) -> Meshes:
         """Return the meshes moved to MESHES_FILE of a folder, writing it where needed."""
         if not self.refs or (self.folder == folder and not self.made):
             return self

@@ -107,7 +107,7 @@ def flight_ids(places: Collection[Place]) -> dict[Place, str]:
 
 
 def sample_id(flight_id: str, frame_index: int) -> str:
-    """`trajectory_1776047127_ORI_frame_00004`."""
+    """Return the id of a window, such as `trajectory_1776047127_ORI_frame_00004`."""
     return f"{flight_id}_frame_{frame_index:05d}"
 
 

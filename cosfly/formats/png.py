@@ -174,7 +174,7 @@ def _undone(lines, channels):  # type: ignore[no-untyped-def]
             for x in range(size):
                 target[x] = (row[x] + above[x]) & 255
         else:
-            # Each channel waits for its own left alone: beside each other they take a third of the time.
+            # A channel depends on its own left value only: the channels side by side take a third of the time.
             for x in range(min(channels, size)):
                 up = np.int64(above[x])
                 target[x] = row[x] + (0 if kind == SUB else up >> 1 if kind == AVERAGE else up)

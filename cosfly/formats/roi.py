@@ -42,11 +42,11 @@ class Roi(RoiPolygon):
     polygons: list[RoiPolygon] = []
 
     def rings(self) -> list[RoiPolygon]:
-        """All polygons in one form."""
+        """Return all polygons as rings."""
         return [self, *self.polygons] if self.points_world else self.polygons
 
     def region(self) -> BaseGeometry:
-        """All polygons, each without its holes, as one area."""
+        """Return all polygons without their holes as one area."""
         areas = [
             shapely.Polygon(ring.points_world) - shapely.union_all([shapely.Polygon(hole) for hole in ring.holes])
             for ring in self.rings()

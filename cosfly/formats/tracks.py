@@ -83,4 +83,9 @@ def read_twin(flight: Track) -> Track | None:
 def _no_twin(flight: Track, other: Track) -> VerifyError:
     got, expected = (f"{len(f)} points from {f.time_s[0]:.3f} to {f.time_s[-1]:.3f} s" for f in (other, flight))
     got = f"{got}, is_original {other.is_original}"
-    return VerifyError("not the clean twin of the flight beside it", where=other.folder, got=got, expected=expected)
+    return VerifyError(
+        "the clean track does not belong to the perturbed track next to it",
+        where=other.folder,
+        got=got,
+        expected=expected,
+    )

@@ -1,7 +1,7 @@
 """How much of what could be flown was flown: heights, distances, directions, sizes, occlusion, styles, paces.
 
 A student cannot learn what it never sees. Counts of frames in fixed bins, so that flights, runs and releases add up;
-each shown beside those of the plain run that ships (`default_coverage.json`).
+each compared with those of `cosfly run showcase` (`default_coverage.json`).
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def azimuths_deg(offsets_m: np.ndarray, headings_deg: np.ndarray) -> np.ndarray:
     """Return where the drone stands as seen from the walker: (n,) degrees from the heading, -180 to 180, left positive.
 
     Args:
-        offsets_m: (n, 3) from person to drone. headings_deg: (n,), whither the person walks.
+        offsets_m: (n, 3) from person to drone. headings_deg: (n,), the walking direction of the target.
     """
     bearing = np.degrees(np.arctan2(offsets_m[:, 1], offsets_m[:, 0]))
     return (bearing - headings_deg + 180.0) % 360.0 - 180.0

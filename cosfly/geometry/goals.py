@@ -47,19 +47,19 @@ class SeenFrame:
     rotation: np.ndarray
 
     def column_share(self, number: int) -> float:
-        """Mean column of somebody's pixels, of the picture's width."""
+        """Return the mean column of a person's pixels as a share of the picture's width."""
         return float(np.nonzero(self.ids == number)[1].mean()) / self.ids.shape[1]
 
     def depth_m(self, number: int) -> float:
-        """How far away somebody's pixels are, in the middle."""
+        """Return the median depth of a person's pixels, m."""
         return float(np.median(self.depth[self.ids == number]))
 
     def place_m(self, number: int) -> np.ndarray:
-        """Where somebody's pixels are in the middle, (3,), from the camera in the world's directions."""
+        """Return the median place of a person's pixels, (3,) m, from the camera along the world axes."""
         return np.median(self._points_m(self.ids == number), axis=0)
 
     def distance_m(self, number: int, kind: str) -> float:
-        """From somebody to what is seen of a kind, over the ground; infinity where nothing is."""
+        """Return the distance over ground from a person to visible pixels of a kind, m; infinity without any."""
         x, y, z = self.place_m(number)
         points = self._points_m(self.kinds == KINDS[kind])
         points = points[points[:, 2] >= z + LANDMARKS[kind][2]]
@@ -73,7 +73,7 @@ class SeenFrame:
 
 
 def meant(says: Iterable[str], looks: Appearance, people: Mapping[int, Appearance], picture: SeenFrame) -> set[int]:
-    """Tell of whom in a picture a description is true. looks: what it says of slots. people: by instance id."""
+    """Return the people that a description fits. looks: slots of the description. people: by instance id."""
     slots = {*says} - {*SIDES, *LANDMARKS}
     found = {n for n, one in people.items() if not slots & {*looks.differences(one)} and (picture.ids == n).any()}
     for relation in {*says} - slots:
@@ -133,7 +133,7 @@ def otherwise(looks: Appearance, slot: str) -> Appearance:
 
 
 def words_of(says: Sequence[str], looks: Appearance) -> Words:
-    """Say it in both languages."""
+    """Return the description in both languages."""
     noun = FIGURES[looks.figure] if "figure" in says else {"en": "person", "zh": "行人"}
     side = next((SIDES[one] for one in says if one in SIDES), ("", "", 0.0, 0.0))
     mark = next((LANDMARKS[one] for one in says if one in LANDMARKS), ("", "", 0.0))

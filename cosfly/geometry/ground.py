@@ -55,7 +55,7 @@ class Ground:
         return np.hypot(rise_x * goes_on[:, 0], rise_y * goes_on[:, 1]) / self.cell_m
 
     def range_under(self, mins: np.ndarray, maxs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest ground under upright boxes, at middles and corners: mins, maxs (n, 3); gives (n,) each."""
+        """Return the lowest and highest ground under upright boxes (n, 3), at centers and corners, (n,) each."""
         middles = (mins + maxs)[:, :2] / 2
         corners = [np.stack([x, y], axis=1) for x in (mins[:, 0], maxs[:, 0]) for y in (mins[:, 1], maxs[:, 1])]
         heights = np.stack([self.height_at(places) for places in (middles, *corners)])

@@ -1,6 +1,6 @@
 """What a flight teaches a policy: at each frame the velocities to command, and the places ahead.
 
-All of it is of the planned motion, as labels are: a perturbation that is drawn anew for every frame is no manoeuvre.
+All of it is of the planned motion, as labels are: a perturbation that is drawn for each frame is no manoeuvre.
 Seen from a perturbed frame, the waypoints lead back to the plan.
 """
 
@@ -32,7 +32,7 @@ def without_perturbation(
         poses (n, 6) and targets (n, 3); NaN where nobody recorded by how much a frame was perturbed.
     """
     planned, targets = poses - offsets, targets_m - target_offsets_m
-    # A frame without a shift was not aimed anew, whether or not its target is known. An unknown shift (NaN) counts as
+    # A frame without a shift was not aimed again, whether or not its target is known. An unknown shift (NaN) counts as
     # one.
     is_shifted = (offsets[:, :3] != 0).any(axis=1) | (target_offsets_m != 0).any(axis=1)
     aims = [np.degrees(look_at(eye[:, :3], at)).T for eye, at in ((poses, targets_m), (planned, targets))]

@@ -138,7 +138,7 @@ def assign_splits(
     what: str = "walks",
     fix: str = "give more of them, or set a fraction to 0",
 ) -> dict[str, Split]:
-    """Hand out groups to splits: group -> split.
+    """Assign groups to splits: group -> split.
 
     Groups are ranked by a hash of (seed, group); the first go to test, the next to val, the rest to train, in numbers
     as near to the fractions as a whole group allows and at least one for each split that has a share.

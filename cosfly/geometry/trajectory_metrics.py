@@ -123,7 +123,7 @@ def figure_of_draws(value: float, drawn: np.ndarray, count: int, num_walks: int,
 
 
 def interval_of(drawn: np.ndarray, confidence: float) -> tuple[float | None, float | None]:
-    """Return the percentiles between which `confidence` of what was drawn lies, NaN left out."""
+    """Return the percentiles between which `confidence` of the samples lies, NaN ignored."""
     drawn = drawn[~np.isnan(drawn)]  # draws in which nothing of the kind occurs
     if not len(drawn):
         return None, None

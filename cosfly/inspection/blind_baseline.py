@@ -37,7 +37,7 @@ def past_of(flight: Track, window: Sequence[int], is_ordered: bool) -> np.ndarra
     poses = np.where(np.isnan(planned), np.hstack([flight.positions_m[at], flight.rotations_deg[at]]), planned)
     targets_m = np.where(np.isnan(walked_m), flight.targets_m[at], walked_m)
     yaw_deg, step_s = float(poses[-1, 4]), np.diff(flight.time_s[at])[:, None]
-    step_s[step_s == 0] = np.nan  # a frame that stands in for one that is not
+    step_s[step_s == 0] = np.nan  # a repeated frame
     drone, walker = (in_axes_of(yaw_deg, places_m - poses[-1, :3]) for places_m in (poses[:, :3], targets_m))
     flown, walked, away = np.diff(drone, axis=0) / step_s, np.diff(walker, axis=0) / step_s, walker - drone
     apart_m, speeds = np.hypot(away[:, 0], away[:, 1]), np.linalg.norm(walked, axis=1)

@@ -147,5 +147,5 @@ def num_crossings(polygon: Polygon) -> int:
 
 
 def united(polygons: list[Polygon]) -> BaseGeometry:
-    """Unite polygons that may be invalid."""
+    """Merge polygons that may be invalid."""
     return shapely.union_all(shapely.make_valid(np.array(polygons, dtype=object))) if polygons else MultiPolygon()

@@ -174,7 +174,7 @@ const save = () => attempt(async () => {
 });
 const proposeFirst = () => attempt(async () => put((await (await request("propose")).json()).roi));
 
-// --- a mask beside it ------------------------------------------------------------------------------------------------
+// --- a mask to compare ------------------------------------------------------------------------------------------------
 
 const openMask = (file) => attempt(async () => {
   const bitmap = await createImageBitmap(file).catch(() => { throw new Error(`${file.name}: ${say("no_picture")}`); });

@@ -69,7 +69,7 @@ def figures(ground: WalkableGround) -> dict[str, Any]:
 
 
 def propose(ground: WalkableGround, name: str) -> Roi:
-    """Outline the ground that walks are drawn on, less holes of SMALLEST_HOLE_M2 and more, to TOLERANCE_M.
+    """Compute the outline of the ground that pedestrians use, without holes below SMALLEST_HOLE_M2, to TOLERANCE_M.
 
     Args:
         name: of the map.
@@ -104,7 +104,7 @@ def _is_large(ring: shapely.LinearRing) -> bool:
 
 
 def run_propose(map_: Path, cfg: PedestriansConfig, out: Path) -> str:
-    """Reads a map, writes a first `roi_polygon.json`, says what it holds."""
+    """Read a map, write a first `roi_polygon.json` and report what it holds."""
     if out.exists():
         what = "a folder, not a file" if out.is_dir() else "there is a region already"
         raise InputError(what, where=out, fix="name another file" + ("" if out.is_dir() else ", or remove this one"))

@@ -55,7 +55,7 @@ def make_horizon(index, target, reach_m, least_slope):
     """Sort the boxes round a target by direction, so that a look from above tests the few that can hide it.
 
     Good for looks from within `reach_m` in the plane, from places that rise at least `least_slope` per horizontal metre
-    above the lowest foot: lower boxes are left out. A ray that starts at height `low` or above and ends d away at p_z
+    above the lowest foot: lower boxes are ignored. A ray that starts at height `low` or above and ends d away at p_z
     has risen to low + (p_z - low) t at the share t of its way, and it is no nearer to a box at horizontal distance r
     than t = (r - FOOT_SIDE_M) / d.
     """

@@ -58,7 +58,7 @@ def draw_backdrop(cfg: RenderConfig, box_map: BoxMap, view: TopView, seed: int =
 def run(
     cfg: RenderConfig, boxes: Path, out: Path, *, bounds_m: Bounds | None = None, pixels_per_m: float, seed: int = 0
 ) -> Path:
-    """Reads `boxes_3d.json`; writes the PNG `out` and its world frame, and returns `out`.
+    """Read `boxes_3d.json`, write the PNG `out` and its world frame, and return `out`.
 
     Args:
         bounds_m: Shown part; None shows the whole map.

@@ -21,7 +21,7 @@ def cut(text: str, longest: int = LONGEST) -> str:
     if len(text) <= longest:
         return text
     head = longest * 2 // 3
-    return f"{text[:head]} ... ({len(text) - longest:,} characters left out) ... {text[head - longest :]}"
+    return f"{text[:head]} ... ({len(text) - longest:,} characters omitted) ... {text[head - longest :]}"
 
 
 def for_terminal(text: str, longest: int = LONGEST) -> str:

@@ -109,7 +109,7 @@ def run_items(
     watch: Watch = Watch(),
     label: str | None = None,
 ) -> ItemOutcomes:
-    """Do all items that the stage's journal does not hold yet.
+    """Run all items that the stage's journal does not hold yet.
 
     An item whose work raises is recorded as failed and counted; a fatal CosflyError (full disk, no GL) stops the stage,
     and finished items stay. A worker that dies (out of memory, kill) or stalls costs only its item, which gets two

@@ -219,7 +219,7 @@ def _host() -> type:
                 pass  # the worker is gone; `exchange` reports it
 
         def exchange(self, data: bytes | None) -> tuple:
-            """Relay a message; return those of the worker since the last call and its vitals, None if it is gone."""
+            """Forward a message; return those of the worker since the last call and its vitals, None if it is gone."""
             if data is not None:
                 self.inbox.put(data)
             received: list[bytes] = []

@@ -88,7 +88,7 @@ def counted_steps(on_steps: Callable[[int], None]) -> Iterator[None]:
 
 
 def attempt(work: Work, item: Item) -> ItemRecord:
-    """Do one item and return its record; only a fatal error is raised."""
+    """Run one item and return its record; only a fatal error is raised."""
     start_s = time.monotonic()
     try:
         outcome = work(item)
@@ -258,7 +258,7 @@ def return_freed_memory() -> None:
 
 
 def end_with_parent(parent_pid: int) -> None:
-    """Have the system kill this process with its parent; elsewhere than on Linux the pipe reports its end."""
+    """Make the system kill this process with its parent; on other systems than Linux the pipe reports its end."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent_pid:  # it died before the call
@@ -266,6 +266,6 @@ def end_with_parent(parent_pid: int) -> None:
 
 
 def adopt_orphans() -> None:
-    """Become the parent of processes that the processes below this one leave behind, so that it can find them."""
+    """Make this process the parent of processes that its own workers leave behind, so that it can find them."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)

@@ -31,7 +31,7 @@ BOX_COLOR = (255, 214, 10)
 
 
 def contact_sheet(tree: Path, out_png: Path, choice: TrackChoice = ALL_FLIGHTS) -> None:
-    """Reads a playback tree, writes a PNG below 2 MB: for each track a few RGB frames, a depth image and a mask."""
+    """Read a playback tree and write a PNG below 2 MB: a few RGB frames, a depth image and a mask of each track."""
     folders = find_tracks(tree, choice)
     rows = [_row(read_track(folder, strict=False)) for folder in folders[:MOST_ROWS]]
     sheet = np.vstack([_heading(len(folders), rows[0].shape[1]), *rows])
@@ -41,7 +41,7 @@ def contact_sheet(tree: Path, out_png: Path, choice: TrackChoice = ALL_FLIGHTS) 
 def preview_gif(
     tree: Path, out_gif: Path, choice: TrackChoice = ALL_FLIGHTS, frames_per_s: float = 1000 / GIF_FRAME_MS
 ) -> None:
-    """Reads a playback tree, writes its first clean track as an animation below 4 MB, with the target's box."""
+    """Read a playback tree and write its first clean track as an animation below 4 MB, with the target's box."""
     folders = find_tracks(tree, choice)
     track = read_track(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
     frames = _frames_with(track, "rgb.png")
@@ -56,7 +56,7 @@ def preview_gif(
 
 
 def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map: BoxMap | None = None) -> str:
-    """Reads a frame of a playback tree, writes a PNG: colours, depth, instances, and boxes with ids and distances.
+    """Read a frame of a playback tree, writes a PNG: colours, depth, instances, and boxes with ids and distances.
 
     Args:
         frame: Its folder, as for `frame_in`; None is the frame of the first clean track that shows most of the target.

@@ -65,7 +65,7 @@ def run(
     picture_px: int = 320,
     max_mb: float = 24.0,
 ) -> Path:
-    """Reads a map, pedestrian trajectories, drone trajectories of planners and a playback tree; writes one page and
+    """Read a map, pedestrian trajectories, drone trajectories of planners and a playback tree; writes one page and
     returns its path.
 
     Args:

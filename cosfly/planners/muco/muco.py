@@ -228,7 +228,7 @@ def _rounded_off(found: np.ndarray, problem: Problem, obstacles: BoxIndex) -> np
 
 
 def optimize(start: np.ndarray, problem: Problem, obstacles: BoxIndex, cfg: MucoConfig) -> tuple[np.ndarray, dict]:
-    """Improve a feasible trajectory; its ends stay.
+    """Optimize a feasible trajectory; its ends stay.
 
     Args:
         start: (n, 3), feasible.

@@ -99,7 +99,7 @@ def solve_band(band, damping, gradient):
 
 @njit(cache=True)
 def try_step(points, steps, scale, cap_m, as_a_whole, problem, index, masked, state, trial):
-    """Cap, project and evaluate one trial step of the interior waypoints.
+    """Compute one trial step of the interior waypoints: limit, project and evaluate it.
 
     Args:
         points: (n, 3) m, kept. steps: (n - 2, 3) m. scale: share of it that is taken. cap_m: longest move of a
@@ -133,7 +133,7 @@ def move(points, steps, scale, cap_m, as_a_whole, trial):
 
 @njit(cache=True)
 def descend(points, problem, index, rules, states, history):
-    """Improve a feasible trajectory, which is overwritten; its ends stay.
+    """Optimize a feasible trajectory in place; its ends stay.
 
     The visibility term is a staircase that the model does not see: where its slope does not lower the loss, the step is
     tried without it, and for 1, 2, 4 ... REST_MAX iterations it is not tried again.

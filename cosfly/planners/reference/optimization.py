@@ -30,7 +30,7 @@ FIELD_M3 = 40.0  # repulsion against an attraction of 1: they balance 3.4 m from
 
 
 def potential_field(task: Task) -> np.ndarray | None:
-    """Go down the potential in steps, at even speed; None if the goal is not reached, as behind a wall."""
+    """Follow the potential downhill at even speed; None if the goal is not reached, as behind a wall."""
     route = [task.start]
     for _ in range(STEPS_MAX):
         here = route[-1]
@@ -54,7 +54,7 @@ INFLUENCE_M = 2.0  # beyond the clearance
 
 
 def elastic_band(task: Task) -> np.ndarray | None:
-    """Contract the path of A* and push it away from boxes; None if A* finds no path."""
+    """Smooth the path of A* and push it away from boxes; None if A* finds no path."""
     band = along_voxels(task)
     if band is None:
         return None
@@ -74,7 +74,7 @@ OBSTACLE_BEYOND_M = 2.0  # the obstacle cost begins this far beyond the clearanc
 
 
 def chomp(task: Task) -> np.ndarray:
-    """Descend by the covariant gradient from the straight line.
+    """Optimize the straight line along the covariant gradient.
 
     Lite: the cost of a position counts once for each waypoint, not for each body part and metre. In the metric of the
     smoothness, the gradient of the smoothness is the difference from the straight line, which is its minimum.
@@ -101,7 +101,7 @@ DIFFERENCES = ((1.0, 1), (5.0, 2))  # weight and order of squared differences
 
 
 def trajopt(task: Task) -> np.ndarray:
-    """Minimise smoothness and a hinge on the distance to boxes, of rising weight, by L-BFGS-B."""
+    """Minimize smoothness and a hinge on the distance to boxes, of rising weight, by L-BFGS-B."""
     points = task.line()
     bounds = list(zip(np.tile(task.low, task.num - 2), np.tile(task.high, task.num - 2), strict=True))
     for weight in HINGE_WEIGHTS if bounds else ():

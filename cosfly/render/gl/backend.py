@@ -380,7 +380,7 @@ def _release(context: Any) -> None:
 
 
 def smoothed(rgb: np.ndarray) -> np.ndarray:
-    """Soften edges in a picture, (h, w, 3) uint8, where brightness jumps."""
+    """Smooth edges in a picture, (h, w, 3) uint8, where brightness jumps."""
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     steps = cv2.absdiff(gray, cv2.GaussianBlur(gray, (3, 3), 0.8))
     _, mask = cv2.threshold(steps, EDGE_LEVELS, 255, cv2.THRESH_BINARY)

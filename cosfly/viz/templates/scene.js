@@ -1,4 +1,4 @@
-// A map in 3D with walks and flights over it, played back; beside it the planning matrix, the rendered frames and the planners' figures.
+// A map in 3D with walks and flights over it, played back, with the planning matrix, the rendered frames and the planners' figures.
 (() => {
 const data = pageData();
 const TRACK_COLORS = ["#2b6cb0", "#d97706", "#2f855a", "#9f3fb5", "#0e9f9f", "#c53030", "#6b7a0f", "#7c5a3a"], PERSON = "#e0409a", FIELDS = 10;
@@ -85,7 +85,7 @@ const matrix = new MapCanvas(byId("matrix"), [low[0], low[1], high[0], high[1]],
 if (!space.gl) { byId("lacks").hidden = false; byId("lacks").textContent = "This browser has no WebGL 2: boxes are not drawn."; }
 if (data.matrix) createImageBitmap(new Blob([bytesOf(data.matrix.png)])).then((image) => { cells = image; matrix.redraw(); document.body.dataset.matrix = "yes"; });
 
-// --- beside them -----------------------------------------------------------------------------------------------------
+// --- panels -----------------------------------------------------------------------------------------------------
 
 const box = (is, work, title) => { const node = make("input", { type: "checkbox", checked: is, "aria-label": title, title }); node.addEventListener("change", () => { work(node.checked); redraw(); }); return node; };
 const chip = (color) => { const node = make("i", { class: "chip" }); node.style.background = color; return node; };

@@ -16,8 +16,8 @@ void main() {
   vec3 facing = normalize(cross(dFdx(offset), dFdy(offset)));
   float light = 0.62 + 0.38 * clamp(dot(facing, normalize(vec3(0.35, -0.5, 0.9))), -0.4, 1.0);
   vec3 rim = (1.0 - abs(place)) / max(fwidth(place), 1e-6);  // pixels to the faces: the least is to the own one
-  float beside = max(min(rim.x, rim.y), min(max(rim.x, rim.y), rim.z));
-  float edge = edges * (1.0 - smoothstep(0.4, 1.4, beside)) * clamp(160.0 / length(offset), 0.0, 1.0);
+  float second = max(min(rim.x, rim.y), min(max(rim.x, rim.y), rim.z));
+  float edge = edges * (1.0 - smoothstep(0.4, 1.4, second)) * clamp(160.0 / length(offset), 0.0, 1.0);
   shown = vec4(color.rgb * light * (1.0 - 0.45 * edge), mix(color.a, min(1.0, color.a + 0.3), edge));
   shown.rgb *= shown.a;
 }`;
