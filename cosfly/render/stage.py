@@ -169,7 +169,7 @@ def run(
     resume: Resume = "if-same",
     others: Path | None = None,
 ) -> Path:
-    """Reads the maps `boxes_3d.json` (drawn) and `step2_simplified.json` (clearance), `drone_trace.json` and, with
+    """Read the maps `boxes_3d.json` (drawn) and `step2_simplified.json` (clearance), `drone_trace.json` and, with
     bystanders, `others.json`; writes the playback tree.
 
     Trajectories that the planner dropped are not drawn; the manifest counts them. Returns the tree's root, `out`.
