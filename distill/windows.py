@@ -155,7 +155,9 @@ def facts_of(flight: Track, window: Sequence[int]) -> dict[str, np.ndarray]:
         "target": flight.targets_m[at],
         "target_mask_bbox": np.full((len(at), 4), np.nan) if mask is None else mask[at],
     }
-    values |= {name: getattr(flight, name)[at] for name in FACTS if name not in values}
+    values |= {"time_s": flight.time_s[at], "visibility": flight.target.visibility[at]}
+    of_target = ("uv", "bbox", "depth_m", "in_view", "visible")
+    values |= {f"target_{name}": getattr(flight.target, name)[at] for name in of_target}
     return {name: np.array(values[name], dtype=bool if name in FLAGS else np.float64) for name in FACTS}
 
 

@@ -83,7 +83,7 @@ def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(t
         assert flight.source["algorithm"].startswith("flown by rules")
         record = flown[flight.source["scenario_id"]]
         assert np.allclose(flight.positions_m, [frame.pose[:3] for frame in record.frames], atol=1e-3)
-        assert list(flight.target_visible) == [frame.visible for frame in record.frames]
+        assert list(flight.target.visible) == [frame.visible for frame in record.frames]
         decided |= {f"{flight.flight_id}_frame_{i:05d}": frame.action for i, frame in enumerate(record.frames)}
     asked = [caption for caption in captions if decided[caption.sample_id] is not None and caption.repair is None]
     assert asked
@@ -112,7 +112,7 @@ def test_a_policy_of_ones_own_flies_as_a_student_that_decides_the_same(town, tmp
     for one, other in zip(flown.values(), same.values(), strict=True):
         assert (one.engine, one.student) == ("policy", "own:Ahead")
         assert [f.command for f in one.frames] == [f.command for f in other.frames]
-    assert "--policy" in attempt(town, tmp_path / "both", f"{SHORT} --policy own:Ahead --student rules").output
+    assert "--policy" in attempt(town, tmp_path / "both", f"{SHORT} --policy own:Ahead --student track_straight").output
     assert "own:Missing" in str(attempt(town, tmp_path / "none", f"{SHORT} --policy own:Missing").exception)
 
 

@@ -484,7 +484,9 @@ def test_a_flight_that_its_tree_does_not_list(workplace):
         {"path": p.relative_to(tree).as_posix(), "bytes": 1, "sha256": "0" * 64 if p.parent == twin else sha256_file(p)}
         for p in files
     ]
-    write_json(tree / "manifest.json", {"schema": "cosfly.manifest", "schema_version": "1.0", "outputs": outputs})
+    counts = {"input": 2, "kept": 2, "dropped": {}, "failed": {}}
+    manifest = {"schema": "cosfly.manifest", "schema_version": "1.0", "stage": "render", "outputs": outputs}
+    write_json(tree / "manifest.json", manifest | {"counts": counts, "seconds": 1.0})
     found = inspect(workplace)
     assert codes_of(found, broken) == {"not_of_this_tree": "error"}
     assert codes_of(found, twin) == {"checksum": "error"}

@@ -308,9 +308,9 @@ def test_a_request_holds_sampling_and_schema(stand_in, model):
         engine = engine_of(model, endpoint=endpoint)
         return engine.parameters(engine.sampling.request(messages, [], schema, 5)).values
 
-    plain = parameters_of(temperature=0.3, top_p=0.8, max_tokens=99)
+    plain = parameters_of(temperature=0.3, max_tokens=99)
     assert plain.pop("structured_outputs").values == {"json": schema}
-    assert plain == {"temperature": 0.3, "top_p": 0.8, "max_tokens": 99, "seed": 5}
+    assert plain == {"temperature": 0.3, "top_p": 0.95, "max_tokens": 99, "seed": 5}
     assert parameters_of(json_schema=False)["structured_outputs"] is None
     more = parameters_of(extra_body={"top_k": 20, "chat_template_kwargs": {"enable_thinking": False}})
     assert more["top_k"] == 20
