@@ -5,6 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import random
+import subprocess
+import sys
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -14,9 +17,31 @@ from teacher_server import is_mirror, kept_answers
 
 from caption.run.stage import run
 from cosfly.formats.captions import read_captions
+from cosfly.llm import client
 from cosfly.llm.answers import Answer, AnswerBook
 from cosfly.runtime.errors import TeacherError
 from specimens import make_playback_tree
+
+
+def keys_by_flight(out: Path) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for kept in kept_answers(out):
+        found.setdefault(kept["sample_id"].partition("_frame_")[0], []).append(kept["key"])
+    return found
+
+
+LIMITED = """
+import json, resource, sys
+from pathlib import Path
+from caption.schema import CaptionConfig
+from caption.run.stage import run
+from cosfly.runtime.errors import StorageError
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
+try:
+    run(CaptionConfig.model_validate(json.loads(sys.argv[4])), Path(sys.argv[2]), Path(sys.argv[3]))
+except StorageError as error:
+    print(error, file=sys.stderr)
+"""
 
 
 @pytest.fixture(scope="module")
@@ -148,3 +173,35 @@ def fill(folder: Path, num_flights: int, num_windows: int, unfinished: set[int])
 
 
 # --- the disk ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_total_timeout_bounds_all_tries(tree, tmp_path, monkeypatch):
+    monkeypatch.setattr(client, "FIRST_PAUSE_S", 0.3)
+    monkeypatch.setattr(client, "LONGEST_PAUSE_S", 0.3)
+    endpoint = {"max_tries": 50, "total_timeout_s": 0.5, "stop_after_failures": 1}
+    with deciding(fault=lambda number, body: "500") as server:
+        start_s = time.monotonic()
+        with pytest.raises(TeacherError, match="total_timeout"):
+            run(settings(server.url, endpoint=endpoint, limit=1), tree, tmp_path / "out")
+        assert time.monotonic() - start_s < 5.0
+        assert 1 <= len(server.bodies) <= 4
+
+
+def test_a_disk_that_fills_up_costs_nothing_that_was_written(tree, tmp_path, whole):
+    """The limit on a file's size stands for the disk: the system cuts the line that passes it short, as a full disk
+    does."""
+    out = tmp_path / "out"
+    with deciding() as server:
+        config = settings(server.url)
+        filled = subprocess.run(
+            [sys.executable, "-c", LIMITED, "9000", str(tree), str(out), config.model_dump_json()],
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert "cannot write" in filled.stderr, filled.stderr
+        assert "finished work is kept" in filled.stderr
+        assert not (out / "manifest.json").exists()
+        kept = keys_by_flight(out)
+        assert run(config, tree, out).read_bytes() == whole
+    now = keys_by_flight(out)
+    assert all(now[flight][: len(keys)] == keys for flight, keys in kept.items())
+    assert len(keys_of(out)) == len(set(keys_of(out)))

@@ -10,6 +10,7 @@ from html.parser import HTMLParser
 
 import pytest
 
+from caption.run import stage
 from caption.run.ledger import CaptionReport
 from caption.run.stage import run
 from caption.run.windows import cut_windows
@@ -168,3 +169,13 @@ class Tags(HTMLParser):
 
 def report_of(done):
     return CaptionReport.model_validate_json((done / "caption_report.json").read_text())
+
+
+@pytest.mark.parametrize("name", ["glossary"])
+def test_captions_of_another_prompt_are_refused_by_name(tree, tmp_path, monkeypatch, name):
+    shutil.copytree(run(CaptionConfig(), tree, tmp_path / "first").parent, tmp_path / "out")
+    changed = tmp_path / "changed"
+    changed.write_text("otherwise")
+    monkeypatch.setitem(stage.PACKAGE_FILES, name, changed)
+    with pytest.raises(ResumeError, match=f"the {name} changed"):
+        run(CaptionConfig(), tree, tmp_path / "out")

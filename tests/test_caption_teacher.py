@@ -173,3 +173,18 @@ def test_a_retry_after_holds_every_request():
             return time.monotonic() - begun_s
 
     assert asyncio.run(start_s()) >= 0.19
+
+
+def test_a_hopeless_teacher_is_stopped_and_its_commonest_reasons_are_explained(tree, tmp_path):
+    """Of its first answers none is accepted; a teacher of whom one was is not stopped, and a setting goes on."""
+    cfg = {"stop_after_dropped": 3, "endpoint": {"concurrency": 1}, "repair": KEEP}
+    told = r"none of the first 3 answers.*3 structure_.*\(no answer had the fields"
+    with deciding("ascend", lambda number, body: "short") as server:
+        with pytest.raises(TeacherError, match=told):
+            run(settings(server.url, **cfg), tree, tmp_path / "out")
+        with pytest.raises(NothingKept):
+            run(settings(server.url, **cfg | {"stop_after_dropped": 0}), tree, tmp_path / "out")
+    assert report_of(tmp_path / "out")["windows"]["input"] > 3
+    with deciding("ascend", lambda number, body: "short" if number > 6 else None) as server:
+        run(settings(server.url, **cfg), tree, tmp_path / "one")
+    assert report_of(tmp_path / "one")["windows"]["kept"] > 0

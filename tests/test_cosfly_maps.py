@@ -247,3 +247,10 @@ def test_stage_writes_the_same_bytes_and_resumes(tmp_path: Path):
     with pytest.raises(ResumeError, match="seed was 5, is 6"):
         run(MapsConfig(), tmp_path / "one", seed=6)
     assert read_boxes(product).header.source.seed == 5
+
+
+def test_surfaces_of_a_town_do_not_share_a_plane():
+    town = load_map(MapsConfig())
+    for one, other in combinations(("Roads", "Sidewalks", "RoadLines"), 2):
+        tops = [boxes_of(town, kind).maxs[:, 2] for kind in (one, other)]
+        assert abs(tops[0].max() - tops[1].max()) > 0.015

@@ -409,3 +409,22 @@ def test_a_shift_that_hides_a_seen_target_falls_back(tmp_path):
 
 
 # --- gallery ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_walled_in_person_is_not_moved():
+    start = planned(1).targets_m[0]
+    cage = make_box_map(
+        start + 0.75 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]),
+        [[0.4, 4, 2], [0.4, 4, 2], [4, 0.4, 2], [4, 0.4, 2]], np.zeros((4, 3)), [KINDS["Walls"]] * 4,
+    )  # fmt: skip
+    found = [
+        perturbed(PerturbationConfig(position_probability=1.0, pedestrian_radius_m=1.0), 1, cage, seed)
+        for seed in range(30)
+    ]
+    outcomes = {f.states[0]["position"] for f in found}
+    assert "fallback: person in an obstacle" in outcomes
+    for f in found:
+        assert (
+            signed_distances(obstacle_index(cage), f.poses.targets_m)[0].min() >= 0.3
+            or f.states[0]["position"] != "applied"
+        )

@@ -220,3 +220,17 @@ def test_records_stand_in_every_file_and_labels_are_those_of_fair_weather(trees)
             fair = read_meta(before)
             target = meta.target.model_copy(update={k: getattr(fair.target, k) for k in ("contrast", "legible")})
             assert meta.model_copy(update={"weather": None, "look": fair.look, "target": target}) == fair
+
+
+def test_rain_falls_and_wets_the_road(renderer):
+    dry = params("overcast", fog_density=0, precipitation=0)
+    wet = dry.model_copy(update={"precipitation": 90.0})
+    before, after = drawn(renderer, dry), drawn(renderer, wet)
+    sky = before.kinds == KINDS["Sky"]
+    assert after.rgb[sky].astype(float).std() > before.rgb[sky].astype(float).std(), "streaks"
+    above = pose_towards((0.0, -1.0, 12.0), (0.0, 0.0, 0.0))
+    road = [drawn(renderer, knobs, above) for knobs in (dry, wet)]
+    where = road[0].kinds == KINDS["Roads"]
+    assert np.median(road[1].rgb[where]) < 0.85 * np.median(road[0].rgb[where]), "darker from above"
+    moved = drawn(renderer, wet, pose_towards((-14.0, -16.0, 8.01), (12.0, 2.0, 2.0)))
+    assert (moved.rgb[:20] != after.rgb[:20]).any(), "drops fall anew in another frame"

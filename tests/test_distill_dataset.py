@@ -20,12 +20,12 @@ from cosfly.formats.captions import TOKENS, write_captions
 from cosfly.formats.playback import read_track
 from cosfly.geometry.splits import SPLITS
 from cosfly.inspection.blind_baseline import past_of
-from cosfly.runtime.errors import VerifyError
+from cosfly.runtime.errors import ResumeError, VerifyError
 from distill.prepare import stage
 from distill.prepare.sources import RunSource
 from distill.prepare.splitting import check_no_leak
 from distill.prepare.stage import Balance, PrepareConfig, WindowRanks, balance_of, keeps, limit_to, make_sample
-from distill.schema import Sample, open_split, resolve_trees
+from distill.schema import RECORD, Sample, open_split, resolve_trees, split_path
 from specimens import make_playback_tree
 
 
@@ -276,3 +276,27 @@ def test_a_limit_is_exact_and_each_decision_has_its_share_in_any_order(counts, p
     before, after = (Counter(decision for _, decision, _ in found) for found in (left, kept))
     assert all(abs(after[name] - len(kept) / len(left) * count) < 1 for name, count in before.items())
     assert set(limited(windows[::-1])[0]) == set(kept)
+
+
+def test_run_twice_gives_the_same_bytes(tree, captions, tmp_path):
+    first, second = (prepared(tree, captions, tmp_path / name) for name in "ab")
+    for split in SPLITS:
+        assert split_path(first, split).read_bytes() == split_path(second, split).read_bytes()
+    assert prepared(tree, captions, first) == first
+    with pytest.raises(ResumeError, match="languages"):
+        prepared(tree, captions, first, languages=("en",))
+
+
+def test_the_library_of_data_sets_opens_it(tree, captions, tmp_path):
+    datasets = pytest.importorskip("datasets", reason="needs the extra distill")
+    out = prepared(tree, captions, tmp_path / "set")
+    found = datasets.load_dataset(str(out), cache_dir=str(tmp_path / "cache"))
+    assert set(found) == {"train", "validation", "test"}
+    systems = json.loads((out / RECORD).read_text())["systems"]
+    assert len(systems) == 2  # one a language, however many samples
+    for split, name in (("train", "train"), ("val", "validation")):
+        samples = open_split(out, split)
+        assert len(found[name]) == len(samples)
+        row, sample = found[name][3], samples[3]
+        assert (row["prompt"], row["answer"], row["window"]) == (sample.prompt.user, sample.answer, list(sample.window))
+        assert systems[row["system"]] == sample.prompt.system

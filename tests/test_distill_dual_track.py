@@ -14,7 +14,7 @@ from cosfly.formats.playback import read_track
 from cosfly.geometry.splits import SPLITS
 from cosfly.runtime.run_dir import read_failures, read_manifest
 from distill.prepare import dual_track
-from distill.prepare.dual_track import DualTrackConfig, TrackSample, read_track_samples, windows_of
+from distill.prepare.dual_track import DualTrackConfig, TrackSample, read_track_samples, read_track_set, windows_of
 from specimens import make_playback_tree
 
 NUM_POINTS = 24
@@ -92,3 +92,10 @@ def test_a_bad_flight_stops_no_other(own_tree, tmp_path):
     assert counts.dropped == {"no_clean_flight": 1, "clean_flight_of_other_frames": 1}
     assert counts.failed.total() == 1
     assert flights[0].parent.name in read_failures(out / "failures.jsonl")[0].id
+
+
+def test_no_walk_is_in_two_splits(dataset):
+    walks = [{sample.walk for sample in found} for found in samples(dataset).values()]
+    assert all(walks)
+    assert sum(map(len, walks)) == len(set.union(*walks)) == 4
+    assert read_track_set(dataset).samples == {split: len(found) for split, found in samples(dataset).items()}

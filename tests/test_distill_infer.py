@@ -12,9 +12,10 @@ import pytest
 from commands import invoke
 from PIL import Image
 from specimens_distill import make_captions, prepared
-from teacher_server import TeacherServer
+from teacher_server import TeacherServer, kept_answers
 
 from cosfly.formats.predictions import read_predictions
+from cosfly.runtime.errors import TeacherError
 from distill.inference import stage as infer
 from distill.schema import open_split
 from specimens import make_playback_tree
@@ -83,3 +84,22 @@ def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
         assert result.exit_code == 0, result.output
         assert len(server.bodies) == num_asked + 1
     assert all(p.coc is not None for p in read_predictions(tmp_path / "out" / "predictions.jsonl"))
+
+
+def test_nothing_answered_is_asked_twice(place, tmp_path):
+    out = tmp_path / "out"
+    cfg = settings(endpoint={"stop_after_failures": 2})
+    with TeacherServer(lambda number, body: "500" if number >= 5 else None) as server:
+        with pytest.raises(TeacherError, match=r"[2-9] samples in a row got no answer.*http_500.*same command"):
+            infer_with(cfg, place, server.url, out)
+        num_kept = len(kept_answers(out))
+        assert num_kept >= 5 - ENDPOINT["concurrency"]
+        assert not (out / "predictions.jsonl").exists()
+        server.fault, num_asked = (lambda number, body: None), len(server.bodies)
+        path = infer_with(cfg, place, server.url, out)
+        num_samples = len(read_predictions(path))
+        assert len(server.bodies) == num_asked + num_samples - num_kept
+        (out / "manifest.json").unlink()
+        before = path.read_bytes()
+        assert infer_with(cfg, place, server.url, out).read_bytes() == before
+        assert len(server.bodies) == num_asked + num_samples - num_kept

@@ -15,9 +15,14 @@ from specimens_students import features_of, inputs_of
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
+from teacher_server import kept_answers  # noqa: E402
+
 from cosfly.formats.predictions import Prediction, read_predictions  # noqa: E402
+from cosfly.llm.student_chat import TAUGHT  # noqa: E402
+from distill.inference import merge  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
 from distill.schema import Sample, open_split, resolve_trees  # noqa: E402
+from distill.student.checkpoint import ADAPTER_FACTS  # noqa: E402
 from distill.student.decoding import decode  # noqa: E402
 from distill.student.encoding import encode_text  # noqa: E402
 from distill.student.model import load_student  # noqa: E402
@@ -155,3 +160,19 @@ def test_constrained_answers_all_parse(place, clean, tmp_path):
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_a_merged_student_sees_pictures_as_it_was_taught(place, tmp_path):
+    """Its processor is the base's, which keeps more of a picture than the training did."""
+    adapter = Path(shutil.copytree(place / "trained" / "adapter", tmp_path / "few" / "adapter"))
+    for name in (TAUGHT, ADAPTER_FACTS):
+        (adapter / name).write_text(json.dumps(json.loads((adapter / name).read_text()) | {"max_pixels": 32 * 32}))
+    merged = merge.run(place / "student", adapter, tmp_path / "merged")
+    given = (settings(max_samples=3), place / "set", [place / "tree"])
+    infer.run(*given, place / "student", tmp_path / "beside", adapter=adapter)
+    infer.run(*given, merged, tmp_path / "alone")
+    infer.run(*given, place / "student", tmp_path / "base")
+    runs = [kept_answers(tmp_path / name) for name in ("beside", "alone", "base")]
+    beside, alone, base = ([line["usage"]["prompt_tokens"] for line in run] for run in runs)
+    assert alone == beside
+    assert sum(base) > sum(beside)

@@ -17,6 +17,7 @@ from specimens_distill import make_adapter  # noqa: E402
 from specimens_students import inputs_of, samples_of, trees_of  # noqa: E402
 
 from cosfly.runtime.errors import InputError  # noqa: E402
+from cosfly.runtime.json_io import write_json  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.student.model import Student, load_student  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
@@ -103,3 +104,16 @@ def test_damaged_adapters_are_refused(base, adapter, tmp_path):
         with pytest.raises(InputError, match=words):
             merge.run(base, folder, tmp_path / f"out_{number}")
         assert [path.name for path in (tmp_path / f"out_{number}").iterdir() if path.is_dir()] == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [({"use_dora": True}, "use_dora"), ({"rank_pattern": {"q_proj": 2}}, "rank_pattern"), ({"bias": "all"}, "bias")],
+)
+def test_another_kind_of_adapter_is_refused(base, adapter, tmp_path, changes, words):
+    shutil.copytree(adapter, tmp_path / "adapter")
+    path = tmp_path / "adapter" / "adapter_config.json"
+    write_json(path, json.loads(path.read_text()) | changes)
+    with pytest.raises(InputError, match=words):
+        merge.run(base, tmp_path / "adapter", tmp_path / "out")
+    assert not (tmp_path / "out" / "model").exists()

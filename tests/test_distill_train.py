@@ -19,7 +19,7 @@ from cosfly.formats.predictions import read_predictions  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
 from distill.student import model as student  # noqa: E402
 from distill.student.checkpoint import load_checkpoint  # noqa: E402
-from distill.student.encoding import IGNORED, encode_text, load_pictures, padded  # noqa: E402
+from distill.student.encoding import IGNORED, encode_text, load_pictures, padded, prompt_batch  # noqa: E402
 from distill.training import stage as train  # noqa: E402
 from distill.training.settings import Steps, TrainConfig  # noqa: E402
 
@@ -163,3 +163,15 @@ def test_a_student_that_overfits_answers_right(place, tmp_path):
     predictions = read_predictions(out)
     assert [p.raw for p in predictions] == [sample.answer for sample in learnt]
     assert all(p.coc is not None and p.is_finished for p in predictions)
+
+
+def test_positions_are_the_librarys(place):
+    """For every sample, and for pictures of two shapes between texts of all lengths."""
+    own = load(place)
+    rows = [encode_text(own, sample) for sample in samples_of(place)]
+    for row in rows:
+        inputs = prompt_batch(own, [row])
+        names = ("input_ids", "mm_token_type_ids", "image_grid_thw")
+        wanted, _ = own.core.model.get_rope_index(*(inputs[n] for n in names), attention_mask=inputs["attention_mask"])
+        found = padded(own, [row])[2][:, 0, : len(row.prompt_ids)]
+        assert np.array_equal(found, wanted[:, 0].numpy())

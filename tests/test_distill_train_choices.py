@@ -11,10 +11,13 @@ torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
 from safetensors.torch import load_file  # noqa: E402
-from specimens_students import MAX_PIXELS, inputs_of, load, log_of, run, samples_of, trees_of  # noqa: E402
+from specimens_students import MAX_PIXELS, inputs_of, load, log_of, losses_of, run, samples_of, trees_of  # noqa: E402
 
 from cosfly.runtime.errors import InputError  # noqa: E402
+from distill.student.checkpoint import Progress  # noqa: E402
 from distill.student.model import load_student  # noqa: E402
+from distill.training.fit import Validation, judged  # noqa: E402
+from distill.training.settings import TrainConfig  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -65,3 +68,26 @@ def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path):
     weights.write_bytes(weights.read_bytes()[:-7])
     with pytest.raises(InputError, match=r"best validation is damaged.*weights\.safetensors"):
         run(place, out, **settings)
+
+
+@pytest.mark.slow
+def test_bfloat16_computes_with_float32_weights_that_learn(place, tmp_path):
+    settings = {"method": "full", "max_steps": 4, "learning_rate": 1e-3, "validation_answers": True}
+    for dtype in ("float32", "bfloat16"):
+        run(place, tmp_path / dtype, dtype=dtype, max_new_tokens=4, **settings)
+    found, wanted = losses_of(tmp_path / "bfloat16"), losses_of(tmp_path / "float32")
+    assert found == pytest.approx(wanted, rel=0.02)
+    assert found != wanted
+    newest = sorted((tmp_path / "bfloat16" / "checkpoints").iterdir())[-1]
+    assert {tensor.dtype for tensor in load_file(newest / "weights.safetensors").values()} == {torch.float32}
+
+
+def test_the_best_is_who_decides_best_and_patience_ends():
+    progress, cfg, found = Progress(), TrainConfig(patience=2), []
+    for step, (share, loss) in enumerate([(0.2, 3.0), (0.5, 2.0), (0.5, 1.0), (0.4, 0.5), (0.5, 1.5)], 1):
+        validation = Validation(samples=4, loss=loss, accuracy=share, consistent=0.1 * step)  # the latter only grows
+        progress = judged(progress.model_copy(update={"step": step}), validation, cfg)
+        found.append((progress.best_step, progress.stale, progress.has_ended))
+    assert found == [(1, 0, False), (2, 0, False), (3, 0, False), (3, 1, False), (3, 2, True)]
+    patient = TrainConfig(patience=0)
+    assert not judged(Progress(step=9, best_score=(1.0, 0.0)), Validation(samples=1, loss=1.0), patient).has_ended

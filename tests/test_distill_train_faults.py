@@ -15,6 +15,7 @@ from processes import is_running, wait_until
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
+from specimens_distill import write_set  # noqa: E402
 from specimens_students import FAST, TWELVE, begun, load, log_of, run, samples_of  # noqa: E402
 
 from cosfly.runtime.errors import ConfigError, InputError  # noqa: E402
@@ -92,3 +93,22 @@ def test_workers_end_with_a_training_that_was_killed(tmp_path):
         assert len(workers) == 2
         process.kill()
     wait_until(lambda: not any(map(is_running, workers)))
+
+
+def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path):
+    good = samples_of(place)
+    long = good[0].model_copy(update={"sample_id": "long", "answer": "tree " * 5000})
+    spoken = good[1].model_copy(update={"sample_id": "spoken", "answer": f"{good[1].answer}<|im_end|>"})
+    shown = good[2].prompt.model_copy(update={"user": "an <|image_pad|> stands here"})
+    pictured = good[2].model_copy(update={"sample_id": "pictured", "prompt": shown})
+    sized = good[3].model_copy(update={"sample_id": "sized", "picture_px": (32, 32)})
+    splits = {"train": [*good, long, spoken, pictured, sized], "val": samples_of(place, "val")}
+    dataset = write_set(tmp_path / "set", splits, [place / "tree"])
+    run(place, tmp_path / "out", dataset=dataset, max_steps=1)
+    counts = json.loads((tmp_path / "out" / "manifest.json").read_text())["counts"]
+    assert counts["dropped"] == {"special_token": 2, "too_long": 1, "unfit_picture": 1}
+    assert counts["kept"] == len(good)
+    assert counts["input"] == len(good) + 4
+    told = (tmp_path / "out" / "preflight.json").read_text()
+    assert "long/en" in told or "long/zh" in told
+    assert "at most 4096" in told

@@ -7,6 +7,7 @@ import json
 import shutil
 import struct
 import zlib
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -309,3 +310,22 @@ def test_after_a_failed_flight_the_finished_shards_are_not_done_again(tmp_path, 
 
 
 # --- its readers ------------------------------------------------------------------------------------------------------
+
+
+def test_every_released_caption_has_its_whole_window(tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 1, 100, width_px=32, height_px=18)
+    captions = [make_caption(f, i) for f in map(read_track, find_tracks(tree)) for i in range(4, 90)]
+    write_captions(tmp_path / "captions.jsonl", captions)
+    write_inspection(tmp_path / "inspect.json", make_inspection(tree, {}))
+    folder = run(split_cfg(num_frames=60), [source_of(tmp_path)], tmp_path / "r")
+    rows = table_of(folder, ["variant", "frame_index", "caption_window", "has_caption"])
+    for variant in ("ORI", "aug_001"):
+        own = [row for row in rows if row["variant"] == variant]
+        frames = {row["frame_index"] for row in own}
+        assert len(frames) == 60
+        assert sum(b - a > 1 for a, b in pairwise(sorted(frames))) == 1  # two runs of thirty
+        released = [row for row in own if row["has_caption"]]
+        assert all(set(row["caption_window"]) <= frames for row in released)
+        assert len(released) >= 0.8 * len([index for index in frames if 4 <= index < 90])
+    everything = run(split_cfg(num_frames=None), [source_of(tmp_path)], tmp_path / "all")
+    assert read_record(everything / "release.json").history.captions.released == 2 * 86

@@ -236,3 +236,18 @@ def test_one_changed_digit_of_the_card_fails_wherever_it_stands(dataset):
         report = verify(dataset, level="rows")
         line = text[:place].count("\n") + 1
         assert [i.where for i in report.issues if i.code == "card"] == [f"README.md:{line}"]
+
+
+def test_the_account_names_every_flight_and_caption(built):
+    history = read_json(built / "release.json")["history"]
+    assert history["flights"] == {
+        "found": 6, "inspected": 6, "released": 4, "left_out": {"rejected: missing_file": 1, "review: stray_frame": 1},
+    }  # fmt: skip
+    captions = history["captions"]
+    assert captions["read"] == 6 * 8
+    assert captions["dropped"] == {"hard_conflict": 6}
+    assert captions["flight_left_out"] == 2 * 7
+    # Of 12 frames 2 to 9 are released; captions stand at 4 to 10, and each needs the four frames before its own.
+    assert captions["released"] == 4 * 4
+    assert captions["window_not_whole"] == 4 * 2
+    assert captions["frame_not_selected"] == 4

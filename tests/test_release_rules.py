@@ -59,3 +59,9 @@ def test_a_window_of_one_frame_gives_the_even_stride_of_the_paper(num_points, nu
 )
 def test_by_hand(num_points, num_frames, window, expected):
     assert select_frames(num_points, num_frames, window).tolist() == expected
+
+
+@given(st.integers(1, 400), st.integers(400, 800))
+def test_a_short_flight_is_kept_whole(num_points, num_frames):
+    assert select_frames(num_points, num_frames, WINDOW).tolist() == list(range(num_points))
+    assert select_frames(num_points, None, WINDOW).tolist() == list(range(num_points))

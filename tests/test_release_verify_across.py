@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from tables import each
 
 from cosfly.geometry.reprojection import Agreement
@@ -12,7 +13,16 @@ from release.flight_rows import FlightRows
 from release.verify import scene
 from release.verify.across import Summary, check_across
 from release.verify.findings import Findings
-from release.verify.scene import PERSON, SKY
+from release.verify.scene import PERSON, SKY, survey
+
+
+def _obvious(depth, mask):
+    kinds, ids = mask[..., 0], mask[..., 1].astype(int) | mask[..., 2].astype(int) << 8
+    person = ids == 65535
+    rows, columns = np.nonzero(person)
+    box = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+    odd = int(((kinds == SKY) != (depth == FAR_M)).sum())
+    return [depth.min(), depth.max(), odd, person.sum(), (person & (kinds != PERSON)).sum(), kinds.max()], box
 
 
 def flight(number: int, **values) -> Summary:
@@ -103,3 +113,13 @@ def _frame(seed, size=(45, 77), *, sky=True):
     depth[mask[..., 0] == SKY] = FAR_M
     depth[rng.random(size) < 0.003] = FAR_M if sky else 0.0
     return depth, mask
+
+
+@pytest.mark.parametrize("sky", [True, False])
+@pytest.mark.parametrize("seed", range(2))
+def test_every_pixel_is_counted(seed, sky):
+    depth, mask = _frame(seed, sky=sky)
+    found, (counts, box) = survey(depth, mask), _obvious(depth, mask)
+    assert list(found[:-1]) == counts
+    assert found.box.tolist() == box
+    assert (found.num_odd_sky > 0) == sky
