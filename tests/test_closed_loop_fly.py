@@ -91,6 +91,7 @@ def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(t
     assert np.mean(same) == 1.0
 
 
+@pytest.mark.slow
 def test_the_ceiling_sees_more_than_chance_and_all_is_the_same_however_many_fly_at_once(town, tmp_path):
     seen = {}
     for student, alone in (("planner", False), ("random", True)):
@@ -103,6 +104,7 @@ def test_the_ceiling_sees_more_than_chance_and_all_is_the_same_however_many_fly_
     assert seen["random"] < seen["planner"]
 
 
+@pytest.mark.slow
 def test_a_policy_of_ones_own_flies_as_a_student_that_decides_the_same(town, tmp_path, monkeypatch):
     code = "class Ahead:\n    def reset(self, goal, seed): pass\n    def act(self, seen): return 'track_straight'\n"
     (tmp_path / "own.py").write_text(code)
@@ -121,6 +123,7 @@ def test_a_policy_of_ones_own_flies_as_a_student_that_decides_the_same(town, tmp
 ONE = "--set caption.endpoint.max_tries=1 --set fly.side_by_side=3"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "answer"),
     [("wrong_decision", "invalid"), ("wrong_shape", "unreadable"), ("empty_choices", "none")],
@@ -136,6 +139,7 @@ def test_what_a_model_answers_wrong_is_its_own_failure_and_the_flight_goes_on(to
         assert record.engine == "endpoint"
 
 
+@pytest.mark.slow
 def test_a_model_is_asked_about_all_flights_at_once_and_nothing_twice(town, tmp_path):
     with TeacherServer(delay_s=0.2) as server:
         flown = fly(town, tmp_path, f"{SHORT} {ONE} --student {server.url}")
@@ -164,6 +168,7 @@ def student(tmp_path_factory) -> Path:
     return root / "model"
 
 
+@pytest.mark.slow
 def test_a_student_in_this_process_answers_all_flights_as_one_batch(town, tmp_path, student):
     few = "--set distill.infer.max_new_tokens=4 --set distill.infer.device=cpu --set fly.most_decisions=2"
     flown = fly(town, tmp_path, f"{SHORT} {few} --student transformers:{student}")
@@ -173,6 +178,7 @@ def test_a_student_in_this_process_answers_all_flights_as_one_batch(town, tmp_pa
         assert all(frame.words is not None and frame.answer_s > 0 for frame in record.decisions)
 
 
+@pytest.mark.slow
 def test_a_student_is_asked_with_the_very_prompts_that_it_was_taught_with(town, tmp_path, student):
     with TeacherServer() as server:
         more = f"--workers 1 --set fly.most_decisions=8 --student {server.url} --as-student {student}"

@@ -72,6 +72,7 @@ def test_redrawn_frames_show_what_the_student_saw(town, tmp_path):  # noqa: F811
             )  # shadows of a tree are as fine as its flight is short
 
 
+@pytest.mark.slow
 @each(
     ("more", "reason"),
     [

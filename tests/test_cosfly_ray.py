@@ -165,6 +165,7 @@ def refused(tmp_path: Path, words: str, watch: Watch, make: Any = make_worker) -
     assert not (tmp_path / "s/manifest.json").exists()
 
 
+@pytest.mark.slow
 def test_where_no_cluster_answers_one_line_says_so(tmp_path, monkeypatch):
     ray.shutdown()
     refused(

@@ -45,6 +45,7 @@ def box_map(request) -> BoxMap:
     return delft(path)
 
 
+@pytest.mark.slow
 def test_what_stands_begins_where_no_flight_comes_and_fields_cover_the_ground(box_map: BoxMap):
     rim, (low, high) = rim_of(box_map, 0), box_map.bounds()
     flat = np.isin(rim.kinds, FLAT)

@@ -30,6 +30,7 @@ def by_rules(prompt: str) -> WorldPlan:
     return plan_by_rules(prompt, 0)[0]
 
 
+@pytest.mark.slow
 @each("row", PROMPTS, ids=[row["name"] for row in PROMPTS])
 def test_a_prompt_gives_a_valid_world_with_each_named_object(row):
     plan = by_rules(row["prompt"])
@@ -65,6 +66,7 @@ def test_the_same_prompt_and_seed_give_the_same_bytes_and_another_seed_another_w
     assert one.read_bytes() == two.read_bytes() != other.read_bytes()
 
 
+@pytest.mark.slow
 def test_any_plan_that_can_be_gives_a_world_and_says_what_it_lacks():
     rng = np.random.default_rng(0)
     for _ in range(25):

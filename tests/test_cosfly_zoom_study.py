@@ -42,6 +42,7 @@ def studied(tmp_path_factory) -> tuple[Path, str]:
     return folder / "out", result.output
 
 
+@pytest.mark.slow
 @needs_gl
 def test_the_target_grows_as_the_lens_does(studied):
     """In the middle of the picture sizes go as focal lengths, and what hides the person does not change."""

@@ -271,6 +271,7 @@ ODD_ROWS = {
 }
 
 
+@pytest.mark.slow
 @each("name", ODD_ROWS)
 def test_odd_rows_are_findings_and_no_traceback(honest, tmp_path, name):
     try:
