@@ -290,9 +290,10 @@ class LocalTransport:
         resource_tracker.ensure_running()  # else the first worker starts it, and with it ends the holding back
         with signals_held_back():
             self._process.start()
+            # A Ctrl-C is raised at the end of this block, a second one may interrupt the code that ends the worker, and
+            # the worker ignores the SIGTERM that Python sends at its exit.
+            atexit.register(self._process.kill)
         there.close()
-        # A second Ctrl-C may interrupt the code that ends it, and it ignores the SIGTERM that Python sends at the end.
-        atexit.register(self._process.kill)
         self.pid: int | None = self._process.pid
 
     def send(self, what: Start | Item | None) -> None:
