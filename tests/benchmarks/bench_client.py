@@ -91,7 +91,7 @@ def _client(
     The product is not merged: only asking counts.
     """
     stage = open_stage(cfg, tree, out, 0, "never")
-    allotted, _ = allot(named_flights(tree), cfg, VOCABULARY)
+    allotted, _ = allot(named_flights(tree), cfg)
     bodies: list[bytes] = []
     frames: list[SharedFrames] = []
     plain_init, plain_encode = SharedFrames.__init__, encode_body
