@@ -78,7 +78,7 @@ def main() -> None:
             continue
         (out / EPISODES).mkdir(parents=True, exist_ok=True)
         stage.open_engine = lambda *args, how=(noise, without): Checkpoint(open_engine(*args), *how)
-        stage.make_worker(whole, given.map, given.simplified, plans, None, out, 0, 1)(Item("all", numbers))
+        stage.make_worker(whole, (given.map, given.simplified, plans, None), out, 0, 1)(Item("all", numbers))
         flown = [
             read_episode(path).model_copy(update={"student": name}) for path in sorted((out / EPISODES).glob("*.json"))
         ]
