@@ -86,9 +86,10 @@ def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
     assert all(p.coc is not None for p in read_predictions(tmp_path / "out" / "predictions.jsonl"))
 
 
-def test_nothing_answered_is_asked_twice(place, tmp_path):
+def test_nothing_answered_is_asked_twice(place, tmp_path, monkeypatch):
+    monkeypatch.setattr("distill.inference.stage.STOP_AFTER_FAILURES", 2)
     out = tmp_path / "out"
-    cfg = settings(endpoint={"stop_after_failures": 2})
+    cfg = settings()
     with TeacherServer(lambda number, body: "500" if number >= 5 else None) as server:
         with pytest.raises(TeacherError, match=r"[2-9] samples in a row got no answer.*http_500.*same command"):
             infer_with(cfg, place, server.url, out)

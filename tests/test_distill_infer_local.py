@@ -18,7 +18,7 @@ pytest.importorskip("peft", reason="needs the extra distill")
 from teacher_server import kept_answers  # noqa: E402
 
 from cosfly.formats.predictions import Prediction, read_predictions  # noqa: E402
-from cosfly.llm.student_chat import TAUGHT  # noqa: E402
+from cosfly.llm.student_chat import CHAT_FORMAT_FILE  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
 from distill.schema import Sample, open_split, resolve_trees  # noqa: E402
@@ -165,7 +165,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def test_a_merged_student_sees_pictures_as_it_was_taught(place, tmp_path):
     """Its processor is the base's, which keeps more of a picture than the training did."""
     adapter = Path(shutil.copytree(place / "trained" / "adapter", tmp_path / "few" / "adapter"))
-    for name in (TAUGHT, ADAPTER_FACTS):
+    for name in (CHAT_FORMAT_FILE, ADAPTER_FACTS):
         (adapter / name).write_text(json.dumps(json.loads((adapter / name).read_text()) | {"max_pixels": 32 * 32}))
     merged = merge.run(place / "student", adapter, tmp_path / "merged")
     given = (settings(max_samples=3), place / "set", [place / "tree"])
