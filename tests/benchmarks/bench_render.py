@@ -153,7 +153,7 @@ def parts(folder: Path, num_frames: int) -> tuple[str, list[Any]]:
             contents = [
                 measured.of("PNG of colours", frames.rgb_bytes)(frame.rgb),
                 measured.of("PNG of kinds and ids", frames.instance_bytes)(frame.kinds, frame.ids),
-                measured.of("depth packed", frames.depth_file)(frame.depth, "png"),
+                measured.of("depth packed", frames.depth_file)(frame.depth, "png")[1],
             ]
             for k, data in enumerate(contents):
                 measured.of("hash", flight.sha256_bytes)(data)
@@ -251,7 +251,7 @@ def memory(num_frames: int) -> list[list[Any]]:
             done += len(render_track(renderer, script, Path(scratch), writing))
         if not rows or done - rows[-1][0] >= num_frames // 10:
             rows.append([done, resident_mib()])
-    return [[count, mib, 100.0 * (mib / rows[1][1] - 1.0)] for count, mib in rows]
+    return [[count, mib, 100.0 * (mib / rows[min(1, len(rows) - 1)][1] - 1.0)] for count, mib in rows]
 
 
 # --- the stage with more and more workers -----------------------------------------------------------------------------
