@@ -99,7 +99,8 @@ class SimulatorRenderer(ABC):
                     self._recover(problem)
                 return self._frame(camera_pose, fov_deg, bodies)
             except (NoPictureError, RuntimeError, EnvironmentMissing) as error:
-                problem = error
+                if not isinstance(problem, EnvironmentMissing):  # the first one names the cause best
+                    problem = error
                 log.warning("%s: a frame failed (%d of %d): %s", self.device, attempt, TRIES, error)
         if isinstance(problem, EnvironmentMissing):
             raise problem
