@@ -1,8 +1,11 @@
 """Settings: strict, all problems at once, the nearest name."""
 
+import importlib
+
 import pytest
 from pydantic import BaseModel, Field
 
+from cosfly.pipeline.command_settings import SECTIONS
 from cosfly.pipeline.settings import RunConfig
 from cosfly.pipeline.settings_guide import explain, nested
 from cosfly.runtime.config import Config, load
@@ -105,3 +108,9 @@ def test_every_setting_is_explained_once_with_its_value():
     assert [setting.name for setting in explained] == names(cfg, "")
     assert all(setting.meaning for setting in explained)
     assert nested(explained) == cfg.model_dump(mode="json")
+
+
+def test_every_section_of_the_settings_is_a_model():
+    for place in SECTIONS.values():
+        module, name = place.split(":")
+        assert issubclass(getattr(importlib.import_module(module), name), Config)

@@ -119,7 +119,7 @@ class Place:
 
     def words(self, text: str) -> list[str]:
         """The words of a command as a shell gives them on, with what is small in place of what is large."""
-        text = text.replace("http://localhost:8000", self.teacher)
+        text = text.replace("http://localhost:8000", self.teacher).replace(" /shared/", f" {self.root}/shared/")
         for told, port_here in self.ports.items():
             text = re.sub(rf"(port[ =]){told}\b", rf"\g<1>{port_here}", text)
         words = [part for word in shlex.split(text, comments=True) for part in (sorted(glob.glob(word)) or [word])]

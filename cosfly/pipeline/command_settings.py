@@ -28,7 +28,7 @@ SECTIONS = {  # section -> its model
     "caption": "caption.schema:CaptionConfig",
     "release": "release.package.config:ReleaseConfig",
     "fly": "cosfly.closed_loop.settings:FlyConfig",
-    "world": "cosfly.worldgen.settings:WorldConfig",
+    "world": "cosfly.worldgen.stage:WorldConfig",
     "distill": "cosfly.pipeline.settings:DistillConfig",
 }
 
