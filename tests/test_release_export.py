@@ -67,11 +67,12 @@ def assert_same_flight(found: Path, given: Path, frames: list[int] | None = None
     """Every number and every picture of a flight, or of some frames of it."""
     a, b = read_track(given), read_track(found, strict=frames is None)
     kept = np.arange(len(a)) if frames is None else np.array(frames)
-    for name in type(a).__dataclass_fields__:
-        x, y = getattr(a, name), getattr(b, name)
+    records = (a, b), (a.target, b.target), (a.perturbation, b.perturbation)
+    fields = [(name, getattr(x, name), getattr(y, name)) for x, y in records for name in type(x).__dataclass_fields__]
+    for name, x, y in fields:
         if isinstance(x, np.ndarray):
             assert np.array_equal(x[kept], y, equal_nan=True), name
-        elif name not in ("folder", "raw", "source", "camera", "issues"):
+        elif name not in ("folder", "raw", "source", "camera", "issues", "target", "perturbation"):
             assert x == y, name
     assert np.array_equal(a.camera.intrinsic, b.camera.intrinsic)
     assert (a.camera.width_px, a.camera.height_px) == (b.camera.width_px, b.camera.height_px)
