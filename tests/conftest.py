@@ -20,6 +20,9 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("cosfly")
 
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell starts a command of the background so
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # else no Ctrl-C of a test reaches its command
+
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
