@@ -86,7 +86,7 @@ def test_what_is_not_flown_is_counted_and_stays_in_every_table(made):
     assert "| minimum jerk | gradient, optimization | 1 of 2 | 1 of 2 | 0.500 |" in page
     manifest = json.loads((made / "manifest.json").read_text())
     assert manifest["counts"]["kept"] == 2
-    assert len([entry for entry in manifest["outputs"] if entry["path"].endswith(".png")]) == 4
+    assert len([entry for entry in manifest["outputs"] if entry["path"].endswith(".png")]) == 5
 
 
 def test_the_tables_are_those_of_the_flights(made):

@@ -235,7 +235,7 @@ def test_the_clean_twin_is_found_by_what_it_says_it_is(foreign, tmp_path):
         assert_array_equal(twin.positions_m, clean.positions_m)
         assert read_twin(clean) is None
     change_file(clean.folder, lambda v: v["points"].pop())
-    with pytest.raises(VerifyError, match="not the clean twin"):
+    with pytest.raises(VerifyError, match="the clean track does not belong"):
         read_twin(shaken)
 
 
