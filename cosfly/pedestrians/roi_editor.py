@@ -7,14 +7,10 @@ machine alone, under an address that nobody can guess, and writes the one file t
 from __future__ import annotations
 
 import base64
-import hmac
 import json
-import logging
-import secrets
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -33,16 +29,13 @@ from cosfly.pedestrians.walkable import (
     check_roi,
     walkable_ground,
 )
-from cosfly.runtime.errors import CosflyError, EnvironmentMissing, InputError, StorageError
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import read_bytes, read_text, sha256_bytes
 from cosfly.viz.page import page, scripts
+from cosfly.viz.page_server import MOST_BYTES, PageServer
 from cosfly.viz.topview import TopView, draw_map, png_bytes
 
-log = logging.getLogger(__name__)
-
-HOST = "127.0.0.1"
 MOST_SIDE, MOST_CELLS = 16_000, 64_000_000  # what browsers draw on one canvas
-MOST_BYTES = 32 * 1024 * 1024  # of a request: 100,000 vertices take 4 MB
 OCCUPIED, MARGIN, UNUSED, FREE = 128, 190, 228, 255  # grey levels of the backdrop
 IN_REGION, WALKABLE = (90, 160, 230, 60), (60, 150, 240, 110)  # RGBA over the backdrop
 TOLERANCE_M, SMALLEST_HOLE_M2 = 1.0, 100.0  # of a proposal, which a person goes on with
@@ -245,88 +238,14 @@ def _from_above(box_map: BoxMap, grid: OccupancyGrid) -> np.ndarray:
     return draw_map(box_map, view)
 
 
-# --- the server -------------------------------------------------------------------------------------------------------
+# --- the editor on a page ---------------------------------------------------------------------------------------------
 
 
-def open_editor(map_: Path, cfg: PedestriansConfig, roi: Path, port: int, backdrop: Path | None) -> Server:
-    """Read all that the page shows, and listen; `Server.serve` answers until it is interrupted."""
+def open_editor(map_: Path, cfg: PedestriansConfig, roi: Path, port: int, backdrop: Path | None) -> PageServer:
+    """Read all that the page shows, and listen; `PageServer.serve` answers until it is interrupted."""
     box_map = _read_map(map_)
     picture = None if backdrop is None else Backdrop.read(backdrop)
     if picture is not None and not picture.covers(box_map):
         what = "the picture shows no part of the map"
         raise InputError(what, where=backdrop, got=str(picture.frame()), expected=f"a picture of {box_map.name}")
-    return Server(Editor(box_map, cfg, roi, map_, picture), port)
-
-
-class Server:
-    """Serves the page to this machine, under `address` alone."""
-
-    def __init__(self, editor: Editor, port: int) -> None:
-        self.editor, self.token = editor, secrets.token_urlsafe(24)
-        try:
-            self.http = ThreadingHTTPServer((HOST, port), type("Handler", (_Handler,), {"ours": self}))
-        except OSError as error:
-            fix = "give another --port, or none: a free one is taken"
-            raise EnvironmentMissing("cannot listen", where=f"{HOST}:{port}", got=error.strerror, fix=fix) from None
-        self.host = f"{HOST}:{self.http.server_address[1]}"
-        self.address = f"http://{self.host}/{self.token}/"
-
-    def serve(self) -> None:
-        try:
-            self.http.serve_forever()
-        finally:
-            self.http.server_close()
-
-
-class _Handler(BaseHTTPRequestHandler):
-    ours: Server
-    timeout = 30
-    server_version, sys_version = "cosfly", ""
-
-    def do_GET(self) -> None:
-        if self._name() == "":
-            self._send(200, self.ours.editor.page_html().encode(), "text/html; charset=utf-8")
-        else:
-            self._send(404, b"", "text/plain")
-
-    def do_POST(self) -> None:
-        """Answer our page alone: another one that a browser shows has another origin, and does not know the token."""
-        name, length = self._name(), self.headers.get("Content-Length", "")
-        if name is None or self.headers.get("Origin") != f"http://{self.ours.host}":
-            return self._send(404, b"", "text/plain")
-        if not length.isdecimal() or int(length) > MOST_BYTES:
-            return self._tell(
-                InputError("the request is too large", got=length, expected=f"at most {MOST_BYTES} bytes")
-            )
-        try:
-            self._send(200, self.ours.editor.answer(name, self.rfile.read(int(length))), "application/octet-stream")
-        except CosflyError as error:
-            self._tell(error)
-        except KeyError:
-            self._send(404, b"", "text/plain")
-
-    def _name(self) -> str | None:
-        """Return what is asked for below our address; None where the address is not ours, whatever name led here."""
-        begin = f"/{self.ours.token}/"
-        is_ours = hmac.compare_digest(self.path[: len(begin)].encode(), begin.encode())
-        return self.path[len(begin) :] if is_ours and self.headers.get("Host") == self.ours.host else None
-
-    def _tell(self, error: CosflyError) -> None:
-        self._send(
-            409 if isinstance(error, StorageError) else 400,
-            json.dumps({"error": str(error)}).encode(),
-            "application/json",
-        )
-
-    def _send(self, status: int, data: bytes, kind: str) -> None:
-        self.close_connection = True
-        self.send_response(status)
-        headers = {"Content-Type": kind, "Content-Length": str(len(data)), "Cache-Control": "no-store"}
-        headers |= {"Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff", "X-Frame-Options": "DENY"}
-        for name, value in headers.items():
-            self.send_header(name, value)
-        self.end_headers()
-        self.wfile.write(data)
-
-    def log_message(self, format: str, *args: Any) -> None:
-        log.debug("answered %s", args[1] if len(args) > 1 else "")  # the address stays out of logs
+    return PageServer(Editor(box_map, cfg, roi, map_, picture), port)
