@@ -114,7 +114,7 @@ def test_a_policy_of_ones_own_flies_as_a_student_that_decides_the_same(town, tmp
     for one, other in zip(flown.values(), same.values(), strict=True):
         assert (one.engine, one.student) == ("policy", "own:Ahead")
         assert [f.command for f in one.frames] == [f.command for f in other.frames]
-    assert "--policy" in attempt(town, tmp_path / "both", f"{SHORT} --policy own:Ahead --student track_straight").output
+    assert "--policy" in attempt(town, tmp_path / "both", f"{SHORT} --policy own:Ahead --student rules").output
     assert "own:Missing" in str(attempt(town, tmp_path / "none", f"{SHORT} --policy own:Missing").exception)
 
 

@@ -38,8 +38,8 @@ def fly(
     """Fly a student in a closed loop: its decisions move the drone, and the new view is drawn."""
     from cosfly.closed_loop import stage
 
-    cfg, has_student = job.cfg, job.cfg.fly.student != "rules"
-    if policy and has_student:
+    cfg = job.cfg
+    if policy and (cfg.fly.student != "rules" or "fly.student" in job.given):
         raise typer.BadParameter("give either --policy or --student")
     flown = cfg.fly.model_copy(update={"student": f"policy:{policy}"}) if policy else cfg.fly
     run = stage.ClosedLoopConfig(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -88,11 +88,15 @@ def choice_of(section: str) -> dict[str, Short]:
 
 @dataclass(frozen=True)
 class Job:
-    """The resolved settings of a command, and how to work. overrides: the values of --set."""
+    """The resolved settings of a command, and how to work.
+
+    overrides: the values of --set. given: settings that an option of the command set.
+    """
 
     cfg: RunConfig
     overrides: Sequence[str] = ()
     resume: Resume = "if-same"
+    given: Collection[str] = ()
 
     @property
     def worker_options(self) -> dict[str, Any]:
@@ -169,7 +173,7 @@ def takes(sections: str = "", names: str = "", **short: Short) -> Callable[[Call
                     extra[one.setting] = one.words.get(value, value) if isinstance(value, str) else value
             cfg = resolve(given["config"], given["overrides"], extra, None if sections == "*" else sections.split())
             cfg = _town_of(cfg, given["town"]) if "town" in listed else cfg
-            job = Job(cfg, given["overrides"] or (), given.get("resume", "if-same"))
+            job = Job(cfg, given["overrides"] or (), given.get("resume", "if-same"), extra)
             function(job, **{name: _opened(cfg, given[name]) for name in taken})
 
         settings = [one.parameter(name) for name, one in shorts.items() if name not in taken]
