@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from pydantic import BaseModel
 from shapely.geometry import Polygon
 from tables import each
 from typer.testing import CliRunner
@@ -40,6 +41,13 @@ class _Dated(Config):
 
 
 # --- what is no regular file (hostile contents: tests/test_hostile_files.py) ------------------------------------------
+
+
+def test_a_key_that_is_given_twice_in_a_file_of_ours(tmp_path):
+    (tmp_path / "x.json").write_text('{"result": "rejected", "result": "accepted"}')
+    assert json_io.read_json(tmp_path / "x.json") == {"result": "accepted"}
+    with pytest.raises(InputError, match="'result' is given twice"):
+        json_io.read_model(tmp_path / "x.json", BaseModel, RELEASE_FORMAT)
 
 
 @pytest.mark.timeout(60)

@@ -52,15 +52,28 @@ def _integer(text: str) -> int:
     return int(text)
 
 
-def parse_json(text: str | bytes) -> Any:
-    """Return the value of JSON text in UTF-8; ValueError where it is none or holds what this module refuses."""
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"{next(name for name in names if names.count(name) > 1)!r} is given twice")
+    return members
+
+
+def parse_json(text: str | bytes, *, unique_keys: bool = False) -> Any:
+    """Return the value of JSON text in UTF-8; ValueError where it is none or holds what this module refuses.
+
+    unique_keys: Refuse a key that is given twice in one object, of which readers in other languages may take either.
+    """
     data = text.encode() if isinstance(text, str) else text.removeprefix(b"\xef\xbb\xbf")
     num_groups = data.count(b"[") + data.count(b"{")
     if num_groups > max(MOST_GROUPS, len(data) / LEAST_GROUP_BYTES):
         raise ValueError(f"{num_groups:,} lists and objects in {len(data):,} characters")
     flat, hooks = data.translate(_ZEROS, b"+"), dict[str, Any]()
+    if unique_keys:
+        hooks["object_pairs_hook"] = _unique
     if _LONG_EXPONENT in flat or _LONG_NUMBER in flat:
-        hooks = {"parse_float": _finite, "parse_int": _integer}
+        hooks |= {"parse_float": _finite, "parse_int": _integer}
     del flat  # as large as the file
     try:
         value = json.loads(data.decode() if isinstance(text, bytes) else text, parse_constant=_finite, **hooks)
@@ -82,11 +95,11 @@ def is_deep(value: Any) -> bool:
     return True
 
 
-def parse_document(data: bytes | str, where: str | Path, *, what: str = "file") -> Any:
+def parse_document(data: bytes | str, where: str | Path, *, what: str = "file", unique_keys: bool = False) -> Any:
     """Return the value of a file's JSON text; InputError where `parse_json` refuses it."""
     raw = data.encode() if isinstance(data, str) else data
     try:
-        value = parse_json(raw)
+        value = parse_json(raw, unique_keys=unique_keys)
         if _SURROGATE.search(raw):
             json.dumps(value, ensure_ascii=False).encode()  # fails on half of a pair
     except UnicodeDecodeError:
@@ -227,7 +240,8 @@ def model_of(value: Any, model: type[Model], form: FileFormat, where: Path | str
 
 def read_model(path: Path, model: type[Model], form: FileFormat, *, tree: Path | None = None) -> Model:
     """Read a JSON file of the wanted schema and major version."""
-    return model_of(read_json(path, what=form.what, tree=tree), model, form, path)
+    data = read_bytes(path, what=form.what, tree=tree)
+    return model_of(parse_document(data, path, what=form.what, unique_keys=True), model, form, path)
 
 
 def write_model(path: Path, content: BaseModel, form: FileFormat) -> None:
