@@ -7,6 +7,8 @@ decision names the inspection by the digest of its file and counts for that insp
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
@@ -63,10 +65,19 @@ def read_decisions(inspected: Path) -> dict[str, Decision]:
     return found
 
 
+def _queue(inspected: Path) -> tuple[list[str], dict[str, Decision]]:
+    """Return the folders of the tracks in review, and the decisions on all tracks."""
+    return _folders_in_review(read_inspection(inspected).flights), read_decisions(inspected)
+
+
+def _folders_in_review(tracks: Iterable[TrackInspection]) -> list[str]:
+    return [track.folder for track in tracks if track.result == "review"]
+
+
 def undecided(inspected: Path) -> list[str]:
     """Return the folders of the tracks in review that nobody has decided."""
-    decisions = read_decisions(inspected)
-    return [track.folder for track in in_review(read_inspection(inspected).flights) if track.folder not in decisions]
+    queue, decisions = _queue(inspected)
+    return [folder for folder in queue if folder not in decisions]
 
 
 def how_to_decide(folder: Path) -> str:
@@ -77,9 +88,14 @@ def how_to_decide(folder: Path) -> str:
     )
 
 
-def in_review(tracks: list[TrackInspection]) -> list[TrackInspection]:
-    """Return the tracks in review."""
-    return [track for track in tracks if track.result == "review"]
+def summary(inspected: Path) -> str:
+    """Return the state of the review in one line, with the names of open tracks."""
+    queue, decisions = _queue(inspected)
+    verdicts = [decisions[folder].verdict for folder in queue if folder in decisions]
+    waiting, num_others = [folder for folder in queue if folder not in decisions], len(decisions.keys() - set(queue))
+    counts = f"{verdicts.count('accepted')} accepted, {verdicts.count('rejected')} rejected, {len(waiting)} open"
+    text = f"{len(queue)} flights in review: {counts}" + (f"; {num_others} others rejected" if num_others else "")
+    return text + (f" ({', '.join(waiting[:3])}{', ...' if len(waiting) > 3 else ''})" if waiting else "")
 
 
 def read_settled(inspected: Path) -> Inspection:
@@ -87,15 +103,50 @@ def read_settled(inspected: Path) -> Inspection:
     inspection, decisions = read_inspection(inspected), read_decisions(inspected)
     if not decisions:
         return inspection
-    tracks = [
-        track.model_copy(update={"result": one.verdict, "decided": one.verdict})
-        if (one := decisions.get(track.folder))
-        else track
-        for track in inspection.flights
-    ]
+    verdicts = {folder: {"result": one.verdict, "decided": one.verdict} for folder, one in decisions.items()}
+    tracks = [track.model_copy(update=verdicts.get(track.folder)) for track in inspection.flights]
     is_planned = any(track.trace_id is not None for track in tracks) or not inspection.funnel.trajectories.rendered
     counts = count_trajectories(tracks, planned=is_planned)
     trajectories = inspection.funnel.trajectories.model_copy(update=counts)
     trajectories.check()
     funnel = inspection.funnel.model_copy(update={"trajectories": trajectories})
     return inspection.model_copy(update={"flights": tracks, "funnel": funnel})
+
+
+def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[Decision]:
+    """Record all choices, or none of them.
+
+    A trajectory's folder means its tracks in review; a rejection also covers those that were accepted.
+    """
+    read_decisions(inspected)  # existing ones must be of this inspection
+    about = {"inspection": sha256_file(inspected), "by": by, "at": datetime.now(UTC).isoformat(timespec="seconds")}
+    tracks, decisions = read_inspection(inspected).flights, list[Decision]()
+    for choice in choices:
+        for track in _chosen(choice, tracks, inspected):
+            if track.result == "rejected" and choice.verdict == "accepted":
+                raise InputError(
+                    "a flight that breaks a rule cannot be accepted",
+                    where=track.folder,
+                    got=track.reason or "rejected",
+                    expected="a flight in review",
+                    fix="fix the flight, or change the threshold and inspect again",
+                )
+            named = {"folder": track.folder, "sha256": track.sha256}
+            decisions.append(Decision(**choice.model_dump() | named | about))
+    with Journal(inspected.with_name(REVIEW)) as journal:
+        for decision in decisions:
+            journal.append(decision.model_dump())
+    return decisions
+
+
+def _chosen(choice: Choice, tracks: list[TrackInspection], inspected: Path) -> list[TrackInspection]:
+    """Return the tracks that a choice means."""
+    name = choice.folder.strip("/")
+    named = [track for track in tracks if track.folder == name]
+    below = [track for track in tracks if track.folder.rpartition("/")[0] == name]
+    meant = ("review",) if choice.verdict == "accepted" else ("review", "accepted")
+    found = named or [track for track in below if track.result in meant] or below
+    if not found:
+        expected = f"the folder of a flight or of its trajectory, as {', '.join(_folders_in_review(tracks)[:3])}"
+        raise InputError("no such flight", where=inspected, got=choice.folder, expected=expected)
+    return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosfly.formats.episode_scores import Figure
+from cosfly.formats.episodes import Figure
 from cosfly.geometry.axes import DT_S
 
 ACCEL_SCALE_MPS2, JERK_SCALE_MPS3 = 5.0, 10.0  # eq:smoothness_score
