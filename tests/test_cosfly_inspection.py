@@ -23,7 +23,6 @@ from cosfly.formats.frames import (
     frame_name,
     read_depth,
     read_instance,
-    tree_position,
 )
 from cosfly.formats.inspection import read_inspection
 from cosfly.formats.issues import Report
@@ -547,7 +546,7 @@ def test_every_check_has_a_planted_defect():
 
 def other_at(place_m, kind: str = "Pedestrians", number: int = 7) -> BystanderMeta:
     return BystanderMeta(
-        instance_id=number, semantic_id=KINDS[kind], world_location=tree_position(np.asarray(place_m, float)), yaw=0.0,
+        instance_id=number, semantic_id=KINDS[kind], world_location=np.asarray(place_m, float), yaw=0.0,
         half_extents_m=(0.3, 0.3, 0.9), num_pixels=0,
     )  # fmt: skip
 

@@ -5,7 +5,7 @@ World: right-handed, metres, +x East, +y North, +z up. Files carry degrees, kern
 rotation = Rz(yaw) @ Ry(-pitch) @ Rx(roll) on a body frame x forward, y left, z up.
 Cameras are OpenCV cameras (x right, y down, z forward) and depth is z-depth.
 
-CARLA and Unreal are left-handed (y to the right, yaw clockwise): `mirror_*` below is that change, its own inverse.
+CARLA and Unreal are left-handed (y to the right, yaw clockwise): `mirror_poses` is that change, its own inverse.
 """
 
 from __future__ import annotations
@@ -132,14 +132,9 @@ def wrap_deg(angle_deg: np.ndarray | float) -> np.ndarray | float:
     return (np.asarray(angle_deg) + 180.0) % 360.0 - 180.0
 
 
-def mirror_positions(positions_m: np.ndarray) -> np.ndarray:
-    """Convert (..., 3) positions between right-handed and CARLA axes: y changes sign."""
-    return np.asarray(positions_m, dtype=np.float64) * np.array([1.0, -1.0, 1.0])
-
-
-def mirror_rotations(rotations_deg: np.ndarray) -> np.ndarray:
-    """Convert (..., 3) pitch, yaw, roll between right-handed and CARLA axes: yaw changes sign."""
-    return np.asarray(rotations_deg, dtype=np.float64) * np.array([1.0, -1.0, 1.0])
+def mirror_poses(poses: np.ndarray) -> np.ndarray:
+    """Convert positions or rotations (..., 3), or one after the other (..., 6), between right-handed and CARLA axes."""
+    return np.asarray(poses, dtype=np.float64) * np.tile([1.0, -1.0, 1.0], np.shape(poses)[-1] // 3)
 
 
 # --- time -------------------------------------------------------------------------------------------------------------

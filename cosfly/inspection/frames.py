@@ -98,10 +98,10 @@ def _check_header(path: Path, track: Track, where: str, report: Report) -> None:
     is_depth = path.suffix == ".npy"
     expected = f"float32 ({height}, {width})" if is_depth else f"a PNG of {width} x {height} px"
     try:
-        found = array_header(path, tree=tree) if is_depth else picture_size(path, tree=tree) or "no PNG header"
+        found = str(array_header(path, tree=tree) if is_depth else picture_size(path, tree=tree) or "no PNG header")
     except InputError as error:
-        found = error.got or error.what
-    if str(found) != (expected if is_depth else str((width, height))):
+        found = str(error.got or error.what)
+    if found != (expected if is_depth else str((width, height))):
         report.error("wrong_format", where, found, expected)
 
 
@@ -211,7 +211,7 @@ def check_bystanders(
                 where = f"meta.json of frame {i}: others"
                 report.error("broken_annotation", where, f"semantic_id {line.semantic_id}", " or ".join(BUILDS))
                 continue
-            feet_m = line.center_m - np.array([0.0, 0.0, BUILDS[kind].half_extents_m[2]])
+            feet_m = line.world_location - np.array([0.0, 0.0, BUILDS[kind].half_extents_m[2]])
             bystander = Bystander(kind, feet_m[None], np.array([line.heading_rad]))
             distance_m = float(distances_to_boxes_m(track.positions_m[i], bystander)[0])
             nearest_m = min(nearest_m, distance_m)

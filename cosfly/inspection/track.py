@@ -26,8 +26,7 @@ from cosfly.geometry.coverage import Coverage, axis_values
 from cosfly.geometry.trajectory_metrics import (
     CLEARANCE_CAP_M,
     CLEARANCE_TOLERANCE_M,
-    accel_rms,
-    jerk_rms,
+    derivative_rms,
     length_m,
     smoothness_score,
 )
@@ -143,7 +142,7 @@ def _read(folder: Path, report: Report) -> Track:
 def check_plan(trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: Metrics) -> None:
     """Check the smoothness of the plan and the result of its prefilter."""
     dt_s = step_s(trace.time_s)
-    accel, jerk = accel_rms(trace.positions_m, dt_s), jerk_rms(trace.positions_m, dt_s)
+    accel, jerk = (derivative_rms(trace.positions_m, order, dt_s) for order in (2, 3))
     score = smoothness_score(accel, jerk)
     metrics.update(accel_rms_mps2=accel, jerk_rms_mps3=jerk, smoothness=score)
     where = f"plan {trace.path_id}"
