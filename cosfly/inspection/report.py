@@ -42,23 +42,16 @@ def report_html(name: str, inspection: Inspection, views: Mapping[str, TrackView
     Args:
         name: of the run. views: pictures and curves by track folder, as many as `page_mb` allows.
     """
-    order = sorted(inspection.flights, key=lambda track: (-RESULTS.index(track.result), track.folder))
-    is_covered = inspection.coverage is not None and inspection.coverage.frames
-    accepted = [track for track in inspection.flights if track.result == "accepted"] or inspection.flights
-    shown = [
-        views[one.folder].pictures[1] for one in sorted(accepted, key=lambda one: one.track) if one.folder in views
-    ]
+    tracks, coverage = inspection.flights, inspection.coverage
+    accepted = [track for track in tracks if track.result == "accepted"] or tracks
+    accepted = [track for track in sorted(accepted, key=lambda track: track.track) if track.folder in views]
     counts = {
-        state: sum(int(track.metrics.get(f"frames_{state.replace(' ', '_')}") or 0) for track in inspection.flights)
+        state: sum(int(track.metrics.get(f"frames_{state.replace(' ', '_')}") or 0) for track in tracks)
         for state in STATES
     }
     total = sum(counts.values())
-    states = [
-        (state, counts[state], f"{counts[state] / max(total, 1):.1%}", f"{paper:.0%}")
-        for state, paper in STATES.items()
-    ]
     cards, size, num_without_pictures = list[str](), 0, 0
-    for track in order:
+    for track in sorted(tracks, key=lambda track: (-RESULTS.index(track.result), track.folder)):
         card = _card(track, views.get(track.folder))
         if track.folder in views and size + len(card) > page_mb * MB:
             card, num_without_pictures = _card(track, None), num_without_pictures + 1
@@ -74,10 +67,10 @@ def report_html(name: str, inspection: Inspection, views: Mapping[str, TrackView
         cards=cards,
         num_without_pictures=num_without_pictures,
         page_mb=page_mb,
-        pictures=[one for one in shown if one][:OPENING_PICTURES],
-        states=states,
+        pictures=[one for track in accepted if (one := views[track.folder].pictures[1])][:OPENING_PICTURES],
+        states=[(one, counts[one], f"{counts[one] / max(total, 1):.1%}", f"{STATES[one]:.0%}") for one in STATES],
         num_perturbable=total,
-        coverage=coverage_html(inspection.coverage) if is_covered and inspection.coverage else None,
+        coverage=coverage_html(coverage) if coverage is not None and coverage.frames else None,
     )
 
 
