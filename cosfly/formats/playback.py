@@ -308,30 +308,15 @@ def read_track(folder: Path, *, strict: bool = True) -> Track:
         reader.optional(lambda: validated(WeatherRecord, raw["weather"], f"{path}: weather"))
     is_original = bool(object_of(raw, "augmentation").get("is_original", variant == ORIGINAL))
     camera = reader.camera(raw.get("camera"))
+    intrinsics, between = reader.intrinsics(points, camera), reader.between(points)
     return Track(
-        town=town,
-        trajectory=trajectory,
-        variant=variant,
-        camera=camera,
-        intrinsics=reader.intrinsics(points, camera),
-        between=reader.between(points),
-        time_s=time_s,
-        positions_m=poses[:, :3],
-        rotations_deg=poses[:, 3:],
-        targets_m=mirror_poses(_vectors_of(targets, "world_location", XYZ)),
-        target=_target_view(targets),
-        perturbation=_perturbation(points, is_original),
-        source=object_of(raw, "source"),
-        is_original=is_original,
-        folder=folder,
-        raw=raw,
-        issues=tuple(reader.issues),
-        segments=segments,
-        mission=mirrored(mission),
-        people=people,
-        goal=goal,
+        town, trajectory, variant, camera, time_s, poses[:, :3], poses[:, 3:],
+        mirror_poses(_vectors_of(targets, "world_location", XYZ)), _target_view(targets),
+        _perturbation(points, is_original), source=object_of(raw, "source"), is_original=is_original, folder=folder,
+        raw=raw, issues=tuple(reader.issues), segments=segments, mission=mirrored(mission),
+        intrinsics=intrinsics, between=between, people=people, goal=goal,
         bystanders=None if np.isnan(bystanders[:, 0]).any() else bystanders,
-    )
+    )  # fmt: skip
 
 
 class _FieldReader:
@@ -515,22 +500,15 @@ def write_track(folder: Path, track: Track) -> None:
     assert len(points) == len(track), "raw points and columns differ in number"
     camera, target, perturbation = track.camera, track.target, track.perturbation
     raw |= {
-        "schema": SCHEMA,
-        "schema_version": SCHEMA_VERSION,
-        "trace_dir": track.variant,
-        "dataset_format": raw.get("dataset_format", DATASET_FORMAT),
-        "frames_dir": raw.get("frames_dir", FRAMES_DIR),
-        "coordinates": raw.get("coordinates", COORDINATES),
-        "source": track.source,
+        "schema": SCHEMA, "schema_version": SCHEMA_VERSION, "trace_dir": track.variant,
+        "dataset_format": raw.get("dataset_format", DATASET_FORMAT), "frames_dir": raw.get("frames_dir", FRAMES_DIR),
+        "coordinates": raw.get("coordinates", COORDINATES), "source": track.source,
         **flown_as_json(track.segments, mirrored(track.mission)),
         **{name: asdict(one) for name, one in (("people", track.people), ("goal", track.goal)) if one is not None},
-        "camera": {
-            **object_of(raw, "camera"), "width": camera.width_px, "height": camera.height_px, **camera.focal_record()
-        },
-        "augmentation": {
-            "enabled": not track.is_original, "aug_index": 0 if track.is_original else 1,
-            **object_of(raw, "augmentation"), "is_original": track.is_original,
-        },
+        "camera": object_of(raw, "camera")
+        | {"width": camera.width_px, "height": camera.height_px, **camera.focal_record()},
+        "augmentation": {"enabled": not track.is_original, "aug_index": 0 if track.is_original else 1}
+        | object_of(raw, "augmentation") | {"is_original": track.is_original},
     }  # fmt: skip
     poses = mirror_poses(np.hstack([track.positions_m, track.rotations_deg])) + 0.0
     vectors: list[tuple[str, str, tuple[str, ...], np.ndarray | None]] = [

@@ -54,8 +54,10 @@ class Course:
         inside = (before >= 0) & (after < len(time_s))
         gaps_s = time_s[after[inside]] - time_s[before[inside]]
         seconds = seconds[inside][gaps_s <= MOST_GAP_S]
-        found = [np.interp(seconds, time_s, column) for column in places_m.T] if len(seconds) else np.empty((3, 0))
-        return Course(self.name, self.town, seconds, np.column_stack(found))
+        found = np.empty((len(seconds), 3))
+        for axis in range(3) if len(seconds) else ():
+            found[:, axis] = np.interp(seconds, time_s, places_m[:, axis])
+        return Course(self.name, self.town, seconds, found)
 
     @cached_property
     def key(self) -> tuple[str, bytes]:
@@ -160,5 +162,5 @@ def assign_splits(
     num_test, num_val = (max(1, round(share * len(ranked))) if share else 0 for share in (test, val))
     while num_test + num_val >= len(ranked):  # rounding took all: the larger share gives one back
         num_test, num_val = (num_test - 1, num_val) if num_test >= num_val else (num_test, num_val - 1)
-    names: list[Split] = ["test"] * num_test + ["val"] * num_val + ["train"] * (len(ranked) - num_test - num_val)
-    return dict(zip(ranked, names, strict=True))
+    counts: dict[Split, int] = {"test": num_test, "val": num_val, "train": len(ranked) - num_test - num_val}
+    return dict(zip(ranked, (split for split, count in counts.items() for _ in range(count)), strict=True))

@@ -58,20 +58,12 @@ def report_html(name: str, inspection: Inspection, views: Mapping[str, TrackView
         size += len(card)
         cards.append(card)
     return page(
-        "cosfly/inspection/report.html",
-        title=name,
-        style=STYLE,
-        inspection=inspection,
-        results=RESULTS,
-        columns=COLUMNS,
-        cards=cards,
-        num_without_pictures=num_without_pictures,
-        page_mb=page_mb,
+        "cosfly/inspection/report.html", title=name, style=STYLE, inspection=inspection, results=RESULTS,
+        columns=COLUMNS, cards=cards, num_without_pictures=num_without_pictures, page_mb=page_mb,
         pictures=[one for track in accepted if (one := views[track.folder].pictures[1])][:OPENING_PICTURES],
         states=[(one, counts[one], f"{counts[one] / max(total, 1):.1%}", f"{STATES[one]:.0%}") for one in STATES],
-        num_perturbable=total,
-        coverage=coverage_html(coverage) if coverage is not None and coverage.frames else None,
-    )
+        num_perturbable=total, coverage=coverage_html(coverage) if coverage is not None and coverage.frames else None,
+    )  # fmt: skip
 
 
 def _card(track: TrackInspection, view: TrackView | None) -> str:
