@@ -86,17 +86,13 @@ def _plot(name: str, view: TrackView) -> dict[str, Any] | None:
     low, high = min(edges), max(edges)
     scale = (PLOT_HEIGHT - 4.0) / ((high - low) or 1.0)
     step = PLOT_WIDTH / ((time_s[-1] - time_s[0]) or 1.0)
-    parts, pen_is_down = [], False
-    for at_s, value in zip(time_s, values, strict=True):
-        if value is not None:
-            parts.append(
-                f"{'L' if pen_is_down else 'M'}{(at_s - time_s[0]) * step:.1f} "
-                f"{PLOT_HEIGHT - 2.0 - (value - low) * scale:.1f}"
-            )
-        pen_is_down = value is not None
+    points = [
+        (before, f"{(at_s - time_s[0]) * step:.1f} {PLOT_HEIGHT - 2.0 - (value - low) * scale:.1f}")
+        for before, at_s, value in zip([None, *values], time_s, values, strict=False) if value is not None
+    ]  # fmt: skip
     return {
         "title": title,
-        "path": "".join(parts),
+        "path": "".join(f"{'M' if before is None else 'L'}{point}" for before, point in points),
         "found": f"{min(known):.2f} to {max(known):.2f}{' ' * bool(unit)}{unit}, mean {float(np.mean(known)):.2f}",
         "axes": f"{low:.4g} to {high:.4g}; {time_s[0]:g} s to {time_s[-1]:g} s",
     }

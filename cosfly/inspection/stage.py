@@ -18,11 +18,11 @@ from cosfly.formats.inspection import (
     TrackInspection,
     TrajectoryFunnel,
     count_trajectories,
+    how_to_decide,
     write_inspection,
 )
 from cosfly.formats.issues import Report
 from cosfly.formats.playback import read_track
-from cosfly.formats.review import how_to_decide
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.coverage import Coverage

@@ -13,9 +13,9 @@ import numpy as np
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.captions import Caption, read_captions
 from cosfly.formats.frames import frame_path
+from cosfly.formats.inspection import read_settled
 from cosfly.formats.places import folder_name, place_of, town_folder
 from cosfly.formats.playback import Track, read_track
-from cosfly.formats.review import read_settled
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
