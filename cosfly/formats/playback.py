@@ -397,7 +397,7 @@ class _FieldReader:
             if i + 1 < len(points):
                 following = poses[i + 1, :3]
                 expected = f"the next point's position {following.tolist()}"
-                is_right = bool((np.abs(_parts_of(found, XYZ) - following) <= WAYPOINT_TOLERANCE_M).all())
+                is_right = bool((np.abs(np.subtract(_parts_of(found, XYZ), following)) <= WAYPOINT_TOLERANCE_M).all())
             if not is_right:
                 self.issue(f"points[{i}].nav_waypoint.t1_world", repr(found)[:60], expected)
                 break  # one note is enough
@@ -441,16 +441,17 @@ def object_of(group: dict, key: str) -> dict:
     return value if isinstance(value, dict) else {}
 
 
-def _parts_of(value: Any, names: tuple[str, ...]) -> np.ndarray:
+def _parts_of(value: Any, names: tuple[str, ...]) -> list:
     """Return the numbers of {"x": .., "y": ..} or [.., ..]; NaN for anything else, nulls included."""
     parts = [value.get(n) for n in names] if isinstance(value, dict) else value
-    is_vector = isinstance(parts, list) and len(parts) == len(names) and all(map(is_number, parts))
-    return np.array(parts if is_vector else [np.nan] * len(names), dtype=np.float64)
+    if isinstance(parts, list) and len(parts) == len(names) and all(map(is_number, parts)):
+        return parts
+    return [np.nan] * len(names)
 
 
 def _vectors_of(groups: list[dict], key: str, names: tuple[str, ...]) -> np.ndarray:
     """Read a vector of each group, (n, len(names))."""
-    return np.array([_parts_of(group.get(key), names) for group in groups]).reshape(-1, len(names))
+    return np.array([_parts_of(group.get(key), names) for group in groups], np.float64).reshape(-1, len(names))
 
 
 def _numbers_of(groups: list[dict], key: str) -> np.ndarray:

@@ -116,36 +116,23 @@ def _check_meta(frame: Path, i: int, where: str, report: Report) -> FrameMeta | 
     return meta
 
 
-class Checksums:
-    """The digests in `checksums.sha256`, each compared once: when a file is read anyway, or at the end."""
-
-    def __init__(self, folder: Path, report: Report, *, is_wanted: bool) -> None:
-        self._folder, self._report, self._open = folder, report, dict[str, str]()
-        if is_wanted and not (folder / CHECKSUMS).is_file():
-            report.add("note", "no_checksums", CHECKSUMS, "no such file", "digests of the track's files")
-        elif is_wanted:
-            try:
-                self._open = read_checksums(folder)
-            except InputError as error:
-                report.error("checksum", CHECKSUMS, error.got or error.what, "lines of sha256sum")
-
-    def compare(self, name: str, data: bytes) -> None:
-        """Compare the content of a file; its name is relative to the track's folder."""
-        digest = self._open.pop(name, None)
-        if digest is not None and sha256_bytes(data) != digest:
-            self._report.error("checksum", name, "other bytes", f"the digest in {CHECKSUMS}")
-
-    def compare_rest(self) -> None:
-        """Read and compare the files that were not compared yet."""
-        for name, digest in self._open.items():
-            advance()
-            _compare_file(self._folder / name, name, digest, CHECKSUMS, self._report)
+def listed_digests(folder: Path, report: Report) -> dict[str, str]:
+    """Read the digests of a track's `checksums.sha256`, by name in its folder; report where that is not possible."""
+    if not (folder / CHECKSUMS).is_file():
+        report.add("note", "no_checksums", CHECKSUMS, "no such file", "digests of the track's files")
+        return {}
+    try:
+        return read_checksums(folder)
+    except InputError as error:
+        report.error("checksum", CHECKSUMS, error.got or error.what, "lines of sha256sum")
+        return {}
 
 
-def _compare_file(path: Path, name: str, digest: str, listed_in: str, report: Report) -> None:
-    if not path.is_file():
+def compare_file(folder: Path, name: str, digest: str, report: Report, *, listed_in: str = CHECKSUMS) -> None:
+    """Compare a file of a track with its digest."""
+    if not (folder / name).is_file():
         report.error("missing_file", name, "no such file", f"a file, listed in {listed_in}")
-    elif sha256_file(path) != digest:
+    elif sha256_file(folder / name) != digest:
         report.error("checksum", name, "other bytes", f"the digest in {listed_in}")
 
 
@@ -154,7 +141,7 @@ def check_recorded(folder: Path, root: Path, recorded: Mapping[str, str], report
     for name in ("trajectory.json", CHECKSUMS) if recorded else ():
         digest = recorded.get((folder / name).relative_to(root).as_posix())
         if digest is not None:
-            _compare_file(folder / name, name, digest, "the tree's manifest", report)
+            compare_file(folder, name, digest, report, listed_in="the tree's manifest")
         elif name == "trajectory.json":
             got, expected = "no such entry in the tree's manifest", "a track that was made with it"
             report.error("not_of_this_tree", name, got, expected)
@@ -251,10 +238,12 @@ class FrameNumbers:
 
 
 def check_frames(
-    track: Track, indices: Iterable[int], bystanders: Mapping[int, BystandersMeta], checksums: Checksums, report: Report
+    track: Track, indices: Iterable[int], bystanders: dict[int, BystandersMeta], digests: dict[str, str], report: Report
 ) -> FrameNumbers:
-    """Decode frames, each file once; compare colour, depth and mask with each other, the poses and the previous
-    frame."""
+    """Decode frames; compare colour, depth and mask with each other, the poses and the previous frame.
+
+    Each file is read once, and compared with its digest, which leaves `digests` then.
+    """
     numbers, jumps = FrameNumbers(), dict[int, Agreement]()
     previous: tuple[int, np.ndarray] | None = None
     surfaces: tuple[int, View] | None = None  # of the previous frame with depth
@@ -262,7 +251,7 @@ def check_frames(
         advance()
         where = frame_name(i)
         try:
-            picture = unpack(_read(track, i, checksums), Path(where))
+            picture = unpack(_read(track, i, digests, report), Path(where))
         except InputError as error:
             report.error("broken_image", str(error.where), f"{error.what}: {error.got}", "a file that decodes in full")
             continue
@@ -292,14 +281,16 @@ def check_frames(
     return numbers
 
 
-def _read(track: Track, i: int, checksums: Checksums) -> dict[str, bytes]:
+def _read(track: Track, i: int, digests: dict[str, str], report: Report) -> dict[str, bytes]:
     """Read the existing pictures of a frame; `check_files` reports missing ones."""
     assert track.folder is not None
     folder, tree, files = track.frame_folder(i), tree_of_track(track.folder), dict[str, bytes]()
     for name in FILE_NAMES.values():
         if (path := frame_path(folder, name)).exists():
-            files[path.name] = read_bytes(path, what="image", tree=tree)
-            checksums.compare(f"{frame_name(i)}/{path.name}", files[path.name])
+            data = files[path.name] = read_bytes(path, what="image", tree=tree)
+            digest = digests.pop(place := f"{frame_name(i)}/{path.name}", None)
+            if digest is not None and sha256_bytes(data) != digest:
+                report.error("checksum", place, "other bytes", f"the digest in {CHECKSUMS}")
     return files
 
 

@@ -32,17 +32,19 @@ from cosfly.geometry.trajectory_metrics import (
 )
 from cosfly.inspection import settings as limits
 from cosfly.inspection.frames import (
-    Checksums,
     check_bystanders,
     check_files,
     check_frames,
     check_recorded,
+    compare_file,
+    listed_digests,
     target_box,
 )
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.view import TrackView, draw_track
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.run_dir import digest_of, folder_digests
+from cosfly.runtime.worker import advance
 
 if TYPE_CHECKING:
     from cosfly.formats.boxes import BoxMap
@@ -101,7 +103,7 @@ def inspect_track(
     result: Result = "rejected" if report.num("error") else "review" if report.num("warning") else "accepted"
     try:
         sha256 = digest_of(folder_digests(folder))
-    except InputError:  # reported by `Checksums`
+    except InputError:  # reported by `listed_digests`
         sha256 = None
     record = TrackInspection(
         town=track.town, trajectory=track.trajectory, variant=track.variant, is_original=track.is_original,
@@ -294,9 +296,11 @@ def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Met
     # Other programs count others in another way.
     bystanders = {i: meta.others for i, meta in metas.items() if track.is_ours and meta and meta.others}
     check_bystanders(track, bystanders, cfg.clearance_min_m, report, metrics)
-    checksums = Checksums(track.folder, report, is_wanted=cfg.check_checksums)
-    frames = check_frames(track, metas, bystanders, checksums, report)
-    checksums.compare_rest()
+    digests = listed_digests(track.folder, report) if cfg.check_checksums else {}
+    frames = check_frames(track, metas, bystanders, digests, report)
+    for name, digest in digests.items():
+        advance()
+        compare_file(track.folder, name, digest, report)
     known = target.visibility[~np.isnan(target.visibility)]
     quality = float(np.mean(frames.track_ious)) if frames.track_ious else None
     invalid = max(frames.invalid_depth_shares, default=None)
