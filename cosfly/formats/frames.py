@@ -301,7 +301,7 @@ def read_depth(frame: Path) -> np.ndarray:
 
 def depth_values(data: bytes | memoryview, where: Path) -> np.ndarray:
     """Return the depth of an image's bytes in either form, as `read_depth`; a `.npy` is not copied."""
-    if is_packed(data):
+    if data[: len(PNG_SIGNATURE)] == PNG_SIGNATURE:
         depth = floats_of(data, where)
     else:
         header = parse_array_header(memoryview(data), where, what="depth image")
@@ -323,11 +323,6 @@ def instance_bytes(kinds: np.ndarray, ids: np.ndarray) -> bytes:
     return areas_png(kinds, (ids & 0xFF).astype(np.uint8), (ids >> 8).astype(np.uint8))
 
 
-def is_packed(data: bytes | memoryview) -> bool:
-    """Return whether a depth image's bytes are those of a `depth_float32.png`."""
-    return data[: len(PNG_SIGNATURE)] == PNG_SIGNATURE
-
-
 def depth_file(depth: np.ndarray, form: DepthFormat) -> tuple[str, bytes]:
     """Name and content of the file of a depth image, (h, w) float32."""
     return (DEPTH_PNG, floats_png(depth)) if form == "png" else (DEPTH_NPY, depth_bytes(depth))
@@ -338,3 +333,8 @@ def depth_bytes(depth: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     np.lib.format.write_array(buffer, np.ascontiguousarray(depth), version=(1, 0), allow_pickle=False)
     return buffer.getvalue()
+
+
+def as_depth_npy(data: bytes, where: Path) -> bytes:
+    """Return the content of `depth.npy` of a depth image's bytes in either form."""
+    return depth_bytes(depth_values(data, where)) if data.startswith(PNG_SIGNATURE) else data
