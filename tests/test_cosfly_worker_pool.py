@@ -129,9 +129,3 @@ def test_a_second_signal_that_breaks_off_the_ending_ends_the_workers_too(tmp_pat
     process.send_signal(signal.SIGTERM)
     assert process.wait(timeout=60) in (130, 143, -signal.SIGTERM)
     wait_until(lambda: not any(map(is_running, pids)))
-
-
-# --- telling how far it is --------------------------------------------------------------------------------------------
-
-
-# --- events -----------------------------------------------------------------------------------------------------------

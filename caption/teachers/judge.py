@@ -67,7 +67,7 @@ def read_gold(path: Path = GOLD) -> Iterator[GoldCaption]:
     """Yield the captions of a set, by default the one that ships."""
     for number, line in enumerate(read_unpacked(path, what="gold captions").splitlines(), 1):
         where = f"{path}:{number}"
-        value = parse_document(line, where, what="line")
+        value = parse_document(line, where)
         yield validated(GoldCaption, value, where)
 
 

@@ -116,7 +116,7 @@ def _read_glb(data: bytes, folder: _Folder) -> dict[str, Mesh]:
 
 def _read_gltf(data: bytes, folder: _Folder, binary: bytes = b"") -> dict[str, Mesh]:
     """Let trimesh place the primitives, each a mesh of its own, of a document without what is not drawn."""
-    document = parse_document(data, folder.path, what="mesh")
+    document = parse_document(data, folder.path)
     accessors, views = document.get("accessors", []), document.get("bufferViews", [])
     if document.get("extensionsRequired") or any("sparse" in a or "bufferView" not in a for a in accessors):
         raise InputError("the mesh needs an extension or sparse numbers", where=folder.path, expected="plain glTF 2.0")

@@ -75,7 +75,7 @@ def read_roi(path: Path, most_vertices: int = MOST_VERTICES) -> Roi:
 
 def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Roi:
     """Return the region of interest of a file's bytes."""
-    value = parse_document(data, path, what=WHAT)
+    value = parse_document(data, path)
     if is_geojson(value):
         value = {"polygons": _polygons_of(features_of(value, path), path)}
     roi = validated(Roi, value, path)

@@ -179,7 +179,7 @@ def _read_parts(path: Path) -> tuple[str, _Document, list[tuple[str, _Part]]]:
     texts = [(f"{path}: line {k + 1}", line) for k, line in enumerate(lines) if line.strip()] if is_sequence else []
     version, parts = "", list[tuple[str, _Part]]()
     for where, text in texts or [(str(path), data)]:
-        value = parse_document(text, where, what="city model")
+        value = parse_document(text, where)
         found = value.get("type") if isinstance(value, dict) else type(value).__name__
         expected, model = ("CityJSONFeature", _Part) if parts else ("CityJSON", _Document)
         if not isinstance(value, dict) or found != expected:

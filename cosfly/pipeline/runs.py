@@ -14,7 +14,7 @@ from cosfly.pipeline.settings import RunConfig
 from cosfly.pipeline.settings_guide import Setting, changed
 from cosfly.runtime.config import load
 from cosfly.runtime.errors import CosflyError, InputError
-from cosfly.runtime.run_dir import Failed, StageFolder, Tally, is_held, read_manifest
+from cosfly.runtime.run_dir import StageFolder, Tally, is_held, read_manifest
 
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")  # of a run, in order
 TO_LOOK_AT = (
@@ -137,10 +137,5 @@ def _stage(name: str, folder: Path) -> StageSummary:
     outcomes = {record.id: record for record in StageFolder(folder, name, False).items()}
     tally = Tally(input=len(outcomes))
     for record in outcomes.values():
-        if isinstance(record, Failed):
-            tally.failed[record.code] += 1
-        elif record.status == "dropped":
-            tally.dropped[record.reason] += 1
-        else:
-            tally.kept += 1
+        tally.count(record)
     return StageSummary(name, folder, "begun", tally)

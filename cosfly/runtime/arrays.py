@@ -8,7 +8,6 @@ as Python literals, which a crafted one makes slow and two threads at once make 
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 import os
 import re
@@ -31,8 +30,6 @@ _DESCR = re.compile(rb"'descr' *: *'([<>|=][a-z][0-9]{1,2})'")
 _ORDER = re.compile(rb"'fortran_order' *: *(True|False)")
 _SHAPE = re.compile(rb"'shape' *: *\(([0-9, ]{0,200})\)")
 
-_Bytes = io.BufferedReader | io.BytesIO
-
 
 # --- NumPy arrays -----------------------------------------------------------------------------------------------------
 
@@ -51,70 +48,60 @@ class ArrayHeader(NamedTuple):
 
 def array_header(path: Path, *, tree: Path | None = None) -> ArrayHeader:
     """Read the header of a `.npy` file, and check that the numbers are all there."""
-    with open_file(path, what="array", tree=tree) as file:
-        return _header(file, path, "array")
+    with open_file(path, what="array", tree=tree) as file, disk_errors(path, "array"):
+        return _header(file.read(MOST_HEADER_BYTES + 12), os.fstat(file.fileno()).st_size, path, "array")
 
 
 def parse_array_header(data: memoryview, where: str | Path, *, what: str = "array") -> ArrayHeader:
     """Return the header of the bytes of a `.npy` file, which are not copied."""
-    return _header(io.BytesIO(data[: MOST_HEADER_BYTES + 12]), where, what, len(data))
+    return _header(bytes(data[: MOST_HEADER_BYTES + 12]), len(data), where, what)
 
 
 def read_array(path: Path, *, dtype: type, ndim: int, what: str = "array", tree: Path | None = None) -> np.ndarray:
     """Read a `.npy` file of a known type and number of dimensions."""
-    with open_file(path, what=what, tree=tree) as file:
-        return _array(file, path, what, dtype, ndim)
+    with open_file(path, what=what, tree=tree) as file, disk_errors(path, what):
+        header = _header(file.read(MOST_HEADER_BYTES + 12), os.fstat(file.fileno()).st_size, path, what)
+        _check_kind(header, path, dtype, ndim, what)
+        file.seek(header.offset)
+        values: np.ndarray = np.fromfile(file, dtype, math.prod(header.shape))
+    if values.size != math.prod(header.shape):
+        raise InputError(f"the {what} became shorter while it was read", where=path)
+    return values.reshape(header.shape, order="F" if header.is_fortran else "C")
 
 
 def parse_array(data: bytes, where: str | Path, *, dtype: type, ndim: int, what: str = "array") -> np.ndarray:
     """Return the array of the bytes of a `.npy` file."""
-    return _array(io.BytesIO(data), where, what, dtype, ndim)
+    header = parse_array_header(memoryview(data), where, what=what)
+    _check_kind(header, where, dtype, ndim, what)
+    return np.ndarray(header.shape, dtype, data, header.offset, order="F" if header.is_fortran else "C").copy("K")
 
 
-def _array(file: _Bytes, where: str | Path, what: str, dtype: type, ndim: int) -> np.ndarray:
-    header = _header(file, where, what)
+def _check_kind(header: ArrayHeader, where: str | Path, dtype: type, ndim: int, what: str) -> None:
     if header.dtype != dtype or len(header.shape) != ndim:
         expected = f"{np.dtype(dtype)} of {ndim} dimensions"
         raise InputError(f"not a {what}", where=where, got=str(header), expected=expected)
     check_pixels(math.prod(header.shape), where, str(header.shape))
-    values: np.ndarray = np.empty(header.shape, dtype, order="F" if header.is_fortran else "C")
-    with disk_errors(Path(where), what):
-        num_read = file.readinto(values.T.data if header.is_fortran else values.data)
-    if num_read != values.nbytes:
-        raise _no_array(where, what, "a file that became shorter while it was read")
-    return values
 
 
-def _header(file: _Bytes, where: str | Path, what: str, whole_size: int | None = None) -> ArrayHeader:
-    with disk_errors(Path(where), what):
-        size = file.seek(0, os.SEEK_END) if whole_size is None else whole_size
-        file.seek(0)
-        start = file.read(12)
-        form = "<H" if start[6:7] == b"\1" else "<I"
-        first = 8 + struct.calcsize(form)
-        if len(start) < 12 or not start.startswith(NPY_MAGIC) or not 1 <= start[6] <= 3:
-            raise _no_array(where, what, f"{size} bytes that do not begin as a NumPy array")
-        (length,) = struct.unpack_from(form, start, 8)
-        if length > MOST_HEADER_BYTES:
-            raise _no_array(where, what, f"a header of {length} bytes")
-        file.seek(first)
-        text = file.read(length)
-    found = [match.group(1).decode() for p in (_DESCR, _ORDER, _SHAPE) if (match := p.search(text))]
-    if len(found) < 3:
-        raise _no_array(where, what, repr(text[:80].decode("latin-1")))
-    descr, order, shape = found
-    with contextlib.suppress(TypeError, ValueError):
-        lengths = tuple(int(part) for part in shape.split(",") if part.strip())
-        header = ArrayHeader(np.dtype(descr), lengths, order == "True", first + length)
-        is_whole = math.prod(lengths) * header.dtype.itemsize == size - header.offset
-        # With a length of 0 the product says nothing about the others, which may be beyond every machine.
-        if is_whole and max(lengths, default=0) <= size:
-            return header
-    raise _no_array(where, what, f"{size} bytes that are not a complete NumPy array, {descr} ({shape})")
-
-
-def _no_array(where: str | Path, what: str, got: str) -> InputError:
-    return InputError(f"not a {what}", where=where, got=got, expected="a complete .npy file of numbers")
+def _header(start: bytes, size: int, where: str | Path, what: str) -> ArrayHeader:
+    """Return the header of a file of `size` bytes from its first ones."""
+    got, first = f"{size} bytes that do not begin as a NumPy array", 10 if start[6:7] == b"\1" else 12
+    if len(start) >= 12 and start.startswith(NPY_MAGIC) and 1 <= start[6] <= 3:
+        length = int.from_bytes(start[8:first], "little")
+        text = start[first : first + length] if length <= MOST_HEADER_BYTES else b""
+        found = [match.group(1).decode() for p in (_DESCR, _ORDER, _SHAPE) if (match := p.search(text))]
+        got = f"a header of {length} bytes, {text[:80].decode('latin-1')!r}"
+        if len(found) == 3:
+            descr, order, shape = found
+            got = f"{size} bytes that are not a complete NumPy array, {descr} ({shape})"
+            with contextlib.suppress(TypeError, ValueError):
+                lengths = tuple(int(part) for part in shape.split(",") if part.strip())
+                header = ArrayHeader(np.dtype(descr), lengths, order == "True", first + length)
+                is_whole = math.prod(lengths) * header.dtype.itemsize == size - header.offset
+                # With a length of 0 the product says nothing about the others, which may be beyond every machine.
+                if is_whole and max(lengths, default=0) <= size:
+                    return header
+    raise InputError(f"not a {what}", where=where, got=got, expected="a complete .npy file of numbers")
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------

@@ -1,9 +1,8 @@
 """Numba's `njit` with a cache that never serves stale code.
 
-Numba keeps a compiled function, with everything it calls, until its own file changes: after an update of `kernels.py`
-alone, a planner would keep the old kernels. Here every version of all compiled sources together has its own cache
-folder, $XDG_CACHE_HOME/cosfly/<digest>. NUMBA_CACHE_DIR, if set, is used as it is. Of several processes that need a
-function, one compiles it and the others wait for its lock and load it.
+Numba keeps a compiled function until its own file changes, whatever becomes of those that it calls. Here every version
+of all compiled sources together has its own cache folder, $XDG_CACHE_HOME/cosfly/<digest>, unless NUMBA_CACHE_DIR is
+set. Of several processes that need a function, one compiles it and the others wait for its lock and load it.
 
 Two habits keep compiling short: a literal argument is a type of its own to numba, which compiles the function once
 more, so it is passed as `int64(0)`; and whole arrays are set by `fill` or a loop, because numba's `array[:] = ...`
@@ -15,10 +14,9 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
+import itertools
 import logging
 import os
-import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -34,7 +32,6 @@ __all__ = ["boolean", "int64", "njit"]
 log = logging.getLogger(__name__)
 
 PACKAGE = Path(__file__).parents[1]
-UNUSED_DAYS = 30  # a cache of other sources that no process has opened for so long is deleted
 
 
 class _SharedCache(caching.FunctionCache):
@@ -44,7 +41,13 @@ class _SharedCache(caching.FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         found = super().load_overload(sig, target_context)
-        if found is None and self._take_lock():
+        if found is None:
+            if self._lock is None:  # a function may need itself, or another overload of itself
+                with contextlib.suppress(OSError):  # no place for a lock: each compiles for itself
+                    os.makedirs(self.cache_path, exist_ok=True)
+                    path = os.path.join(self.cache_path, f"{self._py_func.__qualname__}.lock")
+                    self._lock = open(path, "w")  # noqa: SIM115
+                    fcntl.flock(self._lock, fcntl.LOCK_EX)
             found = super().load_overload(sig, target_context)  # another process may have compiled it meanwhile
             if found is not None:
                 self._release_lock()
@@ -55,18 +58,6 @@ class _SharedCache(caching.FunctionCache):
             super().save_overload(sig, data)
         finally:
             self._release_lock()
-
-    def _take_lock(self) -> bool:
-        if self._lock is None:  # a function may need itself, or another overload of itself
-            try:
-                os.makedirs(self.cache_path, exist_ok=True)
-                path = os.path.join(self.cache_path, f"{self._py_func.__qualname__}.lock")
-                self._lock = open(path, "w")  # noqa: SIM115
-                fcntl.flock(self._lock, fcntl.LOCK_EX)
-            except OSError:  # no place for a lock: each compiles for itself
-                self._release_lock()
-                return False
-        return True
 
     def _release_lock(self) -> None:
         if self._lock is not None:
@@ -88,22 +79,15 @@ def njit(**options: Any) -> Callable[[Callable], Callable]:
 
 
 def _use_own_cache(caches: Path) -> None:
-    """Let numba cache in a folder of the sources' own, if it can be made, and delete those unused for long."""
-    digest, now_s = hashlib.sha256(), time.time()
+    """Let numba cache in a folder of the sources' own, if it can be made."""
+    digest = hashlib.sha256()
     for path in sorted(PACKAGE.rglob("*.py")):
         if b"@njit" in (text := read_bytes(path)):
             digest.update(str(path.relative_to(PACKAGE)).encode() + b"\0" + text)
     folder = caches / digest.hexdigest()[:16]
-    try:
+    with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
-        os.utime(folder, (now_s, now_s))
-    except OSError:
-        return
-    numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
-    for other in caches.iterdir():
-        with contextlib.suppress(OSError):  # another process may have deleted it
-            if now_s - other.stat().st_mtime > UNUSED_DAYS * 86400.0:
-                shutil.rmtree(other, ignore_errors=True)
+        numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
 
 
 class _CompileListener(event.Listener):
@@ -117,17 +101,9 @@ class _CompileListener(event.Listener):
         """Log nothing."""
 
 
-class _FirstRecord(logging.Filter):
-    """Passes one record: a process compiles several functions, and so does each of its workers."""
-
-    has_passed = False
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        had_passed, self.has_passed = self.has_passed, True
-        return not had_passed
-
-
-log.addFilter(_FirstRecord())
+# One line: a process compiles several functions, and so does each of its workers, whose records come here too.
+_num_records = itertools.count()
+log.addFilter(lambda record: next(_num_records) == 0)
 event.register("numba:compile", _CompileListener())
 
 if "NUMBA_CACHE_DIR" not in os.environ:

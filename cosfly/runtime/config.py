@@ -41,14 +41,16 @@ class Config(BaseModel):
 
     def recorded(self) -> dict[str, Any]:
         """Return the settings and constants that decide what a stage makes, JSON-able: all but those of MayDiffer."""
-        values = {name: getattr(self, name) for name in self._names() if not self._may_differ(name)}
-        groups = {name: value.recorded() for name, value in values.items() if isinstance(value, Config)}
-        return to_jsonable_python(values) | groups
+        may_differ = {name for name, field in type(self).model_fields.items() if _MAY_DIFFER in field.metadata}
+        return self._values("recorded", [name for name in self._names() if name not in may_differ])
 
     def all_values(self) -> dict[str, Any]:
         """Return all settings and constants, JSON-able."""
-        values = {name: getattr(self, name) for name in self._names()}
-        groups = {name: value.all_values() for name, value in values.items() if isinstance(value, Config)}
+        return self._values("all_values", self._names())
+
+    def _values(self, of_group: str, names: list[str]) -> dict[str, Any]:
+        values = {name: getattr(self, name) for name in names}
+        groups = {name: getattr(one, of_group)() for name, one in values.items() if isinstance(one, Config)}
         return to_jsonable_python(values) | groups
 
     @classmethod
@@ -56,10 +58,6 @@ class Config(BaseModel):
         """Return the names of settings and constants (ClassVar) in the order of their declaration."""
         names = (name for base in reversed(cls.__mro__) if issubclass(base, Config) for name in get_annotations(base))
         return [name for name in dict.fromkeys(names) if name in cls.model_fields or name in cls.__class_vars__]
-
-    @classmethod
-    def _may_differ(cls, name: str) -> bool:
-        return name in cls.model_fields and _MAY_DIFFER in cls.model_fields[name].metadata
 
 
 # --- YAML -------------------------------------------------------------------------------------------------------------

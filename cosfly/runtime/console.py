@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rich.console import Console
-from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 
@@ -37,13 +36,6 @@ log = logging.getLogger(__name__)
 SECONDS_BETWEEN_LINES = 10.0  # progress as log lines where there is no terminal
 
 
-class _Printable(logging.Formatter):
-    """Formats a record with control characters escaped: its words may be a server's."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        return for_terminal(super().format(record), LONGEST_LOG)
-
-
 class _Lines(logging.Handler):
     """Writes a record as one line, however long: a pipe has no width."""
 
@@ -54,32 +46,26 @@ class _Lines(logging.Handler):
 class _File(logging.FileHandler):
     """Writes records to a file. A file that cannot be written any more is reported once, and the command continues."""
 
+    def format(self, record: logging.LogRecord) -> str:
+        return for_terminal(super().format(record), LONGEST_LOG)  # its words may be a server's
+
     def handleError(self, record: logging.LogRecord) -> None:  # the name of the library
         logging.getLogger().removeHandler(self)
         log.warning("the log %s cannot be written any more: %s", self.baseFilename, sys.exc_info()[1])
 
 
-LINE, WHEN = "%(asctime)s %(levelname)-8s %(message)s", "%Y-%m-%dT%H:%M:%S%z"
-
-
 def set_up_logging(level: int, file: Path | None = None) -> None:
     """Send log lines of a level to the shared console and all of them to a file, where each has its time."""
-    handler: logging.Handler
-    if console.is_terminal:
-        handler = RichHandler(console=console, show_path=False, show_time=False, markup=False, rich_tracebacks=False)
-        handler.setFormatter(_Printable("%(message)s"))
-    else:
-        handler = _Lines()
-        handler.setFormatter(_Printable(LINE, WHEN))
-    handler.setLevel(level)
-    handlers: list[logging.Handler] = [handler]
+    with_time = logging.Formatter("%(asctime)s %(levelname)-8s %(message)s", "%Y-%m-%dT%H:%M:%S%z")
+    handlers: list[logging.Handler] = [_Lines(level)]
+    handlers[0].setFormatter(logging.Formatter("%(levelname)-8s %(message)s") if console.is_terminal else with_time)
     if file is not None:
         try:
             handlers.append(_File(file, encoding="utf-8"))
         except OSError as error:
             fix = "choose another --log-file"
             raise StorageError("cannot write the log", where=file, got=error.strerror, fix=fix) from None
-        handlers[1].setFormatter(_Printable(LINE, WHEN))
+        handlers[1].setFormatter(with_time)
     logging.basicConfig(handlers=handlers, force=True)
     set_levels(logging.DEBUG if file is not None else level)
 
@@ -104,12 +90,9 @@ def progress_bar(label: str, total: int | None, done: int = 0) -> Iterator[Advan
     """Show progress: a bar on a terminal, else a log line every few seconds; total None: unknown. Yields
     advance(count)."""
     if console.is_terminal:
-        text, bar, times = (
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            (TimeElapsedColumn(), TimeRemainingColumn()),
-        )
-        with Progress(text, bar, MofNCompleteColumn(), *times, console=console, transient=True) as progress:
+        name, bar, number = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn()
+        times = TimeElapsedColumn(), TimeRemainingColumn()
+        with Progress(name, bar, number, *times, console=console, transient=True) as progress:
             task = progress.add_task(label, total=total, completed=done)
 
             def move(count: int, words: str = "") -> None:

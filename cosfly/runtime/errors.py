@@ -1,34 +1,19 @@
 """Errors that data, configuration or the environment can cause. Everything else is a bug and keeps its traceback.
 
-CosflyError
-|-- ConfigError         a setting is unknown, of the wrong type, or contradicts another
-|-- InputError          a file is missing, malformed, of another version, or holds an impossible value
-|-- ResumeError         a folder holds work made with other settings or inputs
-|-- EnvironmentMissing  a package, library, device or GL backend is missing        (fatal)
-|-- StorageError        a disk is full or not writable                             (fatal)
-|-- NoPathError         no endpoints, no route, no feasible trajectory
-|-- NothingKept         a stage has nothing for the next one
-|-- RenderError         a frame cannot be made or is not what it must be
-|-- TeacherError        an endpoint cannot be reached or does not speak the protocol (fatal)
-`-- VerifyError         a finished product differs from its records
-
 A *fatal* error ends the stage; any other, raised inside one item, is recorded for that item and counted.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
-from difflib import SequenceMatcher
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from cosfly.runtime.escaping import for_terminal
 
 MOST_NAMED = 12  # problems in a message
-# Names of settings that share words are nearer than their letters: goal_min_m is min_distance_m, not resolution_m.
-NEAR, SHARED_WORD = 0.6, 0.15
 
 
 class CosflyError(Exception):
@@ -42,8 +27,12 @@ class CosflyError(Exception):
         fix: What to do.
     """
 
-    fatal = False
-    code = "error"
+    fatal: ClassVar[bool] = False
+    code: ClassVar[str] = "error"
+
+    def __init_subclass__(cls, **fixed: Any) -> None:
+        for name, value in fixed.items():
+            setattr(cls, name, value)
 
     def __init__(
         self,
@@ -58,13 +47,10 @@ class CosflyError(Exception):
         self.what, self.where, self.got, self.expected, self.fix = what, where, got, expected, fix
 
     def __str__(self) -> str:
-        parts = [f"{self.where}: {self.what}" if self.where is not None else self.what]
-        if self.got is not None:
-            parts.append(f"got {self.got if isinstance(self.got, str) else repr(self.got)}")
-        if self.expected is not None:
-            parts.append(f"expected {self.expected}")
-        if self.fix is not None:
-            parts.append(self.fix)
+        got = self.got if self.got is None or isinstance(self.got, str) else repr(self.got)
+        named = (("got ", got), ("expected ", self.expected), ("", self.fix))
+        parts = [self.what if self.where is None else f"{self.where}: {self.what}"]
+        parts += [word + text for word, text in named if text is not None]
         # One line that a terminal prints, whatever the parts held.
         return " ".join("; ".join(map(for_terminal, parts)).split())
 
@@ -77,64 +63,54 @@ class CosflyError(Exception):
 
     def __reduce__(self) -> tuple:
         # Errors cross process borders; the default reduction would drop the keyword arguments.
-        details: dict[str, Any] = {"where": self.where, "got": self.got, "expected": self.expected, "fix": self.fix}
+        details = {name: getattr(self, name) for name in ("where", "got", "expected", "fix")}
         return partial(type(self), self.what, **details), ()
 
 
-class ConfigError(CosflyError):
-    code = "config"
+class ConfigError(CosflyError, code="config"):
+    """A setting is unknown, of the wrong type, or contradicts another."""
 
 
-class InputError(CosflyError):
-    code = "input"
+class InputError(CosflyError, code="input"):
+    """A file is missing, malformed, of another version, or holds an impossible value."""
 
 
-class ResumeError(CosflyError):
-    code = "resume"
+class ResumeError(CosflyError, code="resume"):
+    """A folder holds work made with other settings or inputs."""
 
 
-class EnvironmentMissing(CosflyError):
-    fatal = True
-    code = "environment"
+class EnvironmentMissing(CosflyError, code="environment", fatal=True):
+    """A package, library, device or GL backend is missing."""
 
 
-class StorageError(CosflyError):
-    fatal = True
-    code = "storage"
+class StorageError(CosflyError, code="storage", fatal=True):
+    """A disk is full or not writable."""
 
 
-class NoPathError(CosflyError):
-    code = "no_path"
+class NoPathError(CosflyError, code="no_path"):
+    """There are no endpoints, no route, or no feasible trajectory."""
 
 
-class NothingKept(CosflyError):
-    code = "nothing_kept"
+class NothingKept(CosflyError, code="nothing_kept"):
+    """A stage has nothing for the next one."""
 
 
-class RenderError(CosflyError):
-    code = "render"
+class RenderError(CosflyError, code="render"):
+    """A frame cannot be made or is not what it must be."""
 
 
-class TeacherError(CosflyError):
-    fatal = True
-    code = "teacher"
+class TeacherError(CosflyError, code="teacher", fatal=True):
+    """An endpoint cannot be reached or does not speak the protocol."""
 
 
-class VerifyError(CosflyError):
-    code = "verify"
+class VerifyError(CosflyError, code="verify"):
+    """A finished product differs from its records."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return ' (did you mean X?)' for the nearest known name, or the empty string."""
-    found = max(known, key=partial(_nearness, name), default="")
-    return f" (did you mean {found!r}?)" if found and _nearness(name, found) >= NEAR else ""
-
-
-def _nearness(name: str, known: str) -> float:
-    """Return the share of letters that two names have in common, and more for each common word that is no unit."""
-    shared = {*re.split(r"[\W_]+", name)} & {*re.split(r"[\W_]+", known)}
-    counts = len(shared) if any(len(word) > 2 for word in shared) else 0
-    return SequenceMatcher(None, name, known).ratio() + SHARED_WORD * counts
+    found = get_close_matches(name, list(known), 1)
+    return f" (did you mean {found[0]!r}?)" if found else ""
 
 
 def plain(message: str) -> str:

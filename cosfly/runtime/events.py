@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from cosfly.runtime.journal import Journal
 
 EVENTS = "events.jsonl"
-PROBES_OF_ONE_PACE = 500  # after so many the pace is halved: a week of work makes a few thousand lines
+MOST_PROBES = 500  # of one e-fold of the time since the beginning: a week of work makes a few thousand lines
 MEBIBYTE = 2**20
 Loss = Literal["heartbeat_lost", "timed_out", "worker_died"]
 LOSSES: dict[str, str] = {  # events of a worker that is of no use any more
@@ -24,31 +24,16 @@ LOSSES: dict[str, str] = {  # events of a worker that is of no use any more
     "timed_out": "it did not get on within its time limit",
     "worker_died": "its worker process died; it may need more memory than there is",
 }
-
-Kind = Literal[
-    "began",  # workers: how many
-    "worker_started",
-    "restarted",
-    "item_done",  # status, seconds, steps
-    "heartbeat_lost",
-    "timed_out",
-    "worker_died",
-    "retried",  # attempt; steps: how many were lost
-    "given_up",
-    "probe",
-    "ended",
-]
+Kind = Loss | Literal["began", "worker_started", "restarted", "item_done", "retried", "given_up", "probe", "ended"]
 
 
 class Event(BaseModel):
-    """A line of `events.jsonl`. at_s: seconds since 1970. worker: its place, 0 and up; a restarted one keeps it. node:
-    the name of its machine in a cluster.
+    """A line of `events.jsonl`; what each kind holds, and the units, are in docs/files.md.
 
-    Of a probe: rss_mib by worker (the most since the last probe), cores in use by all workers, free disk space, mean
-    load and memory in use of all NVIDIA devices of the machine where it has some.
+    worker: its place, 0 and up; a restarted one keeps it. rss_mib: by worker, the most since the last probe.
     """
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
+    model_config = ConfigDict(frozen=True)
 
     at_s: float
     event: Kind
@@ -69,14 +54,18 @@ class Event(BaseModel):
 
 
 class Vitals(NamedTuple):
-    """The processor time and memory of a worker process."""
+    """The processor time of a worker process with all its threads, and its resident memory."""
 
     cpu_s: float
     rss_mib: float
 
     @classmethod
     def of(cls, pid: int) -> Vitals:
-        return cls(cpu_seconds(pid), rss_mib(pid))
+        """Return the vitals of a process of this machine; zeros where it is gone or the system does not tell."""
+        if not (fields := process_stat(pid)):
+            return cls(0.0, 0.0)
+        cpu_s = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # utime, stime: proc(5)
+        return cls(cpu_s, round(int(fields[21]) * os.sysconf("SC_PAGE_SIZE") / MEBIBYTE, 1))
 
 
 class EventLog:
@@ -84,14 +73,14 @@ class EventLog:
 
     def __init__(self, folder: Path) -> None:
         self._journal, self._folder = Journal(folder / EVENTS), folder
-        self._num_probes, self._pace, self._probed_s = 0, 1, time.monotonic()
+        self._begun_s = self._probed_s = time.monotonic()
         self._peaks_mib: dict[int, float] = {}
         self._cpu_s: dict[int, float] = {}  # by worker, at the last probe
         self._used_s = 0.0  # by all workers since the last line
 
     def write(self, event: Kind, **fields: object) -> None:
-        line = Event.model_validate({"at_s": round(time.time(), 3), "event": event, **fields})
-        self._journal.append(line.model_dump(exclude_none=True), sync=False)
+        line = {"at_s": round(time.time(), 3), "event": event, **fields}
+        self._journal.append({name: value for name, value in line.items() if value is not None}, sync=False)
 
     def probe(self, workers: Mapping[int, Vitals]) -> None:
         """Measure memory and time of the workers (by place) and the disk; not every measurement is written."""
@@ -100,16 +89,14 @@ class EventLog:
             before_s = self._cpu_s.get(worker, 0.0)
             self._used_s += cpu_s - before_s if cpu_s >= before_s else cpu_s  # of one that replaces another
             self._cpu_s[worker] = cpu_s
-        self._num_probes += 1
-        if self._num_probes % self._pace:
+        now_s = time.monotonic()
+        elapsed_s = now_s - self._probed_s
+        if elapsed_s < (now_s - self._begun_s) / MOST_PROBES:
             return
-        elapsed_s = time.monotonic() - self._probed_s
         cores = round(self._used_s / elapsed_s, 2) if elapsed_s else 0.0
         free = shutil.disk_usage(self._folder).free / MEBIBYTE
         self.write("probe", rss_mib=self._peaks_mib, cores_used=cores, disk_free_mib=round(free, 1), **gpu_use())
-        self._peaks_mib, self._used_s, self._probed_s = {}, 0.0, time.monotonic()
-        if self._num_probes == self._pace * PROBES_OF_ONE_PACE:
-            self._num_probes, self._pace = 0, 2 * self._pace
+        self._peaks_mib, self._used_s, self._probed_s = {}, 0.0, now_s
 
     def close(self) -> None:
         self._journal.close()
@@ -139,18 +126,6 @@ def process_stat(pid: int) -> list[bytes]:
         return Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
     except OSError:
         return []
-
-
-def cpu_seconds(pid: int) -> float:
-    """Return the processor time of a process and all its threads; 0 where it is gone or unknown."""
-    fields = process_stat(pid)
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else 0.0  # utime, stime: proc(5)
-
-
-def rss_mib(pid: int) -> float:
-    """Return the resident memory of a process, MiB; 0 where it is gone or unknown."""
-    fields = process_stat(pid)
-    return round(int(fields[21]) * os.sysconf("SC_PAGE_SIZE") / MEBIBYTE, 1) if fields else 0.0
 
 
 def gpu_use() -> dict[str, float]:

@@ -18,7 +18,6 @@ import shutil
 import stat
 import zlib
 from collections.abc import Iterator, Mapping
-from fnmatch import fnmatch
 from pathlib import Path, PosixPath
 from typing import IO
 
@@ -31,7 +30,6 @@ FILE_MB = 2_048  # read as a whole: the trajectories of a town are some 100 MB a
 LINE_MB = 64  # of a JSON-lines file: a caption with its evidence has some 8 kB
 UNPACK_FACTOR = 100  # largest ratio of unpacked to packed size: JSON packs to a third, indented JSON to a 15th
 SMALL_UNPACKED_MB = 64  # what any packed file may unpack to, however small it is
-CHUNK = 16 * MB
 CHECK_PATH = "check the path"
 SPLIT = "split it, or cut out the part that is needed"
 GZIP_MAGIC = b"\x1f\x8b"
@@ -64,9 +62,6 @@ def open_file(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Pa
         what, fix: Words for the message.
         tree: The directory whose files are being read: a link that leads out of it is refused. None: the user named
             this file.
-
-    Raises:
-        InputError: The file is missing, not regular, not readable, or not below its tree.
     """
     if tree is not None:
         check_stays_below(path, tree)
@@ -94,24 +89,22 @@ def disk_errors(path: Path, what: str, fix: str = CHECK_PATH) -> Iterator[None]:
 
 
 def read_bytes(
-    path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None, most_mb: float = FILE_MB
+    path: Path,
+    *,
+    what: str = "file",
+    fix: str = CHECK_PATH,
+    tree: Path | None = None,
+    most_mb: float = FILE_MB,
+    span: tuple[int, int] | None = None,
 ) -> bytes:
-    """Read a whole file of at most `most_mb`; other arguments as for `open_file`."""
+    """Read a file of at most `most_mb`, or a span of it (first byte, number); other arguments as for `open_file`."""
     with open_file(path, what=what, fix=fix, tree=tree) as file, disk_errors(path, what, fix):
-        size = os.fstat(file.fileno()).st_size
+        first, size = span or (0, os.fstat(file.fileno()).st_size)
         if size > most_mb * MB:
             raise over_limit(path, f"{size / MB:,.3g} MB", f"{most_mb:,g} MB in one piece", SPLIT)
-        return file.read(size)
-
-
-def read_span(path: Path, first: int, size: int, *, what: str = "file") -> bytes:
-    """Read `size` bytes from byte `first` on of a file that the user named."""
-    if size > FILE_MB * MB:
-        raise over_limit(path, f"{size / MB:,.0f} MB", f"{FILE_MB:,} MB in one piece", SPLIT)
-    with open_file(path, what=what) as file, disk_errors(path, what):
         file.seek(first)
         data = file.read(size)
-    if len(data) != size:
+    if span is not None and len(data) != size:
         raise InputError(f"the {what} became shorter while it was read", where=path, got=f"{first + len(data)} bytes")
     return data
 
@@ -151,20 +144,17 @@ def read_unpacked(path: Path, *, what: str = "file", most_mb: float = FILE_MB) -
     if not data.startswith(GZIP_MAGIC):
         return data
     by_factor = max(SMALL_UNPACKED_MB * MB, UNPACK_FACTOR * len(data))
-    chunks, size = [], 0
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
-            while chunk := packed.read(CHUNK):
-                size += len(chunk)
-                if size > most_mb * MB:
-                    raise over_limit(path, "more, unpacked", f"{most_mb:,g} MB in one piece", SPLIT)
-                if size > by_factor:
-                    got = f"{len(data):,} bytes that unpack to more"
-                    raise over_limit(path, got, f"{UNPACK_FACTOR} times the file", "if you trust it, gunzip it before")
-                chunks.append(chunk)
+            unpacked = packed.read(int(min(by_factor, most_mb * MB)) + 1)
     except (OSError, EOFError, zlib.error) as error:
         raise InputError("the gzip data is damaged", where=path, got=str(error)) from None
-    return b"".join(chunks)
+    if len(unpacked) > most_mb * MB:
+        raise over_limit(path, "more, unpacked", f"{most_mb:,g} MB in one piece", SPLIT)
+    if len(unpacked) > by_factor:
+        got = f"{len(data):,} bytes that unpack to more"
+        raise over_limit(path, got, f"{UNPACK_FACTOR} times the file", "if you trust it, gunzip it before")
+    return unpacked
 
 
 def sha256_file(path: Path, *, tree: Path | None = None) -> str:
@@ -184,9 +174,9 @@ def files_named(tree: Path, name: str) -> list[Path]:
     A linked directory is entered if it leads to a place inside the tree's parent directory, or anywhere with
     `follow_links`; others are logged.
     """
-    found: list[Path] = []
-    waiting: list[tuple[Path, tuple[str, ...]]] = [(tree, (os.path.realpath(tree),))]
-    parent = os.path.dirname(os.path.realpath(tree))
+    found, root = list[Path](), os.path.realpath(tree)
+    waiting: list[tuple[Path, tuple[str, ...]]] = [(tree, (root,))]
+    parent = os.path.dirname(root)
     while waiting:
         folder, above = waiting.pop()
         with disk_errors(folder, "folder"), os.scandir(folder) as listed:
@@ -200,9 +190,7 @@ def files_named(tree: Path, name: str) -> list[Path]:
             elif entry.is_symlink() and os.path.isdir(entry.path):  # isdir is false for a link to itself
                 real = os.path.realpath(entry.path)
                 if not (isinstance(tree, LinkedPath) or is_below(real, parent)):
-                    log.warning(
-                        "%s: leads to %s, which is skipped; --set follow_links=true follows it", entry.path, real
-                    )
+                    log.warning("%s: leads to %s, skipped; --set follow_links=true follows it", entry.path, real)
                 elif real not in above and real != parent:  # a link to a folder above would go round for ever
                     waiting.append((folder / entry.name, (*above, real)))
     return sorted(found)
@@ -232,17 +220,14 @@ def check_stays_below(path: Path, tree: Path, *, in_parent: bool = False) -> Non
 
 
 def real_path(path: Path) -> str:
-    """Return `os.path.realpath`, by asking the system where it can be asked: that looks at no folder on the way."""
-    try:
+    """Return `os.path.realpath`, in a sixth of the time where the system can be asked."""
+    with contextlib.suppress(OSError, AttributeError):  # not there, or another system
         number = os.open(path, os.O_PATH | os.O_CLOEXEC)
-    except (OSError, AttributeError):  # not there, or another system
-        return os.path.realpath(path)
-    try:
-        return os.readlink(f"/proc/self/fd/{number}")
-    except OSError:  # no /proc
-        return os.path.realpath(path)
-    finally:
-        os.close(number)
+        try:
+            return os.readlink(f"/proc/self/fd/{number}")
+        finally:
+            os.close(number)
+    return os.path.realpath(path)
 
 
 def is_below(path: str, root: str) -> bool:
@@ -253,8 +238,7 @@ def is_below(path: str, root: str) -> bool:
 def inside(root: Path, name: str, *, in_parent: bool = False) -> Path:
     """Join a name from a file to a root; InputError where it leads out, by its parts or by a link.
 
-    Args:
-        in_parent: A link may lead into the parent directory of the root.
+    in_parent: A link may lead into the parent directory of the root.
     """
     plain = _plain_name(root, name)
     check_stays_below(root / plain, root, in_parent=in_parent)
@@ -315,59 +299,52 @@ def storage_errors(path: Path) -> Iterator[None]:
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[IO[bytes]]:
     """Open a file under a temporary name that is renamed at the end: a kill leaves either the old file or the new."""
-    refuse_link(path)
     if path.is_dir():
         raise StorageError("cannot write a file where a folder is", where=path, fix="name a file in it")
-    with storage_errors(path):
-        partial = _new_partial(path)
-        try:
-            with open(partial, "xb") as file:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(partial, path)
-        except BaseException:
-            partial.unlink(missing_ok=True)  # on a full disk it would hold the space that is needed
-            raise
+    with _renamed(path) as partial, open(partial, "xb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
 
 
 @contextlib.contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Make a folder under a temporary name that is renamed when the block ends without an error."""
-    refuse_link(path)
-    with storage_errors(path):
-        partial = _new_partial(path)
+    with _renamed(path) as partial:
         partial.mkdir()
-        try:
-            yield partial
-        except BaseException:
-            shutil.rmtree(partial, ignore_errors=True)
-            raise
+        yield partial
         if path.exists():
             shutil.rmtree(path)
-        os.replace(partial, path)
 
 
-def _new_partial(path: Path) -> Path:
-    """Return the temporary name of a file or folder, once what killed processes left under such names is removed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    begin = f".{path.name}."
-    for name in os.listdir(path.parent):
-        if name.startswith(begin) and name.endswith(".partial"):
-            owner = name.removeprefix(begin).removesuffix(".partial")
-            if owner.isdecimal() and not _is_another(int(owner)):
+@contextlib.contextmanager
+def _renamed(path: Path) -> Iterator[Path]:
+    """Yield a temporary name, once what killed processes left under such names is removed, and rename it at the end."""
+    refuse_link(path)
+    begin, end = f".{path.name}.", ".partial"
+    partial = path.with_name(f"{begin}{os.getpid()}{end}")
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for name in os.listdir(path.parent):
+            owner = name.removeprefix(begin).removesuffix(end)
+            if name == f"{begin}{owner}{end}" and owner.isdecimal() and not _is_another(int(owner)):
                 _remove(path.with_name(name))
-    return path.with_name(f"{begin}{os.getpid()}.partial")
+        try:
+            yield partial
+            os.replace(partial, path)
+        except BaseException:  # on a full disk it would hold the space that is needed
+            with contextlib.suppress(OSError):
+                _remove(partial)
+            raise
 
 
 def _is_another(pid: int) -> bool:
     """Return whether another process has this id."""
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
+    with contextlib.suppress(PermissionError):
+        try:
+            os.kill(pid, 0)
+        except (ProcessLookupError, OverflowError):
+            return False
     return pid != os.getpid()
 
 
@@ -376,11 +353,6 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-def is_partial_of(name: str, path: Path) -> bool:
-    """Return whether a path is the temporary name of a file or folder, of any process."""
-    return fnmatch(path.name, f".{name}.*.partial")
 
 
 def remove_partials(folder: Path) -> None:
@@ -411,18 +383,15 @@ def checksum_lines(digests: Mapping[str, str]) -> str:
 def read_checksums(folder: Path) -> dict[str, str]:
     """Read `checksums.sha256`: relative name -> hex digest; InputError where a name leads out of the folder."""
     path = folder / CHECKSUMS
-    digests: dict[str, str] = {}
-    root, checked = f"{folder}{os.sep}", {""}  # each folder once: a track has thousands of files
+    digests, checked = dict[str, str](), {""}  # each folder once: a track has thousands of files
     for number, line in enumerate(read_text(path, what="checksums", tree=folder).splitlines(), 1):
         digest, _, name = line.partition("  ")
         if len(digest) != 64 or not name:
             raise InputError("a broken checksum line", where=f"{path}:{number}", got=line[:80])
         plain = _plain_name(folder, name)
         above = os.path.dirname(plain)
-        if above not in checked:
-            check_stays_below(folder / above, folder)
-            checked.add(above)
-        if os.path.islink(root + plain):
+        if above not in checked or os.path.islink(f"{folder}{os.sep}{plain}"):
             check_stays_below(folder / plain, folder)
+            checked.add(above)
         digests[plain] = digest
     return digests

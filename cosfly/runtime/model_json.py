@@ -43,6 +43,7 @@ _NOTHING = re.compile(r"(?:[\s\u00ad\u200b-\u200f\u2028-\u202e\u2060-\u2064\ufef
 # Finish reason -> ours, of a message that was cut off.
 _CUT = {"length": "cut_short", "max_tokens": "cut_short"} | {name: name for name in ("content_filter", CONTEXT_FULL)}
 
+_KEY = re.compile(r'\s*"')
 # Half a surrogate pair, which no file can hold, and the replacement of bytes that a decoder could not read.
 _UNREADABLE = re.compile("[\ud800-\udfff\ufffd]")
 
@@ -66,33 +67,70 @@ def find_object(text: str, names: Collection[str], finish_reason: str | None = N
     """
     if len(text) > MAX_CHARACTERS:
         return Found(None, "too_long")
-    found = _found(text, names)
-    cut = _CUT.get((finish_reason or "").lower())
-    return (
-        found if cut is None or (found.value is not None and found.is_end) else Found(None, cut, found.recovered, False)
-    )
+    found, cut = _found(text, names), _CUT.get((finish_reason or "").lower())
+    is_sure = cut is None or (found.value is not None and found.is_end)
+    return found if is_sure else Found(None, cut, found.recovered, False)
 
 
 def _found(text: str, names: Collection[str]) -> Found:
-    message = _read_message(text)
-    plain_names = {_plain(name) for name in names}
+    message, names_by_plain = _read_message(text), {_plain(name): name for name in names}
     for one in reversed(message.objects):
-        if _unwrapped(one.value, plain_names) is None:
+        if (inner := _unwrapped(one.value, names_by_plain)) is None:
             continue
         if message.broken_at >= one.end:
             return Found(None, "broken_json", is_end=False)
         around = (text[message.start : one.start], text[one.end :])
-        recovered = ["thinking_tags"] if message.has_thoughts else []
-        recovered += ["code_fence"] if any("```" in part for part in around) else []
-        recovered += [] if all(_NOTHING.fullmatch(part) for part in around) else ["prose_around"]
-        is_end = _NOTHING.fullmatch(around[1]) is not None
-        if one.problem is not None:
-            return Found(None, one.problem, tuple(recovered), is_end)
-        return _named(one.value, names, recovered, is_end)
-    return _without_names(text, message)
+        renamed = {names_by_plain.get(_plain(key), key): member for key, member in inner.items()}
+        problem = one.problem or ("duplicate_key" if len(renamed) < len(inner) else None)
+        if problem is None and _UNREADABLE.search(json.dumps(renamed, ensure_ascii=False)):
+            problem = "unreadable_character"
+        recovered = {
+            "thinking_tags": message.has_thoughts,
+            "code_fence": any("```" in part for part in around),
+            "prose_around": not all(_NOTHING.fullmatch(part) for part in around),
+            "wrapped": inner is not one.value,
+            "key_names": renamed.keys() != inner.keys(),
+        }
+        kinds, is_end = tuple(filter(recovered.get, recovered)), _NOTHING.fullmatch(around[1]) is not None
+        return Found(None if problem else renamed, problem, kinds, is_end)
+    if message.broken_at >= 0:
+        return Found(None, "broken_json", is_end=False)
+    if message.objects:
+        last = message.objects[-1]
+        return Found(None, last.problem) if last.problem else Found(last.value)
+    if message.is_thought or (message.has_thoughts and _NOTHING.fullmatch(text, message.start)):
+        return Found(None, "only_thinking", is_end=False)
+    return Found(None, "empty" if _NOTHING.fullmatch(text) else "no_json_object")
 
 
-# --- where the object is ----------------------------------------------------------------------------------------------
+def _plain(name: str) -> str:
+    """Return the letters of a name in any spelling: criticalComponents, Critical-Components, **critical component**."""
+    return re.sub(r"[\W_]+", "", name).lower()
+
+
+def _unwrapped(value: dict[str, Any], plain_names: Collection[str], wrappers: int = 0) -> dict[str, Any] | None:
+    """Return the object that has one of the names: this one or the only one in it, as in a function call; or None."""
+    if any(_plain(key) in plain_names for key in value):
+        return value
+    if wrappers == MAX_WRAPPERS:
+        return None
+    members = filter(None, map(_object_of, value.values()))
+    inner = [one for member in members if (one := _unwrapped(member, plain_names, wrappers + 1)) is not None]
+    return inner[0] if len(inner) == 1 else None
+
+
+def _object_of(member: Any) -> dict[str, Any] | None:
+    """Return a member that is an object, or one as a JSON text."""
+    if isinstance(member, str) and member.lstrip().startswith("{"):
+        try:
+            found = _Reader().read(member.strip(), 0)
+        except (ValueError, RecursionError):
+            return None
+        return None if found.problem else found.value
+    return member if isinstance(member, dict) else None
+
+
+# --- where the objects are --------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -148,9 +186,6 @@ def _read_message(text: str) -> _Message:
     return message
 
 
-_KEY = re.compile(r'\s*"')
-
-
 class _Reader:
     """Reads JSON objects, and notes the reason why a value is refused."""
 
@@ -182,61 +217,3 @@ class _Reader:
         if not abs(value) < float("inf"):
             self._problem = "not_finite"
         return value
-
-
-def _without_names(text: str, message: _Message) -> Found:
-    """Return the reason why there is no object, or one of other names."""
-    if message.broken_at >= 0:
-        return Found(None, "broken_json", is_end=False)
-    if message.objects:
-        last = message.objects[-1]
-        return Found(None, last.problem) if last.problem else Found(last.value)
-    if message.is_thought or (message.has_thoughts and _NOTHING.fullmatch(text, message.start)):
-        return Found(None, "only_thinking", is_end=False)
-    return Found(None, "empty" if _NOTHING.fullmatch(text) else "no_json_object")
-
-
-# --- which object it is -----------------------------------------------------------------------------------------------
-
-
-def _plain(name: str) -> str:
-    """Return the letters of a name in any spelling: criticalComponents, Critical-Components, **critical component**."""
-    return re.sub(r"[\W_]+", "", name).lower()
-
-
-def _unwrapped(value: dict[str, Any], plain_names: Collection[str], wrappers: int = 0) -> dict[str, Any] | None:
-    """Return the object that has one of the names: this one or the only one in it, as in a function call; or None."""
-    if any(_plain(key) in plain_names for key in value):
-        return value
-    if wrappers == MAX_WRAPPERS:
-        return None
-    found = [_unwrapped(member, plain_names, wrappers + 1) for member in map(_object_of, value.values()) if member]
-    inner = [member for member in found if member is not None]
-    return inner[0] if len(inner) == 1 else None
-
-
-def _object_of(member: Any) -> dict[str, Any] | None:
-    """Return a member that is an object, or one as a JSON text."""
-    if isinstance(member, str) and member.lstrip().startswith("{"):
-        try:
-            found = _Reader().read(member.strip(), 0)
-        except (ValueError, RecursionError):
-            return None
-        return None if found.problem else found.value
-    return member if isinstance(member, dict) else None
-
-
-def _named(value: dict[str, Any], names: Collection[str], recovered: list[str], is_end: bool) -> Found:
-    """Return the object with its keys spelled like the names."""
-    names_by_plain = {_plain(name): name for name in names}
-    inner = _unwrapped(value, names_by_plain.keys())
-    if inner is None:
-        return Found(value, None, tuple(recovered), is_end)
-    renamed = {names_by_plain.get(_plain(key), key): member for key, member in inner.items()}
-    if len(renamed) < len(inner):
-        return Found(None, "duplicate_key", tuple(recovered), is_end)
-    recovered += ["wrapped"] if inner is not value else []
-    recovered += ["key_names"] if renamed.keys() != inner.keys() else []
-    if _UNREADABLE.search(json.dumps(renamed, ensure_ascii=False)):
-        return Found(None, "unreadable_character", tuple(recovered), is_end)
-    return Found(renamed, None, tuple(recovered), is_end)

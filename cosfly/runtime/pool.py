@@ -6,8 +6,8 @@ one item. Load maps and open GL contexts in it. A worker that dies, stalls or ta
 is tried again.
 
 Everything that can block on a worker (sending it an item, reading from it) happens in a thread of its own, so no worker
-can hold up the stage. Where a process runs and how it is reached is its `Transport`: here one of this machine, at the
-other end of a pipe (`worker`); in `ray_engine` one on a node of a cluster.
+can hold up the stage. Its process is of this machine, at the other end of a pipe (`LocalTransport`), or on a node of a
+cluster (`ray_engine.RayTransport`).
 """
 
 from __future__ import annotations
@@ -23,12 +23,11 @@ import statistics
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing import resource_tracker
-from typing import Protocol
 
 import numpy as np
 
@@ -37,8 +36,8 @@ from cosfly.runtime.errors import CosflyError, EnvironmentMissing
 from cosfly.runtime.events import LOSSES, EventLog, Loss, Vitals
 from cosfly.runtime.io import remove_partials
 from cosfly.runtime.journal import Journal
-from cosfly.runtime.ray_engine import ALL_ROOM, Cluster, RayConfig
-from cosfly.runtime.run_dir import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, read_item, write_failures
+from cosfly.runtime.ray_engine import ALL_ROOM, Cluster, RayConfig, RayTransport
+from cosfly.runtime.run_dir import Failed, ItemRecord, Kept, StageFolder, Tally, read_item, write_failures
 from cosfly.runtime.worker import (
     Abort,
     Item,
@@ -48,7 +47,6 @@ from cosfly.runtime.worker import (
     Work,
     WorkerOptions,
     attempt,
-    counted_steps,
     signals_held_back,
     work_through,
 )
@@ -120,29 +118,30 @@ def run_items(
     Args:
         make_worker: Module-level function; `make_worker(*worker_args)` returns the work function, once per process.
         workers: Processes; 0 works in this process, where nothing can end an item that hangs.
-        watch: The place of the workers, and when one counts as stalled.
 
     Returns:
         Records and tally, in the order of `items` whatever the order of work.
     """
     line_bytes = _finished_before(stage, items)
     indices = np.flatnonzero(line_bytes < 0)
-    todo = [item for item, line_byte in zip(items, line_bytes, strict=True) if line_byte < 0]
+    todo = [items[index] for index in indices.tolist()]
     if num_finished := len(items) - len(todo):
         log.info("%s: %d of %d items were finished before", stage.stage, num_finished, len(items))
-    progress = _Progress(items, todo)
+    progress, start = _Progress(items, todo), partial(make_worker, *worker_args)
     if workers and todo:
-        outcomes = _in_processes(stage, todo, Start(make_worker, worker_args), workers, watch, progress)
+        outcomes = _in_processes(stage, todo, start, workers, watch, progress)
     else:
-        outcomes = _in_this_process(todo, Start(make_worker, worker_args), progress.move)
+        outcomes = _in_this_process(todo, start, progress.move)
     # Closed at once, also while an error is on its way: no worker outlives the call.
     with stage.journal as journal, progress.shown(label or stage.stage), contextlib.closing(outcomes):
         for todo_index, record in outcomes:
             line_bytes[indices[todo_index]] = journal.append(record.model_dump())
-            _log(stage.stage, record)
+            if isinstance(record, Failed):
+                named = "" if record.id in record.message else f"{record.id}: "
+                log.error("%s: %s%s", stage.stage, named, record.message)
             progress.finish(todo[todo_index])
     finished = ItemOutcomes(tally := Tally(input=len(items)), stage.journal, line_bytes)
-    write_failures(stage.path / "failures.jsonl", _counted(finished.records, tally))
+    write_failures(stage.path / "failures.jsonl", filter(None, map(tally.count, finished.records)))
     if "worker_died" in tally.failed:
         # The cause is the machine, not the item: it must not become a result. The stage stays open.
         raise EnvironmentMissing(
@@ -165,54 +164,29 @@ def _finished_before(stage: StageFolder, items: Sequence[Item]) -> np.ndarray:
     return line_bytes
 
 
-def _log(stage: str, record: ItemRecord) -> None:
-    if isinstance(record, Failed):
-        named = "" if record.id in record.message else f"{record.id}: "
-        log.error("%s: %s%s", stage, named, record.message)
-    else:
-        reason = f" ({record.reason})" if isinstance(record, Dropped) else ""
-        log.debug("%s: %s: %s%s, %.2f s", stage, record.id, record.status, reason, record.seconds)
-
-
-def _counted(records: Iterable[ItemRecord], tally: Tally) -> Iterator[Failed]:
-    """Count records in a tally, and yield those that failed."""
-    for record in records:
-        if isinstance(record, Kept):
-            tally.kept += 1
-        elif isinstance(record, Dropped):
-            tally.dropped[record.reason] += 1
-        else:
-            tally.failed[record.code] += 1
-            yield record
-
-
 def _in_this_process(
     items: Sequence[Item], start: Start, on_steps: Callable[[Item, int], None]
 ) -> Generator[tuple[int, ItemRecord], None, None]:
-    work = start.make_worker(*start.worker_args) if items else None
+    work = start() if items else None
     for index, item in enumerate(items):
         assert work is not None
-        with counted_steps(partial(on_steps, item)):
-            record = attempt(work, item)
-        yield index, record
+        yield index, attempt(work, item, partial(on_steps, item))
 
 
 def _in_processes(
     stage: StageFolder, items: Sequence[Item], start: Start, workers: int, watch: Watch, progress: _Progress
 ) -> Generator[tuple[int, ItemRecord], None, None]:
-    start_transport: StartTransport = LocalTransport
+    start_transport: Callable[[WorkerOptions], Transport] = LocalTransport
     if watch.ray is not None:
         cluster = Cluster(watch.ray, stage.path)
         start_transport, workers = cluster.start_transport, cluster.room if workers == ALL_ROOM else workers
-    events = EventLog(stage.path)
-    pool = WorkerPool(start, min(workers, len(items)), watch, events, progress.move, start_transport)
-    try:
-        yield from pool.outcomes(items)
-    except CosflyError:
-        remove_partials(stage.path)  # on a full disk they hold the space that is needed
-        raise
-    finally:
-        events.close()
+    with contextlib.closing(EventLog(stage.path)) as events:
+        pool = WorkerPool(start, min(workers, len(items)), watch, events, progress.move, start_transport)
+        try:
+            yield from pool.outcomes(items)
+        except CosflyError:
+            remove_partials(stage.path)  # on a full disk they hold the space that is needed
+            raise
     if pool.num_lost:
         remove_partials(stage.path)  # of the lost workers
 
@@ -238,48 +212,22 @@ class _Progress:
     def move(self, item: Item, num_steps: int) -> None:
         """Set the number of steps done of an item; fewer than before where it is started again."""
         if self._in_steps:
-            self._set(item, min(num_steps, self._size(item)))
+            count = min(num_steps, self._size(item))
+            self._advance(count - self._current.get(item.item_id, 0))
+            self._current[item.item_id] = count
 
     def finish(self, item: Item) -> None:
-        self._set(item, self._size(item))
-        del self._current[item.item_id]
-
-    def _set(self, item: Item, count: int) -> None:
-        gained = count - self._current.get(item.item_id, 0)
-        self._current[item.item_id] = count
-        self._advance(gained)
+        self._advance(self._size(item) - self._current.pop(item.item_id, 0))
 
 
-# --- how a process is reached -----------------------------------------------------------------------------------------
-
-
-class Transport(Protocol):
-    """A worker's process, wherever it is, which runs `work_through`.
-
-    pid: None until it has started. node: The name of its machine in a cluster.
-    """
-
-    pid: int | None
-    node: str | None
-
-    def send(self, what: Start | Item | None) -> None:
-        """Send it its Start, then items one by one, at last None; may block."""
-
-    def receive(self) -> Message:
-        """Return its next message; EOFError or OSError when it is gone."""
-
-    def look(self) -> Vitals | None:
-        """Return its vitals without blocking; None: it is gone."""
-
-    def kill(self, patience_s: float) -> None:
-        """End it, at once or after the time in which it may end by itself; it is gone or out of reach then."""
-
-
-StartTransport = Callable[[WorkerOptions], Transport]
+# --- the processes ----------------------------------------------------------------------------------------------------
 
 
 class LocalTransport:
-    """A process of this machine, which it starts."""
+    """A process of this machine, which it starts and which runs `work_through`.
+
+    pid: None until it has started. node: The name of its machine in a cluster.
+    """
 
     node: str | None = None
 
@@ -297,15 +245,19 @@ class LocalTransport:
         self.pid: int | None = self._process.pid
 
     def send(self, what: Start | Item | None) -> None:
+        """Send it its Start, then items one by one, at last None; may block."""
         self.connection.send(what)
 
     def receive(self) -> Message:
+        """Return its next message; EOFError or OSError when it is gone."""
         return self.connection.recv()
 
     def look(self) -> Vitals | None:
+        """Return its vitals without blocking; None: it is gone."""
         return Vitals.of(self._process.pid or 0) if self._process.is_alive() else None
 
     def kill(self, patience_s: float) -> None:
+        """End it, at once or after the time in which it may end by itself; it is gone or out of reach then."""
         if patience_s:
             self._process.join(patience_s)
         self._process.kill()
@@ -313,27 +265,13 @@ class LocalTransport:
         atexit.unregister(self._process.kill)
 
 
+Transport = LocalTransport | RayTransport
+
+
 # --- the pool ---------------------------------------------------------------------------------------------------------
 
 
-def limit_s(watch: Watch, seconds: Collection[float], attempt: int, has_begun: bool) -> float:
-    """Return how long an item may report no step.
-
-    Args:
-        seconds: The times of finished items.
-        attempt: 0 for the first.
-        has_begun: False while the worker still reads maps and compiles, for which a limit that somebody set was not
-            meant.
-    """
-    if watch.item_limit_s == 0:
-        return math.inf
-    if watch.item_limit_s is not None and has_begun:
-        return watch.item_limit_s
-    typical_s = statistics.median(seconds) if seconds else 0.0
-    return max(LEAST_LIMIT_S, TYPICAL_ITEMS * typical_s, watch.item_limit_s or 0.0) * 2**attempt
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class _Attempt:
     item_index: int  # among all items
     item: Item
@@ -376,47 +314,38 @@ class WorkerPool:
     watch: Watch
     events: EventLog
     on_steps: Callable[[Item, int], None]
-    start_transport: StartTransport = LocalTransport
+    start_transport: Callable[[WorkerOptions], Transport]
     num_lost: int = 0
     _num_done: int = 0
     _seconds: deque[float] = field(default_factory=lambda: deque(maxlen=ITEMS_REMEMBERED))
-    _new: Iterator[tuple[int, Item]] = field(default_factory=lambda: iter(()))  # with their indices
-    _num_new: int = 0
-    _again: deque[_Attempt] = field(default_factory=deque)
+    _todo: deque[_Attempt] = field(default_factory=deque)
     _alone: deque[_Attempt] = field(default_factory=deque)  # last attempts
     _workers: dict[int, _Worker] = field(default_factory=dict)
     _lost: set[int] = field(default_factory=set)  # places that wait for a new worker
     _messages: queue.SimpleQueue[tuple[_Worker, Message | None]] = field(default_factory=queue.SimpleQueue)
 
     def outcomes(self, items: Sequence[Item]) -> Iterator[tuple[int, ItemRecord]]:
-        """Yield the index and the record of each item as it is done.
-
-        Raises:
-            CosflyError: A fatal one of a worker; or EnvironmentMissing: workers die or stall all the time.
-        """
+        """Yield the index and the record of each item as it is done."""
         self.events.write("began", workers=self.num_workers)
-        self._new, self._num_new = enumerate(items), len(items)
+        self._todo.extend(_Attempt(index, item) for index, item in enumerate(items))
         next_check_s, next_probe_s = time.monotonic() + self.watch.check_s, time.monotonic()
+        patience_s = 0.0
         try:
-            while self._num_new or self._again or self._alone or self._busy():
+            while self._todo or self._alone or self._busy():
                 self._hand_out()
                 yield from self._handle_message(min(next_check_s, next_probe_s))
                 if (now_s := time.monotonic()) >= next_probe_s:
                     next_probe_s = now_s + self.watch.probe_s
-                    self.events.probe(
-                        {
-                            w.place: seen
-                            for w in self._workers.values()
-                            if w.transport.pid and (seen := w.transport.look())
-                        }
-                    )
+                    seen = {w.place: w.transport.look() for w in self._workers.values() if w.transport.pid}
+                    self.events.probe({place: vitals for place, vitals in seen.items() if vitals})
                 if now_s >= next_check_s:
                     next_check_s = now_s + self.watch.check_s
                     yield from self._check()
-        except BaseException:
-            self._end(patience_s=0.0)
-            raise
-        self._end(patience_s=PATIENCE_S)
+            patience_s = PATIENCE_S
+        finally:
+            if workers := list(self._workers.values()):
+                with ThreadPoolExecutor(len(workers)) as at_once:
+                    list(at_once.map(lambda worker: self._stop(worker, patience_s), workers))
         self.events.write("ended")
 
     def _busy(self) -> list[_Worker]:
@@ -438,15 +367,12 @@ class WorkerPool:
     def _is_short(self) -> bool:
         """Return whether there is more to do now than workers without an item, including those that still start."""
         num_idle = len(self._workers) - len(self._busy())
-        return num_idle < (self._num_new + len(self._again) or int(bool(self._alone) and not self._busy()))
+        return num_idle < (len(self._todo) or int(bool(self._alone) and not self._busy()))
 
     def _next_attempt(self, place: int) -> _Attempt | None:
         """Return the next attempt for a place. A last attempt runs alone: there may not be the memory for two."""
-        if self._num_new:
-            self._num_new -= 1
-            return _Attempt(*next(self._new))
-        if self._again:
-            return self._again.popleft()
+        if self._todo:
+            return self._todo.popleft()
         if self._alone and not self._busy():
             for worker in [worker for worker in self._workers.values() if worker.place != place]:
                 self._stop(worker, PATIENCE_S)
@@ -477,11 +403,9 @@ class WorkerPool:
             raise error
         elif isinstance(message, logging.LogRecord):
             logging.getLogger(message.name).handle(message)
-        elif attempt is None:
+        elif attempt is None or (isinstance(message, Sign) and message.item_id != attempt.item.item_id):
             return
         elif isinstance(message, Sign):
-            if message.item_id != attempt.item.item_id:
-                return
             if not worker.has_begun:
                 worker.has_begun, worker.begun_s, worker.quiet_s = True, time.monotonic(), 0.0
             elif message.num_steps != worker.num_steps:
@@ -502,7 +426,6 @@ class WorkerPool:
         Time is counted in checks here: while this process itself was stopped, no worker could report.
         """
         for worker in self._busy():
-            assert worker.attempt is not None
             seen = worker.transport.look()
             cpu_s = worker.cpu_s if seen is None else seen.cpu_s
             lives = worker.has_reported or cpu_s != worker.cpu_s
@@ -513,15 +436,25 @@ class WorkerPool:
                 yield from self._lose(worker, "worker_died")
             elif worker.failed_checks >= self.watch.failed_checks:
                 yield from self._lose(worker, "heartbeat_lost")
-            elif worker.quiet_s > limit_s(self.watch, self._seconds, worker.attempt.number, worker.has_begun):
+            elif worker.quiet_s > self._limit_s(worker):
                 yield from self._lose(worker, "timed_out")
+
+    def _limit_s(self, worker: _Worker) -> float:
+        """Return how long an item may report no step; a limit that was set is not meant for reading and compiling."""
+        limit_s = self.watch.item_limit_s
+        if limit_s == 0 or worker.attempt is None:
+            return math.inf
+        if limit_s is not None and worker.has_begun:
+            return limit_s
+        typical_s = statistics.median(self._seconds) if self._seconds else 0.0
+        return max(LEAST_LIMIT_S, TYPICAL_ITEMS * typical_s, limit_s or 0.0) * 2**worker.attempt.number
 
     def _lose(self, worker: _Worker, loss: Loss) -> Iterator[tuple[int, ItemRecord]]:
         """End a worker that is of no use any more; its item is tried again, or has failed."""
         self._stop(worker, 0.0)
         self._lost.add(worker.place)
-        attempt, self.num_lost = worker.attempt, self.num_lost + 1
-        about = worker.about
+        self.num_lost += 1
+        attempt, about = worker.attempt, worker.about
         if attempt is not None:
             seconds = round(time.monotonic() - worker.begun_s, 3) if worker.has_begun else 0.0
             about |= {"item": attempt.item.item_id, "seconds": seconds, "steps": worker.num_steps}
@@ -537,27 +470,21 @@ class WorkerPool:
             )
         if attempt is None:
             return
-        item, tries = attempt.item, attempt.number + 1
+        name, tries = attempt.item.item_id, attempt.number + 1
         if tries <= self.watch.retries:
-            log.warning("%s: %s; it is tried again", item.item_id, LOSSES[loss])
-            (self._alone if tries == self.watch.retries else self._again).append(replace(attempt, number=tries))
-            self.events.write("retried", item=item.item_id, attempt=tries)
-            return
-        self.events.write("given_up", item=item.item_id)
-        code = "worker_died" if loss == "worker_died" else "timed_out"
-        message = f"{item.item_id}: {LOSSES[loss]}, {tries} times"
-        yield attempt.item_index, Failed(id=item.item_id, code=code, message=message)
+            log.warning("%s: %s; it is tried again", name, LOSSES[loss])
+            (self._alone if tries == self.watch.retries else self._todo).append(replace(attempt, number=tries))
+            self.events.write("retried", item=name, attempt=tries)
+        else:
+            self.events.write("given_up", item=name)
+            code, message = "worker_died" if loss == "worker_died" else "timed_out", f"{LOSSES[loss]}, {tries} times"
+            yield attempt.item_index, Failed(id=name, code=code, message=f"{name}: {message}")
 
     def _stop(self, worker: _Worker, patience_s: float) -> None:
         """End a worker, at once or after the time in which it may end by itself."""
         del self._workers[worker.place]
         worker.inbox.put(None)
         worker.transport.kill(patience_s)
-
-    def _end(self, patience_s: float) -> None:
-        if workers := list(self._workers.values()):
-            with ThreadPoolExecutor(len(workers)) as at_once:
-                list(at_once.map(lambda worker: self._stop(worker, patience_s), workers))
 
 
 def _attend(worker: _Worker, start: Start, messages: queue.SimpleQueue) -> None:

@@ -15,7 +15,7 @@ import signal
 import sys
 from collections import deque
 from collections.abc import Iterator
-from functools import cached_property
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -55,49 +55,33 @@ class RayConfig(Config):
 
 
 class Cluster:
-    """A cluster, and a stage's folder that its nodes share."""
+    """A cluster, and a stage's folder that its nodes share. room: how many workers fit on its nodes when they are idle;
+    needs: the resources of a worker in words."""
 
     def __init__(self, cfg: RayConfig, folder: Path) -> None:
-        self._cfg, self._folder, self._ray = cfg, folder, connected(cfg)
-        self._record = sha256_file(folder / "stage.json")
+        self._folder, self._ray, self._record = folder, connected(cfg), sha256_file(folder / "stage.json")
+        self._takes = {"num_cpus": cfg.worker_cpus, "num_gpus": cfg.worker_gpus, "max_restarts": 0}
+        shares = {"CPU": cfg.worker_cpus} | ({"GPU": cfg.worker_gpus} if cfg.worker_gpus else {})
+        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        self.room = sum(min(int(node.get(name, 0.0) / one + 1e-6) for name, one in shares.items()) for node in nodes)
+        self.needs = " and ".join(f"{share:g} {name}s" for name, share in shares.items())
         if not self.room:
-            nodes = [node["Resources"] for node in self._alive()]
             got = ", ".join(f"{node.get('CPU', 0):g} CPUs and {node.get('GPU', 0):g} GPUs" for node in nodes)
             fix = "lower ray.worker_cpus or ray.worker_gpus, or add a node that has as many"
             what = "no node has room for a worker"
             raise EnvironmentMissing(what, got=f"nodes of {got}", expected=self.needs, fix=fix)
-
-    @property
-    def needs(self) -> str:
-        """Return the resources of a worker in words."""
-        gpus = f" and {self._cfg.worker_gpus:g} GPUs" if self._cfg.worker_gpus else ""
-        return f"{self._cfg.worker_cpus:g} CPUs{gpus}"
-
-    @cached_property
-    def room(self) -> int:
-        """Return how many workers fit on the nodes when they are otherwise idle."""
-        taken = [("CPU", self._cfg.worker_cpus), *([("GPU", self._cfg.worker_gpus)] if self._cfg.worker_gpus else [])]
-        nodes = (node["Resources"] for node in self._alive())
-        return sum(min(int(node.get(name, 0.0) / share + 1e-6) for name, share in taken) for node in nodes)
-
-    def _alive(self) -> list[dict[str, Any]]:
-        return [node for node in self._ray.nodes() if node["Alive"]]
+        self._actor = self._ray.remote(_host())
 
     def start_transport(self, worker_options: WorkerOptions) -> RayTransport:
         """Request a worker on any node."""
-        takes = {"num_cpus": self._cfg.worker_cpus, "num_gpus": self._cfg.worker_gpus, "max_restarts": 0}
-        heartbeat_s, log_level, place = worker_options.heartbeat_s, worker_options.log_level, worker_options.place
-        host = self._actor.options(**takes).remote(heartbeat_s, log_level, place)
-        started = host.start.remote(str(self._folder), self._record, os.getcwd(), sys.path, cosfly.__version__)
-        return RayTransport(self._ray, host, started, place, self.needs)
-
-    @cached_property
-    def _actor(self) -> Any:
-        return self._ray.remote(_host())
+        host, options = self._actor.options(**self._takes).remote(), astuple(worker_options)[1:]
+        of_stage = str(self._folder), self._record, os.getcwd()
+        started = host.start.remote(options, *of_stage, sys.path, cosfly.__version__)
+        return RayTransport(self._ray, host, started, worker_options.place, self.needs)
 
 
 class RayTransport:
-    """The connection to a worker process on a node."""
+    """The connection to a worker process on a node; its methods are those of `pool.LocalTransport`."""
 
     def __init__(self, ray: Any, host: Any, started: Any, place: int, needs: str) -> None:
         self.pid: int | None = None
@@ -108,21 +92,18 @@ class RayTransport:
         self._vitals: Vitals | None = Vitals(0.0, 0.0)
 
     def send(self, what: Start | Item | None) -> None:
+        """Send a message, the first once the worker has started; EnvironmentMissing where its node is not fit."""
         data = pickle.dumps(what)
         with self._gone_as_eof():
-            if self.pid is None:
-                self._wait_for_node()
+            while self.pid is None:
+                if self._ray.wait([self._started], timeout=WAITING_S)[0]:
+                    node, pid, problem = self._ray.get(self._started)
+                    if problem:
+                        raise EnvironmentMissing(where=f"node {node}", **problem)
+                    self.node, self.pid = node, pid
+                elif self._place == 0:
+                    log.warning("worker 0 waits for a node with %s free; `ray status` shows who has them", self._needs)
             self._call = self._host.exchange.remote(data)
-
-    def _wait_for_node(self) -> None:
-        """Wait until the worker has started on a node; EnvironmentMissing where the node is not fit for it."""
-        while not self._ray.wait([self._started], timeout=WAITING_S)[0]:
-            if self._place == 0:
-                log.warning("worker 0 waits for a node with %s free; `ray status` shows who has them", self._needs)
-        node, pid, problem = self._ray.get(self._started)
-        if problem:
-            raise EnvironmentMissing(where=f"node {node}", **problem)
-        self.node, self.pid = node, pid
 
     def receive(self) -> Message:
         while not self._received:
@@ -164,15 +145,10 @@ def _host() -> type:
     class Host:
         """Starts a worker on its node and relays its messages. One call at a time."""
 
-        def __init__(self, heartbeat_s: float, log_level: int, place: int) -> None:
-            import queue
-
-            self.heartbeat_s, self.log_level, self.place = heartbeat_s, log_level, place
-            self.inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()  # a worker that still imports reads nothing
-
-        def start(self, folder: str, record: str, cwd: str, path: list[str], version: str) -> tuple:
+        def start(self, options: tuple, folder: str, record: str, cwd: str, path: list[str], version: str) -> tuple:
             """Return the node's name, the worker's process id, and the node's problem as an error's arguments."""
             import os
+            import queue
             import socket
             import sys
             import threading
@@ -207,7 +183,9 @@ def _host() -> type:
                 os.environ.setdefault("GLCONTEXT_DEVICE_INDEX", str(devices[0]))  # of EGL, which counts NVIDIA's first
             sys.path.extend(place for place in path if place not in sys.path)  # a spawned process takes it over
             vars(sys.modules["__main__"]).pop("__file__", None)  # Ray's own, which a spawned process would run again
-            self.worker = LocalTransport(WorkerOptions(os.getpid(), self.heartbeat_s, self.log_level, self.place))
+            self.heartbeat_s = options[0]
+            self.inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()  # a worker that still imports reads nothing
+            self.worker = LocalTransport(WorkerOptions(os.getpid(), *options))
             threading.Thread(target=self._send, daemon=True).start()
             return node, self.worker.pid, None
 
@@ -255,7 +233,8 @@ def connected(cfg: RayConfig) -> Any:
         return ray
     address = cfg.address or os.environ.get("RAY_ADDRESS") or "local"
     own: dict[str, Any] = {"object_store_memory": STORE_BYTES, "include_dashboard": False} if address == "local" else {}
-    _check_reachable(address)
+    if ":" in address:
+        _check_reachable(address)
     handler = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address, **own, log_to_driver=False, logging_level=logging.ERROR, namespace="cosfly")
@@ -274,8 +253,6 @@ def _check_reachable(address: str) -> None:
     import grpc
     from ray._private.gcs_utils import create_gcs_channel
 
-    if ":" not in address:
-        return
     channel = create_gcs_channel(address)
     try:
         grpc.channel_ready_future(channel).result(ANSWER_S)

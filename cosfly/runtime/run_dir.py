@@ -17,8 +17,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
-from weakref import WeakValueDictionary
+from typing import Annotated, Any, Literal, Self
 
 from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_serializer
@@ -32,7 +31,6 @@ from cosfly.runtime.io import (
     checksum_lines,
     files_named,
     inside,
-    is_partial_of,
     read_checksums,
     refuse_links,
     remove_partials,
@@ -49,7 +47,6 @@ from cosfly.runtime.json_io import (
     model_lines,
     read_json,
     read_model,
-    read_object,
     validated,
     write_model,
 )
@@ -59,7 +56,7 @@ log = logging.getLogger(__name__)
 LOCK = ".lock"
 STAGE_FORMAT = FileFormat("cosfly.stage", "1.0", "stage record")
 MANIFEST_FORMAT = FileFormat("cosfly.manifest", "1.0", "manifest")
-RECORDS = (("manifest.json", MANIFEST_FORMAT.schema), ("stage.json", STAGE_FORMAT.schema))
+RECORDS = {"manifest.json": MANIFEST_FORMAT.schema, "stage.json": STAGE_FORMAT.schema}
 TRACK_FILE = "trajectory.json"
 BEGUN = ("stage.json", "items.jsonl", "failures.jsonl", EVENTS, "preflight.json")  # there before anything is finished
 ROLES = {"maps": "boxes", "map": "simplified"}  # a product that stages call by two names
@@ -71,62 +68,45 @@ Resume = Literal["never", "if-same"]
 # --- the lock ---------------------------------------------------------------------------------------------------------
 
 
-class FolderLock:
+class FolderLock(FileLock):
     """The system's lock on `.lock` in a folder, held until release, the last reference, or the end of the process."""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self._lock = path, FileLock(path, timeout=0, thread_local=False)
-        with storage_errors(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                self._lock.acquire()
-            except Timeout:
-                fix = "wait for it or stop it, then run the same command again; or choose another --out"
-                raise ResumeError("another process is at work in this folder", where=path.parent, fix=fix) from None
-            except NotImplementedError:
-                fix = "choose another --out"
-                raise StorageError("the file system has no locks", where=path.parent, fix=fix) from None
-
-    @property
-    def is_held(self) -> bool:
-        return self._lock.is_locked
-
-    def release(self) -> None:
-        """Release the folder and remove the file, so that a finished folder holds products only."""
-        if self._lock.is_locked:
-            with contextlib.suppress(OSError):
-                self.path.unlink()  # while it is locked: a process that waits for this file then makes its own
-            self._lock.release(force=True)
-
-    def __enter__(self) -> FolderLock:
+    def __enter__(self) -> Self:  # `hold_folder` has acquired it
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.release()
-
-    def __del__(self) -> None:
-        self.release()
-
-
-# A process may open a folder again while it still refers to the first lock, for example after an error in a notebook.
-_held: WeakValueDictionary[Path, FolderLock] = WeakValueDictionary()
+    def release(self, force: bool = True) -> None:
+        """Release the folder and remove the file, so that a finished folder holds products only."""
+        if self.is_locked:
+            with contextlib.suppress(OSError):
+                os.unlink(self.lock_file)  # while it is locked: a process that waits for this file makes its own
+            super().release(force)
 
 
 def hold_folder(folder: Path) -> FolderLock:
-    """Lock a folder, which is created if needed; ResumeError where another process holds it."""
+    """Lock a folder, which is created if needed; ResumeError where another process holds it.
+
+    A process may lock a folder again while it still refers to the first lock, as after an error in a notebook.
+    """
     path = folder.resolve() / LOCK
-    held = _held.get(path)
-    if held is None or not held.is_held:
-        held = _held[path] = FolderLock(path)
-    return held
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = FolderLock(path, timeout=0, thread_local=False, is_singleton=True)
+        try:
+            lock.acquire()
+        except Timeout:
+            fix = "wait for it or stop it, then run the same command again; or choose another --out"
+            raise ResumeError("another process is at work in this folder", where=path.parent, fix=fix) from None
+        except NotImplementedError:
+            what = "the file system has no locks"
+            raise StorageError(what, where=path.parent, fix="choose another --out") from None
+    return lock
 
 
 def is_held(folder: Path) -> bool:
-    """Return whether a process holds a folder now."""
+    """Return whether another process holds a folder now."""
     try:
         if (folder / LOCK).is_file():
-            with FileLock(folder / LOCK, timeout=0):
-                pass
+            FileLock(folder / LOCK, timeout=0).acquire().lock.release()
     except Timeout:
         return True
     except (OSError, NotImplementedError):
@@ -226,6 +206,17 @@ class Tally(BaseModel):
     dropped: Counter[str] = Counter()
     failed: Counter[str] = Counter()
 
+    def count(self, record: ItemRecord) -> Failed | None:
+        """Count a record, and return it if it is a failure."""
+        if isinstance(record, Failed):
+            self.failed[record.code] += 1
+            return record
+        if isinstance(record, Dropped):
+            self.dropped[record.reason] += 1
+        else:
+            self.kept += 1
+        return None
+
     def check(self) -> None:
         """Assert that nothing was lost: a tally that does not add up is a bug of ours, not of the input."""
         total = self.kept + self.dropped.total() + self.failed.total()
@@ -247,10 +238,8 @@ class Tally(BaseModel):
         return f"{text} of {self.input}"
 
 
-class Manifest(BaseModel):
+class Manifest(_Record, extra="allow"):
     """`manifest.json`: the products of a finished stage; `facts` are the stage's own."""
-
-    model_config = ConfigDict(extra="allow", frozen=True)
 
     stage: str
     outputs: list[Output]
@@ -303,10 +292,8 @@ class StageFolder:
         """Start or resume a stage.
 
         Args:
-            config: The stage's settings; those that are MayDiffer are not recorded.
             inputs: Name -> file or folder that the stage reads.
-            resume: `never` refuses a folder that holds work; `if-same` resumes only with equal settings, inputs and
-                seed.
+            resume: `never` refuses a folder that holds work; `if-same` wants equal settings, inputs and seed.
             package_files: Name -> file or flat folder of the package that decides what is made.
             audited: Names of inputs that the stage itself compares with their records, item by item.
             begun: Files and folders that the stage writes before anything is finished, next to those of every stage.
@@ -319,8 +306,6 @@ class StageFolder:
             code_version=cosfly.__version__,
             package_files={name: _digest(p) for name, p in sorted(package_files.items())},
         )
-        for name, path in inputs.items():
-            log.debug("%s: reads %s: %s", stage, name, path)
         if out.exists() and not out.is_dir():
             raise StorageError("the output folder is a file", where=out, fix="choose another --out")
         if (out / "manifest.json").exists():
@@ -362,14 +347,11 @@ class StageFolder:
         return self.journal.read_as(read_item)
 
     def finish(self, outputs: Iterable[Path], tally: Tally, **facts: Any) -> None:
-        """Write the manifest: the stage is complete.
+        """Write the manifest: the stage is complete. NothingKept where no item was kept; what was written stays.
 
         Args:
             outputs: Files inside the folder; of a folder with many files, its checksum file.
             facts: Further JSON-able facts for the manifest.
-
-        Raises:
-            NothingKept: No item was kept. What was written stays, without a manifest.
         """
         tally.check()
         if not tally.kept:
@@ -394,27 +376,21 @@ class StageFolder:
     ) -> NothingKept:
         """Return the error of a stage that has nothing for the next one, with its counts and its first failure.
 
-        Args:
-            where: The file that says why; None: the stage's folder.
-            fix: What to do, where the caller knows more about it.
+        where: The file that says why; None: the stage's folder.
         """
-        path = self.path / "failures.jsonl"
-        failures = read_failures(path) if path.exists() else []
-        return NothingKept(
-            f"{self.stage} kept nothing, so the next stage has no input",
-            where=where or self.path,
-            got=f"{tally}; the first failure: {failures[0].message}" if failures else str(tally),
-            expected=expected,
-            fix=fix
-            or "fix what failures.jsonl and items.jsonl there name, or change the settings and choose another --out",
-        )
+        path, got = self.path / "failures.jsonl", str(tally)
+        if failures := read_failures(path) if path.exists() else []:
+            got += f"; the first failure: {failures[0].message}"
+        fix = fix or "fix what failures.jsonl and items.jsonl there name, or change settings and choose another --out"
+        what = f"{self.stage} kept nothing, so the next stage has no input"
+        return NothingKept(what, where=where or self.path, got=got, expected=expected, fix=fix)
 
 
 def _prepare_resume(out: Path, record: StageRecord, resume: Resume, begun: Collection[str]) -> None:
     """Make a folder ready to be resumed; ResumeError where it may not be."""
     if not (out / "stage.json").exists():
         # A kill may have come while the record was being written.
-        if any(entry.name != LOCK and not is_partial_of("stage.json", entry) for entry in out.iterdir()):
+        if any(entry.name != LOCK and not entry.match(".stage.json.*.partial") for entry in out.iterdir()):
             what = "the output folder holds files that are not cosfly's"
             raise ResumeError(what, where=out, fix="choose an empty --out")
     elif _holds_work(out, begun):
@@ -423,18 +399,6 @@ def _prepare_resume(out: Path, record: StageRecord, resume: Resume, begun: Colle
         # stage.json stays until the new one is written: without it a kill would leave what looks like foreign files.
         for path in (out / name for name in begun if name != "stage.json"):
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-
-
-def _check_same(out: Path, record: StageRecord, resume: Resume) -> None:
-    """Raise ResumeError where the work in a folder may not be resumed as `record` says."""
-    found = read_stage_record(out)
-    if resume == "never":
-        raise ResumeError("the folder already holds work", where=out, fix="choose another --out, or --resume if-same")
-    if differences := _differences(found, record):
-        what, fix = "the folder holds work made with other settings or inputs", "choose another --out, or restore them"
-        raise ResumeError(what, where=out, got="; ".join(differences), fix=fix)
-    if found.code_version != record.code_version:
-        log.warning("%s: resumed by version %s, started by %s", out, record.code_version, found.code_version)
 
 
 def _holds_work(out: Path, begun: Collection[str]) -> bool:
@@ -447,22 +411,28 @@ def _holds_work(out: Path, begun: Collection[str]) -> bool:
     )
 
 
-def _differences(found: StageRecord, wanted: StageRecord) -> list[str]:
-    """Return which settings, inputs or seed differ, in words."""
-    before = flattened(found.config) | {"seed": found.seed}
-    after = flattened(wanted.config) | {"seed": wanted.seed}
-    changed = [
+def _check_same(out: Path, record: StageRecord, resume: Resume) -> None:
+    """Raise ResumeError where the work in a folder may not be resumed as `record` says."""
+    found = read_stage_record(out)
+    if resume == "never":
+        raise ResumeError("the folder already holds work", where=out, fix="choose another --out, or --resume if-same")
+    before, after = (flattened(one.config) | {"seed": one.seed} for one in (found, record))
+    differences = [
         f"{key} was {before.get(key)!r}, is {after.get(key)!r}"
         for key in sorted(before.keys() | after.keys(), key=lambda key: (key == "seed", key))
         if before.get(key) != after.get(key)
     ]
-    for name in sorted(found.inputs.keys() | wanted.inputs.keys()):
-        old, new = found.inputs.get(name), wanted.inputs.get(name)
+    for name in sorted(found.inputs.keys() | record.inputs.keys()):
+        old, new = found.inputs.get(name), record.inputs.get(name)
         if old is None or new is None or old.sha256 != new.sha256:
-            changed.append(f"the input {name} ({new.path if new else 'none'}) has changed")
-    both = found.package_files.keys() & wanted.package_files.keys()
-    different = (name for name in sorted(both) if found.package_files[name] != wanted.package_files[name])
-    return [*changed, *(f"the {name} changed" for name in different)]
+            differences.append(f"the input {name} ({new.path if new else 'none'}) has changed")
+    both = found.package_files.keys() & record.package_files.keys()
+    changed = (name for name in sorted(both) if found.package_files[name] != record.package_files[name])
+    if differences := [*differences, *(f"the {name} changed" for name in changed)]:
+        what, fix = "the folder holds work made with other settings or inputs", "choose another --out, or restore them"
+        raise ResumeError(what, where=out, got="; ".join(differences), fix=fix)
+    if found.code_version != record.code_version:
+        log.warning("%s: resumed by version %s, started by %s", out, record.code_version, found.code_version)
 
 
 def _digest(path: Path) -> str:
@@ -500,9 +470,8 @@ def fingerprint(path: Path) -> str:
         raise InputError("there is no such file or folder", where=path, fix=fix)
     if not path.is_dir():
         return sha256_file(path)  # an error where it is a pipe or a device
-    if _has_record(path, *RECORDS[0]):
-        outputs = read_object(path / "manifest.json", what="manifest").get("outputs", [])
-        return sha256_bytes(dump_json(outputs).encode())
+    if manifest := _record(path, "manifest.json"):
+        return sha256_bytes(dump_json(manifest.get("outputs", [])).encode())
     digest = hashlib.sha256()
     for file in files_named(path, TRACK_FILE):
         digest.update(f"{file.relative_to(path)} {sha256_file(file)}\n".encode())
@@ -524,9 +493,8 @@ def folder_digests(folder: Path) -> dict[str, str]:
 
 def recorded_digests(folder: Path) -> dict[str, str]:
     """Return the sha256 of a finished stage's products by their paths; empty where there is no manifest of ours."""
-    if not _has_record(folder, *RECORDS[0]):
-        return {}
-    return {output.path: output.sha256 for output in read_manifest(folder).outputs}
+    outputs = read_manifest(folder).outputs if _record(folder, "manifest.json") else []
+    return {output.path: output.sha256 for output in outputs}
 
 
 def digest_of(digests: Mapping[str, str]) -> str:
@@ -543,13 +511,9 @@ def checked_inputs(inputs: Mapping[str, Path], audited: Collection[str] = ()) ->
     Args:
         inputs: Name -> file or folder; of several runs with a number in front, as `2.data`.
         audited: Names of inputs whose files the stage itself compares with their records, one by one.
-
-    Raises:
-        InputError: An input is missing, or its name is not UTF-8 text.
-        VerifyError: An input was changed since its stage finished it, its stage is not finished, or it was made of
-            another input than the one given next to it.
     """
     for name, path in inputs.items():
+        log.debug("reads %s: %s", name, path)
         try:
             str(path).encode()
         except UnicodeEncodeError:
@@ -563,22 +527,22 @@ def checked_inputs(inputs: Mapping[str, Path], audited: Collection[str] = ()) ->
     return found
 
 
+def _record(folder: Path, name: str) -> dict[str, Any] | None:
+    """Return a record of ours as JSON; None where there is none: others write files of these names too."""
+    value = read_json(folder / name) if (folder / name).is_file() else None
+    return value if isinstance(value, dict) and value.get("schema") == RECORDS[name] else None
+
+
 def _stage_folder(path: Path) -> Path | None:
     """Return the folder of the stage that made an input: itself, its parent or the parent's parent; None: not ours."""
-    places = [path] if path.is_dir() else [path.absolute().parent, path.absolute().parent.parent]
-    return next((place for place in places if any(_has_record(place, *record) for record in RECORDS)), None)
-
-
-def _has_record(folder: Path, name: str, schema: str) -> bool:
-    """Return whether a folder has a record of ours; others write files of these names too."""
-    value = read_json(folder / name) if (folder / name).is_file() else None
-    return isinstance(value, dict) and value.get("schema") == schema
+    places = [path] if path.is_dir() else path.absolute().parents[:2]
+    return next((place for place in places if any(_record(place, name) for name in RECORDS)), None)
 
 
 def record_of(product: Path) -> StageRecord | None:
     """Return the record of the stage that made a product; None where there is none."""
     folder = _stage_folder(product)
-    return read_stage_record(folder) if folder is not None and _has_record(folder, *RECORDS[1]) else None
+    return read_stage_record(folder) if folder is not None and _record(folder, "stage.json") else None
 
 
 def _check_finished(path: Path) -> None:
@@ -586,16 +550,20 @@ def _check_finished(path: Path) -> None:
     folder = _stage_folder(path)
     if folder is None or not path.exists():
         return
-    for name, schema in RECORDS:
-        if not _has_record(folder, name, schema):
+    for name in RECORDS:
+        if not _record(folder, name):
             what, got = "the stage that makes this is not finished, or its records are gone", f"no {name} in {folder}"
             fix = "run that stage again; to use what is there as it is, copy it to a folder of its own"
             raise VerifyError(what, where=path, got=got, expected=f"{name} of that stage", fix=fix)
-    digests = recorded_digests(folder)
-    if path.is_file():
-        name = path.absolute().relative_to(folder.absolute()).as_posix()
-        digests = {name: digests[name]} if name in digests else {}
-    if wrong := list(_changed(folder, digests)):
+    name, wrong = os.path.relpath(path, folder), list[str]()
+    for listed, digest in recorded_digests(folder).items():
+        file = inside(folder, listed)
+        if path.is_dir() or listed == name:
+            if not file.is_file():
+                wrong.append(f"{file} is missing")
+            elif sha256_file(file) != digest:
+                wrong.append(f"{file} has other bytes")
+    if wrong:
         more = f" and {len(wrong) - NUM_NAMED} more" if len(wrong) > NUM_NAMED else ""
         what = "the files of this stage are not those that it finished"
         expected = "the files whose digests are in its records"
@@ -603,29 +571,16 @@ def _check_finished(path: Path) -> None:
         raise VerifyError(what, where=folder, got="; ".join(wrong[:NUM_NAMED]) + more, expected=expected, fix=fix)
 
 
-def _changed(folder: Path, digests: Mapping[str, str]) -> Iterator[str]:
-    for name, digest in digests.items():
-        path = inside(folder, name)
-        if not path.is_file():
-            yield f"{path} is missing"
-        elif sha256_file(path) != digest:
-            yield f"{path} has other bytes"
-
-
 def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], found: Mapping[str, StageInput]) -> None:
     """Check that each input which an input was made of, and which is given too, is the one given."""
-    record = record_of(path)
-    if record is None:
+    if (record := record_of(path)) is None:
         return
     front = name.rpartition(".")[0]
     peers = {_role(other): other for other in inputs if other.rpartition(".")[0] == front}
-    made_of: dict[str, list[tuple[str, StageInput]]] = {}  # role -> the inputs of that role
-    for other, entry in record.inputs.items():
-        made_of.setdefault(_role(other), []).append((other, entry))
-    for role, entries in made_of.items():
-        peer = peers.get(role, name)
-        if peer != name and all(entry.sha256 != found[peer].sha256 for _, entry in entries):
-            wanted, entry = entries[0]
+    for role, peer in peers.items():
+        made_of = [(other, entry) for other, entry in record.inputs.items() if _role(other) == role]
+        if made_of and peer != name and all(entry.sha256 != found[peer].sha256 for _, entry in made_of):
+            wanted, entry = made_of[0]
             what, got = f"it was made of another input {wanted!r} than the one given with it", f"given: {inputs[peer]}"
             fix = f"give the two that belong together, or make {path.name} again"
             raise VerifyError(what, where=path, got=got, expected=f"{entry.path}, as it was then", fix=fix)

@@ -117,13 +117,7 @@ def row_batches(path: Path | str, table: _Table, k: int, columns: list[str], num
     """Yield one row group of an open table in batches, which reuse the same memory."""
     _check_size(path, table, k)
     with arrow_errors(path):
-        batches = table.iter_batches(num_rows, row_groups=[k], columns=columns, use_threads=False)
-    while True:
-        with arrow_errors(path):
-            batch = next(batches, None)
-        if batch is None:
-            return
-        yield batch
+        yield from table.iter_batches(num_rows, row_groups=[k], columns=columns, use_threads=False)
 
 
 def _check_size(path: Path | str, table: _Table, k: int) -> None:
@@ -137,8 +131,7 @@ def rows_of(path: Path, columns: list[str] | None = None, *, tree: Path | None =
     """Yield the rows of a parquet file."""
     for group in row_groups(path, columns, tree=tree):
         with arrow_errors(path):  # for text that is not UTF-8
-            rows = group.to_pylist()
-        yield from rows
+            yield from group.to_pylist()
 
 
 class TableRows(Sequence[dict[str, Any]]):
@@ -155,20 +148,15 @@ class TableRows(Sequence[dict[str, Any]]):
         self._firsts: list[int] = []  # number of the first row of each group, and of all rows
         self._held: OrderedDict[int, pa.Table] = OrderedDict()
 
-    def __getstate__(self) -> tuple[Path, list[str]]:
-        return self._path, self._columns
-
-    def __setstate__(self, state: tuple[Path, list[str]]) -> None:
-        self._path, self._columns = state
-        self._begin()
+    def __reduce__(self) -> tuple:
+        return type(self), (self._path, self._columns)
 
     def _opened(self) -> _Table:
         if self._process != os.getpid():  # a fork shares the place in the open file with its parent
             self._begin()
         if self._table is None:
             table = self._stack.enter_context(open_table(self._path))
-            missing = sorted(set(self._columns) - set(table.schema_arrow.names))
-            if missing:
+            if missing := sorted(set(self._columns) - set(table.schema_arrow.names)):
                 raise InputError("columns are missing", where=self._path, got=", ".join(missing)[:200])
             counts = [table.metadata.row_group(k).num_rows for k in range(table.num_row_groups)]
             self._firsts = list(accumulate(counts, initial=0))

@@ -57,6 +57,7 @@ class Outcome:
 
 
 Work = Callable[[Item], Outcome]
+Start = Callable[[], Work]  # the first message to a worker: a partial of a module-level function
 
 _place = 0
 _on_steps: Callable[[int], None] | None = None
@@ -76,19 +77,13 @@ def advance(num_steps: int = 1) -> None:
         _on_steps(_num_steps)
 
 
-@contextlib.contextmanager
-def counted_steps(on_steps: Callable[[int], None]) -> Iterator[None]:
-    """Call `on_steps` with the number of steps done whenever an item's work calls `advance` in this process."""
+def attempt(work: Work, item: Item, on_steps: Callable[[int], None] | None = None) -> ItemRecord:
+    """Run one item and return its record; only a fatal error is raised.
+
+    on_steps: It is called with the number of steps done whenever the item's work calls `advance`.
+    """
     global _on_steps, _num_steps
     _on_steps, _num_steps = on_steps, 0
-    try:
-        yield
-    finally:
-        _on_steps = None
-
-
-def attempt(work: Work, item: Item) -> ItemRecord:
-    """Run one item and return its record; only a fatal error is raised."""
     start_s = time.monotonic()
     try:
         outcome = work(item)
@@ -99,6 +94,8 @@ def attempt(work: Work, item: Item) -> ItemRecord:
     except Exception as error:  # the item boundary: a bug in one item must not lose the others
         log.error("%s: a bug in cosfly\n%s", item.item_id, traceback.format_exc())
         return Failed(id=item.item_id, code="bug", message=f"{type(error).__name__}: {error}")
+    finally:
+        _on_steps = None
     seconds = round(time.monotonic() - start_s, 3)
     if outcome.drop_reason is None:
         return Kept(id=item.item_id, result=outcome.result, seconds=seconds)
@@ -136,14 +133,6 @@ class WorkerOptions:
     place: int = 0
 
 
-@dataclass(frozen=True)
-class Start:
-    """The first message to a worker; `make_worker` is a module-level function."""
-
-    make_worker: Callable[..., Work]
-    worker_args: tuple
-
-
 # --- the process ------------------------------------------------------------------------------------------------------
 
 
@@ -165,13 +154,14 @@ def work_through(connection: Connection, worker_options: WorkerOptions) -> None:
         mallopt(TRIM_THRESHOLD, MOST_KEPT_BYTES)
     threading.Thread(target=sender.send_heartbeats, args=(worker_options.heartbeat_s,), daemon=True).start()
     try:
-        start: Start | None = _received(connection)
-        work = start.make_worker(*start.worker_args) if start else None
+        make: Start | None = _received(connection)
+        work = make() if make else None
         while work and (item := _received(connection)):
             sender.begin(item)
-            with counted_steps(sender.count):
-                record = attempt(work, item)
-            sender.finish(record)
+            record = attempt(work, item)
+            sender.is_busy = False
+            sender.send(Sign(record.id, _num_steps))
+            sender.send(record)
     # The boundary of the process: an error that ends the work is sent, or the pool would take it for a death.
     except Exception as error:
         if not isinstance(error, CosflyError):
@@ -196,7 +186,7 @@ class _Sender(logging.handlers.QueueHandler):
         super().__init__(None)  # type: ignore[arg-type]  # there is no queue: `enqueue` sends
         self._connection, self._sending = connection, threading.Lock()
         self._item_id: str | None = None
-        self._num_steps, self._is_busy = 0, True
+        self.is_busy = True
 
     def enqueue(self, record: logging.LogRecord) -> None:
         self.send(record)
@@ -209,22 +199,16 @@ class _Sender(logging.handlers.QueueHandler):
             os._exit(1)  # the parent is gone
 
     def begin(self, item: Item) -> None:
-        self._item_id, self._num_steps, self._is_busy = item.item_id, 0, True
+        global _num_steps
+        _num_steps = 0
+        self._item_id, self.is_busy = item.item_id, True
         self.send(Sign(item.item_id, 0))
-
-    def count(self, num_steps: int) -> None:
-        self._num_steps = num_steps
-
-    def finish(self, record: ItemRecord) -> None:
-        self._is_busy = False
-        self.send(Sign(record.id, self._num_steps))
-        self.send(record)
 
     def send_heartbeats(self, heartbeat_s: float) -> None:
         while True:
             time.sleep(heartbeat_s)
-            if self._is_busy:
-                self.send(Sign(self._item_id, self._num_steps))
+            if self.is_busy:
+                self.send(Sign(self._item_id, _num_steps))
 
 
 # --- the system -------------------------------------------------------------------------------------------------------

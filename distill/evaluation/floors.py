@@ -30,7 +30,7 @@ WITH_TEXT = ("shuffled", "constant")  # floors that have texts
 
 def coc_of(sample: Sample) -> Coc:
     """Return a sample's answer."""
-    return validated(Coc, parse_document(sample.answer, sample.key, what="answer"), sample.key)
+    return validated(Coc, parse_document(sample.answer, sample.key), sample.key)
 
 
 def majority(decisions: Iterable[str]) -> str | None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from cosfly.formats.captions import ACTIONS, Caption, caption_lines, not_in_set
 from cosfly.formats.places import sample_id
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import read_span
+from cosfly.runtime.io import read_bytes
 from cosfly.runtime.json_io import dump_json, parse_document, parse_json, validated
 from release.columns import LANGUAGES, published_name
 
@@ -39,9 +39,9 @@ class FlightCaptions:
 
     def read(self) -> Iterator[Caption]:
         """Yield them as they stand; raises InputError where they cannot be read any more."""
-        for first, size in self.spans:
-            for line in read_span(self.path, first, size, what="captions").splitlines():
-                value = parse_document(line, self.path, what="line")
+        for span in self.spans:
+            for line in read_bytes(self.path, span=span, what="captions").splitlines():
+                value = parse_document(line, self.path)
                 yield validated(Caption, value, self.path)
 
 

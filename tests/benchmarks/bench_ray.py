@@ -33,7 +33,7 @@ from toy_workers import make_talking_worker, stage_in
 from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
-from cosfly.runtime.events import LOSSES, Event, read_events, rss_mib
+from cosfly.runtime.events import LOSSES, Event, Vitals, read_events
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.ray_engine import RayConfig, connected
 from cosfly.runtime.run_dir import read_manifest
@@ -109,10 +109,10 @@ def do_nothing(folder: Path, engine: RayConfig | None, count: int) -> None:
     items = [Item(str(k)) for k in range(count)]
     if engine is not None:
         connected(engine)
-    before_mib, begun_s = rss_mib(os.getpid()), time.monotonic()
+    before_mib, begun_s = Vitals.of(os.getpid()).rss_mib, time.monotonic()
     run_items(stage_in(folder), items, make_talking_worker, workers=WORKERS, watch=Watch(engine))
     pace = count / (time.monotonic() - begun_s)
-    name, after_mib = "local" if engine is None else "ray", rss_mib(os.getpid())
+    name, after_mib = "local" if engine is None else "ray", Vitals.of(os.getpid()).rss_mib
     print(f"{name}, {count:,} items: driver {before_mib:.0f} MiB before, {after_mib:.0f} after; {pace:.0f} items/s")
 
 
