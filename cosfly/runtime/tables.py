@@ -7,8 +7,8 @@ import contextlib
 import io
 import os
 import threading
-from collections import OrderedDict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import lru_cache
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -138,49 +138,36 @@ class TableRows(Sequence[dict[str, Any]]):
     """The rows of a parquet file by number. It stays open with a few row groups in memory; each process has its own."""
 
     def __init__(self, path: Path, columns: list[str]) -> None:
-        self._path, self._columns = path, columns
-        self._begin()
-
-    def _begin(self) -> None:
-        self._process, self._lock = os.getpid(), threading.Lock()
-        self._stack = contextlib.ExitStack()
-        self._table: _Table | None = None
+        self._path, self._columns, self._stack = path, columns, contextlib.ExitStack()
+        self._process, self._lock = -1, threading.Lock()
         self._firsts: list[int] = []  # number of the first row of each group, and of all rows
-        self._held: OrderedDict[int, pa.Table] = OrderedDict()
+        self._group: Callable[[int], pa.Table]
 
     def __reduce__(self) -> tuple:
         return type(self), (self._path, self._columns)
 
-    def _opened(self) -> _Table:
+    def _open(self) -> None:
         if self._process != os.getpid():  # a fork shares the place in the open file with its parent
-            self._begin()
-        if self._table is None:
             table = self._stack.enter_context(open_table(self._path))
             if missing := sorted(set(self._columns) - set(table.schema_arrow.names)):
                 raise InputError("columns are missing", where=self._path, got=", ".join(missing)[:200])
-            counts = [table.metadata.row_group(k).num_rows for k in range(table.num_row_groups)]
+            counts = (table.metadata.row_group(k).num_rows for k in range(table.num_row_groups))
             self._firsts = list(accumulate(counts, initial=0))
-            self._table = table
-        return self._table
+            self._group = lru_cache(GROUPS_HELD)(lambda k: read_row_group(self._path, table, k, self._columns))
+            self._process, self._lock = os.getpid(), threading.Lock()
 
     def __len__(self) -> int:
-        self._opened()
+        self._open()
         return self._firsts[-1]
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         return rows_of(self._path, self._columns)
 
     def __getitem__(self, number: int) -> dict[str, Any]:  # type: ignore[override]  # one row at a time
-        table = self._opened()
-        if not 0 <= number < self._firsts[-1]:
+        if not 0 <= number < len(self):
             raise IndexError(number)
         k = bisect.bisect_right(self._firsts, number) - 1
         with self._lock:
-            if k not in self._held:
-                self._held[k] = read_row_group(self._path, table, k, self._columns)
-                if len(self._held) > GROUPS_HELD:
-                    self._held.popitem(last=False)
-            self._held.move_to_end(k)
-            group = self._held[k]
+            group = self._group(k)
         with arrow_errors(self._path):
             return group.slice(number - self._firsts[k], 1).to_pylist()[0]
