@@ -21,7 +21,7 @@ CFG = PedestriansConfig(road_cost=20, open_cost=3, min_component_cells=100, min_
 def street(*, marked: bool = False) -> BoxList:
     """Two streets of 8 m that cross at the origin, between pavements of 4 m, on a lawn of 80 m; one has dashes."""
     boxes = BoxList()
-    boxes.add_span("Terrain", (-40, -40), (40, 40), -0.4, -0.1)
+    boxes.span("Terrain", (-40, -40), (40, 40), -0.4, -0.1)
     for size in (80, 8), (8, 80):
         boxes.add("Roads", (0, 0), size, -0.36, -0.06)
     for sx in (-1, 1):

@@ -14,7 +14,6 @@ from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.formats.kinds import KINDS
 from cosfly.runtime.errors import ResumeError
 from cosfly.simplify.passes import (
-    MergeRule,
     SimplifyConfig,
     clusters,
     crop_below_ground,
@@ -107,7 +106,7 @@ def test_clusters_equal_the_slow_version(seed, count, gap_m):
 @given(seed=st.integers(0, 10**6), min_fill=st.sampled_from([0.0, 0.5, 0.85, 1.0]))
 def test_merged_boxes_enclose_their_members_and_fill_enough(seed, min_fill):
     boxes = random_map(seed, 60)
-    merged = merge(boxes, {VEGETATION: MergeRule(2.0, min_fill), BUILDINGS: MergeRule(5.0, min_fill)})
+    merged = merge(boxes, {VEGETATION: (2.0, min_fill), BUILDINGS: (5.0, min_fill)})
     assert len(set(merged.ids.tolist())) == len(merged)
     assert set(merged.ids.tolist()) <= set(boxes.ids.tolist())
     for kind, low, high in zip(boxes.kinds, boxes.mins, boxes.maxs, strict=True):

@@ -12,10 +12,10 @@ import io
 import logging
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import shapely
@@ -26,10 +26,9 @@ from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, 
 from cosfly.formats.columns import LARGEST
 from cosfly.formats.geojson import read_features
 from cosfly.formats.kinds import GROUND_KINDS, KINDS, SURFACE_KINDS
-from cosfly.maps.boxlist import BoxList
-from cosfly.maps.coordinates import Unit, offset_header, origin_m, to_metres
+from cosfly.maps.boxlist import BoxList, origin_m, required
 from cosfly.maps.derived_ground import with_derived_ground
-from cosfly.maps.footprints import CUT_SHARES, cover
+from cosfly.maps.footprints import CUT_SHARES, Rectangle, cover
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, InputError, nearest
 from cosfly.runtime.io import read_text
@@ -38,12 +37,14 @@ log = logging.getLogger(__name__)
 
 NUMBERS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_deg")
 COLUMNS = ("type", "id", "name", *NUMBERS)
-REQUIRED = ("type", "x_m", "y_m", "length_m", "width_m")  # of a table; and height_m, except of surfaces
+PLACE = ("x_m", "y_m", "length_m", "width_m")  # every table has them; and height_m, except of surfaces
 TYPES = [kind for kind in KINDS if kind != "NONE"]
 SLAB_M = 0.3  # thickness of a surface without a height: its top is the ground
 FAR_M = 10_000.0  # a map with its middle farther from the origin is moved there
 OUTLINE_FILL, OUTLINE_PIECE_M = 0.9, 3.0  # share of its boxes that an outline fills; shortest piece that is cut
 OVERLAP_M = 0.05  # boxes that share less than this only touch
+WIDEST_DEG = 2.0  # of a map in longitude and latitude: beyond this a plane that touches the Earth is no map of it
+EARTH_M, EARTH_E2 = 6_378_137.0, 0.00669437999014  # WGS 84: equatorial radius, squared eccentricity
 
 
 class BoxesConfig(Config):
@@ -51,14 +52,14 @@ class BoxesConfig(Config):
 
     name: str = Field("Boxes", min_length=1, description="map name, the head of the playback tree's folder names")
     path: Path | None = Field(None, description="boxes_3d.json, .csv or .geojson; names of columns: docs/files.md")
-    units: Unit = Field("m", description="unit of the coordinates of GeoJSON: m, or degrees of longitude and latitude")
+    units: Literal["m", "degrees"] = Field(
+        "m", description="unit of the coordinates of GeoJSON: m, or degrees of longitude and latitude"
+    )
     types: dict[str, str] = Field({}, description="names of the file -> types of cosfly, as in {house: Buildings}")
     ignore: list[str] = Field([], description="columns or properties to ignore; ['*']: all unknown ones")
     ground_z_m: float = Field(0.0, description="height of the flat ground, in the file's coordinates, m")
     derive_ground: bool = Field(False, description="the same as maps.cityjson.derive_ground")
-    licence: LicenceId = Field(
-        UNKNOWN_LICENCE, description="licence of the boxes, as the hub spells it (cc-by-4.0); goes into every release"
-    )
+    licence: LicenceId = Field(UNKNOWN_LICENCE, description="licence of the boxes, as the hub spells it (cc-by-4.0)")
     credits: str = Field("", description="attribution: the map's makers, one sentence or more")
 
     @field_validator("types")
@@ -69,10 +70,7 @@ class BoxesConfig(Config):
         return types
 
     def inputs(self) -> dict[str, Path]:
-        if self.path is None:
-            fix = "--set maps.boxes.path=FILE"
-            raise ConfigError("no file is set", where="maps.boxes.path", expected="a path", fix=fix)
-        return {"boxes": self.path}
+        return {"boxes": required(self.path, "maps.boxes.path")}
 
 
 class _Row(NamedTuple):
@@ -87,10 +85,13 @@ class _Row(NamedTuple):
 def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     """Read boxes; the seed changes nothing."""
     path = cfg.inputs()["boxes"]
-    readers = {".json": _read_ours, ".csv": _read_rows, ".geojson": _read_rows}
-    if path.suffix.lower() not in readers:
-        raise InputError("the kind of map is unknown", where=path, got=path.suffix, expected=", ".join(readers))
-    box_map = readers[path.suffix.lower()](cfg, path)
+    suffix = path.suffix.lower()
+    if suffix not in (".json", ".csv", ".geojson"):
+        raise InputError("the kind of map is unknown", where=path, got=path.suffix, expected=".json, .csv, .geojson")
+    if suffix == ".json" and (cfg.types or cfg.ignore or cfg.ground_z_m):
+        what, fix = "boxes_3d.json has its own types and ground", "remove the settings types, ignore and ground_z_m"
+        raise ConfigError(what, where="maps.boxes", fix=fix)
+    box_map = read_boxes(path) if suffix == ".json" else _read_rows(cfg, path, suffix)
     given = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})
     source = MapSource(tool=box_map.header.source.tool or "boxes", file=path.name)
     header = box_map.header.model_copy(update={**given, "source": source})
@@ -98,7 +99,7 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     if np.abs((low + high)[:2] / 2).max() > FAR_M and header.ground is None:
         origin = origin_m(low, high, path)
         log.info("%s: the middle of the map, %s, becomes the origin", path.name, origin[:2].tolist())
-        header = header.model_copy(update={"offset_m": offset_header(origin)})
+        header = header.model_copy(update={"offset_m": dict(zip("xyz", origin.tolist(), strict=True))})
         box_map = replace(box_map, centers=box_map.centers - origin)
     box_map = replace(box_map, header=header)
     log.info("%s: %s", path.name, plausibility(box_map))
@@ -125,15 +126,8 @@ def plausibility(box_map: BoxMap) -> str:
     )
 
 
-def _read_ours(cfg: BoxesConfig, path: Path) -> BoxMap:
-    if cfg.types or cfg.ignore or cfg.ground_z_m:
-        what, fix = "boxes_3d.json has its own types and ground", "remove the settings types, ignore and ground_z_m"
-        raise ConfigError(what, where="maps.boxes", fix=fix)
-    return read_boxes(path)
-
-
-def _read_rows(cfg: BoxesConfig, path: Path) -> BoxMap:
-    rows = list((_table_rows if path.suffix.lower() == ".csv" else _feature_rows)(cfg, path))
+def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
+    rows = list((_table_rows if suffix == ".csv" else _feature_rows)(cfg, path))
     if not rows:
         raise InputError("the map holds no boxes", where=path, expected="a box in each row or feature")
     boxes, places = BoxList(), dict[str, list[str]]()  # problem -> its rows, so that it is listed once
@@ -163,7 +157,9 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
                 continue
             if not names:
                 names = cells
-                problems = _unknown(names, cfg) + [f"no column {name}" for name in REQUIRED if name not in names]
+                problems = _unknown(names, cfg) + [
+                    f"no column {name}" for name in ("type", *PLACE) if name not in names
+                ]
                 problems += [f"column {name} occurs twice" for name, count in Counter(names).items() if count > 1]
                 if problems:
                     raise InputError.of_all(problems, where=path, expected=f"columns {', '.join(COLUMNS)}, by commas")
@@ -180,18 +176,41 @@ def _feature_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
     names = dict.fromkeys(name for feature in features for name in feature.properties)
     yield from (_Row("", {}, problem=problem) for problem in _unknown(list(names), cfg))
     rings = [ring for feature in features for part in feature.parts for ring in part]
-    project = to_metres(cfg.units, np.concatenate(rings), path) if rings else None
+    project = _to_metres(cfg, np.concatenate(rings), path) if rings else None
     for feature in features:
         row = {k: value for k, value in feature.properties.items() if value is not None and k in COLUMNS}
         if feature.wrong or project is None:
             yield _Row(feature.where, row, problem=feature.wrong)
             continue
-        for part in feature.parts:
-            outer, *holes = (project(ring) for ring in part)
+        for outer, *holes in ([project(ring) for ring in part] for part in feature.parts):
             if len(outer) == 1:
                 yield _Row(feature.where, {**row, "x_m": outer[0, 0], "y_m": outer[0, 1]})
             else:
                 yield _Row(feature.where, row, Polygon(outer, holes))
+
+
+def _to_metres(cfg: BoxesConfig, places: np.ndarray, path: Path) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the function that turns coordinates, like all of the file, (n, 2), into metres east and north.
+
+    Degrees are projected on the plane that touches the Earth in the middle.
+    """
+    low, high = places.min(axis=0), places.max(axis=0)
+    size = float((high - low).max())
+    may_be_degrees = size <= WIDEST_DEG and (np.abs(places) <= [180.0, 90.0]).all()
+    if (cfg.units == "degrees" and not may_be_degrees) or (cfg.units == "m" and may_be_degrees and size > 0):
+        other, expected = "m", "longitude and latitude of one town"
+        if cfg.units == "m":
+            other, expected = "degrees", "wider than 2 m"
+        got, fix = f"{low.tolist()} to {high.tolist()}", f"--set maps.boxes.units={other}, if that is their unit"
+        raise InputError(f"the coordinates are not in {cfg.units}", where=path, got=got, expected=expected, fix=fix)
+    if cfg.units == "m":
+        return lambda ring: ring
+    middle = (low + high) / 2
+    log.info("longitude and latitude: metres east and north of %.6f, %.6f", *middle)
+    latitude = math.radians(middle[1])
+    bent = 1 - EARTH_E2 * math.sin(latitude) ** 2
+    east_m, north_m = EARTH_M / math.sqrt(bent) * math.cos(latitude), EARTH_M * (1 - EARTH_E2) / bent**1.5  # a radian
+    return lambda ring: np.radians(ring - middle) * [east_m, north_m]
 
 
 def _unknown(names: Sequence[str], cfg: BoxesConfig) -> list[str]:
@@ -204,29 +223,25 @@ def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> str:
     name = str(row.values.get("type", ""))
     kind, numbers = cfg.types.get(name, name), {k: _number(row.values[k]) for k in NUMBERS if k in row.values}
     is_slab = "height_m" not in numbers and kind in TYPES and KINDS[kind] in GROUND_KINDS
-    needed = ("x_m", "y_m", "length_m", "width_m") if row.outline is None else ()
-    needed = needed if is_slab else (*needed, "height_m")
+    needed = PLACE * (row.outline is None) + ("height_m",) * (not is_slab)
     problems = [] if kind in TYPES else [f"unknown type {name[:40]!r}{nearest(name, [*TYPES, *cfg.types])}"]
     problems += [f"no {size}" for size in needed if size not in numbers]
-    problems += [
-        f"{k} is not a finite number: {str(row.values[k])[:40]!r}" for k, v in numbers.items() if math.isnan(v)
-    ]
+    wrong = [name for name, number in numbers.items() if math.isnan(number)]
+    problems += [f"{name} is not a finite number: {str(row.values[name])[:40]!r}" for name in wrong]
     problems += [f"{size} is not more than 0" for size in needed if size[0] in "lwh" and numbers.get(size, 1.0) <= 0]
     if row.outline is not None and not row.outline.is_valid:
         problems.append(f"the outline crosses itself: {shapely.is_valid_reason(row.outline)}")
     if problems:
         return ", ".join(problems)
     height_m = SLAB_M if is_slab else numbers["height_m"]
-    low_m = cfg.ground_z_m - (SLAB_M if is_slab else 0.0)
-    if "z_m" in numbers:
-        low_m = numbers["z_m"] - height_m / 2
+    low_m = numbers["z_m"] - height_m / 2 if "z_m" in numbers else cfg.ground_z_m - SLAB_M * is_slab
     if row.outline is None:
-        size = numbers["length_m"], numbers["width_m"]
-        yaw_deg = numbers.get("yaw_deg", 0.0)
-        boxes.add(kind, (numbers["x_m"], numbers["y_m"]), size, low_m, low_m + height_m, yaw_deg)
-        return ""
-    for rectangle in cover(row.outline, min_fill=OUTLINE_FILL, min_size_m=OUTLINE_PIECE_M, shares=CUT_SHARES):
-        boxes.add(kind, rectangle.center, rectangle.size, low_m, low_m + height_m, rectangle.yaw_deg)
+        x_m, y_m, length_m, width_m = (numbers[name] for name in PLACE)
+        rectangles = [Rectangle((x_m, y_m), (length_m, width_m), numbers.get("yaw_deg", 0.0))]
+    else:
+        rectangles = cover(row.outline, min_fill=OUTLINE_FILL, min_size_m=OUTLINE_PIECE_M, shares=CUT_SHARES)
+    for center, size, yaw_deg in rectangles:
+        boxes.add(kind, center, size, low_m, low_m + height_m, yaw_deg)
     return ""
 
 

@@ -1,43 +1,63 @@
-"""The list of upright boxes that every map source fills, and that becomes a BoxMap."""
+"""What the map sources share: the list of boxes that they fill, the file that they read, the origin of a map."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map
 from cosfly.formats.kinds import KINDS
+from cosfly.runtime.errors import ConfigError, InputError
 
 Pair = Sequence[float] | np.ndarray  # x and y
+WIDEST_M = 20_000.0  # of a map
 
 
+@dataclass
 class BoxList:
     """A growing list of upright boxes in world metres, with ids from 1 in the order of adding."""
 
-    def __init__(self) -> None:
-        self._rows: list[tuple[float, ...]] = []  # center 3, half extent 3, yaw_deg
-        self._kinds: list[int] = []
+    rows: list[tuple[float, ...]] = field(default_factory=list)  # center 3, half extent 3, yaw_deg
+    kinds: list[int] = field(default_factory=list)
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self.rows)
 
     def add(self, kind: str, center_xy: Pair, size_xy: Pair, low_m: float, high_m: float, yaw_deg: float = 0.0) -> None:
         """Add a box by its footprint (full sizes before turning, m) and its height interval."""
         if size_xy[0] <= 0 or size_xy[1] <= 0 or high_m <= low_m:
             raise ValueError(f"the box is empty: {kind}, {size_xy}, {low_m} to {high_m} m")
         center = (float(center_xy[0]), float(center_xy[1]), (low_m + high_m) / 2)
-        self._rows.append((*center, size_xy[0] / 2, size_xy[1] / 2, (high_m - low_m) / 2, float(yaw_deg)))
-        self._kinds.append(KINDS[kind])
+        self.rows.append((*center, size_xy[0] / 2, size_xy[1] / 2, (high_m - low_m) / 2, float(yaw_deg)))
+        self.kinds.append(KINDS[kind])
 
-    def add_span(self, kind: str, low_xy: Pair, high_xy: Pair, low_m: float, high_m: float) -> None:
-        """Add an unturned box by the corners of its footprint."""
-        center = ((low_xy[0] + high_xy[0]) / 2, (low_xy[1] + high_xy[1]) / 2)
-        self.add(kind, center, (high_xy[0] - low_xy[0], high_xy[1] - low_xy[1]), low_m, high_m)
+    def span(self, kind: str, a: Pair, b: Pair, low_m: float, high_m: float) -> None:
+        """Add an unturned box by two opposite corners of its footprint, in any order."""
+        center = (a[0] + b[0]) / 2, (a[1] + b[1]) / 2
+        self.add(kind, center, (abs(b[0] - a[0]), abs(b[1] - a[1])), low_m, high_m)
 
     def box_map(self, header: MapHeader | None = None) -> BoxMap:
         """Return the map of everything added so far."""
-        rows = np.array(self._rows, dtype=np.float64).reshape(-1, 7)
+        rows = np.array(self.rows, dtype=np.float64).reshape(-1, 7)
         rotations_deg = np.zeros((len(rows), 3))
         rotations_deg[:, 1] = rows[:, 6]
-        return make_box_map(rows[:, :3], rows[:, 3:6], rotations_deg, self._kinds, header=header)
+        return make_box_map(rows[:, :3], rows[:, 3:6], rotations_deg, self.kinds, header=header)
+
+
+def origin_m(low: np.ndarray, high: np.ndarray, where: str | Path, ground_z_m: float = 0.0) -> np.ndarray:
+    """Return the place that becomes a map's origin, (3,) m: the middle of its bounds, at the height of its ground."""
+    if not (high - low <= WIDEST_M).all():
+        got = " x ".join(f"{size:.6g}" for size in high - low) + " m"
+        fix = "cut a part out, or remove stray vertices"
+        raise InputError("the map is too wide or too high", where=where, got=got, expected="at most 20 km", fix=fix)
+    return np.array([*np.round((low + high)[:2] / 2), round(float(ground_z_m), 3)])
+
+
+def required(path: Path | None, setting: str) -> Path:
+    """Return the path of a setting; raise ConfigError if it is not set."""
+    if path is None:
+        raise ConfigError("no file is set", where=setting, expected="a path", fix=f"--set {setting}=FILE")
+    return path

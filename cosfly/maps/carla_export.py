@@ -1,9 +1,7 @@
 """The town of a running CARLA server: `get_environment_objects` of every label, as boxes (sec:step1).
 
-The client can crash, so it runs in its own process. A building is several boxes, as intended. Known defects of such
-exports are counted and reported: labels without objects, repeated objects and ids, boxes without a size, one huge box
-around all of the terrain or the vegetation; and roads without objects along them, as on large maps, where the server
-has only the tiles around the spectator in memory.
+Known defects of such exports are counted and reported: labels without objects, repeated objects and ids, boxes without
+a size, one huge box around all of the terrain or the vegetation, and roads without objects along them.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ import multiprocessing
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -59,7 +57,7 @@ class CarlaTown:
 
 
 def ask(cfg: CarlaConfig) -> CarlaTown:
-    """Ask the server for all objects and road points; runs in its own process."""
+    """Ask the server for all objects and road points; runs in its own process, because the client can crash."""
     connection = connect(cfg, cfg.port)
     answers = CarlaTown(connection.town, connection.version)
     labels = connection.carla.CityObjectLabel.names.items()
@@ -94,43 +92,32 @@ def load(cfg: CarlaMapConfig, seed: int) -> BoxMap:
 def box_map_of(answers: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
     """Return a map of a server's answers; the header counts dropped objects."""
     where = f"{cfg.host}:{cfg.port} (CARLA {answers.version}), {answers.town}"
-    dropped, seen, ids, num_repeated = Counter[str](), set(), set[int](), 0
-    centers, halves, turns, kinds = [], [], [], []
-    numbers = list[int]()
+    dropped, seen, num_repeated = Counter[str](), set(), 0
+    rows = dict[int, tuple]()  # by id: centre, half sizes, rotation, kind
     for label, number, name, box in answers.rows:
         key = (label, *np.round(box, 3).tolist())
         if reason := _unfit(label, np.array(box), cfg) or ("duplicate" if key in seen else ""):
             dropped[reason] += 1
             continue
         seen.add(key)
-        if number in ids:
+        if number in rows:
             num_repeated += 1
             number = int(sha256_bytes(f"{number} {name} {key}".encode())[:16], 16)
-        ids.add(number)
         position_m, rotation_deg = world_pose((*box[:3], *box[6:]))
-        centers.append(position_m)
-        halves.append(box[3:6])
-        turns.append(rotation_deg)
-        kinds.append(KINDS[label])
-        numbers.append(number)
-    if not numbers:
+        rows[number] = position_m, box[3:6], rotation_deg, KINDS[label]
+    if not rows:
         expected = "objects of get_environment_objects"
         raise InputError("the town has no objects", where=where, got=f"{len(answers.rows)}", expected=expected)
     header = MapHeader(
-        name=cfg.name or answers.town,
-        source=MapSource(tool="CARLA", version=answers.version, file=answers.town),
-        licence=cfg.licence,
-        credits=cfg.credits,
-        extent_sources={"engine": len(numbers)},
-        num_objects=len(answers.rows),
-        dropped_objects=dict(dropped),
-        empty_labels=answers.empty_labels,
-        repeated_ids=num_repeated,
-    )
-    box_map = make_box_map(centers, halves, turns, kinds, numbers, header)
+        name=cfg.name or answers.town, source=MapSource(tool="CARLA", version=answers.version, file=answers.town),
+        licence=cfg.licence, credits=cfg.credits, extent_sources={"engine": len(rows)}, num_objects=len(answers.rows),
+        dropped_objects=dict(dropped), empty_labels=answers.empty_labels, repeated_ids=num_repeated,
+    )  # fmt: skip
+    centers, halves, turns, kinds = zip(*rows.values(), strict=True)
+    box_map = make_box_map(centers, halves, turns, kinds, list(rows), header)
     tops_m = box_map.maxs[box_map.kinds == KINDS["Roads"], 2]
     ground_z_m = cfg.ground_z_m if cfg.ground_z_m is not None else float(np.median(tops_m)) if len(tops_m) else 0.0
-    box_map = make_box_map(centers, halves, turns, kinds, numbers, header.model_copy(update={"ground_z_m": ground_z_m}))
+    box_map = replace(box_map, header=header.model_copy(update={"ground_z_m": ground_z_m}))
     _report(answers, box_map, where, tops_m)
     return box_map
 
@@ -162,6 +149,6 @@ def _report(answers: CarlaTown, box_map: BoxMap, where: str, tops_m: np.ndarray)
     gaps_m = [np.maximum(low_m - place, place - high_m).max(axis=1).min() for place in roads_m]
     if num := sum(gap > ALONG_M for gap in gaps_m):
         what = (
-            "%s: %d of %d places on roads have no object within %.0f m: on a large map only tiles near the spectator do"
+            "%s: %d of %d places on roads have no object within %.0f m: large maps load only tiles near the spectator"
         )
         log.warning(what, where, num, len(roads_m), ALONG_M)

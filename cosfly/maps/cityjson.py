@@ -1,17 +1,12 @@
 """A CityJSON city model (1.1 or 2.0, one document or a text sequence, plain or gzipped): polygons become oriented
-boxes.
-
-One box around an object can be hundreds of metres wide, so everything is cut up: solids into rectangles that cover
-their footprint, surfaces into thin slabs that never obstruct a pedestrian, walls along their course. Vegetation is a
-surface in such models, with the heights of its canopy in the vertices: it becomes a lawn, and trees where it rises well
-over the ground. The middle of the map becomes the origin, and the usual height of its roads z = 0; `header.offset_m`
-leads back. Ground that is nearly flat is made flat; sloping ground is kept as a grid of heights, from its terrain or
-the feet of its buildings, and everything but solids follows it.
+boxes, cut up, because one box around an object can be hundreds of metres wide. Surfaces become thin slabs that never
+obstruct a pedestrian; green with the heights of its canopy becomes a lawn, and trees where it rises over the ground.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,13 +19,11 @@ from shapely.geometry import Polygon
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, GroundGrid, LicenceId, MapHeader, MapSource
 from cosfly.formats.meshes import MESHES_FILE, Mesh, Meshes, MeshRef
 from cosfly.geometry.ground import Ground
-from cosfly.maps.boxlist import BoxList
+from cosfly.maps.boxlist import BoxList, origin_m, required
 from cosfly.maps.cityjson_file import CityObject, Surface, read_model
-from cosfly.maps.coordinates import offset_header, origin_m
 from cosfly.maps.derived_ground import with_derived_ground
 from cosfly.maps.footprints import CUT_SHARES, Rectangle, check_outline, cover, polygons_of, rectangle_polygon, united
 from cosfly.runtime.config import Config
-from cosfly.runtime.errors import ConfigError
 
 log = logging.getLogger(__name__)
 
@@ -71,25 +64,16 @@ class CityJsonConfig(Config):
 
     name: str = Field("CityJson", min_length=1, description="map name, the head of the playback tree's folder names")
     path: Path | None = Field(None, description="the CityJSON file, .json or .city.jsonl, or either gzipped")
-    licence: LicenceId = Field(
-        UNKNOWN_LICENCE, description="licence of the model, as the hub spells it (cc-by-4.0); goes into every release"
-    )
+    licence: LicenceId = Field(UNKNOWN_LICENCE, description="licence of the model, as the hub spells it (cc-by-4.0)")
     credits: str = Field("", description="attribution: the model's makers, one sentence or more")
     tool: str = Field("CityJSON", description="tool and version that made the file, for the records")
-    solids: bool = Field(
-        True, description="draw solids with their own roofs and walls (meshes.glb); planners use the boxes"
-    )
+    solids: bool = Field(True, description="draw solids with their own roofs and walls; planners use the boxes")
     derive_ground: bool = Field(
-        True,
-        description="a model without streets, pavements and squares gets pavement along facades, asphalt between near "
-        "buildings and lawn, derived from the buildings; the map's header and credits say so",
+        True, description="derive pavement, asphalt and lawn from the buildings of a model without streets and squares"
     )
 
     def inputs(self) -> dict[str, Path]:
-        if self.path is None:
-            fix = "--set maps.cityjson.path=FILE"
-            raise ConfigError("no file is set", where="maps.cityjson.path", expected="a path", fix=fix)
-        return {"city_model": self.path}
+        return {"city_model": required(self.path, "maps.cityjson.path")}
 
 
 class Facet(NamedTuple):
@@ -105,7 +89,8 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     model = read_model(path)
     objects, origin = _centred(model.objects, path)
     ground = ground_of(objects)
-    objects = objects if ground.is_flat else [_over_ground(item, ground) for item in objects]
+    if not ground.is_flat:  # heights over the ground below each vertex; solids keep theirs, or their roofs would slope
+        objects = [item if item.rule.form == "solid" else _over_ground(item, ground) for item in objects]
     facets = {item.object_id: _facets(item) for item in objects}
     footprints = {key: united([facet.polygon for facet in value]) for key, value in facets.items()}
     boxes, solid_rows = BoxList(), list[int]()
@@ -135,18 +120,13 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
             _add_trees(boxes, item, facets[item.object_id])
     _add_water(boxes, objects, footprints)
     header = MapHeader(
-        name=cfg.name,
-        source=MapSource(tool=cfg.tool, version=f"CityJSON {model.version}", file=path.name),
-        licence=cfg.licence,
-        credits=cfg.credits,
-        ground_z_m=0.0,
-        offset_m=offset_header(origin),
-        building_footprint_m2=round(footprint_m2, 1),
+        name=cfg.name, source=MapSource(tool=cfg.tool, version=f"CityJSON {model.version}", file=path.name),
+        licence=cfg.licence, credits=cfg.credits, ground_z_m=0.0,
+        offset_m=dict(zip("xyz", origin.tolist(), strict=True)), building_footprint_m2=round(footprint_m2, 1),
         building_area_ratio=round(boxes_m2 / footprint_m2, 4) if footprint_m2 else None,
         building_covered_share=round(covered_m2 / footprint_m2, 4) if footprint_m2 else None,
-        num_objects=model.num_objects,
-        dropped_objects=model.dropped,
-    )
+        num_objects=model.num_objects, dropped_objects=model.dropped,
+    )  # fmt: skip
     if not ground.is_flat:
         header = header.model_copy(update={"ground": GroundGrid.of(ground)})
     box_map = replace(boxes.box_map(header), meshes=Meshes(refs, made=made))
@@ -157,10 +137,6 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
 
 
 def _over_ground(item: CityObject, ground: Ground) -> CityObject:
-    """Return an object with heights over the ground below each vertex; solids keep theirs, or their roofs would
-    slope."""
-    if item.rule.form == "solid":
-        return item
     rings = [[r - np.outer(ground.height_at(r), [0.0, 0.0, 1.0]) for r in surface] for surface in item.surfaces]
     return item._replace(surfaces=rings)
 
@@ -182,7 +158,7 @@ def _facets(item: CityObject) -> list[Facet]:
     """Project the surfaces of an object that are not upright."""
     facets = []
     for ring, *holes in item.surfaces:
-        # Newell's normal: correct for any planar ring. (np.cross is slow on short rings.)
+        # Newell's normal is correct for any planar ring; np.cross is slow on short rings.
         after = np.concatenate([ring[1:], ring[:1]])
         normal = (ring[:, [1, 2, 0]] * after[:, [2, 0, 1]] - ring[:, [2, 0, 1]] * after[:, [1, 2, 0]]).sum(axis=0)
         if abs(normal[2]) <= STEEP * np.linalg.norm(normal) or abs(normal[2]) < 1e-6:
@@ -199,25 +175,26 @@ def _facets(item: CityObject) -> list[Facet]:
 # --- boxes ------------------------------------------------------------------------------------------------------------
 
 
+def _pieces(footprint: Any, tolerance_m: float, **rules: Any) -> Iterator[Rectangle]:
+    """Yield the rectangles that cover each polygon of a footprint, simplified; `rules` are those of `cover`."""
+    for polygon in polygons_of(footprint):
+        yield from cover(polygon.simplify(tolerance_m), **rules)
+
+
 def _add_solid(
     boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint, ground: Ground
 ) -> tuple[Any, Mesh | None]:
     """Add a building as upright boxes from its lowest ground (or below it) to its top; return the union of their
-    outlines, and the mesh to draw.
-
-    A box is as high as the mesh in it, so that a spire, which the plainer geometry lacks, is known to planners.
-    """
+    outlines, and the mesh to draw. A box is as high as the mesh in it, so that planners know its spires."""
     z = item.corners()[:, 2]
     low = min(float(z.min()), float(ground.height_at(item.corners()).min()))
     high = max(float(z.max()), float(z.min()) + 0.1)
     mesh = solid_mesh(item.detailed, low) if cfg.solids else None
     outlines = []
-    for polygon in polygons_of(footprint):
-        outline = polygon.simplify(0.05)
-        for rectangle in cover(outline, min_fill=SOLID_FILL, min_size_m=SOLID_PIECE_M, shares=CUT_SHARES):
-            top = high if mesh is None else top_within(mesh, rectangle, high)
-            boxes.add(item.rule.kind, rectangle.center, rectangle.size, low, max(top, low + 0.1), rectangle.yaw_deg)
-            outlines.append(rectangle_polygon(rectangle))
+    for rectangle in _pieces(footprint, 0.05, min_fill=SOLID_FILL, min_size_m=SOLID_PIECE_M, shares=CUT_SHARES):
+        top = high if mesh is None else _top_within(mesh, rectangle, high)
+        boxes.add(item.rule.kind, rectangle.center, rectangle.size, low, max(top, low + 0.1), rectangle.yaw_deg)
+        outlines.append(rectangle_polygon(rectangle))
     return united(outlines), mesh
 
 
@@ -228,19 +205,19 @@ def solid_mesh(surfaces: list[Surface], foot_m: float) -> Mesh | None:
     """
     lowest = min(float(ring[:, 2].min()) for surface in surfaces for ring in surface)
 
-    def lowered(ring: np.ndarray) -> np.ndarray:
-        low = ring.copy()
-        low[ring[:, 2] <= lowest + FOOT_M, 2] = min(lowest, foot_m)
-        return low
-
-    found = [part for surface in surfaces if len(part := triangles_of([lowered(ring) for ring in surface]))]
-    if not found:
+    parts = []
+    for surface in surfaces:
+        rings = [ring.copy() for ring in surface]
+        for ring in rings:
+            ring[ring[:, 2] <= lowest + FOOT_M, 2] = min(lowest, foot_m)
+        parts.append(_triangles_of(rings))
+    corners = np.concatenate(parts)
+    if not len(corners):
         return None
-    corners = np.concatenate(found)
     return Mesh(corners, np.full((len(corners), 3), np.nan))
 
 
-def top_within(mesh: Mesh, rectangle: Rectangle, otherwise: float) -> float:
+def _top_within(mesh: Mesh, rectangle: Rectangle, otherwise: float) -> float:
     """Return the height of the highest triangle over a rectangle; `otherwise` if there is none."""
     yaw = np.radians(rectangle.yaw_deg)
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
@@ -249,7 +226,7 @@ def top_within(mesh: Mesh, rectangle: Rectangle, otherwise: float) -> float:
     return float(mesh.corners_m[over, :, 2].max()) if over.any() else otherwise
 
 
-def triangles_of(rings: Surface) -> np.ndarray:
+def _triangles_of(rings: Surface) -> np.ndarray:
     """Return triangles of a surface that turn as its outline does, (k, 3, 3), with the surface's own corners.
 
     Of an outline that crosses itself the valid parts are used; their new corners lie in the surface's plane.
@@ -267,15 +244,15 @@ def triangles_of(rings: Surface) -> np.ndarray:
     axes = np.stack([side, np.cross(normal, side)])  # seen from outside the outline turns counter-clockwise
     middle = outline.mean(axis=0)
     flat = [(ring - middle) @ axes.T for ring in rings]
-    if len(rings) == 1 and len(outline) == 4 and _is_convex(flat[0]):
-        return outline[[(0, 1, 2), (0, 2, 3)]]
+    if len(rings) == 1 and len(outline) == 4:
+        edges = np.roll(flat[0], -1, axis=0) - flat[0]
+        following = np.roll(edges, -1, axis=0)
+        if (edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0] > 0).all():  # convex
+            return outline[[(0, 1, 2), (0, 2, 3)]]
     polygon = Polygon(flat[0], flat[1:])
     pieces = polygons_of(polygon if polygon.is_valid else shapely.make_valid(polygon))
-    own = {
-        (x, y): corner
-        for places, ring in zip(flat, rings, strict=True)
-        for (x, y), corner in zip(places.tolist(), ring, strict=True)
-    }
+    own = {(x, y): corner for places, ring in zip(flat, rings, strict=True)
+           for (x, y), corner in zip(places.tolist(), ring, strict=True)}  # fmt: skip
     found = []
     for triangle in shapely.get_parts([shapely.constrained_delaunay_triangles(piece) for piece in pieces]):
         places = shapely.get_coordinates(shapely.orient_polygons(triangle))[:3]
@@ -283,39 +260,28 @@ def triangles_of(rings: Surface) -> np.ndarray:
     return np.array(found).reshape(-1, 3, 3)
 
 
-def _is_convex(ring: np.ndarray) -> bool:
-    edges = np.roll(ring, -1, axis=0) - ring
-    following = np.roll(edges, -1, axis=0)
-    return bool((edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0] > 0).all())
-
-
 def _add_wall(boxes: BoxList, item: CityObject, footprint, *, is_flat: bool) -> None:
     """Add a wall piece by piece along its course, as high as the upper quartile of its vertices."""
     high = float(np.clip(np.percentile(item.corners()[:, 2], 75), 0.3, WALL_MAX_M))
-    for polygon in polygons_of(footprint):
-        longest_m, low = (np.inf, -SLAB_M) if is_flat else (SLOPED_WALL_M, -SLOPED_WALL_DEPTH_M)
-        outline = polygon.simplify(0.02)
-        for rectangle in cover(outline, min_fill=WALL_FILL, min_size_m=WALL_PIECE_M, max_size_m=longest_m):
-            boxes.add(item.rule.kind, rectangle.center, rectangle.size, low, high, rectangle.yaw_deg)
+    longest_m, low = (np.inf, -SLAB_M) if is_flat else (SLOPED_WALL_M, -SLOPED_WALL_DEPTH_M)
+    for piece in _pieces(footprint, 0.02, min_fill=WALL_FILL, min_size_m=WALL_PIECE_M, max_size_m=longest_m):
+        boxes.add(item.rule.kind, piece.center, piece.size, low, high, piece.yaw_deg)
 
 
 def _add_surface(boxes: BoxList, kind: str, footprint) -> None:
     """Add a surface as slabs at the height of its kind, so that it never obstructs a pedestrian."""
     top = SURFACE_TOPS_M.get(kind, -0.1)
     fill, piece_m = (WATER_FILL, WATER_PIECE_M) if kind == "Water" else (SURFACE_FILL, SURFACE_PIECE_M)
-    for polygon in polygons_of(footprint):
-        for rectangle in cover(polygon.simplify(0.05), min_fill=fill, min_size_m=piece_m, max_size_m=SURFACE_MAX_M):
-            boxes.add(kind, rectangle.center, rectangle.size, top - SLAB_M, top, rectangle.yaw_deg)
+    for piece in _pieces(footprint, 0.05, min_fill=fill, min_size_m=piece_m, max_size_m=SURFACE_MAX_M):
+        boxes.add(kind, piece.center, piece.size, top - SLAB_M, top, piece.yaw_deg)
 
 
 def _add_water(boxes: BoxList, objects: list[CityObject], footprints: dict[str, Any]) -> None:
     """Add water without the bridges and streets that cross it: pedestrians cannot walk on water."""
-    water = [footprints[item.object_id] for item in objects if item.rule.kind == "Water"]
-    if not water:
-        return
+    water = united([footprints[item.object_id] for item in objects if item.rule.kind == "Water"])
     crossing = [footprints[i.object_id] for i in objects if i.rule.kind in ("Bridge", "Roads", "Sidewalks", "Ground")]
-    rest = shapely.difference(united(water), shapely.buffer(united(crossing), 0.05)) if crossing else united(water)
-    _add_surface(boxes, "Water", rest)
+    if not water.is_empty:
+        _add_surface(boxes, "Water", shapely.difference(water, shapely.buffer(united(crossing), 0.05)))
 
 
 def _add_trees(boxes: BoxList, item: CityObject, facets: list[Facet]) -> None:
@@ -333,8 +299,7 @@ def _canopy_heights(item: CityObject, facets: list[Facet]) -> tuple[np.ndarray, 
     """Rasterise the heights of a surface: the highest corner in each cell, and the surface over the cell's middle.
 
     Returns:
-        Heights (nx, ny) m, 0 off the surface; the indices (2,) of the first cell, with its low corner at
-        index * CANOPY_CELL_M.
+        Heights (nx, ny) m, 0 off the surface; indices (2,) of the first cell: its low corner over CANOPY_CELL_M.
     """
     cell_m = CANOPY_CELL_M
     bounds = np.array([facet.polygon.bounds for facet in facets])
@@ -357,11 +322,8 @@ def _canopy_heights(item: CityObject, facets: list[Facet]) -> tuple[np.ndarray, 
 
 
 def _crowns(heights: np.ndarray) -> list[tuple[int, int, int, int, float]]:
-    """Gather the cells of a canopy, (nx, ny) m, into trees, the highest first.
-
-    Returns:
-        (x0, y0, x1, y1, height) in cells, ends excluded; every cell over CANOPY_M lies in exactly one.
-    """
+    """Gather the cells of a canopy, (nx, ny) m, into trees, the highest first: (x0, y0, x1, y1, height) in cells, ends
+    excluded. Every cell over CANOPY_M lies in exactly one."""
     free = heights > CANOPY_M
     trees = []
     for flat in np.argsort(-heights, axis=None, kind="stable"):
@@ -393,8 +355,8 @@ def ground_of(objects: list[CityObject]) -> Ground:
     samples, origin = (np.concatenate(terrain) if terrain else np.empty((0, 3))), "its terrain and streets"
     if not terrain:
         feet = [item.corners() for item in objects if item.rule.form == "solid"] or [i.corners() for i in objects]
-        middles = [[*(c[:, :2].min(axis=0) + c[:, :2].max(axis=0)) / 2, c[:, 2].min()] for c in feet]
-        samples, origin = np.array(middles), "the feet of its buildings"
+        samples = np.array([[*(c[:, :2].min(axis=0) + c[:, :2].max(axis=0)) / 2, c[:, 2].min()] for c in feet])
+        origin = "the feet of its buildings"
     low, high = np.percentile(samples[:, 2], RISE_SHARES)
     if high - low <= FLAT_WITHIN_M:
         if high - low > REPORTED_RISE_M:

@@ -1,7 +1,6 @@
 """Reading CityJSON: from the file to objects with a rule and with surfaces in the file's coordinates.
 
-Versions 1.1 and 2.0, one document or a text sequence (CityJSONSeq: the document first, then one feature a line), plain
-or gzipped. In a sequence every feature has its own vertices.
+One document or a text sequence (CityJSONSeq: the document first, then one feature a line, with its own vertices).
 """
 
 from __future__ import annotations
@@ -39,6 +38,11 @@ class ObjectRule(NamedTuple):
     form: Form
     attribute: str = ""
     value: str = "*"
+
+    def covers(self, item: _Object) -> bool:
+        """Return whether the rule is for an object. Extension types (a leading +) count as their base name."""
+        given = str((item.attributes or {}).get(self.attribute, ""))
+        return fnmatchcase(item.type.removeprefix("+"), self.type) and fnmatchcase(given, self.value)
 
 
 # The first rule that matches decides. Attribute values are those of the Dutch register BGT, as 3dfier writes them.
@@ -135,39 +139,35 @@ class _Document(_Part):
     templates: _Templates = Field(_Templates(), alias="geometry-templates")
 
 
-class _Shapes(NamedTuple):
+class _Vertices(NamedTuple):
     """Vertices of a part, the templates of the document and their vertices, (n, 3) m."""
 
-    vertices: np.ndarray
+    own: np.ndarray
     templates: list[_Geometry]
-    template_vertices: np.ndarray
+    of_templates: np.ndarray
 
 
 def read_model(path: Path) -> CityModel:
     """Read a CityJSON file or text sequence, plain or gzipped; coordinates stay the file's."""
     version, head, features = _read_parts(path)
-    templates = head.templates
-    template_vertices = _vectors(templates.vertices, f"{path}: geometry-templates.vertices-templates")
-    scale, translate = np.array(head.transform.scale), np.array(head.transform.translate)
-    objects: dict[str, CityObject] = {}
-    dropped = {"unmapped_type": 0, "group": 0, "no_geometry": 0, "outline_of_parts": 0, "repeated_id": 0}
-    known, num_objects = set[str](), 0
+    of_templates = _vectors(head.templates.vertices, f"{path}: geometry-templates.vertices-templates")
+    objects, known, num_objects = dict[str, CityObject](), set[str](), 0
+    dropped = dict.fromkeys(("unmapped_type", "group", "no_geometry", "outline_of_parts", "repeated_id"), 0)
     for where, part in [(str(path), head), *features] if head.objects else features:
-        vertices = _vectors(part.vertices, f"{where}: vertices") * scale + translate
-        shapes = _Shapes(vertices, templates.templates, template_vertices)
+        own = _vectors(part.vertices, f"{where}: vertices") * head.transform.scale + head.transform.translate
+        vertices = _Vertices(own, head.templates.templates, of_templates)
         num_objects += len(part.objects)
         for object_id, value in part.objects.items():
-            found = _city_object(object_id, value, part, shapes, f"{where}: CityObjects.{object_id}")
-            reason = "repeated_id" if object_id in known else found if isinstance(found, str) else ""
-            known.add(object_id)
-            if reason:
-                dropped[reason] += 1
-            elif isinstance(found, CityObject):
+            found = _city_object(object_id, value, part, vertices, f"{where}: CityObjects.{object_id}")
+            if object_id in known or isinstance(found, str):
+                dropped["repeated_id" if object_id in known else str(found)] += 1
+            else:
                 objects[object_id] = found
-    if not objects:
-        got = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count) or "no objects"
-        raise InputError("the model has no usable object", where=f"{path}: CityObjects", got=got)
+            known.add(object_id)
     dropped = {reason: count for reason, count in dropped.items() if count}
+    if not objects:
+        got = ", ".join(f"{count} {reason}" for reason, count in dropped.items()) or "no objects"
+        raise InputError("the model has no usable object", where=f"{path}: CityObjects", got=got)
     return CityModel(list(objects.values()), dropped, num_objects, version)
 
 
@@ -175,14 +175,15 @@ def _read_parts(path: Path) -> tuple[str, _Document, list[tuple[str, _Part]]]:
     """Return the version, the document, and the features of a sequence with their places in the file."""
     data = read_unpacked(path, what="city model", most_mb=CITY_MB)
     lines = data.replace(RECORD_SEPARATOR, b"").splitlines()
-    is_sequence = len(lines) > 1 and b'"CityJSONFeature"' in data and _is_json(lines[0])
-    texts = [(f"{path}: line {k + 1}", line) for k, line in enumerate(lines) if line.strip()] if is_sequence else []
-    version, parts = "", list[tuple[str, _Part]]()
-    for where, text in texts or [(str(path), data)]:
+    texts = [(str(path), data)]
+    if len(lines) > 1 and b'"CityJSONFeature"' in data and _is_json(lines[0]):
+        texts = [(f"{path}: line {k + 1}", line) for k, line in enumerate(lines) if line.strip()]
+    version, parts = "", list[tuple[str, Any]]()
+    for where, text in texts:
         value = parse_document(text, where)
         found = value.get("type") if isinstance(value, dict) else type(value).__name__
-        expected, model = ("CityJSONFeature", _Part) if parts else ("CityJSON", _Document)
-        if not isinstance(value, dict) or found != expected:
+        expected = "CityJSONFeature" if parts else "CityJSON"
+        if found != expected:
             fix = None if parts else "put the CityJSON object with version and transform on the first line"
             what = "the object is not of the expected type"
             raise InputError(what, where=f"{where}: type", got=repr(found)[:80], expected=repr(expected), fix=fix)
@@ -192,10 +193,8 @@ def _read_parts(path: Path) -> tuple[str, _Document, list[tuple[str, _Part]]]:
                 what, got = "the version of CityJSON is not supported", repr(value.get("version"))[:80]
                 fix = "convert the file, for instance with `cjio OLD upgrade save NEW`"
                 raise InputError(what, where=f"{where}: version", got=got, expected=" or ".join(VERSIONS), fix=fix)
-        parts.append((where, validated(model, value, where)))
-    head = parts[0][1]
-    assert isinstance(head, _Document)
-    return version, head, parts[1:]
+        parts.append((where, validated(_Part if parts else _Document, value, where)))
+    return version, parts[0][1], parts[1:]
 
 
 def _is_json(line: bytes) -> bool:
@@ -215,15 +214,15 @@ def _vectors(values: list[Any], where: str) -> np.ndarray:
     return vectors
 
 
-def _city_object(object_id: str, value: _Object, part: _Part, shapes: _Shapes, where: str) -> CityObject | str:
+def _city_object(object_id: str, value: _Object, part: _Part, vertices: _Vertices, where: str) -> CityObject | str:
     """Return an object, or the reason why it is dropped."""
     if value.type == "CityObjectGroup":  # its members are objects themselves
         return "group"
-    rule = rule_of(value.type, value.attributes or {})
+    rule = next((rule for rule in RULES if rule.covers(value)), None)
     if rule is None:
         log.warning("%s: no rule for the type %s; dropped", object_id, value.type)
         return "unmapped_type"
-    placed = [_placed(g, shapes, f"{where}.geometry[{k}]") for k, g in enumerate(value.geometry)]
+    placed = [_placed(g, vertices, f"{where}.geometry[{k}]") for k, g in enumerate(value.geometry)]
     usable = [(geometry.level, number) for number, (geometry, _) in enumerate(placed) if geometry.type in NESTING]
     if not usable:
         return "no_geometry"
@@ -241,42 +240,30 @@ def _city_object(object_id: str, value: _Object, part: _Part, shapes: _Shapes, w
     return CityObject(object_id, rule, surfaces, detailed)
 
 
-def rule_of(object_type: str, attributes: dict) -> ObjectRule | None:
-    """Return the rule of an object. Extension types (a leading +) count as their base name."""
-    for rule in RULES:
-        if fnmatchcase(object_type.removeprefix("+"), rule.type) and (
-            not rule.attribute or fnmatchcase(str(attributes.get(rule.attribute, "")), rule.value)
-        ):
-            return rule
-    return None
-
-
-def _placed(geometry: _Geometry, shapes: _Shapes, where: str) -> tuple[_Geometry, np.ndarray]:
+def _placed(geometry: _Geometry, vertices: _Vertices, where: str) -> tuple[_Geometry, np.ndarray]:
     """Return a geometry and its vertices; of an instance its template, moved to its place."""
     if geometry.type != "GeometryInstance":
-        return geometry, shapes.vertices
+        return geometry, vertices.own
     anchor = geometry.boundaries[0] if len(geometry.boundaries) == 1 else None
-    if not 0 <= geometry.template < len(shapes.templates):
-        got, expected = str(geometry.template)[:40], f"below {len(shapes.templates)}"
+    if not 0 <= geometry.template < len(vertices.templates):
+        got, expected = str(geometry.template)[:40], f"below {len(vertices.templates)}"
         raise InputError("the template does not exist", where=f"{where}.template", got=got, expected=expected)
-    if type(anchor) is not int or not 0 <= anchor < len(shapes.vertices):
+    if type(anchor) is not int or not 0 <= anchor < len(vertices.own):
         got, expected = repr(geometry.boundaries)[:40], "one vertex index"
         raise InputError("the instance has no place", where=f"{where}.boundaries", got=got, expected=expected)
     if len(geometry.transformationMatrix) != 16:
         what, where = "the instance has no matrix", f"{where}.transformationMatrix"
         raise InputError(what, where=where, expected="16 finite numbers, row by row")
     matrix = np.array(geometry.transformationMatrix).reshape(4, 4)
-    corners = shapes.template_vertices @ matrix[:3, :3].T + matrix[:3, 3] + shapes.vertices[anchor]
-    return shapes.templates[geometry.template], corners
+    corners = vertices.of_templates @ matrix[:3, :3].T + matrix[:3, 3] + vertices.own[anchor]
+    return vertices.templates[geometry.template], corners
 
 
 def _surfaces(geometry: _Geometry, corners: np.ndarray, where: str) -> list[Surface]:
     """Return the surfaces of one geometry; of a solid those of its outer shell."""
     lists, nesting = geometry.boundaries, NESTING[geometry.type]
-    found: list = []
-    for solid in lists if nesting == 2 else [lists] if nesting == 1 else [[lists]]:
-        for shell in _list(solid, where)[:1]:  # the outer shell
-            found += _list(shell, where)
+    solids = lists if nesting == 2 else [lists] if nesting == 1 else [[lists]]
+    found = [one for solid in solids for shell in _list(solid, where)[:1] for one in _list(shell, where)]
     return [_rings(surface, corners, f"{where} surface {k}") for k, surface in enumerate(found)]
 
 
@@ -288,7 +275,7 @@ def _list(value: Any, where: str) -> list:
 
 
 def _rings(surface: Any, vertices: np.ndarray, where: str) -> Surface:
-    rings, num_vertices = Surface(), 0
+    rings = Surface()
     for ring in _list(surface, where):
         if not isinstance(ring, list) or len(ring) < 3 or not all(type(index) is int for index in ring):
             expected = "at least three vertex indices"
@@ -296,10 +283,9 @@ def _rings(surface: Any, vertices: np.ndarray, where: str) -> Surface:
         if min(ring) < 0 or max(ring) >= len(vertices):
             got, expected = str(min(ring) if min(ring) < 0 else max(ring)), f"0 to {len(vertices) - 1}"
             raise InputError("the vertex does not exist", where=where, got=got[:60], expected=expected)
-        num_vertices += len(ring)
         rings.append(vertices[ring])
     if not rings or not all(np.isfinite(ring).all() for ring in rings):
         raise InputError("the surface has no finite vertices", where=where, expected="a list of rings")
-    if num_vertices > MOST_VERTICES:
-        raise over_limit(where, f"a surface of {num_vertices:,} vertices", f"{MOST_VERTICES:,}", "simplify it")
+    if (num := sum(map(len, rings))) > MOST_VERTICES:
+        raise over_limit(where, f"a surface of {num:,} vertices", f"{MOST_VERTICES:,}", "simplify it")
     return rings

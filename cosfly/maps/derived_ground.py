@@ -1,9 +1,5 @@
 """Ground for a map of buildings without streets: pavement along facades, asphalt between near buildings, lawn
-elsewhere.
-
-It is derived from the buildings alone: the map's header counts its boxes (`derived_ground`), and its credits, which
-every product and release repeats, say so.
-"""
+elsewhere. The map's header counts its boxes (`derived_ground`), and its credits, that every release repeats, say so."""
 
 from __future__ import annotations
 
@@ -34,7 +30,7 @@ def with_derived_ground(box_map: BoxMap) -> BoxMap:
     boxes = BoxList()
     if not (box_map.kinds == KINDS["Terrain"]).any():
         low, high = box_map.bounds()
-        boxes.add_span("Terrain", low[:2] - VERGE_M, high[:2] + VERGE_M, LAWN_TOP_M - SLAB_M, LAWN_TOP_M)
+        boxes.span("Terrain", low[:2] - VERGE_M, high[:2] + VERGE_M, LAWN_TOP_M - SLAB_M, LAWN_TOP_M)
     houses = [
         Rectangle((center[0], center[1]), (2 * half[0], 2 * half[1]), turn[1])
         for center, half, turn in zip(standing.centers, standing.half_extents, standing.rotations_deg, strict=True)
@@ -54,8 +50,7 @@ def with_derived_ground(box_map: BoxMap) -> BoxMap:
     derived.ids[:] = np.setdiff1d(np.arange(1, len(box_map) + len(derived) + 1), box_map.ids)[: len(derived)]
     header = box_map.header
     update = {
-        "derived_ground": len(derived),
-        "added_boxes": header.added_boxes + len(derived),
+        "derived_ground": len(derived), "added_boxes": header.added_boxes + len(derived),
         "credits": f"{header.credits.rstrip('. ')}. {CREDITS}".removeprefix(". "),
-    }
+    }  # fmt: skip
     return replace(box_map.joined(derived), header=header.model_copy(update=update))

@@ -69,17 +69,11 @@ def cover(
     max_size_m: float = np.inf,
     shares: Sequence[float] = (0.5,),
 ) -> list[Rectangle]:
-    """Cover a polygon, but not its holes, with oriented rectangles.
+    """Cover a valid polygon, but not its holes and pieces below MIN_AREA_M2, with oriented rectangles.
 
     A piece is done when its rectangle's longer side is at most `min_size_m`, or at most `max_size_m` and the piece
-    fills it to `min_fill`. Otherwise it is cut across the longer side, at the share (with several shares: across the
-    side and at the share) that leaves the least empty area.
-
-    Args:
-        polygon: valid. shares: where to try to cut, from 0 to 1 along a side.
-
-    Returns:
-        Rectangles that together cover the polygon, except pieces below MIN_AREA_M2.
+    fills it to `min_fill`. Otherwise it is cut across the longer side, at the share of it (with several shares: across
+    the side and at the share) that leaves the least empty area.
     """
     if not 0 < min_fill <= 1 or not min_size_m > 0 or not all(0 < share < 1 for share in shares):
         raise ValueError(f"min_fill {min_fill}, min_size_m {min_size_m}, shares {shares}")
@@ -88,34 +82,29 @@ def cover(
     while waiting:
         piece, depth = waiting.pop()
         rectangle = oriented_rectangle(piece)
-        area = rectangle.size[0] * rectangle.size[1]
-        longest = max(rectangle.size)
+        area, longest = rectangle.size[0] * rectangle.size[1], max(rectangle.size)
         is_full = piece.area >= min_fill * area and longest <= max_size_m
-        if is_full or area <= MIN_AREA_M2 or longest <= min_size_m or depth == MAX_DEPTH:
-            if min(rectangle.size) > 1e-3:
-                done.append(rectangle)
-            continue
-        waiting += [(part, depth + 1) for part in _cut(piece, rectangle, shares)]
+        if not (is_full or area <= MIN_AREA_M2 or longest <= min_size_m or depth == MAX_DEPTH):
+            waiting += [(part, depth + 1) for part in _cut(piece, rectangle, shares)]
+        elif min(rectangle.size) > 1e-3:
+            done.append(rectangle)
     return done
 
 
 def _cut(piece: Polygon, rectangle: Rectangle, shares: Sequence[float]) -> list[Polygon]:
-    longer = 0 if rectangle.size[0] >= rectangle.size[1] else 1
-    best: tuple[float, list[Polygon]] | None = None
+    longer, least_m2, best = int(rectangle.size[0] < rectangle.size[1]), np.inf, list[Polygon]()
     for axis in (longer, 1 - longer) if len(shares) > 1 else (longer,):
         for share in shares:
             parts: list[Polygon] = []
-            for low, high in ((-0.6, share - 0.5), (share - 0.5, 0.6)):
-                along, across = ((low, high), (-0.6, 0.6)) if axis == 0 else ((-0.6, 0.6), (low, high))
-                window = rectangle_polygon(rectangle, along, across)
+            for cut in ((-0.6, share - 0.5), (share - 0.5, 0.6)):
+                window = rectangle_polygon(rectangle, *((cut, (-0.6, 0.6)) if axis == 0 else ((-0.6, 0.6), cut)))
                 parts += polygons_of(shapely.intersection(piece, window))
             if len(shares) == 1:
                 return parts
-            empty = sum(float(np.prod(oriented_rectangle(part).size)) for part in parts) - piece.area
-            if best is None or empty < best[0] - 1e-9:
-                best = (empty, parts)
-    assert best is not None
-    return best[1]
+            empty_m2 = sum(float(np.prod(oriented_rectangle(part).size)) for part in parts) - piece.area
+            if empty_m2 < least_m2 - 1e-9:
+                least_m2, best = empty_m2, parts
+    return best
 
 
 def check_outline(polygon: Polygon, where: str) -> None:

@@ -1,17 +1,15 @@
 """A SimWorld city: the world file of its generator, with the table of asset sizes.
 
-The source is Unreal's: centimetres, left-handed, y to the right, yaw clockwise. A box has its foot at the node's
-location; its size is the table's full size times the node's scale. The source lacks sizes of street furniture
-(placeholder cubes in the size table), so ASSETS has plausible ones (counted as `default`), and widths of roads, so
-carriageway and pavement follow from the objects along them (counted as `road`). A world that names its own surfaces, as
-`cosfly world` writes it (nodes such as Sidewalks_C, named after a kind), is read as it is: nothing is added or moved.
-`header.extent_sources` holds the counts.
+The source is Unreal's: centimetres, left-handed, yaw clockwise. A box has its foot at the node's location; its size is
+the table's full size times the node's scale. The source lacks sizes of street furniture (`default`: those of ASSETS)
+and widths of roads (`road`: from the objects along them). A world that names its own surfaces, as `cosfly world` writes
+it, is read as it is. `header.extent_sources` holds the counts.
 """
 
 from __future__ import annotations
 
-import itertools
 import logging
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -22,9 +20,9 @@ from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.formats.columns import LARGEST
 from cosfly.formats.kinds import KIND_NAMES
 from cosfly.geometry.axes import box_corners
-from cosfly.maps.boxlist import BoxList
+from cosfly.maps.boxlist import BoxList, required
 from cosfly.runtime.config import Config
-from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import read_json, validated
 from cosfly.simulators.assets import Asset, asset_of, kind_of
 
@@ -51,12 +49,12 @@ class SimWorldConfig(Config):
     name: str = Field("SimWorld", min_length=1, description="map name, the head of the playback tree's folder names")
     world: Path | None = Field(None, description="world file, progen_world.json")
     sizes: list[Path] = Field(
-        [], description="asset size tables; the first that has an asset counts; none: Bbox.json next to the world"
+        [], description="asset size tables, the first with an asset counts; none: Bbox.json nearby"
     )
     licence: LicenceId = Field("apache-2.0", description="licence, as the hub spells it; goes into every release")
     credits: str = Field("SimWorld, maitrix-org and contributors", description="attribution: the world's makers")
     unknown: Literal["error", "drop"] = Field(
-        "error", description="assets without a kind or a size: an error, or dropped and counted"
+        "error", description="assets without a kind or a size: fail, or drop them"
     )
 
     @field_validator("sizes", mode="before")
@@ -65,18 +63,15 @@ class SimWorldConfig(Config):
         return [sizes] if isinstance(sizes, str | Path) else sizes
 
     def inputs(self) -> dict[str, Path]:
-        if self.world is None:
-            fix = "--set maps.simworld.world=FILE"
-            raise ConfigError("no world file is set", where="maps.simworld.world", expected="a path", fix=fix)
-        if self.world.is_dir():  # its size table would be looked for next to the folder
-            what, expected = "the world is a folder", "a world file of SimWorld, JSON"
-            raise InputError(what, where=self.world, expected=expected)
-        tables = self.sizes or [self.world.parent / "Bbox.json"]
+        world = required(self.world, "maps.simworld.world")
+        if world.is_dir():  # its size table would be looked for next to the folder
+            raise InputError("the world is a folder", where=world, expected="a world file of SimWorld, JSON")
+        tables = self.sizes or [world.parent / "Bbox.json"]
         for path in tables:
             if not path.is_file():
                 what, fix = "the asset size table is missing", "set it with --set maps.simworld.sizes=FILE"
                 raise InputError(what, where=path, expected="SimWorld's Bbox.json", fix=fix)
-        return {"world": self.world, **{f"sizes_{k}": path for k, path in enumerate(tables)}}
+        return {"world": world, **{f"sizes_{k}": path for k, path in enumerate(tables)}}
 
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
@@ -92,6 +87,9 @@ class _Size(BaseModel):
     x: Positive
     y: Positive
     z: Positive
+
+    def array(self) -> np.ndarray:
+        return np.array([self.x, self.y, self.z])
 
 
 class _Orientation(BaseModel):
@@ -110,6 +108,11 @@ class _Node(BaseModel):
     id: str
     instance_name: str
     properties: _Properties
+
+    @property
+    def xy_m(self) -> np.ndarray:
+        """The location in the world: Unreal's y points right."""
+        return np.array([self.properties.location.x * M_PER_CM, -self.properties.location.y * M_PER_CM])
 
 
 class _World(BaseModel):
@@ -137,10 +140,6 @@ class Centerline(NamedTuple):
     def direction(self) -> np.ndarray:
         return (self.end - self.start) / self.length_m
 
-    @property
-    def yaw_deg(self) -> float:
-        return float(np.degrees(np.arctan2(*self.direction[::-1])))
-
 
 def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
     """Read a SimWorld city; the seed changes nothing."""
@@ -163,28 +162,20 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
             dropped += 1
             continue
         sources[_add_node(boxes, node, asset, size, stand_m, world)] += 1
-    widths: dict = {}
-    num_asset_boxes = len(boxes)
+    widths, num_asset_boxes = {}, len(boxes)
     if not has_surfaces:
         lines = [_centerline(node) for node in road_nodes]
         widths = _add_roads(boxes, lines)
-        sources["road"] = widths.pop("num_boxes")
+        sources["road"] = len(boxes) - num_asset_boxes
         num_asset_boxes = len(boxes)
         _add_ground_and_paint(boxes, lines, widths)
+    tool = "cosfly world" if has_surfaces else "SimWorld city generator"
     header = MapHeader(
-        name=cfg.name,
-        source=MapSource(
-            tool="cosfly world" if has_surfaces else "SimWorld city generator", version="world file", file=world.name
-        ),
-        licence=cfg.licence,
-        credits=cfg.credits,
-        ground_z_m=0.0,
-        extent_sources=sources,
-        roads=widths,
-        added_boxes=len(boxes) - num_asset_boxes,
-        num_objects=len(nodes),
+        name=cfg.name, source=MapSource(tool=tool, version="world file", file=world.name), licence=cfg.licence,
+        credits=cfg.credits, ground_z_m=0.0, extent_sources=sources, roads=widths,
+        added_boxes=len(boxes) - num_asset_boxes, num_objects=len(nodes),
         dropped_objects={"unknown_asset": dropped} if dropped else {},
-    )
+    )  # fmt: skip
     return boxes.box_map(header)
 
 
@@ -194,16 +185,15 @@ def read_sizes(paths: list[Path]) -> dict[str, np.ndarray]:
     for path in paths:
         for group in validated(_SizeTable, read_json(path, what="asset size table"), path).values():
             for name, asset in group.items():
-                sizes.setdefault(name, np.array([asset.bbox.x, asset.bbox.y, asset.bbox.z]))
+                sizes.setdefault(name, asset.bbox.array())
     return sizes
 
 
 def _check_unknown(cfg: SimWorldConfig, node: _Node, what: str) -> None:
     """Report an asset that cannot be placed, as an error or in the log."""
     if cfg.unknown == "error":
-        fix = "add it to ASSETS in cosfly/simulators/assets.py"
-        if what == "size":
-            fix = "add a size table with it to maps.simworld.sizes"
+        fix = "add a size table with it to maps.simworld.sizes"
+        fix = "add it to ASSETS in cosfly/simulators/assets.py" if what == "kind" else fix
         raise InputError(
             f"an asset has no {what}", where=f"{cfg.world}: {node.id}.instance_name", got=node.instance_name,
             fix=f"{fix}, or drop such assets with --set maps.simworld.unknown=drop",
@@ -213,19 +203,17 @@ def _check_unknown(cfg: SimWorldConfig, node: _Node, what: str) -> None:
 
 def _add_node(boxes: BoxList, node: _Node, asset: Asset, size_cm: np.ndarray, stand_m: float, world: Path) -> str:
     """Add one object; return the source of its extent."""
-    location, scale = node.properties.location, node.properties.scale
     is_placeholder = asset.default_size_m is not None and bool((size_cm == PLACEHOLDER_CM).all())
     size = np.array(asset.default_size_m) if is_placeholder else size_cm * M_PER_CM
-    size = size * [scale.x, scale.y, scale.z]
+    size = size * node.properties.scale.array()
     if not LEAST_M <= size.min() <= size.max() <= LARGEST:
         raise InputError(
             "the size of an object is out of range", where=f"{world}: {node.id}", got=f"{size.tolist()} m",
             expected=f"{LEAST_M:g} m or more", fix="correct its scale, or its asset's size in the table",
         )  # fmt: skip
-    foot = location.z * M_PER_CM
+    foot = node.properties.location.z * M_PER_CM
     low = 0.0 if 0 < foot <= stand_m else foot
-    xy = (location.x * M_PER_CM, -location.y * M_PER_CM)  # Unreal's y points right
-    boxes.add(asset.kind, xy, size[:2], low, foot + size[2], -node.properties.orientation.yaw)
+    boxes.add(asset.kind, node.xy_m, size[:2], low, foot + size[2], -node.properties.orientation.yaw)
     return "default" if is_placeholder else "bbox"
 
 
@@ -239,13 +227,12 @@ def _centerline(node: _Node) -> Centerline:
     world, and the world holds 10.
     """
     turn = -np.radians(node.properties.orientation.yaw)
-    middle = np.array([node.properties.location.x, -node.properties.location.y]) * M_PER_CM
     half = np.array([np.cos(turn), np.sin(turn)]) * ROAD_LENGTH_M / 2
-    return Centerline(middle - half, middle + half)
+    return Centerline(node.xy_m - half, node.xy_m + half)
 
 
 def _distances_m(points: np.ndarray, lines: list[Centerline]) -> np.ndarray:
-    """Return the distances of (n, 2) points to the nearest centre line, (n,)."""
+    """Return the distances of points, (n, 2), to the nearest centre line."""
     best = np.full(len(points), np.inf)
     for line in lines:
         along = np.clip((points - line.start) @ line.direction, 0.0, line.length_m)
@@ -264,7 +251,11 @@ def _half_widths(boxes: BoxList, lines: list[Centerline]) -> tuple[float, float]
     fronts = [DEFAULT_FRONT_M]
     rows = np.flatnonzero(kinds == "Buildings")
     if len(rows):
-        edges = np.concatenate([_outline_points(box_map, int(row)) for row in rows])
+        shares, yaws = np.linspace(0.0, 1.0, 25)[:, None], np.radians(box_map.rotations_deg[:, 1])
+        footprints = [
+            box_corners(box_map.centers[row], box_map.half_extents[row], yaws[row])[[0, 2, 6, 4, 0], :2] for row in rows
+        ]
+        edges = np.concatenate([a + shares * (b - a) for ring in footprints for a, b in pairwise(ring)])
         nearest = _distances_m(edges, lines).reshape(len(rows), -1).min(axis=1)
         fronts = nearest[nearest < BESIDE_ROAD_M].tolist() or fronts
     front = float(np.percentile(fronts, 10))
@@ -274,62 +265,46 @@ def _half_widths(boxes: BoxList, lines: list[Centerline]) -> tuple[float, float]
     return round(max(kerb, 2.0), 2), round(max(front, kerb + 1.0), 2)
 
 
-def _outline_points(box_map: BoxMap, row: int) -> np.ndarray:
-    """Return points along a footprint's edges, (n, 2)."""
-    corners = box_corners(box_map.centers[row], box_map.half_extents[row], np.radians(box_map.rotations_deg[row, 1]))
-    ring = corners[[0, 2, 6, 4, 0], :2]
-    shares = np.linspace(0.0, 1.0, 25)[:, None]
-    return np.concatenate([a + shares * (b - a) for a, b in itertools.pairwise(ring)])
-
-
-def _add_roads(boxes: BoxList, lines: list[Centerline]) -> dict:
+def _add_roads(boxes: BoxList, lines: list[Centerline]) -> dict[str, float]:
     """Add carriageways and pavements, without overlaps: a square at every junction, straight pieces between."""
     if not lines:
-        return {"num_boxes": 0}
+        return {}
     kerb, front = _half_widths(boxes, lines)
-    before = len(boxes)
+    middle, width = (front + kerb) / 2, front - kerb  # of the pavement, from the centre line
+
+    def add_slab(kind: str, place: np.ndarray, size: tuple[float, float], x: np.ndarray) -> None:
+        top = ROAD_TOP_M if kind == "Roads" else PAVEMENT_TOP_M
+        boxes.add(kind, place, size, top - SLAB_M, top, float(np.degrees(np.arctan2(x[1], x[0]))))
+
     junctions: dict[tuple[int, int], list[np.ndarray]] = {}
     for line in lines:
-        for end, away in ((line.start, line.direction), (line.end, -line.direction)):
+        x, free_m = line.direction, line.length_m - 2 * front  # a junction's slabs reach as far as the fronts
+        for end, away in ((line.start, x), (line.end, -x)):
             junctions.setdefault(tuple(np.round(end).astype(int)), []).append(away)
-        middle, yaw = (line.start + line.end) / 2, line.yaw_deg
-        normal = np.array([-line.direction[1], line.direction[0]])
-        if line.length_m > 2 * front:  # a junction's slabs reach as far as the fronts
-            _slab(boxes, "Roads", middle, (line.length_m - 2 * front, 2 * kerb), yaw)
+        if free_m > 0:
+            add_slab("Roads", (line.start + line.end) / 2, (free_m, 2 * kerb), x)
             for side in (-1, 1):
-                size = (line.length_m - 2 * front, front - kerb)
-                _slab(boxes, "Sidewalks", middle + side * (front + kerb) / 2 * normal, size, yaw)
-    for place, arms in junctions.items():
-        _add_junction(boxes, np.array(place, dtype=np.float64), arms, kerb, front)
-    return {"num_boxes": len(boxes) - before, "carriageway_m": 2 * kerb, "front_to_front_m": 2 * front}
-
-
-def _add_junction(boxes: BoxList, place: np.ndarray, arms: list[np.ndarray], kerb: float, front: float) -> None:
-    """Add the crossing square, pavement at its four corners, and pavement across the sides without a road."""
-    x = arms[0]
-    y = np.array([-x[1], x[0]])
-    yaw = float(np.degrees(np.arctan2(x[1], x[0])))
-    _slab(boxes, "Roads", place, (2 * kerb, 2 * kerb), yaw)
-    middle, width = (front + kerb) / 2, front - kerb
-    for a in (-1, 1):
-        for b in (-1, 1):
-            _slab(boxes, "Sidewalks", place + middle * (a * x + b * y), (width, width), yaw)
-    along, across = (width, 2 * kerb), (2 * kerb, width)
-    for side, size in ((x, along), (-x, along), (y, across), (-y, across)):
-        is_road = any(arm @ side > 0.7 for arm in arms)
-        _slab(boxes, "Roads" if is_road else "Sidewalks", place + middle * side, size, yaw)
-
-
-def _slab(boxes: BoxList, kind: str, middle: np.ndarray, size: tuple[float, float], yaw_deg: float) -> None:
-    top = ROAD_TOP_M if kind == "Roads" else PAVEMENT_TOP_M
-    boxes.add(kind, middle, size, top - SLAB_M, top, yaw_deg)
+                place = (line.start + line.end) / 2 + side * middle * np.array([-x[1], x[0]])
+                add_slab("Sidewalks", place, (free_m, width), x)
+    for key, arms in junctions.items():  # pavement at the four corners, and across the sides without a road
+        place, x = np.array(key, dtype=np.float64), arms[0]
+        y = np.array([-x[1], x[0]])
+        add_slab("Roads", place, (2 * kerb, 2 * kerb), x)
+        for a, b in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+            add_slab("Sidewalks", place + middle * (a * x + b * y), (width, width), x)
+        along, across = (width, 2 * kerb), (2 * kerb, width)
+        for away, size in ((x, along), (-x, along), (y, across), (-y, across)):
+            is_road = any(arm @ away > 0.7 for arm in arms)
+            add_slab("Roads" if is_road else "Sidewalks", place + middle * away, size, x)
+    return {"carriageway_m": 2 * kerb, "front_to_front_m": 2 * front}
 
 
 def _add_ground_and_paint(boxes: BoxList, lines: list[Centerline], widths: dict) -> None:
     """Add the ground below everything, and centre dashes: neither is in the source."""
     low, high = boxes.box_map().bounds()
-    boxes.add_span("Terrain", low[:2] - MAP_MARGIN_M, high[:2] + MAP_MARGIN_M, BASE_TOP_M - SLAB_M, BASE_TOP_M)
+    boxes.span("Terrain", low[:2] - MAP_MARGIN_M, high[:2] + MAP_MARGIN_M, BASE_TOP_M - SLAB_M, BASE_TOP_M)
     for line in lines:
+        yaw_deg = float(np.degrees(np.arctan2(*line.direction[::-1])))
         for at in np.arange(widths["carriageway_m"], line.length_m - widths["carriageway_m"], 9.0):
             place = line.start + (at + 1.5) * line.direction
-            boxes.add("RoadLines", place, (3.0, 0.16), ROAD_TOP_M - 0.04, PAINT_TOP_M, line.yaw_deg)
+            boxes.add("RoadLines", place, (3.0, 0.16), ROAD_TOP_M - 0.04, PAINT_TOP_M, yaw_deg)

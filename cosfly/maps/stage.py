@@ -41,14 +41,12 @@ class MapsConfig(Config):
     source: Literal["synthetic", "simworld", "cityjson", "boxes", "carla", "unrealcv"] = Field(
         "synthetic", description="what to read"
     )
-    synthetic: SyntheticConfig = Field(default_factory=SyntheticConfig, description="the seeded town")
-    simworld: SimWorldConfig = Field(default_factory=SimWorldConfig, description="a SimWorld world with asset sizes")
-    cityjson: CityJsonConfig = Field(default_factory=CityJsonConfig, description="a CityJSON city model")
-    boxes: BoxesConfig = Field(default_factory=BoxesConfig, description="boxes of your own: JSON, CSV or GeoJSON")
-    carla: CarlaMapConfig = Field(default_factory=CarlaMapConfig, description="the town of a running CARLA server")
-    unrealcv: UnrealCvMapConfig = Field(
-        default_factory=UnrealCvMapConfig, description="the level of a running UnrealCV server, as SimWorld's"
-    )
+    synthetic: SyntheticConfig = Field(SyntheticConfig(), description="the seeded town")
+    simworld: SimWorldConfig = Field(SimWorldConfig(), description="a SimWorld world with asset sizes")
+    cityjson: CityJsonConfig = Field(CityJsonConfig(), description="a CityJSON city model")
+    boxes: BoxesConfig = Field(BoxesConfig(), description="boxes of your own: JSON, CSV or GeoJSON")
+    carla: CarlaMapConfig = Field(CarlaMapConfig(), description="the town of a running CARLA server")
+    unrealcv: UnrealCvMapConfig = Field(UnrealCvMapConfig(), description="the level of a running UnrealCV server")
 
     @property
     def licence(self) -> str:
@@ -62,19 +60,19 @@ class MapsConfig(Config):
 
 
 def load_map(cfg: MapsConfig, *, seed: int = 0, follow_links: bool = False) -> BoxMap:
-    """Read or build the map of the chosen source; its meshes are read when they are drawn."""
+    """Read or build the map of the chosen source; its meshes are read when they are drawn.
+
+    Args:
+        follow_links: also read meshes through links that lead out of the map's folder.
+    """
     box_map = SOURCES[cfg.source](getattr(cfg, cfg.source), seed)
-    meshes = box_map.meshes
-    if follow_links and meshes.folder is not None:
-        meshes = replace(meshes, folder=LinkedPath(meshes.folder))
-    return replace(box_map, meshes=meshes)
+    if not follow_links or box_map.meshes.folder is None:
+        return box_map
+    return replace(box_map, meshes=replace(box_map.meshes, folder=LinkedPath(box_map.meshes.folder)))
 
 
 def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same", follow_links: bool = False) -> Path:
     """Read the source's files, if it has any; write `boxes_3d.json` and the overview `map.png`.
-
-    Args:
-        follow_links: also read meshes through links that lead out of the map's folder.
 
     Raises:
         InputError: If a file is malformed, or does not contain the height of the ground.
@@ -90,8 +88,7 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same"
     outputs = [product, out / "map.png"] + [out / MESHES_FILE] * bool(box_map.meshes.refs)
     if cfg.source == "unrealcv":
         outputs += unrealcv_export.write_objects(box_map, out)
-    view = TopView.around(np.stack(box_map.bounds()), PICTURE_PX)
-    write_bytes(out / "map.png", png_bytes(draw_map(box_map, view)))
+    write_bytes(out / "map.png", png_bytes(draw_map(box_map, TopView.around(np.stack(box_map.bounds()), PICTURE_PX))))
     dropped = box_map.header.dropped_objects
     num_objects = len(box_map) if box_map.header.num_objects is None else box_map.header.num_objects
     tally = Tally(input=num_objects, kept=num_objects - sum(dropped.values()), dropped=dropped)

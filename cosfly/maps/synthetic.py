@@ -10,31 +10,18 @@ that simulators export.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
-from cosfly.maps.boxlist import BoxList
-from cosfly.maps.town_blocks import (
-    BASE_TOP_M,
-    BLOCKS,
-    ORDINARY_LOTS,
-    PAINT_TOP_M,
-    ROAD_TOP_M,
-    SLAB_M,
-    WATER_TOP_M,
-    Lots,
-    Plot,
-    add_ring,
-    build_on_lots,
-    lay,
-    point,
-)
+from cosfly.maps.boxlist import BoxList, Pair
+from cosfly.maps.town_blocks import BLOCKS, ORDINARY_LOTS, ROAD_TOP_M, SLAB_M, WATER_TOP_M, Lots, Plot, Range, point
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import nearest
 from cosfly.runtime.seeding import rng_for
@@ -46,6 +33,7 @@ WIDE_M = 26.0  # wider streets have wide pavements and large trees
 VERGE_M = 10.0  # of lawn around the town
 DASH_M, DASH_GAP_M = 3.0, 6.0
 RAILING_M = 0.2
+PAINT_TOP_M, BASE_TOP_M = -0.03, -0.12  # over and below ROAD_TOP_M
 
 
 @dataclass(frozen=True)
@@ -57,7 +45,7 @@ class TownPlan:
     street_m: float = 20.0  # width from front to front
     boulevard_m: float = 28.0  # width of the widest street of each direction
     unevenness: float = 0.0  # how much the sides of blocks differ, as a share of the mean side
-    blocks: Mapping[str, float] = field(default_factory=dict)  # share of each kind, a name in BLOCKS or `lots`
+    blocks: Mapping[str, float] = field(default_factory=dict)  # share of each kind, a name in BLOCKS
     center: str | None = None  # kind of the block in the middle
     lots: Lots = ORDINARY_LOTS  # buildings of blocks of kind `lots`
     river_m: float = 0.0  # width of a river in place of a boulevard; 0: none
@@ -118,8 +106,8 @@ class SyntheticConfig(Config):
     @model_validator(mode="after")
     def _is_possible(self) -> SyntheticConfig:
         if self.preset not in PRESETS:
-            suggestion = nearest(self.preset, list(PRESETS))
-            raise ValueError(f"there is no preset {self.preset!r}{suggestion}; there are {', '.join(PRESETS)}")
+            hint = nearest(self.preset, list(PRESETS))
+            raise ValueError(f"there is no preset {self.preset!r}{hint}; there are {', '.join(PRESETS)}")
         if (side := self.plan.narrowest_block_m) < MIN_BLOCK_M:
             what = f"a block would be {side:.1f} m wide, less than {MIN_BLOCK_M:.0f} m"
             raise ValueError(f"{what}: raise size_m or lower num_blocks")
@@ -139,25 +127,16 @@ class SyntheticConfig(Config):
         return {}
 
 
-@dataclass(frozen=True)
-class Strip:
-    """One street's cross-section along its axis: from front to front, with the carriageway inside."""
+class Strip(NamedTuple):
+    """One street's cross-section along its axis: from front to front, and the carriageway inside."""
 
     low_m: float
     high_m: float
-    sidewalk_m: float
+    road: Range
 
     @property
     def middle_m(self) -> float:
         return (self.low_m + self.high_m) / 2
-
-    @property
-    def is_wide(self) -> bool:
-        return self.high_m - self.low_m >= WIDE_M
-
-    @property
-    def road(self) -> tuple[float, float]:
-        return self.low_m + self.sidewalk_m, self.high_m - self.sidewalk_m
 
 
 @dataclass(frozen=True)
@@ -172,16 +151,16 @@ class Streets:
         """Return the streets along x (0) or y (1)."""
         return self.columns if axis else self.rows
 
-    def stretches(self, axis: int) -> list[tuple[float, float]]:
+    def stretches(self, axis: int) -> list[Range]:
         """Return the stretches of a street along an axis between the carriageways that cross it."""
-        return [(a.road[1], b.road[0]) for a, b in itertools.pairwise(self.along(1 - axis))]
+        return [(a.road[1], b.road[0]) for a, b in pairwise(self.along(1 - axis))]
 
     def blocks(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the low and the high corner of each block, row by row."""
         return [
             (np.array([a.high_m, c.high_m]), np.array([b.low_m, d.low_m]))
-            for c, d in itertools.pairwise(self.rows)
-            for a, b in itertools.pairwise(self.columns)
+            for c, d in pairwise(self.rows)
+            for a, b in pairwise(self.columns)
         ]
 
 
@@ -192,32 +171,30 @@ def load(cfg: SyntheticConfig, seed: int) -> BoxMap:
 
 def build_town(plan: TownPlan, name: str, seed: int) -> BoxMap:
     """Build the town of a plan and a seed."""
-    boxes = BoxList()
-    streets = street_grid(plan, seed)
-    half = plan.size_m / 2
-    boxes.add_span("Terrain", (-half, -half), (half, half), BASE_TOP_M - SLAB_M, BASE_TOP_M)
-    _add_surfaces(boxes, streets)
-    _add_road_paint(boxes, streets)
-    corners = np.full(2, -half), np.full(2, half)
+    streets, half = street_grid(plan, seed), plan.size_m / 2
+
+    def plot_of(low: Pair, high: Pair, item: str) -> Plot:
+        return Plot(boxes, low, high, rng_for(seed, "maps", item), plan.lots)
+
+    boxes, corners = BoxList(), ((-half, -half), (half, half))
+    town = plot_of(*corners, "verge")
+    town.span("Terrain", *corners, BASE_TOP_M - SLAB_M, BASE_TOP_M)
+    _add_surfaces(town, streets)
+    _add_road_paint(town, streets)
     for axis in (0, 1):
         for number, strip in enumerate(streets.along(axis)):
-            plot = Plot(boxes, *corners, rng_for(seed, "maps", f"street {axis} {number}"))
-            _furnish_street(plot, plan, axis, strip, streets)
-    _add_crossings(boxes, streets)
-    _add_verge(Plot(boxes, *corners, rng_for(seed, "maps", "verge")), streets)
+            _furnish_street(plot_of(*corners, f"street {axis} {number}"), plan, axis, strip, streets)
+    _add_crossings(town, streets)
+    _add_verge(town, streets)
     if streets.river is not None:
-        _add_river(boxes, plan, streets, streets.river)
+        _add_river(town, plan, streets, streets.river)
     if plan.shore_m:
-        boxes.add_span("Water", (-half, -half - plan.shore_m), (half, -half - RAILING_M), -1.2, WATER_TOP_M)
-        boxes.add_span("Walls", (-half, -half - RAILING_M), (half, -half), -1.2, 0.4)  # of a quay
+        town.span("Water", (-half, -half - plan.shore_m), (half, -half - RAILING_M), -1.2, WATER_TOP_M)
+        town.span("Walls", (-half, -half - RAILING_M), (half, -half), -1.2, 0.4)  # of a quay
     kinds = _block_kinds(plan, rng_for(seed, "maps", "plan"))
-    for number, (kind, (low, high)) in enumerate(zip(kinds, streets.blocks(), strict=True)):
+    for number, (kind, block) in enumerate(zip(kinds, streets.blocks(), strict=True)):
         row, column = divmod(number, plan.num_blocks)
-        plot = Plot(boxes, low, high, rng_for(seed, "maps", f"block {row} {column}"))
-        if kind == "lots":
-            build_on_lots(plot, plan.lots)
-        else:
-            BLOCKS[kind](plot)
+        BLOCKS[kind](plot_of(*block, f"block {row} {column}"))
     source = MapSource(tool="cosfly maps synthetic", version=GENERATOR_VERSION, seed=seed)
     return boxes.box_map(MapHeader(name=name, source=source, licence=OUR_LICENCE, ground_z_m=0.0))
 
@@ -225,81 +202,73 @@ def build_town(plan: TownPlan, name: str, seed: int) -> BoxMap:
 def street_grid(plan: TownPlan, seed: int) -> Streets:
     """Return the streets of a town, and its river."""
     wide = 1 if plan.num_blocks > 1 else 0  # the boulevard's place
-    rows = _strips(plan, plan.river_m or plan.boulevard_m, wide, rng_for(seed, "maps", "rows"))
-    columns = _strips(plan, plan.boulevard_m, wide, rng_for(seed, "maps", "columns"))
-    return Streets(rows, columns, rows[wide] if plan.river_m else None)
+
+    def strips(widest_m: float, axis: str) -> list[Strip]:
+        widths = [plan.street_m] * (plan.num_blocks + 1)
+        widths[wide] = widest_m
+        parts = 1.0 + plan.unevenness * rng_for(seed, "maps", axis).uniform(-1.0, 1.0, plan.num_blocks)
+        sides_m = (plan.size_m - 2 * VERGE_M - sum(widths)) * parts / parts.sum()
+        found, at = [], -plan.size_m / 2 + VERGE_M
+        for width, side_m in zip(widths, [*sides_m.tolist(), 0.0], strict=True):
+            sidewalk_m = 6.0 if width >= WIDE_M else max(2.5, 0.22 * width)
+            found.append(Strip(at, at + width, (at + sidewalk_m, at + width - sidewalk_m)))
+            at += width + side_m
+        return found
+
+    rows = strips(plan.river_m or plan.boulevard_m, "rows")
+    return Streets(rows, strips(plan.boulevard_m, "columns"), rows[wide] if plan.river_m else None)
 
 
-def _strips(plan: TownPlan, widest_m: float, wide: int, rng: np.random.Generator) -> list[Strip]:
-    """Return the streets across one axis, low to high; number `wide` is the widest."""
-    widths = [plan.street_m] * (plan.num_blocks + 1)
-    widths[wide] = widest_m
-    parts = 1.0 + plan.unevenness * rng.uniform(-1.0, 1.0, plan.num_blocks)
-    sides_m = (plan.size_m - 2 * VERGE_M - sum(widths)) * parts / parts.sum()
-    strips, at = [], -plan.size_m / 2 + VERGE_M
-    for width, side_m in zip(widths, [*sides_m.tolist(), 0.0], strict=True):
-        strips.append(Strip(at, at + width, 6.0 if width >= WIDE_M else max(2.5, 0.22 * width)))
-        at += width + side_m
-    return strips
-
-
-def _add_surfaces(boxes: BoxList, streets: Streets) -> None:
+def _add_surfaces(town: Plot, streets: Streets) -> None:
     """Add carriageways, and a ring of pavement around each block and the town; the ground of a block is its own."""
     rows, columns = streets.rows, streets.columns
     first, last = (columns[0].road[0], rows[0].road[0]), (columns[-1].road[1], rows[-1].road[1])
     for row, column in zip(rows, columns, strict=True):
         if row is not streets.river:
-            lay(boxes, "Roads", (first[0], row.road[0]), (last[0], row.road[1]))
+            town.lay("Roads", (first[0], row.road[0]), (last[0], row.road[1]))
         for low, high in streets.stretches(1):
-            lay(boxes, "Roads", (column.road[0], low), (column.road[1], high))
-    for a, b in itertools.pairwise(columns):
-        for c, d in itertools.pairwise(rows):
+            town.lay("Roads", (column.road[0], low), (column.road[1], high))
+    for a, b in pairwise(columns):
+        for c, d in pairwise(rows):
             kerbs = (a.road[1], c.road[1]), (b.road[0], d.road[0])
-            add_ring(boxes, "Sidewalks", kerbs, ((a.high_m, c.high_m), (b.low_m, d.low_m)))
-    fronts = (columns[0].low_m, rows[0].low_m), (columns[-1].high_m, rows[-1].high_m)
-    add_ring(boxes, "Sidewalks", fronts, (first, last))
+            town.ring("Sidewalks", kerbs, ((a.high_m, c.high_m), (b.low_m, d.low_m)))
+    town.ring("Sidewalks", ((columns[0].low_m, rows[0].low_m), (columns[-1].high_m, rows[-1].high_m)), (first, last))
 
 
-def _add_river(boxes: BoxList, plan: TownPlan, streets: Streets, river: Strip) -> None:
+def _add_river(town: Plot, plan: TownPlan, streets: Streets, river: Strip) -> None:
     """Add water from edge to edge between quays, and a bridge with railings where a street along y crosses it."""
-    low, high = river.road
-    count = len(streets.columns)
-    crossing = streets.columns  # those with a bridge, spread evenly
-    if 0 < plan.bridges < count:
-        crossing = [streets.columns[int((k + 0.5) * count / plan.bridges)] for k in range(plan.bridges)]
+    (low, high), count, crossing = river.road, len(streets.columns), streets.columns
+    if 0 < plan.bridges < count:  # spread evenly
+        crossing = [crossing[int((k + 0.5) * count / plan.bridges)] for k in range(plan.bridges)]
     edges = [-plan.size_m / 2, *(m for strip in crossing for m in (strip.low_m, strip.high_m)), plan.size_m / 2]
     for a, b in zip(edges[::2], edges[1::2], strict=True):
-        boxes.add_span("Water", (a, low), (b, high), -1.2, WATER_TOP_M)
+        town.span("Water", (a, low), (b, high), -1.2, WATER_TOP_M)
         for quay in (low, high):
-            boxes.add_span("Walls", (a, quay - RAILING_M), (b, quay + RAILING_M), -1.2, 0.5)
+            town.span("Walls", (a, quay - RAILING_M), (b, quay + RAILING_M), -1.2, 0.5)
     for strip in crossing:
-        lay(boxes, "Roads", (strip.road[0], low), (strip.road[1], high))
+        town.lay("Roads", (strip.road[0], low), (strip.road[1], high))
         for side, kerb, edge in ((-1, strip.road[0], strip.low_m), (1, strip.road[1], strip.high_m)):
-            lay(boxes, "Sidewalks", (min(kerb, edge), low), (max(kerb, edge), high))
-            railing = edge - side * RAILING_M
-            boxes.add_span("Fences", (min(railing, edge), low), (max(railing, edge), high), -SLAB_M, 1.1)
+            town.lay("Sidewalks", (kerb, low), (edge, high))
+            town.span("Fences", (edge - side * RAILING_M, low), (edge, high), -SLAB_M, 1.1)
 
 
-def _add_road_paint(boxes: BoxList, streets: Streets) -> None:
+def _add_road_paint(town: Plot, streets: Streets) -> None:
     """Add centre dashes, and a zebra crossing at both ends of every stretch."""
-
-    def paint(axis: int, along: float, across: float, length_m: float, width_m: float) -> None:
-        size = point(axis, length_m, width_m)
-        boxes.add("RoadLines", point(axis, along, across), size, ROAD_TOP_M - 0.04, PAINT_TOP_M)
-
     for axis in (0, 1):
         for strip in streets.along(axis):
             for low, high in streets.stretches(axis) if strip is not streets.river else []:
-                for at in np.arange(low + 7.0, high - 7.0 - DASH_M, DASH_M + DASH_GAP_M):
-                    paint(axis, at + DASH_M / 2, strip.middle_m, DASH_M, 0.16)
-                for end in (low + 2.5, high - 2.5):
-                    for across in np.arange(strip.road[0] + 0.7, strip.road[1] - 0.5, 1.2):
-                        paint(axis, end, across, 3.0, 0.55)
+                dashes = np.arange(low + 7.0, high - 7.0 - DASH_M, DASH_M + DASH_GAP_M) + DASH_M / 2
+                stripes = np.arange(strip.road[0] + 0.7, strip.road[1] - 0.5, 1.2)
+                paint = [(at, strip.middle_m, DASH_M, 0.16) for at in dashes]
+                paint += [(end, across, 3.0, 0.55) for end in (low + 2.5, high - 2.5) for across in stripes]
+                for along, across, length_m, width_m in paint:
+                    size = point(axis, length_m, width_m)
+                    town.add("RoadLines", point(axis, along, across), size, ROAD_TOP_M - 0.04, PAINT_TOP_M)
 
 
 def _furnish_street(plot: Plot, plan: TownPlan, axis: int, strip: Strip, streets: Streets) -> None:
     """Add lamps, trees, parked cars, benches, bins and signs along both kerbs of a street."""
-    rng, wide = plot.rng, strip.is_wide
+    rng, wide = plot.rng, strip.high_m - strip.low_m >= WIDE_M
     parked_share = plan.parked_share if strip is not streets.river else 0.0
     for low, high in streets.stretches(axis):
         for side, kerb in ((-1, strip.road[0]), (1, strip.road[1])):
@@ -316,51 +285,47 @@ def _furnish_street(plot: Plot, plan: TownPlan, axis: int, strip: Strip, streets
                     plot.bench(axis, along, row)
             for along in np.arange(low + 9.5, high - 11.0, 6.6):
                 if rng.random() < parked_share:
-                    _park_vehicle(plot, axis, point(axis, along + rng.uniform(-0.4, 0.4), kerb - side * 1.15))
+                    place = point(axis, along + rng.uniform(-0.4, 0.4), kerb - side * 1.15)
+                    is_truck = rng.random() < 0.06
+                    size = (6.2, 2.2) if is_truck else (rng.uniform(4.0, 4.7), 1.8)
+                    top = 2.7 if is_truck else rng.uniform(1.4, 1.65)
+                    plot.add("Truck" if is_truck else "Car", place, point(axis, *size), ROAD_TOP_M, top)
             along, across = low + 6.0 if side < 0 else high - 6.0, kerb + side * 0.6
             plot.add("Poles", point(axis, along, across), (0.08, 0.08), 0.0, 2.9)
             plot.add("TrafficSigns", point(axis, along + 0.07, across), point(axis, 0.06, 0.65), 2.2, 2.85)
 
 
-def _park_vehicle(plot: Plot, axis: int, place: tuple[float, float]) -> None:
-    if plot.rng.random() < 0.06:
-        plot.add("Truck", place, point(axis, 6.2, 2.2), ROAD_TOP_M, 2.7)
-        return
-    length = plot.rng.uniform(4.0, 4.7)
-    plot.add("Car", place, point(axis, length, 1.8), ROAD_TOP_M, plot.rng.uniform(1.4, 1.65))
-
-
-def _add_crossings(boxes: BoxList, streets: Streets) -> None:
+def _add_crossings(town: Plot, streets: Streets) -> None:
     """Add a signal on two opposite corners of every inner crossing; its lamps are boxes inside its housing."""
     for a in streets.columns[1:-1]:
         for b in (strip for strip in streets.rows[1:-1] if strip is not streets.river):
-            for side in (-1, 1):
-                x, y = (a.road[1] + 0.7, b.road[1] + 0.7) if side > 0 else (a.road[0] - 0.7, b.road[0] - 0.7)
-                boxes.add("Poles", (x, y), (0.16, 0.16), 0.0, 3.4)
-                boxes.add("TrafficLight", (x - side * 0.3, y), (0.36, 0.34), 2.5, 3.5)
+            for side, end in ((-1, 0), (1, 1)):
+                x, y = a.road[end] + side * 0.7, b.road[end] + side * 0.7
+                town.add("Poles", (x, y), (0.16, 0.16), 0.0, 3.4)
+                town.add("TrafficLight", (x - side * 0.3, y), (0.36, 0.34), 2.5, 3.5)
                 for low in (2.54, 2.86, 3.18):
-                    boxes.add("TrafficLight", (x - side * 0.3, y), (0.3, 0.3), low, low + 0.28)
+                    town.add("TrafficLight", (x - side * 0.3, y), (0.3, 0.3), low, low + 0.28)
+    low_m, high_m = streets.columns[0].low_m, streets.columns[-1].high_m
     for strip in streets.rows:  # a sewer under every street along x
-        ends = streets.columns[0].low_m, streets.columns[-1].high_m
-        boxes.add_span("Static", (ends[0], strip.middle_m - 0.6), (ends[1], strip.middle_m + 0.6), -4.2, -3.0)
+        town.span("Static", (low_m, strip.middle_m - 0.6), (high_m, strip.middle_m + 0.6), -4.2, -3.0)
 
 
-def _add_verge(plot: Plot, streets: Streets) -> None:
+def _add_verge(town: Plot, streets: Streets) -> None:
     """Add lawn, trees and a fence with gates around the town, but not in a river."""
-    rng, half, edge, river = plot.rng, plot.high[0], streets.columns[-1].high_m, streets.river
-    add_ring(plot.boxes, "Terrain", (plot.low, plot.high), ((-edge,) * 2, (edge,) * 2))
+    rng, half, edge, river = town.rng, town.high[0], streets.columns[-1].high_m, streets.river
+    town.ring("Terrain", (town.low, town.high), ((-edge,) * 2, (edge,) * 2))
     for side in (-1, 1):
         for axis in (0, 1):
-            line = side * (half - 0.4)
             for at in np.arange(-half + 2.0, half - 12.0, 14.0):  # 12 m panels, 2 m gates
                 if river is None or axis == 0 or not river.low_m < at + 6.0 < river.high_m:
-                    plot.add("Fences", point(axis, at + 6.0, line), point(axis, 12.0, 0.1), -0.1, 1.3)
+                    place = point(axis, at + 6.0, side * (half - 0.4))
+                    town.add("Fences", place, point(axis, 12.0, 0.1), -0.1, 1.3)
             for at in np.arange(-half + 8.0, half - 6.0, 11.0):
                 in_river = river is not None and axis == 1 and river.low_m - 6.0 < at < river.high_m + 6.0
                 if rng.random() < 0.75 and not in_river:
                     along = at + rng.uniform(-2, 2)
                     place = point(axis, along, side * (half - 0.45 * VERGE_M + rng.uniform(-0.8, 0.8)))
-                    plot.tree(place, (3.5, 5.5), (6.0, 12.0))
+                    town.tree(place, (3.5, 5.5), (6.0, 12.0))
 
 
 def _block_kinds(plan: TownPlan, rng: np.random.Generator) -> list[str]:
@@ -369,13 +334,11 @@ def _block_kinds(plan: TownPlan, rng: np.random.Generator) -> list[str]:
     if plan.blocks:  # of each kind so many, the largest remainders rounded up
         exact = {name: share / sum(plan.blocks.values()) * count for name, share in plan.blocks.items()}
         kinds = [name for name, value in exact.items() for _ in range(int(value))]
-        by_remainder = sorted(exact, key=lambda name: int(exact[name]) - exact[name])
-        kinds += by_remainder[: count - len(kinds)]
+        kinds += sorted(exact, key=lambda name: int(exact[name]) - exact[name])[: count - len(kinds)]
     else:
-        built = ("courtyard", "houses", "towers")
         share = max(1, count // 9)
         kinds = ["park"] * (share if count > 1 else 0) + ["square"] * (share if count > 3 else 0)
-        kinds += [built[i % 3] for i in range(count - len(kinds))]
+        kinds += [("courtyard", "houses", "towers")[i % 3] for i in range(count - len(kinds))]
     kinds = [kinds[i] for i in rng.permutation(count)]
     if plan.center in kinds:
         middle, at = plan.num_blocks // 2 * (plan.num_blocks + 1), kinds.index(plan.center)

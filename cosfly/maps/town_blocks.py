@@ -11,7 +11,7 @@ import numpy as np
 from cosfly.maps.boxlist import BoxList, Pair
 
 # Tops of the surfaces, m. At least two centimetres apart: a depth buffer separates them at 300 m.
-PAVED_TOP_M, LAWN_TOP_M, PAINT_TOP_M, ROAD_TOP_M, BASE_TOP_M = 0.0, -0.02, -0.03, -0.06, -0.12
+PAVED_TOP_M, LAWN_TOP_M, ROAD_TOP_M = 0.0, -0.02, -0.06
 TOPS_M = {"Sidewalks": PAVED_TOP_M, "Terrain": LAWN_TOP_M, "Roads": ROAD_TOP_M}
 WATER_TOP_M = 0.05  # over the ground, so that water is an obstacle to pedestrians
 SLAB_M = 0.3
@@ -40,57 +40,32 @@ def point(axis: int, along: float, across: float) -> tuple[float, float]:
     return (along, across) if axis == 0 else (across, along)
 
 
-def lay(boxes: BoxList, kind: str, low: Pair, high: Pair) -> None:
-    """Add a slab of ground at the height of its kind, by the corners of its footprint."""
-    boxes.add_span(kind, low, high, TOPS_M[kind] - SLAB_M, TOPS_M[kind])
+class Plot(BoxList):
+    """A rectangle of the town from its low to its high corner, (2,) m, that adds to the town's boxes and draws from
+    its own random generator."""
 
-
-def add_ring(boxes: BoxList, kind: str, outer: Any, inner: Any, heights_m: Range | None = None) -> None:
-    """Add four slabs between two rectangles, a low and a high corner each; ground lies at the height of its kind."""
-    base, top = heights_m or (TOPS_M[kind] - SLAB_M, TOPS_M[kind])
-    (low, high), (inner_low, inner_high) = outer, inner
-    boxes.add_span(kind, low, (high[0], inner_low[1]), base, top)
-    boxes.add_span(kind, (low[0], inner_high[1]), high, base, top)
-    boxes.add_span(kind, (low[0], inner_low[1]), (inner_low[0], inner_high[1]), base, top)
-    boxes.add_span(kind, (inner_high[0], inner_low[1]), (high[0], inner_high[1]), base, top)
-
-
-@dataclass(frozen=True)
-class Plot:
-    """A rectangle of the town from its low to its high corner, (2,) m, that draws from its own random generator."""
-
-    boxes: BoxList
-    low: np.ndarray
-    high: np.ndarray
-    rng: np.random.Generator
-
-    @property
-    def size(self) -> np.ndarray:
-        return self.high - self.low
-
-    @property
-    def middle(self) -> np.ndarray:
-        return (self.low + self.high) / 2
+    def __init__(self, town: BoxList, low: Pair, high: Pair, rng: np.random.Generator, lots: Lots) -> None:
+        super().__init__(town.rows, town.kinds)
+        self.low, self.high, self.rng, self.lots = np.asarray(low), np.asarray(high), rng, lots
+        self.size, self.middle = self.high - self.low, (self.low + self.high) / 2
 
     def at(self, x: float, y: float) -> np.ndarray:
         """Return the point at shares of the plot's sides."""
         return self.low + self.size * (x, y)
 
-    def add(self, kind: str, center: Pair, size: Pair, low_m: float, high_m: float, yaw_deg: float = 0.0) -> None:
-        """Add a box by its footprint and its heights."""
-        self.boxes.add(kind, center, size, low_m, high_m, yaw_deg)
+    def lay(self, kind: str, a: Pair | None = None, b: Pair | None = None) -> None:
+        """Add ground at the height of its kind, by two opposite corners; without them over the whole plot."""
+        a, b = (self.low, self.high) if a is None or b is None else (a, b)
+        self.span(kind, a, b, TOPS_M[kind] - SLAB_M, TOPS_M[kind])
 
-    def span(self, kind: str, a: Pair, b: Pair, low_m: float, high_m: float) -> None:
-        """Add a box by two opposite corners of its footprint, in any order."""
-        self.boxes.add_span(kind, np.minimum(a, b), np.maximum(a, b), low_m, high_m)
-
-    def pave(self, a: Pair, b: Pair) -> None:
-        """Add pavement between two opposite corners of its footprint, in any order."""
-        lay(self.boxes, "Sidewalks", np.minimum(a, b), np.maximum(a, b))
-
-    def cover(self, kind: str) -> None:
-        """Cover the plot with pavement or lawn."""
-        lay(self.boxes, kind, self.low, self.high)
+    def ring(self, kind: str, outer: Any, inner: Any, heights_m: Range | None = None) -> None:
+        """Add four slabs between two rectangles, each by its low and high corner; without heights they are ground."""
+        heights = heights_m or (TOPS_M[kind] - SLAB_M, TOPS_M[kind])
+        (low, high), (inner_low, inner_high) = outer, inner
+        self.span(kind, low, (high[0], inner_low[1]), *heights)
+        self.span(kind, (low[0], inner_high[1]), high, *heights)
+        self.span(kind, (low[0], inner_low[1]), (inner_low[0], inner_high[1]), *heights)
+        self.span(kind, (inner_high[0], inner_low[1]), (high[0], inner_high[1]), *heights)
 
     def bench(self, axis: int, along: float, across: float) -> None:
         """Add a bench of 1.8 m along a street, and a bin next to it."""
@@ -119,25 +94,24 @@ class Plot:
             top = height * (1.0 if is_top else rng.uniform(0.75, 0.9))
             self.add("Vegetation", (x + dx * shift, y + dy * shift), (size, size), low, top)
 
-
-def _lay_crossing_paths(plot: Plot, half_m: float) -> None:
-    """Lay two crossing paths, and lawn in the quarters between them."""
-    low, high, (x, y) = plot.low, plot.high, plot.middle
-    plot.pave((low[0], y - half_m), (high[0], y + half_m))
-    for a, b in ((low[1], y - half_m), (y + half_m, high[1])):
-        plot.pave((x - half_m, a), (x + half_m, b))
-        for c, d in ((low[0], x - half_m), (x + half_m, high[0])):
-            lay(plot.boxes, "Terrain", (c, a), (d, b))
+    def crossing_paths(self, half_m: float) -> None:
+        """Lay two crossing paths, and lawn in the quarters between them."""
+        low, high, (x, y) = self.low, self.high, self.middle
+        self.lay("Sidewalks", (low[0], y - half_m), (high[0], y + half_m))
+        for a, b in ((low[1], y - half_m), (y + half_m, high[1])):
+            self.lay("Sidewalks", (x - half_m, a), (x + half_m, b))
+            for c, d in ((low[0], x - half_m), (x + half_m, high[0])):
+                self.lay("Terrain", (c, a), (d, b))
 
 
 def _park(plot: Plot) -> None:
     """Build lawns between two crossing paths, a pond with a stone rim, groves, a hedge with openings."""
     low, high, middle = plot.low, plot.high, plot.middle
-    _lay_crossing_paths(plot, 2.0)
-    pond = np.array([middle + np.array((3.5, 3.5)), high - 3.5])
+    plot.crossing_paths(2.0)
+    pond = np.array([middle + 3.5, high - 3.5])
     water = pond[0] + 0.5, pond[1] - 0.5
     plot.span("Water", *water, -0.8, WATER_TOP_M)
-    add_ring(plot.boxes, "Static", pond, water, (-0.5, 0.3))
+    plot.ring("Static", pond, water, (-0.5, 0.3))
     for x, y in ((0, 0), (1, 0), (0, 1)):  # the quarters without the pond
         a, b = np.where((x, y), middle, low) + 4.5, np.where((x, y), high, middle) - 4.5
         for _ in range(5):
@@ -151,15 +125,14 @@ def _park(plot: Plot) -> None:
 
 def _square(plot: Plot) -> None:
     """Build a paved square with a hall, a fountain, kiosks and trees in rows."""
-    plot.cover("Sidewalks")
+    plot.lay("Sidewalks")
     low, high, middle, size = plot.low, plot.high, plot.middle, plot.size
     hall = np.array([size[0] * 0.5, min(14.0, size[1] * 0.3)])
     center = np.array([middle[0], high[1] - hall[1] / 2 - 2.0])
     plot.add("Buildings", center, hall, -1.5, 9.0)
     plot.add("Buildings", center, (6.0, 6.0), 9.0, 17.0)  # a clock tower on the roof
-    plot.add("Water", (middle[0], middle[1] - 4.0), (5.0, 5.0), -0.6, 0.45)
-    rim = middle + np.array([(-3.0, -7.0), (3.0, -1.0)]), middle + np.array([(-2.5, -6.5), (2.5, -1.5)])
-    add_ring(plot.boxes, "Static", *rim, (-0.4, 0.6))
+    plot.add("Water", middle - (0.0, 4.0), (5.0, 5.0), -0.6, 0.45)
+    plot.ring("Static", np.add(middle, [(-3, -7), (3, -1)]), np.add(middle, [(-2.5, -6.5), (2.5, -1.5)]), (-0.4, 0.6))
     for x in np.linspace(low[0] + 4.0, high[0] - 4.0, 6):
         plot.tree((x, low[1] + 3.5), (3.0, 3.8), (5.5, 7.5))
     for side in (-1, 1):
@@ -171,7 +144,7 @@ def _square(plot: Plot) -> None:
 
 def _courtyard(plot: Plot) -> None:
     """Build four L-shaped houses around a green yard, with a passage on every side."""
-    plot.cover("Terrain")
+    plot.lay("Terrain")
     rng, low, high = plot.rng, plot.low + 1.5, plot.high - 1.5
     middle, depth = (low + high) / 2, min(12.0, 0.24 * (high - low).min())
     gap = rng.uniform(5.5, 7.0) / 2
@@ -183,18 +156,17 @@ def _courtyard(plot: Plot) -> None:
             plot.span("Buildings", corner, (middle[0] + sx * gap, back), -2.0, height)
             lower = height - rng.choice([0.0, 3.0, 6.0])
             plot.span("Buildings", (corner[0], back), (corner[0] - sx * depth, middle[1] + sy * gap), -2.0, lower)
-            roof = corner - (sx * 2.0, sy * 2.0), corner - (sx * 6.0, sy * 6.0)
-            plot.span("Buildings", *roof, height, height + 2.6)
+            plot.span("Buildings", corner - (sx * 2.0, sy * 2.0), corner - (sx * 6.0, sy * 6.0), height, height + 2.6)
             cellar = corner - (sx * 1.0, sy * 1.0), corner - (sx * 9.0, sy * (depth - 1.0))
             plot.span("Buildings", *cellar, -5.0, -2.2)
     for _ in range(4):
         plot.tree(rng.uniform(low + depth + 4.0, high - depth - 4.0), (3.5, 5.0), (6.0, 9.0), 0.5)
-    plot.bench(0, middle[0], middle[1])
+    plot.bench(0, *middle)
 
 
 def _houses(plot: Plot) -> None:
     """Build two rows of slightly turned houses, back to back, with gardens, hedges and garden walls between them."""
-    plot.cover("Terrain")
+    plot.lay("Terrain")
     rng, low, high, middle = plot.rng, plot.low, plot.high, plot.middle
     columns = max(2, int((high[0] - low[0]) // 18.0))
     pitch = (high[0] - low[0]) / columns
@@ -222,26 +194,25 @@ def _houses(plot: Plot) -> None:
 
 def _towers(plot: Plot) -> None:
     """Build two towers on podiums and a lower slab between them, on a paved plot."""
-    plot.cover("Sidewalks")
+    plot.lay("Sidewalks")
     rng, size = plot.rng, plot.size
     for number, center in enumerate((plot.at(0.27, 0.3), plot.at(0.72, 0.7))):
-        podium = np.array([size[0] * 0.4, size[1] * 0.42])
+        podium = size * (0.4, 0.42)
         yaw = float(rng.choice([0.0, 0.0, -12.0, 15.0])) if number else 0.0
         plot.add("Buildings", center, podium, -1.0, 5.0)
         plot.add("Buildings", center, podium * rng.uniform(0.6, 0.72), 5.0, rng.uniform(20.0, 35.0), yaw)
         plot.add("Buildings", center + podium * 0.1, (5.0, 5.0), 1.0, 18.0, yaw)  # the lift shaft, inside
-    slab, height = size * (0.34, 0.2), rng.uniform(8.0, 12.0)
-    plot.add("Buildings", plot.at(0.73, 0.22), slab, -1.0, height, rng.uniform(-9.0, 9.0))
+    height = rng.uniform(8.0, 12.0)
+    plot.add("Buildings", plot.at(0.73, 0.22), size * (0.34, 0.2), -1.0, height, rng.uniform(-9.0, 9.0))
     for place in ((0.2, 0.62), (0.32, 0.72), (0.2, 0.84), (0.34, 0.9)):
         plot.tree(plot.at(*place), (3.2, 4.4), (6.0, 9.0), 0.5)
 
 
 def _lanes(plot: Plot) -> None:
     """Build terraces of narrow old houses with lanes between them; one way through is built over."""
-    plot.cover("Sidewalks")
-    rng, low, high = plot.rng, plot.low, plot.high
-    lane, depth = 5.6, 8.5
-    rows = max(2, int((high[1] - low[1] + lane) // (depth + lane)))
+    plot.lay("Sidewalks")
+    rng, low, high, lane = plot.rng, plot.low, plot.high, 5.6
+    rows = max(2, int((high[1] - low[1] + lane) // (8.5 + lane)))
     depth = (high[1] - low[1] - (rows - 1) * lane) / rows
     gap_row = rng.integers(rows)
     for row in range(rows):
@@ -264,7 +235,7 @@ def _lanes(plot: Plot) -> None:
 
 def _skyscrapers(plot: Plot) -> None:
     """Build three towers of different heights on a plaza, with a colonnade of trees."""
-    plot.cover("Sidewalks")
+    plot.lay("Sidewalks")
     rng, low, high, size = plot.rng, plot.low, plot.high, plot.size
     for place in ((0.25, 0.27), (0.74, 0.34), (0.42, 0.76)):
         center, foot = plot.at(*place), size * rng.uniform(0.24, 0.32, 2)
@@ -275,12 +246,12 @@ def _skyscrapers(plot: Plot) -> None:
         plot.add("Buildings", center, (4.0, 4.0), 0.5, height * 0.55, yaw)  # the lift shaft, inside
     for along in np.arange(low[0] + 5.0, high[0] - 4.0, 9.0):
         plot.tree((along, high[1] - 3.5), (3.0, 4.0), (6.0, 9.0))
-    plot.bench(0, low[0] + size[0] * 0.75, low[1] + size[1] * 0.75)
+    plot.bench(0, *plot.at(0.75, 0.75))
 
 
 def _campus(plot: Plot) -> None:
     """Build two long halls and a library around a lawn, with paths from door to door."""
-    plot.cover("Terrain")
+    plot.lay("Terrain")
     rng, low, high, size, middle = plot.rng, plot.low, plot.high, plot.size, plot.middle
     for y in (low[1] + size[1] * 0.14, high[1] - size[1] * 0.14):
         long = np.array([size[0] * rng.uniform(0.62, 0.8), size[1] * 0.17])
@@ -291,7 +262,7 @@ def _campus(plot: Plot) -> None:
     library = (high[0] - size[0] * 0.14, middle[1])
     plot.add("Buildings", library, size * (0.2, 0.26), -1.0, rng.uniform(14.0, 22.0), rng.uniform(-12.0, 12.0))
     for y in (middle[1] - size[1] * 0.16, middle[1] + size[1] * 0.16):
-        plot.pave((low[0], y - 1.5), (high[0] - size[0] * 0.28, y + 1.5))
+        plot.lay("Sidewalks", (low[0], y - 1.5), (high[0] - size[0] * 0.28, y + 1.5))
         plot.bench(0, low[0] + size[0] * 0.3, y + 2.4)
     for _ in range(6):
         plot.tree(rng.uniform(plot.at(0.06, 0.3), plot.at(0.66, 0.7)), (4.0, 6.0), (7.0, 12.0), 0.5)
@@ -299,14 +270,15 @@ def _campus(plot: Plot) -> None:
 
 def _farm(plot: Plot) -> None:
     """Build a farmhouse and a barn at a yard, an orchard in rows, a field behind a dry wall."""
-    plot.cover("Terrain")
+    plot.lay("Terrain")
     rng, low, high, size = plot.rng, plot.low, plot.high, plot.size
     yaw = rng.uniform(-10.0, 10.0)
-    house, barn = plot.at(0.24, 0.2), plot.at(0.3, 0.62)
-    plot.add("Buildings", house, (12.0, 8.5), -0.5, 5.6, yaw)
-    plot.add("Buildings", house, (11.0, 4.4), 5.6, 7.8, yaw)
-    plot.add("Buildings", barn, (17.0, 10.0), -0.3, 6.2, yaw + 90.0)
-    plot.add("Buildings", barn, (16.0, 5.0), 6.2, 8.6, yaw + 90.0)
+    for place, foot, roof, eaves, ridge, base, turn in (
+        (plot.at(0.24, 0.2), (12.0, 8.5), (11.0, 4.4), 5.6, 7.8, -0.5, 0.0),
+        (plot.at(0.3, 0.62), (17.0, 10.0), (16.0, 5.0), 6.2, 8.6, -0.3, 90.0),  # the barn
+    ):
+        plot.add("Buildings", place, foot, base, eaves, yaw + turn)
+        plot.add("Buildings", place, roof, eaves, ridge, yaw + turn)
     plot.add("Static", plot.at(0.44, 0.4), (2.6, 1.6), 0.0, 1.2, yaw)  # a cart
     for x in np.arange(low[0] + size[0] * 0.56, high[0] - 3.0, 6.5):
         for y in np.arange(low[1] + 4.0, low[1] + size[1] * 0.55, 6.5):
@@ -320,7 +292,7 @@ def _farm(plot: Plot) -> None:
 
 def _market(plot: Plot) -> None:
     """Build rows of stalls with awnings around a market hall that has arcades on its long sides."""
-    plot.cover("Sidewalks")
+    plot.lay("Sidewalks")
     rng, low, high, middle = plot.rng, plot.low, plot.high, plot.middle
     hall = plot.size * (0.34, 0.26)
     plot.add("Buildings", middle, hall - (0.0, 2 * ARCADE_M), -0.5, PASSAGE_M)
@@ -328,11 +300,10 @@ def _market(plot: Plot) -> None:
     plot.add("Buildings", middle, hall * (0.9, 0.4), 7.0, 9.5)
     for x in np.linspace(-0.5, 0.5, 6) * (hall[0] - 0.5):
         for side in (-1, 1):
-            plot.add("Poles", middle + np.array([x, side * (hall[1] / 2 - 0.25)]), (0.5, 0.5), 0.0, PASSAGE_M)
+            plot.add("Poles", np.add(middle, (x, side * (hall[1] / 2 - 0.25))), (0.5, 0.5), 0.0, PASSAGE_M)
     for y in np.arange(low[1] + 4.0, high[1] - 3.0, 7.0):
         for x in np.arange(low[0] + 4.0, high[0] - 3.0, 5.2):
-            clear = (np.abs(np.array([x, y]) - middle) > hall / 2 + 3.5).any()
-            if clear and rng.random() < 0.7:
+            if (np.abs((x, y) - middle) > hall / 2 + 3.5).any() and rng.random() < 0.7:
                 yaw = rng.uniform(-6.0, 6.0)
                 plot.add("Static", (x, y), (2.6, 1.6), 0.0, 1.0, yaw)
                 plot.add("Static", (x, y), (3.2, 2.4), 2.3, 2.5, yaw)  # the awning
@@ -344,24 +315,24 @@ def _market(plot: Plot) -> None:
 
 def _meadow(plot: Plot) -> None:
     """Leave open grass with a path along it, two groves and a pavilion: room for a drone to circle."""
-    plot.cover("Terrain")
+    plot.lay("Terrain")
     low, high, middle = plot.low, plot.high, plot.middle
-    plot.pave((low[0], middle[1] - 1.5), (high[0], middle[1] + 1.5))
+    plot.lay("Sidewalks", (low[0], middle[1] - 1.5), (high[0], middle[1] + 1.5))
     for corner in (plot.at(0.18, 0.2), plot.at(0.8, 0.8)):
         for _ in range(4):
             plot.tree(corner + plot.rng.uniform(-5.0, 5.0, 2), (4.0, 6.0), (7.0, 12.0))
     pavilion = plot.at(0.78, 0.24)
     plot.add("Static", pavilion, (5.0, 5.0), 2.7, 3.4)
-    for dx in (-2.2, 2.2):
-        for dy in (-2.2, 2.2):
-            plot.add("Poles", (pavilion[0] + dx, pavilion[1] + dy), (0.2, 0.2), 0.0, 2.7)
+    for leg in ((-2.2, -2.2), (-2.2, 2.2), (2.2, -2.2), (2.2, 2.2)):
+        plot.add("Poles", pavilion + leg, (0.2, 0.2), 0.0, 2.7)
     plot.bench(0, middle[0], middle[1] + 2.4)
 
 
-def build_on_lots(plot: Plot, style: Lots) -> None:
+def _lots(plot: Plot) -> None:
     """Build two rows of lots, back to back, each with its front to a street and a path to it through its garden."""
+    style = plot.lots
     has_gardens = style.setback_m >= 2.5
-    plot.cover("Terrain" if has_gardens else "Sidewalks")
+    plot.lay("Terrain" if has_gardens else "Sidewalks")
     rng, low, high, (lowest, highest) = plot.rng, plot.low, plot.high, style.heights_m
     depth = plot.size[1] / 2 - max(2.5, 0.08 * plot.size[1]) - style.setback_m
     fall = min(1.0, float(np.linalg.norm(plot.middle)) / style.fall_m) if style.fall_m else 0.0
@@ -376,13 +347,13 @@ def build_on_lots(plot: Plot, style: Lots) -> None:
             middle = np.array([at + front / 2, row + side * (style.setback_m + deep / 2)])
             plot.add("Buildings", middle, (front, deep), 0.0, height)
             if has_gardens:
-                plot.pave((middle[0] - 0.8, row), (middle[0] + 0.8, row + side * style.setback_m))
+                plot.lay("Sidewalks", (middle[0] - 0.8, row), (middle[0] + 0.8, row + side * style.setback_m))
             at += front + style.gap_m * rng.uniform(1.0, 1.6)
 
 
 def _plaza(plot: Plot) -> None:
     """Pave a square, free in the middle, with trees and benches along its edges."""
-    plot.cover("Sidewalks")
+    plot.lay("Sidewalks")
     low, high = plot.low, plot.high
     for x in np.arange(low[0] + 6.0, high[0] - 5.0, 11.0):
         for y, inwards in ((low[1] + 2.5, 1), (high[1] - 2.5, -1)):
@@ -393,17 +364,17 @@ def _plaza(plot: Plot) -> None:
 
 def _green(plot: Plot) -> None:
     """Lay a lawn between two crossing paths, free in the middle of each quarter, with trees along its edges."""
-    low, high, middle = plot.low, plot.high, plot.middle
-    _lay_crossing_paths(plot, 1.5)
+    low, high = plot.low, plot.high
+    plot.crossing_paths(1.5)
     for axis in (0, 1):
         for along in np.arange(low[axis] + 6.0, high[axis] - 5.0, 9.0):
             for across in (low[1 - axis] + 4.0, high[1 - axis] - 4.0):
-                if abs(along - middle[axis]) > 4.0:
+                if abs(along - plot.middle[axis]) > 4.0:
                     plot.tree(point(axis, along, across), (3.5, 5.5), (7.0, 12.0))
 
 
 BLOCKS: dict[str, Callable[[Plot], None]] = {
     "park": _park, "square": _square, "courtyard": _courtyard, "houses": _houses, "towers": _towers, "lanes": _lanes,
     "skyscrapers": _skyscrapers, "campus": _campus, "farm": _farm, "market": _market, "meadow": _meadow,
-    "plaza": _plaza, "green": _green,
+    "plaza": _plaza, "green": _green, "lots": _lots,
 }  # fmt: skip

@@ -2,8 +2,7 @@
 
 The sources of sizes are counted, as in the paper: `road`, bounds of a road; `bbox`, a table of asset sizes; `engine`,
 bounds of any other object; `default`, no answer: the plausible size of its asset or a cube of 1 m. Bounds are along the
-world's axes; of a turned object the box with these bounds is computed. An id is derived from the object's name, so that
-pictures of the same level refer to the box (`id_of`).
+world's axes; of a turned object the box with these bounds is computed. Ids are derived from names (`id_of`).
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ class UnrealCvMapConfig(UnrealCvConfig):
     # objects longer than this both ways and higher than 2 m, landscapes, are dropped and counted, m
     huge_m: ClassVar[float] = 150.0
     most_default: float | None = Field(
-        None, ge=0, le=1, description="largest share of boxes of a `default` size; more fail the export; null: any"
+        None, ge=0, le=1, description="largest share of boxes of a `default` size; null: any"
     )
 
     def inputs(self) -> dict[str, Path]:
@@ -125,15 +124,10 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
     tops_m = boxes[is_road, 2] + boxes[is_road, 5]
     ground_z_m = cfg.ground_z_m if cfg.ground_z_m is not None else float(np.median(tops_m)) if len(tops_m) else 0.0
     header = MapHeader(
-        name=cfg.name or level or "Unreal",
-        source=MapSource(tool="UnrealCV", version=version, file=level),
-        licence=cfg.licence,
-        credits=cfg.credits,
-        ground_z_m=ground_z_m,
-        extent_sources=counts,
-        num_objects=len(objects),
-        dropped_objects=dict(dropped),
-    )
+        name=cfg.name or level or "Unreal", source=MapSource(tool="UnrealCV", version=version, file=level),
+        licence=cfg.licence, credits=cfg.credits, ground_z_m=ground_z_m, extent_sources=counts,
+        num_objects=len(objects), dropped_objects=dict(dropped),
+    )  # fmt: skip
     log.info("%s: sizes from %s", where, counts)
     if dropped:
         log.warning("%s: dropped: %s", where, dict(dropped))

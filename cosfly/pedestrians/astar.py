@@ -28,20 +28,15 @@ STRAIGHT, DIAGONAL = range(2)  # columns of the steps
 
 
 def find_route(
-    free: np.ndarray,
-    start: tuple[int, int],
-    goal: tuple[int, int],
-    classes: np.ndarray | None = None,
+    free: np.ndarray, start: tuple[int, int], goal: tuple[int, int], classes: np.ndarray | None = None,
     costs: np.ndarray = UNIFORM,
-) -> np.ndarray | None:
-    """Find a cheapest route between two cells.
+) -> np.ndarray | None:  # fmt: skip
+    """Find a cheapest route between two cells, (k, 2) int64 cells with both ends; None if there is no route.
 
     Args:
         free: (ny, nx) bool, contiguous; start, goal: (x index, y index).
         classes: (ny, nx) uint8, rows of `costs`; None: all 0. costs: (classes, 4) int64, at least 1, what a cell costs
             along x, along y, and along the diagonals of equal and of opposite signs.
-    Returns:
-        (k, 2) int64 cells from start to goal, both included (k is 1 if they are the same); None if there is no route.
     """
     if free.ndim != 2 or free.dtype != np.bool_ or not free.flags.c_contiguous:
         raise ValueError("free must be a contiguous two-dimensional array of bool")
@@ -60,7 +55,12 @@ def find_route(
     least = 2 * int(costs.min())  # so that the estimate is never above the cost of a route
     if not _search(free, origin, target, state, steps, from_direction, classes, costs, least):
         return None
-    return _trace_back(from_direction, num_x, origin, target)
+    cells = [target]
+    while cells[-1] != origin:
+        direction = from_direction[cells[-1]]
+        cells.append(cells[-1] - int(_STEP_Y[direction] * num_x + _STEP_X[direction]))
+    rows, columns = np.divmod(np.array(cells[::-1], dtype=np.int64), num_x)
+    return np.column_stack([columns, rows])
 
 
 def route_cost(cells: np.ndarray) -> float:
@@ -175,21 +175,3 @@ def _move(heap_key, heap_cell, source, place):  # pragma: no cover (compiled)
 @njit(cache=True)
 def _is_before(total, to_go, other_total, other_to_go):  # pragma: no cover (compiled)
     return total < other_total or (total == other_total and to_go < other_to_go)
-
-
-@njit(cache=True)
-def _trace_back(from_direction, num_x, origin, target):  # pragma: no cover (compiled)
-    """Follow the directions from the target to the origin; return the cells from the origin on, (k, 2)."""
-    count, cell = 1, target
-    while cell != origin:
-        direction = from_direction[cell]
-        cell -= _STEP_Y[direction] * num_x + _STEP_X[direction]
-        count += 1
-    cells = np.empty((count, 2), dtype=np.int64)
-    cell = target
-    for k in range(count - 1, -1, -1):
-        cells[k, 0], cells[k, 1] = cell % num_x, cell // num_x
-        if k > 0:
-            direction = from_direction[cell]
-            cell -= _STEP_Y[direction] * num_x + _STEP_X[direction]
-    return cells

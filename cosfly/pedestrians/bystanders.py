@@ -1,8 +1,8 @@
 """Bystanders and cars around a pedestrian trajectory, clear of the target and of each other.
 
-They are placed one after the other: the target first, then bystanders, then cars. Each bystander passes the target at a
-moment of its own; the first is near from the start. Where a new one would collide, it waits a little before that
-place; if waiting does not help, it is drawn again, and skipped after some tries. So there may be fewer than requested.
+They are placed one after the other. Each bystander passes the target at a moment of its own; the first is near from the
+start. Where a new one would collide, it waits a little before that place; if waiting does not help, it is drawn again,
+and skipped after some tries. So there may be fewer than requested.
 """
 
 from __future__ import annotations
@@ -15,17 +15,9 @@ from cosfly.formats.bystanders import Bystander, Bystanders
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.geometry.axes import headings_of
 from cosfly.geometry.ground import Ground
+from cosfly.pedestrians import speed_model
 from cosfly.pedestrians.lanes import Lane
-from cosfly.pedestrians.speed_model import (
-    PACES,
-    STOP_GAP_MIN,
-    PacedRoute,
-    arrival_times,
-    menger_curvature,
-    sample,
-    speeds_at,
-    take_pace,
-)
+from cosfly.pedestrians.speed_model import PACES, STOP_GAP_MIN, PacedRoute, speeds_at, take_pace
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, sample_goal
 from cosfly.runtime.seeding import draw_by_share
 
@@ -68,8 +60,8 @@ class Trip:
         if self.kind == "Car":
             speeds_mps = braked(speeds_mps, self.route.along_m)
         line = np.column_stack([self.route.along_m, np.zeros(len(speeds_mps))])
-        times_s, now_s = arrival_times(line, speeds_mps), time_s + self.head_start_s
-        return sample(line, speeds_mps, times_s, self.route.stops_s, now_s)[0][:, 0]
+        times_s, now_s = speed_model.arrival_times(line, speeds_mps), time_s + self.head_start_s
+        return speed_model.sample(line, speeds_mps, times_s, self.route.stops_s, now_s)[0][:, 0]
 
     def waiting(self, before_m: float) -> Trip:
         """Return the trip with a stop of WAIT_S, or a longer one, at least KEEP_BACK_M before a place of the route."""
@@ -96,23 +88,16 @@ def braked(limits_mps: np.ndarray, along_m: np.ndarray) -> np.ndarray:
 
 
 def bystanders_of(
-    target: PedestrianTrajectory,
-    ground: WalkableGround,
-    lanes: list[Lane],
-    cfg: PedestriansConfig,
+    target: PedestrianTrajectory, ground: WalkableGround, lanes: list[Lane], cfg: PedestriansConfig,
     rng: np.random.Generator,
-) -> Bystanders:
+) -> Bystanders:  # fmt: skip
     """Place the bystanders and cars around one pedestrian trajectory."""
     placed = [Bystander("Pedestrians", target.positions_m, headings_of(target.positions_m, target.time_s))]
     for kind, wanted in (("Pedestrians", cfg.others), ("Car", cfg.traffic)):
         for number in range(wanted):
             for _ in range(cfg.num_retries + 1):
                 is_car = kind == "Car"
-                trip = (
-                    draw_car_trip(target, lanes, cfg, rng)
-                    if is_car
-                    else draw_bystander_trip(target, number, ground, cfg, rng)
-                )
+                trip = _draw_car(target, lanes, cfg, rng) if is_car else _draw_walk(target, number, ground, cfg, rng)
                 other = None if trip is None else avoid_collisions(trip, target.time_s, placed, ground.heights)
                 if other is not None:
                     placed.append(replace(other, is_look_alike=not is_car and number < cfg.look_alikes))
@@ -134,7 +119,7 @@ def avoid_collisions(trip: Trip, time_s: np.ndarray, placed: list[Bystander], he
     return None
 
 
-def draw_bystander_trip(
+def _draw_walk(
     target: PedestrianTrajectory, number: int, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator
 ) -> Trip | None:
     """Draw a bystander's route that passes the target, back and forth for the duration; None if there is none."""
@@ -156,14 +141,14 @@ def draw_bystander_trip(
     route = take_pace(ground.grid.centers_of(cells), pace, rng)
     trip = Trip("Pedestrians", route, speeds_at(route, pace, cfg, rng) * rng.uniform(*OWN_SPEED))
     while trip.along_m(3.0 * target.time_s[-1:])[0] >= trip.route.along_m[-1]:
-        trip = with_return(trip)
+        trip = _with_return(trip)
     times_s = moment_s + np.arange(0.0, target.time_s[-1], target.time_s[1])
     apart_m = trip.moved(times_s, ground.heights).positions_m[:, :2] - ground.grid.centers_of(np.array(place))
     away_m = np.linalg.norm(apart_m, axis=1)
     return replace(trip, head_start_s=float(times_s[np.argmin(away_m)]) - moment_s)
 
 
-def with_return(trip: Trip) -> Trip:
+def _with_return(trip: Trip) -> Trip:
     """Return the trip with the route back to its start, after a stop at its end or just before."""
     route = trip.route
     stops_s = np.concatenate([route.stops_s, route.stops_s[-2::-1]])
@@ -174,7 +159,7 @@ def with_return(trip: Trip) -> Trip:
     return replace(trip, route=back, limits_mps=np.concatenate([trip.limits_mps, trip.limits_mps[-2::-1]]))
 
 
-def draw_car_trip(
+def _draw_car(
     target: PedestrianTrajectory, lanes: list[Lane], cfg: PedestriansConfig, rng: np.random.Generator
 ) -> Trip | None:
     """Draw a car's route that starts nearby and lasts as long, or up to a dead end; None where no lane is near."""
@@ -196,7 +181,7 @@ def draw_car_trip(
     route = PacedRoute.without_stops(np.concatenate(pieces))
     if route.along_m[-1] < SHORTEST_DRIVE_M:
         return None
-    curvatures = np.maximum(menger_curvature(route.polyline_m), 1e-6)
+    curvatures = np.maximum(speed_model.menger_curvature(route.polyline_m), 1e-6)
     limits_mps = np.minimum(CAR_SPEED_MPS * rng.uniform(*OWN_SPEED), np.sqrt(CAR_SIDEWAYS_MPS2 / curvatures))
     limits_mps[-1] = 0.0
     return Trip("Car", route, limits_mps)

@@ -1,15 +1,9 @@
 """The footing of each cell: pavement, open ground, carriageway or crossing.
 
-A crossing is
-
-- in a map that marks crossings: carriageway under its stripes, in any direction. Stripes are paint that is MARKED_M
-wide
-  in every direction once gaps below GAP_M are closed, unlike dashes and edge lines;
-- in other maps: carriageway straight across, from pavement to pavement along the grid axis (of four, with the
-diagonals)
-  along which they are nearest, at most ACROSS_SHARE as wide as the carriageway at right angles to it.
-
-So routes cross a street and do not run along it, and avoid a junction without marks.
+In a map that marks crossings, a crossing is carriageway under stripes: paint that is MARKED_M wide in every direction
+once gaps below GAP_M are closed, unlike dashes and edge lines. In other maps it is carriageway straight across, from
+pavement to pavement along the grid axis (of four, with the diagonals) along which they are nearest, at most
+ACROSS_SHARE as wide as the carriageway at right angles to it. So routes cross a street and do not run along it.
 """
 
 from __future__ import annotations

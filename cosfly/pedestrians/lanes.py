@@ -1,7 +1,7 @@
 """The lanes of a map's straight roads, and the curves from lane to lane at its junctions.
 
-A map's roads are boxes. A box of Roads that is longer than wide is a street; streets that cross, or that reach each
-other over road, meet in a junction. Maps whose roads are patches have no lanes and no cars.
+A box of Roads that is longer than wide is a street; streets that cross, or that reach each other over road, meet in a
+junction. Maps whose roads are patches have no lanes and no cars.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ BEFORE_CURVE_M = 1.5  # from the start of a curve to the crossing carriageway
 SAME_PLACE_M = 3.0
 
 IsFree = Callable[[np.ndarray], bool]  # whether a car can pass all of these positions, (n, 2) m
+Station = tuple[float, int]  # m along a street, and the number of the junction there, -1 for a dead end
 
 
 @dataclass(frozen=True)
@@ -48,9 +49,12 @@ class Street:
 
 @dataclass
 class Lane:
-    """A lane between two junctions: points_m (k, 2); onward: the next lanes, with the curves to them, (j, 2)."""
+    """A lane between two stations of a street: points_m (k, 2); onward: next lanes, and curves to them, (j, 2)."""
 
     points_m: np.ndarray
+    street: Street
+    first: Station
+    last: Station
     onward: list[tuple[int, np.ndarray]] = field(default_factory=list)
 
     def distance_m(self, place_m: np.ndarray) -> float:
@@ -71,27 +75,25 @@ def lanes_of(box_map: BoxMap) -> list[Lane]:
         is_clear = signed_distances(obstacles, places, CLEAR_M)[0] >= CLEAR_M
         return bool(_on_road(roads, points_m).all() and is_clear.all())
 
-    junctions, stations = _junctions(streets)
-    lanes: list[Lane] = []
-    ways: list[_Way] = []
-    for street, along in zip(streets, stations, strict=True):
-        for low, high in pairwise(along):
-            for way in (_Way(street, low, high), _Way(street, high, low)):
-                line = way.line(junctions, is_free)
-                if line is not None:
-                    lanes.append(Lane(line))
-                    ways.append(way)
-    for lane, way in zip(lanes, ways, strict=True):
-        for number, after in enumerate(ways):
-            if way.leads_to(after):
-                curve = _curve(lane.points_m, lanes[number].points_m)
+    widths_m, stations = _junctions(streets)
+    lanes = [
+        lane
+        for street, along in zip(streets, stations, strict=True)
+        for low, high in pairwise(along)
+        for way in ((low, high), (high, low))
+        if (lane := _lane(street, *way, widths_m, is_free)) is not None
+    ]
+    for lane in lanes:
+        for number, after in enumerate(lanes):
+            is_back = after.street is lane.street and after.last == lane.first  # cars do not turn on the spot
+            if lane.last[1] >= 0 and after.first[1] == lane.last[1] and not is_back:
+                curve = _curve(lane.points_m, after.points_m)
                 if is_free(curve):
                     lane.onward.append((number, curve))
     return lanes
 
 
 def _streets(roads: BoxMap) -> list[Street]:
-    """Return the streets of the boxes of road."""
     streets = []
     rows = roads.centers[:, :2], roads.half_extents[:, :2], roads.rotations_deg
     for center, half, rotation in zip(*rows, strict=True):
@@ -99,11 +101,11 @@ def _streets(roads: BoxMap) -> list[Street]:
         direction = np.array([np.cos(yaw), np.sin(yaw)])
         long, short = half.max(), half.min()
         if long >= LONG * short and 2.0 * short >= NARROWEST_M:
-            reach = [
+            before_m, after_m = (
                 _reach_m(roads, center + sign * long * direction, sign * direction, REACH * 2.0 * short)
                 for sign in (-1.0, 1.0)
-            ]
-            streets.append(Street(center - long * direction, direction, 2.0 * long, 2.0 * short, (reach[0], reach[1])))
+            )
+            streets.append(Street(center - long * direction, direction, 2.0 * long, 2.0 * short, (before_m, after_m)))
     return streets
 
 
@@ -124,22 +126,20 @@ def _on_road(roads: BoxMap, points_m: np.ndarray) -> np.ndarray:
     return ((np.abs(x) <= half[:, 0]) & (np.abs(y) <= half[:, 1])).any(axis=1)
 
 
-@dataclass(frozen=True)
-class Junction:
-    """A meeting of streets: place_m (2,); width_m of the widest."""
-
-    place_m: np.ndarray
-    width_m: float
-
-
-def _junctions(streets: list[Street]) -> tuple[list[Junction], list[list[tuple[float, int]]]]:
-    """Return junctions, and the stations of each street in order: (m along it, junction), -1 for a dead end."""
-    junctions: list[Junction] = []
+def _junctions(streets: list[Street]) -> tuple[list[float], list[list[Station]]]:
+    """Return the width of the widest street of each junction, m, and the stations of each street in order."""
+    places_m, widths_m = list[np.ndarray](), list[float]()
     stations: list[dict[int, float]] = [{} for _ in streets]
     for (i, one), (j, two) in combinations(enumerate(streets), 2):
         meeting = _meeting(one, two)
         if meeting is not None:
-            number = _number_of(one.at(meeting[0]), max(one.width_m, two.width_m), junctions)
+            place_m = one.at(meeting[0])
+            near = (k for k, known_m in enumerate(places_m) if np.linalg.norm(known_m - place_m) < SAME_PLACE_M)
+            number = next(near, len(places_m))
+            if number == len(places_m):
+                places_m.append(place_m)
+                widths_m.append(0.0)
+            widths_m[number] = max(widths_m[number], one.width_m, two.width_m)
             stations[i].setdefault(number, meeting[0])
             stations[j].setdefault(number, meeting[1])
     lists = []
@@ -150,47 +150,24 @@ def _junctions(streets: list[Street]) -> tuple[list[Junction], list[list[tuple[f
         if along[-1][0] < street.length_m - street.width_m:
             along.append((street.length_m, -1))
         lists.append(along)
-    return junctions, lists
+    return widths_m, lists
 
 
-def _number_of(place_m: np.ndarray, width_m: float, junctions: list[Junction]) -> int:
-    """Return the number of the junction at a place, which is added or widened in the list."""
-    for number, known in enumerate(junctions):
-        if np.linalg.norm(known.place_m - place_m) < SAME_PLACE_M:
-            junctions[number] = Junction(known.place_m, max(width_m, known.width_m))
-            return number
-    junctions.append(Junction(place_m, width_m))
-    return len(junctions) - 1
-
-
-@dataclass(frozen=True)
-class _Way:
-    """A stretch of a street between two stations, driven from the first to the second."""
-
-    street: Street
-    first: tuple[float, int]
-    last: tuple[float, int]
-
-    def leads_to(self, after: _Way) -> bool:
-        """Return whether another way continues this one; cars do not turn on the spot."""
-        is_back = after.street is self.street and after.last == self.first
-        return self.last[1] >= 0 and after.first[1] == self.last[1] and not is_back
-
-    def line(self, junctions: list[Junction], is_free: IsFree) -> np.ndarray | None:
-        """Return its lane on the right, as far from the middle as it is free, (k, 2) m; None if blocked."""
-        sign = np.sign(self.last[0] - self.first[0])
-        (start, end) = (
-            along + toward * sign * (junctions[number].width_m / 2.0 + BEFORE_CURVE_M if number >= 0 else 3.0)
-            for toward, (along, number) in ((1.0, self.first), (-1.0, self.last))
-        )
-        if sign * (end - start) < SHORTEST_LANE_M:
-            return None
-        direction = sign * self.street.direction
-        right = np.array([direction[1], -direction[0]])
-        steps = np.linspace(start, end, int(abs(end - start) / STEP_M) + 2)
-        middle = self.street.start_m + steps[:, None] * self.street.direction
-        shifts = (share * self.street.width_m * right for share in LANE_SHARES)
-        return next((lane for shift in shifts if is_free(lane := middle + shift)), None)
+def _lane(street: Street, first: Station, last: Station, widths_m: list[float], is_free: IsFree) -> Lane | None:
+    """Return the lane on the right between two stations, as far from the middle as it is free; None if blocked."""
+    sign = np.sign(last[0] - first[0])
+    start, end = (
+        along + toward * sign * (widths_m[number] / 2.0 + BEFORE_CURVE_M if number >= 0 else 3.0)
+        for toward, (along, number) in ((1.0, first), (-1.0, last))
+    )
+    if sign * (end - start) < SHORTEST_LANE_M:
+        return None
+    direction = sign * street.direction
+    right = np.array([direction[1], -direction[0]])
+    steps = np.linspace(start, end, int(abs(end - start) / STEP_M) + 2)
+    middle = street.start_m + steps[:, None] * street.direction
+    lines = (middle + share * street.width_m * right for share in LANE_SHARES)
+    return next((Lane(line, street, first, last) for line in lines if is_free(line)), None)
 
 
 def _meeting(one: Street, two: Street) -> tuple[float, float] | None:

@@ -1,7 +1,6 @@
 """`cosfly roi`: the region of interest of a map, proposed, and drawn on a local page (subsec:appendix_g_editor).
 
-The page draws; what it shows of a region is computed here, by the code that the stage walks with. It is served to this
-machine alone, under an address that nobody can guess, and writes the one file that the command named.
+The page draws; what it shows of a region is computed here, by the code that the stage walks with.
 """
 
 from __future__ import annotations
@@ -22,13 +21,8 @@ from shapely.geometry.base import BaseGeometry
 from cosfly.formats.backdrop import Backdrop
 from cosfly.formats.boxes import AXES, BoxMap, check_ground, read_boxes
 from cosfly.formats.roi import Roi, RoiPolygon, parse_roi, write_roi
-from cosfly.geometry.grid import OccupancyGrid, empty_grid
-from cosfly.pedestrians.walkable import (
-    PedestriansConfig,
-    WalkableGround,
-    check_roi,
-    walkable_ground,
-)
+from cosfly.geometry.grid import empty_grid
+from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, check_roi, walkable_ground
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import read_bytes, read_text, sha256_bytes
 from cosfly.viz.page import page, scripts
@@ -40,22 +34,6 @@ OCCUPIED, MARGIN, UNUSED, FREE = 128, 190, 228, 255  # grey levels of the backdr
 IN_REGION, WALKABLE = (90, 160, 230, 60), (60, 150, 240, 110)  # RGBA over the backdrop
 TOLERANCE_M, SMALLEST_HOLE_M2 = 1.0, 100.0  # of a proposal, which a person goes on with
 FROM_ABOVE_PX = 2400
-
-
-# --- figures ----------------------------------------------------------------------------------------------------------
-
-
-def figures(ground: WalkableGround) -> dict[str, Any]:
-    """Return what the page shows of a ground: cells and components."""
-    counts = ground.counts
-    return {
-        "region": counts["cells_in_roi"],
-        "walkable": counts["cells_walkable"],
-        "used": counts["cells_used"],
-        "components": counts["components"],
-        "large": counts["components_used"],
-        "largest": counts["component_sizes_used"][0],
-    }
 
 
 # --- a first region ---------------------------------------------------------------------------------------------------
@@ -105,9 +83,8 @@ def run_propose(map_: Path, cfg: PedestriansConfig, out: Path) -> str:
     roi = propose(walkable_ground(box_map, cfg, where=map_), box_map.name)
     ground = walkable_ground(box_map, cfg, roi, where=map_, roi_where=out)
     write_roi(out, roi)
-    rings = roi.rings()
-    num_holes = sum(len(polygon.holes) for polygon in rings)
-    return f"polygons: {len(rings)}, holes: {num_holes}, walkable cells: {ground.counts['cells_used']:,}"
+    rings, num_cells = roi.rings(), ground.counts["cells_used"]
+    return f"polygons: {len(rings)}, holes: {sum(len(one.holes) for one in rings)}, walkable cells: {num_cells:,}"
 
 
 def _read_map(path: Path) -> BoxMap:
@@ -148,11 +125,14 @@ class Editor:
 
     def page_html(self) -> str:
         """Return the page."""
-        folder, grid = Path(__file__).parent, self.bare.grid
+        folder, grid, ground = Path(__file__).parent, self.bare.grid, self.bare
+        levels = np.full(ground.walkable.shape, FREE, dtype=np.uint8)
+        for mask, level in ((~ground.walkable, UNUSED), (ground.inflated.occupied, MARGIN), (grid.occupied, OCCUPIED)):
+            levels[mask] = level
         data = {
             "map": self.box_map.name, "most_bytes": MOST_BYTES, "axes": AXES, "roi": self.opened,
             "x_min": grid.x_min_m, "y_min": grid.y_min_m, "cell": grid.resolution_m, "size": grid.size,
-            "grid": _encoded(self._backdrop_cells()), "levels": [OCCUPIED, MARGIN, UNUSED, FREE],
+            "grid": _encoded(levels), "levels": [OCCUPIED, MARGIN, UNUSED, FREE],
             "alphas": [IN_REGION[3], WALKABLE[3]], "picture": self.backdrop and self.backdrop.frame(),
             **self.cells(None),
         }  # fmt: skip
@@ -160,13 +140,6 @@ class Editor:
         script = scripts("tools.js", "canvas.js") + read_text(folder / "roi_editor.js")
         template = "cosfly/pedestrians/roi_editor.html"
         return page(template, title=self.box_map.name, style=style, script=script, asks=True, data=data)
-
-    def _backdrop_cells(self) -> np.ndarray:
-        ground, levels = self.bare, np.full(self.bare.grid.occupied.shape, FREE, dtype=np.uint8)
-        levels[~ground.walkable] = UNUSED
-        levels[ground.inflated.occupied] = MARGIN
-        levels[ground.grid.occupied] = OCCUPIED
-        return levels
 
     def region_of(self, data: bytes, where: Path) -> dict[str, Any]:
         """Read a file's bytes; gives the region and its cells."""
@@ -183,7 +156,12 @@ class Editor:
         if ground.is_in_roi is not None:
             picture[ground.is_in_roi] = IN_REGION
         picture[ground.walkable] = WALKABLE
-        return {"cells": _encoded(picture), "figures": figures(ground)}
+        names = {"region": "cells_in_roi", "walkable": "cells_walkable", "used": "cells_used",
+                 "components": "components", "large": "components_used"}  # fmt: skip
+        figures = {name: ground.counts[key] for name, key in names.items()}
+        return {
+            "cells": _encoded(picture), "figures": figures | {"largest": ground.counts["component_sizes_used"][0]},
+        }  # fmt: skip
 
     def save(self, data: bytes) -> dict[str, Any]:
         """Write the region, unless somebody else has written the file meanwhile."""
@@ -199,13 +177,14 @@ class Editor:
         return {"figures": found["figures"], "saved": str(self.path)}
 
     def answer(self, name: str, data: bytes) -> bytes:
-        """Answer what the page asks for.
-
-        Raises:
-            CosflyError: as a message for the page.
-        """
+        """Answer what the page asks for; errors are messages for the page."""
         if name == "above":
-            return png_bytes(_from_above(self.box_map, self.bare.grid))
+            grid, size_m = self.bare.grid, np.array(self.bare.grid.size) * self.bare.grid.resolution_m
+            per_m = FROM_ABOVE_PX / size_m.max()
+            width, height = (max(1, round(side)) for side in size_m * per_m)
+            # A place is 0 in the middle of the first pixel.
+            corner = grid.x_min_m + 0.5 / per_m, grid.y_min_m + size_m[1] - 0.5 / per_m
+            return png_bytes(draw_map(self.box_map, TopView(*corner, per_m, (width, height))))
         if name == "picture" and self.backdrop:
             return png_bytes(self.backdrop.picture)
         asked: dict[str, Callable[[], dict[str, Any]]] = {
@@ -226,16 +205,6 @@ def _encoded(picture: np.ndarray) -> str:
     done, data = cv2.imencode(".png", np.ascontiguousarray(picture[::-1]), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     assert done, "OpenCV encodes any 8-bit picture"
     return base64.b64encode(data.tobytes()).decode()
-
-
-def _from_above(box_map: BoxMap, grid: OccupancyGrid) -> np.ndarray:
-    """Draw the map over just the grid's cells."""
-    per_m = FROM_ABOVE_PX / max(grid.size) / grid.resolution_m
-    width, height = (max(1, round(size * grid.resolution_m * per_m)) for size in grid.size)
-    north_m = grid.y_min_m + grid.size[1] * grid.resolution_m
-    # A place is 0 in the middle of the first pixel.
-    view = TopView(grid.x_min_m + 0.5 / per_m, north_m - 0.5 / per_m, per_m, (width, height))
-    return draw_map(box_map, view)
 
 
 # --- the editor on a page ---------------------------------------------------------------------------------------------

@@ -19,13 +19,8 @@ SLOWEST_SPEED_MPS = 0.05  # eq:speed alone allows 0, with which a pedestrian wou
 
 
 def menger_curvature(polyline_m: np.ndarray) -> np.ndarray:
-    """Return the curvature at the waypoints of a polyline (eq:menger).
-
-    Args:
-        polyline_m: (k, 2) m.
-    Returns:
-        (k,) 1/m; 0 at both ends and where the product of the three distances is below CURVATURE_EPSILON_M3.
-    """
+    """Return the curvature at the waypoints of a polyline, (k, 2) m, in 1/m (eq:menger): 0 at both ends and where the
+    product of the three distances is below CURVATURE_EPSILON_M3."""
     curvatures = np.zeros(len(polyline_m))
     if len(polyline_m) < 3:
         return curvatures
@@ -36,29 +31,6 @@ def menger_curvature(polyline_m: np.ndarray) -> np.ndarray:
     is_safe = product >= CURVATURE_EPSILON_M3
     curvatures[1:-1][is_safe] = 2.0 * cross[is_safe] / product[is_safe]
     return curvatures
-
-
-def speed_profile(
-    curvatures: np.ndarray,
-    rng: np.random.Generator,
-    *,
-    cruise_speed_mps: float = 1.2,
-    curvature_gain_m: float = 5.0,
-    jitter: float = 0.15,
-    min_speed_mps: float = 0.0,
-    max_speed_mps: float = 1.6,
-) -> np.ndarray:
-    """Return speeds at waypoints (eq:speed).
-
-    Args:
-        curvatures: (k,) 1/m. curvature_gain_m: alpha. jitter: beta.
-    Returns:
-        (k,) m/s within the range, whose lower end is at least SLOWEST_SPEED_MPS. With the defaults eq:speed gives at
-        least 0.067 m/s (a right angle of two 0.5 m steps), so that this bound has no effect.
-    """
-    unrest = 1.0 + jitter * rng.uniform(-1.0, 1.0, size=len(curvatures))
-    speeds_mps = cruise_speed_mps / (1.0 + curvature_gain_m * curvatures) * unrest
-    return np.clip(speeds_mps, max(min_speed_mps, SLOWEST_SPEED_MPS), max_speed_mps)
 
 
 def arrival_times(polyline_m: np.ndarray, speeds_mps: np.ndarray) -> np.ndarray:
@@ -73,10 +45,7 @@ def arrival_times(polyline_m: np.ndarray, speeds_mps: np.ndarray) -> np.ndarray:
 def resample(
     polyline_m: np.ndarray, speeds_mps: np.ndarray, times_s: np.ndarray, step_s: float, stops_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sample a timed polyline at equal steps.
-
-    Within a piece the speed changes evenly from one waypoint to the next. The last sample is the goal, reached within
-    the last step.
+    """Sample a timed polyline at equal steps; the last sample is the goal, reached within the last step.
 
     Args:
         polyline_m: (k, 2) m, k at least 2, no two neighbours equal. speeds_mps: (k,), 0 at stops. times_s: (k,) from
@@ -92,7 +61,10 @@ def resample(
 def sample(
     polyline_m: np.ndarray, speeds_mps: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray, time_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (n, 2) and speeds (n,) at any times, (n,) s, of a timed polyline; after its end, the end."""
+    """Return positions (n, 2) and speeds (n,) at any times, (n,) s, of a timed polyline; after its end, the end.
+
+    Within a piece the speed changes evenly from one waypoint to the next.
+    """
     now_s = np.minimum(time_s - standing_time_s(time_s, times_s, stops_s), times_s[-1])
     piece = np.clip(np.searchsorted(times_s, now_s, side="right") - 1, 0, len(times_s) - 2)
     duration_s = times_s[piece + 1] - times_s[piece]
@@ -117,11 +89,10 @@ STOP_GAP_MIN = 2  # waypoints from one stop to the next: a piece between two sto
 
 @dataclass(frozen=True)
 class Pace:
-    """One row of the table of paces; values are drawn uniformly from ranges.
+    """One row of the table of paces; values are drawn uniformly from ranges. Shares are of the route.
 
-    hurries: cruises at `hurry_speed_mps`. stop_every_m: distance between stops; None: no stops. stop_s: duration of a
-    stop. turn_at: share of the route at which the pedestrian turns back; None: never. back: share of the route so far
-    that is walked back.
+    hurries: cruises at `hurry_speed_mps`. stop_every_m: distance between stops. stop_s: duration of a stop. turn_at:
+    where the pedestrian turns back. back: how much of the route so far is walked back.
     """
 
     hurries: bool = False
@@ -149,22 +120,21 @@ class PacedRoute:
     polyline_m: np.ndarray
     stops_s: np.ndarray
 
+    @classmethod
+    def without_stops(cls, polyline_m: np.ndarray) -> PacedRoute:
+        return cls(polyline_m, np.zeros(len(polyline_m)))
+
     @cached_property
     def along_m(self) -> np.ndarray:
         """Return the distance along the route to each waypoint, (k,) m."""
         return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.polyline_m, axis=0), axis=1))])
-
-    @classmethod
-    def without_stops(cls, polyline_m: np.ndarray) -> PacedRoute:
-        return cls(polyline_m, np.zeros(len(polyline_m)))
 
 
 def take_pace(route_m: np.ndarray, pace: Pace, rng: np.random.Generator) -> PacedRoute:
     """Apply a pace to a route, (k, 2) m. There are no stops at its ends; a route of two points is unchanged."""
     if len(route_m) < 3:
         return PacedRoute.without_stops(route_m)
-    turn = len(route_m) - 1
-    polyline_m = route_m
+    polyline_m, turn = route_m, len(route_m) - 1
     if pace.turn_at is not None:
         turn = int(np.clip(round(rng.uniform(*pace.turn_at) * turn), 1, turn))
         num_back = max(1, round(rng.uniform(*pace.back) * turn))
@@ -173,34 +143,27 @@ def take_pace(route_m: np.ndarray, pace: Pace, rng: np.random.Generator) -> Pace
     if pace.turn_at is not None:
         route.stops_s[turn] = rng.uniform(*pace.stop_s)
     if pace.stop_every_m is not None:
-        _add_stops(route, pace.stop_every_m, pace.stop_s, rng)
+        next_m, first = rng.uniform(*pace.stop_every_m), 1
+        while next_m < route.along_m[-1]:
+            waypoint = max(int(np.searchsorted(route.along_m, next_m)), first)
+            if waypoint >= len(polyline_m) - 1:
+                break
+            route.stops_s[waypoint] = rng.uniform(*pace.stop_s)
+            next_m, first = route.along_m[waypoint] + rng.uniform(*pace.stop_every_m), waypoint + STOP_GAP_MIN
     return route
 
 
 def speeds_at(route: PacedRoute, pace: Pace, cfg: PedestriansConfig, rng: np.random.Generator) -> np.ndarray:
-    """Return the speeds at the waypoints of a paced route, (k,) m/s, 0 at stops."""
-    speeds_mps = speed_profile(
-        menger_curvature(route.polyline_m),
-        rng,
-        cruise_speed_mps=cfg.hurry_speed_mps if pace.hurries else cfg.cruise_speed_mps,
-        curvature_gain_m=cfg.curvature_gain_m,
-        jitter=cfg.speed_jitter,
-        min_speed_mps=cfg.min_speed_mps,
-        max_speed_mps=max(cfg.max_speed_mps, cfg.hurry_speed_mps) if pace.hurries else cfg.max_speed_mps,
-    )
+    """Return the speeds at the waypoints of a paced route, (k,) m/s, 0 at stops (eq:speed).
+
+    The least speed is SLOWEST_SPEED_MPS. With the defaults eq:speed gives at least 0.067 m/s (a right angle of two
+    0.5 m steps), so that this bound has no effect.
+    """
+    cruise_mps, most_mps = cfg.cruise_speed_mps, cfg.max_speed_mps
+    if pace.hurries:
+        cruise_mps, most_mps = cfg.hurry_speed_mps, max(cfg.max_speed_mps, cfg.hurry_speed_mps)
+    unrest = 1.0 + cfg.speed_jitter * rng.uniform(-1.0, 1.0, size=len(route.polyline_m))
+    speeds_mps = cruise_mps / (1.0 + cfg.curvature_gain_m * menger_curvature(route.polyline_m)) * unrest
+    speeds_mps = np.clip(speeds_mps, max(cfg.min_speed_mps, SLOWEST_SPEED_MPS), most_mps)
     speeds_mps[route.stops_s > 0] = 0.0
     return speeds_mps
-
-
-def _add_stops(
-    route: PacedRoute, every_m: tuple[float, float], stop_s: tuple[float, float], rng: np.random.Generator
-) -> None:
-    """Add stops to a route, in place."""
-    along_m = route.along_m
-    next_m, first = rng.uniform(*every_m), 1
-    while next_m < along_m[-1]:
-        waypoint = max(int(np.searchsorted(along_m, next_m)), first)
-        if waypoint >= len(along_m) - 1:
-            return
-        route.stops_s[waypoint] = rng.uniform(*stop_s)
-        next_m, first = along_m[waypoint] + rng.uniform(*every_m), waypoint + STOP_GAP_MIN

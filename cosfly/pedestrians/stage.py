@@ -1,22 +1,17 @@
 """Stage `pedestrians`: trajectories over the free ground of a simplified map (Step 3 of the paper, sec:step3).
 
-Grid, projection, inflation, connectivity, sampling, A* and report follow each other as in the paper. Speed follows the
-literal formulas on the A* polyline, one waypoint per cell, so that curvature slows a pedestrian only in the one or two
-steps next to a corner: mean speeds are 1.05 to 1.17 m/s at a cruising speed of 1.2 where streets run along the axes,
-and 0.83 m/s in an old town whose streets do not (22 corners in 100 m). Without collinear waypoints, the low speed of a
-corner would extend over the straight segment behind it (0.92 instead of 1.07 m/s on the same 40 routes of a test town).
-
-Two guards of ours are on by default, and a setting turns each off: `ground` keeps trajectories on known ground (a city
-model is empty, not free, outside its data), `max_detour` rejects ends that are close to each other only across a canal.
+Speed follows the literal formulas on the A* polyline, one waypoint per cell, so that curvature slows a pedestrian only
+in the one or two steps next to a corner. Without collinear waypoints the low speed of a corner would extend over the
+straight segment behind it (0.92 instead of 1.07 m/s on the same 40 routes of a test town).
 """
 
 from __future__ import annotations
 
 import colorsys
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -59,8 +54,7 @@ RETRY_REASONS = ("no_goal", "detour")
 # --- one trajectory ---------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class PedestrianResult:
+class PedestrianResult(NamedTuple):
     """A trajectory with the pairs of ends rejected, by reason, and the seconds of the steps."""
 
     trajectory: PedestrianTrajectory
@@ -71,10 +65,8 @@ class PedestrianResult:
 def make_pedestrian(
     path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, pace: str | None = None
 ) -> PedestrianResult:
-    """Make one trajectory: draw its ends, find the route, apply a pace, sample it.
+    """Make one trajectory: draw its ends, find the route, apply a pace (None: drawn by its share), sample it.
 
-    Args:
-        pace: None: drawn by its share.
     Raises:
         NoPathError: If every pair of ends is rejected.
     """
@@ -120,12 +112,11 @@ def _draw_route(
             continue
         return ground.grid.centers_of(cells), retries
     raise NoPathError(
-        "every pair of ends was rejected",
-        where=path_id,
+        "every pair of ends was rejected", where=path_id,
         got=f"{retries['no_goal']} starts without a goal, {retries['detour']} detours in {cfg.num_retries + 1} tries",
         expected=f"a cell {cfg.min_distance_m:g} to {cfg.max_distance_m:g} m away in the same walkable area",
         fix="lower min_distance_m, raise max_distance_m, max_detour or num_retries, or widen the region of interest",
-    )
+    )  # fmt: skip
 
 
 class _PedestrianRecord(BaseModel):
@@ -163,33 +154,21 @@ def report(
         length_m = float(np.linalg.norm(np.diff(path.polyline_m, axis=0), axis=1).sum())
         duration_s = float(path.time_s[-1])
         on_road, on_crossings = count_on_road(path, ground.footing, ground.grid)
+        straight_m = float(np.linalg.norm(path.polyline_m[-1] - path.polyline_m[0]))
         rows.append(
-            {
-                "id": path.path_id,
-                **pace_field(path.pace),
-                "cells": len(path.polyline_m),
-                "length_m": round(length_m, 3),
-                "straight_m": round(float(np.linalg.norm(path.polyline_m[-1] - path.polyline_m[0])), 3),
-                "points": len(path.time_s),
-                "on_carriageway": on_road,
-                "on_crossings": on_crossings,
-                "duration_s": duration_s,
-                "mean_speed_mps": round(length_m / duration_s, 4),
-                "retries": rejected,
-            }
-        )
+            {"id": path.path_id, **pace_field(path.pace), "cells": len(path.polyline_m), "length_m": round(length_m, 3),
+             "straight_m": round(straight_m, 3), "points": len(path.time_s), "on_carriageway": on_road,
+             "on_crossings": on_crossings, "duration_s": duration_s,
+             "mean_speed_mps": round(length_m / duration_s, 4), "retries": rejected}
+        )  # fmt: skip
     sums = {key: sum(row[key] for row in rows) for key in ("points", "on_carriageway", "on_crossings")}
     total_m, total_s = (sum(row[key] for row in rows) for key in ("length_m", "duration_s"))
     total = {
-        "paths": len(rows),
-        "cells": sum(row["cells"] for row in rows),
-        **sums,
-        "on_carriageway_share": round(sums["on_carriageway"] / sums["points"], 4),
-        "length_m": round(total_m, 3),
-        "duration_s": total_s,
-        "mean_speed_mps": round(total_m / total_s, 4),
+        "paths": len(rows), "cells": sum(row["cells"] for row in rows), **sums,
+        "on_carriageway_share": round(sums["on_carriageway"] / sums["points"], 4), "length_m": round(total_m, 3),
+        "duration_s": total_s, "mean_speed_mps": round(total_m / total_s, 4),
         "retries": {reason: sum(rejected[reason] for rejected in retries) for reason in RETRY_REASONS},
-    }
+    }  # fmt: skip
     return {**REPORT_FORMAT.header, "ground": ground.counts, "paths": rows, "failed": failed, "total": total}
 
 
@@ -209,29 +188,17 @@ def _write_bystanders(path: Path, records: list[dict], header: dict, cfg: Pedest
 
 
 def run(
-    cfg: PedestriansConfig,
-    simplified_map: Path,
-    out: Path,
-    *,
-    seed: int = 0,
-    workers: int = 0,
-    watch: Watch = Watch(),
-    resume: Resume = "if-same",
-    roi: Path | None = None,
-) -> Path:
-    """Read `step2_simplified.json` (and a region of interest); write `path.json`, a report and `paths.png`, and
-    `others.json` where there are bystanders or cars.
+    cfg: PedestriansConfig, simplified_map: Path, out: Path, *, seed: int = 0, workers: int = 0,
+    watch: Watch = Watch(), resume: Resume = "if-same", roi: Path | None = None,
+) -> Path:  # fmt: skip
+    """Read `step2_simplified.json` (and `roi`, a region of interest); write `path.json`, a report and `paths.png`, and
+    `others.json` where there are bystanders or cars; return the path of `path.json`.
 
-    Args:
-        roi: `roi_polygon.json`; None: the whole map.
-    Returns:
-        The path of `path.json`.
     Raises:
         NoPathError: If nothing is walkable.
         NothingKept: If no trajectory can be made; single failures are counted.
     """
     inputs = {"map": simplified_map} | ({"roi": roi} if roi else {})
-    settings = cfg.all_values()
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
     product = out / "path.json"
     if stage.is_complete:
@@ -245,8 +212,9 @@ def run(
     # Workers need the labels only; sending the rest takes time.
     lean = replace(ground, inflated=ground.grid, is_in_roi=None)
     lanes = lanes_of(box_map) if cfg.traffic else []
-    inputs_of = (cfg, seed, lean, lanes)
-    finished = run_items(stage, items, make_worker, inputs_of, workers=workers, watch=watch, label="trajectories")
+    finished = run_items(
+        stage, items, make_worker, (cfg, seed, lean, lanes), workers=workers, watch=watch, label="trajectories"
+    )
     if not finished.tally.kept:
         raise stage.nothing_kept(finished.tally)
     results = [result_of(record, _PedestrianRecord) for record in finished.kept]
@@ -258,7 +226,7 @@ def run(
     with clock("report"):
         retries = [result.retries for result in results]
         summary = report(ground, paths, retries, dict(sorted(finished.tally.failed.items())))
-        write_paths(product, paths, {"map": box_map.name, "seed": seed, "settings": settings})
+        write_paths(product, paths, {"map": box_map.name, "seed": seed, "settings": cfg.all_values()})
         if cfg.has_others:
             header = {"map": box_map.name, "seed": seed, "dt_s": cfg.dt_s}
             outputs.append(out / BYSTANDERS_FILE)
@@ -309,13 +277,14 @@ def _ground_picture(ground: WalkableGround) -> tuple[np.ndarray, TopView]:
     grid = ground.grid
     num_x, num_y = grid.size
     scale = LONGER_SIDE_PX / max(num_x, num_y)
-    classes = np.full((num_y, num_x), 2, dtype=np.uint8)
-    classes[ground.walkable] = 3
-    classes[ground.walkable & (ground.footing >= ROAD)] = 4
-    classes[ground.walkable & (ground.footing == CROSSING)] = 5
-    classes[ground.inflated.occupied] = 1
-    classes[grid.occupied] = 0
-    cells = np.array([OBSTACLE, MARGIN, UNUSED, USED, ON_ROAD, ON_CROSSING], dtype=np.uint8)[classes[::-1]]
+    colors = np.full((num_y, num_x, 3), UNUSED, dtype=np.uint8)
+    for mask, color in (
+        (ground.walkable, USED), (ground.walkable & (ground.footing >= ROAD), ON_ROAD),
+        (ground.walkable & (ground.footing == CROSSING), ON_CROSSING), (ground.inflated.occupied, MARGIN),
+        (grid.occupied, OBSTACLE),
+    ):  # fmt: skip
+        colors[mask] = color
+    cells = np.ascontiguousarray(colors[::-1])
     width, height = max(1, round(num_x * scale)), max(1, round(num_y * scale))
     picture = cv2.resize(cells, (width, height), interpolation=cv2.INTER_NEAREST if scale >= 1 else cv2.INTER_AREA)
     per_m = scale / grid.resolution_m

@@ -57,54 +57,37 @@ class PedestriansConfig(Config):
     num_paths: int = Field(20, ge=1, le=100_000, description="pedestrian trajectories to make")
     resolution_m: float = Field(0.5, gt=0, le=10, description="side of a grid cell, m")
     human_height_m: ClassVar[float] = 2.0  # boxes that reach between the ground and this height block, m
-    safety_radius_m: float = Field(
-        0.5, ge=0, le=50, description="distance that pedestrians keep from obstacles, m; 0: none"
-    )
+    safety_radius_m: float = Field(0.5, ge=0, le=50, description="distance to keep from obstacles, m; 0: none")
     min_distance_m: float = Field(50.0, gt=0, description="least straight distance from start to goal, m")
     max_distance_m: float = Field(100.0, gt=0, le=2000, description="greatest straight distance from start to goal, m")
     min_component_cells: int = Field(4000, ge=1, description="smallest connected free area that is used, cells")
     num_retries: int = Field(5, ge=0, description="further pairs of ends tried where the first pair is rejected")
     max_detour: float = Field(3.0, ge=0, description="longest route, times the straight distance; 0: no limit")
     ground: Literal["anywhere", "surfaces", "paved"] = Field(
-        "surfaces",
-        description="walkable ground: anywhere; surfaces: on any ground box (anywhere, if a map has no streets, and "
-        "ground boxes under less than half of it); paved: streets and squares",
+        "surfaces", description="walkable ground: anywhere; any ground box (if a map knows its ground); or paved ones"
     )
     road_cost: int = Field(
-        1,
-        ge=1,
-        le=100,
-        description="cost of a metre of carriageway away from crossings, in metres of pavement; above 1 no trajectory "
-        "starts or ends on the carriageway; 1: all ground costs the same, as in the paper",
-    )
+        1, ge=1, le=100, description="cost of a metre of carriageway off crossings, in metres of pavement; 1: all "
+        "ground costs the same, as in the paper; above 1 no trajectory starts or ends on it",
+    )  # fmt: skip
     open_cost: int = Field(1, ge=1, le=100, description="cost of a metre of open ground, in metres of pavement")
     cruise_speed_mps: ClassVar[float] = 1.2  # speed on straight ground, m/s
     curvature_gain_m: ClassVar[float] = 5.0  # alpha of eq:speed, m
     speed_jitter: ClassVar[float] = 0.15  # beta of eq:speed: random share of the speed
     min_speed_mps: ClassVar[float] = 0.0  # least speed, m/s
     max_speed_mps: ClassVar[float] = 1.6  # greatest speed, m/s
-    pace: dict[str, float] = Field(
-        {PLAIN_PACE: 1.0}, description=f"share of each pace, drawn to a quota: {', '.join(PACES)}"
-    )
+    pace: dict[str, float] = Field({PLAIN_PACE: 1.0}, description=f"share of each pace, to a quota: {', '.join(PACES)}")
     hurry_speed_mps: float = Field(1.6, ge=SLOWEST_SPEED_MPS, description="cruising speed of paces that hurry, m/s")
     others: int = Field(0, ge=0, le=500, description="bystanders around each pedestrian trajectory")
     look_alikes: int = Field(
-        0,
-        ge=0,
-        le=500,
-        description="number of the bystanders whose clothes differ from the target's in one thing: hard distractors",
+        0, ge=0, le=500, description="bystanders whose clothes differ from the target's in one thing: hard distractors"
     )
-    traffic: int = Field(
-        0, ge=0, le=500, description="cars around each pedestrian trajectory, where the map has straight roads"
-    )
+    traffic: int = Field(0, ge=0, le=500, description="cars around each trajectory, where the map has straight roads")
     others_reach_m: ClassVar[float] = 40.0  # greatest distance of bystanders and cars from the trajectory, m
     dt_s: float = Field(
-        DT_S,
-        ge=0.05,
-        le=5,
-        description="time step of trajectories, frames and windows (dt), s; counts of frames (caption.window) and the "
-        "thresholds of labels are for 0.5",
-    )
+        DT_S, ge=0.05, le=5, description="time step of trajectories, frames and windows (dt), s; counts of frames "
+        "(caption.window) and the thresholds of labels are for 0.5",
+    )  # fmt: skip
 
     @property
     def has_others(self) -> bool:
@@ -167,7 +150,7 @@ class WalkableGround:
 
     @cached_property
     def row_ends(self) -> np.ndarray:
-        """Return the number of cells of `may_end` up to the end of each row, (ny,) int64."""
+        """Return the number of cells of `may_end` up to each row's end, (ny,) int64."""
         return np.cumsum(np.count_nonzero(self.may_end, axis=1))
 
     def route(self, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
@@ -202,14 +185,11 @@ def walkable_ground(
     roi_where: str | Path = "region of interest",
     clock: Clock | None = None,
 ) -> WalkableGround:
-    """Return the walkable ground of a map.
+    """Return the walkable ground of a map; `where` and `roi_where` are the files to name in an error.
 
     Components are 8-connected, as in the paper, and those below `min_component_cells` are not used. A route that never
     cuts a corner cannot pass between two cells that touch at a corner only, so an 8-connected component may hold
     several parts; both ends of a route are drawn from one part, so that it exists.
-
-    Args:
-        where, roi_where: The files to name in an error.
     """
     clock = clock or Clock()
     with clock("grid"):
@@ -223,8 +203,11 @@ def walkable_ground(
         inflated = inflate(grid, cfg.safety_radius_m)
         free = ~inflated.occupied
         num_free = _count(free)
-        has_surface = _surface(box_map, cfg.ground, grid, free)
-        is_steep = _steep(box_map.ground, grid)
+        has_surface, is_steep = _surface(box_map, cfg.ground, grid, free), None
+        if not box_map.ground.is_flat:
+            columns, rows = np.meshgrid(*(np.arange(size) for size in grid.size))
+            slopes = box_map.ground.slope_at(grid.centers_of(np.stack([columns.ravel(), rows.ravel()], axis=1)))
+            is_steep = (slopes > SLOPE_MAX).reshape(free.shape)
         for mask in (has_surface, is_in_roi, None if is_steep is None else ~is_steep):
             if mask is not None:
                 free &= mask
@@ -247,18 +230,14 @@ def walkable_ground(
         place = where if roi is None else roi_where
         parts = _parts_of_large_components(free, cfg.min_component_cells, counts, place)
     with clock("footing"):
-        costs = costs_of(cfg.open_cost, cfg.road_cost)
-        ground = WalkableGround(
-            grid, inflated, parts, footing_of(box_map, grid), box_map.ground, costs, is_in_roi, counts
-        )
+        costs, footing = costs_of(cfg.open_cost, cfg.road_cost), footing_of(box_map, grid)
+    ground = WalkableGround(grid, inflated, parts, footing, box_map.ground, costs, is_in_roi, counts)
     if not ground.row_ends[-1]:
         raise NoPathError(
-            "all walkable ground is carriageway, where no trajectory may start or end",
-            where=where,
-            got=f"{counts['cells_used']} walkable cells, all Roads",
+            "all walkable ground is carriageway, where no trajectory may start or end", where=where,
+            got=f"{counts['cells_used']} walkable cells, all Roads", fix="set road_cost to 1",
             expected="pavements, squares or paths (Sidewalks, Ground)",
-            fix="set road_cost to 1",
-        )
+        )  # fmt: skip
     return ground
 
 
@@ -266,24 +245,13 @@ def _count(mask: np.ndarray) -> int:
     return int(np.count_nonzero(mask))
 
 
-def _steep(ground: Ground, grid: OccupancyGrid) -> np.ndarray | None:
-    """Return which cells are too steep to walk on, (ny, nx) bool; None where the ground is flat."""
-    if ground.is_flat:
-        return None
-    columns, rows = np.meshgrid(*(np.arange(size) for size in grid.size))
-    slopes = ground.slope_at(grid.centers_of(np.stack([columns.ravel(), rows.ravel()], axis=1)))
-    return (slopes > SLOPE_MAX).reshape(grid.occupied.shape)
-
-
 def _surface(box_map: BoxMap, ground: str, grid: OccupancyGrid, free: np.ndarray) -> np.ndarray | None:
-    """Return the cells with ground as the settings want it; None for all cells, also where the map's ground is unknown.
+    """Return the cells with ground as the settings want it, (ny, nx) bool; None for all cells, also where the map's
+    ground is unknown.
 
     It is unknown without ground boxes, or with neither streets nor squares and other ground under a small part of the
-    map. What lies outside a city model's data has no obstacles either: without ground boxes it looks like a square.
-
-    Args:
-        ground: `anywhere` in the map's bounds; over any ground box (`surfaces`); over PAVED_KINDS only (`paved`). free:
-            (ny, nx) bool, cells without obstacles.
+    free cells. What lies outside a city model's data has no obstacles either: without ground boxes it looks like a
+    square.
     """
     if ground == "anywhere":
         return None
@@ -304,8 +272,7 @@ def _surface(box_map: BoxMap, ground: str, grid: OccupancyGrid, free: np.ndarray
     if paved is None and num_found < SURFACE_SHARE_MIN * num_free:
         log.warning(
             "%s has no boxes of Roads, Sidewalks or Ground, and other ground under %d of %d free cells only: people "
-            "walk wherever there is no obstacle",
-            box_map.name, num_found, num_free,
+            "walk wherever there is no obstacle", box_map.name, num_found, num_free,
         )  # fmt: skip
         return None
     return found
@@ -319,12 +286,11 @@ def _parts_of_large_components(
     is_large = sizes >= min_component_cells
     if not is_large.any():
         raise NoPathError(
-            "no connected walkable area is large enough",
-            where=where,
+            "no connected walkable area is large enough", where=where,
             got=f"{int(sizes.max())} cells in the largest of {len(sizes) - 1}",
             expected=f"at least {min_component_cells} cells (min_component_cells)",
             fix="lower min_component_cells or safety_radius_m, or widen the region of interest",
-        )
+        )  # fmt: skip
     parts, part_sizes = connected_parts(is_large[components], 4)
     used = sorted(sizes[is_large].tolist(), reverse=True)
     counts.update(components=len(sizes) - 1, components_used=len(used), component_sizes_used=used)
@@ -378,11 +344,8 @@ def sample_start(ground: WalkableGround, rng: np.random.Generator) -> tuple[int,
 def sample_goal(
     ground: WalkableGround, start: tuple[int, int], min_cells: float, max_cells: float, rng: np.random.Generator
 ) -> tuple[int, int] | None:
-    """Draw a cell of `may_end` in the start's part, at a straight distance within [min_cells, max_cells], uniformly.
-
-    Returns:
-        (x index, y index), or None if there is no such cell.
-    """
+    """Draw a cell of `may_end` in the start's part, (x index, y index), at a straight distance within [min_cells,
+    max_cells], uniformly; None if there is none."""
     reach = int(max_cells)
     x, y = start
     left, low = max(0, x - reach), max(0, y - reach)

@@ -1,21 +1,16 @@
-"""The passes of Step 2: fewer boxes that keep the layout of obstacles (sec:step2): merge, crop_tree, crop_below_ground,
-prune_nested.
+"""The passes of Step 2: fewer boxes that keep the layout of obstacles (sec:step2).
 
-Two rules of the paper lose more than they should on real maps, so each has a guard, on by default, that a setting turns
-off. *merge* replaces a cluster by its enclosing axis-aligned box: rows of houses that stand askew would swallow the
-street between them, so a cluster that fills too little of that box is halved until its parts fill enough (`min_fill`,
-`min_canopy_fill`; 0 is the paper's rule). *crop_tree* keeps the full footprint below the cut, so that
-pedestrians cannot walk below a tree, which is the purpose of the cut: `trunk: stem` leaves stems instead (`trunk: full`
-is the paper's rule). The report holds the walkable area of both.
-
-The paper's SimWorld runs simplify otherwise (app:simworld:step3); its variants are settings: `merge_by: center`,
-`crop_strategy: adaptive`, `below_ground: clip`, `nested_tolerance_m: 1e-6`.
+Two rules of the paper lose more than they should on real maps, so each has a guard that a setting turns off: *merge*
+halves clusters that fill too little of their enclosing box, or houses that stand askew would swallow the street between
+them (`min_fill`, `min_canopy_fill`); *crop_tree* leaves stems below the cut, not full footprints, so that pedestrians
+can walk below a tree (`trunk`). The variants of the paper's SimWorld runs (app:simworld:step3) are settings.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal
 
 import numpy as np
 import shapely
@@ -28,45 +23,42 @@ from cosfly.geometry.axes import axis_aligned_half_extents
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.config import Config
 
-# --- the first pass of Step 2: clusters of neighbouring boxes become one box each -------------------------------------
-# Clusters come from union-find over the pairs that a sweep meets, never over all pairs.
-
-
+VEGETATION = KINDS["Vegetation"]
 CLOSED_GAP_M = 1.0  # twice the safety radius of a person (tab:ped_params): pedestrians cannot walk through
 FILL_CELLS = 64  # a cluster's fill is measured on at most FILL_CELLS x FILL_CELLS cells: 1.6 % a cell along each axis
 
 
-class MergeRule(NamedTuple):
-    """How boxes of a kind are merged: largest gap on every axis, m; least share of the merged footprint covered."""
-
-    gap_m: float
-    min_fill: float
+# --- merge ------------------------------------------------------------------------------------------------------------
 
 
 def merge(
-    box_map: BoxMap, rules: dict[int, MergeRule], groups: np.ndarray | None = None, *, by_center: bool = False
+    box_map: BoxMap,
+    rules: dict[int, tuple[float, float]],
+    groups: np.ndarray | None = None,
+    *,
+    by_center: bool = False,
 ) -> BoxMap:
     """Replace clusters of neighbours of one kind by enclosing axis-aligned boxes; single boxes keep their rotation.
 
-    A cluster whose members, gaps of CLOSED_GAP_M between them closed, cover less than `min_fill` of the enclosing
-    footprint is halved at the median of its longer side, again and again; a `min_fill` of 0 never halves.
+    A cluster whose members, gaps of CLOSED_GAP_M between them closed, cover less than the least share of the enclosing
+    footprint is halved at the median of its longer side, again and again; a share of 0 never halves.
 
     Args:
-        rules: kind -> rule; other kinds stay.
+        rules: kind -> largest gap on every axis, m, and least share; other kinds stay.
         groups: (n,) bool, boxes of different groups are not neighbours; None: one group.
         by_center: neighbours are boxes with centres, not faces, within the gap on every axis.
     Source: sec:step2, "Merging adjacent boxes"; by centres: app:simworld:step3; the guard is ours.
     """
     mins, maxs = box_map.mins, box_map.maxs
     labels, min_fill = np.arange(len(box_map)), np.zeros(len(box_map))
-    for kind, rule in sorted(rules.items()):
+    split = np.zeros(len(box_map), dtype=bool) if groups is None else groups
+    lows, highs = (box_map.centers, box_map.centers) if by_center else (mins, maxs)
+    for kind, (gap_m, least_share) in sorted(rules.items()):
         of_kind = box_map.kinds == kind
-        min_fill[of_kind] = rule.min_fill
-        split = np.zeros(len(box_map), dtype=bool) if groups is None else groups
+        min_fill[of_kind] = least_share
         for group in np.unique(split[of_kind]):
             rows = np.flatnonzero(of_kind & (split == group))
-            lows, highs = (box_map.centers, box_map.centers) if by_center else (mins, maxs)
-            labels[rows] = rows[clusters(lows[rows], highs[rows], rule.gap_m)]
+            labels[rows] = rows[clusters(lows[rows], highs[rows], gap_m)]
     labels = _halve_sparse(box_map, mins, maxs, labels, min_fill)
     order = np.lexsort((box_map.ids, labels))
     if len(order) == 0:
@@ -86,13 +78,8 @@ def merge(
 
 
 def clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:
-    """Return clusters of boxes with gaps of at most `gap_m` on every axis.
-
-    Args:
-        mins, maxs: (n, 3) m.
-    Returns:
-        (n,) int64: the lowest row of each box's cluster.
-    """
+    """Return the lowest row of each box's cluster, (n,) int64: boxes, (n, 3) m, with gaps of at most `gap_m` on every
+    axis."""
     if mins.shape != maxs.shape or mins.ndim != 2 or mins.shape[1] != 3:
         raise ValueError(f"mins and maxs must be (n, 3), got {mins.shape} and {maxs.shape}")
     if not gap_m >= 0:
@@ -102,6 +89,14 @@ def clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:
     axis = int(np.argmax(maxs.max(axis=0)[:2] - mins.min(axis=0)[:2]))  # sweep along the longer side: fewer meet
     order = np.argsort(mins[:, axis], kind="stable")
     return _sweep_clusters(mins, maxs, order, axis, gap_m + 1e-9)  # micrometre files: 2.000000 m apart still counts
+
+
+@njit(cache=True)
+def _root(parent, row):  # pragma: no cover (compiled)
+    while parent[row] != row:
+        parent[row] = parent[parent[row]]
+        row = parent[row]
+    return row
 
 
 @njit(cache=True)
@@ -121,22 +116,10 @@ def _sweep_clusters(mins, maxs, order, axis, gap_m):  # pragma: no cover (compil
                     near = False
                     break
             if near:
-                root_a, root_b = a, b
-                while parent[root_a] != root_a:
-                    parent[root_a] = parent[parent[root_a]]
-                    root_a = parent[root_a]
-                while parent[root_b] != root_b:
-                    parent[root_b] = parent[parent[root_b]]
-                    root_b = parent[root_b]
-                if root_a < root_b:
-                    parent[root_b] = root_a
-                else:
-                    parent[root_a] = root_b
+                root_a, root_b = _root(parent, a), _root(parent, b)
+                parent[max(root_a, root_b)] = min(root_a, root_b)
     for row in range(len(parent)):
-        root = row
-        while parent[root] != root:
-            root = parent[root]
-        parent[row] = root
+        parent[row] = _root(parent, row)
     return parent
 
 
@@ -165,25 +148,20 @@ def _halve(order, starts, rectangles, mins, maxs, min_fill, labels):  # pragma: 
             size -= 1
             start, stop = stack[size, 0], stack[size, 1]
             part = order[start:stop].copy()
-            lowest = part.min()
-            for row in part:
-                labels[row] = lowest
+            labels[part] = part.min()
             if len(part) == 1 or min_fill[part[0]] <= 0.0:
                 continue
             low, high = mins[part[0]].copy(), maxs[part[0]].copy()
-            members = np.empty((len(part), rectangles.shape[1]))
-            for place, row in enumerate(part):
+            members = rectangles[part]
+            for row in part:
                 for k in range(2):
                     low[k] = min(low[k], mins[row, k])
                     high[k] = max(high[k], maxs[row, k])
-                for k in range(rectangles.shape[1]):
-                    members[place, k] = rectangles[row, k]
             if fill_share(members, low, high) >= min_fill[part[0]]:
                 continue
             axis = 0 if high[0] - low[0] >= high[1] - low[1] else 1
             ranks = np.argsort(members[:, axis], kind="mergesort")
-            for place in range(len(part)):
-                order[start + place] = part[ranks[place]]
+            order[start:stop] = part[ranks]
             middle = (start + stop) // 2
             stack[size, 0], stack[size, 1] = start, middle
             stack[size + 1, 0], stack[size + 1, 1] = middle, stop
@@ -204,20 +182,18 @@ def fill_share(rectangles, low, high):  # pragma: no cover (compiled)
     for x, y, cos, sin, half_x, half_y in rectangles:
         reach_x = abs(cos) * half_x + abs(sin) * half_y
         reach_y = abs(sin) * half_x + abs(cos) * half_y
-        for row in range(
-            max(0, int((y - reach_y - low[1]) / step_y)), min(num_y, int((y + reach_y - low[1]) / step_y) + 1)
-        ):
+        first_row, last_row = int((y - reach_y - low[1]) / step_y), int((y + reach_y - low[1]) / step_y)
+        first_column, last_column = int((x - reach_x - low[0]) / step_x), int((x + reach_x - low[0]) / step_x)
+        for row in range(max(0, first_row), min(num_y, last_row + 1)):
             dy = low[1] + (row + 0.5) * step_y - y
-            for column in range(
-                max(0, int((x - reach_x - low[0]) / step_x)), min(num_x, int((x + reach_x - low[0]) / step_x) + 1)
-            ):
+            for column in range(max(0, first_column), min(num_x, last_column + 1)):
                 dx = low[0] + (column + 0.5) * step_x - x
                 if abs(dx * cos + dy * sin) <= half_x and abs(dy * cos - dx * sin) <= half_y:
                     covered[row, column] = True
     return covered.sum() / covered.size
 
 
-VEGETATION = KINDS["Vegetation"]
+# --- all passes -------------------------------------------------------------------------------------------------------
 
 
 class SimplifyConfig(Config):
@@ -233,11 +209,9 @@ class SimplifyConfig(Config):
         "Vegetation": 2.0, "Buildings": 5.0, "Walls": None, "Fences": None, "Static": None,
     }  # fmt: skip
     min_fill: float = Field(
-        0.85, ge=0.0, le=1.0, description="least share of a merged footprint that members cover; 0: the paper's rule"
+        0.85, ge=0.0, le=1.0, description="least filled share of a merged footprint; 0: the paper's rule"
     )
-    min_canopy_fill: float = Field(
-        0.5, ge=0.0, le=1.0, description="the same for vegetation: round crowns never fill a box; 0: the paper's rule"
-    )
+    min_canopy_fill: float = Field(0.5, ge=0.0, le=1.0, description="the same for vegetation, whose crowns are round")
     crop_tree: bool = Field(True, description="split vegetation into trunk and lifted canopy")
     crop_strategy: Literal["fixed", "adaptive"] = Field(
         "fixed", description="fixed: split at cut_height_m; adaptive: cut tall vegetation into low pieces (SimWorld)"
@@ -251,7 +225,7 @@ class SimplifyConfig(Config):
     cell_size_m: ClassVar[float] = 0.5  # adaptive: width of the stem below the lowest cut, m
     crop_below_ground: bool = Field(True, description="drop boxes, except surfaces, with their top below the ground")
     below_ground: Literal["drop", "clip"] = Field(
-        "drop", description="clip: also cut off the part of a box below the ground (SimWorld); drop: leave boxes whole"
+        "drop", description="drop: keep other boxes whole; clip: cut off the part of a box below the ground (SimWorld)"
     )
     prune_nested: bool = Field(True, description="drop boxes inside another of the same kind")
     nested_tolerance_m: float = Field(0.01, ge=0.0, description="how far a nested box may stick out, m")
@@ -271,38 +245,29 @@ def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplification:
     The result's header gains `passes`, with settings and counts. Ids: a merged box takes its smallest member's, a
     tree's canopy keeps its own, stems and trunks get the smallest numbers that the input does not use.
     """
-    passes = [("input", box_map.counts())]
     feet = _feet(box_map, cfg) if _has_stems(cfg) else None
-    used_ids = box_map.ids
-    result = box_map
-    if cfg.merge:
-        result = merge(result, _merge_rules(cfg), _merge_groups(box_map, cfg), by_center=cfg.merge_by == "center")
-        passes.append(("merge", result.counts()))
-    if cfg.crop_tree:
-        fixed = cfg.crop_strategy == "fixed"
-        result = crop_tree(result, cfg, used_ids, feet) if fixed else crop_tree_adaptive(result, cfg, used_ids)
-        passes.append(("crop_tree", result.counts()))
-    if cfg.crop_below_ground:
-        result = crop_below_ground(result, clip=cfg.below_ground == "clip")
-        passes.append(("crop_below_ground", result.counts()))
-    if cfg.prune_nested:
-        result = prune_nested(result, cfg.nested_tolerance_m)
-        passes.append(("prune_nested", result.counts()))
+    shares = {VEGETATION: cfg.min_canopy_fill}
+    gaps_m = {KINDS[name]: gap for name, gap in cfg.merge_gap_m.items() if gap is not None}
+    rules = {kind: (gap_m, shares.get(kind, cfg.min_fill)) for kind, gap_m in gaps_m.items()}
+    fixed, ids = cfg.crop_strategy == "fixed", box_map.ids
+    apply: dict[str, Callable[[BoxMap], BoxMap]] = {
+        "merge": lambda m: merge(m, rules, _merge_groups(box_map, cfg), by_center=cfg.merge_by == "center"),
+        "crop_tree": lambda m: crop_tree(m, cfg, ids, feet) if fixed else crop_tree_adaptive(m, cfg, ids),
+        "crop_below_ground": lambda m: crop_below_ground(m, clip=cfg.below_ground == "clip"),
+        "prune_nested": lambda m: prune_nested(m, cfg.nested_tolerance_m),
+    }
+    result, passes = box_map, [("input", box_map.counts())]
+    for name in (name for name in apply if getattr(cfg, name)):
+        result = apply[name](result)
+        passes.append((name, result.counts()))
     records = [SimplifyPass(name=name, counts=counts) for name, counts in passes]
     header = box_map.header.model_copy(update={"passes": records, "simplify": cfg.all_values()})
     return Simplification(replace(result, header=header, meshes=Meshes()), passes)
 
 
-def _merge_rules(cfg: SimplifyConfig) -> dict[int, MergeRule]:
-    gaps = {KINDS[name]: gap for name, gap in cfg.merge_gap_m.items() if gap is not None}
-    return {
-        kind: MergeRule(gap, cfg.min_canopy_fill if kind == VEGETATION else cfg.min_fill) for kind, gap in gaps.items()
-    }
-
-
 def _merge_groups(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
-    """Return groups that never merge, (n,) bool: with stems, bushes and hedges must not vanish below the cut of a tree;
-    a box over a passage or an arcade, and not on a box below, must not close it."""
+    """Return groups that never merge, (n,) bool: bushes below the cut of trees with stems; boxes over a passage or an
+    arcade, and not on a box below, which would close it."""
     cut_m = _ground_z_m(box_map) + cfg.cut_height_m
     mins, maxs = box_map.mins, box_map.maxs
     is_plant, is_low = box_map.kinds == VEGETATION, mins[:, 2] <= cut_m
@@ -325,17 +290,26 @@ def _has_stems(cfg: SimplifyConfig) -> bool:
 # --- crop_tree --------------------------------------------------------------------------------------------------------
 
 
-def _feet(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
-    """Return (k, 4): x, y and half widths of a stem for every vegetation box that spans the cut height.
+def _spanning(box_map: BoxMap, cfg: SimplifyConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of vegetation that spans the cut, (k,), and the height of the cut at each, (k,) m."""
+    cut = _ground_z_m(box_map) + cfg.cut_height_m
+    rows = np.flatnonzero((box_map.kinds == VEGETATION) & (box_map.mins[:, 2] < cut) & (box_map.maxs[:, 2] > cut))
+    return rows, cut[rows]
 
-    Taken before the merge, because a merged grove still has one stem for each of its trees.
-    """
-    mins, maxs = box_map.mins[:, 2], box_map.maxs[:, 2]
-    ground_z_m = _ground_z_m(box_map)
-    cut = ground_z_m + cfg.cut_height_m
-    rows = np.flatnonzero((box_map.kinds == VEGETATION) & (mins < cut) & (maxs > cut))
+
+def _upright(box_map: BoxMap, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return half sizes and rotations of rows, (k, 3) each; of tilted boxes those of their bounds."""
+    half, turns = box_map.half_extents[rows], box_map.rotations_deg[rows]
+    is_tilted = (turns[:, [0, 2]] != 0).any(axis=1)[:, None]
+    return np.where(is_tilted, axis_aligned_half_extents(half, turns), half), np.where(is_tilted, 0.0, turns)
+
+
+def _feet(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
+    """Return x, y and half widths, (k, 4), of a stem for every vegetation box that spans the cut height; taken before
+    the merge, because a merged grove still has one stem for each of its trees."""
+    rows, _ = _spanning(box_map, cfg)
     # A box that hangs above the ground is a part of a crown, not a tree, unless it comes down to a metre.
-    rows = rows[mins[rows] <= ground_z_m[rows] + 1.0]
+    rows = rows[box_map.mins[rows, 2] <= _ground_z_m(box_map)[rows] + 1.0]
     half = np.minimum(box_map.half_extents[rows, :2].min(axis=1), cfg.stem_radius_m)
     return np.column_stack([box_map.centers[rows, :2], half, half])
 
@@ -346,27 +320,17 @@ def crop_tree(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray, feet: 
     Boxes wholly below the cut (bushes, hedges) and wholly above it stay as they are, so a second pass changes nothing.
 
     Args:
-        used_ids: ids that new boxes may not take. feet: (k, 4) stems below the canopies; None: full
-            footprints.
+        used_ids: ids that new boxes may not take. feet: (k, 4) stems below the canopies; None: full footprints.
     Source: sec:step2, "Crop tree operation"; stems are ours.
     """
-    ground_z_m = _ground_z_m(box_map)
-    cut = ground_z_m + cfg.cut_height_m
-    rows = np.flatnonzero((box_map.kinds == VEGETATION) & (box_map.mins[:, 2] < cut) & (box_map.maxs[:, 2] > cut))
-    is_tilted = (box_map.rotations_deg[rows][:, [0, 2]] != 0).any(axis=1)
-    rotations = np.where(is_tilted[:, None], 0.0, box_map.rotations_deg[rows])
-    bounds = axis_aligned_half_extents(box_map.half_extents[rows], box_map.rotations_deg[rows])
-    half = np.where(is_tilted[:, None], bounds, box_map.half_extents[rows])
-    tops = box_map.centers[rows, 2] + bounds[:, 2]
-
-    centers, half_extents, all_rotations = (
-        a.copy() for a in (box_map.centers, box_map.half_extents, box_map.rotations_deg)
-    )
-    centers[rows, 2] = (cut[rows] + tops) / 2 + cfg.lift_m
-    half_extents[rows] = np.column_stack([half[:, :2], (tops - cut[rows]) / 2])
-    all_rotations[rows] = rotations
-    canopies = replace(box_map, centers=centers, half_extents=half_extents, rotations_deg=all_rotations)
-
+    rows, cut = _spanning(box_map, cfg)
+    half, rotations = _upright(box_map, rows)
+    tops = box_map.maxs[rows, 2]
+    canopies = replace(box_map, centers=box_map.centers.copy(), half_extents=box_map.half_extents.copy(),
+                       rotations_deg=box_map.rotations_deg.copy())  # fmt: skip
+    canopies.centers[rows, 2] = (cut + tops) / 2 + cfg.lift_m
+    canopies.half_extents[rows] = np.column_stack([half[:, :2], (tops - cut) / 2])
+    canopies.rotations_deg[rows] = rotations
     if feet is None:
         places, widths, turns = box_map.centers[rows, :2], half[:, :2], rotations
     else:
@@ -375,30 +339,25 @@ def crop_tree(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray, feet: 
     trunks = BoxMap(
         np.column_stack([places, box_map.ground.height_at(places) + cfg.cut_height_m / 2]),
         np.column_stack([widths, np.full(count, cfg.cut_height_m / 2)]),
-        turns,
-        np.full(count, VEGETATION, dtype=np.uint8),
-        _free_ids(used_ids, count),
-    )
+        turns, np.full(count, VEGETATION, dtype=np.uint8), _free_ids(used_ids, count),
+    )  # fmt: skip
     return canopies.joined(trunks)
 
 
 def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray) -> BoxMap:
-    """Cut vegetation that is higher than `adaptive_height_m` into a stem below `split_z_m` and pieces no higher than
-    that above.
+    """Cut vegetation that is higher than `adaptive_height_m` into a stem, one cell wide, below `split_z_m` and pieces
+    no higher than that above, with ids that are not in `used_ids`.
 
     The paper names three numbers and their purpose, tall trees in shorter pieces that do not block the walking grid
-    from afar, but no rule; this is ours. The stem is one cell wide. The lowest piece above the cut keeps the id;
-    without one, the stem does.
+    from afar, but no rule; this is ours. The lowest piece above the cut keeps the id; without one, the stem does.
 
-    Args:
-        used_ids: ids that new boxes may not take.
     Source: app:simworld:step3, "crop_tree".
     """
     ground_z_m = _ground_z_m(box_map)
     split = ground_z_m + cfg.split_z_m
     low, high = box_map.mins[:, 2], box_map.maxs[:, 2]
     is_tall = (box_map.kinds == VEGETATION) & (high - np.maximum(low, ground_z_m) > cfg.adaptive_height_m)
-    rows, is_first, lows, highs = [], [], [], []
+    rows, keeps, lows, highs = [], list[bool](), [], []
     for row in np.flatnonzero(is_tall):
         cuts = [float(low[row])]
         if low[row] < split[row] < high[row]:
@@ -406,33 +365,24 @@ def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarra
         num_pieces = int(np.ceil((high[row] - cuts[-1]) / cfg.adaptive_height_m - 1e-9))
         cuts += np.linspace(cuts[-1], high[row], num_pieces + 1)[1:].tolist()
         rows += [row] * (len(cuts) - 1)
-        is_first += [piece == int(len(cuts) > 2 and low[row] < split[row]) for piece in range(len(cuts) - 1)]
+        keeps += [piece == int(len(cuts) > 2 and low[row] < split[row]) for piece in range(len(cuts) - 1)]
         lows += cuts[:-1]
         highs += cuts[1:]
-    pieces = np.array(rows, dtype=np.int64)
+    pieces, is_new = np.array(rows, dtype=np.int64), ~np.array(keeps, dtype=bool)
     low_z, high_z = np.array(lows), np.array(highs)
-    is_tilted = (box_map.rotations_deg[pieces][:, [0, 2]] != 0).any(axis=1)[:, None]
-    bounds = axis_aligned_half_extents(box_map.half_extents[pieces], box_map.rotations_deg[pieces])
-    half = np.where(is_tilted, bounds, box_map.half_extents[pieces])
+    half, turns = _upright(box_map, pieces)
     is_stem = ((low_z < split[pieces]) & (low_z <= ground_z_m[pieces] + 1.0))[:, None]
     half[:, :2] = np.where(is_stem, np.minimum(half[:, :2], cfg.cell_size_m / 2), half[:, :2])
     half[:, 2] = (high_z - low_z) / 2
-    keeps_id = np.array(is_first, dtype=bool)
     ids = box_map.ids[pieces].copy()
-    ids[~keeps_id] = _free_ids(used_ids, int((~keeps_id).sum()))
-    cut = BoxMap(
-        np.column_stack([box_map.centers[pieces, :2], (low_z + high_z) / 2]),
-        half,
-        np.where(is_tilted, 0.0, box_map.rotations_deg[pieces]),
-        box_map.kinds[pieces],
-        ids,
-    )
+    ids[is_new] = _free_ids(used_ids, int(is_new.sum()))
+    centers = np.column_stack([box_map.centers[pieces, :2], (low_z + high_z) / 2])
+    cut = BoxMap(centers, half, turns, box_map.kinds[pieces], ids)
     return box_map.select(~is_tall).joined(cut)
 
 
 def _free_ids(used: np.ndarray, count: int) -> np.ndarray:
-    """Return the smallest positive numbers that are not used, (count,) uint64. Not max + 1: CARLA's ids fill 64
-    bits."""
+    """Return the smallest positive numbers not in use, (count,) uint64. Not max + 1: CARLA's ids fill 64 bits."""
     candidates = np.arange(1, len(used) + count + 1, dtype=np.uint64)
     return candidates[~np.isin(candidates, used)][:count]
 
@@ -470,9 +420,8 @@ def prune_nested(box_map: BoxMap, tolerance_m: float) -> BoxMap:
     keep = np.ones(len(box_map), dtype=bool)
     mins, maxs = box_map.mins, box_map.maxs
     # Bigger first, then the smaller id: a total order, so that two boxes can never drop each other.
-    volumes = np.prod(box_map.half_extents, axis=1)
     rank = np.empty(len(box_map), dtype=np.int64)
-    rank[np.lexsort((box_map.ids, -volumes))] = np.arange(len(box_map))
+    rank[np.lexsort((box_map.ids, -np.prod(box_map.half_extents, axis=1)))] = np.arange(len(box_map))
     is_tilted = (box_map.rotations_deg[:, [0, 2]] != 0).any(axis=1)
     yaw = np.radians(box_map.rotations_deg[:, 1])
     for kind in np.unique(box_map.kinds):
@@ -505,14 +454,12 @@ def _sweep_nested(
                 if mins[inner, k] < mins[outer, k] - tolerance or maxs[inner, k] > maxs[outer, k] + tolerance:
                     inside = False
                     break
-            if inside:
-                for x in (mins[inner, 0], maxs[inner, 0]):
-                    for y in (mins[inner, 1], maxs[inner, 1]):
-                        dx, dy = x - centers[outer, 0], y - centers[outer, 1]
-                        if (
-                            abs(dx * cos[outer] + dy * sin[outer]) > halves[outer, 0] + tolerance
-                            or abs(dy * cos[outer] - dx * sin[outer]) > halves[outer, 1] + tolerance
-                        ):
-                            inside = False
+            if not inside:
+                continue
+            for x in (mins[inner, 0], maxs[inner, 0]):
+                for y in (mins[inner, 1], maxs[inner, 1]):
+                    dx, dy = x - centers[outer, 0], y - centers[outer, 1]
+                    along, across = abs(dx * cos[outer] + dy * sin[outer]), abs(dy * cos[outer] - dx * sin[outer])
+                    inside &= along <= halves[outer, 0] + tolerance and across <= halves[outer, 1] + tolerance
             if inside:
                 keep[inner] = False

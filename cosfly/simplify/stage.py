@@ -34,7 +34,12 @@ def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
     before, after = (occupancy(m, like=grid) for m in (raw, simplified))
     cell_agreement, iou = compare(before, after)
     facts: dict = {"cells": list(grid.size), "cell_agreement": round(cell_agreement, 4), "iou": round(iou, 4)}
-    facts["agreement"] = _cell_by_cell(before.occupied, after.occupied)
+    facts["agreement"] = {
+        "free_in_both": int((~before.occupied & ~after.occupied).sum()),
+        "occupied_in_both": int((before.occupied & after.occupied).sum()),
+        "raw_alone": int((before.occupied & ~after.occupied).sum()),
+        "simplified_alone": int((after.occupied & ~before.occupied).sum()),
+    }
     for kind in ("Vegetation", "Buildings"):
         under = [occupancy(m.select(m.kinds == KINDS[kind]), like=grid).occupied for m in (raw, simplified)]
         differ = (before.occupied != after.occupied) & (under[0] | under[1])
@@ -47,37 +52,24 @@ def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
     return facts
 
 
-def _cell_by_cell(before: np.ndarray, after: np.ndarray) -> dict[str, int]:
-    """Count cells by what they are before and after, (ny, nx) bool each."""
-    table = {"free_in_both": ~before & ~after, "occupied_in_both": before & after}
-    table |= {"raw_alone": before & ~after, "simplified_alone": after & ~before}
-    return {name: int(found.sum()) for name, found in table.items()}
-
-
 def report(raw: BoxMap, result: Simplification, cfg: SimplifyConfig) -> dict:
     """Return the content of `simplify_report.json`."""
+    trunks = {}
+    if cfg.crop_tree and cfg.crop_strategy == "fixed":  # the walkable area of both rules for trunks
+        names = ("cell_agreement", "iou", "simplified_walkable_m2", "simplified_largest_part_m2")
+        for trunk in ("stem", "full"):
+            grid = cross_validate(raw, simplify(raw, cfg.model_copy(update={"trunk": trunk})).box_map)
+            trunks[trunk] = {name: grid[name] for name in names}
+    obstacles = {"raw": int(blocks_walking(raw).sum()), "simplified": int(blocks_walking(result.box_map).sum())}
     return {
         **REPORT_FORMAT.header,
         "name": raw.name,
         "num_boxes": {"raw": len(raw), "simplified": len(result.box_map)},
-        "obstacles_at_walking_height": {
-            "raw": int(blocks_walking(raw).sum()),
-            "simplified": int(blocks_walking(result.box_map).sum()),
-        },
+        "obstacles_at_walking_height": obstacles,
         "passes": [{"pass": name, "num_boxes": sum(c.values()), "counts": c} for name, c in result.passes],
         "grid": cross_validate(raw, result.box_map),
-        "trunks": _compare_trunks(raw, cfg),
+        "trunks": trunks,
     }
-
-
-def _compare_trunks(raw: BoxMap, cfg: SimplifyConfig) -> dict:
-    """Return the walkable area of both rules for trunks; empty if neither is used."""
-    if not (cfg.crop_tree and cfg.crop_strategy == "fixed"):
-        return {}
-    results = {trunk: simplify(raw, cfg.model_copy(update={"trunk": trunk})) for trunk in ("stem", "full")}
-    names = ("cell_agreement", "iou", "simplified_walkable_m2", "simplified_largest_part_m2")
-    grids = {trunk: cross_validate(raw, result.box_map) for trunk, result in results.items()}
-    return {trunk: {name: grid[name] for name in names} for trunk, grid in grids.items()}
 
 
 def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same") -> Path:
@@ -94,20 +86,14 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same
     write_boxes(product, result.box_map)
     facts = report(raw, result, cfg)
     write_json(out / "simplify_report.json", facts)
-    write_bytes(out / "simplify.png", _picture(raw, result.box_map, facts))
-    log.info("%d boxes become %d", len(raw), len(result.box_map))
-    tally = Tally(input=1, kept=1)
-    stage.finish([product, out / "simplify_report.json", out / "simplify.png"], tally, num_boxes=facts["num_boxes"])
-    return product
-
-
-def _picture(raw: BoxMap, simplified: BoxMap, facts: dict) -> bytes:
-    """Draw obstacles at walking height before and after, side by side."""
-    view = TopView.around(np.stack(raw.bounds()), PICTURE_PX)
-    halves = []
-    for title, box_map in (("raw", raw), ("simplified", simplified)):
+    view, halves = TopView.around(np.stack(raw.bounds()), PICTURE_PX), []
+    for title, box_map in (("raw", raw), ("simplified", result.box_map)):  # obstacles at walking height, side by side
         shown = box_map.select(box_map.is_any_of(SURFACE_KINDS) | blocks_walking(box_map))
         area = facts["grid"][f"{title}_walkable_m2"]
         text = f"{title}: {len(box_map)} boxes, {area:.0f} m2 walkable (drawn: boxes below 2 m)"
         halves.append(add_caption(draw_map(shown, view), text))
-    return png_bytes(np.hstack(halves))
+    write_bytes(out / "simplify.png", png_bytes(np.hstack(halves)))
+    log.info("%d boxes become %d", len(raw), len(result.box_map))
+    tally = Tally(input=1, kept=1)
+    stage.finish([product, out / "simplify_report.json", out / "simplify.png"], tally, num_boxes=facts["num_boxes"])
+    return product

@@ -5,6 +5,7 @@ Source: app:simworld:step1, the structured high-level plan.
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -123,8 +124,7 @@ class WorldPlan(BaseModel):
 
     def unknown_objects(self) -> list[str]:
         """Return the named objects that the table lacks, an entry for each."""
-        unknown = [named.name for named in self.objects if named.name not in OBJECTS for _ in range(named.count)]
-        return unknown + self.not_in_table
+        return [o.name for o in self.objects if o.name not in OBJECTS for _ in range(o.count)] + self.not_in_table
 
 
 def town_plan(plan: WorldPlan) -> TownPlan:
@@ -135,21 +135,17 @@ def town_plan(plan: WorldPlan) -> TownPlan:
         block_m = max(block_m, min(max(thing.size_m) * thing.least_scale + EDGE_M + 4.0, 150.0))
     narrowest = block_m * (1.0 - plan.unevenness) / (1.0 + plan.unevenness)
     room = OPEN_SHARE * (narrowest - EDGE_M) ** 2
-    needed = sum(
-        count * (thing.size_m[0] * thing.least_scale + SPACE_M) * (thing.size_m[1] * thing.least_scale + SPACE_M)
-        for thing, count in placed
-    )
+    needed = sum(n * math.prod(side * thing.least_scale + SPACE_M for side in thing.size_m) for thing, n in placed)
     num_open = max(plan.plazas + plan.greens, int(-(-needed // room)))
     while num_open > along**2 // 2 and along < 9:
         along += 1
     plazas = max(plan.plazas, num_open - plan.greens)
-    kind = "lanes" if plan.lanes else "lots"
-    shares = {kind: float(along**2 - plazas - plan.greens), "plaza": float(plazas), "green": float(plan.greens)}
+    shares = {"lanes" if plan.lanes else "lots": along**2 - plazas - plan.greens, "plaza": plazas, "green": plan.greens}
     streets_m = along * plan.street_m + max(plan.avenue_m, plan.river_m)
     return TownPlan(
         size_m=block_m * along + streets_m + 2 * VERGE_M, num_blocks=along, street_m=plan.street_m,
         boulevard_m=plan.avenue_m, unevenness=plan.unevenness, center="plaza" if plazas else None,
-        blocks={block: share for block, share in shares.items() if share > 0}, river_m=plan.river_m,
+        blocks={block: float(share) for block, share in shares.items() if share > 0}, river_m=plan.river_m,
         bridges=plan.bridges, shore_m=plan.shore_m, parked_share=plan.parked_share, tree_parts=False,
         tree_share=0.0 if plan.trees_per_ha[1] < 3 else 0.4 if plan.trees_per_ha[1] < 25 else 0.9,
         lots=Lots(

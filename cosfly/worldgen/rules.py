@@ -34,10 +34,9 @@ SEVERAL = 4  # of a plural without a number
 
 
 def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
-    """Read a prompt; the seed varies unspecified sizes, by up to a tenth.
+    """Read a prompt; return the plan, and the trace: which words were read as which property.
 
-    Returns:
-        The plan, and the trace: which words were read as which property.
+    The seed varies unspecified sizes, by up to a tenth.
 
     Raises:
         InputError: If no word of the prompt is known, or its heights are contradictory.

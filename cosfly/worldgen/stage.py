@@ -1,7 +1,4 @@
-"""`cosfly world PROMPT`: from a prompt to a world that SimWorld and our importer load.
-
-Source: app:simworld:step1.
-"""
+"""`cosfly world PROMPT`: from a prompt to a world that SimWorld and our importer load (app:simworld:step1)."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ from cosfly.formats.boxes import OUR_LICENCE, BoxMap
 from cosfly.formats.kinds import GROUND_KINDS
 from cosfly.llm.answers import AnswerBook, KeptAnswers
 from cosfly.llm.client import ChatClient, EndpointConfig
-from cosfly.llm.contract import NoAnswer, Reply, Request, started
+from cosfly.llm.contract import NoAnswer, Reply, started
 from cosfly.maps.simworld import PLACEHOLDER_CM
 from cosfly.runtime.config import Config, read_yaml, shipped
 from cosfly.runtime.errors import InputError, TeacherError
@@ -158,7 +155,18 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
     messages = [{"role": "system", "content": task}, {"role": "user", "content": prompt}]
     request = endpoint.request(messages, [], WorldPlan.model_json_schema(), seed)
     client = ChatClient(cfg.planner or "", endpoint)
-    reply = asyncio.run(_ask(client, request, answers, sha256_bytes(prompt.encode())[:16]))
+    name = sha256_bytes(prompt.encode())[:16]
+
+    async def ask() -> Reply:
+        with hold_folder(answers), AnswerBook(answers) as book:
+            async with started(client):
+                return await KeptAnswers(client, book).ask(request, name, name, "plan")
+
+    try:
+        reply = asyncio.run(ask())
+    except NoAnswer as error:
+        what, fix = "the planner gave no answer", error.fix or None
+        raise TeacherError(what, where=client.url, got=str(error), fix=fix) from None
     trace = {
         "planner": "model", "url": cfg.planner, "model": client.model, "seed": seed, "messages": messages,
         "answer": reply.text, "finish_reason": reply.finish_reason,
@@ -173,16 +181,6 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
             fix="try another --seed, prompt or model, or omit --planner: the rules need no model",
         )  # fmt: skip
     return validated(WorldPlan, found.value, where), trace
-
-
-async def _ask(client: ChatClient, request: Request, answers: Path, name: str) -> Reply:
-    with hold_folder(answers), AnswerBook(answers) as book:
-        async with started(client):
-            try:
-                return await KeptAnswers(client, book).ask(request, name, name, "plan")
-            except NoAnswer as error:
-                what, fix = "the planner gave no answer", error.fix or None
-                raise TeacherError(what, where=client.url, got=str(error), fix=fix) from None
 
 
 def run(cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
@@ -212,7 +210,11 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same
     write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks})
     view = TopView.around(np.stack(town.boxes.bounds()), 1000)
     write_bytes(out / "map.png", png_bytes(draw_map(town.boxes, view)))
-    write_bytes(out / LOOP_FILE, _loop_settings(cfg, out).encode())
+    settings = read_yaml(shipped("simworld.yaml")) | {"name": "world"}  # of the appendix, with this world
+    world = {"name": cfg.name, "world": str(product.resolve()), "licence": OUR_LICENCE, "credits": CREDITS}
+    settings["maps"] = {"source": "simworld", "simworld": world}
+    loop = "# cosfly run THIS_FILE --out DIR\n" + yaml.safe_dump(settings, sort_keys=False)
+    write_bytes(out / LOOP_FILE, loop.encode())
     for check in checks:
         if not check["is_met"]:
             log.warning("%(check)s: %(got)g, expected %(least)g to %(most)g", check)
@@ -245,11 +247,3 @@ def _write_world(town: Town, out: Path) -> None:
         group = groups["buildings" if name.startswith("BP_Building") else "elements"]
         group[name] = {"bbox": dict(zip("xyz", size, strict=True))}
     write_json(out / SIZES_FILE, {name: group for name, group in groups.items() if group})
-
-
-def _loop_settings(cfg: WorldConfig, out: Path) -> str:
-    """Return the settings of a run on the world: those that ship for SimWorld (the appendix's), with this world."""
-    settings = read_yaml(shipped("simworld.yaml"))
-    world = {"name": cfg.name, "world": str((out / WORLD_FILE).resolve()), "licence": OUR_LICENCE, "credits": CREDITS}
-    settings["maps"] = {"source": "simworld", "simworld": world}
-    return "# cosfly run THIS_FILE --out DIR\n" + yaml.safe_dump(settings | {"name": "world"}, sort_keys=False)

@@ -1,8 +1,8 @@
 """A plan to a world: the procedural layout, the objects of the prompt placed in it, and SimWorld's nodes of both.
 
-Source: app:simworld:step1, the layout and the incremental placement layer. A box of a kind without an asset of SimWorld
-is named after the kind, as Water_C, with a cube of 1 m as its size: SimWorld's loader reports and skips it, our
-importer reads it.
+A box of a kind without an asset of SimWorld is named after the kind, as Water_C, with a cube of 1 m as its size.
+
+Source: app:simworld:step1, the layout and the incremental placement layer.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from cosfly.formats.boxes import BoxMap, make_box_map
+from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.geometry.axes import box_corners
 from cosfly.maps.boxlist import BoxList
@@ -98,7 +98,7 @@ def build(plan: WorldPlan, name: str, seed: int) -> Town:
     """Build the town of a plan: the same plan, seed and name give the same town."""
     settings = town_plan(plan)
     layout = build_town(settings, name, seed)
-    town = Town(name, settings, street_grid(settings, seed), layout, make_box_map(*(np.zeros((0, 3)),) * 3, []))
+    town = Town(name, settings, street_grid(settings, seed), layout, BoxList().box_map())
     town.not_placed += [(missing, "not in the object table") for missing in plan.unknown_objects()]
     _place_objects(town, plan)
     _set_trees(town, plan, rng_for(seed, "world", "trees"))
@@ -110,14 +110,15 @@ def build(plan: WorldPlan, name: str, seed: int) -> Town:
 
 def _place_objects(town: Town, plan: WorldPlan) -> None:
     """Place the largest first, each as near the middle of the town as it finds room; soft boxes make room."""
-    boxes = BoxList()
-    taken = list[BaseGeometry]()
-    outlines = footprints(town.layout)
+    boxes, taken, outlines = BoxList(), list[BaseGeometry](), footprints(town.layout)
     hard = outlines[of_kinds(town.layout, *HARD)]
     pavements = shapely.union_all(outlines[of_kinds(town.layout, "Sidewalks")])
     for thing, count in sorted(plan.known_objects(), key=lambda pair: -math.prod(pair[0].size_m)):
         if thing.where == "layout":
-            _count_bridges(town, thing, count)
+            crossings = town.plan.num_blocks + 1 if town.plan.river_m else 0
+            built = min(count, town.plan.bridges or crossings, crossings)
+            town.placed += [Placed(thing.name, number, (0.0, 0.0), 0.0, 1.0, (0, 0)) for number in range(built)]
+            town.not_placed += [(thing.name, "no street to carry it")] * (count - built)
             continue
         free = _free_area(town, thing)
         for number in range(count):
@@ -130,19 +131,15 @@ def _place_objects(town: Town, plan: WorldPlan) -> None:
             _add_object(boxes, thing, xy, yaw, scale)
             town.placed.append(Placed(thing.name, number, xy, yaw, scale, (first, len(boxes))))
             taken.append(outline)
-            if any(part[0] == "Buildings" for part in thing.parts):
-                _add_path(boxes, outline, pavements)
+            line = shapely.shortest_line(outline, pavements)
+            if any(part[0] == "Buildings" for part in thing.parts) and line.length > 0.5:  # pave the way to a building
+                (x0, y0), (x1, y1) = line.coords
+                middle, turn = ((x0 + x1) / 2, (y0 + y1) / 2), math.degrees(math.atan2(y1 - y0, x1 - x0))
+                boxes.add("Sidewalks", middle, (line.length + 2.0, PATH_M), PAVED_TOP_M - SLAB_M, PAVED_TOP_M, turn)
     town.placement = boxes.box_map()
     soft = of_kinds(town.layout, *SOFT)
     covered = shapely.intersects(outlines, shapely.union_all(taken).buffer(0.5)) if taken else np.zeros(len(soft), bool)
     town.layout = town.layout.select(np.flatnonzero(~(soft & covered)))
-
-
-def _count_bridges(town: Town, thing: Object, count: int) -> None:
-    crossings = town.plan.num_blocks + 1 if town.plan.river_m else 0
-    built = min(count, town.plan.bridges or crossings, crossings)
-    town.placed += [Placed(thing.name, number, (0.0, 0.0), 0.0, 1.0, (0, 0)) for number in range(built)]
-    town.not_placed += [(thing.name, "no street to carry it")] * (count - built)
 
 
 def _free_area(town: Town, thing: Object) -> BaseGeometry:
@@ -153,9 +150,8 @@ def _free_area(town: Town, thing: Object) -> BaseGeometry:
         blocks = [shapely.box(*low, *high) for low, high in town.streets.blocks()]
         return shapely.union_all([block for block in blocks if not len(built.query(block, predicate="intersects"))])
     if plan.shore_m:
-        near = -half - 0.5 if thing.where == "quay" else -half - plan.shore_m
-        far = -half + VERGE_M - 0.5 if thing.where == "quay" else -half
-        return shapely.box(-half + 2, near, half - 2, far)
+        near, far = (-0.5, VERGE_M - 0.5) if thing.where == "quay" else (-plan.shore_m, 0.0)
+        return shapely.box(-half + 2, -half + near, half - 2, -half + far)
     if thing.where == "water" and plan.river_m:
         return shapely.union_all(footprints(town.layout)[of_kinds(town.layout, "Water")])
     return shapely.Polygon()
@@ -193,15 +189,6 @@ def _add_object(boxes: BoxList, thing: Object, xy: tuple[float, float], yaw_deg:
         middle = (xy[0] + scale * (c * x - s * y), xy[1] + scale * (s * x + c * y))
         rises = scale if high > 1.0 else 1.0
         boxes.add(kind, middle, (wide * scale, deep * scale), low * (rises if low > 0 else 1.0), high * rises, yaw_deg)
-
-
-def _add_path(boxes: BoxList, outline: BaseGeometry, pavements: BaseGeometry) -> None:
-    """Pave the way from a building to the nearest pavement."""
-    line = shapely.shortest_line(outline, pavements)
-    if line.length > 0.5:
-        (x0, y0), (x1, y1) = line.coords
-        middle, yaw = ((x0 + x1) / 2, (y0 + y1) / 2), math.degrees(math.atan2(y1 - y0, x1 - x0))
-        boxes.add("Sidewalks", middle, (line.length + 2.0, PATH_M), PAVED_TOP_M - SLAB_M, PAVED_TOP_M, yaw)
 
 
 # --- trees ------------------------------------------------------------------------------------------------------------
@@ -251,15 +238,15 @@ def _planted(town: Town, count: int, rng: np.random.Generator) -> BoxMap:
 @cache
 def _asset_tables() -> dict[str, dict[str, Size]]:
     """Return the assets that boxes of a kind may get, and their full sizes, m."""
-    names = {"BP_Trash_bin_*": "BP_Trash_bin_a_C"}
     furniture: dict[str, Size] = {
-        names.get(asset.pattern, asset.pattern.replace("*", "")): asset.default_size_m
-        for asset in ASSETS
-        if asset.default_size_m is not None and asset.kind == "Static"
-    }
-    of = {start: {name: size for name, size in assets().items() if name.startswith(start)}
-          for start in ("BP_Building", "BP_Tree")}  # fmt: skip
-    return {"Buildings": of["BP_Building"], "Vegetation": of["BP_Tree"], "Static": furniture}
+        {"BP_Trash_bin_*": "BP_Trash_bin_a_C"}.get(asset.pattern, asset.pattern.replace("*", "")): asset.default_size_m
+        for asset in ASSETS if asset.default_size_m is not None and asset.kind == "Static"
+    }  # fmt: skip
+    buildings, trees = (
+        {name: size for name, size in assets().items() if name.startswith(start)}
+        for start in ("BP_Building", "BP_Tree")
+    )
+    return {"Buildings": buildings, "Vegetation": trees, "Static": furniture}
 
 
 def asset_for(kind: str, size_m: Size) -> tuple[str, Size]:

@@ -71,11 +71,11 @@ def _ground(boxes: BoxList, rows: np.ndarray) -> None:
     """Terrain in strips over the whole map, and a tram line along one street."""
     edges = np.linspace(-SIZE_M[0] / 2, SIZE_M[0] / 2, CENSUS["Terrain"] + 1)
     for low, high in itertools.pairwise(edges):
-        boxes.add_span("Terrain", (low, -SIZE_M[1] / 2), (high, SIZE_M[1] / 2), -0.5, 0.0)
+        boxes.span("Terrain", (low, -SIZE_M[1] / 2), (high, SIZE_M[1] / 2), -0.5, 0.0)
     middle = rows[len(rows) // 2] + STREET_M / 2
     for side, half in itertools.product((-0.75, 0.75), (-1, 1)):
         low_x, high_x = sorted((0.0, half * (SIZE_M[0] / 2 - EDGE_M)))
-        boxes.add_span("RailTrack", (low_x, middle + side - 0.05), (high_x, middle + side + 0.05), -0.15, 0.02)
+        boxes.span("RailTrack", (low_x, middle + side - 0.05), (high_x, middle + side + 0.05), -0.15, 0.02)
 
 
 # --- blocks -----------------------------------------------------------------------------------------------------------
@@ -97,7 +97,7 @@ def _houses(boxes: BoxList, built: list[Block], rng: np.random.Generator) -> Non
         boxes.add("Buildings", center + rng.uniform(-2, 2, 2), (4.5, 4.0), height, height + rng.uniform(2.0, 3.0))
         boxes.add("Buildings", center, body * 0.6, 0.1, height - 0.5)
         if number in with_wing:
-            boxes.add_span("Buildings", (corner[0], corner[1] + depth), corner + size, -0.5, height * 0.9)
+            boxes.span("Buildings", (corner[0], corner[1] + depth), corner + size, -0.5, height * 0.9)
 
 
 def _walls(boxes: BoxList, built: list[Block]) -> None:
