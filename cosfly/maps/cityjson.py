@@ -172,9 +172,6 @@ def _facets(item: CityObject) -> list[Facet]:
     return facets
 
 
-# --- boxes ------------------------------------------------------------------------------------------------------------
-
-
 def _pieces(footprint: Any, tolerance_m: float, **rules: Any) -> Iterator[Rectangle]:
     """Yield the rectangles that cover each polygon of a footprint, simplified; `rules` are those of `cover`."""
     for polygon in polygons_of(footprint):
@@ -344,9 +341,6 @@ def _crowns(heights: np.ndarray) -> list[tuple[int, int, int, int, float]]:
         free[x0:x1, y0:y1] = False
         trees.append((x0, y0, x1, y1, float(heights[x0:x1, y0:y1].max())))
     return trees
-
-
-# --- the ground -------------------------------------------------------------------------------------------------------
 
 
 def ground_of(objects: list[CityObject]) -> Ground:

@@ -217,9 +217,6 @@ def _add_node(boxes: BoxList, node: _Node, asset: Asset, size_cm: np.ndarray, st
     return "default" if is_placeholder else "bbox"
 
 
-# --- roads ------------------------------------------------------------------------------------------------------------
-
-
 def _centerline(node: _Node) -> Centerline:
     """Return a road piece's centre line, world metres: its location is the piece's middle, x its direction.
 

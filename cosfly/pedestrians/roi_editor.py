@@ -36,9 +36,6 @@ TOLERANCE_M, SMALLEST_HOLE_M2 = 1.0, 100.0  # of a proposal, which a person goes
 FROM_ABOVE_PX = 2400
 
 
-# --- a first region ---------------------------------------------------------------------------------------------------
-
-
 def propose(ground: WalkableGround, name: str) -> Roi:
     """Compute the outline of the ground that pedestrians use, without holes below SMALLEST_HOLE_M2, to TOLERANCE_M.
 
@@ -91,9 +88,6 @@ def _read_map(path: Path) -> BoxMap:
     box_map = read_boxes(path)
     check_ground(box_map, path)
     return box_map
-
-
-# --- the page ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -205,9 +199,6 @@ def _encoded(picture: np.ndarray) -> str:
     done, data = cv2.imencode(".png", np.ascontiguousarray(picture[::-1]), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     assert done, "OpenCV encodes any 8-bit picture"
     return base64.b64encode(data.tobytes()).decode()
-
-
-# --- the editor on a page ---------------------------------------------------------------------------------------------
 
 
 def open_editor(map_: Path, cfg: PedestriansConfig, roi: Path, port: int, backdrop: Path | None) -> PageServer:

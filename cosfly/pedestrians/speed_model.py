@@ -83,7 +83,6 @@ def standing_time_s(time_s: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray
     return np.clip(time_s[:, None] - begins_s, 0.0, stops_s[at]).sum(axis=1)
 
 
-# --- paces ------------------------------------------------------------------------------------------------------------
 STOP_GAP_MIN = 2  # waypoints from one stop to the next: a piece between two stops would have no speed
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import colorsys
 import logging
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,13 +29,13 @@ from cosfly.pedestrians.crossings import CROSSING, ROAD, count_on_road
 from cosfly.pedestrians.lanes import Lane, lanes_of
 from cosfly.pedestrians.speed_model import PACES, arrival_times, resample, speeds_at, take_pace
 from cosfly.pedestrians.walkable import (
-    Clock,
     PedestriansConfig,
     WalkableGround,
     sample_goal,
     sample_start,
+    timed,
     walkable_ground,
-)  # fmt: skip
+)
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, write_json
@@ -49,9 +50,6 @@ log = logging.getLogger(__name__)
 STAGE = "pedestrians"
 REPORT_FORMAT = FileFormat("cosfly.pedestrians_report", "1.0")
 RETRY_REASONS = ("no_goal", "detour")
-
-
-# --- one trajectory ---------------------------------------------------------------------------------------------------
 
 
 class PedestrianResult(NamedTuple):
@@ -70,12 +68,12 @@ def make_pedestrian(
     Raises:
         NoPathError: If every pair of ends is rejected.
     """
-    clock = Clock()
+    seconds = Counter[str]()
     pace_rng = rng.spawn(1)[0]  # a child takes no draw from its parent: shares of paces change no route
-    route_m, retries = _draw_route(path_id, ground, cfg, rng, clock)
-    with clock("report"):
+    route_m, retries = _draw_route(path_id, ground, cfg, rng, seconds)
+    with timed(seconds, "report"):
         trajectory = follow_route(path_id, route_m, ground.heights, cfg, rng, pace_rng, pace)
-    return PedestrianResult(trajectory, retries, clock.seconds)
+    return PedestrianResult(trajectory, retries, dict(seconds))
 
 
 def follow_route(
@@ -93,19 +91,19 @@ def follow_route(
 
 
 def _draw_route(
-    path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, clock: Clock
+    path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, seconds: Counter[str]
 ) -> tuple[np.ndarray, dict[str, int]]:
     """Draw pairs of ends until one is accepted; return its route, (k, 2) m, and the rejected pairs by reason."""
     limits = cfg.min_distance_m / cfg.resolution_m, cfg.max_distance_m / cfg.resolution_m
     retries = dict.fromkeys(RETRY_REASONS, 0)
     for _ in range(cfg.num_retries + 1):
-        with clock("sample"):
+        with timed(seconds, "sample"):
             start = sample_start(ground, rng)
             goal = sample_goal(ground, start, *limits, rng)
         if goal is None:
             retries["no_goal"] += 1
             continue
-        with clock("astar"):
+        with timed(seconds, "astar"):
             cells = ground.route(start, goal)
         if cfg.max_detour and route_cost(cells) > cfg.max_detour * np.hypot(*(cells[-1] - cells[0])):
             retries["detour"] += 1
@@ -142,9 +140,6 @@ def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround, lanes
     return work
 
 
-# --- the stage --------------------------------------------------------------------------------------------------------
-
-
 def report(
     ground: WalkableGround, paths: list[PedestrianTrajectory], retries: list[dict[str, int]], failed: dict[str, int]
 ) -> dict:
@@ -173,17 +168,16 @@ def report(
 
 
 def _write_bystanders(path: Path, records: list[dict], header: dict, cfg: PedestriansConfig) -> dict[str, dict]:
-    """Write `others.json`; return how many were requested and placed, by kind, with a warning where some are
-    missing."""
+    """Write `others.json`; return how many were requested and placed, by kind; warn where some are missing."""
     items = [Bystanders.from_json(record, f"{path.parent}: items.jsonl") for record in records]
     write_bystanders(path, items, header)
     counts = {}
     for kind, per_item in (("Pedestrians", cfg.others), ("Car", cfg.traffic)):
-        wanted = per_item * len(items)
         placed = sum(other.kind == kind for bystanders in items for other in bystanders.others)
-        counts[kind] = {"wanted": wanted, "placed": placed}
-        if placed < wanted:
-            log.warning("pedestrians: only %d of %d bystanders of kind %s could be placed", placed, wanted, kind)
+        counts[kind] = {"wanted": per_item * len(items), "placed": placed}
+        if placed < per_item * len(items):
+            what = "pedestrians: only %d of %d bystanders of kind %s could be placed"
+            log.warning(what, placed, per_item * len(items), kind)
     return counts
 
 
@@ -203,11 +197,11 @@ def run(
     product = out / "path.json"
     if stage.is_complete:
         return product
-    clock = Clock()
-    with clock("read"):
+    seconds = Counter[str]()
+    with timed(seconds, "read"):
         box_map = read_boxes(simplified_map)
         region = read_roi(roi) if roi else None
-    ground = walkable_ground(box_map, cfg, region, where=simplified_map, roi_where=roi or "", clock=clock)
+    ground = walkable_ground(box_map, cfg, region, where=simplified_map, roi_where=roi or "", seconds=seconds)
     items = [Item(walk_id(k), pace) for k, pace in enumerate(paces_of(cfg.num_paths, cfg.pace, seed))]
     # Workers need the labels only; sending the rest takes time.
     lean = replace(ground, inflated=ground.grid, is_in_roi=None)
@@ -220,10 +214,9 @@ def run(
     results = [result_of(record, _PedestrianRecord) for record in finished.kept]
     paths = [PedestrianTrajectory.from_json(result.path, f"{out}: items.jsonl") for result in results]
     for result in results:
-        for step, taken_s in result.seconds.items():
-            clock.add(step, taken_s)
+        seconds.update(result.seconds)  # type: ignore[arg-type]
     outputs = [product, out / "pedestrians_report.json", out / "paths.png"]
-    with clock("report"):
+    with timed(seconds, "report"):
         retries = [result.retries for result in results]
         summary = report(ground, paths, retries, dict(sorted(finished.tally.failed.items())))
         write_paths(product, paths, {"map": box_map.name, "seed": seed, "settings": cfg.all_values()})
@@ -235,12 +228,10 @@ def run(
         share = summary["total"]["on_carriageway_share"]
         log.info("%.1f %% of the points are on carriageway away from crossings", 100 * share)
         write_bytes(out / "paths.png", draw_overview(ground, paths))
-    seconds = {step: round(value, 4) for step, value in clock.seconds.items()}
-    stage.finish(outputs, finished.tally, ground=ground.counts, total=summary["total"], seconds_by_step=seconds)
+    rounded = {step: round(value, 4) for step, value in seconds.items()}
+    stage.finish(outputs, finished.tally, ground=ground.counts, total=summary["total"], seconds_by_step=rounded)
     return product
 
-
-# --- overview ---------------------------------------------------------------------------------------------------------
 
 LONGER_SIDE_PX = 1600
 # RGB of cells and of the outline of the region of interest
@@ -251,32 +242,7 @@ CAPTION = "dark: obstacles, grey: margin, blue: walkable, violet: carriageway, y
 
 def draw_overview(ground: WalkableGround, paths: list[PedestrianTrajectory]) -> bytes:
     """Draw the ground and the trajectories, north up; a ring is a start, a dot a goal; return PNG bytes."""
-    picture, view = _ground_picture(ground)
-    thickness = max(1, round(LONGER_SIDE_PX / 600))
-    if ground.is_in_roi is not None:
-        outlines, _ = cv2.findContours(ground.is_in_roi.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-        for outline in outlines:
-            draw_line(picture, view.pixels(ground.grid.centers_of(outline[:, 0])), ROI_LINE, thickness, closed=True)
-    for number, path in enumerate(paths):
-        color, line = path_color(number), view.pixels(path.polyline_m)
-        draw_line(picture, line, color, thickness)
-        draw_dot(picture, line[0], 7, PAPER)
-        draw_dot(picture, line[0], 7, color, thickness)
-        draw_dot(picture, line[-1], 6, color)
-    return png_bytes(add_caption(picture, f"{len(paths)} trajectories, a ring is a start; {CAPTION}"))
-
-
-def path_color(number: int) -> tuple[int, int, int]:
-    """Return a strong RGB colour; neighbours are far apart on the colour circle (golden ratio)."""
-    red, green, blue = colorsys.hsv_to_rgb((0.02 + number * 0.618034) % 1.0, 0.85, (0.62, 0.85)[number % 2])
-    return round(red * 255), round(green * 255), round(blue * 255)
-
-
-def _ground_picture(ground: WalkableGround) -> tuple[np.ndarray, TopView]:
-    """Paint the cells, north up; return the picture and its view."""
-    grid = ground.grid
-    num_x, num_y = grid.size
-    scale = LONGER_SIDE_PX / max(num_x, num_y)
+    grid, (num_x, num_y) = ground.grid, ground.grid.size
     colors = np.full((num_y, num_x, 3), UNUSED, dtype=np.uint8)
     for mask, color in (
         (ground.walkable, USED), (ground.walkable & (ground.footing >= ROAD), ON_ROAD),
@@ -284,10 +250,25 @@ def _ground_picture(ground: WalkableGround) -> tuple[np.ndarray, TopView]:
         (grid.occupied, OBSTACLE),
     ):  # fmt: skip
         colors[mask] = color
-    cells = np.ascontiguousarray(colors[::-1])
+    scale = LONGER_SIDE_PX / max(num_x, num_y)
     width, height = max(1, round(num_x * scale)), max(1, round(num_y * scale))
-    picture = cv2.resize(cells, (width, height), interpolation=cv2.INTER_NEAREST if scale >= 1 else cv2.INTER_AREA)
+    how = cv2.INTER_NEAREST if scale >= 1 else cv2.INTER_AREA
+    picture = cv2.resize(np.ascontiguousarray(colors[::-1]), (width, height), interpolation=how)
     per_m = scale / grid.resolution_m
     # A cell's colour fills its pixels; coordinates are 0 in the middle of the first pixel.
     view = TopView(grid.x_min_m + 0.5 / per_m, grid.y_min_m + (height - 0.5) / per_m, per_m, (width, height))
-    return picture, view
+    thickness = max(1, round(LONGER_SIDE_PX / 600))
+    if ground.is_in_roi is not None:
+        outlines, _ = cv2.findContours(ground.is_in_roi.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+        for outline in outlines:
+            draw_line(picture, view.pixels(ground.grid.centers_of(outline[:, 0])), ROI_LINE, thickness, closed=True)
+    for number, path in enumerate(paths):
+        # Neighbours are far apart on the colour circle (golden ratio).
+        hue_rgb = colorsys.hsv_to_rgb((0.02 + number * 0.618034) % 1.0, 0.85, (0.62, 0.85)[number % 2])
+        (red, green, blue), line = (round(part * 255) for part in hue_rgb), view.pixels(path.polyline_m)
+        color = red, green, blue
+        draw_line(picture, line, color, thickness)
+        draw_dot(picture, line[0], 7, PAPER)
+        draw_dot(picture, line[0], 7, color, thickness)
+        draw_dot(picture, line[-1], 6, color)
+    return png_bytes(add_caption(picture, f"{len(paths)} trajectories, a ring is a start; {CAPTION}"))

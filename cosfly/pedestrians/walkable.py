@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -160,46 +161,33 @@ class WalkableGround:
         return cells
 
 
-class Clock:
-    """Adds up the seconds of the stage's steps by name."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, step: str) -> Iterator[None]:
-        start_s = time.perf_counter()
-        yield
-        self.add(step, time.perf_counter() - start_s)
-
-    def add(self, step: str, seconds: float) -> None:
-        self.seconds[step] = self.seconds.get(step, 0.0) + seconds
+@contextmanager
+def timed(seconds: Counter[str], step: str) -> Iterator[None]:
+    """Add the time of a block to the seconds of a step."""
+    start_s = time.perf_counter()
+    yield
+    seconds[step] += time.perf_counter() - start_s  # type: ignore[assignment]
 
 
 def walkable_ground(
-    box_map: BoxMap,
-    cfg: PedestriansConfig,
-    roi: Roi | None = None,
-    *,
-    where: str | Path = "map",
-    roi_where: str | Path = "region of interest",
-    clock: Clock | None = None,
-) -> WalkableGround:
+    box_map: BoxMap, cfg: PedestriansConfig, roi: Roi | None = None, *, where: str | Path = "map",
+    roi_where: str | Path = "region of interest", seconds: Counter[str] | None = None,
+) -> WalkableGround:  # fmt: skip
     """Return the walkable ground of a map; `where` and `roi_where` are the files to name in an error.
 
     Components are 8-connected, as in the paper, and those below `min_component_cells` are not used. A route that never
     cuts a corner cannot pass between two cells that touch at a corner only, so an 8-connected component may hold
     several parts; both ends of a route are drawn from one part, so that it exists.
     """
-    clock = clock or Clock()
-    with clock("grid"):
+    seconds = Counter() if seconds is None else seconds
+    with timed(seconds, "grid"):
         empty = empty_grid(box_map, cfg.resolution_m)
-    with clock("project"):
+    with timed(seconds, "project"):
         grid = occupancy(box_map, height_m=cfg.human_height_m, like=empty)
         is_in_roi = None if roi is None else roi_mask(grid, roi)
     if roi is not None:
         check_roi(roi, box_map, roi_where)
-    with clock("inflate"):
+    with timed(seconds, "inflate"):
         inflated = inflate(grid, cfg.safety_radius_m)
         free = ~inflated.occupied
         num_free = _count(free)
@@ -212,24 +200,18 @@ def walkable_ground(
             if mask is not None:
                 free &= mask
     counts: dict[str, Any] = {
-        "boxes": len(box_map),
-        "boxes_in_the_way": _count(blocks_walking(box_map, height_m=cfg.human_height_m)),
-        "grid": list(grid.size),
-        "cells": free.size,
-        "cells_occupied": _count(grid.occupied),
-        "cells_inflated": free.size - num_free,
-        "cells_free": num_free,
+        "boxes": len(box_map), "boxes_in_the_way": _count(blocks_walking(box_map, height_m=cfg.human_height_m)),
+        "grid": list(grid.size), "cells": free.size, "cells_occupied": _count(grid.occupied),
+        "cells_inflated": free.size - num_free, "cells_free": num_free,
         "ground": cfg.ground if has_surface is not None else "anywhere",
         "cells_with_surface": None if has_surface is None else _count(has_surface),
         "cells_in_roi": None if is_in_roi is None else _count(is_in_roi),
-        **({} if is_steep is None else {"cells_steep": _count(is_steep)}),
-        "cells_walkable": _count(free),
-    }
+        **({} if is_steep is None else {"cells_steep": _count(is_steep)}), "cells_walkable": _count(free),
+    }  # fmt: skip
     _check_walkable(counts, where, roi_where)
-    with clock("connectivity"):
-        place = where if roi is None else roi_where
-        parts = _parts_of_large_components(free, cfg.min_component_cells, counts, place)
-    with clock("footing"):
+    with timed(seconds, "connectivity"):
+        parts = _parts_of_large_components(free, cfg.min_component_cells, counts, where if roi is None else roi_where)
+    with timed(seconds, "footing"):
         costs, footing = costs_of(cfg.open_cost, cfg.road_cost), footing_of(box_map, grid)
     ground = WalkableGround(grid, inflated, parts, footing, box_map.ground, costs, is_in_roi, counts)
     if not ground.row_ends[-1]:
@@ -328,9 +310,6 @@ def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | 
         expected = "a region in the map's world metres"
         fix = "draw it over free ground of this map"
     raise NoPathError(what, where=where, got=got, expected=expected, fix=fix)
-
-
-# --- ends of a trajectory ---------------------------------------------------------------------------------------------
 
 
 def sample_start(ground: WalkableGround, rng: np.random.Generator) -> tuple[int, int]:

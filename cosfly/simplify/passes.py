@@ -28,9 +28,6 @@ CLOSED_GAP_M = 1.0  # twice the safety radius of a person (tab:ped_params): pede
 FILL_CELLS = 64  # a cluster's fill is measured on at most FILL_CELLS x FILL_CELLS cells: 1.6 % a cell along each axis
 
 
-# --- merge ------------------------------------------------------------------------------------------------------------
-
-
 def merge(
     box_map: BoxMap,
     rules: dict[int, tuple[float, float]],
@@ -193,9 +190,6 @@ def fill_share(rectangles, low, high):  # pragma: no cover (compiled)
     return covered.sum() / covered.size
 
 
-# --- all passes -------------------------------------------------------------------------------------------------------
-
-
 class SimplifyConfig(Config):
     """The four passes of Step 2."""
 
@@ -285,9 +279,6 @@ def _ground_z_m(box_map: BoxMap) -> np.ndarray:
 
 def _has_stems(cfg: SimplifyConfig) -> bool:
     return cfg.crop_tree and cfg.crop_strategy == "fixed" and cfg.trunk == "stem"
-
-
-# --- crop_tree --------------------------------------------------------------------------------------------------------
 
 
 def _spanning(box_map: BoxMap, cfg: SimplifyConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -385,9 +376,6 @@ def _free_ids(used: np.ndarray, count: int) -> np.ndarray:
     """Return the smallest positive numbers not in use, (count,) uint64. Not max + 1: CARLA's ids fill 64 bits."""
     candidates = np.arange(1, len(used) + count + 1, dtype=np.uint64)
     return candidates[~np.isin(candidates, used)][:count]
-
-
-# --- removal ----------------------------------------------------------------------------------------------------------
 
 
 def crop_below_ground(box_map: BoxMap, *, clip: bool = False) -> BoxMap:

@@ -105,9 +105,6 @@ def build(plan: WorldPlan, name: str, seed: int) -> Town:
     return town
 
 
-# --- objects of the prompt --------------------------------------------------------------------------------------------
-
-
 def _place_objects(town: Town, plan: WorldPlan) -> None:
     """Place the largest first, each as near the middle of the town as it finds room; soft boxes make room."""
     boxes, taken, outlines = BoxList(), list[BaseGeometry](), footprints(town.layout)
@@ -191,9 +188,6 @@ def _add_object(boxes: BoxList, thing: Object, xy: tuple[float, float], yaw_deg:
         boxes.add(kind, middle, (wide * scale, deep * scale), low * (rises if low > 0 else 1.0), high * rises, yaw_deg)
 
 
-# --- trees ------------------------------------------------------------------------------------------------------------
-
-
 def _set_trees(town: Town, plan: WorldPlan, rng: np.random.Generator) -> None:
     """Fell the trees in front of doors, then fell or plant until their number is within the plan's range."""
     outlines, sizes = footprints(town.boxes), 2 * town.boxes.half_extents[:, :2]
@@ -230,9 +224,6 @@ def _planted(town: Town, count: int, rng: np.random.Generator) -> BoxMap:
             if len(boxes) == count:
                 break
     return boxes.box_map()
-
-
-# --- SimWorld's nodes -------------------------------------------------------------------------------------------------
 
 
 @cache
