@@ -10,6 +10,8 @@ import shapely
 from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.geometry.axes import box_corners
 from cosfly.runtime.io import over_limit
 
 MIN_AREA_M2 = 0.02  # smaller pieces are rounding errors of a cut
@@ -50,6 +52,12 @@ def oriented_rectangle(polygon: Polygon) -> Rectangle:
     c, s = float(cos[best, 0]), float(sin[best, 0])
     center = (c * middle[0] - s * middle[1], s * middle[0] + c * middle[1])
     return Rectangle(center, (float(sizes[best, 0]), float(sizes[best, 1])), float(np.degrees(angles[best])))
+
+
+def footprints(box_map: BoxMap) -> np.ndarray:
+    """Return the footprint of every upright box as a polygon, (n,)."""
+    rows = zip(box_map.centers, box_map.half_extents, np.radians(box_map.rotations_deg[:, 1]), strict=True)
+    return shapely.polygons(np.array([box_corners(*row)[[0, 2, 6, 4], :2] for row in rows]).reshape(-1, 4, 2))
 
 
 def rectangle_polygon(rectangle: Rectangle, along: Share = (-0.5, 0.5), across: Share = (-0.5, 0.5)) -> Polygon:

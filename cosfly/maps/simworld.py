@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
+import shapely
 from pydantic import BaseModel, Field, FiniteFloat, field_validator
 
 from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.formats.columns import LARGEST
 from cosfly.formats.kinds import KIND_NAMES
-from cosfly.geometry.axes import box_corners
 from cosfly.maps.boxlist import BoxList, required
+from cosfly.maps.footprints import footprints
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import read_json, validated
@@ -248,11 +249,9 @@ def _half_widths(boxes: BoxList, lines: list[Centerline]) -> tuple[float, float]
     fronts = [DEFAULT_FRONT_M]
     rows = np.flatnonzero(kinds == "Buildings")
     if len(rows):
-        shares, yaws = np.linspace(0.0, 1.0, 25)[:, None], np.radians(box_map.rotations_deg[:, 1])
-        footprints = [
-            box_corners(box_map.centers[row], box_map.half_extents[row], yaws[row])[[0, 2, 6, 4, 0], :2] for row in rows
-        ]
-        edges = np.concatenate([a + shares * (b - a) for ring in footprints for a, b in pairwise(ring)])
+        rings = shapely.get_coordinates(footprints(box_map.select(rows))).reshape(-1, 5, 2)
+        shares = np.linspace(0.0, 1.0, 25)[:, None]
+        edges = np.concatenate([a + shares * (b - a) for ring in rings for a, b in pairwise(ring)])
         nearest = _distances_m(edges, lines).reshape(len(rows), -1).min(axis=1)
         fronts = nearest[nearest < BESIDE_ROAD_M].tolist() or fronts
     front = float(np.percentile(fronts, 10))

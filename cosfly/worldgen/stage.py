@@ -9,14 +9,14 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import shapely
 import yaml
 from pydantic import Field
 
 from cosfly.formats.boxes import OUR_LICENCE, BoxMap
-from cosfly.formats.kinds import GROUND_KINDS
+from cosfly.formats.kinds import KINDS
+from cosfly.geometry.grid import connected_parts, empty_grid, occupancy, surface
 from cosfly.llm.answers import AnswerBook, KeptAnswers
 from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.contract import NoAnswer, Reply, started
@@ -39,8 +39,6 @@ CHECKS_FORMAT = FileFormat("cosfly.world_checks", "1.0", "checks of a world")
 CREDITS = "cosfly; sizes of assets by SimWorld, maitrix-org and contributors"
 MOST_CHARACTERS = 2000  # of a prompt
 
-CELL_M = 0.5
-HEAD_M, STEP_M = 2.0, 0.25  # boxes above or below these heights do not block pedestrians
 AT_THE_DOOR_M = 2.0  # from a building to the pavement that leads to it
 WALK_M = 100.0  # the longest pedestrian trajectory that must find room: app:simworld:step4 samples 50 to 100 m
 OVERLAP_M = 0.05
@@ -102,32 +100,18 @@ def _num_overlaps(box_map: BoxMap) -> int:
 def _reach(box_map: BoxMap, buildings: np.ndarray) -> tuple[int, float, float]:
     """Return how many buildings the largest walkable component reaches, its length, and its share of all components.
 
-    Walkable is pavement and road that is free up to a pedestrian's head.
+    Walkable is pavement and road without an obstacle, on the grid of the pedestrian stage.
     """
-    low = box_map.bounds()[0][:2]
-    shape = np.ceil((box_map.bounds()[1][:2] - low) / CELL_M).astype(int)[::-1] + 1
-
-    def drawn(polygons: np.ndarray) -> np.ndarray:
-        picture = np.zeros(shape, np.uint8)
-        for polygon in polygons:
-            corners = np.round((np.asarray(polygon.exterior.coords)[:, :2] - low) / CELL_M - 0.5).astype(np.int32)
-            cv2.fillPoly(picture, [corners], 1)
-        return picture
-
-    blocked = (box_map.maxs[:, 2] > STEP_M) & (box_map.mins[:, 2] < HEAD_M) & ~box_map.is_any_of(GROUND_KINDS)
-    blocked |= of_kinds(box_map, "Water") & (box_map.maxs[:, 2] > 0)
-    outlines = footprints(box_map)
-    walkable = drawn(outlines[of_kinds(box_map, "Sidewalks", "Roads")])
-    walkable[drawn(outlines[blocked]) > 0] = 0
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(walkable)
-    if count < 2:
+    grid = empty_grid(box_map)
+    paved = surface(box_map, {KINDS["Sidewalks"], KINDS["Roads"]}, like=grid)
+    assert paved is not None, "every town has streets"
+    labels, sizes = connected_parts(paved & ~occupancy(box_map, like=grid).occupied, 8)
+    if len(sizes) < 2:
         return 0, 0.0, 0.0
-    largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-    length_m = CELL_M * float(np.hypot(*stats[largest, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]))
-    door = np.ones((2 * int(AT_THE_DOOR_M / CELL_M) + 1,) * 2, np.uint8)
-    near = cv2.dilate((labels == largest).astype(np.uint8), door)
-    reached = sum(bool((near & drawn(np.array([polygon]))).any()) for polygon in buildings)
-    return reached, length_m, stats[largest, cv2.CC_STAT_AREA] / stats[1:, cv2.CC_STAT_AREA].sum()
+    cells = np.argwhere(labels == np.argmax(sizes))[:, ::-1]
+    near = shapely.STRtree(shapely.points(grid.centers_of(cells))).query(buildings, "dwithin", AT_THE_DOOR_M)
+    length_m = grid.resolution_m * float(np.hypot(*(np.ptp(cells, axis=0) + 1)))
+    return len(np.unique(near[0])), length_m, sizes.max() / sizes.sum()
 
 
 TASK = """You plan a town for a generator that lays out streets, blocks and buildings. The user describes the town.

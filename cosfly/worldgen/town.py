@@ -19,8 +19,8 @@ from shapely.geometry.base import BaseGeometry
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KIND_NAMES, KINDS
-from cosfly.geometry.axes import box_corners
 from cosfly.maps.boxlist import BoxList
+from cosfly.maps.footprints import footprints
 from cosfly.maps.synthetic import VERGE_M, Streets, TownPlan, build_town, street_grid
 from cosfly.maps.town_blocks import LAWN_TOP_M, PAVED_TOP_M, SLAB_M
 from cosfly.runtime.seeding import rng_for
@@ -72,15 +72,6 @@ class Town:
     def land_m2(self) -> float:
         """The area without the river."""
         return self.plan.size_m * (self.plan.size_m - self.plan.river_m)
-
-
-def footprints(box_map: BoxMap) -> np.ndarray:
-    """Return the footprint of every box as a polygon, (n,)."""
-    corners = [
-        box_corners(center, half, math.radians(yaw))[[0, 2, 6, 4], :2]
-        for center, half, yaw in zip(box_map.centers, box_map.half_extents, box_map.rotations_deg[:, 1], strict=True)
-    ]
-    return shapely.polygons(np.array(corners).reshape(-1, 4, 2))
 
 
 def of_kinds(box_map: BoxMap, *names: str) -> np.ndarray:
