@@ -89,8 +89,12 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     model = read_model(path)
     objects, origin = _centred(model.objects, path)
     ground = ground_of(objects)
+
+    def lowered(ring: np.ndarray) -> np.ndarray:
+        return ring - np.outer(ground.height_at(ring), [0.0, 0.0, 1.0])
+
     if not ground.is_flat:  # heights over the ground below each vertex; solids keep theirs, or their roofs would slope
-        objects = [item if item.rule.form == "solid" else _over_ground(item, ground) for item in objects]
+        objects = [item if item.rule.form == "solid" else item.moved(lowered) for item in objects]
     facets = {item.object_id: _facets(item) for item in objects}
     footprints = {key: united([facet.polygon for facet in value]) for key, value in facets.items()}
     boxes, solid_rows = BoxList(), list[int]()
@@ -110,15 +114,22 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
             if item.rule.kind == "Buildings":
                 footprint_m2, boxes_m2 = footprint_m2 + footprint.area, boxes_m2 + outline.area
                 covered_m2 += shapely.intersection(footprint, outline).area
-        elif item.rule.form == "wall":
-            _add_wall(boxes, item, footprint, is_flat=ground.is_flat)
+        elif item.rule.form == "wall":  # as high as the upper quartile of its vertices
+            high = float(np.clip(np.percentile(item.corners()[:, 2], 75), 0.3, WALL_MAX_M))
+            longest_m, low = (np.inf, -SLAB_M) if ground.is_flat else (SLOPED_WALL_M, -SLOPED_WALL_DEPTH_M)
+            for piece in _pieces(footprint, 0.02, min_fill=WALL_FILL, min_size_m=WALL_PIECE_M, max_size_m=longest_m):
+                boxes.add(item.rule.kind, piece.center, piece.size, low, high, piece.yaw_deg)
         elif item.rule.kind != "Water":
             _add_surface(boxes, item.rule.kind, footprint)
         if item.rule.kind == "Bridge":
             _add_surface(boxes, "Sidewalks", footprint)  # for pedestrians
-        if item.rule.form == "green":
+        if item.rule.form == "green" and facets[item.object_id]:
             _add_trees(boxes, item, facets[item.object_id])
-    _add_water(boxes, objects, footprints)
+    # Water without the bridges and streets that cross it: pedestrians cannot walk on water.
+    water = united([footprints[item.object_id] for item in objects if item.rule.kind == "Water"])
+    crossing = [footprints[i.object_id] for i in objects if i.rule.kind in ("Bridge", "Roads", "Sidewalks", "Ground")]
+    water = shapely.difference(water, shapely.buffer(united(crossing), 0.05)) if crossing else water
+    _add_surface(boxes, "Water", water)
     header = MapHeader(
         name=cfg.name, source=MapSource(tool=cfg.tool, version=f"CityJSON {model.version}", file=path.name),
         licence=cfg.licence, credits=cfg.credits, ground_z_m=0.0,
@@ -136,22 +147,13 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     return with_derived_ground(box_map) if cfg.derive_ground else box_map
 
 
-def _over_ground(item: CityObject, ground: Ground) -> CityObject:
-    rings = [[r - np.outer(ground.height_at(r), [0.0, 0.0, 1.0]) for r in surface] for surface in item.surfaces]
-    return item._replace(surfaces=rings)
-
-
 def _centred(objects: list[CityObject], path: Path) -> tuple[list[CityObject], np.ndarray]:
     """Move the middle of the map to the origin and the usual height of roads to z = 0; return the offset too."""
     corners = np.concatenate([item.corners() for item in objects])
     roads = [item.corners() for item in objects if item.rule.kind in ("Roads", "Sidewalks")]
     ground = np.median(np.concatenate(roads)[:, 2]) if roads else np.percentile(corners[:, 2], 5)
     origin = origin_m(corners.min(axis=0), corners.max(axis=0), f"{path}: vertices", float(ground))
-
-    def moved(surfaces: list[Surface]) -> list[Surface]:
-        return [[ring - origin for ring in rings] for rings in surfaces]
-
-    return [item._replace(surfaces=moved(item.surfaces), detailed=moved(item.detailed)) for item in objects], origin
+    return [item.moved(lambda ring: ring - origin) for item in objects], origin
 
 
 def _facets(item: CityObject) -> list[Facet]:
@@ -257,14 +259,6 @@ def _triangles_of(rings: Surface) -> np.ndarray:
     return np.array(found).reshape(-1, 3, 3)
 
 
-def _add_wall(boxes: BoxList, item: CityObject, footprint, *, is_flat: bool) -> None:
-    """Add a wall piece by piece along its course, as high as the upper quartile of its vertices."""
-    high = float(np.clip(np.percentile(item.corners()[:, 2], 75), 0.3, WALL_MAX_M))
-    longest_m, low = (np.inf, -SLAB_M) if is_flat else (SLOPED_WALL_M, -SLOPED_WALL_DEPTH_M)
-    for piece in _pieces(footprint, 0.02, min_fill=WALL_FILL, min_size_m=WALL_PIECE_M, max_size_m=longest_m):
-        boxes.add(item.rule.kind, piece.center, piece.size, low, high, piece.yaw_deg)
-
-
 def _add_surface(boxes: BoxList, kind: str, footprint) -> None:
     """Add a surface as slabs at the height of its kind, so that it never obstructs a pedestrian."""
     top = SURFACE_TOPS_M.get(kind, -0.1)
@@ -273,21 +267,11 @@ def _add_surface(boxes: BoxList, kind: str, footprint) -> None:
         boxes.add(kind, piece.center, piece.size, top - SLAB_M, top, piece.yaw_deg)
 
 
-def _add_water(boxes: BoxList, objects: list[CityObject], footprints: dict[str, Any]) -> None:
-    """Add water without the bridges and streets that cross it: pedestrians cannot walk on water."""
-    water = united([footprints[item.object_id] for item in objects if item.rule.kind == "Water"])
-    crossing = [footprints[i.object_id] for i in objects if i.rule.kind in ("Bridge", "Roads", "Sidewalks", "Ground")]
-    if not water.is_empty:
-        _add_surface(boxes, "Water", shapely.difference(water, shapely.buffer(united(crossing), 0.05)))
-
-
 def _add_trees(boxes: BoxList, item: CityObject, facets: list[Facet]) -> None:
     """Add a vegetation box for every patch of raster cells where the green rises over CANOPY_M."""
-    if not facets:
-        return
     heights, low = _canopy_heights(item, facets)
     for x0, y0, x1, y1, top in _crowns(heights):
-        first, last = (np.array(corner) + low for corner in ((x0, y0), (x1, y1)))
+        first, last = np.add(low, (x0, y0)), np.add(low, (x1, y1))
         size = np.maximum((last - first) * CANOPY_CELL_M, CROWN_MIN_M)
         boxes.add("Vegetation", (first + last) / 2 * CANOPY_CELL_M, size, 0.0, min(top, CANOPY_MAX_M))
 

@@ -6,6 +6,7 @@ One document or a text sequence (CityJSONSeq: the document first, then one featu
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -84,6 +85,11 @@ class CityObject(NamedTuple):
     def corners(self) -> np.ndarray:
         """Return all vertices, (n, 3) m."""
         return np.concatenate([ring for surface in self.surfaces for ring in surface])
+
+    def moved(self, move: Callable[[np.ndarray], np.ndarray]) -> CityObject:
+        """Return the object with each ring of vertices moved."""
+        surfaces, detailed = ([[move(r) for r in rings] for rings in each] for each in (self.surfaces, self.detailed))
+        return self._replace(surfaces=surfaces, detailed=detailed)
 
 
 class CityModel(NamedTuple):
