@@ -1,10 +1,8 @@
-"""A seeded town: streets on a grid, lawns, and blocks of one kind each, from market to skyscrapers; perhaps a river
-with bridges.
+"""A seeded town: streets on a grid, lawns, and blocks of one kind each, from market to skyscrapers; perhaps a river.
 
-It is made to be planned and rendered, not to imitate one place. Every block draws from its own random generator, so
-that one block does not change with another. Heights: pavements at z = 0; carriageways, lawns and paint a few
-centimetres lower, so that no two surfaces share a plane. A few boxes lie below the ground or inside others, as in maps
-that simulators export.
+Every block draws from its own random generator, so that one block does not change with another. Pavements are at z = 0;
+carriageways, lawns and paint a few centimetres lower, so that no two surfaces share a plane. A few boxes lie below the
+ground or inside others, as in maps that simulators export.
 """
 
 from __future__ import annotations

@@ -67,6 +67,11 @@ class Plot(BoxList):
         self.span(kind, (low[0], inner_low[1]), (inner_low[0], inner_high[1]), *heights)
         self.span(kind, (inner_high[0], inner_low[1]), (high[0], inner_high[1]), *heights)
 
+    def stack(self, kind: str, center: Pair, yaw_deg: float, *parts: tuple[Pair, float, float]) -> None:
+        """Add boxes around one middle, each by its footprint and its height interval."""
+        for size, low_m, high_m in parts:
+            self.add(kind, center, size, low_m, high_m, yaw_deg)
+
     def bench(self, axis: int, along: float, across: float) -> None:
         """Add a bench of 1.8 m along a street, and a bin next to it."""
         self.add("Static", point(axis, along, across), point(axis, 1.8, 0.55), 0.0, 0.48)
@@ -129,8 +134,7 @@ def _square(plot: Plot) -> None:
     low, high, middle, size = plot.low, plot.high, plot.middle, plot.size
     hall = np.array([size[0] * 0.5, min(14.0, size[1] * 0.3)])
     center = np.array([middle[0], high[1] - hall[1] / 2 - 2.0])
-    plot.add("Buildings", center, hall, -1.5, 9.0)
-    plot.add("Buildings", center, (6.0, 6.0), 9.0, 17.0)  # a clock tower on the roof
+    plot.stack("Buildings", center, 0.0, (hall, -1.5, 9.0), ((6.0, 6.0), 9.0, 17.0))  # a clock tower on the roof
     plot.add("Water", middle - (0.0, 4.0), (5.0, 5.0), -0.6, 0.45)
     plot.ring("Static", np.add(middle, [(-3, -7), (3, -1)]), np.add(middle, [(-2.5, -6.5), (2.5, -1.5)]), (-0.4, 0.6))
     for x in np.linspace(low[0] + 4.0, high[0] - 4.0, 6):
@@ -148,17 +152,16 @@ def _courtyard(plot: Plot) -> None:
     rng, low, high = plot.rng, plot.low + 1.5, plot.high - 1.5
     middle, depth = (low + high) / 2, min(12.0, 0.24 * (high - low).min())
     gap = rng.uniform(5.5, 7.0) / 2
-    for sx in (-1, 1):
-        for sy in (-1, 1):
-            corner = np.array([low[0] if sx < 0 else high[0], low[1] if sy < 0 else high[1]])
-            height = rng.uniform(10.0, 19.0)
-            back = corner[1] - sy * depth
-            plot.span("Buildings", corner, (middle[0] + sx * gap, back), -2.0, height)
-            lower = height - rng.choice([0.0, 3.0, 6.0])
-            plot.span("Buildings", (corner[0], back), (corner[0] - sx * depth, middle[1] + sy * gap), -2.0, lower)
-            plot.span("Buildings", corner - (sx * 2.0, sy * 2.0), corner - (sx * 6.0, sy * 6.0), height, height + 2.6)
-            cellar = corner - (sx * 1.0, sy * 1.0), corner - (sx * 9.0, sy * (depth - 1.0))
-            plot.span("Buildings", *cellar, -5.0, -2.2)
+    for sx, sy in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+        corner = np.array([low[0] if sx < 0 else high[0], low[1] if sy < 0 else high[1]])
+        height, back = rng.uniform(10.0, 19.0), corner[1] - sy * depth
+        plot.span("Buildings", corner, (middle[0] + sx * gap, back), -2.0, height)
+        lower = height - rng.choice([0.0, 3.0, 6.0])
+        plot.span("Buildings", (corner[0], back), (corner[0] - sx * depth, middle[1] + sy * gap), -2.0, lower)
+        roof = corner - (sx * 2.0, sy * 2.0), corner - (sx * 6.0, sy * 6.0)
+        plot.span("Buildings", *roof, height, height + 2.6)
+        cellar = corner - (sx * 1.0, sy * 1.0), corner - (sx * 9.0, sy * (depth - 1.0))
+        plot.span("Buildings", *cellar, -5.0, -2.2)
     for _ in range(4):
         plot.tree(rng.uniform(low + depth + 4.0, high - depth - 4.0), (3.5, 5.0), (6.0, 9.0), 0.5)
     plot.bench(0, *middle)
@@ -175,20 +178,19 @@ def _houses(plot: Plot) -> None:
             center = np.array([low[0] + (column + 0.5) * pitch, row + side * 8.5]) + rng.uniform(-0.6, 0.6, 2)
             width, depth, height = rng.uniform(9.0, 11.0), rng.uniform(8.0, 10.0), rng.uniform(5.6, 7.6)
             yaw = rng.uniform(-7.0, 7.0)
-            plot.add("Buildings", center, (width, depth), -0.5, height, yaw)
-            plot.add("Buildings", center, (width * 0.92, depth * 0.5), height, height + 1.8, yaw)  # the ridge
-            plot.add("Buildings", center, (width * 0.5, depth * 0.5), 0.2, height - 0.5, yaw)  # rooms inside
+            ridge, rooms = (width * 0.92, depth * 0.5), (width * 0.5, depth * 0.5)
+            parts = ((width, depth), -0.5, height), (ridge, height, height + 1.8), (rooms, 0.2, height - 0.5)
+            plot.stack("Buildings", center, yaw, *parts)
             garden = np.array([center[0] + rng.uniform(-3.0, 3.0), (center[1] + side * 5.0 + middle[1]) / 2])
             plot.tree(garden, (2.8, 4.2), (4.0, 7.0), 0.3)
             if column:
                 edge = low[0] + column * pitch
                 front, back = (edge - 0.12, center[1] + side * 1.0), (edge + 0.12, middle[1] - side * 3.5)
                 plot.span("Walls", front, back, -0.2, 1.7)
-    for column in range(columns):
-        a = low[0] + column * pitch + 3.5
+    edges = low[0] + pitch * np.arange(columns)
+    for a in edges + 3.5:
         plot.span("Fences", (a, middle[1] - 0.06), (a + pitch - 5.5, middle[1] + 0.06), -0.1, 1.2)
-    for column in range(columns):
-        a = low[0] + column * pitch
+    for a in edges:
         plot.span("Vegetation", (a + 0.6, low[1] + 0.4), (a + pitch * 0.55, low[1] + 1.2), 0.0, 1.0)
 
 
@@ -256,9 +258,9 @@ def _campus(plot: Plot) -> None:
     for y in (low[1] + size[1] * 0.14, high[1] - size[1] * 0.14):
         long = np.array([size[0] * rng.uniform(0.62, 0.8), size[1] * 0.17])
         height = rng.uniform(8.0, 15.0)
-        plot.add("Buildings", (middle[0], y), long, -1.0, height)
-        plot.add("Buildings", (middle[0], y), long * (0.3, 0.6), height, height + 2.8)
-        plot.add("Buildings", (middle[0], y), long * (0.9, 0.5), 0.2, height - 1.0)  # lecture rooms inside
+        lecture_rooms = long * (0.9, 0.5), 0.2, height - 1.0
+        parts = (long, -1.0, height), (long * (0.3, 0.6), height, height + 2.8), lecture_rooms
+        plot.stack("Buildings", (middle[0], y), 0.0, *parts)
     library = (high[0] - size[0] * 0.14, middle[1])
     plot.add("Buildings", library, size * (0.2, 0.26), -1.0, rng.uniform(14.0, 22.0), rng.uniform(-12.0, 12.0))
     for y in (middle[1] - size[1] * 0.16, middle[1] + size[1] * 0.16):
@@ -273,12 +275,9 @@ def _farm(plot: Plot) -> None:
     plot.lay("Terrain")
     rng, low, high, size = plot.rng, plot.low, plot.high, plot.size
     yaw = rng.uniform(-10.0, 10.0)
-    for place, foot, roof, eaves, ridge, base, turn in (
-        (plot.at(0.24, 0.2), (12.0, 8.5), (11.0, 4.4), 5.6, 7.8, -0.5, 0.0),
-        (plot.at(0.3, 0.62), (17.0, 10.0), (16.0, 5.0), 6.2, 8.6, -0.3, 90.0),  # the barn
-    ):
-        plot.add("Buildings", place, foot, base, eaves, yaw + turn)
-        plot.add("Buildings", place, roof, eaves, ridge, yaw + turn)
+    house, barn = plot.at(0.24, 0.2), plot.at(0.3, 0.62)
+    plot.stack("Buildings", house, yaw, ((12.0, 8.5), -0.5, 5.6), ((11.0, 4.4), 5.6, 7.8))
+    plot.stack("Buildings", barn, yaw + 90.0, ((17.0, 10.0), -0.3, 6.2), ((16.0, 5.0), 6.2, 8.6))
     plot.add("Static", plot.at(0.44, 0.4), (2.6, 1.6), 0.0, 1.2, yaw)  # a cart
     for x in np.arange(low[0] + size[0] * 0.56, high[0] - 3.0, 6.5):
         for y in np.arange(low[1] + 4.0, low[1] + size[1] * 0.55, 6.5):
@@ -295,9 +294,8 @@ def _market(plot: Plot) -> None:
     plot.lay("Sidewalks")
     rng, low, high, middle = plot.rng, plot.low, plot.high, plot.middle
     hall = plot.size * (0.34, 0.26)
-    plot.add("Buildings", middle, hall - (0.0, 2 * ARCADE_M), -0.5, PASSAGE_M)
-    plot.add("Buildings", middle, hall, PASSAGE_M, 7.0)
-    plot.add("Buildings", middle, hall * (0.9, 0.4), 7.0, 9.5)
+    arcades = hall - (0.0, 2 * ARCADE_M), -0.5, PASSAGE_M
+    plot.stack("Buildings", middle, 0.0, arcades, (hall, PASSAGE_M, 7.0), (hall * (0.9, 0.4), 7.0, 9.5))
     for x in np.linspace(-0.5, 0.5, 6) * (hall[0] - 0.5):
         for side in (-1, 1):
             plot.add("Poles", np.add(middle, (x, side * (hall[1] / 2 - 0.25))), (0.5, 0.5), 0.0, PASSAGE_M)
@@ -305,8 +303,8 @@ def _market(plot: Plot) -> None:
         for x in np.arange(low[0] + 4.0, high[0] - 3.0, 5.2):
             if (np.abs((x, y) - middle) > hall / 2 + 3.5).any() and rng.random() < 0.7:
                 yaw = rng.uniform(-6.0, 6.0)
-                plot.add("Static", (x, y), (2.6, 1.6), 0.0, 1.0, yaw)
-                plot.add("Static", (x, y), (3.2, 2.4), 2.3, 2.5, yaw)  # the awning
+                awning = (3.2, 2.4), 2.3, 2.5
+                plot.stack("Static", (x, y), yaw, ((2.6, 1.6), 0.0, 1.0), awning)
                 for post in (x - 1.2, x + 1.2):
                     plot.add("Poles", (post, y), (0.1, 0.1), 0.0, 2.3)
     for x in (low[0] + 2.5, high[0] - 2.5):

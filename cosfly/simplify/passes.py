@@ -56,7 +56,14 @@ def merge(
         for group in np.unique(split[of_kind]):
             rows = np.flatnonzero(of_kind & (split == group))
             labels[rows] = rows[clusters(lows[rows], highs[rows], gap_m)]
-    labels = _halve_sparse(box_map, mins, maxs, labels, min_fill)
+    order = np.argsort(labels, kind="stable")
+    starts = np.flatnonzero(np.r_[True, labels[order][1:] != labels[order][:-1], True]) if len(order) else order
+    # Footprints as centre, unit axes and half sizes: a turned box covers its own rectangle, not its bounds.
+    is_tilted = (box_map.rotations_deg[:, [0, 2]] != 0).any(axis=1)
+    half = np.where(is_tilted[:, None], ((maxs - mins) / 2)[:, :2], box_map.half_extents[:, :2]) + CLOSED_GAP_M / 2
+    yaw = np.where(is_tilted, 0.0, np.radians(box_map.rotations_deg[:, 1]))
+    rectangles = np.column_stack([box_map.centers[:, :2], np.cos(yaw), np.sin(yaw), half])
+    labels = _halve(order, starts, rectangles, mins[:, :2].copy(), maxs[:, :2].copy(), min_fill, labels.copy())
     order = np.lexsort((box_map.ids, labels))
     if len(order) == 0:
         return box_map
@@ -120,23 +127,9 @@ def _sweep_clusters(mins, maxs, order, axis, gap_m):  # pragma: no cover (compil
     return parent
 
 
-def _halve_sparse(
-    box_map: BoxMap, mins: np.ndarray, maxs: np.ndarray, labels: np.ndarray, min_fill: np.ndarray
-) -> np.ndarray:
-    """Split clusters that fill too little of their enclosing footprint; a label is the lowest row of the part."""
-    order = np.argsort(labels, kind="stable")
-    starts = np.flatnonzero(np.r_[True, labels[order][1:] != labels[order][:-1], True]) if len(order) else order
-    # Footprints as centre, unit axes and half sizes: a turned box covers its own rectangle, not its bounds.
-    is_tilted = (box_map.rotations_deg[:, [0, 2]] != 0).any(axis=1)
-    half = np.where(is_tilted[:, None], ((maxs - mins) / 2)[:, :2], box_map.half_extents[:, :2]) + CLOSED_GAP_M / 2
-    yaw = np.where(is_tilted, 0.0, np.radians(box_map.rotations_deg[:, 1]))
-    rectangles = np.column_stack([box_map.centers[:, :2], np.cos(yaw), np.sin(yaw), half])
-    return _halve(order, starts, rectangles, mins[:, :2].copy(), maxs[:, :2].copy(), min_fill, labels.copy())
-
-
 @njit(cache=True)
 def _halve(order, starts, rectangles, mins, maxs, min_fill, labels):  # pragma: no cover (compiled)
-    """Return labels after halving clusters, which are runs of `order`."""
+    """Return labels, the lowest row of each part, after halving clusters that fill too little: runs of `order`."""
     stack = np.empty((128, 2), dtype=np.int64)  # halves are at most 64 deep
     for cluster in range(len(starts) - 1):
         stack[0, 0], stack[0, 1] = starts[cluster], starts[cluster + 1]
