@@ -157,9 +157,8 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
                 continue
             if not names:
                 names = cells
-                problems = _unknown(names, cfg) + [
-                    f"no column {name}" for name in ("type", *PLACE) if name not in names
-                ]
+                problems = _unknown(names, cfg)
+                problems += [f"no column {name}" for name in ("type", *PLACE) if name not in names]
                 problems += [f"column {name} occurs twice" for name, count in Counter(names).items() if count > 1]
                 if problems:
                     raise InputError.of_all(problems, where=path, expected=f"columns {', '.join(COLUMNS)}, by commas")

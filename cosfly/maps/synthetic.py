@@ -62,32 +62,21 @@ class TownPlan:
 
 
 # Towns of different plan, density and height, so that results of one can be checked in another.
-PRESETS = {
-    "small_town": TownPlan(),
-    "grid": TownPlan(
-        size_m=330.0, num_blocks=4, street_m=18.0, boulevard_m=26.0, parked_share=0.6,
-        blocks={"courtyard": 0.6, "towers": 0.2, "square": 0.1, "park": 0.1},),
-    "old_town": TownPlan(
-        size_m=270.0, num_blocks=4, street_m=12.0, boulevard_m=15.0, unevenness=0.12, parked_share=0.1, tree_share=0.3,
-        blocks={"lanes": 0.75, "square": 0.15, "market": 0.1},),
-    "towers": TownPlan(
-        size_m=340.0, street_m=26.0, boulevard_m=40.0, unevenness=0.1,
-        blocks={"skyscrapers": 0.55, "towers": 0.25, "square": 0.2},),
-    "park": TownPlan(
-        size_m=320.0, street_m=16.0, boulevard_m=26.0, unevenness=0.2, parked_share=0.2,
-        blocks={"park": 0.45, "meadow": 0.35, "houses": 0.2},),
-    "campus": TownPlan(
-        size_m=310.0, street_m=15.0, boulevard_m=28.0, unevenness=0.15, parked_share=0.15,
-        blocks={"campus": 0.6, "meadow": 0.2, "square": 0.2},),
-    "village": TownPlan(
-        size_m=300.0, street_m=13.0, boulevard_m=16.0, unevenness=0.3, parked_share=0.1, tree_share=0.4,
-        blocks={"farm": 0.45, "houses": 0.35, "meadow": 0.2},),
-    "river": TownPlan(
-        size_m=320.0, num_blocks=4, street_m=16.0, boulevard_m=26.0, unevenness=0.1, river_m=46.0,
-        blocks={"courtyard": 0.45, "houses": 0.2, "park": 0.2, "square": 0.15},),
-    "market": TownPlan(
-        size_m=280.0, street_m=18.0, boulevard_m=30.0, unevenness=0.1, parked_share=0.2,
-        blocks={"market": 0.45, "courtyard": 0.35, "lanes": 0.2},),
+PRESETS = {"small_town": TownPlan()} | {
+    name: TownPlan(size_m, along, street_m, boulevard_m, unevenness, kinds, river_m=river_m, parked_share=parked,
+                   tree_share=trees)
+    for name, size_m, along, street_m, boulevard_m, river_m, unevenness, parked, trees, kinds in (
+        ("grid", 330.0, 4, 18.0, 26.0, 0.0, 0.0, 0.6, 0.85,
+         {"courtyard": 0.6, "towers": 0.2, "square": 0.1, "park": 0.1}),
+        ("old_town", 270.0, 4, 12.0, 15.0, 0.0, 0.12, 0.1, 0.3, {"lanes": 0.75, "square": 0.15, "market": 0.1}),
+        ("towers", 340.0, 3, 26.0, 40.0, 0.0, 0.1, 0.4, 0.85, {"skyscrapers": 0.55, "towers": 0.25, "square": 0.2}),
+        ("park", 320.0, 3, 16.0, 26.0, 0.0, 0.2, 0.2, 0.85, {"park": 0.45, "meadow": 0.35, "houses": 0.2}),
+        ("campus", 310.0, 3, 15.0, 28.0, 0.0, 0.15, 0.15, 0.85, {"campus": 0.6, "meadow": 0.2, "square": 0.2}),
+        ("village", 300.0, 3, 13.0, 16.0, 0.0, 0.3, 0.1, 0.4, {"farm": 0.45, "houses": 0.35, "meadow": 0.2}),
+        ("river", 320.0, 4, 16.0, 26.0, 46.0, 0.1, 0.4, 0.85,
+         {"courtyard": 0.45, "houses": 0.2, "park": 0.2, "square": 0.15}),
+        ("market", 280.0, 3, 18.0, 30.0, 0.0, 0.1, 0.2, 0.85, {"market": 0.45, "courtyard": 0.35, "lanes": 0.2}),
+    )
 }  # fmt: skip
 
 

@@ -29,11 +29,7 @@ FILL_CELLS = 64  # a cluster's fill is measured on at most FILL_CELLS x FILL_CEL
 
 
 def merge(
-    box_map: BoxMap,
-    rules: dict[int, tuple[float, float]],
-    groups: np.ndarray | None = None,
-    *,
-    by_center: bool = False,
+    box_map: BoxMap, rules: dict[int, tuple[float, float]], groups: np.ndarray | None = None, *, by_center: bool = False
 ) -> BoxMap:
     """Replace clusters of neighbours of one kind by enclosing axis-aligned boxes; single boxes keep their rotation.
 
@@ -72,12 +68,11 @@ def merge(
     is_merged = np.diff(np.r_[first, len(order)]) > 1
     lows, highs = np.minimum.reduceat(mins[order], first), np.maximum.reduceat(maxs[order], first)
     alone = box_map.select(leaders)
-    result = replace(
-        alone,
-        centers=np.where(is_merged[:, None], (lows + highs) / 2, alone.centers),
-        half_extents=np.where(is_merged[:, None], (highs - lows) / 2, alone.half_extents),
-        rotations_deg=np.where(is_merged[:, None], 0.0, alone.rotations_deg),
-    )
+    merged = is_merged[:, None]
+    centers = np.where(merged, (lows + highs) / 2, alone.centers)
+    half_extents = np.where(merged, (highs - lows) / 2, alone.half_extents)
+    rotations_deg = np.where(merged, 0.0, alone.rotations_deg)
+    result = replace(alone, centers=centers, half_extents=half_extents, rotations_deg=rotations_deg)
     return result.select(np.argsort(leaders, kind="stable"))  # the order of the input
 
 

@@ -34,12 +34,10 @@ def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
     before, after = (occupancy(m, like=grid) for m in (raw, simplified))
     cell_agreement, iou = compare(before, after)
     facts: dict = {"cells": list(grid.size), "cell_agreement": round(cell_agreement, 4), "iou": round(iou, 4)}
-    facts["agreement"] = {
-        "free_in_both": int((~before.occupied & ~after.occupied).sum()),
-        "occupied_in_both": int((before.occupied & after.occupied).sum()),
-        "raw_alone": int((before.occupied & ~after.occupied).sum()),
-        "simplified_alone": int((after.occupied & ~before.occupied).sum()),
-    }
+    one, other = before.occupied, after.occupied
+    cells = {"free_in_both": ~one & ~other, "occupied_in_both": one & other}
+    cells |= {"raw_alone": one & ~other, "simplified_alone": other & ~one}
+    facts["agreement"] = {name: int(found.sum()) for name, found in cells.items()}
     for kind in ("Vegetation", "Buildings"):
         under = [occupancy(m.select(m.kinds == KINDS[kind]), like=grid).occupied for m in (raw, simplified)]
         differ = (before.occupied != after.occupied) & (under[0] | under[1])
@@ -62,14 +60,11 @@ def report(raw: BoxMap, result: Simplification, cfg: SimplifyConfig) -> dict:
             trunks[trunk] = {name: grid[name] for name in names}
     obstacles = {"raw": int(blocks_walking(raw).sum()), "simplified": int(blocks_walking(result.box_map).sum())}
     return {
-        **REPORT_FORMAT.header,
-        "name": raw.name,
-        "num_boxes": {"raw": len(raw), "simplified": len(result.box_map)},
+        **REPORT_FORMAT.header, "name": raw.name, "num_boxes": {"raw": len(raw), "simplified": len(result.box_map)},
         "obstacles_at_walking_height": obstacles,
         "passes": [{"pass": name, "num_boxes": sum(c.values()), "counts": c} for name, c in result.passes],
-        "grid": cross_validate(raw, result.box_map),
-        "trunks": trunks,
-    }
+        "grid": cross_validate(raw, result.box_map), "trunks": trunks,
+    }  # fmt: skip
 
 
 def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same") -> Path:

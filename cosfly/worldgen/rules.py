@@ -42,11 +42,8 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
         InputError: If no word of the prompt is known, or its heights are contradictory.
     """
     text = prompt.lower().replace("’", "'")
-    text = re.sub(
-        r"\b(no|without(?: any)?|few|many|hardly any|lots of) (trees|vegetation|greenery)",
-        lambda m: "no-trees" if m[1].startswith("without") else f"{m[1]}-trees".replace(" ", "-"),
-        text,
-    )
+    trees = r"\b(no|without(?: any)?|few|many|hardly any|lots of) (trees|vegetation|greenery)"
+    text = re.sub(trees, lambda m: f"{re.sub('^without.*', 'no', m[1])}-trees".replace(" ", "-"), text)
     text = re.sub(r"\bgarden city\b", "garden-city", text)
     without, text = " ".join(_WITHOUT.findall(text)), _WITHOUT.sub(" , ", text)
     objects, rest = _find_objects(text)
