@@ -18,7 +18,7 @@ from cosfly.geometry.ground import Ground
 from cosfly.pedestrians import speed_model
 from cosfly.pedestrians.lanes import Lane
 from cosfly.pedestrians.speed_model import PACES, STOP_GAP_MIN, PacedRoute, speeds_at, take_pace
-from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, sample_goal
+from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround
 from cosfly.runtime.seeding import draw_by_share
 
 MOST_WAITS, WAIT_S = 10, 3.0  # after this many waits it is drawn again
@@ -126,11 +126,11 @@ def _draw_walk(
     moment_s = number * GOLDEN % 1.0 * float(target.time_s[-1])
     x, y = ground.grid.cells_at(target.positions_m[int(np.searchsorted(target.time_s, moment_s))])
     low, high = np.array(PASS_M) / cfg.resolution_m
-    place = sample_goal(ground, (int(x), int(y)), low, high, rng)
+    place = ground.sample_goal((int(x), int(y)), low, high, rng)
     if place is None:
         return None
     reach = 0.5 * cfg.others_reach_m / cfg.resolution_m, cfg.others_reach_m / cfg.resolution_m
-    drawn = [sample_goal(ground, place, *reach, rng) for _ in range(1 + OPPOSITE_TRIES)]
+    drawn = [ground.sample_goal(place, *reach, rng) for _ in range(1 + OPPOSITE_TRIES)]
     ends = [np.subtract(end, place) for end in drawn if end is not None]
     if len(ends) < 2:
         return None

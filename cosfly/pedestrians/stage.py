@@ -28,14 +28,7 @@ from cosfly.pedestrians.bystanders import bystanders_of
 from cosfly.pedestrians.crossings import CROSSING, ROAD, count_on_road
 from cosfly.pedestrians.lanes import Lane, lanes_of
 from cosfly.pedestrians.speed_model import PACES, arrival_times, resample, speeds_at, take_pace
-from cosfly.pedestrians.walkable import (
-    PedestriansConfig,
-    WalkableGround,
-    sample_goal,
-    sample_start,
-    timed,
-    walkable_ground,
-)
+from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, timed, walkable_ground
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, write_json
@@ -98,8 +91,8 @@ def _draw_route(
     retries = dict.fromkeys(RETRY_REASONS, 0)
     for _ in range(cfg.num_retries + 1):
         with timed(seconds, "sample"):
-            start = sample_start(ground, rng)
-            goal = sample_goal(ground, start, *limits, rng)
+            start = ground.sample_start(rng)
+            goal = ground.sample_goal(start, *limits, rng)
         if goal is None:
             retries["no_goal"] += 1
             continue

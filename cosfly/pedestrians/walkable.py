@@ -23,19 +23,8 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import GROUND_KINDS, PAVED_KINDS
 from cosfly.formats.pedestrian_paths import PLAIN_PACE
 from cosfly.formats.roi import Roi
+from cosfly.geometry import grid as grids
 from cosfly.geometry.axes import DT_S
-from cosfly.geometry.grid import (
-    SURFACE_REACH_M,
-    OccupancyGrid,
-    blocks_walking,
-    connected_parts,
-    empty_grid,
-    inflate,
-    lies_off_ground,
-    occupancy,
-    roi_mask,
-    surface,
-)
 from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.crossings import CROSSING, ROAD, costs_of, footing_of
@@ -130,8 +119,8 @@ class WalkableGround:
     components. footing: (ny, nx) uint8, crossings.py. heights: of the ground. costs: of footings, for routes.
     """
 
-    grid: OccupancyGrid
-    inflated: OccupancyGrid
+    grid: grids.OccupancyGrid
+    inflated: grids.OccupancyGrid
     parts: np.ndarray
     footing: np.ndarray
     heights: Ground
@@ -153,6 +142,30 @@ class WalkableGround:
     def row_ends(self) -> np.ndarray:
         """Return the number of cells of `may_end` up to each row's end, (ny,) int64."""
         return np.cumsum(np.count_nonzero(self.may_end, axis=1))
+
+    def sample_start(self, rng: np.random.Generator) -> tuple[int, int]:
+        """Draw one cell of `may_end`, (x index, y index), uniformly."""
+        drawn = int(rng.integers(self.row_ends[-1]))
+        y = int(np.searchsorted(self.row_ends, drawn, side="right"))
+        columns = np.flatnonzero(self.may_end[y])
+        return int(columns[drawn - self.row_ends[y]]), y  # counted from the row's end: a negative index
+
+    def sample_goal(
+        self, start: tuple[int, int], min_cells: float, max_cells: float, rng: np.random.Generator
+    ) -> tuple[int, int] | None:
+        """Draw a cell of `may_end` in the start's part, (x index, y index), at a straight distance within [min_cells,
+        max_cells], uniformly; None if there is none."""
+        (x, y), reach = start, int(max_cells)
+        left, low = max(0, x - reach), max(0, y - reach)
+        near = np.s_[low : y + reach + 1, left : x + reach + 1]
+        window = self.parts[near]
+        squared = (np.arange(window.shape[0])[:, None] + low - y) ** 2 + (np.arange(window.shape[1]) + left - x) ** 2
+        fits = (window == self.parts[y, x]) & self.may_end[near]
+        candidates = np.flatnonzero(fits & (squared >= min_cells**2) & (squared <= max_cells**2))
+        if len(candidates) == 0:
+            return None
+        row, column = divmod(int(candidates[rng.integers(len(candidates))]), window.shape[1])
+        return column + left, row + low
 
     def route(self, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
         """Return the cells of a cheapest route between two of one part, (k, 2)."""
@@ -181,14 +194,14 @@ def walkable_ground(
     """
     seconds = Counter() if seconds is None else seconds
     with timed(seconds, "grid"):
-        empty = empty_grid(box_map, cfg.resolution_m)
+        empty = grids.empty_grid(box_map, cfg.resolution_m)
     with timed(seconds, "project"):
-        grid = occupancy(box_map, height_m=cfg.human_height_m, like=empty)
-        is_in_roi = None if roi is None else roi_mask(grid, roi)
+        grid = grids.occupancy(box_map, height_m=cfg.human_height_m, like=empty)
+        is_in_roi = None if roi is None else grids.roi_mask(grid, roi)
     if roi is not None:
         check_roi(roi, box_map, roi_where)
     with timed(seconds, "inflate"):
-        inflated = inflate(grid, cfg.safety_radius_m)
+        inflated = grids.inflate(grid, cfg.safety_radius_m)
         free = ~inflated.occupied
         num_free = _count(free)
         has_surface, is_steep = _surface(box_map, cfg.ground, grid, free), None
@@ -200,7 +213,7 @@ def walkable_ground(
             if mask is not None:
                 free &= mask
     counts: dict[str, Any] = {
-        "boxes": len(box_map), "boxes_in_the_way": _count(blocks_walking(box_map, height_m=cfg.human_height_m)),
+        "boxes": len(box_map), "boxes_in_the_way": _count(grids.blocks_walking(box_map, height_m=cfg.human_height_m)),
         "grid": list(grid.size), "cells": free.size, "cells_occupied": _count(grid.occupied),
         "cells_inflated": free.size - num_free, "cells_free": num_free,
         "ground": cfg.ground if has_surface is not None else "anywhere",
@@ -227,7 +240,7 @@ def _count(mask: np.ndarray) -> int:
     return int(np.count_nonzero(mask))
 
 
-def _surface(box_map: BoxMap, ground: str, grid: OccupancyGrid, free: np.ndarray) -> np.ndarray | None:
+def _surface(box_map: BoxMap, ground: str, grid: grids.OccupancyGrid, free: np.ndarray) -> np.ndarray | None:
     """Return the cells with ground as the settings want it, (ny, nx) bool; None for all cells, also where the map's
     ground is unknown.
 
@@ -237,17 +250,18 @@ def _surface(box_map: BoxMap, ground: str, grid: OccupancyGrid, free: np.ndarray
     """
     if ground == "anywhere":
         return None
-    found = surface(box_map, GROUND_KINDS, like=grid)
-    num_off, num_all = _count(lies_off_ground(box_map, GROUND_KINDS)), _count(box_map.is_any_of(GROUND_KINDS))
+    found = grids.surface(box_map, GROUND_KINDS, like=grid)
+    num_off, num_all = _count(grids.lies_off_ground(box_map, GROUND_KINDS)), _count(box_map.is_any_of(GROUND_KINDS))
     if num_off > OFF_GROUND_SHARE_MAX * num_all:
         log.warning(
             "%s: %d of %d ground boxes lie more than %g m off the ground of its header and are not walkable; "
-            "if the map slopes, its header needs heights (ground)", box_map.name, num_off, num_all, SURFACE_REACH_M,
+            "if the map slopes, its header needs heights (ground)",
+            box_map.name, num_off, num_all, grids.SURFACE_REACH_M,
         )  # fmt: skip
     if found is None:
         log.warning("%s has no ground boxes: people walk wherever there is no obstacle", box_map.name)
         return None
-    paved = surface(box_map, PAVED_KINDS, like=grid)
+    paved = grids.surface(box_map, PAVED_KINDS, like=grid)
     if ground == "paved":
         return np.zeros_like(found) if paved is None else paved
     num_found, num_free = _count(found & free), _count(free)
@@ -264,7 +278,7 @@ def _parts_of_large_components(
     free: np.ndarray, min_component_cells: int, counts: dict[str, Any], where: str | Path
 ) -> np.ndarray:
     """Label the parts of the large components; add the component counts."""
-    components, sizes = connected_parts(free, 8)
+    components, sizes = grids.connected_parts(free, 8)
     is_large = sizes >= min_component_cells
     if not is_large.any():
         raise NoPathError(
@@ -273,7 +287,7 @@ def _parts_of_large_components(
             expected=f"at least {min_component_cells} cells (min_component_cells)",
             fix="lower min_component_cells or safety_radius_m, or widen the region of interest",
         )  # fmt: skip
-    parts, part_sizes = connected_parts(is_large[components], 4)
+    parts, part_sizes = grids.connected_parts(is_large[components], 4)
     used = sorted(sizes[is_large].tolist(), reverse=True)
     counts.update(components=len(sizes) - 1, components_used=len(used), component_sizes_used=used)
     counts.update(cells_used=sum(used), parts=len(part_sizes) - 1)
@@ -310,31 +324,3 @@ def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | 
         expected = "a region in the map's world metres"
         fix = "draw it over free ground of this map"
     raise NoPathError(what, where=where, got=got, expected=expected, fix=fix)
-
-
-def sample_start(ground: WalkableGround, rng: np.random.Generator) -> tuple[int, int]:
-    """Draw one cell of `may_end`, (x index, y index), uniformly."""
-    drawn = int(rng.integers(ground.row_ends[-1]))
-    y = int(np.searchsorted(ground.row_ends, drawn, side="right"))
-    columns = np.flatnonzero(ground.may_end[y])
-    return int(columns[drawn - ground.row_ends[y]]), y  # counted from the row's end: a negative index
-
-
-def sample_goal(
-    ground: WalkableGround, start: tuple[int, int], min_cells: float, max_cells: float, rng: np.random.Generator
-) -> tuple[int, int] | None:
-    """Draw a cell of `may_end` in the start's part, (x index, y index), at a straight distance within [min_cells,
-    max_cells], uniformly; None if there is none."""
-    reach = int(max_cells)
-    x, y = start
-    left, low = max(0, x - reach), max(0, y - reach)
-    near = np.s_[low : y + reach + 1, left : x + reach + 1]
-    window = ground.parts[near]
-    squared = (np.arange(window.shape[0])[:, None] + low - y) ** 2 + (np.arange(window.shape[1]) + left - x) ** 2
-    fits = (window == ground.parts[y, x]) & ground.may_end[near]
-    fits &= (squared >= min_cells**2) & (squared <= max_cells**2)
-    candidates = np.flatnonzero(fits)
-    if len(candidates) == 0:
-        return None
-    row, column = divmod(int(candidates[rng.integers(len(candidates))]), window.shape[1])
-    return column + left, row + low
