@@ -37,9 +37,6 @@ def footprint(box_map: BoxMap, row: int, *, with_yaw: bool = True) -> Polygon:
     return shapely.affinity.rotate(box(x - size[0] / 2, y - size[1] / 2, x + size[0] / 2, y + size[1] / 2), yaw)
 
 
-# --- synthetic --------------------------------------------------------------------------------------------------------
-
-
 @each("seed", [0, 1, 2])
 def test_a_town_has_what_the_passes_and_the_walks_need(seed):
     town = load_map(MapsConfig(), seed=seed)
@@ -84,9 +81,6 @@ def test_the_census_town_has_the_papers_counts_and_simplifies_to_a_few_thousand(
 def test_a_wrong_town_is_a_config_error(given, words):
     with pytest.raises(ConfigError, match=words):
         build(MapsConfig, {"synthetic": given}, "x")
-
-
-# --- simworld ---------------------------------------------------------------------------------------------------------
 
 
 def node(name: str, x: float, y: float, yaw: float = 0.0, z: float = 0.0, scale: float = 1.0) -> dict:
@@ -165,9 +159,6 @@ def test_known_answers_of_the_robotics_worlds(shared_data: Path, world: str, pai
     assert overlapping_pairs(buildings, with_yaw=False) == pairs
 
 
-# --- footprints -------------------------------------------------------------------------------------------------------
-
-
 # --- cityjson ---------------------------------------------------------------------------------------------------------
 
 
@@ -229,9 +220,6 @@ def delft() -> BoxMap:
     if not path.is_file():
         pytest.skip(f"the real map is not here: {path}")
     return load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(name="Delft", path=path)))
-
-
-# --- the stage --------------------------------------------------------------------------------------------------------
 
 
 def test_stage_writes_the_same_bytes_and_resumes(tmp_path: Path):

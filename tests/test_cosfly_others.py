@@ -47,9 +47,6 @@ def going(kind: str, start, end, n: int = 2) -> Bystander:
     return Bystander(kind, places, np.full(n, np.arctan2(*(end - start)[1::-1])))
 
 
-# --- the product ------------------------------------------------------------------------------------------------------
-
-
 def test_others_round_trip_and_bad_files(tmp_path):
     path = tmp_path / "others.json"
     write_bystanders(
@@ -84,9 +81,6 @@ def test_others_round_trip_and_bad_files(tmp_path):
     path.write_text(json.dumps(value))
     with pytest.raises(InputError, match=r"paths\[0\]\.others.*|different lengths"):
         read_bystanders(path)
-
-
-# --- lanes ------------------------------------------------------------------------------------------------------------
 
 
 # --- placing ----------------------------------------------------------------------------------------------------------
@@ -156,9 +150,6 @@ def test_the_same_numbers_give_the_same_company_and_more_keep_the_first(placed):
     assert {o.kind for o in bystanders_of(walk, ground, [], CFG, np.random.default_rng(0)).others} == {PERSON}, (
         "no road"
     )
-
-
-# --- the stage --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

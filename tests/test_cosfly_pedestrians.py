@@ -75,9 +75,6 @@ def write_roi(path: Path, points: list) -> Path:
     return path
 
 
-# --- sampling ---------------------------------------------------------------------------------------------------------
-
-
 @each("start", [(0, 0), (4, 2), (6, 6)])
 def test_goals_are_all_cells_of_the_part_at_the_wanted_distance(start):
     rng = np.random.default_rng(1)
@@ -92,9 +89,6 @@ def test_goals_are_all_cells_of_the_part_at_the_wanted_distance(start):
     assert set(drawn) == expected
     counts = np.unique(np.array(drawn), axis=0, return_counts=True)[1]
     assert abs(counts - 200).max() < 75  # 5 standard deviations
-
-
-# --- the ground -------------------------------------------------------------------------------------------------------
 
 
 def test_the_region_of_interest_bounds_every_walk():
@@ -123,9 +117,6 @@ def test_people_walk_where_the_settings_say(ground, columns):
     found = walkable_ground(box_map, PedestriansConfig(ground=ground))
     assert np.count_nonzero(found.parts) == columns * 200
     assert not found.parts[:, columns:].any()
-
-
-# --- one walk ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("number", "dt_s"), [*((k, DT_S) for k in range(6)), (6, 0.2), (7, 2.0)])
@@ -176,9 +167,6 @@ def test_a_detour_is_given_up_and_counted():
     assert worst(walks) <= 2.0 < worst(free_walks)
     assert sum(w.retries["detour"] for w in walks) > 0
     assert sum(w.retries["detour"] for w in free_walks) == 0
-
-
-# --- the stage --------------------------------------------------------------------------------------------------------
 
 
 def test_the_stage_writes_paths_report_and_picture(map_file, tmp_path):

@@ -52,9 +52,6 @@ def random_map(seed: int, count: int, size_m: float = 30.0) -> BoxMap:
     return make_box_map(centers, rng.uniform(0.2, 3.0, (count, 3)), rotations, kinds, ids)
 
 
-# --- merge ------------------------------------------------------------------------------------------------------------
-
-
 @each(
     ("kind", "gap", "count"),
     [
@@ -144,9 +141,6 @@ def test_fill_share(rectangle, share):
     assert fill_share(np.array([rectangle]), np.zeros(2), np.ones(2)) == pytest.approx(share, abs=0.02)
 
 
-# --- crop_tree --------------------------------------------------------------------------------------------------------
-
-
 def test_full_trunks_are_the_papers_split():
     tree = box_map(("Vegetation", (0, 0, 0), (4, 6, 10)), ids=[77])
     cropped = simplify(tree, only("crop_tree", trunk="full")).box_map
@@ -192,9 +186,6 @@ def test_the_simworld_variants_work_together():
     solid = result.box_map.select(result.box_map.kinds != ROADS)
     assert solid.mins[:, 2].min() >= -1e-9
     assert "trunks" not in result.box_map.header.model_dump()
-
-
-# --- removal ----------------------------------------------------------------------------------------------------------
 
 
 def test_below_ground_goes_by_the_top_face_and_spares_surfaces():
@@ -261,9 +252,6 @@ def test_pruning_equals_the_slow_rule_on_unturned_boxes(seed, count):
     assert prune_nested(boxes, 0.01).ids.tolist() == kept
 
 
-# --- all passes -------------------------------------------------------------------------------------------------------
-
-
 @settings(max_examples=20)
 @given(seed=st.integers(0, 10**6), paper=st.booleans())
 def test_the_whole_keeps_its_books(seed, paper):
@@ -277,9 +265,6 @@ def test_the_whole_keeps_its_books(seed, paper):
     after_crop, after_ground = (sum(counts.values()) for _, counts in result.passes[2:4])
     assert sum(result.passes[1][1].values()) <= len(boxes)
     assert after_ground <= after_crop
-
-
-# --- the stage --------------------------------------------------------------------------------------------------------
 
 
 def test_stage_writes_map_report_and_picture(tmp_path: Path):

@@ -11,13 +11,7 @@ from cosfly.pedestrians.speed_model import (
     take_pace,
 )
 
-# --- curvature --------------------------------------------------------------------------------------------------------
-
-
 # --- speed ------------------------------------------------------------------------------------------------------------
-
-
-# --- time -------------------------------------------------------------------------------------------------------------
 
 
 def test_even_speed_gives_even_steps_and_ends_at_the_goal():
@@ -68,9 +62,6 @@ def test_stops_change_when_a_place_is_reached_and_not_which(seed, count):
     assert stood[-1] == pytest.approx(stops.sum())
     for at, stop in zip(times, stops, strict=True):
         assert (np.abs(walked - at) < 1e-9).sum() * 0.01 == pytest.approx(stop, abs=0.03)
-
-
-# --- paces ------------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=60)
