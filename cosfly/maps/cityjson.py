@@ -9,7 +9,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import shapely
@@ -76,11 +76,8 @@ class CityJsonConfig(Config):
         return {"city_model": required(self.path, "maps.cityjson.path")}
 
 
-class Facet(NamedTuple):
-    """The projection of a surface that is not upright, and its plane z = a x + b y + c."""
-
-    polygon: Polygon
-    plane: np.ndarray
+# The projection of a surface that is not upright, and its plane z = a x + b y + c.
+Facet = tuple[Polygon, np.ndarray]
 
 
 def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
@@ -96,7 +93,7 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     if not ground.is_flat:  # heights over the ground below each vertex; solids keep theirs, or their roofs would slope
         objects = [item if item.rule.form == "solid" else item.moved(lowered) for item in objects]
     facets = {item.object_id: _facets(item) for item in objects}
-    footprints = {key: united([facet.polygon for facet in value]) for key, value in facets.items()}
+    footprints = {key: united([polygon for polygon, _ in value]) for key, value in facets.items()}
     boxes, solid_rows = BoxList(), list[int]()
     refs, made = dict[int, MeshRef](), dict[str, Mesh]()
     footprint_m2 = boxes_m2 = covered_m2 = 0.0
@@ -170,7 +167,7 @@ def _facets(item: CityObject) -> list[Facet]:
         plane = np.array([a, b, middle[2] - a * middle[0] - b * middle[1]])
         polygon = Polygon(ring[:, :2], [hole[:, :2] for hole in holes])
         check_outline(polygon, item.object_id)
-        facets.append(Facet(polygon, plane))
+        facets.append((polygon, plane))
     return facets
 
 
@@ -283,21 +280,21 @@ def _canopy_heights(item: CityObject, facets: list[Facet]) -> tuple[np.ndarray, 
         Heights (nx, ny) m, 0 off the surface; indices (2,) of the first cell: its low corner over CANOPY_CELL_M.
     """
     cell_m = CANOPY_CELL_M
-    bounds = np.array([facet.polygon.bounds for facet in facets])
+    bounds = np.array([polygon.bounds for polygon, _ in facets])
     corners = item.corners()
     low = np.floor(np.minimum(bounds[:, :2].min(axis=0), corners[:, :2].min(axis=0)) / cell_m).astype(int)
     high = np.floor(np.maximum(bounds[:, 2:].max(axis=0), corners[:, :2].max(axis=0)) / cell_m).astype(int)
     heights = np.zeros(high - low + 1)
     cells = np.floor(corners[:, :2] / cell_m).astype(int) - low
     np.maximum.at(heights, (cells[:, 0], cells[:, 1]), corners[:, 2])
-    for facet, (x0, y0, x1, y1) in zip(facets, bounds, strict=True):
+    for (polygon, (a, b, c)), (x0, y0, x1, y1) in zip(facets, bounds, strict=True):
         first = np.ceil(np.array([x0, y0]) / cell_m - 0.5).astype(int)
         last = np.floor(np.array([x1, y1]) / cell_m - 0.5).astype(int)
         # No cells where the facet lies between the middles.
         ix, iy = (a.ravel() for a in np.meshgrid(*(np.arange(first[k], last[k] + 1) for k in (0, 1)), indexing="ij"))
         x, y = (ix + 0.5) * cell_m, (iy + 0.5) * cell_m
-        inside = shapely.intersects_xy(facet.polygon, x, y)
-        z = facet.plane[0] * x + facet.plane[1] * y + facet.plane[2]
+        inside = shapely.intersects_xy(polygon, x, y)
+        z = a * x + b * y + c
         np.maximum.at(heights, (ix[inside] - low[0], iy[inside] - low[1]), z[inside])
     return heights, low
 
