@@ -22,10 +22,7 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.tables import rows_of
 from release.columns import PLACE, POINT
 from release.record import read_record
-from release.viewer.content import (
-    ViewerConfig,
-)
-from release.viewer.page import run
+from release.viewer.page import ViewerConfig, run
 from specimens import make_playback_tree
 
 NUM_POINTS = 24

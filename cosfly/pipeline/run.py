@@ -33,7 +33,7 @@ from cosfly.runtime.json_io import read_object, write_json
 from cosfly.runtime.run_dir import Manifest, Resume, hold_folder, read_manifest
 from cosfly.viz.gallery import contact_sheet
 from release.package.sources import Source, choose_licence
-from release.viewer.content import ViewerConfig
+from release.viewer.page import ViewerConfig
 from release.viewer.page import run as write_viewer
 
 log = logging.getLogger(__name__)

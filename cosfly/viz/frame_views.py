@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import base64
+import contextlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -31,6 +33,7 @@ MIDDLE = 3  # one part in so many of the width and of the height of a frame: wha
 DEPTH_RANGE_M = 100.0  # dark end of the pseudo-colour; targets are within a third of it
 PEDESTRIAN_RGB = (255, 40, 40)
 NUM_SHADES = 24
+PAGE_JPEG_QUALITY = 72
 
 
 @dataclass(frozen=True)
@@ -252,3 +255,43 @@ def _bounded(image: np.ndarray, max_side_px: int | None, *, nearest: bool = Fals
     if size == (width, height):
         return image
     return cv2.resize(image, size, interpolation=cv2.INTER_NEAREST if nearest else cv2.INTER_AREA)
+
+
+# --- pictures of a page -----------------------------------------------------------------------------------------------
+
+
+class PagePictures:
+    """The encoder of the pictures of a page of limited size: if not all fit, every n-th frame has some."""
+
+    def __init__(self, room_bytes: float, num_frames: int, width_px: int) -> None:
+        self._room, self._num_frames, self._width_px = room_bytes, max(1, num_frames), width_px
+        self._asked, self._every, self._skipped, self._unreadable = 0, 1, 0, 0
+
+    def of_frame(self, views: Mapping[View, Callable[[], np.ndarray]]) -> dict[View, str]:
+        """Return a frame's pictures, JPEG in base64; an empty table if there is no room for them.
+
+        Args:
+            views: Readers of views as (h, w, 3) uint8 RGB; a damaged view is skipped.
+        """
+        number, self._asked = self._asked, self._asked + 1
+        pictures: dict[View, str] = {}
+        if number % self._every == 0:
+            for view, read in views.items():
+                with contextlib.suppress(InputError):
+                    width_px = self._width_px if view == "rgb" else self._width_px // 2
+                    pictures[view] = small_jpeg(read(), width_px, PAGE_JPEG_QUALITY)
+            self._unreadable += len(pictures) < len(views)
+        size = sum(map(len, pictures.values()))
+        if number == 0 and size * self._num_frames > self._room:
+            self._every = min(self._num_frames, -(-size * self._num_frames // max(1, int(self._room))))
+        if number % self._every or size > self._room:
+            self._skipped += 1
+            return {}
+        self._room -= size
+        return pictures
+
+    def notes(self) -> list[str]:
+        """Return notes on frames without pictures."""
+        skipped = f"{self._skipped:,} of {self._asked:,} shown frames have no pictures, to limit the page's size"
+        unreadable = f"of {self._unreadable:,} frames a picture cannot be read"
+        return [skipped] * bool(self._skipped) + [unreadable] * bool(self._unreadable)

@@ -55,6 +55,12 @@ class TopView:
         return _fixed(offsets_m * self.pixels_per_m) / 2**FRACTION_BITS
 
 
+def footprint(box_map: BoxMap, row: int) -> np.ndarray:
+    """Return the corners of a box from above, in order, (4, 2) m."""
+    corners = box_corners(box_map.centers[row], box_map.half_extents[row], np.radians(box_map.rotations_deg[row, 1]))
+    return corners[[0, 2, 6, 4], :2]  # box_corners varies z fastest, then y, then x
+
+
 def draw_map(box_map: BoxMap, view: TopView) -> np.ndarray:
     """Draw a map from above, low boxes first, high ones lighter; (height, width, 3) uint8 RGB."""
     picture = np.full((*view.size_px[::-1], 3), PAPER, dtype=np.uint8)
@@ -62,15 +68,12 @@ def draw_map(box_map: BoxMap, view: TopView) -> np.ndarray:
     if not box_map.ground.is_flat:
         tops -= box_map.ground.height_at(box_map.centers)
     for row in np.argsort(tops, kind="stable"):
-        corners = box_corners(
-            box_map.centers[row], box_map.half_extents[row], np.radians(box_map.rotations_deg[row, 1])
-        )
-        footprint = view.pixels(corners[[0, 2, 6, 4]])  # box_corners varies z fastest, then y, then x
+        outline = view.pixels(footprint(box_map, row))
         color = np.array(COLORS.get(KIND_NAMES[int(box_map.kinds[row])], OTHER_COLOR), dtype=np.float64)
         color += (255 - color) * np.clip(tops[row] / 80.0, 0.0, 0.5)
-        draw_area(picture, footprint, color.tolist())
+        draw_area(picture, outline, color.tolist())
         if tops[row] > 0.5:
-            draw_line(picture, footprint, (color * 0.6).tolist(), closed=True)
+            draw_line(picture, outline, (color * 0.6).tolist(), closed=True)
     return picture
 
 

@@ -1,211 +1,452 @@
-"""`cosfly view`: one self-contained page of a release or run, for a browser without a network.
+"""`cosfly view`: one self-contained page of a release, a run or a playback tree, for a browser without a network.
 
-The page holds its data as JSON; its one script (`viewer.js`) writes every foreign text as text, never as markup, and
-the page's policy lets no other script run.
+A release is read from its rows; the frames of a run become rows of the same columns first. The page holds its data as
+JSON, with the names that its one script (`viewer.js`) reads; the script writes every foreign text as text, never as
+markup, and the page's policy lets no other script run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import base64
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 import pyarrow as pa
+from pydantic import Field
 
-from cosfly.formats.frames import FrameFile, depth_values
+from cosfly.formats.boxes import BoxMap, read_boxes
+from cosfly.formats.captions import Caption, Coc, read_captions
+from cosfly.formats.frames import FrameFile, depth_values, frame_path
+from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
+from cosfly.formats.places import folder_name, place_of, town_folder
+from cosfly.formats.playback import read_track
+from cosfly.formats.review import read_settled
+from cosfly.formats.tracks import find_tracks
+from cosfly.llm.answer_text import sentences_of
 from cosfly.runtime.arrays import parse_picture
+from cosfly.runtime.config import Config
 from cosfly.runtime.console import progress_bar
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import for_terminal
-from cosfly.runtime.io import read_text, write_bytes
+from cosfly.runtime.io import write_bytes
 from cosfly.runtime.tables import arrow_errors, row_groups
-from cosfly.viz.frame_views import View, depth_colors, segmentation_colors
+from cosfly.viz.frame_views import (
+    VIEW_FILES,
+    PagePictures,
+    View,
+    depth_colors,
+    read_view,
+    segmentation_colors,
+    spread,
+)  # fmt: skip
 from cosfly.viz.page import page, scripts
-from cosfly.viz.page_pictures import PagePictures
+from cosfly.viz.topview import footprint
 from release.card.numbers import bounded, check_columns, check_rows, row_lists
-from release.columns import PICTURES as COLUMNS
-from release.columns import PLACE, POINT, SHORT_NAMES
+from release.columns import (
+    BOX,
+    CAPTION,
+    FIELDS,
+    FRAME,
+    LANGUAGES,
+    PICTURES,
+    PLACE,
+    POINT,
+    SHORT_NAMES,
+    TARGET_PICTURE,
+    Column,
+    Placement,
+    caption_values,
+    scalar_row,
+)  # fmt: skip
 from release.record import ReleaseRecord, read_record
-from release.viewer.content import (
-    PageFlight,
-    PageFrame,
-    ViewerConfig,
-    ViewerPage,
-    caption_of,
-    choose_flights,
-    choose_frames,
-    frame_of,
-    page_pictures,
-    path_of,
-)
-from release.viewer.of_run import show_run
 
 Place = tuple[str, ...]  # PLACE
+Views = Mapping[View, Callable[[], np.ndarray]]
+Item = TypeVar("Item")
+
+MB = 1024 * 1024
+FRAME_BYTES, TRACK_BYTES = 7_000, 14_000  # on the page: a frame without pictures, and a track with its paths
+PATH_POINTS = 240
+MOST_BOXES, MARGIN_M = 2_500, 30.0  # of one map
 VIEW_OF: dict[FrameFile, View] = {"rgb": "rgb", "depth": "depth", "instance": "segmentation"}
-SCAN = [
+TEXTS = {"C": "critical_components", "R": "reasoning_trace"}  # by the letter of a sentence's name
+SCANNED = [
     *PLACE, "sample_id", "track", "split", "frame_index", "time_s", "width_px", "height_px", "fov_deg", "pose",
     "target", "visibility", "has_caption", "verdict", "decision",
 ]  # fmt: skip
 
 
-class FlightScan:
-    """What the first pass keeps of a flight that is shown: its places, the captions' kinds, and where its rows
-    stand.
-    """
+class ViewerConfig(Config):
+    """How much of a release or run a page holds."""
 
-    def __init__(self, row: Mapping[str, Any]) -> None:
-        self.row = row
-        self.fovs_deg = set[float]()
-        self.places: dict[int, tuple[list[float], list[float]]] = {}
-        self.kinds: dict[int, tuple] = {}
-        self.groups: dict[int, tuple[Path, int]] = {}
-        self.frames = list[PageFrame]()
-
-    def add(self, row: Mapping[str, Any], shard: Path, group: int) -> None:
-        """Take a row of the flight."""
-        index, target = row["frame_index"], row["target"]
-        numbers = [row["time_s"], row["fov_deg"], *row["pose"].values(), *(target or {}).values()]
-        for value in (*numbers, row["visibility"] or 0.0):
-            bounded(value)
-        self.fovs_deg.add(round(row["fov_deg"], 1))
-        drone = [row["pose"][axis] for axis in POINT[:2]]
-        self.places[index] = (drone, [np.nan] * 2 if target is None else [target[axis] for axis in POINT[:2]])
-        self.groups[index] = (shard, group)
-        if row["has_caption"]:
-            self.kinds[index] = (row["verdict"], row["decision"])
-
-
-def show_release(dataset: Path, cfg: ViewerConfig) -> ViewerPage:
-    """Reads a release folder, gives what the page shows of it."""
-    record = read_record(dataset / "release.json")
-    names = [flight.flight for flight in record.flights]
-    chosen = set(choose_flights(names, [name.rpartition("/")[0] for name in names], cfg.flights))
-    notes = [] if len(chosen) == len(names) else [f"{len(chosen):,} of {len(names):,} flights are shown"]
-    notes.append("a release holds no map: the tracks are drawn without one")
-    scanned = _scan(dataset, record, chosen)
-    frames = {place: choose_frames(sorted(one.places), one.kinds, cfg.frames) for place, one in scanned.items()}
-    pictures = page_pictures(cfg, len(scanned), sum(map(len, frames.values())))
-    with progress_bar("viewer: frames", pictures.num_frames) as advance:
-        for row in _rows(dataset, record, scanned, frames):
-            scanned[place_of(row)].frames.append(_frame(row, record, pictures))
-            advance(1)
-    flights = [_flight(one) for one in scanned.values()]
-    return ViewerPage(title=record.name, kind="release", notes=[*notes, *pictures.notes()], maps={}, flights=flights)
-
-
-def place_of(row: Mapping[str, Any]) -> Place:
-    return tuple(row[name] for name in PLACE)
-
-
-def _scan(dataset: Path, record: ReleaseRecord, chosen: set[str]) -> dict[Place, FlightScan]:
-    """Read the places of all rows, keep those of the chosen flights, in the rows' order."""
-    scanned: dict[Place, FlightScan] = {}
-    with progress_bar("viewer: rows", sum(shard.rows for shard in record.shards)) as advance:
-        for shard in record.shards:
-            path = dataset / shard.path
-            check_rows(path, shard.rows)
-            for group, rows in enumerate(row_lists(path, SCAN)):
-                for row in rows:
-                    if "/".join(place_of(row)) in chosen:
-                        scanned.setdefault(place_of(row), FlightScan(row)).add(row, path, group)
-                advance(len(rows))
-    return scanned
-
-
-def _rows(
-    dataset: Path, record: ReleaseRecord, scanned: Mapping[Place, FlightScan], frames: Mapping[Place, list[int]]
-) -> Iterator[dict[str, Any]]:
-    """Read the chosen rows with their pictures; of the row groups those alone that hold one."""
-    columns = [*SHORT_NAMES, *(COLUMNS[file].name for file in record.settings.modalities)]
-    wanted: dict[Path, set[int]] = {}
-    for place, indices in frames.items():
-        for index in indices:
-            path, group = scanned[place].groups[index]
-            wanted.setdefault(path, set()).add(group)
-    for shard in record.shards:
-        path = dataset / shard.path
-        for table in row_groups(path, columns, tree=dataset, wanted=wanted.get(path, ())):
-            check_columns(table, columns, path)
-            with arrow_errors(path):
-                places = table.select([*PLACE, "frame_index"]).to_pylist()
-                kept = [row["frame_index"] in frames.get(place_of(row), ()) for row in places]
-                rows = table.filter(pa.array(kept)).to_pylist()
-            yield from rows
-
-
-def _frame(row: Mapping[str, Any], record: ReleaseRecord, pictures: PagePictures) -> PageFrame:
-    views: Mapping[View, Callable[[], np.ndarray]] = {
-        VIEW_OF[file]: partial(picture, row, file, record) for file in record.settings.modalities
-    }
-    return frame_of(row, pictures.of_frame(views), caption_of(row) if row["has_caption"] else None)
-
-
-def picture(row: Mapping[str, Any], file: FrameFile, record: ReleaseRecord) -> np.ndarray:
-    """Return a picture of a row as colours, (h, w, 3) uint8 RGB."""
-    where, cell = f"{row['sample_id']}: {COLUMNS[file].name}", row[COLUMNS[file].name]
-    if file == "depth":
-        return depth_colors(depth_values(cell or b"", Path(where)))
-    data = (cell or {}).get("bytes") or b""
-    if file == "rgb":
-        return cv2.cvtColor(parse_picture(data, where), cv2.COLOR_BGR2RGB)
-    coded = parse_picture(data, where)  # B the high, G the low byte of the id, R the kind
-    return segmentation_colors(coded[..., 2], coded[..., 1].astype(np.uint16) | coded[..., 0].astype(np.uint16) << 8)
-
-
-def _flight(scanned: FlightScan) -> PageFlight:
-    row, order = scanned.row, sorted(scanned.places)
-    return PageFlight(
-        name="/".join(place_of(row)),
-        group="/".join(place_of(row)[:-1]),
-        map=f"{row['run']}/{row['town']}",
-        town=row["town"],
-        track=row["track"],
-        split=row["split"],
-        result=None,
-        fovs_deg=(min(scanned.fovs_deg), max(scanned.fovs_deg)),
-        num_frames=len(order),
-        num_captions=len(scanned.kinds),
-        drone_path=path_of(np.array([scanned.places[index][0] for index in order])),
-        target_path=path_of(np.array([scanned.places[index][1] for index in order])),
-        frames=sorted(scanned.frames, key=lambda frame: frame.index),
+    flights: int = Field(
+        100, ge=1, description="most tracks on a page; of more, trajectories spread evenly, both tracks of each"
     )
-
-
-PICTURES = "pictures"
+    frames: int = Field(16, ge=1, description="most frames of a track, among them one of each verdict and decision")
+    picture_px: int = Field(
+        320, ge=32, le=1280, description="width of a colour picture, px; depth and mask have half of it"
+    )
+    max_mb: int = Field(64, ge=1, description="size of the page, MB; frames lose their pictures to stay below it")
 
 
 def run(folder: Path, out: Path, cfg: ViewerConfig, captions: Path | None = None) -> Path:
-    """Reads a release (or the folder round it), a run folder or a playback tree; writes one page and gives its path.
+    """Read a release (or the folder around it), a run or a playback tree; write one page and return its path.
 
     Args:
         captions: `captions.jsonl` of a playback tree; a run has its own.
+
     Raises:
-        InputError: the folder is none of these, or something in it cannot be read.
+        InputError: If the folder is none of these, or something in it cannot be read.
     """
     dataset = next((place for place in (folder, folder / "dataset") if (place / "release.json").exists()), None)
-    shown = show_run(folder, cfg, captions) if dataset is None else show_release(dataset, cfg)
-    write_bytes(out, page_html(shown).encode())
+    data = _show_run(folder, cfg, captions) if dataset is None else _show_release(dataset, cfg)
+    script, style = scripts("tools.js", "canvas.js", "viewer.js"), scripts("viewer.css")
+    values = {"title": data["title"], "notes": data["notes"], "data": _printable(data)}
+    write_bytes(out, page("cosfly/viz/templates/viewer.html", style=style, script=script, **values).encode())
     return out
-
-
-def page_html(shown: ViewerPage) -> str:
-    """Return the page's text."""
-    style, script = (read_text(Path(__file__).with_name(name)) for name in ("viewer.css", "viewer.js"))
-    script = scripts("tools.js", "canvas.js") + script
-    data = _printable(shown.model_dump(mode="json", exclude_defaults=False))
-    return page(
-        "release/viewer/viewer.html", title=shown.title, style=style, script=script, notes=shown.notes, data=data
-    )
 
 
 def _printable(value: Any) -> Any:
     """Return a value whose texts are cut and free of control characters; pictures, which are ours, stay."""
     if isinstance(value, str):
         return for_terminal(value)
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return [_printable(one) for one in value]
     if isinstance(value, dict):
-        return {_printable(key): one if key == PICTURES else _printable(one) for key, one in value.items()}
+        return {_printable(key): one if key == "pictures" else _printable(one) for key, one in value.items()}
     return value
+
+
+# --- a release --------------------------------------------------------------------------------------------------------
+
+
+class _ScannedRow(NamedTuple):
+    """What the first pass keeps of a row: x, y of drone and target, (4,) m; kind of its caption; where it is stored."""
+
+    places_m: list[float]
+    fov_deg: float
+    kind: tuple | None
+    stored: tuple[Path, int]
+
+
+def _show_release(dataset: Path, cfg: ViewerConfig) -> dict[str, Any]:
+    record = read_record(dataset / "release.json")
+    names = [flight.flight for flight in record.flights]
+    chosen, notes = _choose_tracks(names, [name.rpartition("/")[0] for name in names], cfg)
+    notes.append("a release has no map: the tracks are drawn without one")
+    tracks: dict[Place, dict[str, Any]] = {}
+    scanned: dict[Place, dict[int, _ScannedRow]] = defaultdict(dict)
+    for row, one in _scan(dataset, record, set(chosen)):
+        tracks.setdefault(_place(row), {"town": row["town"], "track": row["track"], "split": row["split"]})
+        scanned[_place(row)][row["frame_index"]] = one
+    frames: dict[Place, list[int]] = {}
+    for place, rows in scanned.items():
+        kinds = {index: row.kind for index, row in rows.items() if row.kind is not None}
+        frames[place] = choose_frames(sorted(rows), kinds, cfg.frames)
+        fovs, places_m = {row.fov_deg for row in rows.values()}, [rows[index].places_m for index in sorted(rows)]
+        tracks[place] |= _track(place, np.array(places_m), (min(fovs), max(fovs)), len(kinds))
+    wanted: dict[Path, set[int]] = defaultdict(set)
+    for place, indices in frames.items():
+        for path, group in (scanned[place][index].stored for index in indices):
+            wanted[path].add(group)
+    notes += _add_frames(tracks, frames, _release_rows(dataset, record, frames, wanted), cfg)
+    return {"title": record.name, "kind": "release", "notes": notes, "maps": {}, "flights": list(tracks.values())}
+
+
+def _place(row: Mapping[str, Any]) -> Place:
+    return tuple(row[name] for name in PLACE)
+
+
+def _scan(dataset: Path, record: ReleaseRecord, chosen: set[str]) -> Iterator[tuple[dict[str, Any], _ScannedRow]]:
+    """Read all rows without pictures; yield those of the chosen tracks, in order."""
+    with progress_bar("viewer: rows", sum(shard.rows for shard in record.shards)) as advance:
+        for shard in record.shards:
+            path = dataset / shard.path
+            check_rows(path, shard.rows)
+            for group, rows in enumerate(row_lists(path, SCANNED)):
+                for row in rows:
+                    if "/".join(_place(row)) not in chosen:
+                        continue
+                    target = row["target"] or dict.fromkeys(POINT, 0.0)
+                    for value in (row["time_s"], *row["pose"].values(), *target.values(), row["visibility"] or 0.0):
+                        bounded(value)
+                    places_m = [row["pose"][axis] for axis in POINT[:2]]
+                    places_m += [np.nan if row["target"] is None else target[axis] for axis in POINT[:2]]
+                    kind = (row["verdict"], row["decision"]) if row["has_caption"] else None
+                    yield row, _ScannedRow(places_m, round(bounded(row["fov_deg"]), 1), kind, (path, group))
+                advance(len(rows))
+
+
+def _release_rows(
+    dataset: Path, record: ReleaseRecord, frames: Mapping[Place, list[int]], wanted: Mapping[Path, set[int]]
+) -> Iterator[tuple[Place, dict[str, Any], Views, dict[str, Any] | None]]:
+    """Read the chosen rows with their pictures, from the row groups that hold one."""
+    columns = [*SHORT_NAMES, *(PICTURES[file].name for file in record.settings.modalities)]
+    for path in (dataset / shard.path for shard in record.shards):
+        for table in row_groups(path, columns, tree=dataset, wanted=wanted.get(path, ())):
+            check_columns(table, columns, path)
+            with arrow_errors(path):
+                places = table.select([*PLACE, "frame_index"]).to_pylist()
+                kept = [row["frame_index"] in frames.get(_place(row), ()) for row in places]
+                rows = table.filter(pa.array(kept)).to_pylist()
+            for row in rows:
+                views = {VIEW_OF[file]: partial(_picture, row, file) for file in record.settings.modalities}
+                yield _place(row), row, views, _caption(row) if row["has_caption"] else None
+
+
+def _picture(row: Mapping[str, Any], file: FrameFile) -> np.ndarray:
+    """Return a picture of a row as colours, (h, w, 3) uint8 RGB."""
+    where, cell = f"{row['sample_id']}: {PICTURES[file].name}", row[PICTURES[file].name]
+    if file == "depth":
+        return depth_colors(depth_values(cell or b"", Path(where)))
+    coded = parse_picture((cell or {}).get("bytes") or b"", where)
+    if file == "rgb":
+        return cv2.cvtColor(coded, cv2.COLOR_BGR2RGB)
+    # Blue is the high byte of the id, green the low one, red the kind.
+    return segmentation_colors(coded[..., 2], coded[..., 1].astype(np.uint16) | coded[..., 0].astype(np.uint16) << 8)
+
+
+# --- a run or a playback tree -----------------------------------------------------------------------------------------
+
+
+class Tree(NamedTuple):
+    """A playback tree and what was made of it; None where that does not exist. run: its name among several."""
+
+    run: str
+    data: Path
+    captions: Path | None = None
+    inspect: Path | None = None
+    boxes: Path | None = None
+
+    def place(self, one: Any) -> Place:
+        """Return the place of a track, by the town, trajectory and variant that anything about it names."""
+        return self.run, town_folder(one.town), one.trajectory, one.variant
+
+
+def find_trees(folder: Path, captions: Path | None = None) -> list[Tree]:
+    """Return what a folder is: a run, a run of several towns, or a playback tree."""
+    towns = sorted(path.parent for path in folder.glob("*/render") if path.is_dir())
+    runs = [folder] if (folder / "render").is_dir() else towns
+    trees = []
+    for place in runs:
+        names = ("caption/captions.jsonl", "inspect/inspect.json", "simplify/step2_simplified.json")
+        own_captions, *others = (place / name if (place / name).exists() else None for name in names)
+        trees.append(Tree(folder_name(place.absolute().name), place / "render", captions or own_captions, *others))
+    return trees or [Tree("", folder, captions)]
+
+
+def _show_run(folder: Path, cfg: ViewerConfig, captions: Path | None) -> dict[str, Any]:
+    trees = find_trees(folder, captions)
+    found = {tree.place(place_of(path)): (tree, path) for tree in trees for path in find_tracks(tree.data)}
+    chosen, notes = _choose_tracks(list(found), [place[:-1] for place in found], cfg)
+    kinds: dict[Place, dict[int, tuple]] = {place: {} for place in chosen}
+    for place, caption in _captions(trees):
+        if place in kinds:
+            decision = caption.en.flight_decision if caption.en else None
+            kinds[place][caption.frame_index] = (caption.status, caption.verdict, decision)
+    inspected = ((tree, read_settled(tree.inspect)) for tree in trees if tree.inspect is not None)
+    results = {tree.place(track): track.result for tree, inspection in inspected for track in inspection.flights}
+    tracks, frames = dict[Place, dict[str, Any]](), dict[Place, list[int]]()
+    for place in chosen:
+        tree, path = found[place]
+        try:
+            track = read_track(path, strict=False)
+        except InputError as error:
+            notes.append(f"not shown: {path.parent.name}/{path.name}: {error.what}")
+            continue
+        frames[place] = choose_frames(range(len(track)), kinds[place], cfg.frames)
+        names = tree.run, track.town, track.trajectory, track.variant
+        places_m = np.hstack([track.positions_m[:, :2], track.targets_m[:, :2]])
+        tracks[place] = _track(names, places_m, track.fovs_deg, len(kinds[place]))
+        kind = "clean" if track.is_original else "perturbed"
+        tracks[place] |= {"town": track.town, "track": kind, "split": None, "result": results.get(place)}
+    rows = _run_rows({place: found[place][1] for place in frames}, frames, trees)
+    notes += _add_frames(tracks, frames, rows, cfg)
+    shown = list(tracks.values())
+    title = folder.absolute().name
+    return {"title": title, "kind": "run", "notes": notes, "maps": _maps(trees, shown), "flights": shown}
+
+
+def _captions(trees: list[Tree]) -> Iterator[tuple[Place, Caption]]:
+    for tree in trees:
+        for caption in () if tree.captions is None else read_captions(tree.captions):
+            yield tree.place(caption), caption
+
+
+def _run_rows(
+    folders: Mapping[Place, Path], frames: Mapping[Place, list[int]], trees: list[Tree]
+) -> Iterator[tuple[Place, dict[str, Any], Views, dict[str, Any] | None]]:
+    """Read the chosen frames, one track at a time."""
+    every = ((place, caption.frame_index, caption) for place, caption in _captions(trees))
+    captions = {(place, index): caption for place, index, caption in every if index in frames.get(place, ())}
+    for place, indices in frames.items():
+        track = read_track(folders[place], strict=False)
+        for index in indices:
+            folder, caption = track.frame_folder(index), captions.get((place, index))
+            values = None if caption is None else caption_values(caption)
+            row = scalar_row(track, index, values, Placement(walk="", split="train"))
+            files = (view for view in VIEW_OF.values() if frame_path(folder, VIEW_FILES[view]).exists())
+            views: Views = {view: partial(read_view, folder, view) for view in files}
+            yield place, row, views, None if caption is None else _caption(row, caption)
+
+
+def _maps(trees: list[Tree], tracks: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """Return the boxes around the tracks of each town, where the run has a map."""
+    maps: dict[str, list[dict[str, Any]]] = {}
+    for tree in trees:
+        near: dict[str, list] = defaultdict(list)
+        for track in tracks:
+            if tree.boxes is not None and track["map"].startswith(f"{tree.run}/"):
+                near[track["map"]] += [*track["drone_path"], *track["target_path"]]
+        maps |= {name: boxes_of(read_boxes(tree.boxes), places) for name, places in sorted(near.items()) if tree.boxes}
+    return maps
+
+
+# --- tracks, frames and captions on the page --------------------------------------------------------------------------
+
+
+def _choose_tracks(tracks: Sequence[Item], groups: Sequence[Hashable], cfg: ViewerConfig) -> tuple[list[Item], list]:
+    """Choose whole groups (the tracks of a trajectory), spread evenly, as many as fit, and one at least; return their
+    tracks, and a note if there are others."""
+    by_group: dict[Hashable, list[Item]] = defaultdict(list)
+    for track, group in zip(tracks, groups, strict=True):
+        by_group[group].append(track)
+    named, chosen = list(by_group.values()), list(tracks)
+    for count in range(len(named), 0, -1):
+        chosen = [track for k in spread(len(named), count) for track in named[k]]
+        if len(chosen) <= cfg.flights:
+            break
+    is_all = len(chosen) == len(tracks)
+    return chosen, [] if is_all else [f"{len(chosen):,} of {len(tracks):,} flights are shown"]
+
+
+def choose_frames(frames: Sequence[int], kinds: Mapping[int, Hashable], most: int) -> list[int]:
+    """Choose frames of a track, in order: the first of each kind until half of them, then evenly of those with
+    captions, then of the others.
+
+    Args:
+        frames: All, ascending. kinds: What the caption of a frame says, such as (verdict, decision).
+    """
+    firsts: dict[Hashable, int] = {}
+    for frame in frames:
+        if frame in kinds:
+            firsts.setdefault(kinds[frame], frame)
+    chosen = set(list(firsts.values())[: max(1, most // 2)])
+    for wanted in (kinds, set(frames) - set(kinds)):
+        others = [frame for frame in frames if frame not in chosen and frame in wanted]
+        chosen |= {others[k] for k in spread(len(others), most - len(chosen))}
+    return sorted(chosen)
+
+
+def _track(names: Place, places_m: np.ndarray, fovs_deg: tuple[float, float], num_captions: int) -> dict[str, Any]:
+    """Return a track: names as in PLACE; places_m: (n, 4) x, y of drone and target, NaN where unknown."""
+    return {
+        "name": "/".join(filter(None, names)),
+        "group": "/".join(filter(None, names[:-1])),  # both tracks of a trajectory
+        "map": "/".join(names[:2]),
+        "result": None,
+        "fovs_deg": [round(fov_deg, 1) for fov_deg in fovs_deg],
+        "num_frames": len(places_m),
+        "num_captions": num_captions,
+        "drone_path": _path(places_m[:, :2]),
+        "target_path": _path(places_m[:, 2:]),
+        "frames": [],
+    }
+
+
+def _path(points_m: np.ndarray) -> list[list[float]]:
+    known = points_m[~np.isnan(points_m).any(axis=1)]
+    return known[spread(len(known), PATH_POINTS)].astype(np.float64).round(1).tolist()
+
+
+def _add_frames(
+    tracks: Mapping[Place, dict[str, Any]],
+    frames: Mapping[Place, list[int]],
+    rows: Iterable[tuple[Place, dict[str, Any], Views, dict[str, Any] | None]],
+    cfg: ViewerConfig,
+) -> list[str]:
+    """Add rows with their pictures and captions to the tracks; return notes on missing pictures."""
+    num_frames = sum(map(len, frames.values()))
+    room = cfg.max_mb * MB - FRAME_BYTES * num_frames - TRACK_BYTES * len(tracks)
+    pictures = PagePictures(room, num_frames, cfg.picture_px)
+    with progress_bar("viewer: frames", num_frames) as advance:
+        for place, row, views, caption in rows:
+            tracks[place]["frames"].append(_frame(row, pictures.of_frame(views), caption))
+            advance(1)
+    for track in tracks.values():
+        track["frames"].sort(key=lambda frame: frame["index"])
+    return pictures.notes()
+
+
+def _frame(row: Mapping[str, Any], pictures: dict[View, str], caption: dict[str, Any] | None) -> dict[str, Any]:
+    """Return a frame. box: of the target, xmin, ymin, xmax, ymax as shares of the picture."""
+    pose, target, seen, picture = row["pose"], row["target"], row["visibility"], row[TARGET_PICTURE]
+    box_px = np.array([(row["target_bbox"] or {}).get(name) for name in BOX], np.float64)
+    box = (box_px / np.maximum(1, (row["width_px"], row["height_px"]) * 2)).round(4)
+    return {
+        "index": row["frame_index"],
+        "time_s": round(row["time_s"], 3),
+        "drone": [round(float(pose[name]), 2) for name in (*POINT, "yaw_deg")],
+        "target": None if target is None else [round(target[name], 2) for name in POINT],
+        "visibility": None if seen is None else round(seen, 3),
+        "is_perturbed": bool(row["is_perturbed"]),
+        "events": row["perturbation"] or None,
+        "facts": _facts(FRAME, row),
+        "fov_deg": round(row["fov_deg"], 1),
+        "box": box.tolist() if np.isfinite(box).all() else None,
+        "pictures": pictures,
+        "target_picture": base64.b64encode(picture["bytes"]).decode() if picture else None,
+        "caption": caption,
+    }
+
+
+def _facts(columns: Sequence[Column], row: Mapping[str, Any]) -> dict[str, str]:
+    values = {column.title: row[column.name] for column in columns if column.shown}
+    return {
+        title: ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+        for title, value in values.items()
+        if value is not None
+    }
+
+
+def _caption(row: Mapping[str, Any], caption: Caption | None = None) -> dict[str, Any]:
+    """Return a caption of its columns, and of the caption of a run, which says more than a release."""
+    texts = {}
+    for language in LANGUAGES:
+        coc = Coc(**{name: row[f"caption_{language}_{name}"] or "" for name in FIELDS})
+        named, states = list(sentences_of(coc)), row[f"sentence_states_{language}"] or []
+        states = states if len(states) == len(named) else [None] * len(named)  # those of another text
+        texts[language] = [
+            {"field": TEXTS[name[0]], "text": text, "state": state}
+            for (name, text), state in zip(named, states, strict=True)
+        ]
+    shown = {name: row[name] for name in ("decision", "label", "verdict")} | {"repair": row["repair_strategy"]}
+    shown |= {"facts": _facts(CAPTION, row), "texts": texts, "problems": [], "dropped": None}
+    if caption is not None and caption.repair is not None:
+        repair, first = caption.repair, f"first {caption.repair.first_decision} ({caption.repair.first_verdict})"
+        shown["repair"] = shown["facts"]["repair"] = f"{repair.rung or repair.outcome}, {first}"
+    if caption is not None:
+        shown["problems"] = caption.checks.evidence if isinstance(caption.checks.evidence, list) else []
+        shown["dropped"] = caption.drop_reason if caption.status == "dropped" else None
+    return shown
+
+
+def boxes_of(box_map: BoxMap, near: Sequence[Sequence[float]]) -> list[dict[str, Any]]:
+    """Return the footprints of the largest boxes of a map around some places, those below others first."""
+    if not near:
+        return []
+    low, high = np.min(near, axis=0) - MARGIN_M, np.max(near, axis=0) + MARGIN_M
+    rows = np.flatnonzero(((box_map.maxs[:, :2] >= low) & (box_map.mins[:, :2] <= high)).all(axis=1))
+    areas = box_map.half_extents[rows, 0] * box_map.half_extents[rows, 1]
+    rows = rows[np.argsort(-areas, kind="stable")[:MOST_BOXES]]
+    is_ground = np.isin(box_map.kinds[rows], list(GROUND_KINDS))
+    tops = box_map.centers[rows, 2] + box_map.half_extents[rows, 2]
+    rows = rows[np.lexsort((tops, ~is_ground))]
+    kinds = (KIND_NAMES[kind] for kind in box_map.kinds[rows].tolist())
+    corners = (footprint(box_map, row).round(1).tolist() for row in rows.tolist())
+    return [{"kind": kind, "corners": four} for kind, four in zip(kinds, corners, strict=True)]
