@@ -14,18 +14,13 @@ TEMPLATE = "cosfly/viz/templates/coverage.html"
 
 def coverage_html(coverage: Coverage) -> str:
     """Return a histogram for each axis, with the range of 90 % of the frames, and a table for each kind of name."""
-    plain = default_coverage()
+    bins, plain = coverage.bins, default_coverage().bins
     histograms = [
-        _histogram(axis, coverage.bins.get(name, []), plain.bins[name])
-        | {"title": _title(axis), "range": _range(coverage, name), "range_of_plain": _range(plain, name)}
-        for name, axis in AXES.items()
+        _histogram(axis, bins.get(name, []), plain[name]) | {"title": title, "range": own, "range_of_plain": of_plain}
+        for (name, axis), (title, own, of_plain) in zip(AXES.items(), ranges(coverage), strict=True)
     ]
     names = {kind: shares(coverage, kind) for kind in NAMED}
     return fragment(TEMPLATE, histograms=histograms, names=names, skies=_skies(coverage.skies))
-
-
-def _title(axis: Axis) -> str:
-    return f"{axis.title}, {axis.unit}" if axis.unit else axis.title
 
 
 def _skies(frames: dict[str, int]) -> dict[str, Any] | None:
@@ -45,8 +40,8 @@ def _skies(frames: dict[str, int]) -> dict[str, Any] | None:
 
 def ranges(coverage: Coverage) -> list[tuple[str, str, str]]:
     """Return a row for each axis: title, 5 % to 95 % of the frames, the same for the default run."""
-    plain = default_coverage()
-    return [(_title(axis), _range(coverage, name), _range(plain, name)) for name, axis in AXES.items()]
+    plain, titles = default_coverage(), [f"{axis.title}, {axis.unit}".rstrip(", ") for axis in AXES.values()]
+    return [(title, _range(coverage, name), _range(plain, name)) for title, name in zip(titles, AXES, strict=True)]
 
 
 def shares(coverage: Coverage, kind: str) -> list[tuple[str, int, str, str]]:
@@ -55,32 +50,27 @@ def shares(coverage: Coverage, kind: str) -> list[tuple[str, int, str, str]]:
     if not counts:
         return []
     names = sorted({*counts, *plain}, key=lambda name: (-counts.get(name, 0), name))
-    return [(name, counts.get(name, 0), _share(counts, name), _share(plain, name)) for name in names]
 
+    def share(table: dict[str, int], name: str) -> str:
+        total = sum(table.values())
+        return f"{100.0 * table.get(name, 0) / total:.1f} %" if total else "-"
 
-def _share(counts: dict[str, int], name: str) -> str:
-    total = sum(counts.values())
-    return f"{100.0 * counts.get(name, 0) / total:.1f} %" if total else "-"
+    return [(name, counts.get(name, 0), share(counts, name), share(plain, name)) for name in names]
 
 
 def _range(coverage: Coverage, name: str) -> str:
     """Return the range of 5 % to 95 % of the frames; for a circle, the shares of its sides."""
+    axis = AXES[name]
     if name == "azimuth_deg":
-        return _sides(coverage.bins.get(name, []))
+        if not (total := sum(counts := coverage.bins.get(name, []))):
+            return "-"
+        middles = [abs(axis.low + (k + 0.5) * axis.step) for k in range(axis.num_bins)]
+        behind = sum(count for count, middle in zip(counts, middles, strict=True) if middle > 135.0) / total
+        ahead = sum(count for count, middle in zip(counts, middles, strict=True) if middle < 45.0) / total
+        return f"{behind:.0%} behind, {1 - behind - ahead:.0%} to the side, {ahead:.0%} in front"
     low, high = coverage.range_of(name)
-    digits = 2 if AXES[name].step < 1.0 else 0
+    digits = 2 if axis.step < 1.0 else 0
     return "-" if low is None or high is None else f"{low:.{digits}f} to {high:.{digits}f}"
-
-
-def _sides(counts: list[int]) -> str:
-    total = sum(counts)
-    if not total:
-        return "-"
-    axis = AXES["azimuth_deg"]
-    middles = [abs(axis.low + (k + 0.5) * axis.step) for k in range(axis.num_bins)]
-    behind = sum(count for count, middle in zip(counts, middles, strict=True) if middle > 135.0) / total
-    ahead = sum(count for count, middle in zip(counts, middles, strict=True) if middle < 45.0) / total
-    return f"{behind:.0%} behind, {1 - behind - ahead:.0%} to the side, {ahead:.0%} in front"
 
 
 def _histogram(axis: Axis, counts: list[int], default: list[int]) -> dict[str, Any]:

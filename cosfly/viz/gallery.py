@@ -34,24 +34,21 @@ def contact_sheet(tree: Path, out_png: Path, choice: TrackChoice = ALL_FLIGHTS) 
     """Read a playback tree and write a PNG below 2 MB: a few RGB frames, a depth image and a mask of each track."""
     folders = find_tracks(tree, choice)
     rows = [_row(read_track(folder, strict=False)) for folder in folders[:MOST_ROWS]]
-    sheet = np.vstack([_heading(len(folders), rows[0].shape[1]), *rows])
-    write_bytes(out_png, _png_below(sheet, SHEET_BYTES))
+    heading = np.full((26, rows[0].shape[1], 3), 60, np.uint8)
+    shown = "" if len(folders) <= MOST_ROWS else f", the first {MOST_ROWS} shown"
+    draw_text(heading, f"{len(folders)} tracks{shown}", 8, 18, 0.5, (255, 255, 255))
+    write_bytes(out_png, _png_below(np.vstack([heading, *rows]), SHEET_BYTES))
 
 
 def preview_gif(
     tree: Path, out_gif: Path, choice: TrackChoice = ALL_FLIGHTS, frames_per_s: float = 1000 / GIF_FRAME_MS
 ) -> None:
     """Read a playback tree and write its first clean track as an animation below 4 MB, with the target's box."""
-    folders = find_tracks(tree, choice)
-    track = read_track(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
-    frames = _frames_with(track, "rgb.png")
-    width, num = GIF_WIDTH_PX, 60
-    while True:
-        chosen = [frames[i] for i in spread(len(frames), num)]
-        data = _gif([_preview(track, i, width) for i in chosen], round(1000 / frames_per_s))
-        if len(data) < GIF_BYTES or num <= 4:
-            break
-        num = max(4, int(num * 0.9 * GIF_BYTES / len(data)))
+    track, frames = _first_clean(tree, choice, "rgb.png")
+    num, data = 60, b""
+    while not data or (len(data) >= GIF_BYTES and num > 4):
+        num = max(4, int(num * 0.9 * GIF_BYTES / len(data))) if data else num
+        data = _gif([_preview(track, frames[i]) for i in spread(len(frames), num)], round(1000 / frames_per_s))
     write_bytes(out_gif, data)
 
 
@@ -100,13 +97,18 @@ def frame_in(tree: Path, frame: str | Path) -> Path:
 
 def best_frame(tree: Path, *names: str) -> Path:
     """Return the frame folder of a tree's first clean track that shows most of the target and has these files."""
-    folders = find_tracks(tree)
-    track = read_track(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
-    frames = _frames_with(track, *names)
+    track, frames = _first_clean(tree, ALL_FLIGHTS, *names)
     return track.frame_folder(max(frames, key=lambda i: (np.nan_to_num(track.target.visibility[i]), i)))
 
 
 # --- pieces -----------------------------------------------------------------------------------------------------------
+
+
+def _first_clean(tree: Path, choice: TrackChoice, *names: str) -> tuple[Track, list[int]]:
+    """Return the first clean track of a tree, or else the first, and its frames that have these files."""
+    folders = find_tracks(tree, choice)
+    track = read_track(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
+    return track, _frames_with(track, *names)
 
 
 def _frames_with(track: Track, *names: str) -> list[int]:
@@ -137,13 +139,6 @@ def _row(track: Track) -> np.ndarray:
     return np.vstack([strip, np.hstack(tiles)])
 
 
-def _heading(num_tracks: int, width_px: int) -> np.ndarray:
-    strip = np.full((26, width_px, 3), 60, np.uint8)
-    shown = "" if num_tracks <= MOST_ROWS else f", the first {MOST_ROWS} shown"
-    draw_text(strip, f"{num_tracks} tracks{shown}", 8, 18, 0.5, (255, 255, 255))
-    return strip
-
-
 def _tile(picture: np.ndarray, text: str) -> np.ndarray:
     tile = cv2.resize(picture, TILE_PX, interpolation=cv2.INTER_AREA)
     draw_text(tile, text, 6, TILE_PX[1] - 8, 0.42, (255, 255, 255), halo=(0, 0, 0))
@@ -159,10 +154,10 @@ def _boxed(picture: np.ndarray, track: Track, i: int) -> np.ndarray:
     return picture
 
 
-def _preview(track: Track, i: int, width_px: int) -> Image.Image:
+def _preview(track: Track, i: int) -> Image.Image:
     picture = _boxed(read_rgb(track.frame_folder(i)), track, i)
-    height_px = round(width_px * picture.shape[0] / picture.shape[1])
-    return Image.fromarray(cv2.resize(picture, (width_px, height_px), interpolation=cv2.INTER_AREA))
+    size_px = GIF_WIDTH_PX, round(GIF_WIDTH_PX * picture.shape[0] / picture.shape[1])
+    return Image.fromarray(cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA))
 
 
 def _gif(frames: list[Image.Image], frame_ms: int) -> bytes:
@@ -170,10 +165,8 @@ def _gif(frames: list[Image.Image], frame_ms: int) -> bytes:
     sample = np.vstack([np.asarray(frames[i]) for i in spread(len(frames), 6)])
     palette = Image.fromarray(sample).quantize(128)
     frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    buffer = io.BytesIO()
-    frames[0].save(
-        buffer, format="GIF", save_all=True, append_images=frames[1:], duration=frame_ms, loop=0, optimize=False
-    )
+    buffer, options = io.BytesIO(), {"append_images": frames[1:], "duration": frame_ms, "loop": 0, "optimize": False}
+    frames[0].save(buffer, format="GIF", save_all=True, **options)
     return buffer.getvalue()
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import FrameMeta
 from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
-from cosfly.geometry.axes import box_corners, rotation_matrices, world_from_camera
+from cosfly.geometry.axes import box_corners, rotation_matrices
 from cosfly.viz.topview import COLORS, FONT, OTHER_COLOR, Color, draw_text
 
 TARGET_COLOR, OTHERS_COLOR = (255, 214, 10), (90, 220, 255)
@@ -50,10 +50,9 @@ class Overlay:
             rgb: (h, w, 3) uint8. ids: (h, w) of `instance.png`, which select the boxes.
         """
         picture = np.ascontiguousarray(rgb).copy()
-        camera_pose = world_from_camera(meta.drone_pose[:3], meta.drone_pose[3:])
-        intrinsic = np.array(meta.camera.intrinsic)
+        camera_pose, intrinsic = meta.drone_pose.camera_pose, np.array(meta.camera.intrinsic)
         scale = picture.shape[1] / 1280.0
-        labels = _Labels(picture, scale)
+        labels: list[tuple[str, float, float, Color]] = []
         for boxes, width in ((self._seen(ids), 1), (_moving(meta), 2)):
             for box in boxes:
                 lines = _lines(box.corners_m, camera_pose, intrinsic, meta.camera.near_m)
@@ -62,8 +61,8 @@ class Overlay:
                 if box.label and lines:
                     ends = np.array(lines).reshape(-1, 2)
                     text = f"{box.label} {np.linalg.norm(box.center_m - camera_pose[:3, 3]):.1f} m"
-                    labels.add(text, float(ends[:, 0].mean()), float(ends[:, 1].min()), box.color)
-        labels.write()
+                    labels.append((text, float(ends[:, 0].mean()), float(ends[:, 1].min()), box.color))
+        _write_labels(picture, labels, max(0.33, 0.45 * scale))
         return picture
 
     def _seen(self, ids: np.ndarray) -> list[_Box]:
@@ -79,22 +78,18 @@ class Overlay:
             kind, center_m = KIND_NAMES[int(self.box_map.kinds[row])], self.box_map.centers[row]
             corners_m = box_corners(np.zeros(3), self.box_map.half_extents[row]) @ turn.T + center_m
             label = f"{kind} {self.instance_ids[row]}" if place >= len(rows) - MOST_LABELS else ""
-            boxes.append(_Box(corners_m, center_m, _bright(COLORS.get(kind, OTHER_COLOR)), label))
+            color = [round(255 - 0.55 * (255 - value)) for value in COLORS.get(kind, OTHER_COLOR)]  # lighter
+            boxes.append(_Box(corners_m, center_m, color, label))
         return boxes
-
-
-def _bright(color: Color) -> Color:
-    """Return a lighter tone."""
-    return tuple(round(255 - 0.55 * (255 - value)) for value in color)
 
 
 def _moving(meta: FrameMeta) -> list[_Box]:
     """Return the boxes of bystanders, then of the target."""
     boxes = []
     for other in meta.others.others if meta.others else ():
-        corners_m = box_corners(other.world_location, np.array(other.half_extents_m), other.heading_rad)
-        boxes.append(_Box(corners_m, other.world_location, OTHERS_COLOR, str(other.instance_id)))
-    center_m = meta.target.world_location
+        corners_m = box_corners(other.center_m, np.array(other.half_extents_m), other.heading_rad)
+        boxes.append(_Box(corners_m, other.center_m, OTHERS_COLOR, str(other.instance_id)))
+    center_m = meta.target.center_m
     corners_m = box_corners(center_m, np.array(meta.target.half_extents_m))
     return [*boxes, _Box(corners_m, center_m, TARGET_COLOR, f"target {meta.target.instance_id}")]
 
@@ -119,31 +114,20 @@ def _lines(
     return lines
 
 
-class _Labels:
-    """Labels of boxes; later ones have priority, and overlapping ones are skipped."""
-
-    def __init__(self, picture: np.ndarray, scale: float) -> None:
-        self._picture, self._size = picture, max(0.33, 0.45 * scale)
-        self._waiting: list[tuple[str, float, float, Color]] = []
-
-    def add(self, text: str, x: float, y: float, color: Color) -> None:
-        """Add a text over a place, px, if that is in the picture."""
-        height, width = self._picture.shape[:2]
-        if 0 <= x < width and -height / 2 <= y < height:
-            self._waiting.append((text, x, y, color))
-
-    def write(self) -> None:
-        """Draw the labels that do not overlap."""
-        height, width = self._picture.shape[:2]
-        taken: list[tuple[float, float, float, float]] = []
-        for text, x, y, color in reversed(self._waiting):
-            (long, high), _ = cv2.getTextSize(text, FONT, self._size, 1)
-            left = float(np.clip(x - long / 2, 2, max(2, width - long - 2)))
-            base = float(np.clip(y - 4, high + 2, height - 4))
-            own = left - 2, base - high - 2, left + long + 2, base + 3
-            if any(own[0] < t[2] and t[0] < own[2] and own[1] < t[3] and t[1] < own[3] for t in taken):
-                continue
-            taken.append(own)
-            corner, other = (round(own[0]), round(own[1])), (round(own[2]), round(own[3]))
-            cv2.rectangle(self._picture, corner, other, (20, 20, 20), -1)
-            draw_text(self._picture, text, left, base, self._size, color)
+def _write_labels(picture: np.ndarray, labels: list[tuple[str, float, float, Color]], size: float) -> None:
+    """Write texts over places, px, in the picture; later ones have priority, and overlapping ones are skipped."""
+    height, width = picture.shape[:2]
+    taken: list[tuple[float, float, float, float]] = []
+    for text, x, y, color in reversed(labels):
+        if not (0 <= x < width and -height / 2 <= y < height):
+            continue
+        (long, high), _ = cv2.getTextSize(text, FONT, size, 1)
+        left = float(np.clip(x - long / 2, 2, max(2, width - long - 2)))
+        base = float(np.clip(y - 4, high + 2, height - 4))
+        own = left - 2, base - high - 2, left + long + 2, base + 3
+        if any(own[0] < t[2] and t[0] < own[2] and own[1] < t[3] and t[1] < own[3] for t in taken):
+            continue
+        taken.append(own)
+        corner, other = (round(own[0]), round(own[1])), (round(own[2]), round(own[3]))
+        cv2.rectangle(picture, corner, other, (20, 20, 20), -1)
+        draw_text(picture, text, left, base, size, color)

@@ -18,13 +18,11 @@ MOST_BYTES = 32 * 1024 * 1024  # of a request: a region of 100,000 vertices take
 
 
 class Site(Protocol):
-    """A page and the answers to its requests."""
+    """A page and the answers to its requests: a CosflyError is a message for the page, KeyError an unknown name."""
 
-    def page_html(self) -> str:
-        """Return the page."""
+    def page_html(self) -> str: ...
 
-    def answer(self, name: str, data: bytes) -> bytes:
-        """Return the answer to a request; raise CosflyError as a message for the page, KeyError for unknown names."""
+    def answer(self, name: str, data: bytes) -> bytes: ...
 
 
 class PageServer:
@@ -35,10 +33,8 @@ class PageServer:
         try:
             self.http = ThreadingHTTPServer((HOST, port), type("Handler", (_Handler,), {"server_of_page": self}))
         except OSError as error:
-            fix = "pass another --port, or none to use a free one"
-            raise EnvironmentMissing(
-                "the port cannot be opened", where=f"{HOST}:{port}", got=error.strerror, fix=fix
-            ) from None
+            what, fix = "the port cannot be opened", "pass another --port, or none to use a free one"
+            raise EnvironmentMissing(what, where=f"{HOST}:{port}", got=error.strerror, fix=fix) from None
         self.host = f"{HOST}:{self.http.server_address[1]}"
         self.address = f"http://{self.host}/{self.token}/"
 
@@ -56,23 +52,20 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "cosfly", ""
 
     def do_GET(self) -> None:
-        if self._name() == "":
-            self._send(200, self.server_of_page.site.page_html().encode(), "text/html; charset=utf-8")
-        else:
-            self._send(404, b"", "text/plain")
+        if self._name() != "":
+            return self._send(404, b"", "text/plain")
+        self._send(200, self.server_of_page.site.page_html().encode(), "text/html; charset=utf-8")
 
     def do_POST(self) -> None:
         """Answer the page only: other pages in a browser have another origin and do not know the token."""
-        name, length = self._name(), self.headers.get("Content-Length", "")
+        site, name, length = self.server_of_page.site, self._name(), self.headers.get("Content-Length", "")
         if name is None or self.headers.get("Origin") != f"http://{self.server_of_page.host}":
             return self._send(404, b"", "text/plain")
         if not length.isdecimal() or int(length) > MOST_BYTES:
             expected = f"at most {MOST_BYTES} bytes"
             return self._send_error(InputError("the request is too large", got=length, expected=expected))
         try:
-            self._send(
-                200, self.server_of_page.site.answer(name, self.rfile.read(int(length))), "application/octet-stream"
-            )
+            self._send(200, site.answer(name, self.rfile.read(int(length))), "application/octet-stream")
         except CosflyError as error:
             self._send_error(error)
         except KeyError:
@@ -91,9 +84,10 @@ class _Handler(BaseHTTPRequestHandler):
     def _send(self, status: int, data: bytes, kind: str) -> None:
         self.close_connection = True
         self.send_response(status)
-        headers = {"Content-Type": kind, "Content-Length": str(len(data)), "Cache-Control": "no-store"}
-        headers |= {"Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff", "X-Frame-Options": "DENY"}
-        for name, value in headers.items():
+        for name, value in {
+            "Content-Type": kind, "Content-Length": str(len(data)), "Cache-Control": "no-store",
+            "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff", "X-Frame-Options": "DENY",
+        }.items():  # fmt: skip
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(data)

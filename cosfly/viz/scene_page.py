@@ -28,8 +28,8 @@ from cosfly.geometry.grid import occupancy
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.io import write_bytes
+from cosfly.viz.frame_views import PagePictures
 from cosfly.viz.page import page, scripts
-from cosfly.viz.page_pictures import PagePictures
 from cosfly.viz.topview import COLORS, OTHER_COLOR
 
 MB = 1024 * 1024
@@ -98,9 +98,8 @@ def run(
             if path.path_id in known
         ],
     }
-    left = (
-        max_mb * MB - sum(len(str(part)) for part in content.values()) - sum(60 * track.rows.size for track in tracks)
-    )
+    left = max_mb * MB - sum(len(str(part)) for part in content.values())
+    left -= sum(60 * track.rows.size for track in tracks)
     if left < 0:
         fix = "raise --max-mb, or use a simplified map and fewer paths"
         raise InputError("the page is too large", where=map_, expected=f"at most {max_mb:g} MB", fix=fix)
@@ -112,31 +111,25 @@ def run(
         }
         for track in tracks
     ]  # fmt: skip
-    write_bytes(out, page_html(box_map.name, notes, content).encode())
+    script, style = scripts("tools.js", "canvas.js", "space.js", "scene.js"), scripts("scene.css")
+    values: dict[str, Any] = {"title": box_map.name, "notes": notes, "data": content}
+    write_bytes(out, page("cosfly/viz/templates/scene.html", style=style, script=script, **values).encode())
     return out
 
 
-def page_html(name: str, notes: Sequence[str], content: dict[str, Any]) -> str:
-    """Return the page's text."""
-    script = scripts("tools.js", "canvas.js", "space.js", "scene.js")
-    style, template = scripts("scene.css"), "cosfly/viz/templates/scene.html"
-    return page(template, title=name, style=style, script=script, notes=notes, data=content)
+def _page_track(path: str, kind: str, track: DroneTrace | Track, visibility: np.ndarray, **more: Any) -> PageTrack:
+    rows = [track.time_s, track.positions_m, track.rotations_deg[:, :2], track.targets_m, visibility]
+    return PageTrack(path, kind, np.column_stack(rows), **more)
 
 
 def _of_trace(trace: DroneTrace) -> PageTrack:
-    rows = np.column_stack(
-        [trace.time_s, trace.positions_m, trace.rotations_deg[:, :2], trace.targets_m, trace.visibility]
-    )
     figures = {name: value for name, value in trace.metrics.items() if isinstance(value, int | float)}
-    return PageTrack(trace.path_id, trace.planner, rows, figures)
+    return _page_track(trace.path_id, trace.planner, trace, trace.visibility, figures=figures)
 
 
 def _of_drawn(drawn: Track) -> PageTrack:
-    rows = np.column_stack(
-        [drawn.time_s, drawn.positions_m, drawn.rotations_deg[:, :2], drawn.targets_m, drawn.target.visibility]
-    )
-    kind = "clean frames" if drawn.is_original else "perturbed frames"
-    return PageTrack(str(drawn.source.get("scenario_id") or drawn.trajectory), kind, rows, {}, drawn)
+    path, kind = str(drawn.source.get("scenario_id") or drawn.trajectory), "clean" if drawn.is_original else "perturbed"
+    return _page_track(path, f"{kind} frames", drawn, drawn.target.visibility, drawn=drawn)
 
 
 def _packed(values: np.ndarray) -> str:
