@@ -40,7 +40,7 @@ from cosfly.render.person import choose_clothes, draw_appearance, dress_bystande
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import make_track_script, open_renderer, run
-from cosfly.render.track import Writing, render_track
+from cosfly.render.track import render_track
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing
 from cosfly.runtime.io import read_checksums, sha256_file
@@ -344,10 +344,7 @@ def test_frames_hold_what_their_annotation_says(finished):
             assert meta.target.num_pixels == int((ids == PERSON_ID).sum()) > 0
             assert meta.target.visible == bool(flight.target.visible[i])
             assert meta.target.visibility == pytest.approx(flight.target.visibility[i], abs=1e-6)
-            tree_y = json.loads((frame / "meta.json").read_text())["drone_pose"]["y"]
-            assert tree_y == -meta.drone_pose[1] == pytest.approx(-flight.positions_m[i, 1]), (
-                "the tree's axes are CARLA's"
-            )
+            assert meta.drone_pose.y == pytest.approx(-flight.positions_m[i, 1]), "the tree's axes are CARLA's"
             assert meta.look == Look(), "sun and air of the picture"
             assert meta.camera.intrinsic == flight.camera.intrinsic.tolist()
             u, v = flight.target.uv[i]
@@ -386,10 +383,10 @@ def test_a_shift_that_hides_a_seen_target_falls_back(tmp_path):
     """The person walks towards a curtain and through it. Nobody is pushed behind it early; behind it shifts go on."""
     trace, around = circling(60), Surroundings(make_box_map([], [], [], []))
     size = {"width_px": CAMERA.width_px, "height_px": CAMERA.height_px, "fovs_deg": (90.0,)}
-    cfg = RenderConfig(**size, first_timestamp=1_776_000_000)
+    cfg = RenderConfig(**size, first_timestamp=1_776_000_000, modalities=("rgb",))
     script = make_track_script(trace, 0, "perturbed", "T", around, cfg, 1)
     curtain = Curtain(x_m=float(trace.targets_m[30, 0]))
-    flight = render_track(curtain, script, tmp_path, Writing(("rgb",), 0.1))
+    flight = render_track(curtain, script, tmp_path, cfg)
     is_seen = trace.targets_m[:, 0] <= curtain.x_m
     np.testing.assert_array_equal(flight.target.visible | ~is_seen, True)
     states = [point["perturbation"] for point in flight.raw["points"]]

@@ -23,12 +23,11 @@ from cosfly.formats.weather import WeatherParams
 from cosfly.geometry.axes import step_s, wrap_deg
 from cosfly.geometry.kernels import swept_distances
 from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M
-from cosfly.render.camera import contrast_of, legibility
-from cosfly.render.contract import PERSON_ID, Frame
+from cosfly.render.contract import Frame
 from cosfly.render.perturbation import PerturbedTrack, Poses, Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import make_track_script, renderer_of
-from cosfly.render.track import annotation, draw_frame
+from cosfly.render.track import draw_frame, written_target
 from cosfly.render.weather import read_pools, weather_of
 
 RATE_HZ = 20.0  # of the autopilot
@@ -209,14 +208,15 @@ class ClosedLoopTrajectory:
     def _drawn(self, i: int, velocity_mps: np.ndarray, clearance_m: float) -> Moment:
         script, poses = self.script, self.poses
         self.airspace.light(poses.targets_m, None if script.weather is None else script.weather.params)
-        frame, seen = draw_frame(self.airspace.renderer, script, i, poses, self.airspace.cfg.visible_threshold)
-        target = annotation(script, i, seen).target
-        target = target.model_copy(update=legibility(target, contrast_of(frame.rgb, frame.ids == PERSON_ID)))
+        frame, target, others = draw_frame(
+            self.airspace.renderer, script, i, poses, self.airspace.cfg.visible_threshold
+        )
+        target = written_target(target, frame)
         position_m, target_m = poses.positions_m[i].copy(), poses.targets_m[i].copy()
         people = script.others.people(script.clothes.looks) if self.airspace.renderer.dresses else None
-        bystanders = {} if seen.others is None else seen.others.people_of(target_m, people)
+        bystanders = {} if others is None else others.people_of(target_m, people)
         height_m = float(position_m[2] - (target_m[2] - TARGET_HEIGHT_M))
         return Moment(
-            i, float(script.time_s[i]), position_m, poses.rotations_deg[i].copy(), velocity_mps,
+            i, float(script.trace.time_s[i]), position_m, poses.rotations_deg[i].copy(), velocity_mps,
             target_m, target, bystanders, frame, clearance_m, height_m,
         )  # fmt: skip

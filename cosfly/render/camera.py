@@ -13,12 +13,11 @@ from pydantic import Field
 from cosfly.formats.frames import LEGIBLE_CONTRAST, LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE, Camera, TargetMeta
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.segments import Segment
-from cosfly.geometry.axes import box_corners, focal_px, intrinsic_matrix, mask_box, project
+from cosfly.geometry.axes import box_corners, focal_px, mask_box, project
 from cosfly.render.contract import NEAR_M, PERSON_ID, Frame
 from cosfly.runtime.config import Config
 
 DEPTH_TOLERANCE_M = 0.05  # something this little in front of the target's box does not hide it
-NOT_HIDDEN = -1  # no instance id
 NO_IDS = np.empty(0, np.int64)
 RING_LEAST_PX = 4  # around a person, for the contrast of colours
 MOST_SAMPLES = 40_000  # rays through the target's box; more are thinned evenly
@@ -51,27 +50,21 @@ def view_target(target_m: np.ndarray, camera_pose: np.ndarray, camera: Camera) -
     """Project the target's 3D box around its hip point, (3,) world."""
     uv, z = project(np.asarray(target_m)[None], camera_pose, camera.intrinsic)
     corners = box_corners(target_m, np.array(PERSON_HALF_EXTENTS_M))
-    in_camera = (corners - camera_pose[:3, 3]) @ camera_pose[:3, :3]
-    seen = _in_front(in_camera)
+    corners = (corners - camera_pose[:3, 3]) @ camera_pose[:3, :3]
+    seen = [corner for corner in corners if corner[2] >= NEAR_M]  # of the part beyond the near plane
+    for a, b in _EDGES:
+        za, zb = corners[a, 2], corners[b, 2]
+        if (za < NEAR_M) != (zb < NEAR_M):
+            seen.append(corners[a] + (corners[b] - corners[a]) * (NEAR_M - za) / (zb - za))
     box = clipped = np.full(4, np.nan)
-    if len(seen):
-        points = seen @ camera.intrinsic.T
+    if seen:
+        points = np.array(seen) @ camera.intrinsic.T
         points = points[:, :2] / points[:, 2:]
         box = np.array([*points.min(axis=0), *points.max(axis=0)])
         clipped = np.clip(box, 0.0, [camera.width_px, camera.height_px] * 2)
         if (clipped[2:] <= clipped[:2]).any():
             clipped = np.full(4, np.nan)
     return TargetView(uv[0], float(z[0]), box, clipped)
-
-
-def _in_front(corners: np.ndarray) -> np.ndarray:
-    """Return the corners of the part of a box beyond the near plane; corners (8, 3) in camera axes."""
-    points = [corner for corner in corners if corner[2] >= NEAR_M]
-    for a, b in _EDGES:
-        za, zb = corners[a, 2], corners[b, 2]
-        if (za < NEAR_M) != (zb < NEAR_M):
-            points.append(corners[a] + (corners[b] - corners[a]) * (NEAR_M - za) / (zb - za))
-    return np.array(points).reshape(-1, 3)
 
 
 def box_depths(
@@ -107,25 +100,8 @@ def rendered_visibility(
     Returns:
         Score, share that bystanders (`other_ids`) hide, share that the map hides, each in [0, 1].
     """
-    num_rays, hiding = _rays_to_box(frame, target_m, view, camera_pose, camera)
-    if num_rays == 0:
-        return 0.0, 0.0, 0.0
-    num_visible, num_others = int(np.count_nonzero(hiding == NOT_HIDDEN)), int(np.isin(hiding, other_ids).sum())
-    return num_visible / num_rays, num_others / num_rays, (len(hiding) - num_visible - num_others) / num_rays
-
-
-def _rays_to_box(
-    frame: Frame, target_m: np.ndarray, view: TargetView, camera_pose: np.ndarray, camera: Camera
-) -> tuple[int, np.ndarray]:
-    """Cast rays at the target's box through pixel centres.
-
-    Returns:
-        the number of rays that enter the box, also outside the image; and for each inside the image, (k,), the id
-        drawn in front of the box, NOT_HIDDEN where that is nothing or the person.
-    """
-    nothing = 0, NO_IDS
     if not view.in_view:
-        return nothing
+        return 0.0, 0.0, 0.0
     x0, y0, x1, y1 = view.box_px
     # A box that reaches far out of the image needs no ray for every pixel out there.
     stride = max(1.0, float(np.sqrt((x1 - x0) * (y1 - y0) / MOST_SAMPLES)))
@@ -135,11 +111,13 @@ def _rays_to_box(
     near = box_depths(pixels + 0.5, np.asarray(target_m), half_m, camera_pose, camera.intrinsic)
     pixels, near = pixels[np.isfinite(near)].astype(np.int64), near[np.isfinite(near)]
     if len(pixels) == 0:
-        return nothing
+        return 0.0, 0.0, 0.0
     inside = ((pixels >= 0) & (pixels < [camera.width_px, camera.height_px])).all(axis=1)
     at = pixels[inside, 1], pixels[inside, 0]
-    free = (frame.depth[at] >= near[inside] - DEPTH_TOLERANCE_M) | (frame.ids[at] == PERSON_ID)
-    return len(pixels), np.where(free, NOT_HIDDEN, frame.ids[at].astype(np.int64))
+    is_free = (frame.depth[at] >= near[inside] - DEPTH_TOLERANCE_M) | (frame.ids[at] == PERSON_ID)
+    num_free, num_others = np.count_nonzero(is_free), np.count_nonzero(np.isin(frame.ids[at][~is_free], other_ids))
+    num_map = len(is_free) - num_free - num_others
+    return num_free / len(pixels), num_others / len(pixels), num_map / len(pixels)
 
 
 def contrast_of(rgb: np.ndarray, is_person: np.ndarray) -> float | None:
@@ -193,27 +171,6 @@ class ZoomConfig(Config):
     ramp_s: float = Field(4.0, ge=0, description="dynamic: duration of a change of level, s; 0: at once")
 
 
-def cameras_of(
-    size_px: tuple[int, int],
-    first_deg: float,
-    fovs_deg: Sequence[float],
-    zoom: ZoomConfig,
-    time_s: np.ndarray,
-    segments: Sequence[Segment],
-    rng: np.random.Generator,
-) -> tuple[Camera, ...]:
-    """Return the camera of each frame of a trajectory.
-
-    Args:
-        size_px: (width, height). first_deg: The level of the first part. fovs_deg: All levels. time_s: (n,). rng: Draws
-            the levels of the later parts.
-    """
-    if zoom.mode == "fixed":
-        return (Camera(*size_px, intrinsic_matrix(*size_px, first_deg)),) * len(time_s)
-    fovs = zoomed_deg(first_deg, fovs_deg, zoom, time_s, segments, rng)
-    return tuple(Camera(*size_px, intrinsic_matrix(*size_px, fov)) for fov in fovs.tolist())
-
-
 def zoomed_deg(
     first_deg: float,
     fovs_deg: Sequence[float],
@@ -225,8 +182,13 @@ def zoomed_deg(
     """Return fields of view, (n,) degrees, that go from part to part to another level, if there is one.
 
     Within a change the picture grows by equal factors in equal times, with smooth ends.
+
+    Args:
+        first_deg: The level of the first part. fovs_deg: All levels. time_s: (n,). rng: Draws the other levels.
     """
-    begins_s = _begins_s(zoom, time_s, segments)
+    begins_s = np.arange(time_s[0] + zoom.part_s, time_s[-1], zoom.part_s).tolist()
+    if segments:
+        begins_s = [float(time_s[segment.begin]) for segment in segments if segment.begin > 0]
     focal = np.full(len(time_s), np.log(focal_px(1, first_deg)))
     level = first_deg
     for begin_s, end_s in zip(begins_s, [*begins_s, float(time_s[-1])][1:], strict=True):
@@ -237,10 +199,3 @@ def zoomed_deg(
         focal += np.log(focal_px(1, following) / focal_px(1, level)) * share**2 * (3.0 - 2.0 * share)
         level = following
     return np.degrees(2.0 * np.arctan(0.5 / np.exp(focal)))
-
-
-def _begins_s(zoom: ZoomConfig, time_s: np.ndarray, segments: Sequence[Segment]) -> list[float]:
-    """Return the times at which parts begin, without the first."""
-    if segments:
-        return [float(time_s[segment.begin]) for segment in segments if segment.begin > 0]
-    return np.arange(time_s[0] + zoom.part_s, time_s[-1], zoom.part_s).tolist()

@@ -11,26 +11,26 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
 
 from cosfly.formats.boxes import BoxMap, check_ground, read_boxes
 from cosfly.formats.bystanders import Bystander, Bystanders, read_bystanders
-from cosfly.formats.frames import Look
-from cosfly.formats.pedestrian_paths import pace_field
+from cosfly.formats.frames import Camera, Look
 from cosfly.formats.places import place_of, town_folder
 from cosfly.formats.town import IDS_FILE, IDS_FORMAT, write_town_map
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.weather import WeatherRecord
-from cosfly.geometry.axes import step_s
-from cosfly.render.camera import cameras_of
+from cosfly.geometry.axes import intrinsic_matrix, step_s
+from cosfly.render.camera import zoomed_deg
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
 from cosfly.render.person import choose_clothes, dress_bystanders, gait_of
-from cosfly.render.perturbation import PERTURBED, PerturbedTrack, Poses, Surroundings, perturb, rng_of_shifts
+from cosfly.render.perturbation import PERTURBED, PerturbedTrack, Poses, Surroundings, perturb
 from cosfly.render.rim import check_outside_rim, rim_of
 from cosfly.render.settings import RenderConfig
-from cosfly.render.track import TrackScript, Writing, check_track, render_track
+from cosfly.render.track import VARIANTS, TrackScript, check_track, render_track
 from cosfly.render.weather import fog_hides, random_seed, read_pools, weather_of
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, InputError
@@ -50,10 +50,8 @@ RENDERERS = {
     "carla": "cosfly.render.carla_backend:CarlaRenderer",
     "unrealcv": "cosfly.render.unrealcv_backend:UnrealCvRenderer",
 }
-VARIANTS = {"clean": "ORI", "perturbed": PERTURBED}
 TRAJECTORY = "trajectory_"
 FIRST_S, SPAN_S = 1_000_000_000, 999_000_000  # seconds of ten digits, as those of the public release
-ENCODER_THREADS = 2  # of each worker, next to the drawing
 FROM_ONE_RUN = "pass the others.json that was written together with path.json"
 
 
@@ -111,45 +109,39 @@ def make_track_script(
     before_m, step = looks.before_m[:-1], step_s(planned.time_s)
     before_s = trace.time_s[0] - step * np.arange(len(before_m), 0, -1)
     gait = gait_of(np.vstack([before_m, trace.targets_m]), np.concatenate([before_s, trace.time_s]))
-    shared = rng_for(seed, "render", looks.path_id)
+    shared, others_rng, zoom_rng = (
+        rng_for(seed, "render", f"{looks.path_id}{item}") for item in ("", "/others", "/zoom")
+    )
     fov_deg = float(cfg.fovs_deg[int(shared.integers(len(cfg.fovs_deg)))])
     clothes = choose_clothes(shared)
-    drawn_others = [other.every(cfg.frame_stride) for other in others]
-    others_rng = rng_for(seed, "render", f"{looks.path_id}/others")
-    cast = dress_bystanders(drawn_others, trace.time_s, clothes.looks, others_rng)
-    lens_rng = rng_for(seed, "render", f"{looks.path_id}/zoom")
+    cast = dress_bystanders(
+        [other.every(cfg.frame_stride) for other in others], trace.time_s, clothes.looks, others_rng
+    )
     size_px = cfg.width_px, cfg.height_px
-    cameras = cameras_of(size_px, fov_deg, cfg.fovs_deg, cfg.zoom, trace.time_s, trace.segments, lens_rng)
+    fovs_deg = [fov_deg]
+    if cfg.zoom.mode == "dynamic":
+        fovs_deg = zoomed_deg(fov_deg, cfg.fovs_deg, cfg.zoom, trace.time_s, trace.segments, zoom_rng).tolist()
+    cameras = tuple(Camera(*size_px, intrinsic_matrix(*size_px, fov_deg)) for fov_deg in fovs_deg)
+    cameras = cameras if cfg.zoom.mode == "dynamic" else cameras * len(trace.time_s)
     poses = Poses(trace.positions_m, trace.rotations_deg, trace.targets_m, trace.clearances_m)
+    perturbed = PerturbedTrack.unperturbed(poses)
     if track == "perturbed":
-        rng = rng_of_shifts(seed, trace.path_id)
+        rng = rng_for(seed, "render", f"{trace.path_id}/{PERTURBED}")
         perturbed = perturb(poses, cameras, surroundings, cfg.perturbation, rng, cast)
-    else:
-        perturbed = PerturbedTrack.unperturbed(poses)
     return TrackScript(
         town=town,
         trajectory=f"{TRAJECTORY}{cfg.first_timestamp + number}",
         variant=VARIANTS[track],
+        number=number,
+        trace=trace,
+        between=planned.between(cfg.frame_stride),
         cameras=cameras,
-        time_s=trace.time_s,
         perturbed=perturbed,
         gait=gait.since(len(before_m)),
         clothes=clothes,
         others=cast,
         look=cfg.look if weather is None else None,
         weather=weather,
-        is_original=track == "clean",
-        segments=trace.segments,
-        mission=trace.mission,
-        between=planned.between(cfg.frame_stride),
-        source={
-            "path_index": number,
-            "scenario_id": trace.path_id,
-            "scenario_name": town,
-            "algorithm": trace.planner,
-            "clearance_min_m": trace.metrics.get("clearance_min_m"),
-            **pace_field(trace.pace),
-        },
     )
 
 
@@ -193,23 +185,40 @@ def run(
         return out
     check_ground(box_map, boxes)
     all_traces = read_traces(traces)
-    _check_ids(all_traces, traces)
-    passed = _passed(stage, all_traces, cfg.path_index)
-    ids_record = _ids_record(box_map, num_others_of(bystanders_by_path(others, all_traces)))
-    if num_shared := ids_record["num_shared"]:
+    if twice := [path_id for path_id, n in Counter(trace.path_id for trace in all_traces).items() if n > 1]:
+        raise InputError("two trajectories have the same id", where=traces, got=min(twice), expected="unique ids")
+    passed = {n: t for n, t in enumerate(all_traces) if t.drop_reason is None and cfg.path_index in (None, n)}
+    if not passed:
+        tally = Tally(input=len(all_traces), dropped=Counter(str(trace.drop_reason) for trace in all_traces))
+        raise stage.nothing_kept(tally, expected="a trajectory that the planner accepted")
+    num_others = num_others_of(bystanders_by_path(others, all_traces))
+    ids = instance_ids(box_map, num_others)
+    if num_shared := int((ids == SHARED_ID).sum()):
         log.warning("render: %d boxes share the instance id %d: ids have 16 bits", num_shared, SHARED_ID)
-    town, first_timestamp = _names(stage, cfg, box_map.name, traces, others, seed)
-    cfg = cfg.model_copy(update={"first_timestamp": first_timestamp, "weather_seed": _weather_seed(stage, cfg)})
-    nearest_m = {n: np.linalg.norm(trace.positions_m - trace.targets_m, axis=1).min() for n, trace in passed}
-    skies = {n: weather_of(cfg, pools, trace.drawn_as(n).number) for n, trace in passed}
-    if hidden := [trace.path_id for n, trace in passed if fog_hides(skies[n], float(nearest_m[n]))]:
+    town, updates = _names(stage, cfg, box_map.name, traces, others, seed)
+    cfg = cfg.model_copy(update=updates)
+    skies = {n: weather_of(cfg, pools, trace.drawn_as(n).number) for n, trace in passed.items()}
+    nearest_m = {n: np.linalg.norm(t.positions_m - t.targets_m, axis=1).min() for n, t in passed.items()}
+    if hidden := [trace.path_id for n, trace in passed.items() if fog_hides(skies[n], float(nearest_m[n]))]:
         log.warning("render: fog hides the target in all frames of %s: plan nearer, or in other weather", hidden)
-    items = [_item(number, trace.every(cfg.frame_stride), track) for number, trace in passed for track in cfg.tracks]
+    items = [
+        Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track), len(trace.time_s[:: cfg.frame_stride]))
+        for number, trace in passed.items()
+        for track in cfg.tracks
+    ]
     arguments = (cfg, boxes, simplified, traces, others, out, town, seed, min(workers, len(items)))
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="render: frames")
-    ids_file = out / town / IDS_FILE
+    ids_file, map_file = out / town / IDS_FILE, write_town_map(out / town, box_map.header)
+    ids_record = {
+        **IDS_FORMAT.header,
+        "person": PERSON_ID,
+        "shared": SHARED_ID,
+        **({"others": [other_id(number) for number in range(num_others)]} if num_others else {}),
+        "num_shared": num_shared,
+        "are_box_ids": has_own_ids(box_map, num_others),
+        "boxes": [[a, b] for a, b in zip(ids.tolist(), box_map.ids.tolist(), strict=True) if a != SHARED_ID],
+    }
     write_json(ids_file, ids_record, indent=None)
-    map_file = write_town_map(out / town, box_map.header)
     made = [result_of(record, _RenderedTrack) for record in finished.kept]
     outputs = [inside(out, one.folder) / name for one in made for name in ("trajectory.json", CHECKSUMS)]
     stage.finish(
@@ -224,19 +233,6 @@ def run(
         goals=dict(sorted(Counter(one.goal for one in made).items())),
     )
     return out
-
-
-def _item(number: int, trace: DroneTrace, track: str) -> Item:
-    return Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track), len(trace.time_s))
-
-
-def _passed(stage: StageFolder, traces: list[DroneTrace], chosen: int | None) -> list[tuple[int, DroneTrace]]:
-    """Return the trajectories to draw, all or the chosen one, each with its number."""
-    passed = [(n, trace) for n, trace in enumerate(traces) if trace.drop_reason is None and chosen in (None, n)]
-    if not passed:
-        tally = Tally(input=len(traces), dropped=Counter(str(trace.drop_reason) for trace in traces))
-        raise stage.nothing_kept(tally, expected="a trajectory that the planner accepted")
-    return passed
 
 
 class _RenderedTrack(BaseModel):
@@ -270,48 +266,26 @@ def num_others_of(bystanders: dict[str, Bystanders]) -> int:
 
 def _names(
     stage: StageFolder, cfg: RenderConfig, map_name: str, traces: Path, others: Path | None, seed: int
-) -> tuple[str, int]:
-    """Return the town's folder and the number of the first trajectory; a resumed tree keeps its own."""
-    numbers = {trace.path_id: number for number, trace in enumerate(read_traces(traces))}
-    for record in stage.items():
-        number = numbers.get(record.id.rpartition("/")[0])
-        if isinstance(record, Kept) and number is not None:
-            place = place_of(Path(result_of(record, _RenderedTrack).folder))
-            return place.town, int(place.trajectory.removeprefix(TRAJECTORY)) - number
-    town = town_folder(cfg.town or map_name)
-    of_others = [] if others is None else [fingerprint(others)]
-    settings = cfg.recorded()
+) -> tuple[str, dict[str, int]]:
+    """Return the town's folder, and the settings that name the first trajectory and seed the weather; a resumed tree
+    keeps its own."""
+    town, settings = town_folder(cfg.town or map_name), cfg.recorded()
     del settings["depth_format"]  # poses are the same in either
-    what = dump_json([town, seed, fingerprint(traces), settings, *of_others])
-    derived = FIRST_S + int(sha256_bytes(what.encode()), 16) % SPAN_S
-    return town, derived if cfg.first_timestamp is None else cfg.first_timestamp
-
-
-def _weather_seed(stage: StageFolder, cfg: RenderConfig) -> int:
-    """Return the seed of the weather; a resumed tree keeps the one that was drawn."""
-    if cfg.weather_seed >= 0:
-        return cfg.weather_seed
-    begun = (result_of(record, _RenderedTrack).weather_seed for record in stage.items() if isinstance(record, Kept))
-    return next((seed for seed in begun if seed is not None), None) or random_seed()
-
-
-def _check_ids(traces: list[DroneTrace], path: Path) -> None:
-    if twice := sorted(i for i, n in Counter(trace.path_id for trace in traces).items() if n > 1):
-        raise InputError("two trajectories have the same id", where=path, got=twice[0], expected="unique ids")
-
-
-def _ids_record(box_map: BoxMap, num_others: int) -> dict:
-    """Return the content of the ids file: rows of (instance id, box id), and the ids of bystanders."""
-    ids = instance_ids(box_map, num_others)
-    return {
-        **IDS_FORMAT.header,
-        "person": PERSON_ID,
-        "shared": SHARED_ID,
-        **({"others": [other_id(number) for number in range(num_others)]} if num_others else {}),
-        "num_shared": int((ids == SHARED_ID).sum()),
-        "are_box_ids": has_own_ids(box_map, num_others),
-        "boxes": [[int(a), int(b)] for a, b in zip(ids, box_map.ids, strict=True) if a != SHARED_ID],
-    }
+    named_by = [town, seed, fingerprint(traces), settings, *([] if others is None else [fingerprint(others)])]
+    first, weather_seed = cfg.first_timestamp, cfg.weather_seed
+    if first is None:
+        first = FIRST_S + int(sha256_bytes(dump_json(named_by).encode()), 16) % SPAN_S
+    numbers = {trace.path_id: number for number, trace in enumerate(read_traces(traces))}
+    begun = [(numbers.get(one.id.rpartition("/")[0]), one) for one in stage.items() if isinstance(one, Kept)]
+    kept = [(number, result_of(one, _RenderedTrack)) for number, one in begun if number is not None]
+    if kept:
+        place = place_of(Path(kept[0][1].folder))
+        town, first = place.town, int(place.trajectory.removeprefix(TRAJECTORY)) - kept[0][0]
+    if weather_seed < 0:
+        weather_seed = (
+            next((one.weather_seed for _, one in kept if one.weather_seed is not None), None) or random_seed()
+        )
+    return town, {"first_timestamp": first, "weather_seed": weather_seed}
 
 
 def make_worker(
@@ -335,7 +309,6 @@ def make_worker(
     box_map, pools = read_boxes(boxes), read_pools(cfg)
     renderer = renderer_of(cfg, box_map, seed, num_others)
     overlay = Overlay(box_map, instance_ids(box_map, num_others)) if cfg.debug else None
-    writing = Writing(tuple(cfg.modalities), cfg.visible_threshold, cfg.depth_format, overlay)
 
     def work(item: Item) -> Outcome:
         number, track = item.payload
@@ -343,27 +316,28 @@ def make_worker(
         check_track(trace, surroundings)
         if cfg.rim:
             check_outside_rim(trace, box_map)
-        others_here = bystanders[trace.path_id].others if bystanders else ()
         weather = weather_of(cfg, pools, trace.drawn_as(number).number)
-        weather_result = {} if weather is None else {
-            "weather": weather.weather_name, "time_of_day": weather.tod_name, "weather_seed": cfg.weather_seed
-        }  # fmt: skip
+        others_here = bystanders[trace.path_id].others if bystanders else ()
         script = make_track_script(trace, number, track, town, surroundings, cfg, seed, others_here, weather)
         folder = out / town / script.trajectory / script.variant
         with atomic_folder(folder) as unfinished:
-            made = render_track(renderer, script, unfinished, writing, ENCODER_THREADS)
-        return Outcome(
-            {
-                "folder": str(folder.relative_to(out)),
-                "num_frames": len(made),
-                "fov_deg": round(made.camera.fov_deg, 6),
-                **({} if made.intrinsics is None else {"fovs_deg": [round(fov, 6) for fov in made.fovs_deg]}),
-                "num_visible": int(made.target.visible.sum()),
-                "mean_visibility": round(float(made.target.visibility.mean()), 6),
-                "num_perturbed": int(made.perturbation.is_perturbed.sum()),
-                "goal": made.raw["goal"]["absent"] if made.goal is None else "told",
-                **weather_result,
-            }
-        )
+            made = render_track(renderer, script, unfinished, cfg, overlay)
+        result: dict[str, Any] = {
+            "folder": str(folder.relative_to(out)),
+            "num_frames": len(made),
+            "fov_deg": round(made.camera.fov_deg, 6),
+        }
+        if made.intrinsics is not None:
+            result["fovs_deg"] = [round(fov, 6) for fov in made.fovs_deg]
+        result |= {
+            "num_visible": int(made.target.visible.sum()),
+            "mean_visibility": round(float(made.target.visibility.mean()), 6),
+            "num_perturbed": int(made.perturbation.is_perturbed.sum()),
+            "goal": made.raw["goal"]["absent"] if made.goal is None else "told",
+        }
+        if weather is not None:
+            names = {"weather": weather.weather_name, "time_of_day": weather.tod_name}
+            result |= names | {"weather_seed": cfg.weather_seed}
+        return Outcome(result)
 
     return work

@@ -44,7 +44,7 @@ from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import make_track_script, open_renderer
-from cosfly.render.track import MARGIN_M, Writing, render_track
+from cosfly.render.track import MARGIN_M, render_track
 from cosfly.runtime.events import read_events
 from cosfly.runtime.run_dir import read_manifest
 
@@ -62,19 +62,17 @@ from cosfly.formats.boxes import read_boxes
 from cosfly.formats.traces import read_traces
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import make_track_script, open_renderer
-from cosfly.render.track import Writing, render_track
+from cosfly.render.track import render_track
 boxes, traces, out, number = *map(Path, sys.argv[1:4]), int(sys.argv[4])
 cfg = RenderConfig(fovs_deg=(90.0,), first_timestamp=1776000000)
 trace = read_traces(traces)[number]
 renderer = open_renderer("gl", read_boxes(boxes), cfg.width_px, cfg.height_px)
-settings = [cfg.visible_threshold]
-writing = Writing(tuple(cfg.modalities), *settings)
 script = make_track_script(trace, number, "clean", "Town", None, cfg, 0)
 with tempfile.TemporaryDirectory() as scratch:
-    render_track(renderer, script, Path(scratch), writing)  # compiles; nothing of it is counted
+    render_track(renderer, script, Path(scratch), cfg)  # compiles; nothing of it is counted
 used_s, start_s = time.process_time(), time.perf_counter()
 (out / str(number)).mkdir()
-count = len(render_track(renderer, script, out / str(number), writing))
+count = len(render_track(renderer, script, out / str(number), cfg))
 print(json.dumps([count, time.process_time() - used_s, time.perf_counter() - start_s]))
 """
 
@@ -243,12 +241,11 @@ def memory(num_frames: int) -> list[list[Any]]:
     trace = plan_trajectory(walk, obstacle_index(simple), cfg, scenes.SEED)
     small = RenderConfig(width_px=160, height_px=90, fovs_deg=(90.0,), first_timestamp=1776000000)
     renderer = open_renderer("gl", box_map, small.width_px, small.height_px)
-    writing = Writing(tuple(small.modalities), small.visible_threshold)
     rows, done = [], 0
     while done < num_frames:
         script = make_track_script(trace, 0, "clean", "Town", Surroundings(simple), small, 0)
         with tempfile.TemporaryDirectory() as scratch:
-            done += len(render_track(renderer, script, Path(scratch), writing))
+            done += len(render_track(renderer, script, Path(scratch), small))
         if not rows or done - rows[-1][0] >= num_frames // 10:
             rows.append([done, resident_mib()])
     return [[count, mib, 100.0 * (mib / rows[min(1, len(rows) - 1)][1] - 1.0)] for count, mib in rows]
