@@ -6,7 +6,6 @@ Works on a GPU and on the CPU (llvmpipe). Depth is written by the shader as floa
 from __future__ import annotations
 
 import weakref
-from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -16,23 +15,12 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import SKY_DEPTH_M, Look
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import WeatherParams
-from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Frame, PosedBystander, PosedPerson, check_pose, far_as_sky
+from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Frame, Others, PosedPerson, check_pose, far_as_sky
 from cosfly.render.figure import figure_of
-from cosfly.render.gl import meshes, movers
-from cosfly.render.gl import parts as part_tables
-from cosfly.render.gl.parts import PART
-from cosfly.render.gl.programs import (
-    LooseTriangles,
-    Programs,
-    attributes,
-    open_context,
-    packed,
-    programs_of,
-    set_uniform,
-    sources,
-)
+from cosfly.render.gl import meshes, movers, programs
+from cosfly.render.gl.parts import DRAW_ORDER, NUM_MATERIALS, PART, CameraView, materials_of
+from cosfly.render.gl.programs import LooseTriangles, Programs, set_uniform
 from cosfly.render.gl.scene import build_scene
-from cosfly.render.gl.view import CameraView
 from cosfly.render.gl.weather_pass import WeatherPass, defines
 from cosfly.runtime.worker import return_freed_memory
 
@@ -59,7 +47,7 @@ class GlRenderer:
     def __init__(
         self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0, rim: BoxMap | None = None
     ) -> None:
-        self.context = open_context()
+        self.context = programs.open_context()
         self._release = weakref.finalize(self, _release, self.context)  # closed or not
         self._release.atexit = False
         driver = (str(self.context.info[f"GL_{name}"]) for name in ("VENDOR", "RENDERER", "VERSION"))
@@ -68,7 +56,8 @@ class GlRenderer:
         self.scene, self.look, self.num_others = build_scene(box_map, num_others, rim), look, num_others
         self.width_px, self.height_px = width_px, height_px
         with self.context:
-            self._depth_program = self.context.program(*sources(("part.glsl", "depth.vert.glsl"), ("depth.frag.glsl",)))
+            texts = programs.sources(("part.glsl", "depth.vert.glsl"), ("depth.frag.glsl",))
+            self._depth_program = self.context.program(*texts)
             self._make_targets()
             self._make_meshes()
             self._looks: dict[str | None, tuple[Programs, Any, WeatherPass | None]] = {}
@@ -80,11 +69,10 @@ class GlRenderer:
     def _use_weather(self, define: str | None) -> None:
         """Switch to the programs of fair weather (None), or of a weather with these defines."""
         if define not in self._looks:
-            programs = programs_of(self.context, define, snaps=not self._is_software)
-            weather = None
+            made, weather = programs.programs_of(self.context, define, snaps=not self._is_software), None
             if define is not None:
-                weather = WeatherPass(self.context, self._color, self._depth, programs.rain, self.num_others)
-            self._looks[define] = programs, self.context.vertex_array(programs.sky, []), weather
+                weather = WeatherPass(self.context, self._color, self._depth, made.rain, self.num_others)
+            self._looks[define] = made, self.context.vertex_array(made.sky, []), weather
         self._programs, self._sky, self._weather = self._looks[define]
 
     def _make_targets(self) -> None:
@@ -95,36 +83,34 @@ class GlRenderer:
         self._image = context.framebuffer([self._color, self._depth, self._tags], context.depth_renderbuffer(size))
         self._shadow = context.depth_texture((SHADOW_SIZE_PX, SHADOW_SIZE_PX))
         self._shadow.compare_func = "<="
-        self._shadow.repeat_x = self._shadow.repeat_y = False
         self._shadow_target = context.framebuffer(depth_attachment=self._shadow)
         self._height = context.texture((HEIGHT_SIZE_PX, HEIGHT_SIZE_PX), 1, dtype="f4")
-        self._height.repeat_x = self._height.repeat_y = False
-        self._height.filter = (self.context.NEAREST, self.context.NEAREST)  # it is smooth already, and this is faster
+        self._height.filter = (context.NEAREST, context.NEAREST)  # it is smooth already, and this is faster
+        for texture in (self._shadow, self._height):
+            texture.repeat_x = texture.repeat_y = False
 
     def _make_meshes(self) -> None:
         """Upload vertices and triangles of every mesh; vertex arrays are made when needed."""
+        all_meshes = meshes.all_meshes()
         self._meshes = [
-            (self.context.buffer(mesh.vertices.tobytes()), self.context.buffer(mesh.triangles.tobytes()))
-            for mesh in meshes.all_meshes()
+            tuple(self.context.buffer(part.tobytes()) for part in (mesh.vertices, mesh.triangles))
+            for mesh in all_meshes
         ]
-        self._num_triangles = [len(mesh.triangles) for mesh in meshes.all_meshes()]
+        self._num_triangles = [len(mesh.triangles) for mesh in all_meshes]
         self._num_waiting = 0
         self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}
-        self._solids = LooseTriangles(self.context, self.scene.solids)
-        self._loose = LooseTriangles(self.context, self.scene.draped), self._solids
+        self._loose = LooseTriangles(self.context, self.scene.loose)
 
     def _array(self, program: Any, mesh: int) -> tuple[Any, Any]:
         """Return vertex array and instance buffer of a program for a mesh."""
         if (program.glo, mesh) not in self._arrays:
             vertices, triangles = self._meshes[mesh]
             instances = self.context.buffer(reserve=PART.itemsize, dynamic=True)
+            names = ("in_center", "in_half", "in_quaternion", "in_color", "in_tag", "in_bias")
             content = [
-                attributes(program, vertices, "3f 3f", ("in_position", "in_normal")),
-                attributes(
-                    program, instances, "3f 3f 4f 4f 1u 1f /i",
-                    ("in_center", "in_half", "in_quaternion", "in_color", "in_tag", "in_bias"),
-                ),
-            ]  # fmt: skip
+                programs.attributes(program, vertices, "3f 3f", ("in_position", "in_normal")),
+                programs.attributes(program, instances, "3f 3f 4f 4f 1u 1f /i", names),
+            ]
             array = self.context.vertex_array(program, content, index_buffer=triangles)
             self._arrays[program.glo, mesh] = array, instances
         return self._arrays[program.glo, mesh]
@@ -132,43 +118,45 @@ class GlRenderer:
     # --- one trajectory ---
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
-        """Compute sun shadows and sky openness for an area of the world, (3,) corners, and set the weather."""
-        self._settle(np.asarray(low_m), np.asarray(high_m))
-        low, high = np.asarray(low_m) - self.origin_m, np.asarray(high_m) - self.origin_m
-        middle = (low + high) / 2.0
-        half = float(np.clip((high - low)[:2].max() / 2.0, 20.0, LARGEST_SHADOW_AREA_M / 2.0))
-        parts = self._parts
-        near = (np.abs(parts.object_centers[:, :2] - middle[:2]) < half * 2.0 + parts.object_radii[:, None]).all(axis=1)
-        casting = np.flatnonzero(near & (parts.max_px > 1e8))
-        with self.context:
-            self._use_weather(None if weather is None else defines(weather))
-            for loose in self._loose:
-                loose.place(self.origin_m - self.scene.origin_m)
-            if self._weather is not None and weather is not None:
-                lamps = self.scene.lamps - (self.origin_m - self.scene.origin_m)
-                self._weather.prepare(weather, parts, lamps, middle, half)
-            self._sun = self.look.sun_direction() if self._weather is None else self._weather.sun_direction
-            centers, radii = self._solids.centers, self._solids.radii
-            near_solids = (np.abs(centers[:, :2] - middle[:2]) < half * 2.0 + radii[:, None]).all(axis=1)
-            centers = np.concatenate([parts.object_centers[casting], centers[near_solids]])
-            radii = np.concatenate([parts.object_radii[casting], radii[near_solids]])
-            self._solids.see(None)
-            self._prepare_shadow(casting, centers, radii, middle, half)
-            top = float((centers[:, 2] + radii).max(initial=self.scene.plane_z_m - self.origin_m[2])) + 1.0
-            self._prepare_openness(casting, top, middle, half)
+        """Compute sun shadows and sky openness for an area of the world, (3,) corners, and set the weather.
 
-    def _settle(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
-        """Select the parts that a camera within these corners can see, and move the origin near it.
-
-        Each frame tests all selected parts, and kilometres from the origin float32 resolves a millimetre only.
+        Each frame tests all parts that a camera within the corners can see, and kilometres from the origin float32
+        resolves a millimetre only: so these parts are selected, and the origin is moved near them.
         """
+        low_m, high_m = np.asarray(low_m), np.asarray(high_m)
         parts, zero = self.scene.parts, self.scene.origin_m
         outside = np.maximum(low_m - zero - parts.object_centers, parts.object_centers - (high_m - zero))
         away_m = np.linalg.norm(np.maximum(outside, 0.0), axis=1) - parts.object_radii
-        steps = np.round(((low_m + high_m) / 2.0 - zero) / ORIGIN_STEP_M) * [1.0, 1.0, 0.0]
-        self.origin_m = zero + steps * ORIGIN_STEP_M
-        self._parts = parts.select(away_m < FAR_M).about(steps * ORIGIN_STEP_M)
-        self._groups = _groups(self._parts.records, self._parts.mesh)
+        shift_m = np.round(((low_m + high_m) / 2.0 - zero) / ORIGIN_STEP_M) * [1.0, 1.0, 0.0] * ORIGIN_STEP_M
+        self.origin_m = zero + shift_m
+        self._parts = parts = parts.select(away_m < FAR_M).about(shift_m)
+        self._groups = _groups(parts.records, parts.mesh)
+        low, high = low_m - self.origin_m, high_m - self.origin_m
+        middle = (low + high) / 2.0
+        half = float(np.clip((high - low)[:2].max() / 2.0, 20.0, LARGEST_SHADOW_AREA_M / 2.0))
+
+        def are_near(centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
+            return (np.abs(centers[:, :2] - middle[:2]) < half * 2.0 + radii[:, None]).all(axis=1)
+
+        casting = np.flatnonzero(are_near(parts.object_centers, parts.object_radii) & (parts.max_px > 1e8))
+        with self.context:
+            self._use_weather(None if weather is None else defines(weather))
+            self._loose.place(self.origin_m - zero)
+            if self._weather is not None and weather is not None:
+                self._weather.prepare(weather, parts, self.scene.lamps - (self.origin_m - zero), middle, half)
+            self._sun = self.look.sun_direction() if self._weather is None else self._weather.sun_direction
+            near = are_near(self._loose.centers, self._loose.radii)
+            centers = np.concatenate([parts.object_centers[casting], self._loose.centers[near]])
+            radii = np.concatenate([parts.object_radii[casting], self._loose.radii[near]])
+            self._loose.see(None)
+            self._prepare_shadow(casting, centers, radii, middle, half)
+            top = float((centers[:, 2] + radii).max(initial=self._ground_z)) + 1.0
+            self._prepare_openness(casting, top, middle, half)
+
+    @property
+    def _ground_z(self) -> np.float64:
+        """Return the height of the ground plane relative to the origin; float32 arrays become float64 by it."""
+        return self.scene.plane_z_m - self.origin_m[2]
 
     def _prepare_shadow(
         self, casting: np.ndarray, centers: np.ndarray, radii: np.ndarray, middle: np.ndarray, half: float
@@ -178,8 +166,7 @@ class GlRenderer:
         side = np.cross([0.0, 0.0, 1.0], sun)
         side /= np.linalg.norm(side)
         axes = np.stack([side, np.cross(sun, side), -sun])  # rows: right, up, away from the sun
-        away = np.abs((centers - middle) @ sun)
-        depth_half = float((away + radii).max(initial=half))  # towers cast from afar
+        depth_half = float((np.abs((centers - middle) @ sun) + radii).max(initial=half))  # towers cast from afar
         clip_from_world = np.eye(4)
         clip_from_world[:3, :3] = axes / np.array([[half * 1.1], [half * 1.1], [depth_half]])
         clip_from_world[:3, 3] = -clip_from_world[:3, :3] @ middle
@@ -192,33 +179,26 @@ class GlRenderer:
 
     def _prepare_openness(self, casting: np.ndarray, top: float, middle: np.ndarray, half: float) -> None:
         """Draw a blurred height map from above: higher objects nearby darken a point. top: no caster is higher."""
-        ground_z = self.scene.plane_z_m - self.origin_m[2]
-        depth_m = top - ground_z + 10.0
+        depth_m, low, pixel_m = top - self._ground_z + 10.0, middle[:2] - half, 2.0 * half / HEIGHT_SIZE_PX
         clip_from_world = np.diag([1.0 / half, 1.0 / half, -2.0 / depth_m, 1.0])
         clip_from_world[:3, 3] = -middle[0] / half, -middle[1] / half, 2.0 * top / depth_m - 1.0
         texture = self.context.depth_texture((HEIGHT_SIZE_PX, HEIGHT_SIZE_PX))
         target = self.context.framebuffer(depth_attachment=texture)
         self._draw_depth(target, clip_from_world, casting)
         share = np.frombuffer(texture.read(alignment=1), np.float32).reshape(HEIGHT_SIZE_PX, HEIGHT_SIZE_PX)
-        heights = (top - share * depth_m).astype(np.float32)
-        base = self._ground_z(middle[:2] - half, 2.0 * half / HEIGHT_SIZE_PX)
-        heights = np.where(share >= 1.0, base, heights)
-        heights = np.minimum(heights, base + TALLEST_AMBIENT_M).astype(np.float32)
-        sigma_px = AMBIENT_BLUR_M / (2.0 * half / HEIGHT_SIZE_PX)
-        self._height.write(np.ascontiguousarray(cv2.GaussianBlur(heights, (0, 0), max(sigma_px, 0.5))).tobytes())
         target.release()
         texture.release()
-        low = middle[:2] - half
+        base: np.ndarray | float = self._ground_z
+        if not self.scene.ground.is_flat:
+            x, y = (low[k] + self.origin_m[k] + pixel_m * (np.arange(HEIGHT_SIZE_PX) + 0.5) for k in (0, 1))
+            places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+            base = self.scene.ground.height_at(places).reshape(HEIGHT_SIZE_PX, HEIGHT_SIZE_PX) - self.origin_m[2]
+        heights = np.where(share >= 1.0, base, (top - share * depth_m).astype(np.float32))
+        heights = np.minimum(heights, base + TALLEST_AMBIENT_M).astype(np.float32)
+        heights = cv2.GaussianBlur(heights, (0, 0), max(AMBIENT_BLUR_M / pixel_m, 0.5))
+        self._height.write(np.ascontiguousarray(heights).tobytes())
         for program in (*self._programs.materials, *self._programs.near_movers):
             set_uniform(program, "height_area", np.array([*low, 0.5 / half, 0.5 / half]))
-
-    def _ground_z(self, low: np.ndarray, pixel_m: float) -> np.ndarray | float:
-        """Return the height of the ground over the openness map, relative to the origin; a number where it is flat."""
-        if self.scene.ground.is_flat:
-            return self.scene.plane_z_m - self.origin_m[2]
-        x, y = (low[axis] + self.origin_m[axis] + pixel_m * (np.arange(HEIGHT_SIZE_PX) + 0.5) for axis in (0, 1))
-        places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        return self.scene.ground.height_at(places).reshape(HEIGHT_SIZE_PX, HEIGHT_SIZE_PX) - self.origin_m[2]
 
     def _draw_depth(self, target: Any, clip_from_world: np.ndarray, rows: np.ndarray) -> None:
         target.use()
@@ -227,34 +207,32 @@ class GlRenderer:
         set_uniform(self._depth_program, "clip_from_world", clip_from_world)
         for mesh in range(len(self._meshes)):
             self._draw(self._depth_program, mesh, self._parts.records[rows[self._parts.mesh[rows] == mesh]])
-        self._solids.draw_all(self._depth_program)
+        self._loose.draw_shadows(self._depth_program)
 
     # --- one frame ---
 
     def render(
-        self,
-        camera_pose: np.ndarray,
-        intrinsic: np.ndarray,
-        person: PosedPerson | None,
-        others: Sequence[PosedBystander] = (),
+        self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None, others: Others = ()
     ) -> Frame:
         """Draw one frame, as the contract says."""
         check_pose(camera_pose, intrinsic)
         figure = None if person is None else figure_of(person)
-        view = CameraView(
-            camera_pose[:3, :3], camera_pose[:3, 3] - self.origin_m, intrinsic, self.width_px, self.height_px
-        )
+        size_px, eye = (self.width_px, self.height_px), camera_pose[:3, 3] - self.origin_m
+        view = CameraView(camera_pose[:3, :3], eye, intrinsic, *size_px)
         moving = [] if figure is None else [movers.figure_parts(figure, PERSON_ID, self.origin_m)]
         moving += movers.draw_bystanders(others, self.origin_m, view)
-        bones = np.zeros((0, 2, 4), np.float32) if figure is None else movers.bones_of(figure, self.origin_m)
+        bones = np.zeros((0, 2, 4), np.float32)
+        if figure is not None:
+            bones = np.zeros((len(figure.bones_m), 2, 4), np.float32)
+            bones[..., :3], bones[:, 0, 3] = figure.bones_m - self.origin_m, figure.bone_radii_m
         capsules = movers.capsules_of(others, self.origin_m, view)
         has_headlights = self._weather is not None and self._weather.has_lights
         shades = movers.shades_of(bones, capsules, self._sun, view, has_headlights)
-        frame_values = {} if self._weather is None else self._weather.frame_values(view.eye, camera_pose, person)
+        uniforms = self._uniforms(view, camera_pose, person)
         with self.context:
-            self._set_camera(self._programs.materials, view, frame_values)
+            self._set_uniforms(self._programs.materials, uniforms)
             rows = view.rows(self._parts)
-            self._solids.see(view)
+            self._loose.see(view)
             self._image.use()
             self._image.clear(depth=1.0)
             self.context.enable_only(self.context.DEPTH_TEST | self.context.CULL_FACE)
@@ -266,30 +244,24 @@ class GlRenderer:
                 self._weather.use()
             self._draw_scene(self._programs.materials, rows, moving)
             if shades:
-                self._set_camera(self._programs.near_movers, view, frame_values)
                 center = np.zeros(3) if person is None else person.hip_m - self.origin_m
-                for program in self._programs.near_movers:
-                    set_uniform(program, "person_center", center)
+                self._set_uniforms(self._programs.near_movers, uniforms | {"person_center": center})
             for shade in shades:
                 self._draw_shaded(shade, bones, rows, moving)
             # Clearing targets of mixed types leaves garbage: the sky's triangle writes all three where nothing is.
             self.context.disable(self.context.CULL_FACE)
             self._sky.render(vertices=3)
             if self._weather is not None:
-                self._weather.draw_rain(self._lens(view) | frame_values)
+                self._weather.draw_rain(uniforms)
             return self._read()
 
-    def _lens(self, view: CameraView) -> dict[str, Any]:
+    def _uniforms(self, view: CameraView, camera_pose: np.ndarray, person: PosedPerson | None) -> dict[str, Any]:
+        """Return the uniforms of a frame; those of a weather replace those of the look."""
+        of_weather = {} if self._weather is None else self._weather.frame_values(view.eye, camera_pose, person)
         return {
             "lens": np.array([*np.diag(view.intrinsic)[:2], *view.intrinsic[:2, 2]]),
             "image_size": np.array([self.width_px, self.height_px]),
             "world_from_camera": view.world_from_camera,
-        }
-
-    def _set_camera(self, programs: list[Any], view: CameraView, frame_values: dict[str, Any]) -> None:
-        """Set the uniforms of a frame; frame_values: of the weather, instead of the look's."""
-        common = {
-            **self._lens(view),
             "sun_direction": self._sun,
             "haze_m": self.look.haze_m,
             "exposure": self.look.exposure,
@@ -297,26 +269,27 @@ class GlRenderer:
             "camera_from_world": view.world_from_camera.T,
             "camera_position": view.eye,
             "world_offset": np.mod(self.origin_m[:2], PATTERN_M),
-            "ground_z": self.scene.plane_z_m - self.origin_m[2],
+            "ground_z": self._ground_z,
             "shadow_map": 0,
             "height_map": 1,
             "sky_depth_m": SKY_DEPTH_M,
             "sky_tag": KINDS["Sky"],
-            **frame_values,
+            **of_weather,
         }
-        bytes_of = {name: packed(value) for name, value in common.items()}
-        for program in (*programs, self._programs.sky):
-            for name, value in bytes_of.items():
-                set_uniform(program, name, value)
+
+    def _set_uniforms(self, materials: list[Any], values: dict[str, Any]) -> None:
+        """Set the uniforms of the sky and of one program for each material."""
+        for name, value in values.items():
+            packed = programs.packed(value)
+            for program in (*materials, self._programs.sky):
+                set_uniform(program, name, packed)
 
     def _draw_shaded(
         self, shade: movers.Shade, bones: np.ndarray, rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]
     ) -> None:
         """Draw a rectangle again, with the shadows of movers."""
-        center, radius = shade.sphere()
-        person = bones if shade.has_person else bones[:0]
         for name, count, most, capsules in (
-            ("person_bones", "person_num_bones", MAX_BONES, person),
+            ("person_bones", "person_num_bones", MAX_BONES, bones if shade.has_person else bones[:0]),
             ("other_bones", "num_others", movers.MOST_CAPSULES, shade.capsules),
         ):
             padded = np.zeros((most, 2, 4), np.float32)
@@ -324,27 +297,28 @@ class GlRenderer:
             for program in self._programs.near_movers:
                 set_uniform(program, name, padded.tobytes())
                 set_uniform(program, count, len(capsules))
-        parts = self._parts
-        away = np.linalg.norm(parts.object_centers[rows] - center, axis=1) - parts.object_radii[rows]
+        # A sphere around all that is darkened.
+        center = (shade.points.min(axis=0) + shade.points.max(axis=0)) / 2.0
+        radius = float(np.linalg.norm(shade.points - center, axis=1).max())
+        away = np.linalg.norm(self._parts.object_centers[rows] - center, axis=1) - self._parts.object_radii[rows]
         near = [part for part in moving if np.linalg.norm(part[0]["center"][0] - center) < radius + MOVER_M]
         x0, y0, x1, y1 = shade.rectangle_px
         self._image.scissor = x0, y0, x1 - x0, y1 - y0
         self._draw_scene(self._programs.near_movers, rows[away < radius], near)
         self._image.scissor = None
 
-    def _draw_scene(self, programs: list[Any], rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]) -> None:
+    def _draw_scene(self, materials: list[Any], rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]) -> None:
         """Draw the ground last, and near before far. moving: records and meshes."""
         records = np.concatenate([*(part for part, _ in moving), self._parts.records[rows]])
         groups = np.concatenate([*(_groups(part, mesh) for part, mesh in moving), self._groups[rows]])
         order = np.argsort(groups, kind="stable")
         records = records[order]
-        starts = np.searchsorted(groups[order], np.arange(part_tables.NUM_MATERIALS * MESH_STRIDE + 1))
-        for material in part_tables.DRAW_ORDER:
+        starts = np.searchsorted(groups[order], np.arange(NUM_MATERIALS * MESH_STRIDE + 1))
+        for material in DRAW_ORDER:
             for mesh in range(len(self._meshes)):
                 group = material * MESH_STRIDE + mesh
-                self._draw(programs[material], mesh, records[starts[group] : starts[group + 1]])
-            for loose in self._loose:
-                loose.draw(programs[material], material)
+                self._draw(materials[material], mesh, records[starts[group] : starts[group + 1]])
+            self._loose.draw(materials[material], material)
 
     def _draw(self, program: Any, mesh: int, records: np.ndarray) -> None:
         if len(records) == 0:
@@ -360,8 +334,7 @@ class GlRenderer:
 
     def _read(self) -> Frame:
         shape = (self.height_px, self.width_px)
-        color = np.empty((*shape, 4), np.uint8)
-        depth, tag = np.empty(shape, np.float32), np.empty(shape, np.uint32)
+        color, depth, tag = np.empty((*shape, 4), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.uint32)
         self._image.read_into(color, components=4, attachment=0)
         self._image.read_into(depth, components=1, attachment=1, dtype="f4")
         self._image.read_into(tag, components=1, attachment=2, dtype="u4")
@@ -389,4 +362,4 @@ def smoothed(rgb: np.ndarray) -> np.ndarray:
 
 def _groups(records: np.ndarray, mesh: np.ndarray) -> np.ndarray:
     """Return a number for each combination of material and mesh, (k,)."""
-    return ((records["tag"] >> 8) & 0xFF).astype(np.int64) * MESH_STRIDE + mesh
+    return materials_of(records).astype(np.int64) * MESH_STRIDE + mesh

@@ -98,32 +98,22 @@ def blob(num_subdivisions: int) -> UnitMesh:
     golden = (1.0 + 5.0**0.5) / 2.0
     points = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0), (0, -1, golden), (0, 1, golden)]
     points += [(0, -1, -golden), (0, 1, -golden), (golden, 0, -1), (golden, 0, 1), (-golden, 0, -1), (-golden, 0, 1)]
-    vertices = [np.array(p) / np.linalg.norm(p) for p in points]
-    triangles = [
+    unit = np.array(points) / np.linalg.norm(points, axis=1, keepdims=True)
+    triangles = np.array([
         (0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6),
         (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7),
         (9, 8, 1),
-    ]  # fmt: skip
+    ])  # fmt: skip
     for _ in range(num_subdivisions):
-        middles: dict[tuple[int, int], int] = {}
-        finer = []
-        for a, b, c in triangles:
-            ab, bc, ca = (_middle(vertices, middles, i, j) for i, j in ((a, b), (b, c), (c, a)))
-            finer += [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
-        triangles = finer
-    unit = np.array(vertices)
+        a, b, c = triangles.T
+        edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
+        edges, numbers = np.unique(edges, axis=0, return_inverse=True)
+        ab, bc, ca = (len(unit) + numbers.reshape(-1, 3)).T
+        middles = unit[edges].sum(axis=1)
+        unit = np.concatenate([unit, middles / np.linalg.norm(middles, axis=1, keepdims=True)])
+        triangles = np.stack([a, ab, ca, b, bc, ab, c, ca, bc, ab, bc, ca], axis=1).reshape(-1, 3)
     dents = np.abs(
         np.sin(unit @ [4.1, 2.3, 1.7]) * np.sin(unit @ [-1.9, 4.7, 2.9]) + 0.6 * np.sin(unit @ [7.3, -6.1, 8.2])
     )
     radius = 1.0 - 0.24 * dents / dents.max()
     return UnitMesh(np.hstack([unit * radius[:, None], unit]).astype(np.float32), np.array(triangles, np.int32))
-
-
-def _middle(vertices: list[np.ndarray], middles: dict[tuple[int, int], int], a: int, b: int) -> int:
-    """Return the index of the vertex between two vertices of the unit sphere, made once."""
-    key = (min(a, b), max(a, b))
-    if key not in middles:
-        between = vertices[a] + vertices[b]
-        vertices.append(between / np.linalg.norm(between))
-        middles[key] = len(vertices) - 1
-    return middles[key]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,16 +10,13 @@ from scipy.spatial.transform import Rotation
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.geometry.axes import box_corners, rotation_matrix
-from cosfly.render.contract import LAYER_STEP, STANDING_LAYER, PosedBystander, PosedCar, PosedPerson
+from cosfly.render.contract import LAYER_STEP, STANDING_LAYER, Others, PosedCar, PosedPerson
 from cosfly.render.figure import PersonFigure, figure_of
 from cosfly.render.gl import meshes
-from cosfly.render.gl.parts import CLOTH, PART, Boxes, PartBuilder, tags
-from cosfly.render.gl.shapes import BUILDERS
-from cosfly.render.gl.view import CameraView
+from cosfly.render.gl.parts import CLOTH, PART, Boxes, CameraView, Parts, tags
+from cosfly.render.gl.shapes import parts_of
 
 SHAPES = {"ball": meshes.SPHERE, "rounded": meshes.ROUNDED, "limb": meshes.LIMB, "disc": meshes.CYLINDER}
-
-
 MOST_CAPSULES = 32  # as many as the shader has room for: the nearest to the camera
 SHADOW_M = 5.0  # of a sphere round a person and its shadow, under a sun of usual height
 PERSON_RADIUS_M = 1.0  # of a sphere round a person
@@ -38,16 +34,7 @@ def figure_parts(figure: PersonFigure, instance_id: int, origin_m: np.ndarray) -
     return records, np.array([SHAPES[shape] for shape in figure.shapes])
 
 
-def bones_of(figure: PersonFigure, origin_m: np.ndarray) -> np.ndarray:
-    """Return the capsules of a figure's shadow, (b, 2, 4): from and radius, to and 0, relative to the origin."""
-    bones = np.zeros((len(figure.bones_m), 2, 4), np.float32)
-    bones[..., :3], bones[:, 0, 3] = figure.bones_m - origin_m, figure.bone_radii_m
-    return bones
-
-
-def draw_bystanders(
-    others: Sequence[PosedBystander], origin_m: np.ndarray, view: CameraView
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def draw_bystanders(others: Others, origin_m: np.ndarray, view: CameraView) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return records and meshes of the bystanders that the camera may see."""
     found = []
     for other in others:
@@ -62,25 +49,24 @@ def draw_bystanders(
 
 def _car(car: PosedCar, instance_id: int, center: np.ndarray, view: CameraView) -> tuple[np.ndarray, np.ndarray]:
     """Return a car of the same shape as the parked cars of a map."""
-    builder, turn = PartBuilder(), rotation_matrix(0.0, car.heading_rad, 0.0)
-    half, ids = np.array(car.half_extents_m), np.array([instance_id], np.uint16)
-    BUILDERS[KINDS["Car"]](
-        builder, Boxes(center[None], half[None], turn[None], ids, np.array([car.seed]), KINDS["Car"], np.zeros(1))
-    )
-    parts = builder.finish()
+    turn, half = rotation_matrix(0.0, car.heading_rad, 0.0), np.array(car.half_extents_m)
+    ids, seeds = np.array([instance_id], np.uint16), np.array([car.seed])
+    boxes = Boxes(center[None], half[None], turn[None], ids, seeds, KINDS["Car"], np.zeros(1))
+    parts = Parts.joined(parts_of(boxes))
     rows = view.rows(parts)
     return parts.records[rows], parts.mesh[rows]
 
 
-def capsules_of(others: Sequence[PosedBystander], origin_m: np.ndarray, view: CameraView) -> np.ndarray:
+def capsules_of(others: Others, origin_m: np.ndarray, view: CameraView) -> np.ndarray:
     """Return capsules of the bystanders that may cast a visible shadow, relative to the origin, (k, 2, 4): from and
     radius, to and instance id.
 
     Each pixel tests each capsule, which takes longer than all else that is drawn of bystanders.
     """
     seen = (other for other in others if view.can_show(other.center_m - origin_m, SHADOW_M))
-    nearest = sorted(seen, key=lambda other: float(np.linalg.norm(other.center_m - origin_m - view.eye)))
-    nearest = nearest[:MOST_CAPSULES]
+    nearest = sorted(seen, key=lambda other: float(np.linalg.norm(other.center_m - origin_m - view.eye)))[
+        :MOST_CAPSULES
+    ]
     capsules = np.zeros((len(nearest), 2, 4), np.float32)
     for capsule, other in zip(capsules, nearest, strict=True):
         center = other.center_m - origin_m
@@ -107,8 +93,7 @@ SKY_RADII, PERSON_SKY_M = 4.5, 1.0  # how far aside a capsule, in its radii, and
 BELOW_M, LONGEST_M = 1.5, 60.0  # a shadow ends this far below the feet, and is at most this long
 
 
-@dataclass(frozen=True, eq=False)
-class Shade:
+class Shade(NamedTuple):
     """One rectangle of pixels and the movers that may darken it.
 
     rectangle_px: x0, y0, x1, y1; points: (k, 3) relative to the scene's origin, whose hull holds all that is darkened;
@@ -120,32 +105,38 @@ class Shade:
     capsules: np.ndarray
     has_person: bool
 
-    def sphere(self) -> tuple[np.ndarray, float]:
-        """Return center (3,) and radius of a sphere that holds the points."""
-        center = (self.points.min(axis=0) + self.points.max(axis=0)) / 2.0
-        return center, float(np.linalg.norm(self.points - center, axis=1).max())
-
 
 def shades_of(
     bones: np.ndarray, capsules: np.ndarray, sun: np.ndarray, view: CameraView, has_headlights: bool = False
 ) -> list[Shade]:
-    """Return the rectangles of a frame; no two of them overlap.
+    """Return the rectangles of a frame, merged where they overlap.
 
     Args:
-        bones: (b, 2, 4) capsules of the person, b is 0 without one. capsules: (c, 2, 4) of bystanders.
-        sun: (3,) unit vector towards it. has_headlights: Cars light the ground in front of them.
+        bones: (b, 2, 4) capsules of the person, b is 0 without one: from and radius, to and 0. capsules: (c, 2, 4) of
+            bystanders. sun: (3,) unit vector towards it. has_headlights: Cars light the ground in front of them.
     """
-    shades: list[Shade] = []
     found = []
     for own in capsules[:, None]:
         points = _darkened(own, sun, SKY_RADII * float(own[0, 0, 3]), LONGEST_M)
-        found.append((own, np.concatenate([points, _lit(own)]) if has_headlights else points, False))
+        found.append((np.concatenate([points, _lit(own)]) if has_headlights else points, own, False))
     if len(bones):
-        found.append((capsules[:0], _darkened(bones, sun, PERSON_SKY_M, PERSON_REACH_M), True))
-    for own, points, is_person in found:
-        rectangle = view.rectangle_px(points)
-        if rectangle is not None:
-            shades = _joined(shades, Shade(rectangle, points, own, is_person))
+        found.append((_darkened(bones, sun, PERSON_SKY_M, PERSON_REACH_M), capsules[:0], True))
+    shades: list[Shade] = []
+    for points, own, is_person in found:
+        if (rectangle := view.rectangle_px(points)) is None:
+            continue
+        new = Shade(rectangle, points, own, is_person)
+        while touching := [shade for shade in shades if _overlap(shade.rectangle_px, new.rectangle_px)]:
+            shades = [shade for shade in shades if not _overlap(shade.rectangle_px, new.rectangle_px)]
+            for shade in touching:
+                (ax0, ay0, ax1, ay1), (bx0, by0, bx1, by1) = shade.rectangle_px, new.rectangle_px
+                new = Shade(
+                    (min(ax0, bx0), min(ay0, by0), max(ax1, bx1), max(ay1, by1)),
+                    np.concatenate([shade.points, new.points]),
+                    np.concatenate([shade.capsules, new.capsules]),
+                    shade.has_person or new.has_person,
+                )
+        shades.append(new)
     return shades
 
 
@@ -172,21 +163,6 @@ def _lit(car: np.ndarray) -> np.ndarray:
 
 def _corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return box_corners((low + high) / 2.0, (high - low) / 2.0)
-
-
-def _joined(shades: list[Shade], new: Shade) -> list[Shade]:
-    """Add a rectangle, merged with those that it overlaps."""
-    while touching := [shade for shade in shades if _overlap(shade.rectangle_px, new.rectangle_px)]:
-        shades = [shade for shade in shades if shade not in touching]
-        for shade in touching:
-            (ax0, ay0, ax1, ay1), (bx0, by0, bx1, by1) = shade.rectangle_px, new.rectangle_px
-            new = Shade(
-                (min(ax0, bx0), min(ay0, by0), max(ax1, bx1), max(ay1, by1)),
-                np.concatenate([shade.points, new.points]),
-                np.concatenate([shade.capsules, new.capsules]),
-                shade.has_person or new.has_person,
-            )
-    return [*shades, new]
 
 
 def _overlap(a: tuple[int, int, int, int], b: tuple[int, int, int, int]) -> bool:

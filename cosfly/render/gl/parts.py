@@ -1,15 +1,16 @@
-"""Drawable parts and their builder: a part is a unit mesh (meshes.py) with half sizes, a rotation, a colour and a
-material number of the shader. Independent of OpenGL and of the shapes of things (shapes.py).
+"""Drawable parts, and which of them a camera sees: a part is a unit mesh (meshes.py) with half sizes, a
+rotation, a colour and a material number of the shader. Independent of OpenGL and of the shapes of things (shapes.py).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cosfly.render.contract import LAYER_STEP, STANDING_LAYER, chance
+from cosfly.render.contract import FAR_M, LAYER_STEP, NEAR_M, STANDING_LAYER, chance
+from cosfly.runtime.compiled import njit
 
 # Materials, the same numbers as in scene.frag.glsl.
 (
@@ -26,6 +27,8 @@ PART = np.dtype(
 # A vertex of a triangle that is no instance of a mesh: place and normal as in a mesh, then its part.
 LOOSE_VERTEX = np.dtype([("position", "3f4"), ("normal", "3f4"), *((name, PART[name]) for name in PART.names or ())])
 
+BRIGHT = 0.5  # red of a lamp's glass; its housing is darker
+SMALLEST_PX = 0.4  # an object whose radius on the image is below this is not drawn
 FAR_PX, NEVER_PX = 14.0, 1e9  # an object of a smaller radius on the image is drawn in its simple form
 
 
@@ -49,6 +52,10 @@ class Parts:
     def __len__(self) -> int:
         return len(self.records)
 
+    @staticmethod
+    def joined(parts: list[Parts]) -> Parts:
+        return Parts(*map(np.concatenate, zip(*(vars(one).values() for one in parts), strict=True)))
+
     def select(self, keep: np.ndarray) -> Parts:
         return Parts(*(column[keep] for column in vars(self).values()))
 
@@ -60,6 +67,11 @@ class Parts:
         records["center"] = self.centers - place
         object_centers = (self.object_centers - place).astype(np.float32)
         return replace(self, records=records, centers=self.centers - place, object_centers=object_centers)
+
+    def lamps(self) -> np.ndarray:
+        """Return the places of the lit lamps, (n, 3)."""
+        is_lamp = (materials_of(self.records) == LAMP) & (self.records["color"][:, 0] > BRIGHT)
+        return self.records["center"][is_lamp].astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -100,13 +112,41 @@ class Boxes:
         """Return a colour of a palette, (k, 3), for each box, (n, 3)."""
         return palette[(self.chance(0) * len(palette)).astype(int)]
 
+    def part(
+        self, mesh: int, half: np.ndarray, material: int, color: np.ndarray | tuple[float, ...], *,
+        offset: np.ndarray | None = None, turn: np.ndarray | None = None, min_px: float = 0.0, max_px: float = NEVER_PX,
+        layer: int | None = None,
+    ) -> Parts:  # fmt: skip
+        """Return one part of each box.
+
+        Args:
+            half: (n, 3) or (3,) half sizes of the part, in its own axes. color: (n, 3) or (3,) linear RGB. offset: (n,
+                3) from the box's centre, in box axes. turn: (3, 3) or (n, 3, 3) box_from_part.
+        """
+        n = len(self)
+        records = np.zeros(n, PART)
+        records["center"] = centers = self.centers.astype(np.float64)
+        if offset is not None:
+            from_middle = np.einsum("nij,nj->ni", self.turns, offset)
+            records["center"] += from_middle
+            centers = centers + from_middle
+        records["half"] = np.maximum(half, 1e-3)
+        if n:
+            records["quaternion"] = Rotation.from_matrix(self.turns if turn is None else self.turns @ turn).as_quat()
+        records["color"][:, :3], records["color"][:, 3] = color, self.seeds
+        records["tag"] = tags(self.kind, material, self.ids)
+        records["bias"] = LAYER_STEP * (STANDING_LAYER if layer is None else layer + self.tiers)
+        radii = np.linalg.norm(self.half, axis=1).astype(np.float32)
+        sizes = np.full(n, min_px, np.float32), np.full(n, max_px, np.float32)
+        return Parts(records, np.full(n, mesh, np.uint8), centers, self.centers.astype(np.float32), radii, *sizes)
+
 
 @dataclass(frozen=True)
 class Loose:
     """Triangles by material. vertices: (3 k,) LOOSE_VERTEX, three to a triangle, relative to the scene's origin.
 
-    things: (k,) ascending, the thing of each triangle; centers (n, 3) float64, radii (n,) of things. Without things
-    all triangles are always drawn.
+    things: (k,) ascending, the thing of each triangle; centers (n, 3) float64, radii (n,) of things. Triangles of a
+    material without things are the ground: always drawn, without a shadow.
     """
 
     vertices: dict[int, np.ndarray]
@@ -114,65 +154,100 @@ class Loose:
     centers: np.ndarray
     radii: np.ndarray
 
-    @staticmethod
-    def all_of(vertices: dict[int, np.ndarray]) -> Loose:
-        return Loose(vertices, {}, np.zeros((0, 3)), np.zeros(0))
 
-
-@dataclass
-class PartBuilder:
-    """Parts that are collected kind by kind."""
-
-    _parts: list[Parts] = field(default_factory=list)
-
-    def add(
-        self, boxes: Boxes, mesh: int, half: np.ndarray, material: int, color: np.ndarray | tuple[float, ...], *,
-        offset: np.ndarray | None = None, turn: np.ndarray | None = None, min_px: float = 0.0, max_px: float = NEVER_PX,
-        layer: int | None = None,
-    ) -> None:  # fmt: skip
-        """Add one part to each box.
-
-        Args:
-            half: (n, 3) or (3,) half sizes of the part, in its own axes; offset: (n, 3) from the box's centre, in box
-                axes.
-            turn: (3, 3) or (n, 3, 3) box_from_part; color: (n, 3) or (3,) linear RGB.
-        """
-        n = len(boxes)
-        if n == 0:
-            return
-        records = np.zeros(n, PART)
-        records["center"] = centers = boxes.centers.astype(np.float64)
-        if offset is not None:
-            from_middle = np.einsum("nij,nj->ni", boxes.turns, np.broadcast_to(offset, (n, 3)))
-            records["center"] += from_middle
-            centers = centers + from_middle
-        records["half"] = np.maximum(half, 1e-3)
-        turns = boxes.turns if turn is None else boxes.turns @ turn
-        records["quaternion"] = Rotation.from_matrix(turns).as_quat()
-        records["color"][:, :3] = color
-        records["color"][:, 3] = boxes.seeds
-        records["tag"] = tags(boxes.kind, material, boxes.ids)
-        records["bias"] = LAYER_STEP * (STANDING_LAYER if layer is None else layer + boxes.tiers)
-        self._parts.append(
-            Parts(
-                records,
-                np.full(n, mesh, np.uint8),
-                centers,
-                boxes.centers.astype(np.float32),
-                np.linalg.norm(boxes.half, axis=1).astype(np.float32),
-                np.full(n, min_px, np.float32),
-                np.full(n, max_px, np.float32),
-            )
-        )
-
-    def add_parts(self, parts: Parts) -> None:
-        """Add the parts of another builder."""
-        self._parts.append(parts)
-
-    def finish(self) -> Parts:
-        return Parts(*map(np.concatenate, zip(*(vars(parts).values() for parts in self._parts), strict=True)))
-
-
-def tags(kind: int, material: int, ids: np.ndarray) -> np.ndarray:
+def tags(kinds: np.ndarray | int, materials: np.ndarray | int, ids: np.ndarray) -> np.ndarray:
     """Pack kind (bits 0-7), material (8-15) and instance id (16-31), as the shader unpacks them."""
-    return np.uint32(kind) | np.uint32(material << 8) | (np.asarray(ids).astype(np.uint32) << np.uint32(16))
+    kinds, materials, ids = (np.asarray(part).astype(np.uint32) for part in (kinds, materials, ids))
+    return kinds | materials << np.uint32(8) | ids << np.uint32(16)
+
+
+def materials_of(records: np.ndarray) -> np.ndarray:
+    """Return the materials of records, (k,) uint32."""
+    return (records["tag"] >> 8) & 0xFF
+
+
+# --- cameras ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """A camera relative to the scene's origin: world_from_camera (3, 3), eye (3,), intrinsic (3, 3) px."""
+
+    world_from_camera: np.ndarray
+    eye: np.ndarray
+    intrinsic: np.ndarray
+    width_px: int
+    height_px: int
+
+    def rows(self, parts: Parts) -> np.ndarray:
+        """Return the rows of the parts to draw, nearest objects first."""
+        least_px = np.maximum(parts.min_px, np.float32(SMALLEST_PX))
+        rows, away = self._spheres(parts.object_centers, parts.object_radii, least_px, parts.max_px)
+        return rows[np.lexsort((away, -parts.records["bias"][rows]))]
+
+    def shown(self, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
+        """Return which spheres may be seen, the nearest first; centers (n, 3), radii (n,) float32, from the scene's
+        origin."""
+        least_px, most_px = (np.full(len(radii), size, np.float32) for size in (SMALLEST_PX, np.inf))
+        rows, away = self._spheres(centers.astype(np.float32), radii, least_px, most_px)
+        return rows[np.argsort(away, kind="stable")]
+
+    def _spheres(
+        self, centers: np.ndarray, radii: np.ndarray, min_px: np.ndarray, max_px: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        middle, size = self.intrinsic[:2, 2], np.array([self.width_px, self.height_px])
+        tangents = np.maximum(middle, size - middle) / np.diag(self.intrinsic)[:2]
+        eye, turn = self.eye.astype(np.float32), np.ascontiguousarray(self.world_from_camera, np.float32)
+        slants = np.sqrt(1.0 + tangents**2)
+        return spheres_in_view(centers, radii, min_px, max_px, eye, turn, tangents, slants, float(self.intrinsic[0, 0]))
+
+    def can_show(self, center: np.ndarray, radius: float) -> bool:
+        """Return whether something within a sphere may be seen; center: (3,) relative to the scene's origin."""
+        return len(self.shown(center[None], np.array([radius], np.float32))) > 0
+
+    def rectangle_px(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
+        """Return the pixels that a hull of points, (n, 3), may cover: x0, y0, x1, y1; None outside the picture."""
+        in_camera = (points - self.eye.astype(np.float32)) @ self.world_from_camera.astype(np.float32)
+        if in_camera[:, 2].max() <= NEAR_M:
+            return None
+        if in_camera[:, 2].min() <= NEAR_M:
+            return 0, 0, self.width_px, self.height_px
+        places = in_camera @ self.intrinsic.T
+        places = places[:, :2] / places[:, 2:]
+        size = [self.width_px, self.height_px]
+        x0, y0 = np.clip(np.floor(places.min(axis=0)) - 1, 0, size).astype(int).tolist()
+        x1, y1 = np.clip(np.ceil(places.max(axis=0)) + 1, 0, size).astype(int).tolist()
+        return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
+
+
+@njit(cache=True, nogil=True)
+def spheres_in_view(  # type: ignore[no-untyped-def]
+    centers, radii, min_px, max_px, eye, turn, tangents, slants, focal_px
+):
+    """Find the spheres that a camera may see with a radius on the image in [min_px, max_px), in one pass.
+
+    Args:
+        centers: (k, 3) float32 m; radii, min_px, max_px: (k,) float32; eye: (3,) float32 m; turn: (3, 3) float32,
+            world_from_camera.
+        tangents, slants: (2,) float64, of the widest angles to the sides and up: tangent, and 1 / cosine. focal_px:
+            float.
+    Returns:
+        rows (n,) int64, in their order; (n,) float32 m, how far along the axis each begins.
+    """
+    rows, away, count = np.empty(len(centers), np.int64), np.empty(len(centers), np.float32), 0
+    near, focal = np.float32(NEAR_M), np.float32(focal_px)
+    for k in range(len(centers)):
+        dx, dy, dz = centers[k, 0] - eye[0], centers[k, 1] - eye[1], centers[k, 2] - eye[2]
+        radius = radii[k]
+        z = dx * turn[0, 2] + dy * turn[1, 2] + dz * turn[2, 2]
+        if not (z + radius > near and z - radius < FAR_M):
+            continue
+        x = dx * turn[0, 0] + dy * turn[1, 0] + dz * turn[2, 0]
+        y = dx * turn[0, 1] + dy * turn[1, 1] + dz * turn[2, 1]
+        if abs(x) - z * tangents[0] >= radius * slants[0] or abs(y) - z * tangents[1] >= radius * slants[1]:
+            continue
+        size_px = focal * radius / max(np.sqrt(x * x + y * y + z * z) - radius, near)
+        if min_px[k] <= size_px < max_px[k]:
+            rows[count], away[count] = k, z - radius
+            count += 1
+    return rows[:count], away[:count]

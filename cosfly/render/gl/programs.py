@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from cosfly.render.contract import DEBIAN_PACKAGES
-from cosfly.render.gl.parts import LOOSE_VERTEX, NUM_MATERIALS, Loose
-from cosfly.render.gl.view import CameraView
+from cosfly.render.gl.parts import LOOSE_VERTEX, NUM_MATERIALS, CameraView, Loose
 from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.io import read_text
 
@@ -24,16 +23,12 @@ def open_context() -> Any:
         import moderngl
 
         settings: Any = {"backend": "egl"}  # moderngl's own annotation of this argument is wrong
-
         return moderngl.create_context(require=330, standalone=True, **settings)
     except ImportError as error:
         raise EnvironmentMissing("the package moderngl is missing", got=str(error), fix="pip install cosfly") from None
     except Exception as error:  # glcontext raises a bare Exception, and OSError where the library is missing
-        raise EnvironmentMissing(
-            "no OpenGL without a window (EGL)",
-            got=str(error),
-            fix=f"apt-get install {DEBIAN_PACKAGES} (these serve the CPU too)",
-        ) from None
+        fix = f"apt-get install {DEBIAN_PACKAGES} (these serve the CPU too)"
+        raise EnvironmentMissing("no OpenGL without a window (EGL)", got=str(error), fix=fix) from None
 
 
 def sources(vertex: tuple[str, ...], fragment: tuple[str, ...], define: str = "") -> tuple[str, str]:
@@ -59,20 +54,17 @@ def programs_of(context: Any, define: str | None, *, snaps: bool) -> Programs:
     """Compile the programs of fair weather (None), or of one with these defines. snaps: for GPUs (scene.frag.glsl)."""
     of_sky = ("light.glsl", *(FAIR if define is None else WEATHER_SKY), "sky.frag.glsl")
     of_surfaces = ("light.glsl", *(FAIR if define is None else WEATHER_SCENE), "scene.frag.glsl")
-    vertex, fragment = sources(
-        ("part.glsl", "scene.vert.glsl"), of_surfaces, "#define SNAPS\n" * snaps + (define or "")
-    )
-    materials, near_movers = (
-        [
-            context.program(vertex, fragment.replace(" MATERIAL;", f" {material};").replace("NEAR_MOVERS;", f"{near};"))
-            for material in range(NUM_MATERIALS)
-        ]
-        for near in ("false", "true")
-    )
+    defines = "#define SNAPS\n" * snaps + (define or "")
+    vertex, fragment = sources(("part.glsl", "scene.vert.glsl"), of_surfaces, defines)
+
+    def program(material: int, near: str) -> Any:
+        text = fragment.replace(" MATERIAL;", f" {material};").replace("NEAR_MOVERS;", f"{near};")
+        return context.program(vertex, text)
+
+    materials, near_movers = ([program(m, near) for m in range(NUM_MATERIALS)] for near in ("false", "true"))
     sky = context.program(*sources(("screen.vert.glsl",), of_sky, define or ""))
-    is_fair = define is None
-    rain = None if is_fair else context.program(*sources(("screen.vert.glsl",), ("light.glsl", "rain.frag.glsl")))
-    return Programs(materials, near_movers, sky, rain)
+    rain = sources(("screen.vert.glsl",), ("light.glsl", "rain.frag.glsl"))
+    return Programs(materials, near_movers, sky, None if define is None else context.program(*rain))
 
 
 def packed(value: Any) -> Any:
@@ -101,10 +93,11 @@ class LooseTriangles:
         self._indices = {m: context.buffer(reserve=4 * len(rows), dynamic=True) for m, rows in loose.vertices.items()}
         numbers = np.arange(len(loose.centers) + 1)
         self._firsts = {material: 3 * np.searchsorted(rows, numbers) for material, rows in loose.things.items()}
-        self._num_indices = dict.fromkeys(loose.vertices, 0)
+        self._num_indices: dict[int, int] = {}
         self._arrays: dict[tuple[int, int], Any] = {}
         self.centers, self.radii = loose.centers.astype(np.float32), loose.radii.astype(np.float32)
-        self.see(None)
+        for material, rows in loose.vertices.items():
+            self._write(material, np.arange(len(rows)))
 
     def place(self, shift_m: np.ndarray) -> None:
         """Move the origin, (3,) relative to the scene's: float32 is most precise near 0."""
@@ -115,15 +108,12 @@ class LooseTriangles:
         self.centers = (self._loose.centers - shift_m).astype(np.float32)
 
     def see(self, view: CameraView | None) -> None:
-        """Select what a camera may see, the nearest first; None selects everything."""
+        """Select the things that a camera may see, the nearest first; None selects everything."""
+        seen = np.arange(len(self.centers)) if view is None else view.shown(self.centers, self.radii)
         for material, firsts in self._firsts.items():
-            seen = np.arange(len(self.centers)) if view is None else view.shown(self.centers, self.radii)
             counts = (firsts[1:] - firsts[:-1])[seen]
             before = np.cumsum(counts) - counts
             self._write(material, np.repeat(firsts[:-1][seen] - before, counts) + np.arange(counts.sum()))
-        if view is None:
-            for material in self._loose.vertices.keys() - self._firsts.keys():
-                self._write(material, np.arange(len(self._loose.vertices[material])))
 
     def _write(self, material: int, indices: np.ndarray) -> None:
         self._indices[material].orphan()
@@ -141,9 +131,9 @@ class LooseTriangles:
             self._arrays[key] = self._context.vertex_array(program, [content], index_buffer=self._indices[material])
         self._arrays[key].render(vertices=self._num_indices[material])
 
-    def draw_all(self, program: Any) -> None:
-        """Draw every material with one program."""
-        for material in self._buffers:
+    def draw_shadows(self, program: Any) -> None:
+        """Draw the selected things with one program."""
+        for material in self._firsts:
             self.draw(program, material)
 
 

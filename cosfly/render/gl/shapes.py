@@ -5,6 +5,7 @@ Every part stays inside its box, so that the planners' collision and visibility 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from cosfly.formats.kinds import KINDS, LAYERS
 from cosfly.render import contract
 from cosfly.render.gl import meshes, parts
-from cosfly.render.gl.parts import FAR_PX, Boxes, PartBuilder
+from cosfly.render.gl.parts import FAR_PX, Boxes, Parts
 
 EDGE_GAP_M, MOST_EDGED = 0.05, 4000
 
@@ -39,36 +40,34 @@ CAR_COLORS = np.array([
     [0.62, 0.63, 0.65], [0.05, 0.05, 0.06], [0.80, 0.80, 0.79], [0.36, 0.03, 0.03], [0.04, 0.09, 0.26],
     [0.23, 0.25, 0.27], [0.10, 0.17, 0.13], [0.48, 0.40, 0.28],
 ])  # fmt: skip
+SIGN_COLORS = np.array([[0.55, 0.03, 0.03], [0.04, 0.12, 0.45], [0.75, 0.75, 0.72], [0.60, 0.42, 0.02]])
+COAT_COLORS = np.array([[0.10, 0.12, 0.20], [0.30, 0.08, 0.07], [0.12, 0.20, 0.13], [0.35, 0.30, 0.22]])
 LEAF_COLORS = np.array(
     [[0.085, 0.165, 0.035], [0.11, 0.19, 0.045], [0.065, 0.135, 0.035], [0.15, 0.20, 0.05], [0.075, 0.155, 0.055]]
 )
 
 
-def _box(material: int, color: tuple[float, float, float], layer: int | None = None):
-    """Return a builder of the box itself, lengthwise: a ground surface in its layer, or a standing thing."""
-
-    def build(builder: PartBuilder, boxes: Boxes) -> None:
-        boxes = boxes.lengthwise()
-        builder.add(boxes, meshes.BOX, boxes.half, material, color, layer=layer)
-
-    return build
+Shape = Callable[[Boxes], list[Parts]]
 
 
-def _terrain(builder: PartBuilder, boxes: Boxes) -> None:
-    """Add lawns of the map, in one colour; meadows and fields of the rim."""
-    boxes = boxes.lengthwise()
+def _box(material: int, color: tuple[float, float, float], layer: int | None = None) -> Shape:
+    """Return the shape of the box itself: a ground surface in its layer, or a standing thing."""
+    return lambda boxes: [boxes.part(meshes.BOX, boxes.half, material, color, layer=layer)]
+
+
+def _terrain(boxes: Boxes) -> list[Parts]:
+    """Return lawns of the map, in one colour; meadows and fields of the rim."""
     is_rim, is_tilled = boxes.ids[:, None] == contract.NO_INSTANCE, boxes.half[:, :1] > LARGEST_MEADOW_M
     crops = np.where(is_tilled, boxes.pick(FIELD_COLORS), boxes.pick(MEADOW_COLORS))
     colors = np.where(is_rim, crops, MEADOW_COLORS[0])
     rows = replace(boxes, seeds=boxes.seeds * 0.999 + (is_rim & is_tilled)[:, 0])  # the shader draws furrows from 1 on
-    builder.add(rows, meshes.BOX, boxes.half, parts.GRASS, colors, layer=LAYERS["Terrain"])
+    return [rows.part(meshes.BOX, boxes.half, parts.GRASS, colors, layer=LAYERS["Terrain"])]
 
 
-def _sidewalks(builder: PartBuilder, boxes: Boxes) -> None:
-    """Add pavement; the shader draws a kerb along the open edges, which the seed encodes."""
-    boxes = boxes.lengthwise()
+def _sidewalks(boxes: Boxes) -> list[Parts]:
+    """Return pavement; the shader draws a kerb along the open edges, which the seed encodes."""
     boxes = replace(boxes, seeds=_open_edges(boxes, height_share=0.0, slack_m=1.0))
-    builder.add(boxes, meshes.BOX, boxes.half, parts.SIDEWALK, (0.36, 0.345, 0.32), layer=LAYERS["Sidewalks"])
+    return [boxes.part(meshes.BOX, boxes.half, parts.SIDEWALK, (0.36, 0.345, 0.32), layer=LAYERS["Sidewalks"])]
 
 
 def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray:
@@ -80,17 +79,14 @@ def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray
     Returns:
         (n,) numbers of bits -x, +x, -y, +y; 0 for more than MOST_EDGED boxes.
     """
-    n, bits = len(boxes), np.zeros(len(boxes))
-    reach = boxes.half + np.array([0.0, 0.0, slack_m])
-    if n > MOST_EDGED:
+    bits, reach = np.zeros(len(boxes)), boxes.half + np.array([0.0, 0.0, slack_m])
+    if len(boxes) > MOST_EDGED:
         return bits
     for bit, (axis, side) in enumerate(((0, -1.0), (0, 1.0), (1, -1.0), (1, 1.0))):
-        is_open = np.zeros(n, dtype=bool)
+        is_open = np.zeros(len(boxes), dtype=bool)
         for share in (-0.9, 0.0, 0.9):
-            local = np.zeros((n, 3))
+            local = boxes.half * np.where(np.arange(3) == 2, height_share, share)
             local[:, axis] = side * (boxes.half[:, axis] + EDGE_GAP_M)
-            local[:, 1 - axis] = share * boxes.half[:, 1 - axis]
-            local[:, 2] = height_share * boxes.half[:, 2]
             for row, probe in enumerate(boxes.centers + np.einsum("nij,nj->ni", boxes.turns, local)):
                 inside = np.abs(np.einsum("nji,nj->ni", boxes.turns, probe - boxes.centers)) <= reach
                 is_open[row] |= not inside.all(axis=1).any()
@@ -98,193 +94,192 @@ def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray
     return bits
 
 
-def plain(builder: PartBuilder, boxes: Boxes) -> None:
-    """Add a box as it is, in one colour."""
-    builder.add(boxes, meshes.BOX, boxes.half, parts.PLAIN, boxes.pick(PLAIN_COLORS))
+def _plain(boxes: Boxes) -> list[Parts]:
+    return [boxes.part(meshes.BOX, boxes.half, parts.PLAIN, boxes.pick(PLAIN_COLORS))]
 
 
-def _buildings(builder: PartBuilder, boxes: Boxes) -> None:
-    """Add houses; the shader draws storeys, windows and a roof rim along the open edges (the seed's whole part)."""
-    colors = boxes.pick(BUILDING_COLORS)
+def _buildings(boxes: Boxes) -> list[Parts]:
+    """Return houses; the shader draws storeys, windows and a roof rim along the open edges (the seed's whole part)."""
     edged = replace(boxes, seeds=boxes.seeds * 0.999 + _open_edges(boxes, height_share=0.98, slack_m=0.0))
-    builder.add(edged, meshes.BOX, boxes.half, parts.FACADE, colors)
+    return [edged.part(meshes.BOX, boxes.half, parts.FACADE, boxes.pick(BUILDING_COLORS))]
 
 
-def _vegetation(builder: PartBuilder, boxes: Boxes) -> None:
-    """Add trees, bushes, hedges and lawns, by the shape of the box."""
+def _vegetation(boxes: Boxes) -> list[Parts]:
+    """Return trees, bushes, hedges and lawns, by the shape of the box."""
     forms, crown_low = contract.plants_of(boxes.centers, boxes.half, boxes.seeds)
     leaf = boxes.pick(LEAF_COLORS) * (0.85 + 0.35 * boxes.chance(3))[:, None]
     of = {form: (boxes.select(forms == form), leaf[forms == form]) for form in range(contract.BROADLEAF + 1)}
     (lawns, grass), (hedges, green), (trunks, _) = of[contract.LAWN], of[contract.HEDGE], of[contract.TRUNK]
-    builder.add(lawns, meshes.BOX, lawns.half, parts.GRASS, grass, layer=LAYERS["RoadLines"])
-    builder.add(hedges, meshes.BOX, hedges.half, parts.LEAVES, green)
-    _bushes(builder, *of[contract.BUSH])
-    builder.add(trunks, meshes.CYLINDER, trunks.half, parts.BARK, BARK_COLOR)
-    _crowns(builder, *of[contract.CROWN], crown_low[forms == contract.CROWN])
-    _conifers(builder, *of[contract.CONIFER])
     trees, low = of[contract.BROADLEAF][0], crown_low[forms == contract.BROADLEAF]
-    _stems(builder, trees, low + 0.75)
-    _crowns(builder, *of[contract.BROADLEAF], low)
+    return [
+        lawns.part(meshes.BOX, lawns.half, parts.GRASS, grass, layer=LAYERS["RoadLines"]),
+        hedges.part(meshes.BOX, hedges.half, parts.LEAVES, green),
+        *_bushes(*of[contract.BUSH]),
+        trunks.part(meshes.CYLINDER, trunks.half, parts.BARK, BARK_COLOR),
+        *_crowns(*of[contract.CROWN], crown_low[forms == contract.CROWN]),
+        *_conifers(*of[contract.CONIFER]),
+        _stems(trees, low + 0.75),
+        *_crowns(*of[contract.BROADLEAF], low),
+    ]
 
 
-def _bushes(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
+def _bushes(boxes: Boxes, leaf: np.ndarray) -> list[Parts]:
     h = boxes.half
-    builder.add(boxes, meshes.BLOB_COARSE, h, parts.LEAVES, leaf, max_px=FAR_PX)
-    builder.add(boxes, meshes.BLOB, h * [0.72, 0.72, 0.98], parts.LEAVES, leaf, min_px=FAR_PX)
+    found = [
+        boxes.part(meshes.BLOB_COARSE, h, parts.LEAVES, leaf, max_px=FAR_PX),
+        boxes.part(meshes.BLOB, h * [0.72, 0.72, 0.98], parts.LEAVES, leaf, min_px=FAR_PX),
+    ]
     for side in (-1.0, 1.0):
-        offset = h * [0.42 * side, 0.25 * side, -0.25]
-        shade = leaf * (1.0 + 0.12 * side)
-        builder.add(boxes, meshes.BLOB, h * [0.56, 0.6, 0.72], parts.LEAVES, shade, offset=offset, min_px=FAR_PX)
+        offset, shade = h * [0.42 * side, 0.25 * side, -0.25], leaf * (1.0 + 0.12 * side)
+        size = h * [0.56, 0.6, 0.72]
+        found.append(boxes.part(meshes.BLOB, size, parts.LEAVES, shade, offset=offset, min_px=FAR_PX))
+    return found
 
 
-def _crowns(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray, crown_low: np.ndarray) -> None:
-    """Add foliage from `crown_low` (n,), in half heights, to the top: blobs inside the inscribed ellipsoid."""
-    h = boxes.half
-    crown_half = h * np.column_stack([np.ones(len(h)), np.ones(len(h)), (1.0 - crown_low) / 2.0])
-    crown_center = h * np.column_stack([np.zeros(len(h)), np.zeros(len(h)), (1.0 + crown_low) / 2.0])
-    builder.add(boxes, meshes.BLOB_COARSE, crown_half, parts.LEAVES, leaf, offset=crown_center, max_px=FAR_PX)
-    builder.add(boxes, meshes.BLOB_FINE, crown_half * 0.74, parts.LEAVES, leaf, offset=crown_center, min_px=FAR_PX)
+def _crowns(boxes: Boxes, leaf: np.ndarray, crown_low: np.ndarray) -> list[Parts]:
+    """Return foliage from `crown_low` (n,), in half heights, to the top: blobs inside the inscribed ellipsoid."""
+    h, one = boxes.half, np.ones(len(boxes))
+    half = h * np.column_stack([one, one, (1.0 - crown_low) / 2.0])
+    center = h * np.column_stack([0.0 * one, 0.0 * one, (1.0 + crown_low) / 2.0])
+    found = [
+        boxes.part(meshes.BLOB_COARSE, half, parts.LEAVES, leaf, offset=center, max_px=FAR_PX),
+        boxes.part(meshes.BLOB_FINE, half * 0.74, parts.LEAVES, leaf, offset=center, min_px=FAR_PX),
+    ]
     for number in range(7):
-        radius = 0.40 + 0.13 * boxes.chance(10 + number)
+        radius = (0.40 + 0.13 * boxes.chance(10 + number))[:, None]
         angle = 2.0 * np.pi * (number / 6.0 + boxes.chance(30)) + 0.5 * boxes.chance(20 + number)
         lift = np.where(number == 6, 0.9, 0.62 * np.sin(2.6 * number + 6.28 * boxes.chance(31)))
         flat = np.sqrt(np.maximum(0.0, 1.0 - lift**2))
-        direction = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), lift])
-        offset = crown_center + crown_half * direction * (1.0 - radius)[:, None]
+        offset = center + half * np.column_stack([flat * np.cos(angle), flat * np.sin(angle), lift]) * (1.0 - radius)
         shade = leaf * (0.86 + 0.3 * boxes.chance(40 + number))[:, None]
-        builder.add(boxes, meshes.BLOB, crown_half * radius[:, None], parts.LEAVES, shade, offset=offset, min_px=FAR_PX)
+        found.append(boxes.part(meshes.BLOB, half * radius, parts.LEAVES, shade, offset=offset, min_px=FAR_PX))
+    return found
 
 
-def _conifers(builder: PartBuilder, boxes: Boxes, leaf: np.ndarray) -> None:
-    h = boxes.half
-    dark = leaf * [0.6, 0.75, 0.85]
-    builder.add(boxes, meshes.CONE, h * [1, 1, 0.92], parts.LEAVES, dark, offset=h * [0, 0, 0.08], max_px=FAR_PX)
-    _stems(builder, boxes, np.full(len(h), -0.5))
+def _conifers(boxes: Boxes, leaf: np.ndarray) -> list[Parts]:
+    h, dark = boxes.half, leaf * [0.6, 0.75, 0.85]
+    far = boxes.part(meshes.CONE, h * [1, 1, 0.92], parts.LEAVES, dark, offset=h * [0, 0, 0.08], max_px=FAR_PX)
+    found = [far, _stems(boxes, np.full(len(h), -0.5))]
     for low, top, radius in ((contract.CONIFER_LOW, 0.1, 1.0), (-0.35, 0.55, 0.78), (0.1, 1.0, 0.55)):
-        size = h * [radius, radius, (top - low) / 2.0]
-        builder.add(boxes, meshes.CONE, size, parts.LEAVES, dark, offset=h * [0, 0, (low + top) / 2.0], min_px=FAR_PX)
+        size, offset = h * [radius, radius, (top - low) / 2.0], h * [0, 0, (low + top) / 2.0]
+        found.append(boxes.part(meshes.CONE, size, parts.LEAVES, dark, offset=offset, min_px=FAR_PX))
+    return found
 
 
-def _stems(builder: PartBuilder, boxes: Boxes, top: np.ndarray) -> None:
-    """Add a stem from each box's bottom to `top` (n,), in units of the half height."""
+def _stems(boxes: Boxes, top: np.ndarray) -> Parts:
+    """Return a stem from each box's bottom to `top` (n,), in units of the half height."""
     h, radius = boxes.half, contract.stem_radius_m(boxes.half)
     size = np.column_stack([radius, radius, h[:, 2] * (top + 1.0) / 2.0])
     offset = np.column_stack([0 * radius, 0 * radius, h[:, 2] * (top - 1.0) / 2.0])
-    builder.add(boxes, meshes.CYLINDER, size, parts.BARK, BARK_COLOR, offset=offset, min_px=FAR_PX)
+    return boxes.part(meshes.CYLINDER, size, parts.BARK, BARK_COLOR, offset=offset, min_px=FAR_PX)
 
 
 _WHEEL_TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # the cylinder's axis along the car's y
 
 
-def _wheels(builder: PartBuilder, boxes: Boxes, radius: np.ndarray, along: float) -> None:
+def _wheels(boxes: Boxes, high: float, long: float, along: float) -> list[Parts]:
+    """Return four wheels; their largest radius is a share of the half height, and of the half length."""
     h = boxes.half
-    thick, color = 0.16 * h[:, 1], (0.02, 0.02, 0.022)
-    size = np.column_stack([radius, radius, thick])
-    for front in (-along, along):
-        for side in (-1.0, 1.0):
-            offset = np.column_stack([front * h[:, 0], side * (0.97 * h[:, 1] - thick), radius - h[:, 2]])
-            builder.add(
-                boxes, meshes.CYLINDER, size, parts.RUBBER, color, offset=offset, turn=_WHEEL_TURN, min_px=FAR_PX
-            )
+    radius, thick = np.minimum(high * h[:, 2], long * h[:, 0]), 0.16 * h[:, 1]
+    size, look = np.column_stack([radius, radius, thick]), (parts.RUBBER, (0.02, 0.02, 0.022))
+    found = []
+    for front, side in ((-along, -1.0), (-along, 1.0), (along, -1.0), (along, 1.0)):
+        offset = np.column_stack([front * h[:, 0], side * (0.97 * h[:, 1] - thick), radius - h[:, 2]])
+        found.append(boxes.part(meshes.CYLINDER, size, *look, offset=offset, turn=_WHEEL_TURN, min_px=FAR_PX))
+    return found
 
 
-def _cars(builder: PartBuilder, boxes: Boxes) -> None:
-    boxes = boxes.lengthwise()
+def _cars(boxes: Boxes) -> list[Parts]:
     h, paint = boxes.half, boxes.pick(CAR_COLORS)
-    builder.add(boxes, meshes.ROUNDED, h * [1, 0.97, 0.36], parts.CAR_PAINT, paint, offset=h * [0, 0, -0.36])
-    builder.add(boxes, meshes.CABIN, h * [0.56, 0.84, 0.37], parts.CABIN, paint, offset=h * [-0.08, 0, 0.3])
-    builder.add(boxes, meshes.CABIN, h * [0.36, 0.69, 0.19], parts.CAR_PAINT, paint, offset=h * [-0.08, 0, 0.81])
-    _wheels(builder, boxes, np.minimum(0.43 * h[:, 2], 0.2 * h[:, 0]), 0.6)
+    return [
+        boxes.part(meshes.ROUNDED, h * [1, 0.97, 0.36], parts.CAR_PAINT, paint, offset=h * [0, 0, -0.36]),
+        boxes.part(meshes.CABIN, h * [0.56, 0.84, 0.37], parts.CABIN, paint, offset=h * [-0.08, 0, 0.3]),
+        boxes.part(meshes.CABIN, h * [0.36, 0.69, 0.19], parts.CAR_PAINT, paint, offset=h * [-0.08, 0, 0.81]),
+        *_wheels(boxes, 0.43, 0.2, 0.6),
+    ]
 
 
-def _trucks(builder: PartBuilder, boxes: Boxes) -> None:
-    boxes = boxes.lengthwise()
+def _trucks(boxes: Boxes) -> list[Parts]:
     h, paint = boxes.half, boxes.pick(CAR_COLORS)
-    builder.add(boxes, meshes.BOX, h * [0.7, 1, 0.83], parts.PLAIN, paint * 0.6 + 0.3, offset=h * [-0.3, 0, 0.17])
-    builder.add(boxes, meshes.ROUNDED, h * [0.27, 0.94, 0.46], parts.CAR_PAINT, paint, offset=h * [0.72, 0, -0.3])
-    builder.add(boxes, meshes.CABIN, h * [0.26, 0.92, 0.3], parts.CABIN, paint, offset=h * [0.68, 0, 0.3])
-    _wheels(builder, boxes, np.minimum(0.28 * h[:, 2], 0.14 * h[:, 0]), 0.68)
+    return [
+        boxes.part(meshes.BOX, h * [0.7, 1, 0.83], parts.PLAIN, paint * 0.6 + 0.3, offset=h * [-0.3, 0, 0.17]),
+        boxes.part(meshes.ROUNDED, h * [0.27, 0.94, 0.46], parts.CAR_PAINT, paint, offset=h * [0.72, 0, -0.3]),
+        boxes.part(meshes.CABIN, h * [0.26, 0.92, 0.3], parts.CABIN, paint, offset=h * [0.68, 0, 0.3]),
+        *_wheels(boxes, 0.28, 0.14, 0.68),
+    ]
 
 
-def _buses(builder: PartBuilder, boxes: Boxes) -> None:
-    boxes = boxes.lengthwise()
-    h = boxes.half
-    builder.add(boxes, meshes.BOX, h * [1, 1, 0.9], parts.BUS, boxes.pick(CAR_COLORS[3:6]), offset=h * [0, 0, 0.1])
-    _wheels(builder, boxes, np.minimum(0.28 * h[:, 2], 0.14 * h[:, 0]), 0.62)
+def _buses(boxes: Boxes) -> list[Parts]:
+    h, paint = boxes.half, boxes.pick(CAR_COLORS[3:6])
+    body = boxes.part(meshes.BOX, h * [1, 1, 0.9], parts.BUS, paint, offset=h * [0, 0, 0.1])
+    return [body, *_wheels(boxes, 0.28, 0.14, 0.62)]
 
 
-def _two_wheelers(builder: PartBuilder, boxes: Boxes) -> None:
-    boxes = boxes.lengthwise()
-    h = boxes.half
+def _two_wheelers(boxes: Boxes) -> list[Parts]:
+    h, rubber, paint = boxes.half, (0.03, 0.03, 0.03), boxes.pick(CAR_COLORS)
     radius = np.minimum(0.4 * h[:, 0], 0.62 * h[:, 2])
     size = np.column_stack([radius, radius, np.minimum(0.05, h[:, 1])])
-    for front in (-1.0, 1.0):
-        offset = np.column_stack([front * (h[:, 0] - radius), 0 * radius, radius - h[:, 2]])
-        builder.add(boxes, meshes.CYLINDER, size, parts.RUBBER, (0.03, 0.03, 0.03), offset=offset, turn=_WHEEL_TURN)
-    builder.add(
-        boxes, meshes.ROUNDED, h * [0.5, 0.25, 0.22], parts.CAR_PAINT, boxes.pick(CAR_COLORS), offset=h * [0, 0, 0.1]
-    )
-    builder.add(boxes, meshes.BOX, h * [0.06, 0.95, 0.06], parts.METAL, (0.1, 0.1, 0.1), offset=h * [0.45, 0, 0.9])
+    places = (np.column_stack([side * (h[:, 0] - radius), 0 * radius, radius - h[:, 2]]) for side in (-1.0, 1.0))
+    return [
+        *(boxes.part(meshes.CYLINDER, size, parts.RUBBER, rubber, offset=at, turn=_WHEEL_TURN) for at in places),
+        boxes.part(meshes.ROUNDED, h * [0.5, 0.25, 0.22], parts.CAR_PAINT, paint, offset=h * [0, 0, 0.1]),
+        boxes.part(meshes.BOX, h * [0.06, 0.95, 0.06], parts.METAL, (0.1, 0.1, 0.1), offset=h * [0.45, 0, 0.9]),
+    ]
 
 
-def _pole(builder: PartBuilder, boxes: Boxes, most_m: float = 0.1) -> None:
+def _pole(boxes: Boxes, most_m: float = 0.1) -> Parts:
     h = boxes.half
     radius = np.minimum(np.minimum(h[:, 0], h[:, 1]), most_m)
     size = np.column_stack([radius, radius, 0.985 * h[:, 2]])
-    builder.add(boxes, meshes.CYLINDER, size, parts.METAL, (0.17, 0.18, 0.18), offset=h * [0, 0, -0.015])
+    return boxes.part(meshes.CYLINDER, size, parts.METAL, (0.17, 0.18, 0.18), offset=h * [0, 0, -0.015])
 
 
-def _poles(builder: PartBuilder, boxes: Boxes) -> None:
-    """Add poles; tall ones have lamps at the ends of an arm, if the box is wide enough for one."""
-    boxes = boxes.lengthwise()
+def _poles(boxes: Boxes) -> list[Parts]:
+    """Return poles; tall ones have lamps at the ends of an arm, if the box is wide enough for one."""
     is_head = boxes.half[:, 2] < boxes.half[:, 0]  # maps that keep arm and head apart from the pole
-    heads = boxes.select(is_head)
-    builder.add(heads, meshes.ROUNDED, heads.half, parts.LAMP, (0.17, 0.17, 0.17))
-    boxes = boxes.select(~is_head)
-    _pole(builder, boxes)
+    heads, boxes = boxes.select(is_head), boxes.select(~is_head)
     lamps = boxes.select(boxes.half[:, 2] > 1.2)
     h = lamps.half
-    size = np.column_stack([h[:, 0], np.minimum(h[:, 1], 0.06), np.minimum(0.03 * h[:, 2], 0.05)])
-    builder.add(lamps, meshes.BOX, size, parts.METAL, (0.2, 0.2, 0.2), offset=h * [0, 0, 0.96], min_px=FAR_PX)
-    head = np.stack(
-        [np.minimum(0.9 * h[:, 0], 0.35), np.minimum(h[:, 1], 0.16), np.minimum(0.04 * h[:, 2], 0.1)], axis=1
-    )
-    for side in (-1.0, 1.0):
-        offset = np.column_stack([side * (h[:, 0] - head[:, 0]), 0 * h[:, 1], 0.93 * h[:, 2]])
-        builder.add(lamps, meshes.ROUNDED, head, parts.LAMP, (0.75, 0.74, 0.68), offset=offset)
+    arm = np.column_stack([h[:, 0], np.minimum(h[:, 1], 0.06), np.minimum(0.03 * h[:, 2], 0.05)])
+    head, glass = np.minimum(h * [0.9, 1.0, 0.04], [0.35, 0.16, 0.1]), (0.75, 0.74, 0.68)
+    ends = (np.column_stack([side * (h[:, 0] - head[:, 0]), 0 * h[:, 1], 0.93 * h[:, 2]]) for side in (-1.0, 1.0))
+    return [
+        heads.part(meshes.ROUNDED, heads.half, parts.LAMP, (0.17, 0.17, 0.17)),
+        _pole(boxes),
+        lamps.part(meshes.BOX, arm, parts.METAL, (0.2, 0.2, 0.2), offset=h * [0, 0, 0.96], min_px=FAR_PX),
+        *(lamps.part(meshes.ROUNDED, head, parts.LAMP, glass, offset=end) for end in ends),
+    ]
 
 
-def _traffic_lights(builder: PartBuilder, boxes: Boxes) -> None:
-    boxes = boxes.lengthwise()
+def _traffic_lights(boxes: Boxes) -> list[Parts]:
     h = boxes.half
-    _pole(builder, boxes)
-    head = np.column_stack([np.minimum(h[:, 0], 0.22), np.minimum(h[:, 1], 0.2), np.minimum(0.35 * h[:, 2], 0.55)])
-    offset = np.column_stack([h[:, 0] - head[:, 0], 0 * h[:, 1], h[:, 2] - head[:, 2]])
+    head = np.minimum(h * [1.0, 1.0, 0.35], [0.22, 0.2, 0.55])
     arm = np.column_stack([h[:, 0], np.minimum(h[:, 1], 0.05), np.minimum(0.05 * h[:, 2], 0.05)])
-    builder.add(boxes, meshes.BOX, arm, parts.METAL, (0.14, 0.14, 0.14), offset=h * [0, 0, 0.9])
-    builder.add(boxes, meshes.BOX, head, parts.SIGNAL, (0.03, 0.035, 0.03), offset=offset)
+    return [
+        _pole(boxes),
+        boxes.part(meshes.BOX, arm, parts.METAL, (0.14, 0.14, 0.14), offset=h * [0, 0, 0.9]),
+        boxes.part(meshes.BOX, head, parts.SIGNAL, (0.03, 0.035, 0.03), offset=(h - head) * [1, 0, 1]),
+    ]
 
 
-def _signs(builder: PartBuilder, boxes: Boxes) -> None:
-    boxes = boxes.lengthwise()
+def _signs(boxes: Boxes) -> list[Parts]:
     h = boxes.half
-    _pole(builder, boxes, 0.04)
-    colors = np.array([[0.55, 0.03, 0.03], [0.04, 0.12, 0.45], [0.75, 0.75, 0.72], [0.60, 0.42, 0.02]])
     size = np.column_stack([h[:, 0], np.minimum(h[:, 1], 0.03), np.minimum(h[:, 0], 0.5 * h[:, 2])])
-    offset = np.column_stack([0 * h[:, 0], 0 * h[:, 1], h[:, 2] - size[:, 2]])
-    builder.add(boxes, meshes.BOX, size, parts.METAL, boxes.pick(colors), offset=offset)
+    board = boxes.part(meshes.BOX, size, parts.METAL, boxes.pick(SIGN_COLORS), offset=(h - size) * [0, 0, 1])
+    return [_pole(boxes, 0.04), board]
 
 
-def _bystanders(builder: PartBuilder, boxes: Boxes) -> None:
-    """Add standing people of the map: trousers, coat, head."""
-    h = boxes.half
-    coats = np.array([[0.10, 0.12, 0.20], [0.30, 0.08, 0.07], [0.12, 0.20, 0.13], [0.35, 0.30, 0.22]])
-    builder.add(boxes, meshes.LIMB, h * [0.5, 0.6, 0.46], parts.CLOTH, (0.05, 0.06, 0.09), offset=h * [0, 0, -0.54])
-    builder.add(boxes, meshes.ROUNDED, h * [0.55, 0.85, 0.36], parts.CLOTH, boxes.pick(coats), offset=h * [0, 0, 0.28])
-    builder.add(boxes, meshes.SPHERE, h * [0.34, 0.3, 0.15], parts.CLOTH, (0.5, 0.32, 0.22), offset=h * [0, 0, 0.82])
+def _people(boxes: Boxes) -> list[Parts]:
+    """Return standing people of the map: trousers, coat, head."""
+    h, coats = boxes.half, boxes.pick(COAT_COLORS)
+    return [
+        boxes.part(meshes.LIMB, h * [0.5, 0.6, 0.46], parts.CLOTH, (0.05, 0.06, 0.09), offset=h * [0, 0, -0.54]),
+        boxes.part(meshes.ROUNDED, h * [0.55, 0.85, 0.36], parts.CLOTH, coats, offset=h * [0, 0, 0.28]),
+        boxes.part(meshes.SPHERE, h * [0.34, 0.3, 0.15], parts.CLOTH, (0.5, 0.32, 0.22), offset=h * [0, 0, 0.82]),
+    ]
 
 
-BUILDERS = {
+SHAPES: dict[int, Shape] = {
     KINDS[name]: build
     for name, build in {
         "Roads": _box(parts.ROAD, (0.095, 0.095, 0.1), LAYERS["Roads"]),
@@ -303,7 +298,7 @@ BUILDERS = {
         "TrafficLight": _traffic_lights,
         "TrafficSigns": _signs,
         "Vegetation": _vegetation,
-        "Pedestrians": _bystanders,
+        "Pedestrians": _people,
         "Car": _cars,
         "Truck": _trucks,
         "Bus": _buses,
@@ -313,3 +308,10 @@ BUILDERS = {
         "Rider": _two_wheelers,
     }.items()
 }
+_AS_THEY_LIE = (_plain, _buildings, _vegetation, _people)
+
+
+def parts_of(boxes: Boxes) -> list[Parts]:
+    """Return the parts of boxes of one kind."""
+    shape = SHAPES.get(boxes.kind, _plain)
+    return shape(boxes if shape in _AS_THEY_LIE else boxes.lengthwise())
