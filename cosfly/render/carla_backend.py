@@ -28,16 +28,9 @@ from cosfly.render.simulator import Body, NoPictureError, ServerCommand, Simulat
 from cosfly.runtime.errors import InputError, RenderError
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import dump_json
+from cosfly.simulators import conventions
 from cosfly.simulators.carla_client import CarlaConfig, CarlaConnection, connect
-from cosfly.simulators.conventions import (
-    ACTOR_BITS,
-    SIMULATED_STEP_S,
-    camera_rotation_deg,
-    depth_of,
-    tags_of,
-    unreal_pose,
-    world_pose,
-)
+from cosfly.simulators.conventions import ACTOR_BITS, SIMULATED_STEP_S, unreal_pose
 from cosfly.simulators.guard import values_of, with_values
 
 log = logging.getLogger(__name__)
@@ -64,8 +57,6 @@ class CarlaRenderer(SimulatorRenderer):
     """A renderer by a CARLA server whose town is the map's."""
 
     engine, port_step = "carla", 10  # a server takes three ports from its own on
-    default_settings = CarlaRenderConfig
-    _cfg: CarlaRenderConfig
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._weather: WeatherParams | None = None
@@ -148,7 +139,7 @@ class CarlaRenderer(SimulatorRenderer):
     # --- one frame ----------------------------------------------------------------------------------------------------
 
     def _frame(self, camera_pose: np.ndarray, fov_deg: float, bodies: dict[int, Body]) -> Frame:
-        pose = self._transform(camera_pose[:3, 3], camera_rotation_deg(camera_pose))
+        pose = self._transform(camera_pose[:3, 3], conventions.camera_rotation_deg(camera_pose))
         if fov_deg != self._fov_deg or not self._cameras:
             self._make_cameras(fov_deg, pose)
         for number in self._movers.keys() - bodies.keys():
@@ -158,8 +149,8 @@ class CarlaRenderer(SimulatorRenderer):
         for camera, _ in self._cameras.values():
             camera.set_transform(pose)
         pictures = self._pictures(self._world.tick(self._cfg.timeout_s))
-        depth = depth_of(pictures["depth"])
-        kinds, actors = tags_of(pictures["tags"])
+        depth = conventions.depth_of(pictures["depth"])
+        kinds, actors = conventions.tags_of(pictures["tags"])
         kinds[kinds > max(KIND_NAMES)] = KINDS["NONE"]
         depth[depth < NEAR_M] = INVALID_DEPTH_M
         depth[kinds == KINDS["Sky"]] = SKY_DEPTH_M
@@ -175,8 +166,7 @@ class CarlaRenderer(SimulatorRenderer):
                 try:
                     number, data = inbox.get(timeout=max(0.0, until_s - time.monotonic()))
                 except queue.Empty:
-                    what = f"camera {name}: nothing of tick {frame} in {picture_s:g} s"
-                    raise NoPictureError(what) from None
+                    raise NoPictureError(f"camera {name}: nothing of tick {frame} in {picture_s:g} s") from None
                 if number == frame:
                     pictures[name] = np.frombuffer(data, np.uint8).reshape(*self._size_px[::-1], 4)
         return pictures
@@ -186,11 +176,11 @@ class CarlaRenderer(SimulatorRenderer):
     def _make_cameras(self, fov_deg: float, pose: Any) -> None:
         """Spawn the three cameras for a field of view, and tick until all of them listen."""
         self._stop_cameras()
+        width, height = map(str, self._size_px)
         for name, blueprint_name in SENSORS.items():
             blueprint = self._library.find(f"sensor.camera.{blueprint_name}")
-            size = zip(("image_size_x", "image_size_y"), map(str, self._size_px), strict=True)
-            attributes = {**dict(size), "fov": f"{fov_deg:g}", **(self._cfg.rgb_attributes if name == "rgb" else {})}
-            for key, text in attributes.items():
+            attributes = {"image_size_x": width, "image_size_y": height, "fov": f"{fov_deg:g}"}
+            for key, text in (attributes | (self._cfg.rgb_attributes if name == "rgb" else {})).items():
                 if not blueprint.has_attribute(key):
                     fix = "remove it from render.carla.rgb_attributes"
                     raise RenderError("the camera has no such attribute", where=self.device, got=key, fix=fix)
@@ -252,11 +242,9 @@ class CarlaRenderer(SimulatorRenderer):
 
     def _vehicle_sizes(self) -> dict[str, np.ndarray]:
         """Return the half extents of every car's blueprint; a server knows them of spawned actors only."""
-        if not self._sizes_m:
-            for blueprint in self._library.filter("vehicle.*"):
-                wheels = "number_of_wheels"
-                if blueprint.has_attribute(wheels) and int(blueprint.get_attribute(wheels)) != 4:
-                    continue
+        wheels = "number_of_wheels"
+        for blueprint in () if self._sizes_m else self._library.filter("vehicle.*"):
+            if not blueprint.has_attribute(wheels) or int(blueprint.get_attribute(wheels)) == 4:
                 actor = self._spawned(blueprint, self._far_up())
                 half = actor.bounding_box.extent
                 self._sizes_m[blueprint.id] = np.array([half.x, half.y, half.z])
@@ -293,23 +281,20 @@ def _ids_in_pictures(server: CarlaConnection, box_map: BoxMap, num_others: int) 
         boxes = server.world.get_level_bbs(server.carla.CityObjectLabel.values[kind])
         if not boxes:
             continue
-        places = [world_pose((b.location.x, b.location.y, b.location.z, 0.0, 0.0, 0.0))[0] for b in boxes]
+        places = [conventions.world_pose((b.location.x, b.location.y, b.location.z, 0.0, 0.0, 0.0))[0] for b in boxes]
         gaps_m, nearest = cKDTree(np.array(places)).query(box_map.centers[rows])
         actor_of_key: dict[int, int] = {}
-        for row, gap_m, place in zip(rows.tolist(), gaps_m.tolist(), nearest.tolist(), strict=True):
-            actor = boxes[place].actor_id
-            if gap_m > SAME_BOX_M:
-                continue
-            key, num_found = kind << 16 | actor & ACTOR_BITS, num_found + 1
+        for row, place in zip(rows[gaps_m <= SAME_BOX_M].tolist(), nearest[gaps_m <= SAME_BOX_M].tolist(), strict=True):
+            actor, num_found = boxes[place].actor_id, num_found + 1
+            key = kind << 16 | actor & ACTOR_BITS
             if key not in actor_of_key:
                 actor_of_key[key], table[key] = actor, ids[row]
             num_doubtful += actor_of_key[key] != actor
     where = f"{server.endpoint} (CARLA {server.version}), {server.town}"
     if not num_found:
+        what = "no box of the map is in the town that the server has loaded"
         fix = "export the map from this town (cosfly maps --source carla), or name its town in render.carla.town"
-        raise InputError(
-            "no box of the map is in the town that the server has loaded", where=where, got=box_map.name, fix=fix
-        )
+        raise InputError(what, where=where, got=box_map.name, fix=fix)
     if num_found < len(box_map) or num_doubtful:
         what = "%s: %d of %d boxes have an id in pictures; %d of those share 16 bits with another"
         log.warning(what, where, num_found, len(box_map), num_doubtful)

@@ -114,6 +114,9 @@ class PosedBystander:
         return self.body.hip_m if isinstance(self.body, PosedPerson) else self.body.center_m
 
 
+Others = Sequence[PosedBystander]
+
+
 class Renderer(Protocol):
     """A renderer of one map, for one thread: `RENDERERS[name](box_map, width_px, height_px, look, num_others, rim)`.
 
@@ -137,11 +140,7 @@ class Renderer(Protocol):
         """
 
     def render(
-        self,
-        camera_pose: np.ndarray,
-        intrinsic: np.ndarray,
-        person: PosedPerson | None,
-        others: Sequence[PosedBystander] = (),
+        self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None, others: Others = ()
     ) -> Frame:
         """Draw one frame from world_from_camera (4, 4), OpenCV axes, through K (3, 3) px.
 
@@ -154,16 +153,14 @@ class Renderer(Protocol):
         """Release the device."""
 
 
-# --- shared by all renderers
-# ----------------------------------------------------------------------------------------------
+# --- shared by all renderers ------------------------------------------------------------------------------------------
 
 
 def far_as_sky(frame: Frame) -> Frame:
     """Set pixels at FAR_M or beyond to sky: layers and rounding move the clip plane."""
     is_far = frame.depth >= FAR_M
-    if np.count_nonzero(is_far) == np.count_nonzero(frame.kinds == KINDS["Sky"]):
-        return frame
-    frame.depth[is_far], frame.kinds[is_far], frame.ids[is_far] = SKY_DEPTH_M, KINDS["Sky"], NO_INSTANCE
+    if np.count_nonzero(is_far) != np.count_nonzero(frame.kinds == KINDS["Sky"]):
+        frame.depth[is_far], frame.kinds[is_far], frame.ids[is_far] = SKY_DEPTH_M, KINDS["Sky"], NO_INSTANCE
     return frame
 
 
@@ -239,7 +236,13 @@ def plants_of(centers_m: np.ndarray, half_m: np.ndarray, seeds: np.ndarray) -> t
     is_lawn = hz < LAWN_HALF_M
     is_hedge = (hz < 1.8) & (wide >= 0.45) & ((wide > 2.5 * narrow) | (wide > 4.0))
     is_trunk = (hz >= 1.3) & (wide < 0.45) & (hz > 3.0 * wide)  # maps that keep trunk and crown apart
-    is_crown = _over_a_trunk(centers_m, half_m, is_trunk)
+    is_crown = np.zeros(len(centers_m), dtype=bool)  # of a trunk that is a box of its own
+    if is_trunk.any():
+        from scipy.spatial import cKDTree  # takes half a second to import, which every command would pay
+
+        gap, nearest = cKDTree(centers_m[is_trunk, :2]).query(centers_m[:, :2])
+        foot = (centers_m[is_trunk, 2] - hz[is_trunk])[nearest]
+        is_crown = (gap < wide + 1.0) & (centers_m[:, 2] - hz > foot + 0.8)
     is_conifer = (chance(seeds, 5) < 0.18) & (hz > 1.6 * wide)
     is_form = [is_lawn, is_hedge, hz < 1.3, is_trunk, is_crown, is_conifer]
     forms = np.select(is_form, [LAWN, HEDGE, BUSH, TRUNK, CROWN, CONIFER], BROADLEAF)
@@ -251,17 +254,6 @@ def stem_radius_m(half_m: np.ndarray) -> np.ndarray:
     """Return the radius of the stem of a tree that is one box, (n,)."""
     narrow = half_m[:, :2].min(axis=1)
     return np.minimum(np.clip(0.075 * narrow, 0.05, 0.32), narrow)
-
-
-def _over_a_trunk(centers_m: np.ndarray, half_m: np.ndarray, is_trunk: np.ndarray) -> np.ndarray:
-    """Return which boxes are the crown of a trunk that is a box of its own, (n,) bool."""
-    if not is_trunk.any():
-        return np.zeros(len(centers_m), dtype=bool)
-    from scipy.spatial import cKDTree  # takes half a second to import, which every command would pay
-
-    gap, nearest = cKDTree(centers_m[is_trunk, :2]).query(centers_m[:, :2])
-    foot = (centers_m[is_trunk, 2] - half_m[is_trunk, 2])[nearest]
-    return (gap < half_m[:, :2].max(axis=1) + 1.0) & (centers_m[:, 2] - half_m[:, 2] > foot + 0.8)
 
 
 def seeds_of(ids: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cosfly.formats.bystanders import Bystander
-from cosfly.formats.frames import BystanderMeta, BystandersMeta, tree_yaw
+from cosfly.formats.frames import BystanderMeta, BystandersMeta, tree_position, tree_yaw
 from cosfly.formats.people import COLORS, EMPTY_SHARE, FIGURES, GARMENTS, HAIR, Appearance, People
 from cosfly.geometry.axes import headings_of
 from cosfly.geometry.kernels import distances_to_boxes_m
@@ -67,24 +67,21 @@ class Gait:
 
     def since(self, first: int) -> Gait:
         """Return the gait from a frame on."""
-        return Gait(self.headings_rad[first:], self.phases_rad[first:], self.swings[first:])
+        return Gait(*(values[first:] for values in vars(self).values()))
 
     def posed(self, i: int, hip_m: np.ndarray, clothes: Clothes) -> PosedPerson:
         """Return the person of frame i, at a hip point, (3,) world."""
-        return PosedPerson(
-            hip_m, float(self.headings_rad[i]), float(self.phases_rad[i]), float(self.swings[i]), clothes
-        )
+        heading_rad, phase_rad, swing = (float(values[i]) for values in vars(self).values())
+        return PosedPerson(hip_m, heading_rad, phase_rad, swing, clothes)
 
 
 def gait_of(targets_m: np.ndarray, time_s: np.ndarray) -> Gait:
     """Compute heading and stride from positions, (n, 3), at times (n,). A standing person keeps the last heading."""
-    n = len(targets_m)
-    if n == 1:
+    if len(targets_m) == 1:
         return Gait(np.zeros(1), np.zeros(1), np.zeros(1))
-    steps = np.diff(targets_m[:, :2], axis=0)
-    walked_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
+    steps_m = np.linalg.norm(np.diff(targets_m[:, :2], axis=0), axis=1)
     speed = np.linalg.norm(np.gradient(targets_m[:, :2], time_s, axis=0), axis=1)
-    phases = 2.0 * np.pi * walked_m / STRIDE_M
+    phases = 2.0 * np.pi * np.concatenate([[0.0], np.cumsum(steps_m)]) / STRIDE_M
     return Gait(headings_of(targets_m, time_s), phases, np.clip(speed / SLOW_MPS, 0.0, 1.0))
 
 
@@ -112,33 +109,34 @@ class DressedBystanders:
 
     def posed(self, i: int) -> list[PosedBystander]:
         """Return all bystanders in frame i."""
-        return [PosedBystander(other_id(number), self._body(number, i)) for number in range(len(self))]
-
-    def _body(self, number: int, i: int) -> PosedPerson | PosedCar:
-        other = self.others[number]
-        center_m = other.centers_m[i]
-        if other.kind == "Pedestrians":
-            return self.gaits[number].posed(i, center_m, self.clothes[number])
-        return PosedCar(center_m, float(other.headings_rad[i]), other.build.half_extents_m, float(self.seeds[number]))
+        found = []
+        for number, other in enumerate(self.others):
+            center_m, heading_rad = other.centers_m[i], float(other.headings_rad[i])
+            body: PosedPerson | PosedCar
+            if other.kind == "Pedestrians":
+                body = self.gaits[number].posed(i, center_m, self.clothes[number])
+            else:
+                body = PosedCar(center_m, heading_rad, other.build.half_extents_m, float(self.seeds[number]))
+            found.append(PosedBystander(other_id(number), body))
+        return found
 
     def meta(self, i: int, frame: Frame, hidden_by_others: float, hidden_by_map: float) -> BystandersMeta:
         """Return the annotation of the bystanders in frame i."""
         pixels = np.bincount(frame.ids.ravel(), minlength=other_id(0) + 1)
-        lines = [
-            BystanderMeta(
-                instance_id=other_id(number),
-                semantic_id=other.kind_number,
-                world_location=other.centers_m[i],
-                yaw=tree_yaw(float(np.degrees(other.headings_rad[i]))),
-                half_extents_m=other.build.half_extents_m,
-                num_pixels=int(pixels[other_id(number)]),
-            )
-            for number, other in enumerate(self.others)
-        ]
         return BystandersMeta(
             target_hidden_by_others=round(hidden_by_others, SHARE_DIGITS),
             target_hidden_by_map=round(hidden_by_map, SHARE_DIGITS),
-            others=lines,
+            others=[
+                BystanderMeta(
+                    instance_id=other_id(number),
+                    semantic_id=other.kind_number,
+                    world_location=tree_position(other.centers_m[i]),
+                    yaw=tree_yaw(float(np.degrees(other.headings_rad[i]))),
+                    half_extents_m=other.build.half_extents_m,
+                    num_pixels=int(pixels[other_id(number)]),
+                )
+                for number, other in enumerate(self.others)
+            ],
         )
 
     def distance_m(self, i: int, point_m: np.ndarray) -> float:

@@ -9,9 +9,8 @@ applied, and the frame's state records why.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -27,7 +26,6 @@ from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_
 from cosfly.render.contract import plane_z_m
 from cosfly.render.person import NO_BYSTANDERS, DressedBystanders
 from cosfly.runtime.config import Config
-from cosfly.runtime.seeding import rng_for
 
 HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # from the hip point: where branches and signs may be in the way
 NONE, APPLIED = "none", "applied"
@@ -154,46 +152,6 @@ class Surroundings:
         return (np.abs(local[:, :2]) <= self._half[:, :2]).all(axis=1)
 
 
-@dataclass(frozen=True)
-class ShiftDraw:
-    """One frame's draws. events: (2,) of position and rotation, below their probability; person_m, drone_m, view_m:
-    (3,); roll: share of the largest, -1 to 1."""
-
-    events: np.ndarray
-    person_m: np.ndarray
-    drone_m: np.ndarray
-    view_m: np.ndarray
-    roll: float
-
-
-def shift_draws(
-    rng: np.random.Generator, *, person_radius_m: float, drone_radius_m: float, view_radius_m: float, is_cubic: bool
-) -> Iterator[ShiftDraw]:
-    """Yield the draws of one frame after the other, without end; each takes the same number of the generator's."""
-    of_roll = rng.spawn(1)[0]  # the paper's track has none, and draws the same with and without
-    for _ in repeat(None):
-        yield ShiftDraw(
-            rng.random(2),
-            _offset(rng, person_radius_m, 2, is_cubic),
-            _offset(rng, drone_radius_m, 3, is_cubic),
-            _offset(rng, view_radius_m, 3, is_cubic),
-            of_roll.uniform(-1.0, 1.0),
-        )
-
-
-def rng_of_shifts(seed: int, path_id: str) -> np.random.Generator:
-    """Return the random generator of the perturbed track of a path."""
-    return rng_for(seed, "render", f"{path_id}/{PERTURBED}")
-
-
-def _offset(rng: np.random.Generator, radius_m: float, num_axes: int, is_cubic: bool) -> np.ndarray:
-    """Return an offset evenly distributed in a cube or a ball, (3,); z is 0 for two axes."""
-    in_cube = radius_m * rng.uniform(-1.0, 1.0, num_axes)
-    direction, share = rng.normal(size=num_axes), rng.random()
-    in_ball = radius_m * direction / np.linalg.norm(direction) * share ** (1.0 / num_axes)
-    return np.append(in_cube if is_cubic else in_ball, np.zeros(3 - num_axes))
-
-
 def perturb(
     planned: Poses,
     cameras: Sequence[Camera],
@@ -205,23 +163,29 @@ def perturb(
     """Perturb every frame of a trajectory; each takes the same number of random draws."""
     unshifted = PerturbedTrack.unperturbed(planned)
     result = replace(PerturbedTrack.unperturbed(planned), unshifted=unshifted)
-    draws = shift_draws(
-        rng,
-        person_radius_m=cfg.pedestrian_radius_m,
-        drone_radius_m=cfg.drone_radius_m,
-        view_radius_m=cfg.view_radius_m,
-        is_cubic=cfg.sampling == "cubic",
-    )
-    for i, draw in zip(range(len(result.states)), draws, strict=False):
+    of_roll = rng.spawn(1)[0]  # the paper's track has none, and draws the same with and without
+    for i in range(len(result.states)):
+        is_shifted, is_turned = rng.random(2) < [cfg.position_probability, cfg.rotation_probability]
+        person_m = _offset(rng, cfg, cfg.pedestrian_radius_m, 2)
+        drone_m, view_m = _offset(rng, cfg, cfg.drone_radius_m, 3), _offset(rng, cfg, cfg.view_radius_m, 3)
+        roll = of_roll.uniform(-1.0, 1.0)
         position = NONE
-        if draw.events[0] < cfg.position_probability:
-            position = _shift(result, planned, i, draw.person_m, draw.drone_m, cameras[i], surroundings, cfg, others)
-        if draw.events[1] < cfg.rotation_probability:
+        if is_shifted:
+            position = _shift(result, planned, i, person_m, drone_m, cameras[i], surroundings, cfg, others)
+        if is_turned:
             for each in (unshifted, result):
-                _turn(each, i, draw, cameras[i], cfg)
+                _turn(each, i, view_m, roll, cameras[i], cfg)
         if position != APPLIED:
             result.drop_shift(i, position)
     return result
+
+
+def _offset(rng: np.random.Generator, cfg: PerturbationConfig, radius_m: float, num_axes: int) -> np.ndarray:
+    """Return an offset evenly distributed in a cube or a ball, (3,); z is 0 for two axes."""
+    in_cube = radius_m * rng.uniform(-1.0, 1.0, num_axes)
+    direction, share = rng.normal(size=num_axes), rng.random()
+    in_ball = radius_m * direction / np.linalg.norm(direction) * share ** (1.0 / num_axes)
+    return np.append(in_cube if cfg.sampling == "cubic" else in_ball, np.zeros(3 - num_axes))
 
 
 def _shift(
@@ -250,25 +214,25 @@ def _shift(
     poses = result.poses
     poses.positions_m[i], poses.targets_m[i], poses.rotations_deg[i] = drone, target, aimed
     poses.clearances_m[i] = distances[0]
-    result.drone_offsets_m[i] = drone_offset
-    result.target_offsets_m[i] = target - planned.targets_m[i]
+    result.drone_offsets_m[i], result.target_offsets_m[i] = drone_offset, target - planned.targets_m[i]
     result.states[i]["position"] = APPLIED
     return APPLIED
 
 
-def _turn(result: PerturbedTrack, i: int, draw: ShiftDraw, camera: Camera, cfg: PerturbationConfig) -> None:
+def _turn(
+    result: PerturbedTrack, i: int, view_m: np.ndarray, roll: float, camera: Camera, cfg: PerturbationConfig
+) -> None:
     """Apply one frame's rotation event to the pose that the frame has, or note the reason for the fallback."""
     drone, target = result.poses.positions_m[i], result.poses.targets_m[i]
-    turn = wrap_deg(_aim_deg(drone, target + draw.view_m) - _aim_deg(drone, target))
-    turn = np.array([*np.clip(turn, -cfg.max_view_deg, cfg.max_view_deg), cfg.max_roll_deg * draw.roll])
+    turn = wrap_deg(_aim_deg(drone, target + view_m) - _aim_deg(drone, target))
+    turn = np.array([*np.clip(turn, -cfg.max_view_deg, cfg.max_view_deg), cfg.max_roll_deg * roll])
     rotation = result.poses.rotations_deg[i] + turn
     rotation[1] = wrap_deg(rotation[1])
     if abs(rotation[0]) >= 90.0 or not in_frame(target, drone, rotation, camera, cfg.frame_margin):
         result.states[i]["rotation"] = OUT_OF_VIEW
         return
     result.states[i]["rotation"] = APPLIED
-    result.poses.rotations_deg[i] = rotation
-    result.rotation_offsets_deg[i] = turn
+    result.poses.rotations_deg[i], result.rotation_offsets_deg[i] = rotation, turn
 
 
 def _aim_deg(eye: np.ndarray, target: np.ndarray) -> np.ndarray:

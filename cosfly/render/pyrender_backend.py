@@ -9,8 +9,6 @@ depth. pyrender's own depth comes from a multisampled 24-bit buffer and is wrong
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import WeatherParams
 from cosfly.geometry.axes import rotation_matrices, rotation_matrix
 from cosfly.render import contract
-from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedBystander, PosedCar, PosedPerson
+from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, Others, PosedBystander, PosedPerson
 from cosfly.render.figure import figure_of
 from cosfly.render.surfaces import are_solids, drape, is_draped, layers_of, solids_of
 from cosfly.runtime.errors import EnvironmentMissing, RenderError
@@ -49,28 +47,22 @@ def _open_screen(width_px: int, height_px: int) -> Any:
     try:
         import pyrender
         import trimesh  # noqa: F401
+        from OpenGL.EGL import eglDestroyContext
         from pyrender.shader_program import ShaderProgramCache
 
         screen = pyrender.OffscreenRenderer(width_px, height_px)
     except ModuleNotFoundError as error:
-        raise EnvironmentMissing(
-            "the renderer pyrender is not installed", got=str(error), fix='pip install "cosfly[pyrender]"'
-        ) from None
+        what, fix = "the renderer pyrender is not installed", 'pip install "cosfly[pyrender]"'
+        raise EnvironmentMissing(what, got=str(error), fix=fix) from None
     # PyOpenGL raises its own, an ImportError without libEGL; pyrender's platforms bare assertions.
     except Exception as error:
-        raise EnvironmentMissing(
-            "no OpenGL without a window (EGL)", got=str(error), fix=f"apt-get install {contract.DEBIAN_PACKAGES}"
-        ) from None
+        fix = f"apt-get install {contract.DEBIAN_PACKAGES}"
+        raise EnvironmentMissing("no OpenGL without a window (EGL)", got=str(error), fix=fix) from None
     screen._renderer._program_cache = ShaderProgramCache(str(Path(__file__).parent / "pyrender_shaders"))
-    _keep_display(screen._platform)
-    return screen
-
-
-def _keep_display(platform: Any) -> None:
-    """Make closing end this context only: pyrender would end the display, which all contexts share."""
-    from OpenGL.EGL import eglDestroyContext
-
+    # Closing ends this context only: pyrender would end the display, which all contexts share.
+    platform = screen._platform
     platform.delete_context = lambda: eglDestroyContext(platform._egl_display, platform._egl_context)
+    return screen
 
 
 class PyrenderRenderer:
@@ -93,16 +85,11 @@ class PyrenderRenderer:
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
         """Check that no weather is asked for; there are no shadows to compute."""
         if weather is not None:
-            raise RenderError(
-                "the renderer pyrender draws no weather", fix="use render.backend gl, or weather_mode off"
-            )
+            fix = "use render.backend gl, or weather_mode off"
+            raise RenderError("the renderer pyrender draws no weather", fix=fix)
 
     def render(
-        self,
-        camera_pose: np.ndarray,
-        intrinsic: np.ndarray,
-        person: PosedPerson | None,
-        others: Sequence[PosedBystander] = (),
+        self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None, others: Others = ()
     ) -> Frame:
         """Draw one frame, as the contract says."""
         contract.check_pose(camera_pose, intrinsic)
@@ -113,12 +100,9 @@ class PyrenderRenderer:
         pose[:3, 3] -= self._origin
         lens = [intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2], intrinsic[1, 2]]
         added = [self._scene.add(pyrender.IntrinsicsCamera(*lens, NEAR_M, FAR_M), pose=pose)]
-        if person is not None:
-            added.append(self._scene.add(self._mesh(*_figure(person, self._origin, contract.PERSON_ID))))
-        for other in others:
-            body, instance_id = other.body, other.instance_id
-            draw = partial(_figure, body) if isinstance(body, PosedPerson) else partial(_car, body)
-            added.append(self._scene.add(self._mesh(*draw(self._origin, instance_id))))
+        target = [] if person is None else [PosedBystander(contract.PERSON_ID, person)]
+        for mover in (*target, *others):
+            added.append(self._scene.add(self._mesh(*_mover(mover, self._origin))))
         tags, colors, bits = (self._draw(red) for red in (255, 128, 0))
         for node in added:
             self._scene.remove_node(node)
@@ -219,38 +203,28 @@ def _all_boxes(
     return np.concatenate(triangles), np.concatenate(colors), np.concatenate(tagged)
 
 
-def _figure(person: PosedPerson, origin: np.ndarray, instance_id: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return triangles, colours and tags of a person, made of balls, boxes and cylinders."""
+def _mover(mover: PosedBystander, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return triangles, colours and tags of a person, made of balls, boxes and cylinders, or of a car of two boxes: the
+    body, and a shorter, narrower cabin."""
     import trimesh
 
-    ball, box = trimesh.creation.icosphere(subdivisions=2), trimesh.creation.box(extents=(2.0, 2.0, 2.0))
-    rod = trimesh.creation.cylinder(1.0, 2.0, sections=12)
-    units = {"ball": ball.triangles, "rounded": box.triangles, "disc": rod.triangles}
-    units["limb"] = rod.triangles * LIMB_SHARE
-    figure, triangles = figure_of(person), []
-    for shape, center, turn, half in zip(figure.shapes, figure.centers_m, figure.turns, figure.half_m, strict=True):
-        triangles.append((units[shape] * half) @ turn.T + center - origin)
-    painted = np.repeat(figure.colors, [len(solid) for solid in triangles], axis=0)
-    return np.concatenate(triangles), painted, _standing_tags("Pedestrians", instance_id, len(painted))
-
-
-def _car(car: PosedCar, origin: np.ndarray, instance_id: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return triangles, colours and tags of a car of two boxes: the body, and a shorter, narrower cabin."""
-    import trimesh
-
-    length, width, height = car.half_extents_m
-    turn, solids = rotation_matrix(0.0, car.heading_rad, 0.0), []
-    for size, place in (
-        ((2 * length, 2 * width, height), (0, 0, -height / 2)),
-        ((length, 1.6 * width, height), (-0.1 * length, 0, height / 2)),
-    ):
-        solids.append(trimesh.creation.box(extents=size).apply_translation(place).triangles)
-    triangles = np.concatenate(solids) @ turn.T + car.center_m - origin
-    paint = CAR_PAINTS[int(car.seed * len(CAR_PAINTS))]
-    return triangles, np.tile(paint, (len(triangles), 1)), _standing_tags("Car", instance_id, len(triangles))
-
-
-def _standing_tags(kind: str, instance_id: int, count: int) -> np.ndarray:
-    """Return the tags of something on the ground, (count, 4)."""
-    tag = _tags(np.array([KINDS[kind]]), np.array([instance_id]), np.array([contract.STANDING_LAYER]))
-    return np.repeat(tag, count, axis=0)
+    body = mover.body
+    if isinstance(body, PosedPerson):
+        ball, box = trimesh.creation.icosphere(subdivisions=2), trimesh.creation.box(extents=(2.0, 2.0, 2.0))
+        rod = trimesh.creation.cylinder(1.0, 2.0, sections=12).triangles
+        units = {"ball": ball.triangles, "rounded": box.triangles, "disc": rod, "limb": rod * LIMB_SHARE}
+        figure = figure_of(body)
+        solids = zip(figure.shapes, figure.centers_m, figure.turns, figure.half_m, strict=True)
+        parts = [(units[shape] * half) @ turn.T + center - origin for shape, center, turn, half in solids]
+        triangles, kind = np.concatenate(parts), KINDS["Pedestrians"]
+        paint = np.repeat(figure.colors, [len(part) for part in parts], axis=0)
+    else:
+        length, width, height = body.half_extents_m
+        lower = trimesh.creation.box(extents=(2 * length, 2 * width, height)).apply_translation((0, 0, -height / 2))
+        cabin = trimesh.creation.box(extents=(length, 1.6 * width, height))
+        cabin.apply_translation((-0.1 * length, 0, height / 2))
+        triangles, kind = np.concatenate([lower.triangles, cabin.triangles]), KINDS["Car"]
+        triangles = triangles @ rotation_matrix(0.0, body.heading_rad, 0.0).T + body.center_m - origin
+        paint = np.tile(CAR_PAINTS[int(body.seed * len(CAR_PAINTS))], (len(triangles), 1))
+    tag = _tags(np.array([kind]), np.array([mover.instance_id]), np.array([contract.STANDING_LAYER]))
+    return triangles, paint, np.repeat(tag, len(triangles), axis=0)

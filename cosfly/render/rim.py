@@ -112,11 +112,9 @@ def _roads(box_map: BoxMap, town: np.ndarray, rng: np.random.Generator) -> np.nd
         strips = [(axis, *ends, place) for place in taken]
         strips += [(across, town[0, across] - m, town[1, across] + m, town[side, axis] + sign * m) for m in LANES_M]
         for along, begin, end, place in strips:
-            length = abs(end - begin) / 2.0 + ROAD_HALF_M
-            middle, size = ((begin + end) / 2.0, place), (length, ROAD_HALF_M)
-            roads.append(
-                [*(middle if along == 0 else middle[::-1]), *(size if along == 0 else size[::-1]), FLAT_HALF_M]
-            )
+            turn = 1 if along == 0 else -1
+            middle, size = ((begin + end) / 2.0, place)[::turn], (abs(end - begin) / 2.0 + ROAD_HALF_M, ROAD_HALF_M)
+            roads.append([*middle, *size[::turn], FLAT_HALF_M])
     return np.array(roads)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,7 +12,7 @@ from pydantic import Field
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import Camera, Look
 from cosfly.geometry.axes import focal_px
-from cosfly.render.contract import PERSON_ID, Frame, PosedBystander, PosedCar, PosedPerson, check_pose
+from cosfly.render.contract import PERSON_ID, Frame, Others, PosedCar, PosedPerson, check_pose
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import EnvironmentMissing, RenderError
 from cosfly.runtime.worker import worker_place
@@ -47,23 +46,14 @@ class SimulatorRenderer(ABC):
     dresses = False  # people wear what their blueprint wears
     engine: ClassVar[str]
     port_step: ClassVar[int] = 1  # between the servers of two workers
-    default_settings: ClassVar[Any]
     device: str
-    _cfg: Any
 
     def __init__(
-        self,
-        box_map: BoxMap,
-        width_px: int,
-        height_px: int,
-        look: Look,
-        num_others: int = 0,
-        rim: BoxMap | None = None,
-        settings: Any = None,
-    ) -> None:
-        self._map, self._size_px, self._num_others = box_map, (width_px, height_px), num_others
-        self._cfg = self.default_settings() if settings is None else settings
-        self._port = self._cfg.port + self.port_step * worker_place()
+        self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0,
+        rim: BoxMap | None = None, *, settings: Any,
+    ) -> None:  # fmt: skip
+        self._map, self._size_px, self._num_others, self._cfg = box_map, (width_px, height_px), num_others, settings
+        self._port = settings.port + self.port_step * worker_place()
         self._open()
 
     @abstractmethod
@@ -82,15 +72,16 @@ class SimulatorRenderer(ABC):
         return EngineGuard(self.engine, self._cfg.host, self._port, self._cfg.server_command, self._cfg.timeout_s)
 
     def render(
-        self,
-        camera_pose: np.ndarray,
-        intrinsic: np.ndarray,
-        person: PosedPerson | None,
-        others: Sequence[PosedBystander] = (),
+        self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None, others: Others = ()
     ) -> Frame:
         """Draw one frame, as the contract says; one that fails is drawn again after `_recover`."""
         check_pose(camera_pose, intrinsic)
-        fov_deg = self._fov_deg_of(intrinsic)
+        width, height = self._size_px
+        fov_deg = round(Camera(width, height, intrinsic).fov_deg, 6)  # all that a simulator knows of a lens
+        f = focal_px(width, fov_deg)
+        if not np.allclose(intrinsic, [[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]], atol=1e-3):
+            what, expected = "the simulator has no such lens", "square pixels and the principal point in the middle"
+            raise RenderError(what, where=self.device, got=str(intrinsic.tolist()), expected=expected)
         bodies = ({} if person is None else {PERSON_ID: person}) | {one.instance_id: one.body for one in others}
         problem: Exception | None = None
         for attempt in range(1, TRIES + 1):
@@ -107,16 +98,6 @@ class SimulatorRenderer(ABC):
         if isinstance(problem, NoPictureError):
             raise RenderError("a camera sends no picture", where=self.device, got=str(problem), fix=FIX)
         raise EnvironmentMissing("the server does not answer any more", where=self.device, got=str(problem), fix=FIX)
-
-    def _fov_deg_of(self, intrinsic: np.ndarray) -> float:
-        """Return the horizontal field of view, degrees: all that a simulator knows of a lens."""
-        width, height = self._size_px
-        fov_deg = round(Camera(width, height, intrinsic).fov_deg, 6)
-        f = focal_px(width, fov_deg)
-        if not np.allclose(intrinsic, [[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]], atol=1e-3):
-            what, expected = "the simulator has no such lens", "square pixels and the principal point in the middle"
-            raise RenderError(what, where=self.device, got=str(intrinsic.tolist()), expected=expected)
-        return fov_deg
 
 
 def placement_of(body: Body, lead_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

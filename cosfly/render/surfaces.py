@@ -23,22 +23,21 @@ MIN_HALF_EXTENT_M = 1e-3
 
 
 @dataclass(frozen=True)
-class DrapedSurfaces:
-    """Triangles on the ground, k of them: corners_m (k, 3, 3) world, counter-clockwise from above; rows (k,) of the
+class Triangles:
+    """Triangles in the world, k of them: corners_m (k, 3, 3), counter-clockwise from above or outside; rows (k,) of the
     map's boxes, or BARE_GROUND."""
 
     corners_m: np.ndarray
     rows: np.ndarray
 
+    def __len__(self) -> int:
+        return len(self.corners_m)
+
     @property
     def normals(self) -> np.ndarray:
-        """Return (k, 3) unit vectors that point up."""
-        return _unit_normals(self.corners_m)
-
-
-def _unit_normals(corners_m: np.ndarray) -> np.ndarray:
-    normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        """Return (k, 3) unit vectors that point up or out; 0 of a triangle without an area."""
+        normals = np.cross(self.corners_m[:, 1] - self.corners_m[:, 0], self.corners_m[:, 2] - self.corners_m[:, 0])
+        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
 def is_draped(box_map: BoxMap) -> np.ndarray:
@@ -48,7 +47,7 @@ def is_draped(box_map: BoxMap) -> np.ndarray:
     return box_map.is_any_of(DRAPED_KINDS) & ~lies_off_ground(box_map, DRAPED_KINDS)
 
 
-def drape(box_map: BoxMap) -> DrapedSurfaces:
+def drape(box_map: BoxMap) -> Triangles:
     """Return the triangles of the ground and of the surfaces on it, for a map with sloping ground."""
     ground = box_map.ground
     if ground.is_flat:
@@ -65,13 +64,12 @@ def drape(box_map: BoxMap) -> DrapedSurfaces:
     halves = np.maximum(box_map.half_extents[rows, :2], MIN_HALF_EXTENT_M)
     pieces, owners = [bare], [np.full(len(bare), BARE_GROUND)]
     for k, row in enumerate(rows):
-        cells = np.add.outer(
-            np.arange(first[k, 1], last[k, 1] + 1) * cells_x, np.arange(first[k, 0], last[k, 0] + 1)
-        ).ravel()
+        x, y = (np.arange(first[k, axis], last[k, axis] + 1) for axis in (0, 1))
+        cells = np.add.outer(y * cells_x, x).ravel()
         triangles = bare[np.concatenate([2 * cells, 2 * cells + 1])]
         pieces.append(_cut(triangles, frames[k], halves[k]))
         owners.append(np.full(len(pieces[-1]), row))
-    return DrapedSurfaces(np.concatenate(pieces), np.concatenate(owners))
+    return Triangles(np.concatenate(pieces), np.concatenate(owners))
 
 
 def _cut(triangles: np.ndarray, frame: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -123,54 +121,37 @@ def layers_of(box_map: BoxMap) -> np.ndarray:
 
 
 def _tiers(box_map: BoxMap, layers: np.ndarray) -> np.ndarray:
-    """Return the tier of each surface, (n,) in [0, 1): the lowest without an earlier one, or the highest."""
-    tiers = np.zeros(len(box_map), dtype=int)
-    for row, others in _overlaps(box_map, layers).items():  # in the map's order, so that earlier ones have theirs
-        free = np.setdiff1d(np.arange(MOST_TIERS), tiers[others])
-        tiers[row] = free[0] if len(free) else MOST_TIERS - 1
-    return tiers / (tiers.max(initial=0) + 1)
-
-
-def _overlaps(box_map: BoxMap, layers: np.ndarray) -> dict[int, list[int]]:
-    """Return by row of a surface the earlier rows that overlap it in the same layer and plane, in order."""
+    """Return the tier of each surface, (n,) in [0, 1): the lowest that no earlier one has which overlaps it in the same
+    layer and plane, or the highest."""
     rows = np.flatnonzero((layers < STANDING_LAYER) & ~box_map.rotations_deg[:, [0, 2]].any(axis=1))
     yaws = np.radians(box_map.rotations_deg[rows, 1])[:, None]
     x, y = np.moveaxis(np.maximum(box_map.half_extents[rows, None, :2] - EDGE_M, 0.0) * CORNERS, 2, 0)
     turned = np.stack([x * np.cos(yaws) - y * np.sin(yaws), x * np.sin(yaws) + y * np.cos(yaws)], axis=2)
     outlines = shapely.polygons(turned + box_map.centers[rows, None, :2])
     tops_m = np.where(is_draped(box_map), 0.0, box_map.maxs[:, 2])[rows]  # those on a slope all lie in the ground
-    found: dict[int, list[int]] = {}
     later, earlier = shapely.STRtree(outlines).query(outlines, predicate="intersects")
     is_same = (earlier < later) & (layers[rows[earlier]] == layers[rows[later]])
     is_same &= np.abs(tops_m[earlier] - tops_m[later]) < SAME_HEIGHT_M
-    order = np.lexsort((earlier[is_same], later[is_same]))
-    for row, other in zip(rows[later[is_same][order]].tolist(), rows[earlier[is_same][order]].tolist(), strict=True):
-        found.setdefault(row, []).append(other)
-    return found
+    overlapped: dict[int, list[int]] = {}
+    for row, other in zip(rows[later[is_same]].tolist(), rows[earlier[is_same]].tolist(), strict=True):
+        overlapped.setdefault(row, []).append(other)
+    tiers = np.zeros(len(box_map), dtype=int)
+    for row in sorted(overlapped):  # in the map's order, so that earlier ones have theirs
+        free = np.setdiff1d(np.arange(MOST_TIERS), tiers[overlapped[row]])
+        tiers[row] = free[0] if len(free) else MOST_TIERS - 1
+    return tiers / (tiers.max(initial=0) + 1)
 
 
 # --- meshes -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Solids:
-    """Triangles of meshes in the world, k of them, each on its own: corners_m (k, 3, 3), counter-clockwise from
-    outside; rows (k,) of the boxes whose id and kind they show; colors (k, 3) linear RGB, NaN for that of the
-    kind; things (k,) ascending, a number for each placed mesh.
-    """
+class Solids(Triangles):
+    """Triangles of meshes: colors (k, 3) linear RGB, NaN for that of the kind; things (k,) ascending, a number for each
+    placed mesh."""
 
-    corners_m: np.ndarray
-    rows: np.ndarray
     colors: np.ndarray
     things: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.corners_m)
-
-    @property
-    def normals(self) -> np.ndarray:
-        """Return (k, 3) unit vectors that point out; 0 of a triangle without an area."""
-        return _unit_normals(self.corners_m)
 
 
 def are_solids(box_map: BoxMap) -> np.ndarray:

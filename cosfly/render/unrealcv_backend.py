@@ -28,17 +28,11 @@ from cosfly.render.contract import NEAR_M, NO_INSTANCE, Frame, PosedPerson, far_
 from cosfly.render.simulator import Body, NoPictureError, ServerCommand, SimulatorRenderer, placement_of
 from cosfly.runtime.arrays import parse_array, parse_picture
 from cosfly.runtime.errors import ConfigError, InputError, RenderError
+from cosfly.simulators import unrealcv_client
 from cosfly.simulators.assets import id_of, kind_of
 from cosfly.simulators.conventions import FAR_CM, camera_rotation_deg, unreal_pose, world_pose
 from cosfly.simulators.guard import EngineGuard
-from cosfly.simulators.unrealcv_client import (
-    OURS,
-    NoAnswerError,
-    UnrealCvConfig,
-    connect,
-    is_refusal,
-    spawned_by_cosfly,
-)
+from cosfly.simulators.unrealcv_client import OURS, NoAnswerError, UnrealCvConfig, is_refusal, spawned_by_cosfly
 
 log = logging.getLogger(__name__)
 
@@ -61,8 +55,7 @@ class UnrealCvRenderConfig(UnrealCvConfig, ServerCommand):
 class UnrealCvRenderer(SimulatorRenderer):
     """A renderer by an UnrealCV server whose level is the map's."""
 
-    engine, default_settings = "unrealcv", UnrealCvRenderConfig
-    _cfg: UnrealCvRenderConfig
+    engine = "unrealcv"
     _guard: EngineGuard | None = None
 
     # --- the server ---------------------------------------------------------------------------------------------------
@@ -70,14 +63,13 @@ class UnrealCvRenderer(SimulatorRenderer):
     def _open(self) -> None:
         """Start the server if a command is given, connect, and find the map in its level."""
         is_first = self._guard is None
-        if self._guard is None:
-            self._guard = self._start_guard()
+        self._guard = self._guard or self._start_guard()
         try:
-            self._server = connect(self._cfg, self._port)
+            self._server = unrealcv_client.connect(self._cfg, self._port)
             weakref.finalize(self, self._server.close)  # a server has one client at a time
             try:
                 with self._server.asking("UnrealCV did not describe its level"):
-                    self._begin(self._guard if is_first else None)
+                    self._begin(is_first)
             except Exception:
                 self._server.close()
                 raise
@@ -86,15 +78,15 @@ class UnrealCvRenderer(SimulatorRenderer):
                 self._leave()
             raise
 
-    def _begin(self, guard: EngineGuard | None) -> None:
-        """Read what the level holds; note for a guard how the camera was found."""
+    def _begin(self, is_first: bool) -> None:
+        """Read what the level holds; note at first for the guard how the camera was found."""
         self.device = f"UnrealCV {self._server.version} at {self._server.endpoint}, {self._server.level}"
         self._spawned: dict[int, str] = {}
         self._fov_deg = 0.0
-        if guard is not None:
-            asked = ("size", "fov", "pose")
-            found = zip(asked, self._server.ask(*(f"vget {self._camera}/{what}" for what in asked)), strict=True)
-            guard.note([f"vset {self._camera}/{what} {text!s}" for what, text in found if not is_refusal(text)])
+        if is_first and self._guard is not None:
+            asked = [f"{self._camera}/{what}" for what in ("size", "fov", "pose")]
+            found = zip(asked, self._server.ask(*(f"vget {name}" for name in asked)), strict=True)
+            self._guard.note([f"vset {name} {text!s}" for name, text in found if not is_refusal(text)])
         names = str(*self._server.ask("vget /objects"))
         left = spawned_by_cosfly(names)  # by a connection that broke
         self._server.run(*(f"vset /object/{name}/destroy" for name in left))
@@ -182,9 +174,8 @@ class UnrealCvRenderer(SimulatorRenderer):
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
         """Remove everybody; the level's own weather stays."""
         if weather is not None:
-            raise RenderError(
-                "the renderer unrealcv draws no weather", where=self.device, fix="use backend gl or carla"
-            )
+            what, fix = "the renderer unrealcv draws no weather", "use backend gl or carla"
+            raise RenderError(what, where=self.device, fix=fix)
         with self._server.asking("UnrealCV did not remove people"):
             for number in list(self._spawned):
                 self._server.run(self._removal(number))
@@ -223,9 +214,8 @@ class UnrealCvRenderer(SimulatorRenderer):
         if np.linalg.norm(place_m - position_m) > SAME_PLACE_M:
             both = np.stack([place_m, position_m])
             over_m = both[:, 2] - self._map.ground.height_at(both)
-            got, wanted = (
-                f"{np.round(p, 2).tolist()}, {over:.1f} m over the ground" for p, over in zip(both, over_m, strict=True)
-            )
+            places = zip(both.round(2).tolist(), over_m, strict=True)
+            got, wanted = (f"{place}, {over:.1f} m over the ground" for place, over in places)
             fix = "find what moves it, as a pawn's gravity, or use another camera (render.unrealcv.camera)"
             what = "the camera is not where it was put"
             raise RenderError(what, where=self.device, got=got, expected=wanted, fix=fix)
@@ -240,8 +230,7 @@ class UnrealCvRenderer(SimulatorRenderer):
         raw = parse_array(depth if isinstance(depth, bytes) else depth.encode(), "depth", dtype=np.float32, ndim=2)
         if sizes := [one.shape[:2] for one in (*pictures, raw) if one.shape[:2] != shape]:
             raise InputError("a picture has another size", where=self.device, got=str(sizes[0]), expected=str(shape))
-        blue, green, red = (pictures[1][..., k].astype(np.int64) for k in range(3))
-        colors = red << 16 | green << 8 | blue
+        colors = pictures[1].astype(np.int64) @ [1, 1 << 8, 1 << 16]  # blue, green, red
         kinds, ids, depth_m = self._kinds[colors], self._ids[colors], raw / np.float32(self._cfg.coord_scale)
         is_sky = ~(raw < FAR_CM)
         depth_m[depth_m < NEAR_M], depth_m[is_sky] = INVALID_DEPTH_M, SKY_DEPTH_M
@@ -256,12 +245,10 @@ class UnrealCvRenderer(SimulatorRenderer):
         position_m, turn_deg, _, speed_mps = placement_of(body, self._cfg.settle_delay_s if animate else 0.0)
         place, turn = self._there(position_m, turn_deg)
         commands = [f"vset /object/{name}/location {place}", f"vset /object/{name}/rotation {turn}"]
-        if not animate or not isinstance(body, PosedPerson):
-            return commands
-        if speed_mps <= 0.0:
-            return [*commands, f"vbp {name} StopAgent"]
-        speed = f"vbp {name} SetMaxSpeed {speed_mps * self._cfg.coord_scale:.3f}"
-        return [*commands, speed, f"vbp {name} MoveForward"]
+        if animate and isinstance(body, PosedPerson):
+            speed = f"vbp {name} SetMaxSpeed {speed_mps * self._cfg.coord_scale:.3f}"
+            commands += [speed, f"vbp {name} MoveForward"] if speed_mps > 0.0 else [f"vbp {name} StopAgent"]
+        return commands
 
     def _spawn(self, number: int, body: Body) -> str:
         """Spawn somebody in a colour that no object has; return their name."""

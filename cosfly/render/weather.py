@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 import secrets
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -86,7 +86,7 @@ class WeatherConfig(Config):
                 problems.append(f"{field} is needed in weather_mode fixed")
             if name is not None and self.weather_mode != "fixed":
                 problems.append(f"{field} is for weather_mode fixed, and the mode is {self.weather_mode}")
-            if name is not None and pool is None:
+            if pool is None:
                 problems += _unknown(name, presets, field)
             if pool is not None and self.weather_mode == "off":
                 problems.append(f"{pool_field} is given, and weather_mode is off")
@@ -107,8 +107,7 @@ class WeatherConfig(Config):
 
     def pool_files(self) -> dict[str, Path]:
         """Return the files of presets, which are inputs of the stage."""
-        files = {"weather_pool": self.weather_pool, "tod_pool": self.tod_pool}
-        return {name: path for name, path in files.items() if path is not None}
+        return {name: path for name in ("weather_pool", "tod_pool") if (path := getattr(self, name)) is not None}
 
 
 class WeatherPool(Config):
@@ -143,11 +142,11 @@ def read_pools(cfg: WeatherConfig) -> Pools:
     for i, (path, model, field) in enumerate(own):
         if path is None:
             continue
-        given, name = build(model, read_yaml(path), path).presets, getattr(cfg, field)
+        given = build(model, read_yaml(path), path).presets
         pools[i] = {preset_token(name): knobs for name, knobs in given.items()}
         if len(pools[i]) < len(given):
             raise ConfigError("two presets have the same name", where=path, got=", ".join(given))
-        if name is not None and (problems := _unknown(name, pools[i], field)):
+        if problems := _unknown(getattr(cfg, field), pools[i], field):
             raise ConfigError("; ".join(problems), where=path)
     found = Pools(*pools)
     lacking = [kind for kind, share in cfg.sky_shares.items() if share and kind not in found.of_kind()]
@@ -157,9 +156,9 @@ def read_pools(cfg: WeatherConfig) -> Pools:
     return found
 
 
-def _unknown(name: str, presets: Mapping[str, Any], field: str) -> list[str]:
-    """Return what is wrong with the name of a preset; an empty list if it exists."""
-    if preset_token(name) in presets:
+def _unknown(name: str | None, presets: Mapping[str, Any], field: str) -> list[str]:
+    """Return what is wrong with the name of a preset; an empty list if it exists, or none is given."""
+    if name is None or preset_token(name) in presets:
         return []
     return [f"{field}: unknown preset {name!r}{nearest(preset_token(name), presets)}; there are {', '.join(presets)}"]
 
@@ -179,14 +178,19 @@ def weather_of(cfg: WeatherConfig, pools: Pools, path_index: int) -> WeatherReco
     if cfg.weather_mode == "off":
         return None
     if cfg.weather_mode == "fixed":
-        names = preset_token(str(cfg.weather_name)), preset_token(str(cfg.tod_name))
+        names = [preset_token(str(name)) for name in (cfg.weather_name, cfg.tod_name)]
     elif cfg.weather_mode == "by_weight":
-        names = next(islice(_to_quota(cfg, pools), path_index, None))
+        # Pairs of one kind are adjacent, so that kinds meet their quota as pairs do. Tokens have no blanks.
+        of_kind = pools.of_kind()
+        shares = {kind: share / len(of_kind[kind]) for kind, share in cfg.sky_shares.items() if share}
+        weights = {f"{kind} {weather} {time}": shares[kind] for kind in shares for weather, time in of_kind[kind]}
+        drawn = draw_to_quota(weights, rng_for(cfg.weather_seed, "render", "skies"))  # none depends on their number
+        _, *names = next(islice(drawn, path_index, None)).split(" ")
     else:
         assert cfg.weather_seed >= 0, "`run` draws one"
         # Python guarantees a stable sequence for a seed only of `random()`.
         rng = random.Random(path_seed(cfg.weather_seed, path_index))
-        names = _random_name(pools.weathers, rng), _random_name(pools.times, rng)
+        names = [list(presets)[int(rng.random() * len(presets))] for presets in (pools.weathers, pools.times)]
     params = resolved(pools.weathers[names[0]], pools.times[names[1]])
     return WeatherRecord(mode=cfg.weather_mode, weather_name=names[0], tod_name=names[1], params=params)
 
@@ -215,18 +219,3 @@ def fog_hides(sky: WeatherRecord | None, distance_m: float) -> bool:
     """Return whether fog and rain make a person illegible at a distance."""
     thick = 0.0 if sky is None else fog_extinction(sky.params) * max(0.0, distance_m - sky.params.fog_distance)
     return math.exp(-CONTRAST_POWER * thick) * STRONGEST_CONTRAST < LEGIBLE_CONTRAST
-
-
-def _to_quota(cfg: WeatherConfig, pools: Pools) -> Iterator[tuple[str, str]]:
-    """Yield weather and time of trajectory 0, 1, ...; none depends on the number of trajectories."""
-    # Pairs of one kind are adjacent, so that kinds meet their quota as pairs do. Tokens have no blanks.
-    of_kind = pools.of_kind()
-    shares = {kind: share / len(of_kind[kind]) for kind, share in cfg.sky_shares.items() if share}
-    weights = {f"{kind} {weather} {time}": shares[kind] for kind in shares for weather, time in of_kind[kind]}
-    for name in draw_to_quota(weights, rng_for(cfg.weather_seed, "render", "skies")):
-        _, weather, time = name.split(" ")
-        yield weather, time
-
-
-def _random_name(presets: Mapping[str, Any], rng: random.Random) -> str:
-    return list(presets)[int(rng.random() * len(presets))]
