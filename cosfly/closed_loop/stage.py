@@ -253,17 +253,15 @@ def make_worker(cfg: ClosedLoopConfig, inputs: Inputs, out: Path, seed: int, num
     """Open a renderer and an engine in this process; return the function that flies the episodes of an item."""
     boxes, simplified, plans, others = inputs
     runner, traces = EpisodeRunner(cfg, out, seed, num), read_traces(plans)
-    companions = rendering.bystanders_by_path(others, traces)
-    num_others = rendering.num_others_of(companions)
+    bystanders, num_others = rendering.bystanders_of(others, traces)
     space = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed, num_others=num_others)
     map_sha256 = sha256_file(boxes)
 
     def opened(n: int) -> ClosedLoopTrajectory:
-        bystanders = companions.get(traces[n].path_id)
+        cast, flown = bystanders.get(traces[n].path_id, ()), _cut(traces[n], cfg.fly)
         return ClosedLoopTrajectory(
-            space, _cut(traces[n], cfg.fly), number=n, num_lead=cfg.fly.lead_frames, lost_s=cfg.fly.lost_s,
-            others=() if bystanders is None else bystanders.others,
-        )  # fmt: skip
+            space, flown, number=n, num_lead=cfg.fly.lead_frames, lost_s=cfg.fly.lost_s, others=cast
+        )
 
     return lambda item: runner.fly({traces[n].path_id: partial(opened, n) for n in item.payload}, map_sha256)
 

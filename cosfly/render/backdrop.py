@@ -1,8 +1,5 @@
-"""A rendered map from above: the backdrop of the editor of regions (sec:appendix_g_mask_editor).
-
-It consists of square tiles, each seen from straight above its middle, so that the ground is in place to the pixel and
-a wall of 30 m leans by 2 m at most.
-"""
+"""A rendered map from above: the backdrop of the editor of regions (sec:appendix_g_mask_editor), in square tiles, each
+seen from straight above its middle: the ground is in place to the pixel, and a wall of 30 m leans by 2 m at most."""
 
 from __future__ import annotations
 
@@ -71,7 +68,7 @@ def run(
     low, high = box_map.bounds()
     west, south, east, north = bounds_m or (*low[:2].tolist(), *high[:2].tolist())
     size = np.ceil(np.array([east - west, north - south]) * pixels_per_m)
-    if not (np.isfinite(size).all() and (size >= 1).all() and size.max() <= LONGEST_SIDE_PX):
+    if not ((size >= 1).all() and (size <= LONGEST_SIDE_PX).all()):
         got = f"{size[0]:g} x {size[1]:g} px of {west:g} {south:g} {east:g} {north:g}"
         expected, fix = f"1 to {LONGEST_SIDE_PX} px each way", "set other --bounds or fewer --pixels-per-m"
         raise ConfigError("the picture cannot have this size", where="--bounds", got=got, expected=expected, fix=fix)

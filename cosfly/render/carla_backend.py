@@ -1,8 +1,6 @@
 """Rendering by a running CARLA server: it draws its own town, people and air, and this module decodes (sec:step5).
 
-Each frame is one synchronous tick: three cameras in one place, and their pictures of that tick. A health check ends a
-worker whose server does not answer, so that the stage replaces it; a guard leaves the server as it was found. A box
-that CARLA does not have, and what has no box, have the id NO_INSTANCE.
+Each frame is one synchronous tick of three cameras in one place. Boxes that CARLA does not have get no id.
 """
 
 from __future__ import annotations

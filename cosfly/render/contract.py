@@ -3,12 +3,11 @@
 All renderers draw the same things in the same places, so that depth, kinds and ids do not depend on the renderer:
 
 - every box, or something of its kind that stays inside it, with its id of `instance_ids`; the person with PERSON_ID;
-- bystanders, people and cars, each with its own id from the caller (`other_id`);
+  bystanders, people and cars, each with its own id from the caller (`other_id`);
 - of a tree that is one box a stem, and foliage only from `crown_low` of `plants_of` up: people walk under it;
-- a ground plane of Terrain under everything (`ground_plane`) or, on sloping ground, its triangles and surfaces
-  (surfaces.py) with the plane below their lowest place; sky where nothing is between NEAR_M and FAR_M (`far_as_sky`);
-- scenery beyond the map if it is asked for (rim.py), with NO_INSTANCE;
-- of coplanar surfaces the one of the higher layer, and within a layer always the same one (surfaces.py).
+- a ground plane of Terrain (`ground_plane`) or sloping ground (surfaces.py), scenery beyond the map (rim.py), with
+  NO_INSTANCE; sky where nothing is between NEAR_M and FAR_M (`far_as_sky`);
+- of coplanar surfaces the one of the higher layer, and within a layer always the same one.
 """
 
 from __future__ import annotations

@@ -1,9 +1,5 @@
-"""The figure of a walking person, as solids for any renderer: 1.8 m high, with a walk cycle driven by the distance
-walked, and the garments of an appearance.
-
-It stays within the circle around the target's box (PERSON_HALF_EXTENTS_M), to 3 mm: in mid-stride the tips of the shoes
-pass its sides by up to 13 cm.
-"""
+"""The figure of a walking person of 1.8 m, as solids for any renderer, with a walk cycle and the garments of an
+appearance. It stays within the circle around the target's box (PERSON_HALF_EXTENTS_M), to 3 mm."""
 
 from __future__ import annotations
 

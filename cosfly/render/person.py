@@ -111,12 +111,10 @@ class DressedBystanders:
         """Return all bystanders in frame i."""
         found = []
         for number, other in enumerate(self.others):
-            center_m, heading_rad = other.centers_m[i], float(other.headings_rad[i])
-            body: PosedPerson | PosedCar
-            if other.kind == "Pedestrians":
-                body = self.gaits[number].posed(i, center_m, self.clothes[number])
-            else:
-                body = PosedCar(center_m, heading_rad, other.build.half_extents_m, float(self.seeds[number]))
+            center_m, half_m = other.centers_m[i], other.build.half_extents_m
+            body: PosedPerson | PosedCar = self.gaits[number].posed(i, center_m, self.clothes[number])
+            if other.kind != "Pedestrians":
+                body = PosedCar(center_m, float(other.headings_rad[i]), half_m, float(self.seeds[number]))
             found.append(PosedBystander(other_id(number), body))
         return found
 

@@ -1,10 +1,6 @@
-"""The perturbed track (app:dual_track): small random shifts of person, drone and view, frame by frame, with fallbacks.
-
-Each frame draws two independent events. *Position*: the person is shifted on the ground and the drone in space.
-*Rotation*: the camera looks at a point near the person, at most theta_max off per axis, and may roll. A shift that
-puts person or drone too near an obstacle, the person out of the picture or, once it is drawn, hides the person, is not
-applied, and the frame's state records why.
-"""
+"""The perturbed track (app:dual_track): small random shifts of person and drone (position) and turns of the view
+(rotation), frame by frame. What comes too near an obstacle, or loses or hides the person, falls back, and the frame's
+state records why."""
 
 from __future__ import annotations
 

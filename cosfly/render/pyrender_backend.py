@@ -1,10 +1,6 @@
-"""The second renderer, a cross-check of the default one: plain boxes, trees and figures through trimesh and
-pyrender (EGL).
-
-It is slower by an order of magnitude and has no shadows, but depth, kinds and ids are right. Each frame is drawn three
-times in pyrender's segmentation mode, with two shaders of this package: tags, colours, and the float32 bits of the
-depth. pyrender's own depth comes from a multisampled 24-bit buffer and is wrong by centimetres at 30 m.
-"""
+"""The second renderer, a slow cross-check of the default one: plain boxes, trees and figures through trimesh and
+pyrender (EGL). Each frame is drawn three times in segmentation mode, for tags, colours and the float32 bits of the
+depth: pyrender's own depth is wrong by centimetres at 30 m."""
 
 from __future__ import annotations
 

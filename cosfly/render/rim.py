@@ -1,9 +1,6 @@
-"""The rim: scenery beyond a map instead of an endless lawn: fields, roads out of the town, houses and trees that thin
-out, blocks on the skyline.
+"""The rim: scenery beyond a map instead of an endless lawn: fields, roads, houses and trees that thin out, a skyline.
 
-Only renderers use it, and its pixels have no instance. Fields lie in the ground plane, also under the map where that
-plane is visible. Solid things begin at SOLIDS_FROM_M, beyond every trajectory. Rectangles are rows of middle and half
-sizes along x and y, then the half height; `town`: (2, 2) the map's low and high corner.
+Rectangles are rows of middle and half sizes along x and y, then the half height; `town`: (2, 2) low and high corner.
 """
 
 from __future__ import annotations

@@ -14,7 +14,6 @@ from cosfly.render.perturbation import PerturbationConfig
 from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
 from cosfly.render.weather import WeatherConfig
 from cosfly.runtime.arrays import LONGEST_SIDE_PX
-from cosfly.runtime.config import Config
 
 SIMULATORS = ("carla", "unrealcv")
 
@@ -87,38 +86,29 @@ class RenderConfig(WeatherConfig):
         description="a target is visible if more than this share of its box is unhidden and it has at least one pixel",
     )
 
-    @property
-    def of_backend(self) -> Config | None:
-        """Return the settings of the chosen renderer; None if it has none."""
-        return getattr(self, self.backend, None)
-
     def recorded(self) -> dict[str, Any]:
         """Return the recorded settings, without those that are unused."""
-        used = {"rim": self.rim, "path_index": self.path_index is not None}
-        used |= {name: self.backend == name for name in SIMULATORS}
-        return {name: value for name, value in super().recorded().items() if used.get(name, True)}
+        unused = {name for name in SIMULATORS if name != self.backend}
+        unused |= {name for name in ("rim", "path_index") if getattr(self, name) in (False, None)}
+        return {name: value for name, value in super().recorded().items() if name not in unused}
 
     @field_validator("fovs_deg")
     @classmethod
     def _fovs_are_possible(cls, fovs: tuple[float, ...]) -> tuple[float, ...]:
         if wrong := [fov for fov in fovs if not LEAST_FOV_DEG <= fov <= MOST_FOV_DEG]:
-            raise ValueError(
-                f"every field of view must lie in (0, 180) degrees, {LEAST_FOV_DEG} to {MOST_FOV_DEG}; got {wrong[0]:g}"
-            )
+            span = f"(0, 180) degrees, {LEAST_FOV_DEG} to {MOST_FOV_DEG}"
+            raise ValueError(f"every field of view must lie in {span}; got {wrong[0]:g}")
         return fovs
 
     @model_validator(mode="after")
     def _weather_can_be_drawn(self) -> RenderConfig:
         if self.backend in SIMULATORS and (self.look != Look() or self.rim):
             raise ValueError(f"backend {self.backend} has its own sun, air and horizon: remove look and rim")
-        if self.weather_mode == "off":
-            return self
-        if self.backend in ("pyrender", "unrealcv"):
+        if self.weather_mode != "off" and self.backend in ("pyrender", "unrealcv"):
             raise ValueError(f"backend {self.backend} draws no weather: use gl or carla, or weather_mode off")
-        if self.look != Look():
-            raise ValueError(
-                "look is for trajectories without weather: remove it (--set 'render.look={}'), or use weather_mode off"
-            )
+        if self.weather_mode != "off" and self.look != Look():
+            fix = "remove it (--set 'render.look={}'), or use weather_mode off"
+            raise ValueError(f"look is for trajectories without weather: {fix}")
         return self
 
     @field_validator("tracks", "modalities")

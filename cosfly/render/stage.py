@@ -1,7 +1,4 @@
-"""Stage 5: drone trajectories to RGB, depth and instance frames of a clean and a perturbed track, as a playback tree.
-
-RENDERERS names the implementations of `contract.Renderer`.
-"""
+"""Stage 5: drone trajectories to a playback tree: RGB, depth and instance frames of a clean and a perturbed track."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.formats.boxes import BoxMap, check_ground, read_boxes
-from cosfly.formats.bystanders import Bystander, Bystanders, read_bystanders
+from cosfly.formats.bystanders import Bystander, read_bystanders
 from cosfly.formats.frames import Camera, Look
 from cosfly.formats.places import place_of, town_folder
 from cosfly.formats.town import IDS_FILE, IDS_FORMAT, write_town_map
@@ -51,6 +48,7 @@ RENDERERS = {
     "unrealcv": "cosfly.render.unrealcv_backend:UnrealCvRenderer",
 }
 TRAJECTORY = "trajectory_"
+Inputs = tuple[Path, Path, Path, Path | None]  # drawn and simplified map, trajectories, bystanders
 FIRST_S, SPAN_S = 1_000_000_000, 999_000_000  # seconds of ten digits, as those of the public release
 FROM_ONE_RUN = "pass the others.json that was written together with path.json"
 
@@ -65,11 +63,7 @@ def open_renderer(
     rim: BoxMap | None = None,
     settings: Config | None = None,
 ) -> Renderer:
-    """Open a renderer for one map and at most `num_others` bystanders.
-
-    Args:
-        settings: The renderer's own, if it has any; None uses its defaults.
-    """
+    """Open a renderer for one map and at most `num_others` bystanders; settings: the renderer's own, if it has any."""
     if name not in RENDERERS:
         raise ConfigError("the renderer is unknown", where="render.backend", got=name, expected=", ".join(RENDERERS))
     module, _, attribute = RENDERERS[name].partition(":")
@@ -81,7 +75,7 @@ def open_renderer(
 def renderer_of(cfg: RenderConfig, box_map: BoxMap, seed: int, num_others: int = 0) -> Renderer:
     """Open the renderer that the settings ask for."""
     rim, size_px = rim_of(box_map, seed) if cfg.rim else None, (cfg.width_px, cfg.height_px)
-    return open_renderer(cfg.backend, box_map, *size_px, cfg.look, num_others, rim, cfg.of_backend)
+    return open_renderer(cfg.backend, box_map, *size_px, cfg.look, num_others, rim, getattr(cfg, cfg.backend, None))
 
 
 # --- scripts of tracks ------------------------------------------------------------------------------------------------
@@ -114,9 +108,8 @@ def make_track_script(
     )
     fov_deg = float(cfg.fovs_deg[int(shared.integers(len(cfg.fovs_deg)))])
     clothes = choose_clothes(shared)
-    cast = dress_bystanders(
-        [other.every(cfg.frame_stride) for other in others], trace.time_s, clothes.looks, others_rng
-    )
+    drawn_others = [other.every(cfg.frame_stride) for other in others]
+    cast = dress_bystanders(drawn_others, trace.time_s, clothes.looks, others_rng)
     size_px = cfg.width_px, cfg.height_px
     fovs_deg = [fov_deg]
     if cfg.zoom.mode == "dynamic":
@@ -191,7 +184,7 @@ def run(
     if not passed:
         tally = Tally(input=len(all_traces), dropped=Counter(str(trace.drop_reason) for trace in all_traces))
         raise stage.nothing_kept(tally, expected="a trajectory that the planner accepted")
-    num_others = num_others_of(bystanders_by_path(others, all_traces))
+    _, num_others = bystanders_of(others, all_traces)
     ids = instance_ids(box_map, num_others)
     if num_shared := int((ids == SHARED_ID).sum()):
         log.warning("render: %d boxes share the instance id %d: ids have 16 bits", num_shared, SHARED_ID)
@@ -206,7 +199,7 @@ def run(
         for number, trace in passed.items()
         for track in cfg.tracks
     ]
-    arguments = (cfg, boxes, simplified, traces, others, out, town, seed, min(workers, len(items)))
+    arguments = (cfg, (boxes, simplified, traces, others), out, town, seed, min(workers, len(items)))
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="render: frames")
     ids_file, map_file = out / town / IDS_FILE, write_town_map(out / town, box_map.header)
     ids_record = {
@@ -244,24 +237,17 @@ class _RenderedTrack(BaseModel):
     weather_seed: int | None = None
 
 
-def bystanders_by_path(others: Path | None, traces: list[DroneTrace]) -> dict[str, Bystanders]:
-    """Read the bystanders of every trajectory, by path id; an empty table without a file."""
-    if others is None:
-        return {}
-    found = {bystanders.path_id: bystanders for bystanders in read_bystanders(others)}
-    for trace in traces:
+def bystanders_of(others: Path | None, traces: list[DroneTrace]) -> tuple[dict[str, list[Bystander]], int]:
+    """Read the bystanders of every trajectory, by path id, and how many ids they need: as many as one has at most."""
+    found = {} if others is None else {one.path_id: one.others for one in read_bystanders(others)}
+    for trace in traces if others is not None else ():
         where, num_times = f"{others}: {trace.path_id}", len(trace.time_s)
         if trace.path_id not in found:
             raise InputError("the file has no bystanders of a path", where=where, fix=FROM_ONE_RUN)
-        if wrong := {len(other.positions_m) for other in found[trace.path_id].others} - {num_times}:
+        if wrong := {len(other.positions_m) for other in found[trace.path_id]} - {num_times}:
             what, got = "bystanders have other times than the trajectory", f"{wrong.pop()} positions"
             raise InputError(what, where=where, got=got, expected=str(num_times), fix=FROM_ONE_RUN)
-    return found
-
-
-def num_others_of(bystanders: dict[str, Bystanders]) -> int:
-    """Return how many ids the bystanders of a tree need: as many as a trajectory has at most."""
-    return max((len(one.others) for one in bystanders.values()), default=0)
+    return found, max(map(len, found.values()), default=0)
 
 
 def _names(
@@ -288,24 +274,14 @@ def _names(
     return town, {"first_timestamp": first, "weather_seed": weather_seed}
 
 
-def make_worker(
-    cfg: RenderConfig,
-    boxes: Path,
-    simplified: Path,
-    traces: Path,
-    others: Path | None,
-    out: Path,
-    town: str,
-    seed: int,
-    num_processes: int,
-) -> Work:
+def make_worker(cfg: RenderConfig, inputs: Inputs, out: Path, town: str, seed: int, num_processes: int) -> Work:
     """Open a renderer in this process and return the function that draws one (trace, track)."""
+    boxes, simplified, traces, others = inputs
     if num_processes > 1:
         # Processes share the cores: one rasteriser thread each. The driver reads it when it loads.
         os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num_processes)))
     surroundings, all_traces = Surroundings(read_boxes(simplified)), read_traces(traces)
-    bystanders = bystanders_by_path(others, all_traces)
-    num_others = num_others_of(bystanders)
+    bystanders, num_others = bystanders_of(others, all_traces)
     box_map, pools = read_boxes(boxes), read_pools(cfg)
     renderer = renderer_of(cfg, box_map, seed, num_others)
     overlay = Overlay(box_map, instance_ids(box_map, num_others)) if cfg.debug else None
@@ -317,8 +293,8 @@ def make_worker(
         if cfg.rim:
             check_outside_rim(trace, box_map)
         weather = weather_of(cfg, pools, trace.drawn_as(number).number)
-        others_here = bystanders[trace.path_id].others if bystanders else ()
-        script = make_track_script(trace, number, track, town, surroundings, cfg, seed, others_here, weather)
+        cast = bystanders.get(trace.path_id, ())
+        script = make_track_script(trace, number, track, town, surroundings, cfg, seed, cast, weather)
         folder = out / town / script.trajectory / script.variant
         with atomic_folder(folder) as unfinished:
             made = render_track(renderer, script, unfinished, cfg, overlay)
@@ -326,18 +302,15 @@ def make_worker(
             "folder": str(folder.relative_to(out)),
             "num_frames": len(made),
             "fov_deg": round(made.camera.fov_deg, 6),
-        }
-        if made.intrinsics is not None:
-            result["fovs_deg"] = [round(fov, 6) for fov in made.fovs_deg]
-        result |= {
+            "fovs_deg": None if made.intrinsics is None else [round(fov, 6) for fov in made.fovs_deg],
             "num_visible": int(made.target.visible.sum()),
             "mean_visibility": round(float(made.target.visibility.mean()), 6),
             "num_perturbed": int(made.perturbation.is_perturbed.sum()),
             "goal": made.raw["goal"]["absent"] if made.goal is None else "told",
         }
         if weather is not None:
-            names = {"weather": weather.weather_name, "time_of_day": weather.tod_name}
-            result |= names | {"weather_seed": cfg.weather_seed}
-        return Outcome(result)
+            result |= {"weather": weather.weather_name, "time_of_day": weather.tod_name}
+            result["weather_seed"] = cfg.weather_seed
+        return Outcome({name: value for name, value in result.items() if value is not None})
 
     return work

@@ -1,8 +1,5 @@
-"""Triangles that all renderers draw instead of boxes, on sloping ground and for meshes; layers of surfaces.
-
-Sloping ground is its own triangles. Each surface is its box's outline cut out of them, so that it lies in the ground
-everywhere; layers decide which of several surfaces in one place is visible.
-"""
+"""Triangles that all renderers draw instead of boxes, on sloping ground and for meshes; layers, which decide which of
+several surfaces in one place is visible. A surface is its box's outline cut out of the ground's triangles."""
 
 from __future__ import annotations
 

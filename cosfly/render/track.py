@@ -225,7 +225,13 @@ def _write_frame(
 ) -> tuple[TargetMeta, dict[str, str]]:
     """Encode and write one frame, in a thread; return the target's annotation, and file name -> sha256."""
     name, meta = frames.frame_name(meta.index), meta.model_copy(update={"target": written_target(meta.target, frame)})
-    contents = dict(_frame_file(file, frame, cfg) for file in cfg.modalities)
+    contents: dict[str, bytes] = {}
+    if "rgb" in cfg.modalities:
+        contents[frames.FILE_NAMES["rgb"]] = frames.rgb_bytes(frame.rgb)
+    if "depth" in cfg.modalities:
+        contents |= [frames.depth_file(frame.depth, cfg.depth_format)]
+    if "instance" in cfg.modalities:
+        contents[frames.FILE_NAMES["instance"]] = frames.instance_bytes(frame.kinds, frame.ids)
     if overlay is not None:
         contents[frames.DEBUG_FILE] = frames.rgb_bytes(overlay.draw(frame.rgb, frame.ids, meta))
     contents["meta.json"] = meta.to_bytes()
@@ -237,19 +243,19 @@ def _write_frame(
     return meta.target, {f"{name}/{file_name}": sha256_bytes(data) for file_name, data in contents.items()}
 
 
-def _frame_file(file: frames.FrameFile, frame: Frame, cfg: RenderConfig) -> tuple[str, bytes]:
-    if file == "depth":
-        return frames.depth_file(frame.depth, cfg.depth_format)
-    is_rgb = file == "rgb"
-    return frames.FILE_NAMES[file], frames.rgb_bytes(frame.rgb) if is_rgb else frames.instance_bytes(
-        frame.kinds, frame.ids
-    )
-
-
 def _track(script: TrackScript, targets: list[TargetMeta], visibility: np.ndarray, bystanders: list[dict]) -> Track:
     perturbed, trace, cameras = script.perturbed, script.trace, script.cameras
     zooms = any(camera is not cameras[0] for camera in cameras)
-    corners = {"uv": ("image_uv", 2), "bbox": ("bbox_2d", 4), "mask_bbox": ("mask_bbox_2d", 4)}
+
+    def column(name: str, num: int = 1) -> np.ndarray:
+        return np.array([[np.nan] * num if (value := getattr(one, name)) is None else value for one in targets])
+
+    offsets = perturbed.drone_offsets_m, perturbed.rotation_offsets_deg, perturbed.target_offsets_m
+    weather = {} if script.weather is None else {"weather": script.weather.model_dump()}
+    points = [
+        {"perturbation": dict(state), "target": target.model_dump(include=set(LEGIBILITY)), **others}
+        for state, target, others in zip(perturbed.states, targets, bystanders, strict=True)
+    ]
     return Track(
         town=script.town,
         trajectory=script.trajectory,
@@ -262,18 +268,12 @@ def _track(script: TrackScript, targets: list[TargetMeta], visibility: np.ndarra
         targets_m=perturbed.poses.targets_m,
         target=TargetRecord(
             visibility=visibility,
-            **{name: np.array([getattr(one, name) for one in targets]) for name in ("in_view", "visible", "depth_m")},
-            **{
-                name: np.array([getattr(one, field) or [np.nan] * num for one in targets])
-                for name, (field, num) in corners.items()
-            },
+            uv=column("image_uv", 2),
+            bbox=column("bbox_2d", 4),
+            mask_bbox=column("mask_bbox_2d", 4),
+            **{name: column(name) for name in ("in_view", "visible", "depth_m")},
         ),
-        perturbation=Perturbation(
-            perturbed.is_perturbed,
-            perturbed.drone_offsets_m,
-            perturbed.rotation_offsets_deg,
-            perturbed.target_offsets_m,
-        ),
+        perturbation=Perturbation(perturbed.is_perturbed, *offsets),
         source={
             "path_index": script.number,
             "scenario_id": trace.path_id,
@@ -287,13 +287,7 @@ def _track(script: TrackScript, targets: list[TargetMeta], visibility: np.ndarra
         people=script.others.people(script.clothes.looks),
         between=script.between,
         is_original=script.variant == VARIANTS["clean"],
-        raw={
-            **({} if script.weather is None else {"weather": script.weather.model_dump()}),
-            "points": [
-                {"perturbation": dict(state), "target": target.model_dump(include=set(LEGIBILITY)), **others}
-                for state, target, others in zip(perturbed.states, targets, bystanders, strict=True)
-            ],
-        },
+        raw={**weather, "points": points},
     )
 
 

@@ -1,13 +1,6 @@
 """Rendering by a running UnrealCV server, as SimWorld's: it draws its own level and people, and this module decodes
-(app:simworld, step 6).
-
-For each frame everybody and the camera are put in their places, the engine runs for the settle delay, and is paused
-while its three pictures are read. The colour of a pixel in the object mask identifies its object, and the object's name
-its box (`cosfly.simulators.assets.id_of`); an object without a box has the id NO_INSTANCE.
-
-If lengths were not converted, the camera would be at ground level and show legs only. So the level is compared with the
-map before anything is drawn, and the camera with its place in each frame.
-"""
+(app:simworld, step 6). The colour of a pixel in the object mask identifies its object, and the object's name its box.
+If lengths were not converted, the camera would be at ground level: so the level is compared with the map."""
 
 from __future__ import annotations
 
@@ -129,12 +122,12 @@ class UnrealCvRenderer(SimulatorRenderer):
         """Compare places of objects with the map's boxes: with another scale the camera would be elsewhere."""
         names = list(linked)[:: max(1, len(linked) // MOST_CHECKED)]
         answers = self._server.ask(*(f"vget /object/{name}/bounds" for name in names))
-        bounds = [self._server.numbers(answer, 6) for answer in answers]
-        pairs = [(np.reshape(b, (2, 3)).mean(axis=0), linked[name]) for name, b in zip(names, bounds, strict=True) if b]
-        if not pairs:
+        found = {linked[name]: self._server.numbers(answer, 6) for name, answer in zip(names, answers, strict=True)}
+        middles = {row: np.reshape(bounds, (2, 3)).mean(axis=0) for row, bounds in found.items() if bounds}
+        if not middles:
             return
-        raw = np.array([world_pose([*middle, 0.0, 0.0, 0.0])[0] for middle, _ in pairs])
-        boxes = self._map.select(np.array([row for _, row in pairs]))
+        raw = np.array([world_pose([*middle, 0.0, 0.0, 0.0])[0] for middle in middles.values()])
+        boxes = self._map.select(np.array(list(middles)))
         middles_m = (boxes.mins + boxes.maxs) / 2
         offset_m = np.array([0.0, 0.0, self._cfg.coord_z_offset])
         gap_m = float(np.median(np.linalg.norm(raw / self._cfg.coord_scale - offset_m - middles_m, axis=1)))

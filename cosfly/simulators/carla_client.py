@@ -63,9 +63,8 @@ def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:
         version, ours = client.get_server_version(), client.get_client_version()
     if version != ours:
         fix = f"run a server of {ours}: streams of other versions crash this client"
-        raise EnvironmentMissing(
-            "the CARLA server has another version than the client", where=endpoint, got=version, expected=ours, fix=fix
-        )
+        what = "the CARLA server has another version than the client"
+        raise EnvironmentMissing(what, where=endpoint, got=version, expected=ours, fix=fix)
     with _server_errors("CARLA did not return its world", endpoint, version):
         world = client.get_world()
         loaded, towns = _short(world.get_map().name), sorted({_short(name) for name in client.get_available_maps()})

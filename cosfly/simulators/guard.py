@@ -1,9 +1,6 @@
-"""A process that restores a simulator's server when its user ends: normally, killed, or by a crash.
-
-It starts the server if a command is given, and then also ends it. Its input is lines of JSON: for CARLA first the
-state of the world, then the number of each spawned actor; for UnrealCV the commands that restore the camera. The end of
-the input is the end of the process that writes it.
-"""
+"""A process that restores a simulator's server when its user ends: normally, killed, or by a crash. It starts and ends
+the server itself if a command is given. Its input is lines of JSON, up to the end of the process that writes it: for
+CARLA the state of the world, then the numbers of spawned actors; for UnrealCV the commands that restore the camera."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
 """A checked connection to an UnrealCV server, as SimWorld runs one: settings, and errors that name host, port, version.
-
-The client is the package `unrealcv`. This module works around its faults: it waits forever for a greeting, reads from
-closed connections, and prints. A server has one client at a time.
-"""
+It works around faults of the package `unrealcv`, which waits forever for a greeting, reads from closed connections,
+and prints. A server has one client at a time."""
 
 from __future__ import annotations
 

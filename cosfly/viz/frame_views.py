@@ -1,7 +1,4 @@
-"""Frames as pictures, the same for teachers, students, contact sheets and reports.
-
-`Pictures` defines the pictures of a prompt and the sentence that describes them.
-"""
+"""Frames as pictures, the same for teachers, students, contact sheets and reports."""
 
 from __future__ import annotations
 
@@ -9,7 +6,6 @@ import base64
 import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -66,17 +62,19 @@ class Pictures:
     def check_size(self, file: Path, found_px: tuple[int, int]) -> None:
         """Check that a file of (width, height) gives pictures of `size_px`."""
         if scaled_size(*found_px, max(self.size_px)) != self.size_px:
-            raise InputError(
-                "the picture has another size than the prompt says",
-                where=file,
-                got="{} x {} px".format(*found_px),
-                expected="{} x {} px, or larger and of this shape".format(*self.size_px),
-                fix="pass the playback tree that was captioned",
-            )
+            what, fix = "the picture has another size than the prompt says", "pass the playback tree that was captioned"
+            expected = "{} x {} px, or larger and of this shape".format(*self.size_px)
+            raise InputError(what, where=file, got="{} x {} px".format(*found_px), expected=expected, fix=fix)
 
     def sentence(self, language: Language) -> str:
         """Return the sentence of a prompt that describes these pictures."""
-        return _sentence(self, language)
+        count, is_tiled = len(self.views), self.layout == "tiled" and len(self.views) > 1
+        form = _SENTENCES[language][3 if is_tiled else min(count, 2)]
+        numbers = {"range": self.depth_range_m, "middle": MIDDLE}
+        words = [_DESCRIPTIONS[language][view].format(**numbers) for view in self.views]
+        listed = {"en": ", ", "zh": "、"}[language].join(words)
+        scale = 2 if "middle" in self.views else int(is_tiled)
+        return form.format(count=count, views=listed) + _SCALE[language][scale].format(*self.size_px)
 
 
 _DESCRIPTIONS: dict[Language, dict[View, str]] = {
@@ -122,17 +120,6 @@ _SCALE: dict[Language, tuple[str, str, str]] = {
 }
 
 
-@lru_cache(maxsize=64)
-def _sentence(pictures: Pictures, language: Language) -> str:
-    count, is_tiled = len(pictures.views), pictures.layout == "tiled" and len(pictures.views) > 1
-    form = _SENTENCES[language][3 if is_tiled else min(count, 2)]
-    numbers = {"range": pictures.depth_range_m, "middle": MIDDLE}
-    words = [_DESCRIPTIONS[language][view].format(**numbers) for view in pictures.views]
-    listed = {"en": ", ", "zh": "、"}[language].join(words)
-    scale = 2 if "middle" in pictures.views else int(is_tiled)
-    return form.format(count=count, views=listed) + _SCALE[language][scale].format(*pictures.size_px)
-
-
 def frame_label(number: int) -> str:
     """Return the text before the pictures of a frame of a window; answers name frames the same way."""
     return f"t{number}:"
@@ -166,7 +153,10 @@ def read_view(
     if view == "depth":
         return depth_colors(_bounded(read_depth(frame), max_side_px, nearest=True), depth_range_m)
     kinds, ids = read_instance(frame)
-    kinds = np.where(np.isin(ids, _ids_of_others(frame)) & (kinds == KINDS["Pedestrians"]), KINDS["Rider"], kinds)
+    with contextlib.suppress(InputError):  # a tree of other software has no annotation
+        others = read_meta(frame).others
+        of_others = [] if others is None else [other.instance_id for other in others.others]  # only the target is red
+        kinds = np.where(np.isin(ids, of_others) & (kinds == KINDS["Pedestrians"]), KINDS["Rider"], kinds)
     return segmentation_colors(_bounded(kinds, max_side_px, nearest=True), _bounded(ids, max_side_px, nearest=True))
 
 
@@ -181,15 +171,6 @@ def _middle(rgb: np.ndarray, max_side_px: int | None) -> np.ndarray:
     middle = rgb[y_px : y_px + part[1], x_px : x_px + part[0]]
     size = scaled_size(width_px, height_px, max_side_px)
     return cv2.resize(middle, size, interpolation=cv2.INTER_AREA if size[0] < part[0] else cv2.INTER_CUBIC)
-
-
-def _ids_of_others(frame: Path) -> list[int]:
-    """Return the ids of bystanders, so that only the target is red; none if the frame has no annotation."""
-    try:
-        others = read_meta(frame).others
-    except InputError:  # a tree of other software
-        return []
-    return [] if others is None else [other.instance_id for other in others.others]
 
 
 def depth_colors(depth_m: np.ndarray, range_m: float = DEPTH_RANGE_M) -> np.ndarray:
@@ -221,11 +202,9 @@ def encode_picture(rgb: np.ndarray, encoding: Literal["jpeg", "png"], jpeg_quali
 
 def thumbnail(frame: Path, width_px: int, jpeg_quality: int = 80) -> str | None:
     """Return `rgb.png` of a frame folder as a small JPEG in base64; None if it cannot be read."""
-    try:
-        rgb = read_rgb(frame)
-    except InputError:
-        return None
-    return small_jpeg(rgb, width_px, jpeg_quality)
+    with contextlib.suppress(InputError):
+        return small_jpeg(read_rgb(frame), width_px, jpeg_quality)
+    return None
 
 
 def small_jpeg(rgb: np.ndarray, width_px: int, jpeg_quality: int = 80) -> str:

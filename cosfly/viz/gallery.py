@@ -70,10 +70,8 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
         ids = read_instance_ids(folder.parents[3]).of_boxes(box_map)
         debug = Overlay(box_map, ids).draw(rgb, read_instance(folder)[1], meta)
     else:
-        raise InputError(
-            "the frame has no debug.png", where=folder, expected="debug.png, or the map that was drawn",
-            fix="pass --map boxes_3d.json, or render with --set render.debug=true",
-        )  # fmt: skip
+        expected, fix = "it, or the map", "pass --map boxes_3d.json, or render with --set render.debug=true"
+        raise InputError("the frame has no debug.png", where=folder, expected=expected, fix=fix)
     panels = [rgb, read_view(folder, "depth"), read_view(folder, "segmentation"), debug]
     titles = (
         f"RGB, {meta.camera.fov_deg:.0f} deg",

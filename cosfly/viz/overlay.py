@@ -1,9 +1,5 @@
 """A frame's labels drawn over its colours: the 3D boxes of map, target and bystanders, with ids and distances
-(`debug.png`).
-
-Everything is projected again from `meta.json` and the map, independently of the picture: a line that does not fit the
-picture shows an error in one of them.
-"""
+(`debug.png`), projected again from `meta.json` and the map: a line that does not fit shows an error in one of them."""
 
 from __future__ import annotations
 

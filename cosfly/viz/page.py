@@ -1,7 +1,5 @@
-"""Self-contained HTML pages from templates with a common base page and style, and Markdown pages.
-
-Every text that a template prints is cut and escaped (autoescape), except markup of the templates, style and script.
-"""
+"""Self-contained HTML pages from templates with a common base page and style, and Markdown pages. Every text that a
+template prints is cut and escaped (autoescape), except markup of the templates, style and script."""
 
 from __future__ import annotations
 

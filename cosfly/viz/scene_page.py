@@ -1,7 +1,5 @@
-"""`cosfly view MAP`: a self-contained page of a map in 3D with pedestrian and drone trajectories and frames.
-
-Arrays are embedded as base64; the page's script draws them (`space.js`, WebGL 2) and plays them back.
-"""
+"""`cosfly view MAP`: a self-contained page of a map in 3D with pedestrian and drone trajectories and frames. Arrays are
+embedded as base64; the page's script draws them (`space.js`, WebGL 2) and plays them back."""
 
 from __future__ import annotations
 

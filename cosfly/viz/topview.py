@@ -1,7 +1,5 @@
-"""Drawing of maps from above, and of the lines, dots and texts of overviews and plots.
-
-Places on a picture are floats, px from its top left corner, rounded to a sixteenth.
-"""
+"""Drawing of maps from above, and of lines, dots and texts of overviews and plots. Places on a picture are floats, px
+from its top left corner, rounded to a sixteenth."""
 
 from __future__ import annotations
 

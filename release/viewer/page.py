@@ -1,9 +1,6 @@
-"""`cosfly view`: one self-contained page of a release, a run or a playback tree, for a browser without a network.
-
-A release is read from its rows; the frames of a run become rows of the same columns first. The page holds its data as
-JSON, with the names that its one script (`viewer.js`) reads; the script writes every foreign text as text, never as
-markup, and the page's policy lets no other script run.
-"""
+"""`cosfly view`: one self-contained page of a release, a run or a playback tree, for a browser without a network. The
+frames of a run become rows of a release's columns first. The data are JSON with the names that `viewer.js` reads; the
+script writes every foreign text as text, never as markup, and the page's policy lets no other script run."""
 
 from __future__ import annotations
 

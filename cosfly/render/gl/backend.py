@@ -1,7 +1,5 @@
-"""The default renderer: OpenGL without a window (EGL), one pass into colour, z-depth in metres, and kind + instance id.
-
-Works on a GPU and on the CPU (llvmpipe). Depth is written by the shader as float32, not taken from the depth buffer.
-"""
+"""The default renderer: OpenGL without a window (EGL), on a GPU or the CPU (llvmpipe), one pass into colour, z-depth in
+metres as float32, and kind + instance id."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""The shapes of houses, trees, cars and lamps: the parts of each kind of box.
-
-Every part stays inside its box, so that the planners' collision and visibility checks hold.
-"""
+"""The shapes of houses, trees, cars and lamps: the parts of each kind of box, all inside the box, so that the planners'
+collision and visibility checks hold."""
 
 from __future__ import annotations
 

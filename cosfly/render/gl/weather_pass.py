@@ -1,6 +1,6 @@
 """Weather in the default renderer: uniforms, the map of street lamps, rain over the picture, the glow of lights.
 
-Weather has programs of its own (`programs`), so that fair weather costs nothing. Depth, kinds and ids are unaffected.
+It has programs of its own (`programs`), so that fair weather costs nothing; depth, kinds and ids are unaffected.
 """
 
 from __future__ import annotations
