@@ -178,25 +178,21 @@ def _all_boxes(
         (ball, is_box & is_round, crowns, middle, table[kinds]),
         (box, is_box & (low > -1.0), stems, (middle - 1.0) / 2.0, np.tile(STEM_COLOR, (len(low), 1))),
     ]
-    triangles, colors, tagged = [], [], []
+    found = []
     for mesh, rows, size, lift, paint in solids:  # lift: of the middle over the box's, in half heights
         middles = centers[rows] + turns[rows, :, 2] * (lift * halves[:, 2])[rows, None]
         corners = np.einsum("nij,nvj->nvi", turns[rows], size[rows, None] * mesh.vertices) + middles[:, None]
-        triangles.append(corners[:, mesh.faces].reshape(-1, 3, 3))
-        colors.append(np.repeat(paint[rows], len(mesh.faces), axis=0))
-        tagged.append(np.repeat(tags[rows], len(mesh.faces), axis=0))
-    meshes = solids_of(box_map)
-    paint = np.where(np.isnan(meshes.colors), table[kinds][meshes.rows], meshes.colors)
-    for sides in (meshes.corners_m, meshes.corners_m[:, ::-1]):  # seen from both
-        triangles.append(sides - origin)
-        colors.append(paint)
-        tagged.append(tags[meshes.rows])
+        repeated = (np.repeat(values[rows], len(mesh.faces), axis=0) for values in (paint, tags))
+        found.append((corners[:, mesh.faces].reshape(-1, 3, 3), *repeated))
+    placed = solids_of(box_map)
+    paint = np.where(np.isnan(placed.colors), table[kinds][placed.rows], placed.colors)
+    for sides in (placed.corners_m, placed.corners_m[:, ::-1]):  # seen from both
+        found.append((sides - origin, paint, tags[placed.rows]))
     if not box_map.ground.is_flat:
-        draped = drape(box_map)
-        triangles.append(draped.corners_m - origin)
-        colors.append(table[kinds][draped.rows])  # the last row, BARE_GROUND, is the plane's
-        tagged.append(tags[draped.rows])
-    return np.concatenate(triangles), np.concatenate(colors), np.concatenate(tagged)
+        draped = drape(box_map)  # the last row, BARE_GROUND, is the plane's
+        found.append((draped.corners_m - origin, table[kinds][draped.rows], tags[draped.rows]))
+    triangles, colors, tagged = map(np.concatenate, zip(*found, strict=True))
+    return triangles, colors, tagged
 
 
 def _mover(mover: PosedBystander, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
