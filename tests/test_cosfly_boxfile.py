@@ -114,6 +114,7 @@ def test_all_that_is_wrong_with_a_table_is_told(tmp_path, subtests):
             (PLAIN.replace("12,8,8,30", '"12,5",8,8,30'), r"length_m is not a finite number: '12,5'"),
             (PLAIN.replace("12,8,8,30", "-12,8,8,30").replace("4,4,6,0", "4,4,nan,0"),
              r"line 2: length_m is not more than 0; line 3: height_m is not a finite number: 'nan'"),
+            (PLAIN.replace("20,4,12", "20,1e18,12"), "line 2: the box is empty"),
             (PLAIN.replace("7,Buildings", "8,Buildings"), "id is not a whole number, each once"),
             (PLAIN.replace("7,Buildings", "x,Buildings"), "id is not a whole number, each once"),
             (PLAIN.replace(",", ";"), "no column type.*by commas"),

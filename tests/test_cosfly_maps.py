@@ -115,6 +115,13 @@ def test_unreal_axes_become_right_handed_metres(tmp_path: Path):
     np.testing.assert_allclose(house.rotations_deg, [(0, -30, 0)])
 
 
+def test_a_building_on_the_road_leaves_a_carriageway(tmp_path: Path):
+    city = simworld(write_world(tmp_path, node("BP_Building_01_C", 100, 200), node("BP_Road1_C", 100, 200)))
+    assert city.header.roads == {"carriageway_m": 4.0, "front_to_front_m": 6.0}
+    with pytest.raises(InputError, match=r"location\.z"):
+        simworld(write_world(tmp_path, node("BP_Building_01_C", 0, 0, z=1e300)))
+
+
 def test_an_asset_without_a_size_is_an_error_or_counted(tmp_path: Path):
     cfg = write_world(tmp_path, node("BP_Building_01_C", 0, 0), node("BP_Building_99_C", 9000, 0))
     with pytest.raises(InputError, match=r"has no size.*BP_Building_99_C.*unknown=drop"):

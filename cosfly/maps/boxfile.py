@@ -239,8 +239,11 @@ def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> str:
         rectangles = [Rectangle((x_m, y_m), (length_m, width_m), numbers.get("yaw_deg", 0.0))]
     else:
         rectangles = cover(row.outline, min_fill=OUTLINE_FILL, min_size_m=OUTLINE_PIECE_M, shares=CUT_SHARES)
-    for center, size, yaw_deg in rectangles:
-        boxes.add(kind, center, size, low_m, low_m + height_m, yaw_deg)
+    try:
+        for center, size, yaw_deg in rectangles:
+            boxes.add(kind, center, size, low_m, low_m + height_m, yaw_deg)
+    except ValueError as error:  # so far from the origin that its size is lost
+        return str(error)
     return ""
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, Field, FiniteFloat
+from pydantic import AliasPath, BaseModel, Field, FiniteFloat
 
 from cosfly.formats.columns import numbers
 from cosfly.runtime.errors import InputError
@@ -28,6 +28,7 @@ RECORD_SEPARATOR = b"\x1e"  # before each text of a sequence of RFC 7464
 # Nesting of `boundaries` above the surfaces. Of a Solid's shells only the outer one counts.
 NESTING = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2, "CompositeSolid": 2}
 Form = Literal["solid", "wall", "surface", "green"]
+Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Surface = list[np.ndarray]  # rings of (n, 3) m: the outline, then the holes
 
 
@@ -101,11 +102,6 @@ class CityModel(NamedTuple):
     version: str
 
 
-class _Transform(BaseModel):
-    scale: tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-    translate: tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-
-
 class _Geometry(BaseModel):
     type: str
     lod: Any = 0
@@ -141,7 +137,8 @@ class _Part(BaseModel):
 
 
 class _Document(_Part):
-    transform: _Transform
+    scale: Vector = Field(validation_alias=AliasPath("transform", "scale"))
+    translate: Vector = Field(validation_alias=AliasPath("transform", "translate"))
     templates: _Templates = Field(_Templates(), alias="geometry-templates")
 
 
@@ -160,7 +157,7 @@ def read_model(path: Path) -> CityModel:
     objects, known, num_objects = dict[str, CityObject](), set[str](), 0
     dropped = dict.fromkeys(("unmapped_type", "group", "no_geometry", "outline_of_parts", "repeated_id"), 0)
     for where, part in [(str(path), head), *features] if head.objects else features:
-        own = _vectors(part.vertices, f"{where}: vertices") * head.transform.scale + head.transform.translate
+        own = _vectors(part.vertices, f"{where}: vertices") * head.scale + head.translate
         vertices = _Vertices(own, head.templates.templates, of_templates)
         num_objects += len(part.objects)
         for object_id, value in part.objects.items():

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import shapely
-from pydantic import BaseModel, Field, FiniteFloat, field_validator
+from pydantic import AliasPath, BaseModel, Field, FiniteFloat, field_validator
 
 from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.formats.columns import LARGEST
@@ -76,12 +76,13 @@ class SimWorldConfig(Config):
 
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
+Place = Annotated[FiniteFloat, Field(ge=-1e9, le=1e9)]  # cm
 
 
 class _Vector(BaseModel):
-    x: FiniteFloat
-    y: FiniteFloat
-    z: FiniteFloat
+    x: Place
+    y: Place
+    z: Place
 
 
 class _Size(BaseModel):
@@ -93,27 +94,20 @@ class _Size(BaseModel):
         return np.array([self.x, self.y, self.z])
 
 
-class _Orientation(BaseModel):
-    pitch: FiniteFloat = Field(ge=0, le=0)  # tilted objects are no upright boxes
-    yaw: FiniteFloat
-    roll: FiniteFloat = Field(ge=0, le=0)
-
-
-class _Properties(BaseModel):
-    location: _Vector
-    orientation: _Orientation
-    scale: _Size
-
-
 class _Node(BaseModel):
     id: str
     instance_name: str
-    properties: _Properties
+    location: _Vector = Field(validation_alias=AliasPath("properties", "location"))
+    scale: _Size = Field(validation_alias=AliasPath("properties", "scale"))
+    yaw: FiniteFloat = Field(validation_alias=AliasPath("properties", "orientation", "yaw"))
+    # Tilted objects are no upright boxes.
+    pitch: FiniteFloat = Field(ge=0, le=0, validation_alias=AliasPath("properties", "orientation", "pitch"))
+    roll: FiniteFloat = Field(ge=0, le=0, validation_alias=AliasPath("properties", "orientation", "roll"))
 
     @property
     def xy_m(self) -> np.ndarray:
         """The location in the world: Unreal's y points right."""
-        return np.array([self.properties.location.x * M_PER_CM, -self.properties.location.y * M_PER_CM])
+        return np.array([self.location.x * M_PER_CM, -self.location.y * M_PER_CM])
 
 
 class _World(BaseModel):
@@ -206,15 +200,15 @@ def _add_node(boxes: BoxList, node: _Node, asset: Asset, size_cm: np.ndarray, st
     """Add one object; return the source of its extent."""
     is_placeholder = asset.default_size_m is not None and bool((size_cm == PLACEHOLDER_CM).all())
     size = np.array(asset.default_size_m) if is_placeholder else size_cm * M_PER_CM
-    size = size * node.properties.scale.array()
+    size = size * node.scale.array()
     if not LEAST_M <= size.min() <= size.max() <= LARGEST:
         raise InputError(
             "the size of an object is out of range", where=f"{world}: {node.id}", got=f"{size.tolist()} m",
             expected=f"{LEAST_M:g} m or more", fix="correct its scale, or its asset's size in the table",
         )  # fmt: skip
-    foot = node.properties.location.z * M_PER_CM
+    foot = node.location.z * M_PER_CM
     low = 0.0 if 0 < foot <= stand_m else foot
-    boxes.add(asset.kind, node.xy_m, size[:2], low, foot + size[2], -node.properties.orientation.yaw)
+    boxes.add(asset.kind, node.xy_m, size[:2], low, foot + size[2], -node.yaw)
     return "default" if is_placeholder else "bbox"
 
 
@@ -224,7 +218,7 @@ def _centerline(node: _Node) -> Centerline:
     The roads.json of a world is not read: in the city that SimWorld ships it holds 7 roads, two of them nowhere in the
     world, and the world holds 10.
     """
-    turn = -np.radians(node.properties.orientation.yaw)
+    turn = -np.radians(node.yaw)
     half = np.array([np.cos(turn), np.sin(turn)]) * ROAD_LENGTH_M / 2
     return Centerline(node.xy_m - half, node.xy_m + half)
 
@@ -258,7 +252,8 @@ def _half_widths(boxes: BoxList, lines: list[Centerline]) -> tuple[float, float]
     furniture = _distances_m(box_map.centers[(kinds == "Static") | (kinds == "Motorcycle"), :2], lines)
     furniture = furniture[furniture < front]
     kerb = float(np.percentile(furniture, 10)) - KERB_M if len(furniture) >= 4 else ROAD_SHARE_OF_FRONT * front
-    return round(max(kerb, 2.0), 2), round(max(front, kerb + 1.0), 2)
+    kerb = max(kerb, 2.0)
+    return round(kerb, 2), round(max(front, kerb + 1.0), 2)
 
 
 def _add_roads(boxes: BoxList, lines: list[Centerline]) -> dict[str, float]:
