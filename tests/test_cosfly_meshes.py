@@ -60,9 +60,6 @@ def two_things() -> trimesh.Scene:
     return scene
 
 
-# --- reading and writing ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("suffix", ["glb", "gltf"])
 def test_nodes_of_gltf_stand_where_they_were_put(tmp_path: Path, suffix: str) -> None:
     path, theirs = tmp_path / f"things.{suffix}", two_things()
@@ -210,13 +207,8 @@ def test_a_box_names_no_file_outside_of_its_folder(tmp_path: Path) -> None:
             read_boxes(path)
 
 
-# --- triangles of polygons --------------------------------------------------------------------------------------------
-
-
 SQUARE = np.array([(0, 0, 0), (4, 0, 0), (4, 4, 0), (0, 4, 0)], dtype=float)
 
-
-# --- CityJSON ---------------------------------------------------------------------------------------------------------
 
 ROOF = [  # a house of 10 x 8 m, eaves at 4 m, ridge at 7 m
     (0, 0, 1), (10, 0, 1), (10, 8, 1), (0, 8, 1), (0, 0, 4), (10, 0, 4), (10, 8, 4), (0, 8, 4), (0, 4, 7), (10, 4, 7),
@@ -260,9 +252,6 @@ def test_a_solid_is_drawn_as_its_finest_surfaces_and_kept_out_of_as_boxes(tmp_pa
     assert not plain.meshes.refs
     assert len(plain) == len(box_map)
     assert not simplify(box_map, SimplifyConfig()).box_map.meshes.refs
-
-
-# --- drawing ----------------------------------------------------------------------------------------------------------
 
 
 def scene_map(folder: Path) -> BoxMap:

@@ -105,8 +105,6 @@ def test_a_prompt_of_which_nothing_can_be_read_is_refused_in_words(prompt):
         by_rules(prompt)
 
 
-# --- a language model plans -------------------------------------------------------------------------------------------
-
 PLANNED = {
     "blocks_along": 2,
     "block_m": 46.0,
@@ -138,9 +136,6 @@ def test_a_models_plan_is_followed_and_its_trace_kept(tmp_path):
     assert "statue" in body["messages"][0]["content"]
     assert body["seed"] == 0
     assert body["response_format"]["json_schema"]["schema"]["properties"].keys() == WorldPlan.model_fields.keys()
-
-
-# --- the command ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
