@@ -24,9 +24,6 @@ from cosfly.formats.frames import (
     instance_bytes,
     read_depth,
     rgb_bytes,
-    tree_angles,
-    tree_pose,
-    tree_position,
 )
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
@@ -291,9 +288,9 @@ def _write_frame(folder: Path, flight: Track, scene: Scene, i: int) -> None:
 
 
 def _meta(flight: Track, i: int, num_pixels: int) -> FrameMeta:
-    nowhere = tree_position(np.zeros(3))
+    nowhere = np.zeros(3)
     target = TargetMeta(
-        world_location=tree_position(flight.targets_m[i]),
+        world_location=flight.targets_m[i],
         half_extents_m=PERSON_HALF_EXTENTS_M,
         instance_id=PERSON_ID,
         semantic_id=KINDS["Pedestrians"],
@@ -312,13 +309,13 @@ def _meta(flight: Track, i: int, num_pixels: int) -> FrameMeta:
         trajectory=flight.trajectory,
         variant=flight.variant,
         camera=camera_meta(flight.camera, 0.3, SKY_DEPTH_M),
-        drone_pose=tree_pose(flight.positions_m[i], flight.rotations_deg[i]),
+        drone_pose=np.hstack([flight.positions_m[i], flight.rotations_deg[i]]),
         target=target,
         perturbation=PerturbationMeta(
             position="none",
             rotation="none",
             drone_position=nowhere,
             target_position=nowhere,
-            drone_rotation=tree_angles(np.zeros(3)),
+            drone_rotation=nowhere,
         ),
     )

@@ -136,7 +136,7 @@ def test_no_step_of_distill_imports_a_step(step):
 
 def test_axes_of_the_tree_are_converted_where_its_files_are_read_and_written():
     importers = {
-        name for name, path in SOURCES.items() if re.search(r"^from .*\bmirror_(pos|rot)", path.read_text(), re.M)
+        name for name, path in SOURCES.items() if re.search(r"^from .*\bmirror_poses\b", path.read_text(), re.M)
     }
     assert importers == {"cosfly.formats.frames", "cosfly.formats.playback", "cosfly.simulators.conventions"}
 

@@ -6,8 +6,7 @@ from commands import invoke
 from test_closed_loop_measures import flight
 
 from cosfly.closed_loop.measures import score_episodes
-from cosfly.formats.episode_scores import SCORE, SCORE_FORMAT
-from cosfly.formats.episodes import episode_file, write_episode
+from cosfly.formats.episodes import SCORE, SCORE_FORMAT, episode_file, write_episode
 from cosfly.runtime.json_io import write_model
 
 GOOD, BAD = "1111111111", "1111100000"

@@ -5,7 +5,7 @@ import pytest
 from test_formats_episodes import frame, record
 
 from cosfly.closed_loop.measures import MEASURES, measure, score_episodes
-from cosfly.formats.episode_scores import SCORE, SCORE_FORMAT, read_score
+from cosfly.formats.episodes import SCORE, SCORE_FORMAT, read_score
 from cosfly.runtime.json_io import write_model
 
 

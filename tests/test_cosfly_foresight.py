@@ -120,7 +120,7 @@ def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
     seen, seen_raw = (kernels.visibility(obstacles, flight, scenario.targets_m).mean() for flight in (points, raw))
     assert seen >= seen_raw - 0.01
     assert facts["raw_visibility"] == pytest.approx(seen_raw, abs=1e-4)
-    assert trajectory_metrics.jerk_rms(points) <= max(0.3 * trajectory_metrics.jerk_rms(raw), 0.05)
+    assert trajectory_metrics.derivative_rms(points, 3) <= max(0.3 * trajectory_metrics.derivative_rms(raw, 3), 0.05)
 
 
 # --- whole flights ----------------------------------------------------------------------------------------------------

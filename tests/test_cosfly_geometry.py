@@ -8,8 +8,7 @@ from numpy.testing import assert_allclose
 from cosfly.geometry.axes import (
     intrinsic_matrix,
     look_at,
-    mirror_positions,
-    mirror_rotations,
+    mirror_poses,
     project,
     rotation_matrix,
     world_from_camera,
@@ -51,11 +50,11 @@ def test_image_axes():
 def test_mirroring_is_its_own_inverse_and_keeps_the_picture():
     """A scene mirrored with its camera is the mirror picture of the scene: nothing else changes at the door."""
     point, eye, rotation = np.array([12.0, 5.0, 1.0]), np.array([0.0, 1.0, 20.0]), np.array([-40.0, 25.0, 0.0])
-    assert_allclose(mirror_positions(mirror_positions(point)), point)
-    assert_allclose(mirror_rotations(mirror_rotations(rotation)), rotation)
+    assert_allclose(mirror_poses(mirror_poses(point)), point)
+    assert_allclose(mirror_poses(mirror_poses(rotation)), rotation)
     k = intrinsic_matrix(1280, 720, 90)
     uv, z = project(point[None], world_from_camera(eye, rotation), k)
-    mirrored = world_from_camera(mirror_positions(eye), mirror_rotations(rotation))
-    uv_mirrored, z_mirrored = project(mirror_positions(point)[None], mirrored, k)
+    mirrored = world_from_camera(mirror_poses(eye), mirror_poses(rotation))
+    uv_mirrored, z_mirrored = project(mirror_poses(point)[None], mirrored, k)
     assert_allclose(z, z_mirrored)
     assert_allclose(uv_mirrored, [[1280 - uv[0, 0], uv[0, 1]]])

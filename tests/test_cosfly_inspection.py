@@ -23,7 +23,6 @@ from cosfly.formats.frames import (
     frame_name,
     read_depth,
     read_instance,
-    tree_position,
 )
 from cosfly.formats.inspection import read_inspection
 from cosfly.formats.issues import Report
@@ -34,8 +33,7 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import mask_box
 from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.inspection import frames
-from cosfly.inspection.files import check_recorded
-from cosfly.inspection.frames import check_bystanders
+from cosfly.inspection.frames import check_bystanders, check_recorded
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
 from cosfly.inspection.track import check_plan, is_shifted
@@ -145,10 +143,10 @@ def test_checksums_that_the_tree_lists_cannot_be_taken_away(workplace):
     tree = workplace / "tree"
     names = [f"{flight.relative_to(tree).as_posix()}/{name}" for name in ("trajectory.json", CHECKSUMS)]
     recorded = {name: sha256_file(tree / name) for name in names}
-    check_recorded(read_track(flight), tree, recorded, report)
+    check_recorded(flight, tree, recorded, report)
     assert report.issues == []
     (flight / CHECKSUMS).unlink()
-    check_recorded(read_track(flight), tree, recorded, report)
+    check_recorded(flight, tree, recorded, report)
     assert [(issue.code, issue.where) for issue in report.issues] == [("missing_file", CHECKSUMS)]
 
 
@@ -548,7 +546,7 @@ def test_every_check_has_a_planted_defect():
 
 def other_at(place_m, kind: str = "Pedestrians", number: int = 7) -> BystanderMeta:
     return BystanderMeta(
-        instance_id=number, semantic_id=KINDS[kind], world_location=tree_position(np.asarray(place_m, float)), yaw=0.0,
+        instance_id=number, semantic_id=KINDS[kind], world_location=np.asarray(place_m, float), yaw=0.0,
         half_extents_m=(0.3, 0.3, 0.9), num_pixels=0,
     )  # fmt: skip
 

@@ -344,7 +344,10 @@ def test_frames_hold_what_their_annotation_says(finished):
             assert meta.target.num_pixels == int((ids == PERSON_ID).sum()) > 0
             assert meta.target.visible == bool(flight.target.visible[i])
             assert meta.target.visibility == pytest.approx(flight.target.visibility[i], abs=1e-6)
-            assert meta.drone_pose.y == pytest.approx(-flight.positions_m[i, 1]), "the tree's axes are CARLA's"
+            tree_y = json.loads((frame / "meta.json").read_text())["drone_pose"]["y"]
+            assert tree_y == -meta.drone_pose[1] == pytest.approx(-flight.positions_m[i, 1]), (
+                "the tree's axes are CARLA's"
+            )
             assert meta.look == Look(), "sun and air of the picture"
             assert meta.camera.intrinsic == flight.camera.intrinsic.tolist()
             u, v = flight.target.uv[i]

@@ -12,11 +12,9 @@ from test_cosfly_inspection import CFG, plan_of, write_map
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.formats.inspection import read_inspection
-from cosfly.formats.review import REVIEW, Choice, read_decisions, read_settled
+from cosfly.formats.inspection import REVIEW, Choice, add_decisions, read_decisions, read_inspection, read_settled
 from cosfly.formats.traces import write_traces
 from cosfly.formats.tracks import find_tracks
-from cosfly.inspection.review import add_decisions
 from cosfly.inspection.stage import run
 from cosfly.runtime.io import sha256_file
 from release.package.sources import Source, gather

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from specimens_rows import make_row
 
-from cosfly.geometry.trajectory_metrics import accel_rms, jerk_rms, length_m
+from cosfly.geometry.trajectory_metrics import derivative_rms, length_m
 from cosfly.runtime.json_io import read_json
 from release.columns import POINT, POSE
 from release.stats.counting import Counts
@@ -44,8 +44,8 @@ def test_motion_is_that_of_the_plan_whatever_the_perturbation(seed, num):
     plan = np.cumsum(rng.normal(0, 1, (num, 3)), axis=0)
     (flight,) = counted(rows_of(plan, list(range(num)), rng.normal(0, 2, (num, 3)))).flights.values()
     assert flight.path_m == pytest.approx(length_m(plan), rel=1e-9)
-    assert flight.accel_rms_mps2 == pytest.approx(accel_rms(plan), rel=1e-6)
-    assert flight.jerk_rms_mps3 == pytest.approx(jerk_rms(plan), rel=1e-6)
+    assert flight.accel_rms_mps2 == pytest.approx(derivative_rms(plan, 2), rel=1e-6)
+    assert flight.jerk_rms_mps3 == pytest.approx(derivative_rms(plan, 3), rel=1e-6)
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------

@@ -81,7 +81,7 @@ def print_results(results: list[StageResult], out: Path) -> None:
 @app.command(epilog="cosfly show runs/first")
 def show(run: Annotated[Path, Argument(metavar="RUN", help="A run directory.")]) -> None:
     """Show a run: its stages, what they kept, their disk space, and the settings that are not the defaults."""
-    from cosfly.formats.review import how_to_decide
+    from cosfly.formats.inspection import how_to_decide
     from cosfly.pipeline.estimate import in_words as size
     from cosfly.pipeline.runs import summarize
     from cosfly.runtime.console import answer_console

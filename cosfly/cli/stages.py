@@ -255,8 +255,7 @@ def inspect_review(
     reason: Annotated[str | None, Option(help="Reason of the decision.")] = None,
 ) -> None:
     """Decide tracks that wait for review, into review.jsonl; without a decision, list them."""
-    from cosfly.formats.review import Choice
-    from cosfly.inspection.review import add_decisions, summary
+    from cosfly.formats.inspection import Choice, add_decisions, summary
 
     product = folder / "inspect.json" if folder.is_dir() else folder
     if accept or reject:

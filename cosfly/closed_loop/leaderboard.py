@@ -14,8 +14,7 @@ from pydantic import BaseModel, ConfigDict
 
 from cosfly.closed_loop.measures import MEASURES, SHARES, figures_of, score_measured
 from cosfly.closed_loop.settings import BASELINES
-from cosfly.formats.episode_scores import Figure, Score, read_score
-from cosfly.formats.episodes import episode_file, read_episode
+from cosfly.formats.episodes import Figure, Score, episode_file, read_episode, read_score
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.config import Config

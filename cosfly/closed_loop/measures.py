@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.formats.episode_scores import EpisodeScore, Figure, Score
-from cosfly.formats.episodes import Episode
+from cosfly.formats.episodes import Episode, EpisodeScore, Figure, Score
 from cosfly.geometry.trajectory_metrics import RELAXED_SAFETY_M, derivative_rms, draw_pedestrians, figure_of_draws
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes

@@ -24,8 +24,7 @@ from cosfly.closed_loop.measures import LOSS_S
 from cosfly.closed_loop.stage import PLAN, TRACES, TREE, ClosedLoopConfig, flown_trace
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, Moment, as_drawn
 from cosfly.formats.boxes import read_boxes
-from cosfly.formats.episode_scores import read_score
-from cosfly.formats.episodes import Episode, EpisodeFrame, episode_file, read_episode
+from cosfly.formats.episodes import Episode, EpisodeFrame, episode_file, read_episode, read_score
 from cosfly.formats.traces import ARRAYS, DroneTrace, Excerpt, read_traces, write_traces
 from cosfly.geometry.axes import look_at, step_s
 from cosfly.geometry.kernels import signed_distances, swept_distances

@@ -25,8 +25,16 @@ from cosfly.closed_loop.settings import FlyConfig
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, Moment, as_drawn
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.captions import TOKENS
-from cosfly.formats.episode_scores import SCORE, SCORE_FORMAT
-from cosfly.formats.episodes import Episode, EpisodeFrame, PathDifficulty, episode_file, read_episode, write_episode
+from cosfly.formats.episodes import (
+    SCORE,
+    SCORE_FORMAT,
+    Episode,
+    EpisodeFrame,
+    PathDifficulty,
+    episode_file,
+    read_episode,
+    write_episode,
+)
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.geometry.axes import headings_of, step_s
 from cosfly.geometry.kernels import BoxIndex, obstacle_index, visibility

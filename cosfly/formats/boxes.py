@@ -176,34 +176,33 @@ class BoxMap:
     def counts(self) -> dict[str, int]:
         """Return the number of boxes by kind name, largest first."""
         numbers, counts = np.unique(self.kinds, return_counts=True)
-        order = sorted(zip(counts.tolist(), numbers.tolist(), strict=True), key=lambda pair: (-pair[0], pair[1]))
-        return {KIND_NAMES[number]: count for count, number in order}
+        order = np.argsort(-counts, kind="stable")
+        return {KIND_NAMES[int(numbers[k])]: int(counts[k]) for k in order}
 
 
 def make_box_map(
     centers: Any, half_extents: Any, rotations_deg: Any, kinds: Any, ids: Any = None, header: MapHeader | None = None
 ) -> BoxMap:
     """Make a BoxMap from anything array-like; ids default to 1..n."""
-    vectors = (np.asarray(rows, dtype=np.float64).reshape(-1, 3) for rows in (centers, half_extents, rotations_deg))
-    centers, half_extents, rotations_deg = vectors
-    ids = np.asarray(np.arange(1, len(centers) + 1) if ids is None else ids, dtype=np.uint64).reshape(-1)
+    vectors = [np.asarray(rows, dtype=np.float64).reshape(-1, 3) for rows in (centers, half_extents, rotations_deg)]
+    ids = np.asarray(np.arange(1, len(vectors[0]) + 1) if ids is None else ids, dtype=np.uint64).reshape(-1)
     kinds = np.asarray(kinds, dtype=np.uint8).reshape(-1)
-    return BoxMap(centers, half_extents, rotations_deg, kinds, ids, header or MapHeader())
+    return BoxMap(vectors[0], vectors[1], vectors[2], kinds, ids, header or MapHeader())
 
 
 def check_boxes(box_map: BoxMap, where: str | Path) -> None:
     """Check finite numbers, extents, kinds and ids."""
-    for name, field_name in (("centers", "center"), ("half_extents", "extent"), ("rotations_deg", "rotation")):
-        bad = np.flatnonzero(~(np.abs(getattr(box_map, name)) <= LARGEST).all(axis=1))  # NaN is not
-        if len(bad):
-            row = int(bad[0])
-            place, got = f"{where}: box {box_map.ids[row]}: {field_name}", str(getattr(box_map, name)[row].tolist())
-            raise InputError("a box is not finite", where=place, got=got, expected="finite numbers")
-    bad = np.flatnonzero((box_map.half_extents < 0).any(axis=1))
-    if len(bad):
-        row = int(bad[0])
-        place, got = f"{where}: box {box_map.ids[row]}: extent", str(box_map.half_extents[row].tolist())
-        raise InputError("a box has a negative extent", where=place, got=got, expected="half sizes of at least 0 m")
+    columns = (box_map.centers, box_map.half_extents, box_map.rotations_deg)
+    checks = [
+        ("a box is not finite", name, rows, ~(np.abs(rows) <= LARGEST), "finite numbers")  # NaN is not
+        for name, rows in zip(("center", "extent", "rotation"), columns, strict=True)
+    ]
+    half = box_map.half_extents
+    checks.append(("a box has a negative extent", "extent", half, half < 0, "half sizes of at least 0 m"))
+    for what, name, rows, is_bad, expected in checks:
+        for row in np.flatnonzero(is_bad.any(axis=1)):
+            place, got = f"{where}: box {box_map.ids[row]}: {name}", str(rows[row].tolist())
+            raise InputError(what, where=place, got=got, expected=expected)
     unknown = [int(kind) for kind in np.unique(box_map.kinds) if int(kind) not in KIND_NAMES]
     if unknown:
         raise InputError("unknown semantic id", where=where, got=str(unknown[0]), expected="0 to 28")
@@ -258,34 +257,22 @@ def write_boxes(path: Path, box_map: BoxMap) -> None:
     mins, maxs = box_map.mins, box_map.maxs
     low, high = box_map.bounds() if len(box_map) else (np.zeros(3), np.zeros(3))
     fields = box_map.header.model_dump(mode="json", by_alias=True, exclude_unset=True)
-    passes: dict[str, Any] = {name: fields.pop(name) for name in ("passes", "simplify") if name in fields}
-    heights = fields.pop("ground", None)
-    header: dict[str, Any] = {
-        **BOXES_FORMAT.header,
-        **fields,
-        "axes": AXES,
-        "bounds": {"min": rounded(low), "max": rounded(high)},
-        "num_boxes": len(box_map),
+    last: dict[str, Any] = {name: fields.pop(name) for name in ("passes", "simplify", "ground") if name in fields}
+    heights = last.pop("ground", None)
+    header = BOXES_FORMAT.header | fields | {
+        "axes": AXES, "bounds": {"min": rounded(low), "max": rounded(high)}, "num_boxes": len(box_map),
         "counts": box_map.counts(),
-        **passes,
-    }
+    } | last  # fmt: skip
     lines = []
-    for i in range(len(box_map)):
-        kind = KIND_NAMES[int(box_map.kinds[i])]
-        box = {
-            "type": kind,
-            "semantic_id": int(box_map.kinds[i]),
-            "color": KIND_COLORS[kind],
-            "id": int(box_map.ids[i]),
-            "center": rounded(box_map.centers[i]),
-            "extent": rounded(box_map.half_extents[i]),
-            "rotation": rounded(box_map.rotations_deg[i]),
-            "min": rounded(mins[i]),
-            "max": rounded(maxs[i]),
-        }
-        if mesh := refs.get(int(box_map.ids[i])):
-            box["mesh"] = mesh.model_dump(exclude_none=True)
-        lines.append(dump_json(box))
+    for i, (number, box_id) in enumerate(zip(box_map.kinds.tolist(), box_map.ids.tolist(), strict=True)):
+        kind, mesh = KIND_NAMES[number], refs.get(box_id)
+        vectors = {
+            "center": box_map.centers[i], "extent": box_map.half_extents[i], "rotation": box_map.rotations_deg[i],
+            "min": mins[i], "max": maxs[i],
+        }  # fmt: skip
+        box = {"type": kind, "semantic_id": number, "color": KIND_COLORS[kind], "id": box_id}
+        box |= {name: rounded(vector) for name, vector in vectors.items()}
+        lines.append(dump_json(box if mesh is None else box | {"mesh": mesh.model_dump(exclude_none=True)}))
     ground = f',\n "ground": {dump_json(heights)}' if heights else ""
     text = dump_json(header, indent=1)[:-2] + ground + ',\n "boxes": [\n' + ",\n".join(lines) + "\n]}\n"
     write_bytes(path, text.encode())

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.formats.columns import column, read_items, records, rounded, text_id, write_items
+from cosfly.formats.columns import as_columns, column, columns, read_items, records, rounded, text_id, write_items
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.runtime.errors import InputError
@@ -77,18 +77,17 @@ class Bystander:
         return replace(self, positions_m=self.positions_m[::stride], headings_rad=self.headings_rad[::stride])
 
     def as_json(self) -> dict:
-        columns = {axis: rounded(self.positions_m[:, k], 4) for k, axis in enumerate("xyz")}
-        flags = {"look_alike": True} if self.is_look_alike else {}
-        return {"kind": self.kind, **flags, **columns, "yaw": rounded(np.degrees(self.headings_rad), 3)}
+        flags, yaw = {"look_alike": True} if self.is_look_alike else {}, rounded(np.degrees(self.headings_rad), 3)
+        return {"kind": self.kind, **flags, **as_columns(self.positions_m, "xyz"), "yaw": yaw}
 
     @classmethod
     def from_json(cls, record: dict, where: str) -> Bystander:
         kind = record.get("kind")
         if not isinstance(kind, str) or kind not in BUILDS:
             raise InputError("no such kind", where=f"{where}.kind", got=repr(kind)[:60], expected=" or ".join(BUILDS))
-        x = column(record, "x", where)
-        y, z, yaw = (column(record, name, where, len(x)) for name in ("y", "z", "yaw"))
-        return cls(kind, np.stack([x, y, z], axis=1), np.radians(yaw), record.get("look_alike") is True)
+        positions_m = columns(record, "xyz", where)
+        yaw = column(record, "yaw", where, len(positions_m))
+        return cls(kind, positions_m, np.radians(yaw), record.get("look_alike") is True)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,6 +14,8 @@ from cosfly.runtime.json_io import MISSING, FileFormat, check_schema, read_json,
 
 Item = TypeVar("Item")
 
+XYZ, ANGLES = ("x", "y", "z"), ("pitch", "yaw", "roll")
+POSE = XYZ + ANGLES
 LARGEST = 1e18  # no length or time is larger in any unit, and no square or sum of such numbers overflows
 
 
@@ -27,12 +29,12 @@ def rounded(vector: np.ndarray, digits: int = 6) -> list[float]:
     return [round(float(v), digits) + 0.0 for v in vector]  # + 0.0 turns -0.0 into 0.0
 
 
-def records(value: dict, name: str, path: Path | str) -> list[dict]:
-    """Read a list of objects, the first level of a product; raises InputError for anything else."""
-    records = value.get(name)
-    if not isinstance(records, list) or not all(isinstance(r, dict) for r in records):
-        raise InputError("not a list of objects", where=f"{path}: {name}")
-    return records
+def records(value: dict, name: str, where: Path | str) -> list[dict]:
+    """Read a list of objects; raises InputError for anything else."""
+    found = value.get(name)
+    if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
+        raise InputError("not a list of objects", where=f"{where}: {name}")
+    return found
 
 
 def read_items(path: Path, form: FileFormat, name: str, parse: Callable[[dict, str], Item]) -> list[Item]:
@@ -53,11 +55,10 @@ def step_field(items: list[Any]) -> dict[str, float | None]:
 
 def text_id(record: dict, where: str) -> str:
     """Read the `id` of a record; raises InputError where it is missing or no text."""
-    if record.get("id") is None:
-        raise InputError(MISSING, where=f"{where}.id", expected="text")
-    if not isinstance(record["id"], str):
-        raise InputError("not an id", where=f"{where}.id", got=repr(record.get("id")), expected="text")
-    return record["id"]
+    if isinstance(found := record.get("id"), str):
+        return found
+    what, got = (MISSING, None) if found is None else ("not an id", repr(found)[:60])
+    raise InputError(what, where=f"{where}.id", got=got, expected="text")
 
 
 def numbers(value: Any, *shape: int | None) -> np.ndarray | None:
@@ -71,23 +72,24 @@ def numbers(value: Any, *shape: int | None) -> np.ndarray | None:
     return found if fits and (np.abs(found) <= LARGEST).all() else None  # NaN is not
 
 
-def column(record: dict, name: str, where: str, length: int | None = None) -> np.ndarray:
-    """Read a list of finite numbers, (n,) float64, n = `length` where it is given; else InputError."""
-    wanted = "a list of finite numbers" if length is None else f"{length} finite numbers"
-    if name not in record:
-        raise InputError(MISSING, where=f"{where}.{name}", expected=wanted)
-    column = numbers(record[name], length)
-    if column is None or len(column) == 0:
-        raise InputError("not a column", where=f"{where}.{name}", got=repr(record[name])[:60], expected=wanted)
-    return column
+def column(record: dict, name: str, where: str, *shape: int | None) -> np.ndarray:
+    """Read numbers of a shape, in which None is any length but 0; raises InputError for anything else."""
+    sides = " x ".join("any number" if side is None else str(side) for side in shape)
+    found = numbers(record.get(name), *shape)
+    if found is None or len(found) == 0:
+        what, got = ("not a column", repr(record[name])[:60]) if name in record else (MISSING, None)
+        raise InputError(what, where=f"{where}.{name}", got=got, expected=f"a list of finite numbers, {sides}")
+    return found
 
 
-def matrix(record: dict, name: str, width: int, where: str) -> np.ndarray:
-    """Read a list of vectors of finite numbers, (n, width) float64; raises InputError for anything else."""
-    wanted = f"a list of {width} finite numbers each"
-    if record.get(name) is None:
-        raise InputError(MISSING, where=f"{where}.{name}", expected=wanted)
-    matrix = numbers(record[name], None, width)
-    if matrix is None:
-        raise InputError("not a list of vectors", where=f"{where}.{name}", got=repr(record[name])[:60], expected=wanted)
-    return matrix
+def columns(record: dict, names: Iterable[str], where: str, length: int | None = None) -> np.ndarray:
+    """Read columns of one length as one array, (n, number of names) float64."""
+    found: list[np.ndarray] = []
+    for name in names:
+        found.append(column(record, name, where, len(found[0]) if found else length))
+    return np.stack(found, axis=1)
+
+
+def as_columns(values: np.ndarray, names: Iterable[str]) -> dict[str, list[float]]:
+    """Return what `columns` reads, to four decimals."""
+    return {name: rounded(values[:, k], 4) for k, name in enumerate(names)}

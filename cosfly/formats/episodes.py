@@ -1,4 +1,5 @@
-"""`episodes/<episode>.json`: the record of one closed-loop episode (`cosfly fly`), frame by frame.
+"""`episodes/<episode>.json`: the record of a closed-loop episode (`cosfly fly`), frame by frame; `score.json`: the
+score of one student, with the sums of each episode, so that folders of several maps can be merged.
 
 Each frame has the visibility of the target, the student's answer to it, and the command flown from it to the next.
 World axes: right-handed, metres, degrees.
@@ -6,6 +7,7 @@ World axes: right-handed, metres, degrees.
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -17,12 +19,12 @@ from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
 EPISODES = "episodes"  # folder of the records
 EPISODE_FORMAT = FileFormat("cosfly.episode", "1.0", "episode")
+SCORE, SCORE_FORMAT = "score.json", FileFormat("cosfly.score", "1.0", "score")
 MOST_WORDS = 4000  # characters of an answer that are kept
 
 # lead: a frame of the plan, before the first decision. late: no answer within the limit; unreadable: not in the
-# requested
-# form; invalid: an unknown decision or an invalid command; none: no answer. After an answer that is not ok the drone
-# hovers. end: the last frame, without a decision.
+# requested form; invalid: an unknown decision or an invalid command; none: no answer. After an answer that is not ok
+# the drone hovers. end: the last frame, without a decision.
 Answer = Literal["lead", "ok", "late", "unreadable", "invalid", "none", "end"]
 # finished: flown to the end of the pedestrian trajectory; crashed: an obstacle or the ground came within the drone's
 # radius; lost: the target was not visible for `fly.lost_s`; left: the drone flew out of the map's bounds.
@@ -134,3 +136,54 @@ def write_episode(path: Path, record: Episode) -> None:
 def read_episode(path: Path) -> Episode:
     """Read the record of an episode; raises as `read_model`."""
     return read_model(path, Episode, EPISODE_FORMAT, tree=path.parent)
+
+
+class Figure(Record):
+    """A figure over `count` samples with its interval; all None if unknown."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+    count: int
+
+
+class EpisodeScore(Record):
+    """The measures of one episode. groups: kind of group (measures.GROUPS) -> group. answers: counts of the student's
+    answers. sums: figure -> numerator and denominator."""
+
+    episode: str
+    town: str
+    walk: str  # map and trajectory: episodes of one are correlated
+    groups: dict[str, str]
+    ended: Ended
+    answers: dict[Answer, NonNegativeInt]
+    sums: dict[str, tuple[FiniteFloat, _Least]]
+
+
+class Score(Record):
+    """The score of one student. episodes_sha256: of the tasks; only equal ones are comparable. list_sha256: of the
+    published list, None for own trajectories. trained_on: towns, None if unknown. figures: by measures.MEASURES;
+    by: kind of group -> group -> figures."""
+
+    student: str = Field(min_length=1)
+    engine: str
+    episodes_sha256: str
+    list_sha256: str | None = None
+    trained_on: tuple[str, ...] | None = None
+    confidence: Annotated[FiniteFloat, Field(gt=0, lt=1)]
+    resamples: int = Field(ge=1)
+    figures: dict[str, Figure]
+    by: dict[str, dict[str, dict[str, Figure]]]
+    flights: tuple[EpisodeScore, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _has_each_episode_once(self) -> Self:
+        counts = Counter((flight.town, flight.episode) for flight in self.flights)
+        if twice := [f"{town}/{episode}" for (town, episode), count in counts.items() if count > 1]:
+            raise ValueError(f"episode {twice[0]} is listed twice")
+        return self
+
+
+def read_score(folder: Path) -> Score:
+    """Read the score in an output directory of `cosfly fly`; raises as `read_model`."""
+    return read_model(folder / SCORE, Score, SCORE_FORMAT, tree=folder)

@@ -1,8 +1,7 @@
 """The files of one frame folder of the playback tree: rgb.png, depth, instance.png and meta.json.
 
 Depth is float32: `depth_float32.png`, packed without loss, or `depth.npy` as in the public layout. Ask `frame_path` for
-a file by its name in the public layout. Axes inside the tree are CARLA's (left-handed); `tree_...` functions take the
-project's right-handed values.
+a file by its name in the public layout. `meta.json` holds CARLA's axes (left-handed), FrameMeta the project's.
 """
 
 from __future__ import annotations
@@ -10,20 +9,22 @@ from __future__ import annotations
 import io
 import os
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
-from pydantic import Field
+from pydantic import Field, PlainSerializer, PlainValidator
 
+from cosfly.formats.columns import ANGLES, POSE, XYZ, numbers
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.people import People
 from cosfly.formats.places import tree_of_track
 from cosfly.formats.png import areas_png, colours_png, floats_of, floats_png
 from cosfly.formats.weather import WeatherRecord
-from cosfly.geometry.axes import mirror_positions, mirror_rotations, world_from_camera
-from cosfly.runtime.arrays import PNG_SIGNATURE, parse_array_header, read_array, read_picture
+from cosfly.geometry.axes import mirror_poses
+from cosfly.runtime.arrays import PNG_SIGNATURE, parse_array_header, read_picture
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import read_bytes
@@ -48,7 +49,6 @@ META_FORMAT = FileFormat("cosfly.frame", "1.0", "frame annotation")
 # difference (CIE76, where 2.3 is just noticeable) from what is around.
 LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE, LEGIBLE_CONTRAST = 16.0, 0.3, 5.0
 BYSTANDER_COLUMNS = ("in_view", "nearest_m", "nearest_id", "alike_id", "alike_differences")  # of a point's `others`
-XYZ, ANGLES = ("x", "y", "z"), ("pitch", "yaw", "roll")
 
 COORDINATES = {
     "frame": "carla",
@@ -81,6 +81,11 @@ class Camera:
         """Focal length of a lens that shows as much, from left to right, on film 36 mm wide."""
         return FILM_WIDTH_MM * self.focal_px / self.width_px
 
+    def focal_record(self) -> dict[str, Any]:
+        """Return what files hold of the lens."""
+        focal = {"focal_length_px": self.focal_px, "focal_length_35mm_mm": round(self.focal_35mm_mm, 6)}
+        return {**focal, "intrinsic": self.intrinsic.tolist()}
+
 
 def level_name(fov_deg: float) -> str:
     """Return the paper's name of a level of zoom, "" for one that is not among them."""
@@ -106,55 +111,31 @@ class Look(Config):
 # --- meta.json --------------------------------------------------------------------------------------------------------
 
 
-class TreePosition(Record):
-    """A position or a shift in the tree's axes, m."""
-
-    x: float
-    y: float
-    z: float
-
-    @property
-    def vector_m(self) -> np.ndarray:
-        """Position in the project's axes, (3,)."""
-        return mirror_positions(np.array([self.x, self.y, self.z]))
+def _read_axes(names: tuple[str, ...], value: Any) -> np.ndarray:
+    """Return what a file holds under these names in the tree's axes, in the project's."""
+    if isinstance(value, np.ndarray):
+        return value
+    found = numbers([value.get(name) for name in names], len(names)) if isinstance(value, dict) else None
+    if found is None or len(value) != len(names):
+        raise ValueError(f"Value should be an object of finite numbers, {', '.join(names)}")
+    return mirror_poses(found)
 
 
-class TreeAngles(Record):
-    """A turn in the tree's axes, degrees."""
-
-    pitch: float
-    yaw: float
-    roll: float
+def _write_axes(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
+    return dict(zip(names, (mirror_poses(values) + 0.0).tolist(), strict=True))  # + 0.0: no minus zero
 
 
-class TreePose(TreeAngles, TreePosition):
-    """The camera's pose in the tree's axes, m and degrees: x, y, z, pitch, yaw, roll."""
-
-    @property
-    def camera_pose(self) -> np.ndarray:
-        """world_from_camera in the project's axes, (4, 4)."""
-        return world_from_camera(self.vector_m, mirror_rotations(np.array([self.pitch, self.yaw, self.roll])))
-
-
-def tree_position(position_m: np.ndarray) -> TreePosition:
-    """Return a position, (3,) m, in the tree's axes."""
-    x, y, z = (mirror_positions(position_m) + 0.0).tolist()  # + 0.0: no minus zero
-    return TreePosition(x=x, y=y, z=z)
-
-
-def tree_angles(rotation_deg: np.ndarray) -> TreeAngles:
-    """Return pitch, yaw, roll, (3,) degrees, in the tree's axes."""
-    return TreeAngles(**dict(zip(ANGLES, (mirror_rotations(rotation_deg) + 0.0).tolist(), strict=True)))
+# In a file in the tree's axes, by name; in memory in the project's: (3,) m, (3,) degrees, (6,) one after the other.
+Position = Annotated[np.ndarray, PlainValidator(partial(_read_axes, XYZ)), PlainSerializer(partial(_write_axes, XYZ))]
+Angles = Annotated[
+    np.ndarray, PlainValidator(partial(_read_axes, ANGLES)), PlainSerializer(partial(_write_axes, ANGLES))
+]
+Pose = Annotated[np.ndarray, PlainValidator(partial(_read_axes, POSE)), PlainSerializer(partial(_write_axes, POSE))]
 
 
 def tree_yaw(yaw_deg: float) -> float:
     """Return a yaw, degrees, in the tree's axes."""
-    return float(mirror_rotations(np.array([0.0, yaw_deg, 0.0]))[1]) + 0.0
-
-
-def tree_pose(position_m: np.ndarray, rotation_deg: np.ndarray) -> TreePose:
-    """Return a pose, (3,) m and (3,) degrees, in the tree's axes."""
-    return TreePose(**dict(tree_position(position_m)), **dict(tree_angles(rotation_deg)))
+    return 0.0 - yaw_deg
 
 
 class CameraMeta(Record):
@@ -172,22 +153,14 @@ class CameraMeta(Record):
 
 def camera_meta(camera: Camera, near_m: float, far_m: float) -> CameraMeta:
     """Return the record of a camera; clip planes in m."""
-    return CameraMeta(
-        width=camera.width_px,
-        height=camera.height_px,
-        fov_deg=round(camera.fov_deg, 6),
-        focal_length_px=camera.focal_px,
-        focal_length_35mm_mm=round(camera.focal_35mm_mm, 6),
-        intrinsic=camera.intrinsic.tolist(),
-        near_m=near_m,
-        far_m=far_m,
-    )
+    size = {"width": camera.width_px, "height": camera.height_px, "fov_deg": round(camera.fov_deg, 6)}
+    return CameraMeta(**size, **camera.focal_record(), near_m=near_m, far_m=far_m)
 
 
 class TargetMeta(Record):
-    """The target in a frame: hip point, box and visibility; px unless named otherwise, null where there is none."""
+    """The target in a frame: hip, (3,) m, box and visibility; px unless named otherwise, null where there is none."""
 
-    world_location: TreePosition
+    world_location: Position
     half_extents_m: tuple[float, float, float]
     instance_id: int
     semantic_id: int
@@ -204,41 +177,31 @@ class TargetMeta(Record):
     contrast: float | None = None
     legible: bool | None = None
 
-    @property
-    def center_m(self) -> np.ndarray:
-        """Middle of the box in the project's axes, (3,)."""
-        return self.world_location.vector_m
-
 
 class PerturbationMeta(Record):
     """The outcome of a frame's events (none, applied, fallback: reason) and the offsets."""
 
     position: str
     rotation: str
-    drone_position: TreePosition
-    target_position: TreePosition
-    drone_rotation: TreeAngles
+    drone_position: Position
+    target_position: Position
+    drone_rotation: Angles
 
 
 class BystanderMeta(Record):
-    """A bystander: middle of the box and yaw in the tree's axes, and pixels in the picture."""
+    """A bystander: middle of the box, heading in degrees clockwise from east, and pixels in the picture."""
 
     instance_id: int
     semantic_id: int
-    world_location: TreePosition
+    world_location: Position
     yaw: float
     half_extents_m: tuple[float, float, float]
     num_pixels: int
 
     @property
-    def center_m(self) -> np.ndarray:
-        """Middle of the box in the project's axes, (3,)."""
-        return self.world_location.vector_m
-
-    @property
     def heading_rad(self) -> float:
         """Heading, counter-clockwise from east."""
-        return float(np.radians(mirror_rotations(np.array([0.0, self.yaw, 0.0]))[1]))
+        return float(-np.radians(self.yaw))
 
 
 class BystandersMeta(Record):
@@ -252,7 +215,7 @@ class BystandersMeta(Record):
         """Return BYSTANDER_COLUMNS: how many people have a pixel, how far the nearest is from the target, m over the
         ground, its id, and who looks most like the target; None without any, the last also without `people`."""
         seen = [one for one in self.others if one.semantic_id == KINDS["Pedestrians"] and one.num_pixels]
-        away_m = {one.instance_id: float(np.hypot(*(one.center_m - target_m)[:2])) for one in seen}
+        away_m = {one.instance_id: float(np.hypot(*(one.world_location - target_m)[:2])) for one in seen}
         nearest = min(away_m, key=away_m.__getitem__, default=None)
         how_far_m = None if nearest is None else round(away_m[nearest], 3)
         alike = (None, None) if people is None else people.most_alike(away_m)
@@ -260,7 +223,7 @@ class BystandersMeta(Record):
 
 
 class FrameMeta(Record):
-    """`meta.json`: all that a loader needs of one frame."""
+    """`meta.json`: all that a loader needs of one frame. drone_pose: (6,) x, y, z, pitch, yaw, roll of the camera."""
 
     coordinates: dict[str, str] = COORDINATES
     index: int
@@ -269,7 +232,7 @@ class FrameMeta(Record):
     trajectory: str
     variant: str
     camera: CameraMeta
-    drone_pose: TreePose
+    drone_pose: Pose
     target: TargetMeta
     perturbation: PerturbationMeta
     look: Look | None = None  # null with weather, and in older trees
@@ -278,8 +241,7 @@ class FrameMeta(Record):
 
     def to_bytes(self) -> bytes:
         """Return the content of the file."""
-        record = {**META_FORMAT.header, **self.model_dump()}
-        return (dump_json(record, indent=1) + "\n").encode()
+        return (dump_json({**META_FORMAT.header, **self.model_dump()}, indent=1) + "\n").encode()
 
 
 def read_meta(frame: Path) -> FrameMeta:
@@ -334,26 +296,21 @@ def read_instance(frame: Path) -> tuple[np.ndarray, np.ndarray]:
 def read_depth(frame: Path) -> np.ndarray:
     """Read the depth of a frame folder, (h, w) float32 z-depth in m; 1000.0 is sky or as far, 0.0 invalid."""
     path = frame_path(frame, DEPTH_NPY)
-    if path.name == DEPTH_PNG:
-        return depth_values(read_bytes(path, what="depth image", tree=tree_of(frame)), path)
-    return _far_clipped(read_array(path, dtype=np.float32, ndim=2, what="depth image", tree=tree_of(frame)))
-
-
-def _far_clipped(depth: np.ndarray) -> np.ndarray:
-    """Return depths, m, clipped at SKY_DEPTH_M; unchanged where one is not finite."""
-    is_beyond = SKY_DEPTH_M < depth.max(initial=0.0) < np.inf
-    return np.minimum(depth, np.float32(SKY_DEPTH_M)) if is_beyond else depth
+    return depth_values(read_bytes(path, what="depth image", tree=tree_of(frame)), path)
 
 
 def depth_values(data: bytes | memoryview, where: Path) -> np.ndarray:
     """Return the depth of an image's bytes in either form, as `read_depth`; a `.npy` is not copied."""
-    if is_packed(data):
-        return _far_clipped(floats_of(data, where))
-    header = parse_array_header(memoryview(data), where, what="depth image")
-    if header.dtype != np.float32 or len(header.shape) != 2:
-        raise InputError("not a depth image", where=where, got=str(header), expected="float32 of 2 dimensions")
-    values = np.frombuffer(data, np.float32, offset=header.offset)
-    return _far_clipped(values.reshape(header.shape, order="F" if header.is_fortran else "C"))
+    if data[: len(PNG_SIGNATURE)] == PNG_SIGNATURE:
+        depth = floats_of(data, where)
+    else:
+        header = parse_array_header(memoryview(data), where, what="depth image")
+        if header.dtype != np.float32 or len(header.shape) != 2:
+            raise InputError("not a depth image", where=where, got=str(header), expected="float32 of 2 dimensions")
+        values = np.frombuffer(data, np.float32, offset=header.offset)
+        depth = values.reshape(header.shape, order="F" if header.is_fortran else "C")
+    is_beyond = SKY_DEPTH_M < depth.max(initial=0.0) < np.inf
+    return np.minimum(depth, np.float32(SKY_DEPTH_M)) if is_beyond else depth
 
 
 def rgb_bytes(rgb: np.ndarray) -> bytes:
@@ -366,11 +323,6 @@ def instance_bytes(kinds: np.ndarray, ids: np.ndarray) -> bytes:
     return areas_png(kinds, (ids & 0xFF).astype(np.uint8), (ids >> 8).astype(np.uint8))
 
 
-def is_packed(data: bytes | memoryview) -> bool:
-    """Return whether a depth image's bytes are those of a `depth_float32.png`."""
-    return data[: len(PNG_SIGNATURE)] == PNG_SIGNATURE
-
-
 def depth_file(depth: np.ndarray, form: DepthFormat) -> tuple[str, bytes]:
     """Name and content of the file of a depth image, (h, w) float32."""
     return (DEPTH_PNG, floats_png(depth)) if form == "png" else (DEPTH_NPY, depth_bytes(depth))
@@ -381,3 +333,8 @@ def depth_bytes(depth: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     np.lib.format.write_array(buffer, np.ascontiguousarray(depth), version=(1, 0), allow_pickle=False)
     return buffer.getvalue()
+
+
+def as_depth_npy(data: bytes, where: Path) -> bytes:
+    """Return the content of `depth.npy` of a depth image's bytes in either form."""
+    return depth_bytes(depth_values(data, where)) if data.startswith(PNG_SIGNATURE) else data

@@ -15,13 +15,8 @@ LARGEST = 1e9  # of a coordinate
 
 
 class Feature(NamedTuple):
-    """One feature.
-
-    Attributes:
-        where: which one, for messages: counted from 1, with its id or name.
-        parts: polygons of rings, the outer one first, (n, 2); a point is a ring of one.
-        wrong: what is wrong with its geometry, in words; it has no parts then.
-    """
+    """One feature. where: which one, for messages: counted from 1, with its id or name. parts: polygons of rings, the
+    outer one first, (n, 2); a point is a ring of one. wrong: what is wrong with its geometry; it has no parts then."""
 
     where: str
     properties: dict[str, Any]
@@ -35,18 +30,16 @@ def is_geojson(value: Any) -> bool:
 
 
 def read_features(path: Path, *, what: str = "GeoJSON") -> list[Feature]:
-    """Read a FeatureCollection, a Feature or a bare geometry. What is wrong with a feature stands in it, so that all
-    can be told at once.
-    """
+    """Read a FeatureCollection, a Feature or a bare geometry. What is wrong with a feature is stored in it, so that all
+    is reported at once."""
     return features_of(read_json(path, what=what), path)
 
 
 def features_of(value: Any, path: Path) -> list[Feature]:
     """Return the features of a document; `path` is for messages. Raises InputError where it is no GeoJSON."""
     if not is_geojson(value):
-        raise InputError(
-            "not GeoJSON", where=f"{path}: type", expected="FeatureCollection, Feature, Polygon or MultiPolygon"
-        )
+        expected = "FeatureCollection, Feature, Polygon or MultiPolygon"
+        raise InputError("not GeoJSON", where=f"{path}: type", expected=expected)
     items = value.get("features") if value["type"] == "FeatureCollection" else [value]
     if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
         raise InputError("no list of features", where=f"{path}: features", expected="a list of Feature")
@@ -57,30 +50,25 @@ def _feature(item: dict[str, Any], number: int) -> Feature:
     geometry = item.get("geometry") if item.get("type") == "Feature" else item
     given = item.get("properties")
     properties: dict[str, Any] = given if isinstance(given, dict) else {}
-    name = next(
-        (value for value in (properties.get("name"), item.get("id"), properties.get("id")) if value not in (None, "")),
-        None,
-    )
-    where = f"feature {number}" + ("" if name is None else f" ({str(name)[:40]})")
+    names = (properties.get("name"), item.get("id"), properties.get("id"))
+    name = next((str(value)[:40] for value in names if value not in (None, "")), None)
+    where = f"feature {number}" + ("" if name is None else f" ({name})")
     kind, places = (geometry.get("type"), geometry.get("coordinates")) if isinstance(geometry, dict) else (None, None)
     if kind not in GEOMETRIES:
-        return Feature(
-            where,
-            properties,
-            [],
-            f"a geometry that has no place here, {str(kind)[:40]}; there are {', '.join(GEOMETRIES)}",
-        )
+        wrong = f"a geometry that has no place here, {str(kind)[:40]}; there are {', '.join(GEOMETRIES)}"
+        return Feature(where, properties, [], wrong)
     nested: Any = {"Point": [[[places]]], "Polygon": [places], "MultiPolygon": places}[kind]
     try:
         parts = [[np.array([place[:2] for place in ring], dtype=np.float64) for ring in part] for part in nested]
-        is_good = all(parts) and all(
-            ring.shape == (len(ring), 2) and (kind == "Point" or (len(ring) > 3 and (ring[0] == ring[-1]).all()))
-            for part in parts for ring in part
-        )  # fmt: skip
-        is_good = is_good and all((np.abs(ring) <= LARGEST).all() for part in parts for ring in part)  # NaN is not
+        is_good = all(parts) and all(_is_ring(ring, kind == "Point") for part in parts for ring in part)
     except (TypeError, ValueError, OverflowError):
         is_good = False
-    if not is_good:
-        needs = "one finite [x, y]" if kind == "Point" else "at least four finite [x, y], the last the first again"
-        return Feature(where, properties, [], f"its coordinates are not places: {needs}")
-    return Feature(where, properties, parts)
+    if is_good:
+        return Feature(where, properties, parts)
+    needs = "one finite [x, y]" if kind == "Point" else "at least four finite [x, y], the last the first again"
+    return Feature(where, properties, [], f"its coordinates are not places: {needs}")
+
+
+def _is_ring(ring: np.ndarray, is_point: bool) -> bool:
+    is_closed = is_point or (len(ring) > 3 and (ring[0] == ring[-1]).all())
+    return bool(ring.shape == (len(ring), 2) and is_closed and (np.abs(ring) <= LARGEST).all())  # NaN is not

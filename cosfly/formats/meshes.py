@@ -132,12 +132,12 @@ def _read_gltf(data: bytes, folder: _Folder, binary: bytes = b"") -> dict[str, M
             node["children"] = [*node.get("children", ()), len(nodes)]
             nodes.append({"mesh": len(owners)})
             owners.append((k, piece))
-    drawn = [{key: piece[key] for key in ("mode", "indices") if key in piece} for _, piece in owners]
-    for flat, (_, piece) in zip(drawn, owners, strict=True):
-        kept = {name: k for name, k in piece["attributes"].items() if name in ("POSITION", "COLOR_0")}
-        flat["attributes"] = kept
-        if flat.get("mode", TRIANGLES) > STRIP:
+    drawn = []
+    for _, piece in owners:
+        if piece.get("mode", TRIANGLES) > STRIP:
             raise InputError("a fan of triangles", where=folder.path, expected="triangles, or strips of them")
+        kept = {name: k for name, k in piece["attributes"].items() if name in ("POSITION", "COLOR_0")}
+        drawn.append({key: piece[key] for key in ("mode", "indices") if key in piece} | {"attributes": kept})
     used = [k for flat in drawn for k in (*flat["attributes"].values(), flat.get("indices")) if k is not None]
     counts = [*(accessors[k]["count"] for k in used), *(view["byteLength"] for view in views)]
     if min(counts, default=0) < 0 or sum(counts) > MOST_NUMBERS + FILE_MB * MB:
@@ -291,9 +291,8 @@ class Meshes:
 
 def write_meshes(path: Path, meshes: dict[str, Mesh]) -> None:
     """Write meshes as binary glTF 2.0, a node each: vertices in single precision about the node's place."""
-    nodes, shapes, views, accessors, materials = (list[dict]() for _ in range(5))
-    parts, colors_known = list[bytes](), dict[tuple[float, ...], int]()
-    at = 0
+    nodes, shapes, views, accessors = (list[dict]() for _ in range(4))
+    parts, material_of, at = list[bytes](), dict[tuple[float, ...], int](), 0
     for name, mesh in meshes.items():
         corners = mesh.corners_m.reshape(-1, 3) @ Z_UP  # the transpose leads back to +y up
         middle = np.round((corners.min(axis=0) + corners.max(axis=0)) / 2)
@@ -304,11 +303,7 @@ def write_meshes(path: Path, meshes: dict[str, Mesh]) -> None:
             near = (corners[chosen] - middle).astype("<f4")
             primitive: dict = {"attributes": {"POSITION": len(accessors)}, "mode": TRIANGLES}
             if (color != NO_COLOR).all():
-                rgb = tuple(color.tolist())
-                if rgb not in colors_known:
-                    colors_known[rgb] = len(materials)
-                    materials.append({"pbrMetallicRoughness": {"baseColorFactor": [*rgb, 1.0]}, "doubleSided": True})
-                primitive["material"] = colors_known[rgb]
+                primitive["material"] = material_of.setdefault(tuple(color.tolist()), len(material_of))
             primitives.append(primitive)
             accessors.append(
                 {"bufferView": len(views), "componentType": FLOAT, "type": "VEC3", "count": len(near),
@@ -319,6 +314,7 @@ def write_meshes(path: Path, meshes: dict[str, Mesh]) -> None:
             at += near.nbytes
         nodes.append({"name": name, "mesh": len(shapes), "translation": middle.tolist()})
         shapes.append({"primitives": primitives})
+    materials = [{"pbrMetallicRoughness": {"baseColorFactor": [*c, 1.0]}, "doubleSided": True} for c in material_of]
     document = {
         "asset": {"version": "2.0", "generator": "cosfly"}, "scene": 0, "scenes": [{"nodes": list(range(len(nodes)))}],
         "nodes": nodes, "meshes": shapes, "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": at}],

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.formats.columns import column, matrix, read_items, rounded, step_field, text_id, write_items
+from cosfly.formats.columns import as_columns, column, columns, read_items, rounded, step_field, text_id, write_items
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import FileFormat
 from cosfly.runtime.seeding import draw_to_quota, rng_for
@@ -47,20 +47,15 @@ class PedestrianTrajectory:
             "length_m": round(float(np.linalg.norm(np.diff(self.polyline_m, axis=0), axis=1).sum()), 3),
             "polyline": [rounded(p, 4) for p in self.polyline_m],
             "t": rounded(self.time_s, 4),
-            **{axis: rounded(self.positions_m[:, k], 4) for k, axis in enumerate("xyz")},
+            **as_columns(self.positions_m, "xyz"),
             "speed": rounded(self.speeds_mps, 4),
         }
 
     @classmethod
     def from_json(cls, record: dict, where: str) -> PedestrianTrajectory:
-        columns = {name: column(record, name, where) for name in ("t", "x", "y", "z", "speed")}
-        lengths = {name: len(column) for name, column in columns.items()}
-        if len(set(lengths.values())) != 1:
-            raise InputError("columns of different lengths", where=where, got=str(lengths))
-        polyline = matrix(record, "polyline", 2, where)
-        positions = np.stack([columns["x"], columns["y"], columns["z"]], axis=1)
-        pace = pace_of(record, where)
-        return cls(text_id(record, where), polyline, columns["t"], positions, columns["speed"], pace)
+        time_s, polyline = column(record, "t", where, None), column(record, "polyline", where, None, 2)
+        positions, speeds = columns(record, "xyz", where, len(time_s)), column(record, "speed", where, len(time_s))
+        return cls(text_id(record, where), polyline, time_s, positions, speeds, pace_of(record, where))
 
 
 def walk_id(number: int) -> str:

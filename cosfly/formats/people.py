@@ -15,41 +15,32 @@ from cosfly.runtime.json_io import validated
 Words = dict[Language, str]
 
 
-def _words(en: str, zh: str) -> Words:
-    return {"en": en, "zh": zh}
-
-
 # Linear RGB as a renderer takes it. So far apart that in any daylight each is seen as what it is called.
 COLORS: dict[str, tuple[Words, tuple[float, float, float]]] = {
-    "red": (_words("red", "红色"), (0.55, 0.02, 0.02)),
-    "orange": (_words("orange", "橙色"), (0.75, 0.21, 0.01)),
-    "yellow": (_words("yellow", "黄色"), (0.75, 0.55, 0.02)),
-    "green": (_words("green", "绿色"), (0.02, 0.28, 0.06)),
-    "blue": (_words("blue", "蓝色"), (0.02, 0.10, 0.50)),
-    "purple": (_words("purple", "紫色"), (0.22, 0.03, 0.34)),
-    "pink": (_words("pink", "粉色"), (0.75, 0.24, 0.38)),
-    "brown": (_words("brown", "棕色"), (0.16, 0.07, 0.03)),
-    "white": (_words("white", "白色"), (0.75, 0.75, 0.72)),
-    "grey": (_words("grey", "灰色"), (0.18, 0.18, 0.19)),
-    "black": (_words("black", "黑色"), (0.012, 0.012, 0.014)),
+    "red": ({"en": "red", "zh": "红色"}, (0.55, 0.02, 0.02)),
+    "orange": ({"en": "orange", "zh": "橙色"}, (0.75, 0.21, 0.01)),
+    "yellow": ({"en": "yellow", "zh": "黄色"}, (0.75, 0.55, 0.02)),
+    "green": ({"en": "green", "zh": "绿色"}, (0.02, 0.28, 0.06)),
+    "blue": ({"en": "blue", "zh": "蓝色"}, (0.02, 0.10, 0.50)),
+    "purple": ({"en": "purple", "zh": "紫色"}, (0.22, 0.03, 0.34)),
+    "pink": ({"en": "pink", "zh": "粉色"}, (0.75, 0.24, 0.38)),
+    "brown": ({"en": "brown", "zh": "棕色"}, (0.16, 0.07, 0.03)),
+    "white": ({"en": "white", "zh": "白色"}, (0.75, 0.75, 0.72)),
+    "grey": ({"en": "grey", "zh": "灰色"}, (0.18, 0.18, 0.19)),
+    "black": ({"en": "black", "zh": "黑色"}, (0.012, 0.012, 0.014)),
 }
 
-# Slot -> what may be worn there, in words. "" is nothing: a bare head, no bag.
+# Slot -> what may be worn there, and its words. "" is nothing: a bare head, no bag.
+_WORN = (
+    ("top", (("t_shirt", "T-shirt", "T恤"), ("jacket", "jacket", "夹克"), ("coat", "long coat", "长大衣"))),
+    ("legs", (("trousers", "trousers", "长裤"), ("shorts", "shorts", "短裤"), ("skirt", "skirt", "裙子"))),
+    ("hat", (("", "", ""), ("cap", "cap", "鸭舌帽"), ("brim", "wide hat", "宽檐帽"))),
+    ("bag", (("", "", ""), ("backpack", "backpack", "背包"), ("shoulder", "shoulder bag", "挎包"))),
+)
 GARMENTS: dict[str, dict[str, Words]] = {
-    "top": {
-        "t_shirt": _words("T-shirt", "T恤"),
-        "jacket": _words("jacket", "夹克"),
-        "coat": _words("long coat", "长大衣"),
-    },
-    "legs": {
-        "trousers": _words("trousers", "长裤"),
-        "shorts": _words("shorts", "短裤"),
-        "skirt": _words("skirt", "裙子"),
-    },
-    "hat": {"": _words("", ""), "cap": _words("cap", "鸭舌帽"), "brim": _words("wide hat", "宽檐帽")},
-    "bag": {"": _words("", ""), "backpack": _words("backpack", "背包"), "shoulder": _words("shoulder bag", "挎包")},
+    slot: {name: {"en": en, "zh": zh} for name, en, zh in garments} for slot, garments in _WORN
 }
-FIGURES: dict[str, Words] = {"woman": _words("woman", "女子"), "man": _words("man", "男子")}
+FIGURES: dict[str, Words] = {"woman": {"en": "woman", "zh": "女子"}, "man": {"en": "man", "zh": "男子"}}
 EMPTY_SHARE = {"hat": 0.6, "bag": 0.4}  # of people, who have none
 HAIR = ("brown", "grey", "black")  # a cap of such a colour is taken for hair from the air: no hat has it
 
@@ -80,12 +71,9 @@ class Appearance:
 
     def differences(self, other: Appearance) -> tuple[str, ...]:
         """Return the fields in which two people differ; a garment counts once."""
-        slots = ("figure", *GARMENTS)
         mine, theirs = asdict(self), asdict(other)
-        return tuple(
-            slot for slot in slots
-            if (mine[slot], mine.get(f"{slot}_color")) != (theirs[slot], theirs.get(f"{slot}_color"))
-        )  # fmt: skip
+        differing = {name.removesuffix("_color") for name in mine if mine[name] != theirs[name]}
+        return tuple(slot for slot in ("figure", *GARMENTS) if slot in differing)
 
 
 @dataclass(frozen=True)

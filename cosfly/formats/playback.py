@@ -12,8 +12,7 @@ else sees the right-handed frame. Unknown keys are kept in `Track.raw` and survi
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -22,14 +21,12 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import ValidationError
 
-from cosfly.formats.columns import is_number, numbers
+from cosfly.formats.columns import ANGLES, POSE, XYZ, is_number, numbers
 from cosfly.formats.frames import (
-    ANGLES,
     BYSTANDER_COLUMNS,
     COORDINATES,
     FRAME_FILES,
     FRAMES_DIR,
-    XYZ,
     Camera,
     frame_name,
     frame_path,
@@ -39,12 +36,12 @@ from cosfly.formats.people import Goal, People, read_goal
 from cosfly.formats.places import place_of, tree_of_track
 from cosfly.formats.segments import FOLLOW, Mission, Segment, flown_as_json, mirrored, read_flown
 from cosfly.formats.weather import WeatherRecord
-from cosfly.geometry.axes import mirror_positions, mirror_rotations, step_s
+from cosfly.geometry.axes import mirror_poses, step_s
 from cosfly.geometry.motion import PlannedMotion, without_perturbation
 from cosfly.runtime.arrays import check_pixels
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import read_bytes
-from cosfly.runtime.json_io import MISSING, read_json, validated, write_json
+from cosfly.runtime.json_io import MISSING, read_object, validated, write_json
 
 Value = TypeVar("Value")
 
@@ -210,8 +207,10 @@ class Track:
         """Names of the presets of weather and time of day; None where the file has none."""
         word = self.raw.get("weather")
         found = {"weather": word} if isinstance(word, str) else object_of(self.raw, "weather")
-        named = {own: (found.get(name) for name in names) for own, names in WEATHER_KEYS.items()}
-        return {own: next((one for one in each if isinstance(one, str)), None) for own, each in named.items()}
+        given = {name: value for name, value in found.items() if isinstance(value, str)}
+        return {
+            own: next((given[name] for name in names if name in given), None) for own, names in WEATHER_KEYS.items()
+        }
 
     @cached_property
     def weather_record(self) -> WeatherRecord | None:
@@ -238,12 +237,12 @@ class Track:
     @cached_property
     def states(self) -> list[str | None]:
         """Which of STATES each frame is in, after fallbacks; None where the file does not say."""
-        shifts, names, found = self.perturbation, tuple(STATES), []
+        shifts, found = self.perturbation, list[str | None]()
         for i in range(len(self)):
             point = self._point(i, "perturbation")
-            shifted = _was_moved((shifts.drone_m[i], shifts.target_m[i]), point.get("drone_position"))
-            turned = _was_moved((shifts.rotation_deg[i],), point.get("drone_rotation"))
-            found.append(None if shifted is None or turned is None else names[shifted + 2 * turned])
+            shifted = _was_moved(np.stack([shifts.drone_m[i], shifts.target_m[i]]), point.get("drone_position"))
+            turned = _was_moved(shifts.rotation_deg[i : i + 1], point.get("drone_rotation"))
+            found.append(None if shifted is None or turned is None else list(STATES)[shifted + 2 * turned])
         return found
 
     @property
@@ -253,11 +252,10 @@ class Track:
 
     def target_picture(self, index: int) -> dict[str, str | bytes] | None:
         """Return the picture of the target and its name, at the frame of the goal only."""
-        if self.goal is None or self.goal.frame != index or self.folder is None:
+        path = None if self.folder is None else self.folder / TARGET_FILE
+        if self.goal is None or self.goal.frame != index or path is None or not path.is_file():
             return None
-        if not (path := self.folder / TARGET_FILE).is_file():
-            return None
-        data = read_bytes(path, what="target picture", tree=tree_of_track(self.folder))
+        data = read_bytes(path, what="target picture", tree=tree_of_track(path.parent))
         return {"bytes": data, "path": f"{self.flight_id}_{TARGET_FILE}"}
 
     def frame_folder(self, index: int) -> Path:
@@ -270,13 +268,12 @@ class Track:
         return [i for i, folder in enumerate(folders) if not all(frame_path(folder, name).is_file() for name in names)]
 
 
-def _was_moved(offsets: tuple[np.ndarray, ...], flag: object) -> bool | None:
+def _was_moved(offsets: np.ndarray, flag: object) -> bool | None:
     """Return whether any offset is not zero; where they are unknown, the file's flag; None without one."""
-    if any((offset != 0).any() and not np.isnan(offset).any() for offset in offsets):
-        return True
-    if any(np.isnan(offset).any() for offset in offsets):
-        return flag if isinstance(flag, bool) else None
-    return False
+    is_known = ~np.isnan(offsets).any(axis=1)
+    if (offsets[is_known] != 0).any() or is_known.all():
+        return bool((offsets[is_known] != 0).any())
+    return flag if isinstance(flag, bool) else None
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
@@ -292,15 +289,13 @@ def read_track(folder: Path, *, strict: bool = True) -> Track:
         InputError: names the file, the point and the field.
     """
     path = folder / "trajectory.json"
-    raw = read_json(path, what="trajectory", tree=tree_of_track(folder))
-    if not isinstance(raw, dict):
-        raise InputError("not a trajectory", where=path, got=type(raw).__name__, expected="an object")
+    raw = read_object(path, what="trajectory", tree=tree_of_track(folder))
     reader = _FieldReader(path, strict)
     _, town, trajectory, variant = astuple(place_of(folder))
     for name, expected in (("schema", SCHEMA), ("schema_version", SCHEMA_VERSION), ("trace_dir", variant)):
         reader.equal(name, raw.get(name), expected)
     points = reader.points(raw)
-    time_s, poses = reader.times(points), reader.poses(points)
+    time_s, poses = reader.times(points), mirror_poses(reader.poses(points))
     targets, others = ([object_of(p, name) for p in points] for name in ("target", "others"))
     if not all(target or p.get("target", "missing") is None for target, p in zip(targets, points, strict=True)):
         reader.issue("points[].target", "missing", "an object, or null where there is nobody")
@@ -313,30 +308,15 @@ def read_track(folder: Path, *, strict: bool = True) -> Track:
         reader.optional(lambda: validated(WeatherRecord, raw["weather"], f"{path}: weather"))
     is_original = bool(object_of(raw, "augmentation").get("is_original", variant == ORIGINAL))
     camera = reader.camera(raw.get("camera"))
+    intrinsics, between = reader.intrinsics(points, camera), reader.between(points)
     return Track(
-        town=town,
-        trajectory=trajectory,
-        variant=variant,
-        camera=camera,
-        intrinsics=reader.intrinsics(points, camera),
-        between=_mirrored_poses(reader.between(points)),
-        time_s=time_s,
-        positions_m=mirror_positions(poses[:, :3]),
-        rotations_deg=mirror_rotations(poses[:, 3:]),
-        targets_m=mirror_positions(_vectors_of(targets, "world_location", XYZ)),
-        target=_target_view(targets),
-        perturbation=_perturbation(points, is_original),
-        source=object_of(raw, "source"),
-        is_original=is_original,
-        folder=folder,
-        raw=raw,
-        issues=tuple(reader.issues),
-        segments=segments,
-        mission=mirrored(mission),
-        people=people,
-        goal=goal,
+        town, trajectory, variant, camera, time_s, poses[:, :3], poses[:, 3:],
+        mirror_poses(_vectors_of(targets, "world_location", XYZ)), _target_view(targets),
+        _perturbation(points, is_original), source=object_of(raw, "source"), is_original=is_original, folder=folder,
+        raw=raw, issues=tuple(reader.issues), segments=segments, mission=mirrored(mission),
+        intrinsics=intrinsics, between=between, people=people, goal=goal,
         bystanders=None if np.isnan(bystanders[:, 0]).any() else bystanders,
-    )
+    )  # fmt: skip
 
 
 class _FieldReader:
@@ -351,25 +331,21 @@ class _FieldReader:
             return InputError(MISSING, where=f"{self.path}: {where}", expected=expected)
         return InputError(message, where=f"{self.path}: {where}", got=str(got), expected=expected)
 
-    def issue(self, where: str, got: object, expected: str) -> None:
-        with self.noted():
-            raise self.error("breaks the layout", where, got, expected)
+    def note(self, error: InputError) -> None:
+        if self.strict:
+            raise error
+        self.issues.append(str(error))
 
-    @contextmanager
-    def noted(self) -> Iterator[None]:
-        """Note an InputError that is raised within, unless the reader is strict."""
-        try:
-            yield
-        except InputError as error:
-            if self.strict:
-                raise
-            self.issues.append(str(error))
+    def issue(self, where: str, got: object, expected: str) -> None:
+        self.note(self.error("breaks the layout", where, got, expected))
 
     def optional(self, read: Callable[[], Value]) -> Value | None:
         """Return an optional field; None, with a note, where it holds something else of this name."""
-        with self.noted():
+        try:
             return read()
-        return None
+        except InputError as error:
+            self.note(error)
+            return None
 
     def equal(self, where: str, got: object, expected: object) -> None:
         if got != expected:
@@ -411,20 +387,19 @@ class _FieldReader:
         return float(value)
 
     def poses(self, points: list[dict]) -> np.ndarray:
-        """Read poses as in the file, (n, 6): x, y, z, pitch, yaw, roll in CARLA's axes, and check the waypoints."""
+        """Read poses as in the file, (n, 6) in CARLA's axes, and check the waypoints."""
         groups = [(f"points[{i}].drone_pose", point.get("drone_pose")) for i, point in enumerate(points)]
-        poses = np.array([[self.number(where, group, name) for name in XYZ + ANGLES] for where, group in groups])
+        poses = np.array([[self.number(where, group, name) for name in POSE] for where, group in groups])
         for i, point in enumerate(points):
             nav = point.get("nav_waypoint")
             found = nav.get("t1_world") if isinstance(nav, dict) else "missing"
-            where = f"points[{i}].nav_waypoint.t1_world"
-            if i + 1 == len(points):
-                if found is not None:
-                    self.issue(where, repr(found)[:60], "null at the last point")
-                break
-            vector, following = np.array(_parts_of(found, XYZ)), poses[i + 1, :3]
-            if np.isnan(vector).any() or np.abs(vector - following).max() > WAYPOINT_TOLERANCE_M:
-                self.issue(where, repr(found)[:60], f"the next point's position {following.tolist()}")
+            expected, is_right = "null at the last point", found is None
+            if i + 1 < len(points):
+                following = poses[i + 1, :3]
+                expected = f"the next point's position {following.tolist()}"
+                is_right = bool((np.abs(np.subtract(_parts_of(found, XYZ), following)) <= WAYPOINT_TOLERANCE_M).all())
+            if not is_right:
+                self.issue(f"points[{i}].nav_waypoint.t1_world", repr(found)[:60], expected)
                 break  # one note is enough
         return poses
 
@@ -432,11 +407,11 @@ class _FieldReader:
         """Read planned poses after each point and before the next, (n, k - 1, 6), NaN after the last; None without."""
         if len(points) < 2 or not any(point.get("between") for point in points):
             return None
-        found = numbers([point.get("between") for point in points[:-1]], None, None, len(XYZ + ANGLES))
+        found = numbers([point.get("between") for point in points[:-1]], None, None, len(POSE))
         if found is None:
             self.issue("points[].between", "something else", "as many poses of 6 finite numbers after each point")
             return None
-        return np.concatenate([found, np.full((1, *found.shape[1:]), np.nan)])
+        return np.concatenate([mirror_poses(found), np.full((1, *found.shape[1:]), np.nan)])
 
     def camera(self, group: Any) -> Camera:
         if not isinstance(group, dict):
@@ -451,16 +426,13 @@ class _FieldReader:
 
     def intrinsics(self, points: list[dict], camera: Camera) -> np.ndarray | None:
         """Read matrices of the frames, (n, 3, 3); None where `camera` is that of all."""
-        found = np.tile(camera.intrinsic, (len(points), 1, 1))
-        for i, own in enumerate(object_of(point, "camera") for point in points):
-            if own.get("intrinsic") is None:
-                continue
+        found, size = [camera.intrinsic] * len(points), {"width": camera.width_px, "height": camera.height_px}
+        for i, own in enumerate(object_of(point, "camera").get("intrinsic") for point in points):
             try:
-                size = {"width": camera.width_px, "height": camera.height_px}
-                found[i] = self.camera({**size, "intrinsic": own["intrinsic"]}).intrinsic
+                found[i] = camera.intrinsic if own is None else self.camera({**size, "intrinsic": own}).intrinsic
             except InputError as error:
                 self.issue(f"points[{i}].camera.intrinsic", error.got, error.expected or "a camera")
-        return None if (found == camera.intrinsic).all() else found
+        return None if (np.array(found) == camera.intrinsic).all() else np.array(found)
 
 
 def object_of(group: dict, key: str) -> dict:
@@ -479,13 +451,12 @@ def _parts_of(value: Any, names: tuple[str, ...]) -> list:
 
 def _vectors_of(groups: list[dict], key: str, names: tuple[str, ...]) -> np.ndarray:
     """Read a vector of each group, (n, len(names))."""
-    parts = [_parts_of(group.get(key), names) for group in groups]
-    return np.array(parts, dtype=np.float64).reshape(-1, len(names))
+    return np.array([_parts_of(group.get(key), names) for group in groups], np.float64).reshape(-1, len(names))
 
 
 def _numbers_of(groups: list[dict], key: str) -> np.ndarray:
     """Read one number of each group, (n,); NaN for anything else."""
-    return np.array([_parts_of([group.get(key)], (key,))[0] for group in groups], dtype=np.float64)
+    return np.array([value if is_number(value := group.get(key)) else np.nan for group in groups], dtype=np.float64)
 
 
 def _target_view(targets: list[dict]) -> TargetRecord:
@@ -504,20 +475,19 @@ def _target_view(targets: list[dict]) -> TargetRecord:
 
 
 def _perturbation(points: list[dict], is_original: bool) -> Perturbation:
-    groups = [object_of(point, "perturbation") for point in points]
+    groups, told = ([object_of(p, "perturbation") for p in points], [p.get("is_perturbed") for p in points])
 
     def offsets(key: str, names: tuple[str, ...]) -> np.ndarray:
-        found = _vectors_of(groups, key, names)
-        pairs = zip(points, groups, strict=True)
-        is_none = [is_original or p.get("is_perturbed") is False or g.get(key) is False for p, g in pairs]
+        found = mirror_poses(_vectors_of(groups, key, names))
+        is_none = [is_original or p is False or g.get(key) is False for p, g in zip(told, groups, strict=True)]
         found[np.isnan(found).any(axis=1) & np.array(is_none)] = 0.0
         return found
 
     return Perturbation(
-        is_perturbed=np.array([bool(point.get("is_perturbed", False)) for point in points]),
-        drone_m=mirror_positions(offsets("drone_position", XYZ)),
-        rotation_deg=mirror_rotations(offsets("drone_rotation", ANGLES)),
-        target_m=mirror_positions(offsets("target_position", XYZ)),
+        is_perturbed=np.array([bool(one) for one in told]),
+        drone_m=offsets("drone_position", XYZ),
+        rotation_deg=offsets("drone_rotation", ANGLES),
+        target_m=offsets("target_position", XYZ),
     )
 
 
@@ -529,66 +499,51 @@ def write_track(folder: Path, track: Track) -> None:
     raw = copy.deepcopy(track.raw)
     points = raw.pop("points", None) or raw.pop("waypoints", None) or [{} for _ in range(len(track))]
     assert len(points) == len(track), "raw points and columns differ in number"
-    raw.update(schema=SCHEMA, schema_version=SCHEMA_VERSION, trace_dir=track.variant)
-    raw.setdefault("dataset_format", DATASET_FORMAT)
-    raw.setdefault("frames_dir", FRAMES_DIR)
-    raw.setdefault("coordinates", COORDINATES)
-    raw["source"] = track.source
-    raw.update(flown_as_json(track.segments, mirrored(track.mission)))
-    if track.people is not None:
-        raw["people"] = asdict(track.people)
-    if track.goal is not None:
-        raw["goal"] = asdict(track.goal)
-    camera = track.camera
-    raw["camera"] = {**object_of(raw, "camera"), "width": camera.width_px, "height": camera.height_px, **_focal(camera)}
-    raw["augmentation"] = {
-        "enabled": not track.is_original,
-        "aug_index": 0 if track.is_original else 1,
-        **object_of(raw, "augmentation"),
-        "is_original": track.is_original,
-    }
-    positions = mirror_positions(track.positions_m) + 0.0
-    poses = np.hstack([positions, mirror_rotations(track.rotations_deg) + 0.0]).tolist()
-    between = _mirrored_poses(track.between)
-    vectors: list[tuple[str, str, tuple[str, ...], np.ndarray]] = [
-        ("target", "world_location", XYZ, mirror_positions(track.targets_m)),
-        ("target", "image_uv", (), track.target.uv),
-        ("target", "bbox_2d", BBOX, track.target.bbox),
-        ("perturbation", "drone_position", XYZ, mirror_positions(track.perturbation.drone_m)),
-        ("perturbation", "drone_rotation", ANGLES, mirror_rotations(track.perturbation.rotation_deg)),
-        ("perturbation", "target_position", XYZ, mirror_positions(track.perturbation.target_m)),
+    camera, target, perturbation = track.camera, track.target, track.perturbation
+    raw |= {
+        "schema": SCHEMA, "schema_version": SCHEMA_VERSION, "trace_dir": track.variant,
+        "dataset_format": raw.get("dataset_format", DATASET_FORMAT), "frames_dir": raw.get("frames_dir", FRAMES_DIR),
+        "coordinates": raw.get("coordinates", COORDINATES), "source": track.source,
+        **flown_as_json(track.segments, mirrored(track.mission)),
+        **{name: asdict(one) for name, one in (("people", track.people), ("goal", track.goal)) if one is not None},
+        "camera": object_of(raw, "camera")
+        | {"width": camera.width_px, "height": camera.height_px, **camera.focal_record()},
+        "augmentation": {"enabled": not track.is_original, "aug_index": 0 if track.is_original else 1}
+        | object_of(raw, "augmentation") | {"is_original": track.is_original},
+    }  # fmt: skip
+    poses = mirror_poses(np.hstack([track.positions_m, track.rotations_deg])) + 0.0
+    vectors: list[tuple[str, str, tuple[str, ...], np.ndarray | None]] = [
+        ("target", "world_location", XYZ, mirror_poses(track.targets_m)),
+        ("target", "image_uv", (), target.uv),
+        ("target", "bbox_2d", BBOX, target.bbox),
+        ("perturbation", "drone_position", XYZ, mirror_poses(perturbation.drone_m)),
+        ("perturbation", "drone_rotation", ANGLES, mirror_poses(perturbation.rotation_deg)),
+        ("perturbation", "target_position", XYZ, mirror_poses(perturbation.target_m)),
+        ("target", "mask_bbox_2d", BBOX, target.mask_bbox),
     ]
-    if track.target.mask_bbox is not None:
-        vectors.append(("target", "mask_bbox_2d", BBOX, track.target.mask_bbox))
     for i, point in enumerate(points):
-        point["index"] = i
-        point["is_perturbed"] = bool(track.perturbation.is_perturbed[i])
-        time_s = float(track.time_s[i])
-        point["timing"] = {"sim_timestamp": time_s, **object_of(point, "timing"), "trace_timestamp": time_s}
-        point["drone_pose"] = {**object_of(point, "drone_pose"), **dict(zip(XYZ + ANGLES, poses[i], strict=True))}
-        following = dict(zip(XYZ, poses[i + 1], strict=False)) if i + 1 < len(points) else None
-        point["nav_waypoint"] = {**object_of(point, "nav_waypoint"), "t1_world": following}
-        point["perturbation"] = object_of(point, "perturbation")
-        point["action"] = _tree_action(track.motion.action[i])
-        if between is not None:
-            point["between"] = None if i + 1 == len(points) else (between[i] + 0.0).tolist()
+        time_s, is_last = float(track.time_s[i]), i + 1 == len(points)
+        following = None if is_last else dict(zip(XYZ, poses[i + 1, :3].tolist(), strict=True))
+        point |= {
+            "index": i,
+            "is_perturbed": bool(perturbation.is_perturbed[i]),
+            "timing": {"sim_timestamp": time_s, **object_of(point, "timing"), "trace_timestamp": time_s},
+            "drone_pose": {**object_of(point, "drone_pose"), **dict(zip(POSE, poses[i].tolist(), strict=True))},
+            "nav_waypoint": {**object_of(point, "nav_waypoint"), "t1_world": following},
+            "perturbation": object_of(point, "perturbation"),
+            "action": _tree_action(track.motion.action[i]),
+        }
+        if track.between is not None:
+            point["between"] = None if is_last else (mirror_poses(track.between[i]) + 0.0).tolist()
         if track.intrinsics is not None:
-            point["camera"] = {**object_of(point, "camera"), **_focal(track.camera_at(i))}
+            point["camera"] = {**object_of(point, "camera"), **track.camera_at(i).focal_record()}
         is_nobody = "target" in point and point["target"] is None and np.isnan(track.targets_m[i]).all()
         if not is_nobody:
-            point["target"] = _target(object_of(point, "target"), track, i)
+            point["target"] = _target(object_of(point, "target"), target, i)
         for group, key, names, values in vectors:
-            if not (is_nobody and group == "target"):
+            if values is not None and not (is_nobody and group == "target"):
                 _put_vector(point[group], key, names, values[i])
-    raw["points"] = points
-    write_json(folder / "trajectory.json", raw)
-
-
-def _mirrored_poses(poses: np.ndarray | None) -> np.ndarray | None:
-    """Change (..., 6) poses between right-handed and CARLA axes."""
-    if poses is None:
-        return None
-    return np.concatenate([mirror_positions(poses[..., :3]), mirror_rotations(poses[..., 3:])], axis=-1)
+    write_json(folder / "trajectory.json", raw | {"points": points})
 
 
 def _tree_action(action: np.ndarray) -> dict[str, float] | None:
@@ -598,35 +553,18 @@ def _tree_action(action: np.ndarray) -> dict[str, float] | None:
     return dict(zip(TREE_ACTION, (action * [1.0, -1.0, 1.0, -1.0, 1.0] + 0.0).tolist(), strict=True))
 
 
-def _focal(camera: Camera) -> dict:
-    return {
-        "focal_length_px": camera.focal_px,
-        "focal_length_35mm_mm": round(camera.focal_35mm_mm, 6),
-        "intrinsic": camera.intrinsic.tolist(),
-    }
-
-
-def _target(group: dict, track: Track, i: int) -> dict:
+def _target(group: dict, target: TargetRecord, i: int) -> dict:
     """Return the target of point i without its vectors; what else the file says of it stays."""
-    target = {"enabled": True} | group
-    target["visible"] = bool(track.target.visible[i])
-    target["in_view"] = bool(track.target.in_view[i])
-    target["depth"] = _number_or_none(track.target.depth_m[i])
-    if not np.isnan(track.target.visibility[i]) or "visibility" in target:
-        target["visibility"] = _number_or_none(track.target.visibility[i])
-    return target
+    depth_m, visibility = (None if np.isnan(v) else float(v) for v in (target.depth_m[i], target.visibility[i]))
+    found = {"enabled": True} | group
+    found |= {"visible": bool(target.visible[i]), "in_view": bool(target.in_view[i]), "depth": depth_m}
+    return found if visibility is None and "visibility" not in found else found | {"visibility": visibility}
 
 
 def _put_vector(group: dict, key: str, names: tuple[str, ...], values: np.ndarray) -> None:
     """Set a vector in the form that the file uses already (object or list); ours is the object where it has names."""
     if isinstance(group.get(key), bool) and (np.isnan(values).any() if group[key] else not values.any()):
         return  # a public file says whether there was an offset, not which
-    numbers = None if np.isnan(values).any() else (values + 0.0).tolist()
-    if numbers is None or isinstance(group.get(key), list) or not names:
-        group[key] = numbers
-    else:
-        group[key] = dict(zip(names, numbers, strict=True))
-
-
-def _number_or_none(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
+    found: list | None = None if np.isnan(values).any() else (values + 0.0).tolist()
+    is_plain = found is None or isinstance(group.get(key), list) or not names
+    group[key] = found if is_plain else dict(zip(names, found or (), strict=True))

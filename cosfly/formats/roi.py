@@ -84,19 +84,18 @@ def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Ro
         raise InputError("the polygon is not closed", where=where, got="false", expected="true", fix=fix)
     if not roi.rings():
         raise InputError("no polygon", where=f"{path}: points_world", expected="at least three points")
-    num_vertices = sum(len(ring) for polygon in roi.rings() for ring in (polygon.points_world, *polygon.holes))
+    rings = [(k, ring) for k, polygon in enumerate(roi.rings()) for ring in (polygon.points_world, *polygon.holes)]
+    num_vertices = sum(len(ring) for _, ring in rings)
     if num_vertices > most_vertices:
-        fix = "simplify its rings"
-        raise over_limit(path, f"{num_vertices:,} vertices", f"{most_vertices:,}", fix)
-    for number, polygon in enumerate(roi.rings()):
-        for ring in (polygon.points_world, *polygon.holes):
-            if len(ring) < 3 or numbers(ring, None, 2) is None:
-                where, got = f"{path}: polygon {number}", f"{len(ring)} points"
-                raise InputError("not a ring", where=where, got=got, expected="at least three finite points")
-            reason = shapely.is_valid_reason(shapely.Polygon(ring))
-            if reason != "Valid Geometry":
-                where, fix = f"{path}: polygon {number}", "draw it again without crossings"
-                raise InputError("a ring crosses itself", where=where, got=reason, fix=fix)
+        raise over_limit(path, f"{num_vertices:,} vertices", f"{most_vertices:,}", "simplify its rings")
+    for number, ring in rings:
+        where = f"{path}: polygon {number}"
+        if len(ring) < 3 or numbers(ring, None, 2) is None:
+            got, expected = f"{len(ring)} points", "at least three finite points"
+            raise InputError("not a ring", where=where, got=got, expected=expected)
+        reason = shapely.is_valid_reason(shapely.Polygon(ring))
+        if reason != "Valid Geometry":
+            raise InputError("a ring crosses itself", where=where, got=reason, fix="draw it again without crossings")
     return roi
 
 

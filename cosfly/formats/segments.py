@@ -6,9 +6,9 @@ A file without them follows the target from end to end, as the paper's do, witho
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, BeforeValidator, Field
 
 from cosfly.formats.columns import LARGEST
 from cosfly.runtime.errors import InputError
@@ -31,45 +31,40 @@ class Segment:
     keeps_sight: bool = True
 
 
+def _coordinates(value: Any) -> list:
+    if not isinstance(value, dict):
+        raise ValueError("Value should be an object of x, y and z")
+    return [value.get(axis) for axis in "xyz"]
+
+
+Home = Annotated[tuple[Coordinate, Coordinate, Coordinate], BeforeValidator(_coordinates), Field(alias="home")]
+
+
 @dataclass(frozen=True)
 class Mission:
     """An order that ends the tracking: from `at_frame` the drone breaks off, from `home_frame` it flies to `home_m`."""
 
     kind: MissionKind
-    at_frame: int
-    home_frame: int
-    home_m: tuple[float, float, float]
+    at_frame: Frame
+    home_frame: Frame
+    home_m: Home
 
     def order_at(self, frame: int) -> str | None:
         """Return the decision that is ordered at a frame, None before the first."""
         return None if frame < self.at_frame else "break_off" if frame < self.home_frame else "return_to_home"
 
 
-class _Home(BaseModel):
-    x: Coordinate
-    y: Coordinate
-    z: Coordinate
-
-
-class _Mission(BaseModel):
-    kind: MissionKind
-    at_frame: Frame
-    home_frame: Frame
-    home: _Home
-
-
 class _Flown(BaseModel):
     segments: tuple[Segment, ...] | None = None
-    mission: _Mission | None = None
+    mission: Mission | None = None
 
 
 def flown_as_json(segments: tuple[Segment, ...], mission: Mission | None) -> dict:
     """Return the keys that `read_flown` reads; none for a trajectory that follows from end to end."""
     record: dict = {"segments": [asdict(part) for part in segments]} if segments else {}
     if mission is not None:
-        home = dict(zip("xyz", mission.home_m, strict=True))
         record["mission"] = {name: getattr(mission, name) for name in ("kind", "at_frame", "home_frame")}
-        record["mission"]["home"] = home
+        record["mission"]["home"] = dict(zip("xyz", mission.home_m, strict=True))
     return record
 
 
@@ -85,16 +80,11 @@ def read_flown(record: dict, num_frames: int, where: str) -> tuple[tuple[Segment
     """Return segments and mission of a record of `num_frames` frames. where: file and place of the record."""
     flown = validated(_Flown, {name: record.get(name) for name in _Flown.model_fields}, where)
     segments, mission = flown.segments or (), flown.mission
-    frames = [
-        (f"segments[{k}].{name}", getattr(part, name)) for k, part in enumerate(segments) for name in ("begin", "end")
-    ]
+    frames = {f"segments[{k}].{name}": getattr(p, name) for k, p in enumerate(segments) for name in ("begin", "end")}
     if mission is not None:
-        frames += [(f"mission.{name}", getattr(mission, name)) for name in ("at_frame", "home_frame")]
-    for name, frame in frames:
+        frames |= {"mission.at_frame": mission.at_frame, "mission.home_frame": mission.home_frame}
+    for name, frame in frames.items():
         if frame > num_frames:
             expected = f"0 to {num_frames}"
             raise InputError("the frame does not exist", where=f"{where}: {name}", got=str(frame), expected=expected)
-    if mission is None:
-        return segments, None
-    home = mission.home
-    return segments, Mission(mission.kind, mission.at_frame, mission.home_frame, (home.x, home.y, home.z))
+    return segments, mission

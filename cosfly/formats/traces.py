@@ -8,7 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.formats.columns import column, matrix, read_items, rounded, step_field, text_id, write_items
+from cosfly.formats.columns import (
+    ANGLES,
+    POSE,
+    XYZ,
+    as_columns,
+    column,
+    columns,
+    read_items,
+    rounded,
+    step_field,
+    text_id,
+    write_items,
+)
 from cosfly.formats.pedestrian_paths import PLAIN_PACE, pace_field, pace_of
 from cosfly.formats.segments import Mission, Segment, flown_as_json, read_flown
 from cosfly.runtime.errors import InputError
@@ -39,7 +51,7 @@ class Excerpt:
         if not isinstance(record, dict) or record.get("number") not in range(MOST_TRAJECTORIES):
             expected = f"id, a number below {MOST_TRAJECTORIES} and before"
             raise InputError("not a part of a flight", where=where, expected=expected)
-        return cls(text_id(record, where), int(record["number"]), matrix(record, "before", 3, where))
+        return cls(text_id(record, where), int(record["number"]), column(record, "before", where, None, 3))
 
 
 @dataclass(frozen=True)
@@ -106,7 +118,6 @@ class DroneTrace:
         return np.concatenate([poses, np.full((1, stride - 1, 6), np.nan)])
 
     def as_json(self) -> dict:
-        names = ("x", "y", "z")
         return {
             "id": self.path_id,
             "planner": self.planner,
@@ -118,31 +129,27 @@ class DroneTrace:
             "metrics": self.metrics,
             "solver": self.solver,
             "t": rounded(self.time_s, 4),
-            "drone": {
-                **{axis: rounded(self.positions_m[:, k], 4) for k, axis in enumerate(names)},
-                **{name: rounded(self.rotations_deg[:, k], 4) for k, name in enumerate(("pitch", "yaw", "roll"))},
-            },
-            "target": {axis: rounded(self.targets_m[:, k], 4) for k, axis in enumerate(names)},
+            "drone": as_columns(np.hstack([self.positions_m, self.rotations_deg]), POSE),
+            "target": as_columns(self.targets_m, XYZ),
             "visibility": rounded(self.visibility, 4),
             "clearance": rounded(self.clearances_m, 4),
         }
 
     @classmethod
     def from_json(cls, record: dict, where: str) -> DroneTrace:
-        time_s = column(record, "t", where)
-        groups = {}
-        for group, names in (("drone", ("x", "y", "z", "pitch", "yaw", "roll")), ("target", ("x", "y", "z"))):
-            part = record.get(group)
-            if not isinstance(part, dict):
+        time_s, groups = column(record, "t", where, None), list[np.ndarray]()
+        for group, names in (("drone", XYZ), ("drone", ANGLES), ("target", XYZ)):
+            if not isinstance(record.get(group), dict):
                 raise InputError("missing", where=f"{where}.{group}", expected="an object of columns")
-            groups[group] = np.stack([column(part, name, f"{where}.{group}", len(time_s)) for name in names], axis=1)
+            groups.append(columns(record[group], names, f"{where}.{group}", len(time_s)))
         visibility, clearances_m = (column(record, name, where, len(time_s)) for name in ("visibility", "clearance"))
         segments, mission = read_flown(record, len(time_s), where)
         more: dict[str, Any] = {name: record[name] for name in MORE if name in record}
         more |= {"segments": segments, "mission": mission, "pace": pace_of(record, where)}
         more["part_of"] = Excerpt.from_json(record.get("part_of"), f"{where}.part_of")
-        name, flown = str(record.get("planner", "")), (groups["drone"][:, :3], groups["drone"][:, 3:], groups["target"])
-        return cls(text_id(record, where), name, time_s, *flown, visibility, clearances_m, **more)
+        name, path_id = str(record.get("planner", "")), text_id(record, where)
+        poses = groups[0], groups[1], groups[2]
+        return cls(path_id, name, time_s, *poses, visibility, clearances_m, **more)
 
 
 def write_traces(path: Path, traces: list[DroneTrace], header: dict) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,23 +22,13 @@ def find_tracks(root: Path, choice: TrackChoice = ALL_FLIGHTS) -> list[Path]:
         raise InputError("there is no such folder", where=root, expected="a playback tree", fix="check the path")
     folders = [path.parent for path in files_named(root, "trajectory.json")]
     if not folders:
-        raise InputError(
-            "not a playback tree",
-            where=root,
-            got="no trajectory.json below it",
-            expected="Town*/trajectory_*/ORI/trajectory.json",
-            fix="check --data",
-        )
-    return chosen_tracks(folders, root, choice)
-
-
-def chosen_tracks(folders: Sequence[Path], root: Path, choice: TrackChoice) -> list[Path]:
-    """Return the chosen tracks of a tree."""
+        got, expected = "no trajectory.json below it", "Town*/trajectory_*/ORI/trajectory.json"
+        raise InputError("not a playback tree", where=root, got=got, expected=expected, fix="check --data")
     chosen = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
-    if folders and not chosen:
-        what, expected = "no flight of the tree has such a name", folders[0].relative_to(root).as_posix()
-        expected = f"a pattern for {expected} and its like"
-        raise InputError(what, where=root, got=", ".join(choice.match), expected=expected, fix="check --flights")
+    if not chosen:
+        what, got = "no flight of the tree has such a name", ", ".join(choice.match)
+        expected = f"a pattern for {folders[0].relative_to(root).as_posix()} and its like"
+        raise InputError(what, where=root, got=got, expected=expected, fix="check --flights")
     if len(choice.tracks) < len(TRACKS):
         chosen = [folder for folder in chosen if track_of(folder) in choice.tracks]
         if not chosen:
@@ -67,25 +56,15 @@ def read_twin(flight: Track) -> Track | None:
     own = type(flight.folder)(os.path.abspath(flight.folder))
     named = own.parent / ORIGINAL
     has_named = named != own and (named / "trajectory.json").exists()
-    for folder in [named] if has_named else sorted(p.parent for p in own.parent.glob("[!.]*/trajectory.json")):
-        twin = read_track(folder, strict=False) if folder != own else flight
-        if twin.is_original:
-            break
-        if has_named:
-            raise _no_twin(flight, twin)
-    else:
+    folders = [named] if has_named else sorted(p.parent for p in own.parent.glob("[!.]*/trajectory.json"))
+    found = (read_track(folder, strict=False) if folder != own else flight for folder in folders)
+    twin = next((track for track in found if track.is_original or has_named), None)
+    if twin is None:
         return None
-    if len(twin) != len(flight) or np.abs(twin.time_s - flight.time_s).max() >= TWIN_TOLERANCE_S:
-        raise _no_twin(flight, twin)
+    has_its_times = len(twin) == len(flight) and np.abs(twin.time_s - flight.time_s).max() < TWIN_TOLERANCE_S
+    if not (twin.is_original and has_its_times):
+        got, expected = (f"{len(f)} points from {f.time_s[0]:.3f} to {f.time_s[-1]:.3f} s" for f in (twin, flight))
+        what = "the clean track does not belong to the perturbed track next to it"
+        got = f"{got}, is_original {twin.is_original}"
+        raise VerifyError(what, where=twin.folder, got=got, expected=expected)
     return twin
-
-
-def _no_twin(flight: Track, other: Track) -> VerifyError:
-    got, expected = (f"{len(f)} points from {f.time_s[0]:.3f} to {f.time_s[-1]:.3f} s" for f in (other, flight))
-    got = f"{got}, is_original {other.is_original}"
-    return VerifyError(
-        "the clean track does not belong to the perturbed track next to it",
-        where=other.folder,
-        got=got,
-        expected=expected,
-    )

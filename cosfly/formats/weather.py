@@ -50,32 +50,18 @@ class WeatherRecord(Record):
     params: WeatherParams
 
 
-def _presets(*rows: tuple[str, float, float, float, float]) -> dict[str, WeatherPreset]:
-    return {
-        name: WeatherPreset(cloudiness=cloud, precipitation=rain, fog_density=fog, fog_distance=begins)
-        for name, cloud, rain, fog, begins in rows
-    }
-
-
-# tab:weather_presets: group -> name -> knobs
-WEATHER_GROUPS = {
-    "sky": _presets(
-        ("clear", 5, 0, 0, 60),
-        ("fair", 20, 0, 0, 60),
-        ("partly_cloudy", 40, 0, 0, 60),
-        ("cloudy", 70, 0, 0, 60),
-        ("overcast", 95, 0, 0, 60),
-    ),
-    "rain": _presets(
-        ("drizzle", 50, 15, 10, 50),
-        ("light_rain", 60, 30, 5, 50),
-        ("medium_rain", 80, 60, 15, 30),
-        ("heavy_rain", 95, 90, 25, 20),
-    ),
-    "fog": _presets(("thin_fog", 30, 0, 30, 30), ("mist", 50, 0, 50, 20), ("dense_fog", 70, 0, 80, 10)),
-    "haze": _presets(("smog", 60, 0, 60, 15), ("dust_haze", 70, 0, 70, 12), ("snow_haze", 90, 0, 40, 20)),
+# tab:weather_presets, of sky, rain, fog and haze: cloudiness, precipitation, fog_density, fog_distance
+_KNOBS = {
+    "clear": (5, 0, 0, 60), "fair": (20, 0, 0, 60), "partly_cloudy": (40, 0, 0, 60), "cloudy": (70, 0, 0, 60),
+    "overcast": (95, 0, 0, 60),
+    "drizzle": (50, 15, 10, 50), "light_rain": (60, 30, 5, 50), "medium_rain": (80, 60, 15, 30),
+    "heavy_rain": (95, 90, 25, 20),
+    "thin_fog": (30, 0, 30, 30), "mist": (50, 0, 50, 20), "dense_fog": (70, 0, 80, 10),
+    "smog": (60, 0, 60, 15), "dust_haze": (70, 0, 70, 12), "snow_haze": (90, 0, 40, 20),
+}  # fmt: skip
+WEATHERS = {
+    name: WeatherPreset(**dict(zip(WeatherPreset.model_fields, knobs, strict=True))) for name, knobs in _KNOBS.items()
 }
-WEATHERS = {name: preset for group in WEATHER_GROUPS.values() for name, preset in group.items()}
 # tab:tod_presets
 TIMES = {
     name: TimePreset(sun_altitude_angle=altitude, sun_azimuth_angle=azimuth)

@@ -5,7 +5,7 @@ World: right-handed, metres, +x East, +y North, +z up. Files carry degrees, kern
 rotation = Rz(yaw) @ Ry(-pitch) @ Rx(roll) on a body frame x forward, y left, z up.
 Cameras are OpenCV cameras (x right, y down, z forward) and depth is z-depth.
 
-CARLA and Unreal are left-handed (y to the right, yaw clockwise): `mirror_*` below is that change, its own inverse.
+CARLA and Unreal are left-handed (y to the right, yaw clockwise): `mirror_poses` is that change, its own inverse.
 """
 
 from __future__ import annotations
@@ -26,24 +26,16 @@ def rotation_matrix(pitch_rad: float, yaw_rad: float, roll_rad: float) -> np.nda
 
 
 def rotation_matrices(rotations_rad: np.ndarray) -> np.ndarray:
-    """Return world_from_body for many rotations.
-
-    Args:
-        rotations_rad: (n, 3) pitch, yaw, roll.
-    Returns:
-        (n, 3, 3) float64.
-    """
+    """Return world_from_body, (n, 3, 3) float64, for rotations (n, 3) of pitch, yaw, roll."""
     pitch, yaw, roll = np.asarray(rotations_rad, dtype=np.float64).T
     cp, sp, cy, sy, cr, sr = np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw), np.cos(roll), np.sin(roll)
     # Rz(yaw) @ Ry(-pitch) @ Rx(roll), written out.
-    return np.stack(
-        [
-            np.stack([cy * cp, -sy * cr - cy * sp * sr, sy * sr - cy * sp * cr], axis=-1),
-            np.stack([sy * cp, cy * cr - sy * sp * sr, -cy * sr - sy * sp * cr], axis=-1),
-            np.stack([sp, cp * sr, cp * cr], axis=-1),
-        ],
-        axis=-2,
+    rows = (
+        [cy * cp, -sy * cr - cy * sp * sr, sy * sr - cy * sp * cr],
+        [sy * cp, cy * cr - sy * sp * sr, -cy * sr - sy * sp * cr],
+        [sp, cp * sr, cp * cr],
     )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def axis_aligned_half_extents(half_extents: np.ndarray, rotations_deg: np.ndarray) -> np.ndarray:
@@ -82,9 +74,8 @@ def world_from_camera(position_m: np.ndarray, rotation_deg: np.ndarray) -> np.nd
     Args:
         position_m: (3,); rotation_deg: (3,) pitch, yaw, roll.
     """
-    pitch, yaw, roll = np.radians(rotation_deg)
     transform = np.eye(4)
-    transform[:3, :3] = rotation_matrix(pitch, yaw, roll) @ BODY_FROM_CAMERA
+    transform[:3, :3] = rotation_matrix(*np.radians(rotation_deg)) @ BODY_FROM_CAMERA
     transform[:3, 3] = position_m
     return transform
 
@@ -98,8 +89,7 @@ def project(points_m: np.ndarray, camera_pose: np.ndarray, intrinsic: np.ndarray
         uv (n, 2) px and z (n,) m. Points with z <= 0 lie behind the camera: their uv is NaN.
     """
     in_camera = (np.asarray(points_m, dtype=np.float64) - camera_pose[:3, 3]) @ camera_pose[:3, :3]
-    z = in_camera[:, 2]
-    uv = np.full((len(in_camera), 2), np.nan)
+    z, uv = in_camera[:, 2], np.full((len(in_camera), 2), np.nan)
     front = z > 0
     homogeneous = in_camera[front] @ intrinsic.T
     uv[front] = homogeneous[:, :2] / homogeneous[:, 2:]
@@ -132,14 +122,9 @@ def wrap_deg(angle_deg: np.ndarray | float) -> np.ndarray | float:
     return (np.asarray(angle_deg) + 180.0) % 360.0 - 180.0
 
 
-def mirror_positions(positions_m: np.ndarray) -> np.ndarray:
-    """Convert (..., 3) positions between right-handed and CARLA axes: y changes sign."""
-    return np.asarray(positions_m, dtype=np.float64) * np.array([1.0, -1.0, 1.0])
-
-
-def mirror_rotations(rotations_deg: np.ndarray) -> np.ndarray:
-    """Convert (..., 3) pitch, yaw, roll between right-handed and CARLA axes: yaw changes sign."""
-    return np.asarray(rotations_deg, dtype=np.float64) * np.array([1.0, -1.0, 1.0])
+def mirror_poses(poses: np.ndarray) -> np.ndarray:
+    """Convert positions or rotations (..., 3), or one after the other (..., 6), between right-handed and CARLA axes."""
+    return np.asarray(poses, dtype=np.float64) * np.tile([1.0, -1.0, 1.0], np.shape(poses)[-1] // 3)
 
 
 # --- time -------------------------------------------------------------------------------------------------------------

@@ -57,15 +57,13 @@ AXES = {
 }
 
 NAMED = ("styles", "paces", "labels", "weathers", "times_of_day")
+COUNTED = (*NAMED, "skies")
 PAIR = " | "  # between the two names of a pair
 
 
 class Coverage(Record):
-    """Frames by bin of each axis, by style, by pace, by label, which only captions tell, and by weather and time of
-    day, where there is any.
-
-    skies: frames by both, as "heavy_rain | night".
-    """
+    """Frames by bin of each axis, by style, by pace, by label, which only captions tell, and where there is any by
+    weather, by time of day, and by both (skies), as "heavy_rain | night"."""
 
     frames: int = 0
     bins: dict[str, list[int]] = Field({})
@@ -101,7 +99,7 @@ class Coverage(Record):
         both = [PAIR.join((weather, time)) for weather, time in pairs if weather is not None and time is not None]
         named = [dict(sorted(Counter(names).items())) for names in (styles, paces, labels, weathers, times, both)]
         counted = {name: axis.counts(values[name]) for name, axis in AXES.items()}
-        return cls(frames=sum(named[0].values()), bins=counted, **dict(zip((*NAMED, "skies"), named, strict=True)))
+        return cls(frames=sum(named[0].values()), bins=counted, **dict(zip(COUNTED, named, strict=True)))
 
     @classmethod
     def total(cls, parts: Iterable[Coverage]) -> Coverage:
@@ -109,16 +107,14 @@ class Coverage(Record):
         parts = list(parts)
         counted = [part.bins for part in parts if part.bins]
         bins = {name: np.sum([one[name] for one in counted], axis=0).tolist() for name in AXES if counted}
-        named = {
-            name: dict(sorted(sum((Counter(getattr(part, name)) for part in parts), Counter()).items()))
-            for name in (*NAMED, "skies")
-        }
-        return cls(frames=sum(part.frames for part in parts), bins=bins, **named)
+        named = {name: sum((Counter(getattr(part, name)) for part in parts), Counter()) for name in COUNTED}
+        counts = {name: dict(sorted(found.items())) for name, found in named.items()}
+        return cls(frames=sum(part.frames for part in parts), bins=bins, **counts)
 
     def range_of(self, name: str) -> tuple[float | None, float | None]:
         """Return the 5th and the 95th percentile of an axis."""
-        counts = self.bins.get(name, [])
-        return AXES[name].percentile(counts, 0.05), AXES[name].percentile(counts, 0.95)
+        axis, counts = AXES[name], self.bins.get(name, [])
+        return axis.percentile(counts, 0.05), axis.percentile(counts, 0.95)
 
 
 def azimuths_deg(offsets_m: np.ndarray, headings_deg: np.ndarray) -> np.ndarray:

@@ -85,10 +85,8 @@ def _off(relation: str, numbers: Collection[int], picture: SeenFrame) -> dict[in
     """Return how far people are from a relation, not above 0 where it holds: m, or shares of the picture's width."""
     if relation in LANDMARKS:
         return {n: picture.distance_m(n, relation) - BY_M for n in numbers}
-    sign = -1.0 if relation in ("right", "far") else 1.0
-    where = {
-        n: sign * (picture.depth_m(n) if relation in ("near", "far") else picture.column_share(n)) for n in numbers
-    }
+    measure, sign = picture.depth_m if relation in ("near", "far") else picture.column_share, SIDES[relation][2]
+    where = {n: sign * measure(n) for n in numbers}
     return {n: one - min(where.values()) for n, one in where.items()}
 
 

@@ -38,10 +38,7 @@ _EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4
 
 @dataclass(frozen=True)
 class OccupancyGrid:
-    """Cells over the ground plane.
-
-    x_min_m, y_min_m: the low corner of cell (0, 0), world. occupied: (ny, nx) bool.
-    """
+    """Cells over the ground plane. x_min_m, y_min_m: the low corner of cell (0, 0), world. occupied: (ny, nx) bool."""
 
     x_min_m: float
     y_min_m: float
@@ -55,13 +52,12 @@ class OccupancyGrid:
 
     def cells_at(self, points_m: np.ndarray) -> np.ndarray:
         """Return (..., 2) int64 x and y indices of (..., 2) world points, which may lie outside."""
-        origin = np.array([self.x_min_m, self.y_min_m])
-        return np.floor((np.asarray(points_m, dtype=np.float64)[..., :2] - origin) / self.resolution_m).astype(np.int64)
+        away_m = np.asarray(points_m, dtype=np.float64)[..., :2] - [self.x_min_m, self.y_min_m]
+        return np.floor(away_m / self.resolution_m).astype(np.int64)
 
     def centers_of(self, cells: np.ndarray) -> np.ndarray:
         """Return (..., 2) world points in the middle of (..., 2) cells (x index, y index)."""
-        origin = np.array([self.x_min_m, self.y_min_m])
-        return (np.asarray(cells, dtype=np.float64) + 0.5) * self.resolution_m + origin
+        return (np.asarray(cells, dtype=np.float64) + 0.5) * self.resolution_m + [self.x_min_m, self.y_min_m]
 
 
 # --- boxes to cells ---------------------------------------------------------------------------------------------------
@@ -109,8 +105,7 @@ def occupancy(
 
     Args:
         like: Use this grid's cells instead of the map's own bounds and `resolution_m`, so that two maps can be
-        compared;
-            boxes outside are ignored.
+            compared; boxes outside are ignored.
     Source: Step 3 of the paper (sec:step3).
     """
     grid = empty_grid(box_map, resolution_m) if like is None else replace(like, occupied=np.zeros_like(like.occupied))
@@ -118,7 +113,7 @@ def occupancy(
     is_water = boxes.kinds == WATER
     lowest, highest = box_map.ground.range_under(boxes.mins, boxes.maxs)
     lows, highs = np.where(is_water, -np.inf, lowest), np.where(is_water, np.inf, highest + height_m)
-    _mark(boxes, lows, highs, grid, grid.occupied, np.ones(len(boxes), bool))
+    _mark(boxes, grid, grid.occupied, np.ones(len(boxes), bool), lows=lows, highs=highs)
     return grid
 
 
@@ -126,6 +121,11 @@ def lies_off_ground(box_map: BoxMap, kinds: Collection[int]) -> np.ndarray:
     """Return which boxes of some kinds have their top more than SURFACE_REACH_M off the ground below, (n,) bool."""
     over_m = box_map.maxs[:, 2] - box_map.ground.height_at(box_map.centers)
     return box_map.is_any_of(kinds) & (np.abs(over_m) > SURFACE_REACH_M)
+
+
+def _surfaces(box_map: BoxMap, kinds: Collection[int]) -> BoxMap:
+    """Return the boxes of some kinds whose tops lie within SURFACE_REACH_M of the ground under their middles."""
+    return box_map.select(box_map.is_any_of(kinds) & ~lies_off_ground(box_map, kinds))
 
 
 def surface(box_map: BoxMap, kinds: Collection[int] = GROUND_KINDS, *, like: OccupancyGrid) -> np.ndarray | None:
@@ -136,12 +136,9 @@ def surface(box_map: BoxMap, kinds: Collection[int] = GROUND_KINDS, *, like: Occ
     Returns:
         (ny, nx) bool, cells that such a box overlaps; None if the map has no such box.
     """
-    boxes = box_map.select(box_map.is_any_of(kinds) & ~lies_off_ground(box_map, kinds))
-    if len(boxes) == 0:
-        return None
-    found = np.zeros_like(like.occupied)
-    _mark(boxes, np.full(len(boxes), -np.inf), np.full(len(boxes), np.inf), like, found, np.ones(len(boxes), bool))
-    return found
+    boxes, found = _surfaces(box_map, kinds), np.zeros_like(like.occupied)
+    _mark(boxes, like, found, np.ones(len(boxes), bool))
+    return found if len(boxes) else None
 
 
 def surface_kinds(box_map: BoxMap, kinds: Collection[int], *, like: OccupancyGrid) -> np.ndarray:
@@ -150,32 +147,33 @@ def surface_kinds(box_map: BoxMap, kinds: Collection[int], *, like: OccupancyGri
     Args:
         kinds: as for `surface`; of kinds in one plane, to a centimetre, the higher layer counts.
     """
-    boxes = box_map.select(box_map.is_any_of(kinds) & ~lies_off_ground(box_map, kinds))
+    boxes = _surfaces(box_map, kinds)
     tops_m = np.round(boxes.maxs[:, 2] - boxes.ground.height_at(boxes.centers), 2)
     boxes = boxes.select(np.lexsort((_LAYER_OF[boxes.kinds], tops_m)))
     found = np.zeros(like.occupied.shape, dtype=np.uint8)
-    ends = np.full(len(boxes), -np.inf), np.full(len(boxes), np.inf)
-    _mark(boxes, *ends, like, found, boxes.kinds, touch=0.5 - TOUCH_M)
+    _mark(boxes, like, found, boxes.kinds, touch=0.5 - TOUCH_M)
     return found
 
 
 def _mark(
-    boxes: BoxMap, lows: np.ndarray, highs: np.ndarray, grid: OccupancyGrid, found: np.ndarray, marks: np.ndarray,
-    *, touch: float | None = None,
+    boxes: BoxMap, grid: OccupancyGrid, found: np.ndarray, marks: np.ndarray,
+    *, lows: np.ndarray | float = -np.inf, highs: np.ndarray | float = np.inf, touch: float | None = None,
 ) -> None:  # fmt: skip
-    """Set the cells of `found` under the slices of boxes between two heights each, (n,) m, to the marks of the boxes.
+    """Set the cells of `found` under boxes to the marks of the boxes.
 
     Args:
-        touch: cells, how deep a slice must reach into a cell; TOUCH_M where None.
+        lows, highs: (n,) m, the slice of a box that counts. touch: cells, how deep a slice must reach into a cell;
+            TOUCH_M where None.
     """
     turns = rotation_matrices(np.radians(boxes.rotations_deg))
     extents = np.maximum(boxes.half_extents, MIN_HALF_EXTENT_M)
     corners = np.einsum("nij,nkj->nki", turns, _CORNER_SIGNS * extents[:, None]) + boxes.centers[:, None]
     corners[..., :2] = (corners[..., :2] - [grid.x_min_m, grid.y_min_m]) / grid.resolution_m
     is_upright = np.abs(turns[:, 2, 2]) > 1.0 - 1e-12
+    ends_m = (np.full(len(boxes), end_m, dtype=np.float64) for end_m in (lows, highs))
     touch = TOUCH_M / grid.resolution_m if touch is None else touch
     # As bytes, so that masks and kinds share one compiled function.
-    _rasterise(corners, lows, highs, is_upright, touch, marks.view(np.uint8), found.view(np.uint8))
+    _rasterise(corners, *ends_m, is_upright, touch, marks.view(np.uint8), found.view(np.uint8))
 
 
 @njit(cache=True)
@@ -280,11 +278,10 @@ def inflate(grid: OccupancyGrid, radius_m: float) -> OccupancyGrid:
 
 def roi_mask(grid: OccupancyGrid, roi: Roi) -> np.ndarray:
     """Return which cells have their centre in a region of interest, (ny, nx) bool."""
-    region, (num_x, num_y) = roi.region(), grid.size
+    region, cells = roi.region(), np.arange(max(grid.size))
     shapely.prepare(region)
-    x = grid.centers_of(np.stack([np.arange(num_x), np.zeros(num_x)], axis=1))[:, 0]
-    y = grid.centers_of(np.stack([np.zeros(num_y), np.arange(num_y)], axis=1))[:, 1]
-    return np.stack([shapely.contains_xy(region, x, row) for row in y])
+    x, y = grid.centers_of(np.stack([cells, cells], axis=1)).T
+    return np.stack([shapely.contains_xy(region, x[: grid.size[0]], row) for row in y[: grid.size[1]]])
 
 
 def connected_parts(free: np.ndarray, connectivity: int) -> tuple[np.ndarray, np.ndarray]:

@@ -38,8 +38,7 @@ class Ground:
         points = np.asarray(points_m, dtype=np.float64)
         if self.is_flat:
             return np.full(len(points), self.heights_m[0, 0])
-        u, v, corners = self._cells(points)
-        low, east, north, far = corners
+        u, v, (low, east, north, far) = self._cells(points)
         return np.where(u >= v, low + u * (east - low) + v * (far - east), low + v * (north - low) + u * (far - north))
 
     def slope_at(self, points_m: np.ndarray) -> np.ndarray:
@@ -62,8 +61,7 @@ class Ground:
         return heights.min(axis=0), heights.max(axis=0)
 
     def _cells(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
-        """Places within cells, 0 to 1 along x and y, and the heights of corners: south-west, -east, north-west,
-        -east."""
+        """Return places within cells, 0 to 1, and the heights of corners: south-west, -east, north-west, -east."""
         num_y, num_x = self.heights_m.shape
         x = np.clip((points[:, 0] - self.west_m) / self.cell_m, 0.0, num_x - 1.0)
         y = np.clip((points[:, 1] - self.south_m) / self.cell_m, 0.0, num_y - 1.0)
@@ -78,11 +76,8 @@ class Ground:
             reach_m: how far the border's heights go on beyond the grid, in cells of their own; 0 for not at all.
         """
         num_y, num_x = self.heights_m.shape
-        x, y, z = (
-            self.west_m + self.cell_m * np.arange(num_x),
-            self.south_m + self.cell_m * np.arange(num_y),
-            self.heights_m,
-        )
+        x, y = self.west_m + self.cell_m * np.arange(num_x), self.south_m + self.cell_m * np.arange(num_y)
+        z = self.heights_m
         if reach_m > 0:
             x, y = (np.concatenate([[line[0] - reach_m], line, [line[-1] + reach_m]]) for line in (x, y))
             z = np.pad(z, 1, mode="edge")
@@ -92,24 +87,20 @@ class Ground:
         return pairs.reshape(-1, 3, 3)
 
     def slabs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return boxes that fill the ground from below, one to a cell: centers, half_extents (k, 3), world_from_box (k,
-        3, 3).
+        """Return boxes that fill the ground from below, one to a cell: centers, half_extents (k, 3), turns (k, 3, 3).
 
         A box follows the plane through its cell's corners; where they lie in none it is lower, by a quarter of the
-        twist.
+        twist. turns: world_from_box.
         """
-        low, east, north, far = (
-            self.heights_m[a, b] for a in (slice(-1), slice(1, None)) for b in (slice(-1), slice(1, None))
-        )
-        gradient = np.stack([east - low + far - north, north - low + far - east], axis=-1).reshape(-1, 2) / (
-            2 * self.cell_m
-        )
+        heights = self.heights_m
+        low, east, north, far = (heights[:-1, :-1], heights[:-1, 1:], heights[1:, :-1], heights[1:, 1:])
+        rises = np.stack([east - low + far - north, north - low + far - east], axis=-1)
+        gradient = rises.reshape(-1, 2) / (2 * self.cell_m)
         num_y, num_x = self.heights_m.shape
         x, y = np.meshgrid(np.arange(num_x - 1) + 0.5, np.arange(num_y - 1) + 0.5)
         middle_z = ((low + east + north + far) - np.abs(low - east - north + far)).ravel() / 4
-        tops = np.column_stack(
-            [self.west_m + self.cell_m * x.ravel(), self.south_m + self.cell_m * y.ravel(), middle_z]
-        )
+        x, y = self.west_m + self.cell_m * x.ravel(), self.south_m + self.cell_m * y.ravel()
+        tops = np.column_stack([x, y, middle_z])
         along = np.column_stack([np.ones(len(tops)), np.zeros(len(tops)), gradient[:, 0]])
         up = np.column_stack([-gradient, np.ones(len(tops))])
         along, up = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True) for vectors in (along, up))

@@ -28,7 +28,6 @@ RAY_OFFSETS_M = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.8], [0.0, 0.0, -0.6], [0
 RAY_SPREAD_M = 0.8  # the longest of the offsets
 CORNER = 3.0**0.5  # times the growth of a rotated box: the largest growth of its axis-aligned bounds
 
-
 # Columns of BoxIndex.rows; u, v, w are the axes of a box's own frame: x = XU u + XV v + XW w + CENTER_X. Places in
 # BoxIndex.grid.
 CENTER_X, CENTER_Y, CENTER_Z, HALF_X, HALF_Y, HALF_Z, XU, XV, XW, YU, YV, YW, ZU, ZV, ZW = range(15)
@@ -71,13 +70,12 @@ def index_boxes(
         raise ValueError("rotations must be finite, half extents at least 0 and cell_m positive")
     spans = np.einsum("kij,kj->ki", np.abs(rotations), half_extents)
     mins, maxs = centers - spans, centers + spans
-    low = mins[:, :2].min(axis=0) if len(centers) else np.zeros(2)
-    size = maxs[:, :2].max(axis=0) - low if len(centers) else np.zeros(2)
+    low, high = (mins[:, :2].min(axis=0), maxs[:, :2].max(axis=0)) if len(centers) else (np.zeros(2), np.zeros(2))
+    size = high - low
     while np.prod(np.floor(size / cell_m) + 1) > MAX_CELLS:
         cell_m *= 2.0
     shape = (np.floor(size / cell_m) + 1).astype(np.int64)
-    first = np.floor((mins[:, :2] - low) / cell_m).astype(np.int64).clip(0, shape - 1)
-    last = np.floor((maxs[:, :2] - low) / cell_m).astype(np.int64).clip(0, shape - 1)
+    first, last = (np.floor((ends[:, :2] - low) / cell_m).astype(np.int64).clip(0, shape - 1) for ends in (mins, maxs))
     starts, members = _fill_cells(first, last, shape)
     rows = np.column_stack([centers, half_extents, rotations.reshape(-1, 9), mins, maxs])
     return BoxIndex(np.ascontiguousarray(rows), np.array([low[0], low[1], cell_m]), shape, starts, members)
@@ -96,29 +94,19 @@ def obstacle_index(box_map: BoxMap) -> BoxIndex:
     return index_boxes(*map(np.concatenate, zip(boxes, ground.slabs(), strict=True)))
 
 
-@njit(cache=True)
-def _fill_cells(first, last, shape):
-    """Return starts and members: a counting sort of boxes by cell, boxes in order within each cell."""
-    starts = np.zeros(shape[0] * shape[1] + 1, dtype=np.int64)
-    for box in range(len(first)):
-        for ix in range(first[box, 0], last[box, 0] + 1):
-            for iy in range(first[box, 1], last[box, 1] + 1):
-                starts[ix * shape[1] + iy + 1] += 1
-    for cell in range(len(starts) - 1):
-        starts[cell + 1] += starts[cell]
-    members = np.empty(starts[-1], dtype=np.int64)
-    filled = starts[:-1].copy()
-    for box in range(len(first)):
-        for ix in range(first[box, 0], last[box, 0] + 1):
-            for iy in range(first[box, 1], last[box, 1] + 1):
-                members[filled[ix * shape[1] + iy]] = box
-                filled[ix * shape[1] + iy] += 1
-    return starts, members
+def _fill_cells(first: np.ndarray, last: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return starts and members: the boxes of each cell, in order. first, last: (k, 2) cells of a box."""
+    spans = last - first + 1
+    counts = spans.prod(axis=1)
+    boxes = np.repeat(np.arange(len(first)), counts)
+    place = np.arange(len(boxes)) - np.repeat(np.cumsum(counts) - counts, counts)  # among the cells of its box
+    along_x, along_y = np.divmod(place, spans[boxes, 1])
+    cells = (first[boxes, 0] + along_x) * shape[1] + first[boxes, 1] + along_y
+    starts = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=int(shape.prod())))])
+    return starts, boxes[np.argsort(cells, kind="stable")]
 
 
 # --- one box ----------------------------------------------------------------------------------------------------------
-
-
 # Single numbers of a row are read, not slices: a slice costs two atomic reference counts, more than the arithmetic.
 
 
@@ -380,8 +368,7 @@ def normals(index: BoxIndex, points: np.ndarray, boxes: np.ndarray) -> np.ndarra
 def _normals(index, points, boxes):
     found = np.empty((len(points), 3))
     for i in range(len(points)):
-        x, y, z = normal_of_box(index.rows, boxes[i], points[i, 0], points[i, 1], points[i, 2])
-        found[i, 0], found[i, 1], found[i, 2] = x, y, z
+        found[i] = normal_of_box(index.rows, boxes[i], points[i, 0], points[i, 1], points[i, 2])
     return found
 
 
@@ -393,8 +380,7 @@ def segments_hit(index: BoxIndex, starts: np.ndarray, ends: np.ndarray, inflate_
     Returns:
         (n,) bool. Touching a face counts, lying inside too. k == 0 gives all False.
     """
-    starts, ends = _pair(starts, ends)
-    return _segments_hit(index, starts, ends, float(inflate_m))
+    return _segments_hit(index, *_pair(starts, ends), float(inflate_m))
 
 
 @njit(cache=True)
@@ -449,8 +435,7 @@ def visibility(index: BoxIndex, drones: np.ndarray, targets: np.ndarray) -> np.n
     Returns:
         (n,) the fraction of unblocked rays, 0, 0.2 ... 1. k == 0 gives all 1.
     """
-    drones, targets = _pair(drones, targets)
-    return _visibility(index, drones, targets)
+    return _visibility(index, *_pair(drones, targets))
 
 
 @njit(cache=True)

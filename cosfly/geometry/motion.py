@@ -87,7 +87,7 @@ class PlannedMotion:
         """Return the same as seen from the frame, (m, 4) as BODY_WAYPOINT."""
         ahead = self.waypoints(i)
         moved = in_axes_of(self.yaw_deg[i], ahead[:, :3] - self.positions_m[i])
-        return np.concatenate([moved, np.reshape(wrap_deg(ahead[:, 3:] - self.yaw_deg[i]), (-1, 1))], axis=1)
+        return np.column_stack([moved, wrap_deg(ahead[:, 3] - self.yaw_deg[i])])
 
 
 def in_axes_of(yaw_deg: np.ndarray | float, vectors: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ NEAR_M, FAR_M = 0.3, 999.0  # beyond is the sky
 LEAST_SEEN = 150  # points; a share of fewer is not reported
 LEAST_PLANES = 30  # points; the depth error of fewer is not reported
 LEAST_SHIFTED = 12  # points of a thing
+FIRM, MOVED, RENAMED = 1, 2, 3
 SHARED_ID = 65534  # of several things: docs/files.md
 MOVING = np.zeros(256, np.bool_)  # kinds of pixels that may be elsewhere in the next frame
 MOVING[[12, 13, 14, 15, 16, 17, 18, 19, 21]] = True  # people, riders, vehicles, what is dynamic (CARLA 0.9.16)
@@ -84,7 +85,7 @@ def compare_views(
     intrinsics = intrinsics.astype(np.float64)
     others = intrinsics if others_intrinsics is None else others_intrinsics.astype(np.float64)
     turn, shift = other.rotation.T @ one.rotation, other.rotation.T @ (one.position_m - other.position_m)
-    counts, errors, standing, firm, moved, renamed = _reproject(
+    counts, errors, standing, ids, states = _reproject(
         one.depth, one.instance, other.depth, other.instance, intrinsics, others, turn, shift, MOVING, FLAT
     )
     back = _reproject(
@@ -93,7 +94,7 @@ def compare_views(
     seen, agree, hidden, through, same = counts.tolist()
     return Agreement(
         seen, agree, hidden, through, same, len(errors), _error_of(errors), _error_of(errors[~standing]),
-        _error_of(errors[standing]), _most_of_one(firm, moved), _most_of_one(firm, renamed),
+        _error_of(errors[standing]), _most_of_one(ids, states, MOVED), _most_of_one(ids, states, RENAMED),
         int(back[0]), int(back[3]),
     )  # fmt: skip
 
@@ -109,12 +110,13 @@ def median_of(values: np.ndarray) -> float:
     return float(found[middle] if len(values) % 2 else (found[middle - 1] + found[middle]) / 2.0)
 
 
-def _most_of_one(firm: np.ndarray, odd: np.ndarray) -> int:
-    """Return the number of odd points of the instance that is mostly odd. firm, odd: ids at points well inside one."""
+def _most_of_one(ids: np.ndarray, states: np.ndarray, state: int) -> int:
+    """Return the number of points in a state, of the instance most of whose points are in it rather than FIRM."""
+    odd = ids[states == state]
     if len(odd) < LEAST_SHIFTED:
         return 0
     counts = np.bincount(odd, minlength=SHARED_ID + 1)
-    counts[counts <= np.bincount(firm, minlength=len(counts))[: len(counts)]] = 0
+    counts[counts <= np.bincount(ids[states == FIRM], minlength=len(counts))[: len(counts)]] = 0
     counts[[0, SHARED_ID]] = 0  # ids of nothing and of many things
     most = int(counts.max())
     return most if most >= LEAST_SHIFTED else 0
@@ -122,17 +124,15 @@ def _most_of_one(firm: np.ndarray, odd: np.ndarray) -> int:
 
 @njit(cache=True, nogil=True)
 def _reproject(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, moving, flat):  # type: ignore
-    """Return counts (5,), errors (k,) and which of them are not on flat ground, and ids at points well inside one
-    instance: of those with their own depth and id, those that are farther, and those with another id there."""
+    """Return counts (5,), errors (k,) and which of them are not on flat ground, and ids (m,) of points well inside one
+    instance with their states: FIRM with their own depth and id, MOVED farther, RENAMED with another id there."""
     height, width = depth_a.shape
     others_height, others_width = depth_b.shape
     has_ids = inst_a.shape[0] > 0 and inst_b.shape[0] > 0
     counts = np.zeros(5, np.int64)
     errors, num_errors = np.empty(COLUMNS * GRID_ROWS), 0
     standing = np.zeros(COLUMNS * GRID_ROWS, np.bool_)
-    firm, num_firm = np.empty(COLUMNS * GRID_ROWS, np.int64), 0
-    moved, num_moved = np.empty(COLUMNS * GRID_ROWS, np.int64), 0
-    renamed, num_renamed = np.empty(COLUMNS * GRID_ROWS, np.int64), 0
+    ids, states, num_ids = np.empty(COLUMNS * GRID_ROWS, np.int64), np.empty(COLUMNS * GRID_ROWS, np.uint8), 0
     for j in range(GRID_ROWS):
         v = int((j + 0.5) * height / GRID_ROWS)
         for i in range(COLUMNS):
@@ -151,17 +151,17 @@ def _reproject(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift
                 continue
             counts[0] += 1
             is_there = best <= TOLERANCE_SHARE * z + TOLERANCE_M
-            own = np.int64(inst_a[v, u, 1]) | np.int64(inst_a[v, u, 2]) << 8 if has_ids else np.int64(0)
+            state = 0
             if is_there and is_whole:
-                firm[num_firm] = own
-                num_firm += 1
+                state = FIRM
             elif is_there and is_one and not flat[inst_a[v, u, 0]]:
-                renamed[num_renamed] = own
-                num_renamed += 1
+                state = RENAMED
             # Farther all round: what is nearer may be another side of the thing, that hides this one.
             elif not is_there and has_ids and (is_through or (is_whole and least > 0.0)):
-                moved[num_moved] = own
-                num_moved += 1
+                state = MOVED
+            if state > 0:
+                ids[num_ids], states[num_ids] = np.int64(inst_a[v, u, 1]) | np.int64(inst_a[v, u, 2]) << 8, state
+                num_ids += 1
             if is_there:
                 counts[1] += 1
                 counts[4] += is_same
@@ -174,7 +174,7 @@ def _reproject(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift
                 counts[3] += 1
             else:
                 counts[2] += 1
-    return counts, errors[:num_errors], standing[:num_errors], firm[:num_firm], moved[:num_moved], renamed[:num_renamed]
+    return counts, errors[:num_errors], standing[:num_errors], ids[:num_ids], states[:num_ids]
 
 
 @njit(cache=True, nogil=True)

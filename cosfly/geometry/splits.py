@@ -47,14 +47,13 @@ class Course:
         """Return the course at the full seconds that it knows, at most MOST_GAP_S between points apart."""
         known = ~np.isnan(self.target_m[:, :2]).any(axis=1)
         time_s, places_m = self.time_s[known], self.target_m[known]
-        begun = np.floor(time_s + ON_TIME_S)
         # Those of the points and of the gaps behind them.
-        seconds = np.unique(begun[:, None] + np.arange(MOST_GAP_S + 1))
+        seconds = np.unique(np.floor(time_s + ON_TIME_S)[:, None] + np.arange(MOST_GAP_S + 1))
         before = np.searchsorted(time_s, seconds + ON_TIME_S, side="right") - 1
         after = np.searchsorted(time_s, seconds - ON_TIME_S)
         inside = (before >= 0) & (after < len(time_s))
-        seconds, before, after = seconds[inside], before[inside], after[inside]
-        seconds = seconds[time_s[after] - time_s[before] <= MOST_GAP_S]
+        gaps_s = time_s[after[inside]] - time_s[before[inside]]
+        seconds = seconds[inside][gaps_s <= MOST_GAP_S]
         found = np.empty((len(seconds), 3))
         for axis in range(3) if len(seconds) else ():
             found[:, axis] = np.interp(seconds, time_s, places_m[:, axis])
@@ -120,8 +119,8 @@ def _near_pairs(tracks: list[Course]) -> list[tuple[str, str]]:
                 num_near[one, other] += 1
     found = []
     for (one, other), count in num_near.items():
-        shared = np.intersect1d(tracks[one].time_s, tracks[other].time_s, assume_unique=True)
-        if count >= min(len(shared), max(FEW_S, NEAR_SHARE * len(shared))):
+        num_shared = len(np.intersect1d(tracks[one].time_s, tracks[other].time_s, assume_unique=True))
+        if count >= min(num_shared, max(FEW_S, NEAR_SHARE * num_shared)):
             found.append((tracks[one].name, tracks[other].name))
     return found
 
@@ -160,10 +159,8 @@ def assign_splits(
                 fix=fix,
             )
         return dict(zip(ranked, wanted, strict=False))
-    num_test = max(1, round(test * len(ranked))) if test else 0
-    num_val = max(1, round(val * len(ranked))) if val else 0
+    num_test, num_val = (max(1, round(share * len(ranked))) if share else 0 for share in (test, val))
     while num_test + num_val >= len(ranked):  # rounding took all: the larger share gives one back
         num_test, num_val = (num_test - 1, num_val) if num_test >= num_val else (num_test, num_val - 1)
     counts: dict[Split, int] = {"test": num_test, "val": num_val, "train": len(ranked) - num_test - num_val}
-    names = [split for split, count in counts.items() for _ in range(count)]
-    return dict(zip(ranked, names, strict=True))
+    return dict(zip(ranked, (split for split, count in counts.items() for _ in range(count)), strict=True))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosfly.formats.episode_scores import Figure
+from cosfly.formats.episodes import Figure
 from cosfly.geometry.axes import DT_S
 
 ACCEL_SCALE_MPS2, JERK_SCALE_MPS3 = 5.0, 10.0  # eq:smoothness_score
@@ -26,20 +26,10 @@ def derivative_rms(positions_m: np.ndarray, order: int, dt_s: float = DT_S) -> f
     Returns:
         0 for a path of at most `order` points, which has no such difference.
     """
-    differences = np.diff(_path(positions_m), n=order, axis=0)
+    differences = _differences(positions_m, order)
     if dt_s <= 0:
         raise ValueError(f"dt_s must be positive, not {dt_s}")
     return float(np.sqrt((differences**2).sum(axis=1).mean())) / dt_s**order if len(differences) else 0.0
-
-
-def accel_rms(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
-    """Return the RMS acceleration of waypoints, (n, 3) m, in m/s^2."""
-    return derivative_rms(positions_m, 2, dt_s)
-
-
-def jerk_rms(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
-    """Return the RMS jerk of waypoints, (n, 3) m, in m/s^3."""
-    return derivative_rms(positions_m, 3, dt_s)
 
 
 def smoothness_score(accel_rms_mps2: float, jerk_rms_mps3: float) -> float:
@@ -49,12 +39,12 @@ def smoothness_score(accel_rms_mps2: float, jerk_rms_mps3: float) -> float:
 
 def length_m(positions_m: np.ndarray) -> float:
     """Return the length of the polyline through (n, 3) points."""
-    return float(_steps_m(positions_m).sum())
+    return float(np.linalg.norm(_differences(positions_m, 1), axis=1).sum())
 
 
 def speed_max_mps(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
     """Return the largest speed between neighbouring waypoints, (n, 3) m, in m/s; 0 for one point."""
-    return float(_steps_m(positions_m).max(initial=0.0)) / dt_s
+    return float(np.linalg.norm(_differences(positions_m, 1), axis=1).max(initial=0.0)) / dt_s
 
 
 def trajectory_metrics(
@@ -71,7 +61,7 @@ def trajectory_metrics(
         positions_m, targets_m: (n, 3). visibility, clearances_m, ground_m: (n,). Altitudes are counted from the ground.
         dt_s: between two positions.
     """
-    accel, jerk = accel_rms(positions_m, dt_s), jerk_rms(positions_m, dt_s)
+    accel, jerk = (derivative_rms(positions_m, order, dt_s) for order in (2, 3))
     altitudes = positions_m[:, 2] - ground_m
     distances = np.linalg.norm(positions_m - targets_m, axis=1)
     figures = {
@@ -95,15 +85,11 @@ def trajectory_metrics(
     return {name: round(value, 4) for name, value in figures.items()}
 
 
-def _steps_m(positions_m: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(np.diff(_path(positions_m), axis=0), axis=1)
-
-
-def _path(positions_m: np.ndarray) -> np.ndarray:
+def _differences(positions_m: np.ndarray, order: int) -> np.ndarray:
     positions = np.asarray(positions_m, dtype=np.float64)
     if positions.ndim != 2 or positions.shape[1] != 3:
         raise ValueError(f"positions must be (n, 3), not {positions.shape}")
-    return positions
+    return np.diff(positions, n=order, axis=0)
 
 
 # --- intervals --------------------------------------------------------------------------------------------------------

@@ -1,4 +1,5 @@
-"""Checks of the pictures of one track: whether they decode, and agree with the poses and with each other.
+"""Checks of the files and pictures of one track: presence and digests, whether they decode, and agree with the poses
+and with each other.
 
 Findings go into a Report, numbers into FrameNumbers; the thresholds of acceptance are in track.py.
 """
@@ -16,12 +17,16 @@ from cosfly.formats.bystanders import BUILDS, Bystander
 from cosfly.formats.frames import (
     DEPTH_NPY,
     FILE_NAMES,
+    FRAME_FILES,
+    FRAMES_DIR,
     INVALID_DEPTH_M,
     SKY_DEPTH_M,
     BystandersMeta,
     FrameMeta,
     frame_name,
     frame_path,
+    public_name,
+    read_meta,
 )
 from cosfly.formats.issues import Report
 from cosfly.formats.kinds import KIND_NAMES, KINDS
@@ -32,76 +37,153 @@ from cosfly.geometry.axes import box_corners, box_iou, mask_box, project, world_
 from cosfly.geometry.kernels import distances_to_boxes_m
 from cosfly.geometry.reprojection import LEAST_SEEN, Agreement, View, compare_views
 from cosfly.geometry.trajectory_metrics import CLEARANCE_TOLERANCE_M
-from cosfly.inspection.files import Checksums
+from cosfly.inspection import settings as limits
 from cosfly.inspection.pixels import NUM_IDS, Picture, PixelFigures, measure_pixels, unpack
-from cosfly.inspection.settings import (
-    FLAT_PAIRS_MIN,
-    FLAT_SURFACE_MAX,
-    JUMP_GONE_MAX,
-    MAGENTA_MAX,
-    MASK_VISIBILITY_MIN,
-    Z_FIGHTING_MAX,
-)
+from cosfly.runtime.arrays import array_header, picture_size
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import read_bytes
+from cosfly.runtime.io import CHECKSUMS, read_bytes, read_checksums, sha256_bytes, sha256_file
 from cosfly.runtime.worker import advance
 
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def check_files(track: Track, report: Report) -> dict[int, FrameMeta | None]:
+    """Check by the headers that every frame has its files, of the right size and type.
+
+    A tree of another program may lack a kind of file, such as `meta.json`, if its checksums list none.
+
+    Returns:
+        The annotation of each complete frame, None in a tree without annotations.
+    """
+    assert track.folder is not None
+    complete: dict[int, FrameMeta | None] = {}
+    folders = [track.frame_folder(i) for i in range(len(track))]
+    absent = [name for name in FRAME_FILES[1:] if not any(frame_path(folder, name).exists() for folder in folders)]
+    absent = [] if absent and _lists(track.folder, absent) else absent
+    for name in absent:
+        where = f"{FRAMES_DIR}/*/{name}"
+        report.add("note", "not_in_this_tree", where, "no such file", "one per frame in cosfly's trees")
+    for i, folder in enumerate(folders):
+        num_issues, meta = len(report.issues), None
+        for name in (name for name in FRAME_FILES if name not in absent):
+            path = frame_path(folder, name)
+            where = f"{frame_name(i)}/{path.name}"
+            if not path.is_file():
+                report.error("missing_file", where, "no such file", "one file per frame and modality")
+            elif name == "meta.json":
+                meta = _check_meta(folder, i, where, report)
+            else:
+                _check_header(path, track, where, report)
+        if len(report.issues) == num_issues:
+            complete[i] = meta
+    frames, known = track.folder / FRAMES_DIR, {folder.name for folder in folders}
+    for stray in sorted(p.name for p in frames.iterdir() if p.name not in known) if frames.is_dir() else []:
+        report.warn("stray_frame", f"{FRAMES_DIR}/{stray}", "no point of this index", f"{len(known)} frames")
+    return complete
+
+
+def _lists(folder: Path, names: list[str]) -> bool:
+    """Return whether a track's checksums list files of these names, or cannot be read."""
+    try:
+        listed = read_checksums(folder) if (folder / CHECKSUMS).is_file() else {}
+    except InputError:
+        return True
+    return any(public_name(name.rpartition("/")[2]) in names for name in listed)
+
+
+def _check_header(path: Path, track: Track, where: str, report: Report) -> None:
+    """Check type and size of a picture or a depth image by its header."""
+    assert track.folder is not None
+    tree, (width, height) = tree_of_track(track.folder), (track.camera.width_px, track.camera.height_px)
+    is_depth = path.suffix == ".npy"
+    expected = f"float32 ({height}, {width})" if is_depth else f"a PNG of {width} x {height} px"
+    try:
+        found = str(array_header(path, tree=tree) if is_depth else picture_size(path, tree=tree) or "no PNG header")
+    except InputError as error:
+        found = str(error.got or error.what)
+    if found != (expected if is_depth else str((width, height))):
+        report.error("wrong_format", where, found, expected)
+
+
+def _check_meta(frame: Path, i: int, where: str, report: Report) -> FrameMeta | None:
+    try:
+        meta = read_meta(frame)
+    except InputError as error:
+        report.error("broken_annotation", where, error.got, "a frame annotation")
+        return None
+    if meta.index != i:
+        report.error("broken_annotation", f"{where}: index", meta.index, str(i))
+    return meta
+
+
+def listed_digests(folder: Path, report: Report) -> dict[str, str]:
+    """Read the digests of a track's `checksums.sha256`, by name in its folder; report where that is not possible."""
+    if not (folder / CHECKSUMS).is_file():
+        report.add("note", "no_checksums", CHECKSUMS, "no such file", "digests of the track's files")
+        return {}
+    try:
+        return read_checksums(folder)
+    except InputError as error:
+        report.error("checksum", CHECKSUMS, error.got or error.what, "lines of sha256sum")
+        return {}
+
+
+def compare_file(folder: Path, name: str, digest: str, report: Report, *, listed_in: str = CHECKSUMS) -> None:
+    """Compare a file of a track with its digest."""
+    if not (folder / name).is_file():
+        report.error("missing_file", name, "no such file", f"a file, listed in {listed_in}")
+    elif sha256_file(folder / name) != digest:
+        report.error("checksum", name, "other bytes", f"the digest in {listed_in}")
+
+
+def check_recorded(folder: Path, root: Path, recorded: Mapping[str, str], report: Report) -> None:
+    """Compare a track's own records with its tree's manifest. recorded: path in the tree -> sha256."""
+    for name in ("trajectory.json", CHECKSUMS) if recorded else ():
+        digest = recorded.get((folder / name).relative_to(root).as_posix())
+        if digest is not None:
+            compare_file(folder, name, digest, report, listed_in="the tree's manifest")
+        elif name == "trajectory.json":
+            got, expected = "no such entry in the tree's manifest", "a track that was made with it"
+            report.error("not_of_this_tree", name, got, expected)
+
+
 # --- jumps ------------------------------------------------------------------------------------------------------------
-# Static surfaces are carried from each frame into the next (cosfly/geometry/reprojection.py). What does not agree with
-# the poses is a jump: something vanished, or the place changed.
+# Static surfaces are carried from each frame into the next (cosfly/geometry/reprojection.py), by depth and ids; colours
+# change with light, rain and zoom. What does not agree with the poses is a jump: something vanished, or the place
+# changed.
 
 NEAR_FRAMES = 2  # farther apart, more surface is hidden than seen twice
 USUAL_AGREE, ROUGH_ERROR = 0.8, 1e-3  # share of points; error of planes as a share of the depth
 
 
-@dataclass
-class Jumps:
-    """Compares depth and ids of successive frames through their poses; colours change with light, rain and zoom."""
+def _view(track: Track, i: int, picture: Picture) -> View:
+    pose = world_from_camera(track.positions_m[i], track.rotations_deg[i])
+    return View(picture.depth, picture.instance, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy())
 
-    track: Track
-    _previous: tuple[int, View] | None = None
-    _frames: list[int] = field(default_factory=list)
-    _found: list[Agreement] = field(default_factory=list)
 
-    def add(self, i: int, picture: Picture) -> None:
-        """Compare the next frame, which has depth, with the previous one."""
-        track = self.track
-        pose = world_from_camera(track.positions_m[i], track.rotations_deg[i])
-        view = View(picture.depth, picture.instance, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy())
-        if self._previous is not None and i - self._previous[0] <= NEAR_FRAMES:
-            k, previous = self._previous
-            intrinsics = [track.camera_at(j).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]] for j in (k, i)]
-            self._frames.append(i)
-            self._found.append(compare_views(previous, view, *intrinsics))
-        self._previous = (i, view)
+def _report_jumps(track: Track, pairs: dict[int, Agreement], report: Report) -> int:
+    """Report the jumps; return how many frames were compared, 0 for a foreign track with inaccurate depth.
 
-    def report(self, report: Report) -> int:
-        """Report the jumps; return how many frames were compared, 0 for a foreign track with inaccurate depth."""
-        if not self.track.is_ours and not self._is_consistent():
-            return 0
-        for i, pair in zip(self._frames, self._found, strict=True):
-            if pair.gone > JUMP_GONE_MAX:
-                got = f"{pair.gone:.1%} of this frame or the previous one is missing in the other"
-                report.warn("temporal_jump", _depth_place(self.track, i), got, f"at most {JUMP_GONE_MAX:.1%}")
-        return len(self._found)
+    pairs: by frame, its agreement with the one before.
+    """
+    if not track.is_ours and not _is_consistent(pairs):
+        return 0
+    for i, pair in pairs.items():
+        if pair.gone > limits.JUMP_GONE_MAX:
+            got = f"{pair.gone:.1%} of this frame or the previous one is missing in the other"
+            report.warn("temporal_jump", _depth_place(track, i), got, f"at most {limits.JUMP_GONE_MAX:.1%}")
+    return len(pairs)
 
-    def _is_consistent(self) -> bool:
-        """Return whether most pairs of frames agree; inaccurate depth agrees nowhere."""
-        pairs = [pair for pair in self._found if pair.seen >= LEAST_SEEN]
-        agree = [pair.agree / pair.seen for pair in pairs]
-        errors = [pair.error for pair in pairs if np.isfinite(pair.error)]
-        is_near = bool(pairs) and float(np.median(agree)) >= USUAL_AGREE
-        return is_near and (not errors or float(np.median(errors)) <= ROUGH_ERROR)
+
+def _is_consistent(pairs: dict[int, Agreement]) -> bool:
+    """Return whether most pairs of frames agree; inaccurate depth agrees nowhere."""
+    judged = [pair for pair in pairs.values() if pair.seen >= LEAST_SEEN]
+    errors = [pair.error for pair in judged if np.isfinite(pair.error)]
+    is_near = bool(judged) and float(np.median([pair.agree / pair.seen for pair in judged])) >= USUAL_AGREE
+    return is_near and (not errors or float(np.median(errors)) <= ROUGH_ERROR)
 
 
 # --- bystanders -------------------------------------------------------------------------------------------------------
-
-
-def bystanders_of_frames(track: Track, metas: Mapping[int, FrameMeta | None]) -> dict[int, BystandersMeta]:
-    """Return the bystanders in the annotations, by frame; empty for foreign tracks."""
-    if not track.is_ours:
-        return {}
-    return {i: meta.others for i, meta in metas.items() if meta is not None and meta.others is not None}
 
 
 def check_bystanders(
@@ -116,7 +198,7 @@ def check_bystanders(
                 where = f"meta.json of frame {i}: others"
                 report.error("broken_annotation", where, f"semantic_id {line.semantic_id}", " or ".join(BUILDS))
                 continue
-            feet_m = line.center_m - np.array([0.0, 0.0, BUILDS[kind].half_extents_m[2]])
+            feet_m = line.world_location - np.array([0.0, 0.0, BUILDS[kind].half_extents_m[2]])
             bystander = Bystander(kind, feet_m[None], np.array([line.heading_rad]))
             distance_m = float(distances_to_boxes_m(track.positions_m[i], bystander)[0])
             nearest_m = min(nearest_m, distance_m)
@@ -156,18 +238,20 @@ class FrameNumbers:
 
 
 def check_frames(
-    track: Track, indices: Iterable[int], bystanders: Mapping[int, BystandersMeta], checksums: Checksums, report: Report
+    track: Track, indices: Iterable[int], bystanders: dict[int, BystandersMeta], digests: dict[str, str], report: Report
 ) -> FrameNumbers:
-    """Decode frames, each file once; compare colour, depth and mask with each other, the poses and the previous
-    frame."""
-    assert track.folder is not None
-    numbers, jumps, tree = FrameNumbers(), Jumps(track), tree_of_track(track.folder)
+    """Decode frames; compare colour, depth and mask with each other, the poses and the previous frame.
+
+    Each file is read once, and compared with its digest, which leaves `digests` then.
+    """
+    numbers, jumps = FrameNumbers(), dict[int, Agreement]()
     previous: tuple[int, np.ndarray] | None = None
+    surfaces: tuple[int, View] | None = None  # of the previous frame with depth
     for i in indices:
         advance()
         where = frame_name(i)
         try:
-            picture = unpack(_read(track, i, tree, checksums), Path(where))
+            picture = unpack(_read(track, i, digests, report), Path(where))
         except InputError as error:
             report.error("broken_image", str(error.where), f"{error.what}: {error.got}", "a file that decodes in full")
             continue
@@ -182,38 +266,46 @@ def check_frames(
         is_bystander = np.zeros(NUM_IDS, dtype=np.bool_)
         others = bystanders[i].others if i in bystanders else ()
         is_bystander[[other.instance_id for other in others if other.instance_id < NUM_IDS]] = True
-        figures = measure_pixels(picture, is_bystander, FLAT_PAIRS_MIN)
+        figures = measure_pixels(picture, is_bystander, limits.FLAT_PAIRS_MIN)
         _check_surfaces(figures, where, report)
         if picture.depth.size and _check_depth(picture.depth, _depth_place(track, i), numbers, report):
-            jumps.add(i, picture)
+            view = _view(track, i, picture)
+            if surfaces is not None and i - surfaces[0] <= NEAR_FRAMES:
+                k, before = surfaces
+                intrinsics = [track.camera_at(j).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]] for j in (k, i)]
+                jumps[i] = compare_views(before, view, *intrinsics)
+            surfaces = (i, view)
             if picture.instance.size:
                 _check_mask(track, i, picture, figures, is_bystander, numbers, report)
-    numbers.num_compared = jumps.report(report)
+    numbers.num_compared = _report_jumps(track, jumps, report)
     return numbers
 
 
-def _read(track: Track, i: int, tree: Path, checksums: Checksums) -> dict[str, bytes]:
+def _read(track: Track, i: int, digests: dict[str, str], report: Report) -> dict[str, bytes]:
     """Read the existing pictures of a frame; `check_files` reports missing ones."""
-    folder, files = track.frame_folder(i), dict[str, bytes]()
+    assert track.folder is not None
+    folder, tree, files = track.frame_folder(i), tree_of_track(track.folder), dict[str, bytes]()
     for name in FILE_NAMES.values():
         if (path := frame_path(folder, name)).exists():
-            files[path.name] = read_bytes(path, what="image", tree=tree)
-            checksums.compare(f"{frame_name(i)}/{path.name}", files[path.name])
+            data = files[path.name] = read_bytes(path, what="image", tree=tree)
+            digest = digests.pop(place := f"{frame_name(i)}/{path.name}", None)
+            if digest is not None and sha256_bytes(data) != digest:
+                report.error("checksum", place, "other bytes", f"the digest in {CHECKSUMS}")
     return files
 
 
 def _check_surfaces(figures: PixelFigures, where: str, report: Report) -> None:
     """Report missing textures and surfaces that fight for pixels."""
-    if figures.flat > FLAT_SURFACE_MAX:
-        kind = KIND_NAMES.get(figures.flat_kind, figures.flat_kind)
+    if figures.flat > limits.FLAT_SURFACE_MAX:
+        kind, most = KIND_NAMES.get(figures.flat_kind, figures.flat_kind), f"at most {limits.FLAT_SURFACE_MAX:.1%}"
         got = f"{figures.flat:.1%} of the picture is a surface of one colour ({kind})"
-        report.warn("missing_texture", f"{where}/rgb.png", got, f"at most {FLAT_SURFACE_MAX:.1%}")
-    if figures.magenta > MAGENTA_MAX:
-        got = f"{figures.magenta:.2%} magenta"
-        report.warn("missing_texture", f"{where}/rgb.png", got, f"at most {MAGENTA_MAX:.2%}")
-    if figures.fighting > Z_FIGHTING_MAX:
+        report.warn("missing_texture", f"{where}/rgb.png", got, most)
+    if figures.magenta > limits.MAGENTA_MAX:
+        most = f"at most {limits.MAGENTA_MAX:.2%}"
+        report.warn("missing_texture", f"{where}/rgb.png", f"{figures.magenta:.2%} magenta", most)
+    if figures.fighting > limits.Z_FIGHTING_MAX:
         got = f"{figures.fighting:.3%} of the pixels alternate between two surfaces of one plane"
-        report.warn("z_fighting", f"{where}/instance.png", got, f"at most {Z_FIGHTING_MAX:.3%}")
+        report.warn("z_fighting", f"{where}/instance.png", got, f"at most {limits.Z_FIGHTING_MAX:.3%}")
 
 
 def _moved(track: Track, i: int, k: int) -> bool:
@@ -232,16 +324,17 @@ def _check_depth(depth: np.ndarray, place: str, numbers: FrameNumbers, report: R
     """Check that depths are metres between invalid (0) and sky (1000)."""
     low, high = float(depth.min()), float(depth.max())  # NaN if any is
     if not np.isfinite([low, high]).all():
-        report.error("depth_range", place, f"{int((~np.isfinite(depth)).sum())} pixels not finite", "finite metres")
-        return False
-    if low < INVALID_DEPTH_M:
-        report.error("depth_range", place, f"{low:.3f} to {high:.3f} m", f"{INVALID_DEPTH_M} to {SKY_DEPTH_M} m")
-        return False
-    if low == high:
-        report.error("depth_range", place, f"{low:.3f} m everywhere", "a depth image")
-        return False
-    numbers.invalid_depth_shares.append(float((depth == INVALID_DEPTH_M).mean()) if low == INVALID_DEPTH_M else 0.0)
-    return True
+        got, expected = f"{int((~np.isfinite(depth)).sum())} pixels not finite", "finite metres"
+    elif low < INVALID_DEPTH_M:
+        got, expected = f"{low:.3f} to {high:.3f} m", f"{INVALID_DEPTH_M} to {SKY_DEPTH_M} m"
+    elif low == high:
+        got, expected = f"{low:.3f} m everywhere", "a depth image"
+    else:
+        is_whole = low > INVALID_DEPTH_M
+        numbers.invalid_depth_shares.append(0.0 if is_whole else float((depth == INVALID_DEPTH_M).mean()))
+        return True
+    report.error("depth_range", place, got, expected)
+    return False
 
 
 def _check_mask(
@@ -267,13 +360,14 @@ def _check_mask(
         region = pedestrian_region(np.where(is_bystander[ids], KINDS["NONE"], instance[..., 0]), box - corner)
     if region is None:
         area_px2 = (box[2] - box[0]) * (box[3] - box[1])
-        if visibility >= MASK_VISIBILITY_MIN and area_px2 >= MASK_MIN_BOX_PX2:
+        if visibility >= limits.MASK_VISIBILITY_MIN and area_px2 >= MASK_MIN_BOX_PX2:
             got = f"no pedestrian pixel at the target's box, visibility {visibility:.2f}"
             report.error("mask_disagrees", where, got, "pedestrian pixels at the projected target")
         numbers.track_ious.append(0.0)
         return
     found = mask_box(region) + corner
-    numbers.track_ious.append(pixels_iou(box, found))
+    # A tolerance of half a pixel at each edge.
+    numbers.track_ious.append(box_iou(np.clip(found, box - 0.5, box + 0.5), found))
     if track.target.mask_bbox is not None:
         recorded = track.target.mask_bbox[i]
         # A pole may cut the target into parts: its box lies between this part and all pedestrian pixels. NaN fails.
@@ -285,12 +379,6 @@ def _check_mask(
     if np.isfinite(expected_m) and abs(found_m - expected_m) > SURFACE_TOLERANCE_M:
         expected = f"{expected_m:.2f} m (target.depth) within {SURFACE_TOLERANCE_M:.1f} m"
         report.error("depth_disagrees", _depth_place(track, i), f"{found_m:.2f} m at the target", expected)
-
-
-def pixels_iou(box: np.ndarray, found: np.ndarray) -> float:
-    """Return the IoU of a box and the box of its pixels, (4,) px each, with a tolerance of half a pixel at each
-    edge."""
-    return box_iou(np.clip(found, box - 0.5, box + 0.5), found)
 
 
 def target_box(track: Track, i: int) -> np.ndarray:

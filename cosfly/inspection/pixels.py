@@ -102,29 +102,37 @@ def measure_pixels(picture: Picture, is_bystander: np.ndarray, flat_share: float
 
 
 @njit(cache=True, nogil=True)
-def _is_plane(depth, y0, x0, y1, x1):  # type: ignore[no-untyped-def]
-    """Return whether the depth between two pixels of a row or column is that of a plane."""
-    first, last = float(depth[y0, x0]), float(depth[y1, x1])
+def _fights(colours, instance, depth, code, other, begins, line, down):  # type: ignore[no-untyped-def]
+    """Return whether two ids alternate over one plane and differ visibly, in a row, or in a column where `down`.
+
+    begins: of their last three runs, of which the first two must be short.
+    """
+    low, middle, end = begins
+    if end - middle > SHORTEST_RUN_PX or middle - low > SHORTEST_RUN_PX:
+        return False
+    # Distant fields are narrow stripes without an id.
+    if code >> 8 == SHARED_ID or other >> 8 == SHARED_ID or (code | other) >> 8 == 0:
+        return False
+    across = 1 - down
+    y, x = across * line, down * line  # of the line's first pixel
+    before = low - 1
+    first, last = float(depth[y + down * before, x + across * before]), float(depth[y + down * end, x + across * end])
     if not (INVALID_DEPTH_M < first < SKY_DEPTH_M and INVALID_DEPTH_M < last < SKY_DEPTH_M):
         return False
     first, last = 1.0 / first, 1.0 / last
-    steps = (y1 - y0) + (x1 - x0)
-    down = np.int64(y1 > y0)
-    for k in range(1, steps):
-        here = float(depth[y0 + down * k, x0 + (1 - down) * k])
-        line = first + (last - first) * k / steps
-        if not here > 0.0 or abs(1.0 / here - line) > PLANE_SHARE * line:
+    for k in range(low, end):
+        here = float(depth[y + down * k, x + across * k])
+        plane = first + (last - first) * (k - before) / (end - before)
+        if not here > 0.0 or abs(1.0 / here - plane) > PLANE_SHARE * plane:
+            return False
+    for k in (middle, end):
+        y0, x0, y1, x1 = y + down * (k - 1), x + across * (k - 1), y + down * k, x + across * k
+        step = np.int64(0)
+        for c in range(3):
+            step += abs(np.int64(colours[y0, x0, c]) - np.int64(colours[y1, x1, c]))
+        if instance[y0, x0, 0] == instance[y1, x1, 0] and step <= VISIBLE_STEP:
             return False
     return True
-
-
-@njit(cache=True, nogil=True)
-def _differs(colours, instance, y0, x0, y1, x1):  # type: ignore[no-untyped-def]
-    """Return whether colour or kind of two pixels differ visibly."""
-    step = np.int64(0)
-    for c in range(3):
-        step += abs(np.int64(colours[y0, x0, c]) - np.int64(colours[y1, x1, c]))
-    return instance[y0, x0, 0] != instance[y1, x1, 0] or step > VISIBLE_STEP
 
 
 @njit(cache=True, nogil=True)
@@ -177,18 +185,8 @@ def _measure(colours, instance, depth, is_bystander):  # type: ignore[no-untyped
                 counts[0] += pink
             if has_depth:
                 # Runs 3, 2, 1 and this one: A, B, A, B, with short ones in the middle.
-                if (
-                    code == id2
-                    and id1 == id3
-                    and begin - first1 <= SHORTEST_RUN_PX
-                    and first1 - first2 <= SHORTEST_RUN_PX
-                    and number != SHARED_ID
-                    and id1 >> 8 != SHARED_ID
-                    and (code | id1) >> 8 != 0  # distant fields are narrow stripes without an id
-                    and _is_plane(depth, y, first2 - 1, y, begin)
-                    and _differs(colours, instance, y, first1 - 1, y, first1)
-                    and _differs(colours, instance, y, begin - 1, y, begin)
-                ):
+                runs = (first2, first1, begin)
+                if code == id2 and id1 == id3 and _fights(colours, instance, depth, code, id1, runs, y, 0):
                     counts[1] += begin - first1
                 id3, id2, id1 = id2, id1, code
                 first2, first1 = first1, begin
@@ -197,21 +195,10 @@ def _measure(colours, instance, depth, is_bystander):  # type: ignore[no-untyped
             for column in range(size):
                 if ids[0, column] != codes[column]:
                     x, code = np.int64(column), np.int64(codes[column])  # type: ignore[assignment]
-                    a, b = firsts[1, x], firsts[0, x]
-                    if (
-                        code == ids[1, x]
-                        and ids[0, x] == ids[2, x]
-                        and ids[2, x] >= 0
-                        and y - b <= SHORTEST_RUN_PX
-                        and b - a <= SHORTEST_RUN_PX
-                        and code >> 8 != SHARED_ID
-                        and ids[0, x] >> 8 != SHARED_ID
-                        and (code | ids[0, x]) >> 8 != 0
-                        and _is_plane(depth, a - 1, x, y, x)
-                        and _differs(colours, instance, b - 1, x, b, x)
-                        and _differs(colours, instance, y - 1, x, y, x)
-                    ):
-                        counts[1] += y - b
+                    other, runs = np.int64(ids[0, x]), (np.int64(firsts[1, x]), np.int64(firsts[0, x]), np.int64(y))
+                    is_turn = code == ids[1, x] and other == ids[2, x]
+                    if is_turn and _fights(colours, instance, depth, code, other, runs, x, 1):
+                        counts[1] += y - runs[1]
                     ids[2, x], ids[1, x], ids[0, x] = ids[1, x], ids[0, x], code
                     firsts[2, x], firsts[1, x], firsts[0, x] = firsts[1, x], firsts[0, x], y
     return pairs, equal, bright, kinds, counts, box

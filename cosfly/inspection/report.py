@@ -42,43 +42,28 @@ def report_html(name: str, inspection: Inspection, views: Mapping[str, TrackView
     Args:
         name: of the run. views: pictures and curves by track folder, as many as `page_mb` allows.
     """
-    order = sorted(inspection.flights, key=lambda track: (-RESULTS.index(track.result), track.folder))
-    is_covered = inspection.coverage is not None and inspection.coverage.frames
-    accepted = [track for track in inspection.flights if track.result == "accepted"] or inspection.flights
-    shown = [
-        views[one.folder].pictures[1] for one in sorted(accepted, key=lambda one: one.track) if one.folder in views
-    ]
+    tracks, coverage = inspection.flights, inspection.coverage
+    accepted = [track for track in tracks if track.result == "accepted"] or tracks
+    accepted = [track for track in sorted(accepted, key=lambda track: track.track) if track.folder in views]
     counts = {
-        state: sum(int(track.metrics.get(f"frames_{state.replace(' ', '_')}") or 0) for track in inspection.flights)
+        state: sum(int(track.metrics.get(f"frames_{state.replace(' ', '_')}") or 0) for track in tracks)
         for state in STATES
     }
     total = sum(counts.values())
-    states = [
-        (state, counts[state], f"{counts[state] / max(total, 1):.1%}", f"{paper:.0%}")
-        for state, paper in STATES.items()
-    ]
     cards, size, num_without_pictures = list[str](), 0, 0
-    for track in order:
+    for track in sorted(tracks, key=lambda track: (-RESULTS.index(track.result), track.folder)):
         card = _card(track, views.get(track.folder))
         if track.folder in views and size + len(card) > page_mb * MB:
             card, num_without_pictures = _card(track, None), num_without_pictures + 1
         size += len(card)
         cards.append(card)
     return page(
-        "cosfly/inspection/report.html",
-        title=name,
-        style=STYLE,
-        inspection=inspection,
-        results=RESULTS,
-        columns=COLUMNS,
-        cards=cards,
-        num_without_pictures=num_without_pictures,
-        page_mb=page_mb,
-        pictures=[one for one in shown if one][:OPENING_PICTURES],
-        states=states,
-        num_perturbable=total,
-        coverage=coverage_html(inspection.coverage) if is_covered and inspection.coverage else None,
-    )
+        "cosfly/inspection/report.html", title=name, style=STYLE, inspection=inspection, results=RESULTS,
+        columns=COLUMNS, cards=cards, num_without_pictures=num_without_pictures, page_mb=page_mb,
+        pictures=[one for track in accepted if (one := views[track.folder].pictures[1])][:OPENING_PICTURES],
+        states=[(one, counts[one], f"{counts[one] / max(total, 1):.1%}", f"{STATES[one]:.0%}") for one in STATES],
+        num_perturbable=total, coverage=coverage_html(coverage) if coverage is not None and coverage.frames else None,
+    )  # fmt: skip
 
 
 def _card(track: TrackInspection, view: TrackView | None) -> str:
@@ -101,17 +86,13 @@ def _plot(name: str, view: TrackView) -> dict[str, Any] | None:
     low, high = min(edges), max(edges)
     scale = (PLOT_HEIGHT - 4.0) / ((high - low) or 1.0)
     step = PLOT_WIDTH / ((time_s[-1] - time_s[0]) or 1.0)
-    parts, pen_is_down = [], False
-    for at_s, value in zip(time_s, values, strict=True):
-        if value is not None:
-            parts.append(
-                f"{'L' if pen_is_down else 'M'}{(at_s - time_s[0]) * step:.1f} "
-                f"{PLOT_HEIGHT - 2.0 - (value - low) * scale:.1f}"
-            )
-        pen_is_down = value is not None
+    points = [
+        (before, f"{(at_s - time_s[0]) * step:.1f} {PLOT_HEIGHT - 2.0 - (value - low) * scale:.1f}")
+        for before, at_s, value in zip([None, *values], time_s, values, strict=False) if value is not None
+    ]  # fmt: skip
     return {
         "title": title,
-        "path": "".join(parts),
+        "path": "".join(f"{'M' if before is None else 'L'}{point}" for before, point in points),
         "found": f"{min(known):.2f} to {max(known):.2f}{' ' * bool(unit)}{unit}, mean {float(np.mean(known)):.2f}",
         "axes": f"{low:.4g} to {high:.4g}; {time_s[0]:g} s to {time_s[-1]:g} s",
     }

@@ -18,11 +18,11 @@ from cosfly.formats.inspection import (
     TrackInspection,
     TrajectoryFunnel,
     count_trajectories,
+    how_to_decide,
     write_inspection,
 )
 from cosfly.formats.issues import Report
 from cosfly.formats.playback import read_track
-from cosfly.formats.review import how_to_decide
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.coverage import Coverage
@@ -88,7 +88,9 @@ def run(
         return product
     planned = None if traces is None else read_traces(traces)
     names = [folder.relative_to(data).as_posix() for folder in find_tracks(data, cfg.flights)]
-    items = [Item(name, name, num_steps=_num_frames(data / name)) for name in names]
+    # About as many steps as frames, for the progress bar.
+    frames = [sum(1 for _ in (data / name / FRAMES_DIR).glob("frame_*")) for name in names]
+    items = [Item(name, name, num_steps=max(1, count)) for name, count in zip(names, frames, strict=True)]
     arguments, label = (cfg, simplified, traces, data), "inspect: frames"
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label=label)
     inspection, views = assemble(finished, planned, cfg, data)
@@ -101,8 +103,8 @@ def run(
 
 def _log_review(counts: TrackFunnel, out: Path) -> None:
     """Log how many tracks wait for review, as a warning if none is accepted, since a release would be empty."""
+    reasons = ", ".join(f"{code} {count}" for code, count in counts.reasons.items())
     if counts.review:
-        reasons = ", ".join(f"{code} {count}" for code, count in counts.reasons.items())
         log.log(
             logging.INFO if counts.accepted else logging.WARNING,
             "inspect: %d of %d tracks wait for a person (%s): %s",
@@ -110,33 +112,24 @@ def _log_review(counts: TrackFunnel, out: Path) -> None:
         )  # fmt: skip
 
 
-def _num_frames(folder: Path) -> int:
-    """Return about how many frames a track has, for the progress bar, by its frame folders."""
-    return max(1, sum(1 for _ in (folder / FRAMES_DIR).glob("frame_*")))
-
-
 def assemble(
     finished: ItemOutcomes, planned: list[DroneTrace] | None, cfg: InspectConfig, data: Path
 ) -> tuple[Inspection, dict[str, TrackView]]:
     """Merge the outcomes of all tracks: the inspection, and the report's views by track folder."""
-    tracks: list[TrackInspection] = []
-    views: dict[str, TrackView] = {}
-    covered: list[Coverage] = []
+    tracks, views, covered = list[TrackInspection](), dict[str, TrackView](), list[Coverage]()
     for outcome in finished.records:
         if isinstance(outcome, Failed):
             tracks.append(_unreadable(outcome, planned or [], data))
-        else:
-            inspected = result_of(outcome, InspectedTrack)
-            tracks.append(inspected.record)
-            views[outcome.id] = inspected.view
-            if inspected.record.result == "accepted":
-                covered.append(inspected.coverage)
+            continue
+        inspected = result_of(outcome, InspectedTrack)
+        tracks.append(inspected.record)
+        views[outcome.id] = inspected.view
+        if inspected.record.result == "accepted":
+            covered.append(inspected.coverage)
     # The funnel counts an unreadable track at the plan of its twin.
     trace_ids = {Path(track.folder).parent: track.trace_id for track in tracks if track.trace_id is not None}
-    tracks = [
-        track.model_copy(update={"trace_id": track.trace_id or trace_ids.get(Path(track.folder).parent)})
-        for track in tracks
-    ]
+    planned_as = [track.trace_id or trace_ids.get(Path(track.folder).parent) for track in tracks]
+    tracks = [track.model_copy(update={"trace_id": i}) for track, i in zip(tracks, planned_as, strict=True)]
     funnel = Funnel(trajectories=_trajectory_funnel(tracks, planned), flights=_track_funnel(tracks))
     funnel.trajectories.check()
     settings, coverage = cfg.model_dump(mode="json"), Coverage.total(covered)
@@ -160,16 +153,12 @@ def _unreadable(outcome: Failed, planned: list[DroneTrace], data: Path) -> Track
 
 def _trajectory_funnel(tracks: list[TrackInspection], planned: list[DroneTrace] | None) -> TrajectoryFunnel:
     """Count planned trajectories by outcome; the worse track of a trajectory decides. Without plans all are planned."""
-    counts = count_trajectories(tracks, planned=planned is not None)
-    rendered = {track.trace_id for track in tracks}
-    dropped = Counter(
-        trace.drop_reason for trace in planned or [] if trace.drop_reason is not None and trace.path_id not in rendered
-    )
+    counts, rendered = count_trajectories(tracks, planned=planned is not None), {track.trace_id for track in tracks}
+    reasons = [trace.drop_reason for trace in planned or [] if trace.path_id not in rendered]
+    dropped = dict(sorted(Counter(reason for reason in reasons if reason is not None).items()))
     num_planned = counts["rendered"] if planned is None else len(planned)
-    not_rendered = num_planned - dropped.total() - counts["rendered"]
-    return TrajectoryFunnel(
-        planned=num_planned, dropped=dict(sorted(dropped.items())), not_rendered=not_rendered, **counts
-    )
+    not_rendered = num_planned - sum(dropped.values()) - counts["rendered"]
+    return TrajectoryFunnel(planned=num_planned, dropped=dropped, not_rendered=not_rendered, **counts)
 
 
 def _track_funnel(tracks: list[TrackInspection]) -> TrackFunnel:

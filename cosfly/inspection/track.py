@@ -26,27 +26,25 @@ from cosfly.geometry.coverage import Coverage, axis_values
 from cosfly.geometry.trajectory_metrics import (
     CLEARANCE_CAP_M,
     CLEARANCE_TOLERANCE_M,
-    accel_rms,
-    jerk_rms,
+    derivative_rms,
     length_m,
     smoothness_score,
 )
-from cosfly.inspection.files import Checksums, check_files, check_recorded
-from cosfly.inspection.frames import bystanders_of_frames, check_bystanders, check_frames, target_box
-from cosfly.inspection.settings import (
-    DRONE_SPEED_MAX_MPS,
-    INVALID_DEPTH_MAX,
-    POSE_TOLERANCE_M,
-    REPROJECTION_TOLERANCE_PX,
-    ROTATION_TOLERANCE_DEG,
-    TARGET_SPEED_MAX_MPS,
-    THUMBNAIL_PX,
-    TRACK_QUALITY_MIN,
-    InspectConfig,
+from cosfly.inspection import settings as limits
+from cosfly.inspection.frames import (
+    check_bystanders,
+    check_files,
+    check_frames,
+    check_recorded,
+    compare_file,
+    listed_digests,
+    target_box,
 )
+from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.view import TrackView, draw_track
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.run_dir import digest_of, folder_digests
+from cosfly.runtime.worker import advance
 
 if TYPE_CHECKING:
     from cosfly.formats.boxes import BoxMap
@@ -55,15 +53,15 @@ if TYPE_CHECKING:
 TIME_TOLERANCE_S = 1e-3
 
 
+Metrics = dict[str, float | int | None]
+
+
 class InspectedTrack(BaseModel):
     """A track's record, view and coverage, as in `items.jsonl`."""
 
     record: TrackInspection
     view: TrackView
     coverage: Coverage
-
-
-Metrics = dict[str, float | int | None]
 
 
 def inspect_track(
@@ -86,12 +84,12 @@ def inspect_track(
     track = _read(folder, report)
     trace = None if traces is None else traces.get(trace_id(track))
     metrics: Metrics = {"num_frames": len(track)}
-    if traces is not None and trace is None:
-        got = f"no trace {trace_id(track)!r}"
-        report.warn("no_trace", "trajectory.json: source.scenario_id", got, "the id of a plan")
     if trace is not None:
         check_plan(trace, cfg, report, metrics)
         check_poses(track, trace, report)
+    elif traces is not None:
+        got = f"no trace {trace_id(track)!r}"
+        report.warn("no_trace", "trajectory.json: source.scenario_id", got, "the id of a plan")
     clearance_m = None if obstacles is None else check_surroundings(track, obstacles, cfg, report, metrics)
     check_shifts(track, report, metrics)
     if not track.is_original:
@@ -99,13 +97,13 @@ def inspect_track(
         metrics.update({f"frames_{state.replace(' ', '_')}": counts[state] for state in STATES})
     check_motion(track, report)
     check_projection(track, report)
-    check_recorded(track, root, recorded, report)
+    check_recorded(folder, root, recorded, report)
     _check_frames(track, cfg, report, metrics)
     issues = report.merged()
     result: Result = "rejected" if report.num("error") else "review" if report.num("warning") else "accepted"
     try:
         sha256 = digest_of(folder_digests(folder))
-    except InputError:  # reported by `Checksums`
+    except InputError:  # reported by `listed_digests`
         sha256 = None
     record = TrackInspection(
         town=track.town, trajectory=track.trajectory, variant=track.variant, is_original=track.is_original,
@@ -113,7 +111,7 @@ def inspect_track(
         result=result, issues=issues,
         metrics={name: None if value is None else round(value, 4) for name, value in metrics.items()},
     )  # fmt: skip
-    view = draw_track(track, _heights_m(track), clearance_m, box_map, THUMBNAIL_PX, report.issues)
+    view = draw_track(track, _heights_m(track), clearance_m, box_map, limits.THUMBNAIL_PX, report.issues)
     return InspectedTrack(record=record, view=view, coverage=coverage_of(track))
 
 
@@ -146,7 +144,7 @@ def _read(folder: Path, report: Report) -> Track:
 def check_plan(trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: Metrics) -> None:
     """Check the smoothness of the plan and the result of its prefilter."""
     dt_s = step_s(trace.time_s)
-    accel, jerk = accel_rms(trace.positions_m, dt_s), jerk_rms(trace.positions_m, dt_s)
+    accel, jerk = (derivative_rms(trace.positions_m, order, dt_s) for order in (2, 3))
     score = smoothness_score(accel, jerk)
     metrics.update(accel_rms_mps2=accel, jerk_rms_mps3=jerk, smoothness=score)
     where = f"plan {trace.path_id}"
@@ -238,9 +236,9 @@ def check_poses(track: Track, trace: DroneTrace, report: Report) -> None:
     moved_m = track.positions_m - track.perturbation.drone_m - trace.positions_m[row]
     target_moved_m = track.targets_m - track.perturbation.target_m - trace.targets_m[row]
     checks = (
-        ("drone_pose", moved_m, POSE_TOLERANCE_M, "m"),
-        ("drone_pose", np.where(is_shifted(track)[:, None], 0.0, turns), ROTATION_TOLERANCE_DEG, "deg"),
-        ("target.world_location", target_moved_m, POSE_TOLERANCE_M, "m"),
+        ("drone_pose", moved_m, limits.POSE_TOLERANCE_M, "m"),
+        ("drone_pose", np.where(is_shifted(track)[:, None], 0.0, turns), limits.ROTATION_TOLERANCE_DEG, "deg"),
+        ("target.world_location", target_moved_m, limits.POSE_TOLERANCE_M, "m"),
     )
     for name, difference, tolerance, unit in checks:
         distance = np.abs(np.asarray(difference)).max(axis=1)
@@ -251,15 +249,11 @@ def check_poses(track: Track, trace: DroneTrace, report: Report) -> None:
 
 def check_motion(track: Track, report: Report) -> None:
     """Find teleports: impossible steps between frames, without the recorded perturbations."""
-    drone_offsets_m, target_offsets_m = (
-        np.nan_to_num(track.perturbation.drone_m),
-        np.nan_to_num(track.perturbation.target_m),
-    )
-    limits = (
-        ("drone_pose", track.positions_m - drone_offsets_m, DRONE_SPEED_MAX_MPS),
-        ("target.world_location", track.targets_m - target_offsets_m, TARGET_SPEED_MAX_MPS),
-    )
-    for name, positions_m, limit_mps in limits:
+    drone_m, target_m = map(np.nan_to_num, (track.perturbation.drone_m, track.perturbation.target_m))
+    for name, positions_m, limit_mps in (
+        ("drone_pose", track.positions_m - drone_m, limits.DRONE_SPEED_MAX_MPS),
+        ("target.world_location", track.targets_m - target_m, limits.TARGET_SPEED_MAX_MPS),
+    ):
         speeds = np.linalg.norm(np.diff(positions_m, axis=0), axis=1) / np.diff(track.time_s)
         for i in np.flatnonzero(speeds > limit_mps):
             where = f"trajectory.json: points[{i + 1}].{name}"
@@ -268,20 +262,21 @@ def check_motion(track: Track, report: Report) -> None:
 
 def check_projection(track: Track, report: Report) -> None:
     """Check the recorded pixel, box and depth of the target against pose, intrinsics and target position."""
+    target = track.target
     for i in range(len(track)):
         point = f"trajectory.json: points[{i}].target"
         if np.isnan(track.targets_m[i]).any():
-            if track.target.in_view[i]:
+            if target.in_view[i]:
                 report.error("target_missing", f"{point}.world_location", "null", "a position: the target is in view")
             continue
         pose = world_from_camera(track.positions_m[i], track.rotations_deg[i])
         uv, depth_m = project(track.targets_m[i : i + 1], pose, track.camera_at(i).intrinsic)
-        box = target_box(track, i)
+        box, pixels = target_box(track, i), limits.REPROJECTION_TOLERANCE_PX
         recorded = (
-            ("image_uv", track.target.uv[i], uv[0], REPROJECTION_TOLERANCE_PX, "px"),
+            ("image_uv", target.uv[i], uv[0], pixels, "px"),
             # The target of another program has another size.
-            ("bbox_2d", track.target.bbox[i] if track.is_ours else box, box, 2 * REPROJECTION_TOLERANCE_PX, "px"),
-            ("depth", track.target.depth_m[i : i + 1], depth_m, 0.01, "m"),
+            ("bbox_2d", target.bbox[i] if track.is_ours else box, box, 2 * pixels, "px"),
+            ("depth", target.depth_m[i : i + 1], depth_m, 0.01, "m"),
         )
         for name, found, expected, tolerance, unit in recorded:
             if np.isnan(found).any() or np.isnan(expected).any():
@@ -290,44 +285,47 @@ def check_projection(track: Track, report: Report) -> None:
             if distance > tolerance:
                 limit = f"the projection of the target within {tolerance:g} {unit}"
                 report.error("projection_differs", f"{point}.{name}", f"{distance:.2f} {unit} from it", limit)
-        if track.target.in_view[i] and np.isnan(track.target.uv[i]).any():
+        if target.in_view[i] and np.isnan(target.uv[i]).any():
             report.error("target_missing", f"{point}.image_uv", "null", "a pixel: the target is in view")
 
 
 def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Metrics) -> None:
     """Check files and pixels; the visibility of rendered frames is measured but never rejects (sec:dataset_stats)."""
-    metas = check_files(track, report)
-    bystanders = bystanders_of_frames(track, metas)
+    assert track.folder is not None
+    metas, target = check_files(track, report), track.target
+    # Other programs count others in another way.
+    bystanders = {i: meta.others for i, meta in metas.items() if track.is_ours and meta and meta.others}
     check_bystanders(track, bystanders, cfg.clearance_min_m, report, metrics)
-    checksums = Checksums(track, report, is_wanted=cfg.check_checksums)
-    frames = check_frames(track, metas, bystanders, checksums, report)
-    checksums.compare_rest()
-    known = track.target.visibility[~np.isnan(track.target.visibility)]
+    digests = listed_digests(track.folder, report) if cfg.check_checksums else {}
+    frames = check_frames(track, metas, bystanders, digests, report)
+    for name, digest in digests.items():
+        advance()
+        compare_file(track.folder, name, digest, report)
+    known = target.visibility[~np.isnan(target.visibility)]
     quality = float(np.mean(frames.track_ious)) if frames.track_ious else None
     invalid = max(frames.invalid_depth_shares, default=None)
-    legible = track.target.legible
-    heights_px = (track.target.bbox[:, 3] - track.target.bbox[:, 1])[track.target.in_view]
-    is_small = None if legible is None or not len(heights_px) else heights_px < LEGIBLE_HEIGHT_PX
+    heights_px = (target.bbox[:, 3] - target.bbox[:, 1])[target.in_view]
+    is_judged = target.legible is not None and len(heights_px) > 0
     metrics.update(
         num_frames_checked=frames.num_checked,
         num_frames_compared=frames.num_compared,
         length_m=length_m(track.positions_m),
         height_mean_m=float(np.nanmean(_heights_m(track))) if not np.isnan(track.targets_m).all() else None,
         rendered_visibility_mean=float(known.mean()) if len(known) else None,
-        visible_share=float(track.target.visible.mean()),
-        legible_share=None if legible is None else float(legible.mean()),
-        small_share=None if is_small is None else float(is_small.mean()),
-        in_view_share=float(track.target.in_view.mean()),
+        visible_share=float(target.visible.mean()),
+        legible_share=None if target.legible is None else float(target.legible.mean()),
+        small_share=float((heights_px < LEGIBLE_HEIGHT_PX).mean()) if is_judged else None,
+        in_view_share=float(target.in_view.mean()),
         perturbed_share=float(track.perturbation.is_perturbed.mean()),
         track_quality=quality,
         invalid_depth_share_max=invalid,
     )
-    if not track.target.visible.any():
+    if not target.visible.any():
         report.warn("never_visible", "trajectory.json: points[].target.visible", "false everywhere", "a target")
-    if quality is not None and quality < TRACK_QUALITY_MIN:
-        report.warn("track_quality", "instance.png", f"IoU {quality:.3f}", f"at least {TRACK_QUALITY_MIN}")
-    if invalid is not None and invalid > INVALID_DEPTH_MAX:
-        expected = f"at most {INVALID_DEPTH_MAX:g} of the pixels of a frame"
+    if quality is not None and quality < limits.TRACK_QUALITY_MIN:
+        report.warn("track_quality", "instance.png", f"IoU {quality:.3f}", f"at least {limits.TRACK_QUALITY_MIN}")
+    if invalid is not None and invalid > limits.INVALID_DEPTH_MAX:
+        expected = f"at most {limits.INVALID_DEPTH_MAX:g} of the pixels of a frame"
         report.warn("invalid_depth", "depth.npy", f"{invalid:.3f} of a frame", expected)
 
 

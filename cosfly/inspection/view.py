@@ -46,13 +46,9 @@ class TrackView(BaseModel):
 
 
 def draw_track(
-    track: Track,
-    heights_m: np.ndarray,
-    clearance_m: np.ndarray | None,
-    box_map: BoxMap | None,
-    width_px: int,
-    issues: Sequence[Issue] = (),
-) -> TrackView:
+    track: Track, heights_m: np.ndarray, clearance_m: np.ndarray | None, box_map: BoxMap | None,
+    width_px: int, issues: Sequence[Issue] = (),
+) -> TrackView:  # fmt: skip
     """Return the view of a track.
 
     Args:
@@ -82,11 +78,11 @@ def draw_track(
 
 def _other_tracks(track: Track) -> list[Track]:
     """Read the other tracks of a trajectory, skipping unreadable ones."""
+    assert track.folder is not None
     found = list[Track]()
-    if track.folder is not None:
-        for path in sorted(track.folder.parent.glob("[!.]*/trajectory.json")):
-            with contextlib.suppress(InputError):
-                found += [read_track(path.parent, strict=False)] if path.parent != track.folder else []
+    for folder in sorted(path.parent for path in track.folder.parent.glob("[!.]*/trajectory.json")):
+        with contextlib.suppress(InputError):
+            found += [read_track(folder, strict=False)] if folder != track.folder else []
     return found
 
 
@@ -110,10 +106,9 @@ def draw_plan(track: Track, box_map: BoxMap | None, others: Sequence[Track] = ()
     person_m = track.targets_m[~np.isnan(track.targets_m).any(axis=1)]
     others_m = [other.positions_m for other in others]
     view = TopView.around(np.concatenate([track.positions_m, person_m, *others_m]), PLAN_PX, MARGIN_M)
-    if box_map is None:
-        picture = np.full((*view.size_px[::-1], 3), PAPER, dtype=np.uint8)
-    else:
-        width_m, height_m = view.size_px[0] / view.pixels_per_m, view.size_px[1] / view.pixels_per_m
+    picture = np.full((*view.size_px[::-1], 3), PAPER, dtype=np.uint8)
+    if box_map is not None:
+        width_m, height_m = np.array(view.size_px) / view.pixels_per_m
         low, high = np.array([view.west_m, view.north_m - height_m]), np.array([view.west_m + width_m, view.north_m])
         is_near = ((box_map.maxs[:, :2] >= low) & (box_map.mins[:, :2] <= high)).all(axis=1)
         picture = draw_map(box_map.select(np.flatnonzero(is_near)), view)

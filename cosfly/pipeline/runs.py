@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from cosfly.formats.review import undecided
+from cosfly.formats.inspection import undecided
 from cosfly.pipeline.settings import RunConfig
 from cosfly.pipeline.settings_guide import Setting, changed
 from cosfly.runtime.config import load

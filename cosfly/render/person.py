@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cosfly.formats.bystanders import Bystander
-from cosfly.formats.frames import BystanderMeta, BystandersMeta, tree_position, tree_yaw
+from cosfly.formats.frames import BystanderMeta, BystandersMeta, tree_yaw
 from cosfly.formats.people import COLORS, EMPTY_SHARE, FIGURES, GARMENTS, HAIR, Appearance, People
 from cosfly.geometry.axes import headings_of
 from cosfly.geometry.kernels import distances_to_boxes_m
@@ -128,7 +128,7 @@ class DressedBystanders:
                 BystanderMeta(
                     instance_id=other_id(number),
                     semantic_id=other.kind_number,
-                    world_location=tree_position(other.centers_m[i]),
+                    world_location=other.centers_m[i],
                     yaw=tree_yaw(float(np.degrees(other.headings_rad[i]))),
                     half_extents_m=other.build.half_extents_m,
                     num_pixels=int(pixels[other_id(number)]),

@@ -170,7 +170,7 @@ def draw_frame(
     is_person = frame.ids == PERSON_ID
     num_px = int(np.count_nonzero(is_person))
     target = TargetMeta(
-        world_location=frames.tree_position(target_m),
+        world_location=target_m,
         half_extents_m=PERSON_HALF_EXTENTS_M,
         instance_id=PERSON_ID,
         semantic_id=KINDS["Pedestrians"],
@@ -206,13 +206,13 @@ def _annotation(script: TrackScript, i: int, target: TargetMeta, others: Bystand
         trajectory=script.trajectory,
         variant=script.variant,
         camera=frames.camera_meta(script.cameras[i], NEAR_M, FAR_M),
-        drone_pose=frames.tree_pose(perturbed.poses.positions_m[i], perturbed.poses.rotations_deg[i]),
+        drone_pose=np.hstack([perturbed.poses.positions_m[i], perturbed.poses.rotations_deg[i]]),
         target=target,
         perturbation=frames.PerturbationMeta(
             **perturbed.states[i],
-            drone_position=frames.tree_position(perturbed.drone_offsets_m[i]),
-            target_position=frames.tree_position(perturbed.target_offsets_m[i]),
-            drone_rotation=frames.tree_angles(perturbed.rotation_offsets_deg[i]),
+            drone_position=perturbed.drone_offsets_m[i],
+            target_position=perturbed.target_offsets_m[i],
+            drone_rotation=perturbed.rotation_offsets_deg[i],
         ),
         look=script.look,
         others=others,

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cosfly.geometry.axes import BODY_FROM_CAMERA, mirror_positions, mirror_rotations
+from cosfly.geometry.axes import BODY_FROM_CAMERA, mirror_poses
 
 CARLA_VERSION = "0.9.16"
 SIMULATED_STEP_S = 0.05  # of synchronous mode (sec:step5)
@@ -24,12 +24,13 @@ FAR_CM = 65504.0  # the largest half-precision number: UnrealCV's depth of the s
 
 def unreal_pose(position_m: np.ndarray, rotation_deg: np.ndarray) -> list[float]:
     """Convert a pose, (3,) m and (3,) pitch, yaw, roll in degrees, to x, y, z, pitch, yaw, roll of Unreal."""
-    return [*(mirror_positions(position_m) + 0.0).tolist(), *(mirror_rotations(rotation_deg) + 0.0).tolist()]
+    return (mirror_poses(np.array([*position_m, *rotation_deg])) + 0.0).tolist()
 
 
 def world_pose(pose: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     """Convert a pose of Unreal to position, (3,) m, and rotation, (3,) degrees."""
-    return mirror_positions(np.array(pose[:3])) + 0.0, mirror_rotations(np.array(pose[3:])) + 0.0
+    found = mirror_poses(np.array(pose)) + 0.0
+    return found[:3], found[3:]
 
 
 def camera_rotation_deg(camera_pose: np.ndarray) -> np.ndarray:

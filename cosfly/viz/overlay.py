@@ -12,7 +12,7 @@ import numpy as np
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import FrameMeta
 from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
-from cosfly.geometry.axes import box_corners, rotation_matrices
+from cosfly.geometry.axes import box_corners, rotation_matrices, world_from_camera
 from cosfly.viz.topview import COLORS, FONT, OTHER_COLOR, Color, draw_text
 
 TARGET_COLOR, OTHERS_COLOR = (255, 214, 10), (90, 220, 255)
@@ -46,7 +46,8 @@ class Overlay:
             rgb: (h, w, 3) uint8. ids: (h, w) of `instance.png`, which select the boxes.
         """
         picture = np.ascontiguousarray(rgb).copy()
-        camera_pose, intrinsic = meta.drone_pose.camera_pose, np.array(meta.camera.intrinsic)
+        camera_pose = world_from_camera(meta.drone_pose[:3], meta.drone_pose[3:])
+        intrinsic = np.array(meta.camera.intrinsic)
         scale = picture.shape[1] / 1280.0
         labels: list[tuple[str, float, float, Color]] = []
         for boxes, width in ((self._seen(ids), 1), (_moving(meta), 2)):
@@ -83,9 +84,9 @@ def _moving(meta: FrameMeta) -> list[_Box]:
     """Return the boxes of bystanders, then of the target."""
     boxes = []
     for other in meta.others.others if meta.others else ():
-        corners_m = box_corners(other.center_m, np.array(other.half_extents_m), other.heading_rad)
-        boxes.append(_Box(corners_m, other.center_m, OTHERS_COLOR, str(other.instance_id)))
-    center_m = meta.target.center_m
+        corners_m = box_corners(other.world_location, np.array(other.half_extents_m), other.heading_rad)
+        boxes.append(_Box(corners_m, other.world_location, OTHERS_COLOR, str(other.instance_id)))
+    center_m = meta.target.world_location
     corners_m = box_corners(center_m, np.array(meta.target.half_extents_m))
     return [*boxes, _Box(corners_m, center_m, TARGET_COLOR, f"target {meta.target.instance_id}")]
 

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.formats.captions import FIELDS, TOKENS, Coc, Language, SentenceState, read_captions
-from cosfly.formats.episode_scores import Figure
+from cosfly.formats.episodes import Figure
 from cosfly.formats.predictions import FAILED, Prediction, Split
 from cosfly.geometry.trajectory_metrics import draw_pedestrians
 from cosfly.inspection.blind_baseline import DRAWN_AHEAD, FITTED_ON, LEAST_WINDOWS, LOOKS_BACK

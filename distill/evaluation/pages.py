@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.formats.captions import FIELDS, TOKENS
-from cosfly.formats.episode_scores import Figure
+from cosfly.formats.episodes import Figure
 from cosfly.runtime.escaping import for_markdown
 from cosfly.runtime.io import read_text
 from cosfly.viz.page import page

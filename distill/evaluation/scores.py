@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cosfly.formats.captions import TOKENS, Coc, SentenceState, Verdict, not_in_set, verdict_on
-from cosfly.formats.episode_scores import Figure
+from cosfly.formats.episodes import Figure
 from cosfly.formats.predictions import FAILED, Prediction
 from cosfly.geometry.trajectory_metrics import draw_pedestrians, figure_of_draws, interval_of
 from cosfly.runtime.errors import InputError

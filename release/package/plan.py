@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cosfly.formats.frames import DEPTH_PNG, FILE_NAMES, frame_name, frame_path
+from cosfly.formats.inspection import how_to_decide
 from cosfly.formats.places import TrackChoice
-from cosfly.formats.review import how_to_decide
 from cosfly.runtime.errors import CosflyError, InputError, NothingKept, VerifyError
 from cosfly.runtime.run_dir import Failed, StageFolder, Tally, write_failures
 from release.columns import SPLIT_NAMES, Placement, SplitName

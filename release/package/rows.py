@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import BaseModel
 
-from cosfly.formats.frames import FILE_NAMES, FrameFile, depth_bytes, depth_values, frame_path, is_packed
+from cosfly.formats.frames import FILE_NAMES, FrameFile, as_depth_npy, frame_path
 from cosfly.formats.places import sample_id
 from cosfly.formats.playback import Track
 from release import columns
@@ -42,8 +42,8 @@ class Rows:
     def add(self, scalars: dict[str, Any], pictures: dict[FrameFile, bytes], flight: Track, i: int) -> None:
         """Add a frame."""
         for file, data in pictures.items():
-            if file == "depth" and is_packed(data):
-                data = depth_bytes(depth_values(data, frame_path(flight.frame_folder(i), FILE_NAMES["depth"])))
+            if file == "depth":
+                data = as_depth_npy(data, frame_path(flight.frame_folder(i), FILE_NAMES["depth"]))
             self._pictures[file].append(data)
             self._num_bytes += len(data)
         self._scalars.append(scalars)

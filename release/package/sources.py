@@ -8,9 +8,8 @@ from pathlib import Path
 
 from cosfly.formats.boxes import UNKNOWN_LICENCE
 from cosfly.formats.captions import OWN_PROMPTS, QUESTIONS
-from cosfly.formats.inspection import Inspection, TrackInspection, TrajectoryFunnel
+from cosfly.formats.inspection import REVIEW, Inspection, TrackInspection, TrajectoryFunnel, read_settled
 from cosfly.formats.places import ALL_FLIGHTS, Place, TrackChoice, flight_ids, folder_name
-from cosfly.formats.review import REVIEW, read_settled
 from cosfly.formats.town import read_town_map
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import ConfigError, InputError

@@ -19,10 +19,10 @@ from pydantic import Field
 from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.formats.captions import Caption, Coc, read_captions
 from cosfly.formats.frames import FrameFile, depth_values, frame_path
+from cosfly.formats.inspection import read_settled
 from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
 from cosfly.formats.places import folder_name, place_of, town_folder
 from cosfly.formats.playback import read_track
-from cosfly.formats.review import read_settled
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.answer_text import sentences_of
 from cosfly.runtime.arrays import parse_picture

@@ -179,7 +179,7 @@ def measure(scene: Scene, planner: str, cfg: PlanConfig) -> list:
         p = made.positions_m
         seen = visibility(scene.obstacles, p, scenario.targets_m).mean()
         hits = segments_hit(scene.obstacles, p[:-1], p[1:]).any()
-        accel, jerk = metrics.accel_rms(p), metrics.jerk_rms(p)
+        accel, jerk = metrics.derivative_rms(p, 2), metrics.derivative_rms(p, 3)
         smooth = accel <= cfg.accel_rms_max_mps2 and jerk <= cfg.jerk_rms_max_mps3
         clearance_m = signed_distances(scene.obstacles, p, 100.0)[0].min()
         times.append(ms)

@@ -20,8 +20,7 @@ from cosfly.closed_loop import stage
 from cosfly.closed_loop.engines import EngineDecision, Observation, open_engine
 from cosfly.closed_loop.measures import score_episodes
 from cosfly.formats.captions import TOKENS, read_captions
-from cosfly.formats.episode_scores import SCORE, SCORE_FORMAT
-from cosfly.formats.episodes import EPISODES, read_episode
+from cosfly.formats.episodes import EPISODES, SCORE, SCORE_FORMAT, read_episode
 from cosfly.formats.traces import read_traces
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners import stage as planning
