@@ -137,15 +137,15 @@ def _reproject(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift
         v = int((j + 0.5) * height / GRID_ROWS)
         for i in range(COLUMNS):
             u = int((i + 0.5) * width / COLUMNS)
-            d = float(depth_a[v, u])
-            if not (d > 0.0 and d < FAR_M) or (has_ids and moving[inst_a[v, u, 0]]):
+            d, own = float(depth_a[v, u]), _code(inst_a, v, u) if has_ids else 0
+            if not (d > 0.0 and d < FAR_M) or moving[own & 255]:
                 continue
             s, t, z = _reprojected(u, v, d, intrinsics, others, turn, shift)
             if not (s > 1.5 and t > 1.5 and s < others_width - 2.5 and t < others_height - 2.5):
                 continue
-            column, row = int(s), int(t)
+            column, row, is_flat = int(s), int(t), flat[own & 255]
             best, least, is_through, is_same, is_free, is_whole, is_one = _around(
-                depth_b, inst_b, row, column, z, inst_a, v, u, has_ids, moving, flat
+                depth_b, inst_b, row, column, z, own, has_ids, moving, flat
             )
             if not is_free:
                 continue
@@ -154,13 +154,13 @@ def _reproject(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift
             state = 0
             if is_there and is_whole:
                 state = FIRM
-            elif is_there and is_one and not flat[inst_a[v, u, 0]]:
+            elif is_there and is_one and not is_flat:
                 state = RENAMED
             # Farther all round: what is nearer may be another side of the thing, that hides this one.
             elif not is_there and has_ids and (is_through or (is_whole and least > 0.0)):
                 state = MOVED
             if state > 0:
-                ids[num_ids], states[num_ids] = np.int64(inst_a[v, u, 1]) | np.int64(inst_a[v, u, 2]) << 8, state
+                ids[num_ids], states[num_ids] = own >> 8, state
                 num_ids += 1
             if is_there:
                 counts[1] += 1
@@ -168,7 +168,7 @@ def _reproject(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift
                 error = _error_on_plane(depth_b, s, t, z)
                 if not np.isnan(error):
                     errors[num_errors] = error
-                    standing[num_errors] = has_ids and not flat[inst_a[v, u, 0]]
+                    standing[num_errors] = has_ids and not is_flat
                     num_errors += 1
             elif is_through:
                 counts[3] += 1
@@ -190,28 +190,29 @@ def _reprojected(u, v, d, intrinsics, others, turn, shift):  # type: ignore[no-u
 
 
 @njit(cache=True, nogil=True)
-def _around(depth, instance, row, column, z, inst_a, v, u, has_ids, moving, flat):  # type: ignore[no-untyped-def]
-    """Compare nine pixels with a point at depth z, of the instance at (v, u) of `inst_a`. Return the least distance in
-    depth, the least depth beyond it, and whether the point is nearer than all, one shows its instance (or kind of flat
-    ground), none shows a moving kind, all show its instance, and all show one instance."""
+def _code(instance, y, x):  # type: ignore[no-untyped-def]
+    """Return a pixel of `instance.png` as one number, the kind lowest."""
+    return np.int64(instance[y, x, 0]) | np.int64(instance[y, x, 1]) << 8 | np.int64(instance[y, x, 2]) << 16
+
+
+@njit(cache=True, nogil=True)
+def _around(depth, instance, row, column, z, own, has_ids, moving, flat):  # type: ignore[no-untyped-def]
+    """Compare nine pixels with a point at depth z, of the instance `own`. Return the least distance in depth, the
+    least depth beyond it, and whether the point is nearer than all, one shows its instance (or kind of flat ground),
+    none shows a moving kind, all show its instance, and all show one instance."""
     best, least, is_through, is_same, is_free, is_whole, is_one = 1e9, 1e9, True, not has_ids, True, has_ids, has_ids
     for y in range(row - 1, row + 2):
         for x in range(column - 1, column + 2):
             off = float(depth[y, x]) - z
             best, least = min(best, abs(off)), min(least, off)
-            if off <= 0.05 * z + 0.3:
-                is_through = False
+            is_through &= off > 0.05 * z + 0.3
             if has_ids:
-                is_free &= not moving[instance[y, x, 0]]
-                is_kind = instance[y, x, 0] == inst_a[v, u, 0]
-                is_own = is_kind and instance[y, x, 1] == inst_a[v, u, 1] and instance[y, x, 2] == inst_a[v, u, 2]
-                is_same |= is_own or (is_kind and flat[inst_a[v, u, 0]])
-                is_whole &= is_own
-                is_one &= (
-                    instance[y, x, 0] == instance[row, column, 0]
-                    and instance[y, x, 1] == instance[row, column, 1]
-                    and instance[y, x, 2] == instance[row, column, 2]
-                )
+                code = _code(instance, y, x)
+                kind = code & 255
+                is_free &= not moving[kind]
+                is_same |= code == own or (kind == own & 255 and flat[kind])
+                is_whole &= code == own
+                is_one &= code == _code(instance, row, column)
     return best, least, is_through, is_same, is_free, is_whole, is_one
 
 
