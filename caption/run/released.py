@@ -45,7 +45,7 @@ def _label_lies(
     has_order = _has_order(caption)
     if caption.prompts and is_order != has_order:
         got = f"{caption.label}, and {'an order' if has_order else 'no order'} in the prompt"
-        return [Mismatch("label", where, got, "an order as label exactly where the prompt tells of one")]
+        return [("label", where, got, "an order as label exactly where the prompt tells of one")]
     num_future = int(shown.settings.get("window", {}).get("future_frames", 5))
     future = _future(shown, motion, caption, rows, num_future)
     if future is None:
@@ -55,13 +55,13 @@ def _label_lies(
     measured = measure(future)
     label = TABLE.label_of(measured)
     if label != caption.label and caption.label not in _nearly(measured):
-        return [Mismatch("label", where, str(caption.label), f"{label}, which the frames after the window show")]
+        return [("label", where, str(caption.label), f"{label}, which the frames after the window show")]
     if caption.verdict is None:
         return []
     verdict = TABLE.verdict_of(caption.decision, measured, caption.label)
     if verdict != caption.verdict:
         got = f"{caption.verdict} for {caption.decision} (label {caption.label})"
-        return [Mismatch("verdict", f"{caption.sample_id}: verdict", got, f"{verdict}, by the frames after the window")]
+        return [("verdict", f"{caption.sample_id}: verdict", got, f"{verdict}, by the frames after the window")]
     return []
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -40,13 +40,5 @@ class ReleasedTrack:
     settings: dict[str, Any]
 
 
-class Mismatch(NamedTuple):
-    """A contradiction, in the words of a finding."""
-
-    code: str
-    where: str
-    got: str
-    expected: str
-
-
+Mismatch = tuple[str, str, str, str]  # a contradiction: code, where, got and expected of its finding
 CaptionReader = Callable[[ReleasedTrack], list[Mismatch]]

@@ -314,7 +314,7 @@ def _check_flight(
     def read_captions() -> None:
         shown = flight.shown(twin, context.caption_settings(flight))
         for lie in reader(shown) if reader is not None else ():
-            findings.error(lie.code, lie.where, lie.got, lie.expected)
+            findings.error(*lie)
 
     checks: list[Callable[[], None]] = [
         lambda: check_identity(flight, findings),
