@@ -7,7 +7,7 @@ each compared with those of `cosfly run showcase` (`default_coverage.json`).
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -84,22 +84,27 @@ class Coverage(Record):
 
     @classmethod
     def of(
-        cls,
-        values: Mapping[str, np.ndarray],
-        styles: Iterable[str],
-        paces: Iterable[str],
-        labels: Iterable[str] = (),
-        skies: Iterable[tuple[str | None, str | None]] = (),
-    ) -> Coverage:
-        """Count frames: values, (n,) of each axis, NaN where unknown; style and pace of each; labels of those that have
-        one; weather and time of day of each, None where nobody says.
+        cls, seen: np.ndarray, hip_height_m: float, styles: Iterable[str], paces: Iterable[str],
+        labels: Iterable[str] = (), skies: Iterable[tuple[str | None, str | None]] = (),
+    ) -> Coverage:  # fmt: skip
+        """Count frames.
+
+        Args:
+            seen: (n, 6) from the hip of the target to the drone (x, y, z, m), the target's heading (degrees), its
+                height (px) and its visible share; NaN where unknown.
+            styles, paces: of each frame. labels: of those that have one. skies: weather and time of day of each, None
+                where unknown.
         """
+        offsets_m, heading_deg, height_px, visibility = seen[:, :3], *seen[:, 3:].T
+        azimuth_deg = azimuths_deg(offsets_m, heading_deg)
+        distance_m = np.linalg.norm(offsets_m, axis=1)
+        values = (offsets_m[:, 2] + hip_height_m, distance_m, azimuth_deg, height_px, visibility)
+        bins = {name: axis.counts(column) for (name, axis), column in zip(AXES.items(), values, strict=True)}
         pairs = list(skies)
         weathers, times = ([pair[k] for pair in pairs if pair[k] is not None] for k in (0, 1))
         both = [PAIR.join((weather, time)) for weather, time in pairs if weather is not None and time is not None]
         named = [dict(sorted(Counter(names).items())) for names in (styles, paces, labels, weathers, times, both)]
-        counted = {name: axis.counts(values[name]) for name, axis in AXES.items()}
-        return cls(frames=sum(named[0].values()), bins=counted, **dict(zip(COUNTED, named, strict=True)))
+        return cls(frames=sum(named[0].values()), bins=bins, **dict(zip(COUNTED, named, strict=True)))
 
     @classmethod
     def total(cls, parts: Iterable[Coverage]) -> Coverage:
@@ -125,28 +130,6 @@ def azimuths_deg(offsets_m: np.ndarray, headings_deg: np.ndarray) -> np.ndarray:
     """
     bearing = np.degrees(np.arctan2(offsets_m[:, 1], offsets_m[:, 0]))
     return (bearing - headings_deg + 180.0) % 360.0 - 180.0
-
-
-def axis_values(
-    offsets_m: np.ndarray,
-    headings_deg: np.ndarray,
-    target_heights_px: np.ndarray,
-    visibility: np.ndarray,
-    hip_height_m: float,
-) -> dict[str, np.ndarray]:
-    """Return the value of each axis at each frame, NaN where unknown.
-
-    Args:
-        offsets_m: (n, 3) from the hip of the target to the drone. headings_deg: (n,), of the target.
-        target_heights_px, visibility: (n,).
-    """
-    return {
-        "height_m": offsets_m[:, 2] + hip_height_m,
-        "distance_m": np.linalg.norm(offsets_m, axis=1),
-        "azimuth_deg": azimuths_deg(offsets_m, headings_deg),
-        "target_height_px": target_heights_px,
-        "visibility": visibility,
-    }
 
 
 @cache

@@ -22,7 +22,7 @@ from cosfly.formats.traces import DroneTrace
 from cosfly.formats.tracks import read_twin
 from cosfly.formats.weather import preset_token
 from cosfly.geometry.axes import project, step_s, world_from_camera, wrap_deg
-from cosfly.geometry.coverage import Coverage, axis_values
+from cosfly.geometry.coverage import Coverage
 from cosfly.geometry.trajectory_metrics import (
     CLEARANCE_CAP_M,
     CLEARANCE_TOLERANCE_M,
@@ -118,11 +118,11 @@ def inspect_track(
 def coverage_of(track: Track) -> Coverage:
     """Count the frames of a track."""
     box = track.target.bbox if track.target.mask_bbox is None else track.target.mask_bbox
-    offsets_m = track.positions_m - track.targets_m
-    heights_px, heading_deg = box[:, 3] - box[:, 1], track.target_headings_deg
-    values = axis_values(offsets_m, heading_deg, heights_px, track.target.visibility, TARGET_HEIGHT_M)
+    heights_px, headings_deg = box[:, 3] - box[:, 1], track.target_headings_deg
+    seen = [track.positions_m - track.targets_m, headings_deg, heights_px, track.target.visibility]
     weather, time = (name and preset_token(name) for name in track.weather.values())
-    return Coverage.of(values, track.styles, [track.pace] * len(track), skies=[(weather, time)] * len(track))
+    paces, skies = [track.pace] * len(track), [(weather, time)] * len(track)
+    return Coverage.of(np.column_stack(seen), TARGET_HEIGHT_M, track.styles, paces, skies=skies)
 
 
 def trace_id(track: Track) -> str:

@@ -19,7 +19,7 @@ import pyarrow.compute as pc
 
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.weather import preset_token
-from cosfly.geometry.coverage import AXES, Coverage, axis_values
+from cosfly.geometry.coverage import Coverage
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.tables import arrow_errors, num_rows, open_table, row_groups
 from release.columns import CAPTION_FIELDS, COUNTED, LANGUAGES, PICTURES, PLACE, POINT, REQUIRED, schema
@@ -207,12 +207,10 @@ class RowCounts:
                 names += [row[column]] if row[column] is not None else []
         if rows:
             values = np.array(seen, dtype=np.float64)
-            heading_deg, height_px, visibility = values[:, 3:].T
-            axes = axis_values(values[:, :3], heading_deg, height_px, visibility, TARGET_HEIGHT_M)
             weathers, times = ([r[k] and preset_token(r[k]) for r in rows] for k in ("weather", "time_of_day"))
-            part = Coverage.of(
-                axes, named["style"], named["pace"], named["label"], skies=zip(weathers, times, strict=True)
-            )
+            styles, paces, labels = (named[column] for column in ("style", "pace", "label"))
+            skies = zip(weathers, times, strict=True)
+            part = Coverage.of(values, TARGET_HEIGHT_M, styles, paces, labels, skies)
             self.coverage = Coverage.total([self.coverage, part]) if self.rows else part
         self.rows += len(rows)
 
@@ -282,7 +280,7 @@ class RowCounts:
             frames_target_in_view=totals["target_in_view"],
             frames_target_visible=totals["target_visible"],
             frames_target_legible=totals["target_legible"] if totals["legible_told"] == self.rows else None,
-            coverage=self.coverage if self.rows else Coverage.of({name: np.empty(0) for name in AXES}, (), ()),
+            coverage=self.coverage if self.rows else Coverage.of(np.empty((0, 6)), TARGET_HEIGHT_M, (), ()),
             captions=self._captions(),
             files=FileNumbers(
                 shards=len(shards),
