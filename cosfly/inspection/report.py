@@ -1,39 +1,161 @@
-"""`report.html` of the inspection: one self-contained page, without scripts, for the reviewer."""
+"""`report.html` of the inspection, one self-contained page without scripts for the reviewer: of each track pictures,
+curves over time, and its path on the map."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, Field, FiniteFloat
 
+from cosfly.formats.boxes import BoxMap
 from cosfly.formats.inspection import RESULTS, Inspection, TrackInspection
-from cosfly.formats.playback import STATES
-from cosfly.inspection.view import PLOTS, TrackView, frames_of_issues
+from cosfly.formats.issues import Issue, sort_key
+from cosfly.formats.playback import STATES, Track, read_track
+from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import read_text
 from cosfly.viz.coverage_page import coverage_html
+from cosfly.viz.frame_views import small_jpeg, thumbnail
 from cosfly.viz.page import fragment, page
+from cosfly.viz.topview import INK, PAPER, TopView, draw_dot, draw_line, draw_map, draw_text
 
 STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
 MB = 1_000_000
 
 # column title, metric, format
 COLUMNS = (
-    ("frames", "num_frames", "{:.0f}"),
-    ("m", "length_m", "{:.1f}"),
-    ("a m/s²", "accel_rms_mps2", "{:.2f}"),
-    ("j m/s³", "jerk_rms_mps3", "{:.2f}"),
-    ("S", "smoothness", "{:.3f}"),
-    ("clear m", "clearance_min_m", "{:.2f}"),
-    ("five-ray", "five_ray_mean", "{:.3f}"),
-    ("rendered", "rendered_visibility_mean", "{:.3f}"),
-    ("visible", "visible_share", "{:.0%}"),
-    ("legible", "legible_share", "{:.0%}"),
-    ("IoU", "track_quality", "{:.2f}"),
-)
+    ("frames", "num_frames", "{:.0f}"), ("m", "length_m", "{:.1f}"), ("a m/s²", "accel_rms_mps2", "{:.2f}"),
+    ("j m/s³", "jerk_rms_mps3", "{:.2f}"), ("S", "smoothness", "{:.3f}"), ("clear m", "clearance_min_m", "{:.2f}"),
+    ("five-ray", "five_ray_mean", "{:.3f}"), ("rendered", "rendered_visibility_mean", "{:.3f}"),
+    ("visible", "visible_share", "{:.0%}"), ("legible", "legible_share", "{:.0%}"), ("IoU", "track_quality", "{:.2f}"),
+)  # fmt: skip
 PLOT_WIDTH, PLOT_HEIGHT = 250.0, 62.0
 OPENING_PICTURES = 4
+CURVE_POINTS = 160
+# Curve -> title, unit, least range of the axis.
+PLOTS: dict[str, tuple[str, str, tuple[float | None, float | None]]] = {
+    "altitude_m": ("height over the target", "m", (0.0, None)),
+    "distance_m": ("distance to the target", "m", (0.0, None)),
+    "visibility": ("visibility in the frame", "", (0.0, 1.0)),
+    "clearance_m": (f"clearance, up to {CLEARANCE_CAP_M:g} m", "m", (0.0, None)),
+    "speed_mps": ("speed", "m/s", (0.0, None)),
+}
+OF_FRAME = re.compile(r"(?:frame_|points\[|frame )(\d+)")  # in `where` of a finding
+BETWEEN_FRAMES = ("temporal_jump", "frozen_frame", "teleport")
+PLAN_PX, MARGIN_M = 300, 12.0
+DRONE, TARGET, OTHER_TRACK = (35, 100, 220), (235, 120, 20), (150, 80, 190)  # RGB
+JPEG = Annotated[str, Field(pattern=r"^[A-Za-z0-9+/=]*$")]
+
+
+# --- tracks -----------------------------------------------------------------------------------------------------------
+
+
+class TrackView(BaseModel):
+    """Curves by their names in PLOTS, with gaps; three frames and the map as JPEGs in base64, None if missing.
+    frames: the indices of the three: those of findings, then the first, the middle and the last."""
+
+    time_s: list[FiniteFloat] = []
+    curves: dict[str, list[FiniteFloat | None]] = {}
+    pictures: list[JPEG | None] = Field([None, None, None], min_length=3, max_length=3)
+    plan: JPEG | None = None
+    frames: list[int] = []
+
+
+def draw_track(
+    track: Track, heights_m: np.ndarray, clearance_m: np.ndarray | None, box_map: BoxMap | None,
+    width_px: int, issues: Sequence[Issue] = (),
+) -> TrackView:  # fmt: skip
+    """Return the view of a track.
+
+    Args:
+        heights_m: (n,) of the drone over the target. clearance_m: (n,) to obstacles; None without a map.
+        width_px: of the pictures. issues: findings whose frames are shown.
+    """
+    rows = np.unique(np.linspace(0, len(track) - 1, CURVE_POINTS).round().astype(int))
+    speeds_mps = np.full(len(track), np.nan)
+    speeds_mps[1:] = np.linalg.norm(np.diff(track.positions_m, axis=0), axis=1) / np.diff(track.time_s)
+    curves = {
+        "altitude_m": heights_m,
+        "distance_m": np.linalg.norm(track.positions_m - track.targets_m, axis=1),
+        "visibility": track.target.visibility,
+        "clearance_m": clearance_m,
+        "speed_mps": speeds_mps,
+    }
+    usual = [0, len(track) // 2, len(track) - 1]
+    chosen = sorted((frames_of_issues(issues, len(track)) + usual)[: len(usual)])
+    return TrackView(
+        time_s=[round(float(at_s), 2) for at_s in track.time_s[rows]],
+        curves={name: _numbers(values[rows]) for name, values in curves.items() if values is not None},
+        pictures=[thumbnail(track.frame_folder(i), width_px) for i in chosen],
+        plan=draw_plan(track, box_map, _other_tracks(track)),
+        frames=chosen,
+    )
+
+
+def _other_tracks(track: Track) -> list[Track]:
+    """Read the other tracks of a trajectory, skipping unreadable ones."""
+    assert track.folder is not None
+    found = list[Track]()
+    for folder in sorted(path.parent for path in track.folder.parent.glob("[!.]*/trajectory.json")):
+        with contextlib.suppress(InputError):
+            found += [read_track(folder, strict=False)] if folder != track.folder else []
+    return found
+
+
+def frames_of_issues(issues: Sequence[Issue], num_frames: int) -> list[int]:
+    """Return the frames of findings, the worst first; of a jump also the previous frame."""
+    found: dict[int, None] = {}
+    for issue in sorted(issues, key=sort_key):
+        named = OF_FRAME.search(issue.where) if issue.severity != "note" else None
+        if named is not None and (i := int(named[1])) < num_frames:
+            found.update(dict.fromkeys([max(i - 1, 0), i] if issue.code in BETWEEN_FRAMES else [i]))
+    return list(found)
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    return [round(float(value), 3) if np.isfinite(value) else None for value in values]
+
+
+def draw_plan(track: Track, box_map: BoxMap | None, others: Sequence[Track] = ()) -> str:
+    """Draw the paths of drone and target on the map from above; return a JPEG in base64. others: the other tracks
+    of the trajectory."""
+    person_m = track.targets_m[~np.isnan(track.targets_m).any(axis=1)]
+    others_m = [other.positions_m for other in others]
+    view = TopView.around(np.concatenate([track.positions_m, person_m, *others_m]), PLAN_PX, MARGIN_M)
+    picture = np.full((*view.size_px[::-1], 3), PAPER, dtype=np.uint8)
+    if box_map is not None:
+        width_m, height_m = np.array(view.size_px) / view.pixels_per_m
+        low, high = np.array([view.west_m, view.north_m - height_m]), np.array([view.west_m + width_m, view.north_m])
+        is_near = ((box_map.maxs[:, :2] >= low) & (box_map.mins[:, :2] <= high)).all(axis=1)
+        picture = draw_map(box_map.select(np.flatnonzero(is_near)), view)
+    for points_m, color in ((person_m, TARGET), (track.positions_m, DRONE)):
+        if len(points_m):
+            places = view.pixels(points_m)
+            draw_line(picture, places, color, 2, halo=4)
+            draw_dot(picture, places[0], 5, color)
+            draw_dot(picture, places[-1], 5, color, 2)
+    for points_m in others_m:
+        draw_line(picture, view.pixels(points_m), OTHER_TRACK)
+    _draw_scale(picture, view)
+    return small_jpeg(picture, picture.shape[1])
+
+
+def _draw_scale(picture: np.ndarray, view: TopView) -> None:
+    """Draw a scale bar of a round number of metres, at most a third of the width."""
+    third_m = picture.shape[1] / 3.0 / view.pixels_per_m
+    power = 10.0 ** np.floor(np.log10(third_m))
+    metres = power * max(k for k in (1.0, 2.0, 5.0) if k * power <= third_m)
+    y = picture.shape[0] - 8.0
+    draw_line(picture, np.array([[8.0, y], [8.0 + metres * view.pixels_per_m, y]]), INK, 2, halo=5)
+    draw_text(picture, f"{metres:g} m", 8.0, y - 6.0, 0.4, halo=(255.0, 255.0, 255.0))
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
 
 
 def report_html(name: str, inspection: Inspection, views: Mapping[str, TrackView], page_mb: float) -> str:

@@ -26,10 +26,9 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.coverage import Coverage
-from cosfly.inspection.report import report_html
+from cosfly.inspection.report import TrackView, report_html
 from cosfly.inspection.settings import PAGE_MB, InspectConfig
 from cosfly.inspection.track import InspectedTrack, inspect_track, trace_id
-from cosfly.inspection.view import TrackView
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.pool import ItemOutcomes, Watch, run_items

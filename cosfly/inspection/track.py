@@ -40,8 +40,8 @@ from cosfly.inspection.frames import (
     listed_digests,
     target_box,
 )
+from cosfly.inspection.report import TrackView, draw_track
 from cosfly.inspection.settings import InspectConfig
-from cosfly.inspection.view import TrackView, draw_track
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.run_dir import digest_of, folder_digests
 from cosfly.runtime.worker import advance
