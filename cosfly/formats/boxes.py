@@ -308,8 +308,7 @@ def read_boxes(path: Path) -> BoxMap:
 
 def _check_computed(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, path: Path) -> None:
     """Compare derived fields of a file with its boxes; other axes or units would not agree."""
-    derived = (("axes", AXES), ("num_boxes", len(box_map)), ("counts", box_map.counts()))
-    for name, follows in derived:
+    for name, follows in (("axes", AXES), ("num_boxes", len(box_map)), ("counts", box_map.counts())):
         if header.get(name, follows) != follows:
             got, expected = str(header[name])[:200], str(follows)[:200]
             raise InputError("not what its boxes are", where=f"{path}: {name}", got=got, expected=expected)
@@ -318,9 +317,9 @@ def _check_computed(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, 
             where, expected = f"{path}: box {box.id}: semantic_id", f"{KINDS[box.type]}, {box.type}"
             raise InputError("not the number of its type", where=where, got=box.semantic_id, expected=expected)
     for name, corners in (("min", box_map.mins), ("max", box_map.maxs)):
-        for row, box in enumerate(boxes):
-            corner = getattr(box, name)
-            if corner is not None and not np.allclose(corner, corners[row], atol=CORNER_M, rtol=1e-6):
-                what, where = "does not follow from center, extent and rotation", f"{path}: box {box.id}: {name}"
-                fix = "extent is half the size, in metres; rotation is pitch, yaw, roll in degrees"
-                raise InputError(what, where=where, got=str(corner), expected=str(rounded(corners[row])), fix=fix)
+        given = np.array([getattr(box, name) or [np.nan] * 3 for box in boxes])  # NaN is not off
+        for row in np.flatnonzero((np.abs(given - corners) > CORNER_M + 1e-6 * np.abs(corners)).any(axis=1)):
+            what, where = "does not follow from center, extent and rotation", f"{path}: box {boxes[row].id}: {name}"
+            fix = "extent is half the size, in metres; rotation is pitch, yaw, roll in degrees"
+            got, expected = str(given[row].tolist()), str(rounded(corners[row]))
+            raise InputError(what, where=where, got=got, expected=expected, fix=fix)
