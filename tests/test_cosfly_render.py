@@ -33,10 +33,9 @@ from cosfly.render.contract import (
     instance_ids,
     other_id,
 )
-from cosfly.render.figure import figure_of
 from cosfly.render.gl import meshes as unit_meshes
 from cosfly.render.gl.movers import figure_parts
-from cosfly.render.person import choose_clothes, draw_appearance, dress_bystanders
+from cosfly.render.person import choose_clothes, draw_appearance, dress_bystanders, figure_of
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import make_track_script, open_renderer, run

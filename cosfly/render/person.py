@@ -1,15 +1,17 @@
-"""People and cars of a trajectory as renderers draw them: gait along the path, clothes, poses of bystanders."""
+"""People and cars of a trajectory as renderers draw them: clothes, gait along the path, bystanders, and the figure of a
+walking person as solids for any renderer."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from cosfly.formats.bystanders import Bystander
 from cosfly.formats.frames import BystanderMeta, BystandersMeta, tree_yaw
+from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.people import COLORS, EMPTY_SHARE, FIGURES, GARMENTS, HAIR, Appearance, People
-from cosfly.geometry.axes import headings_of
+from cosfly.geometry.axes import headings_of, rotation_matrices, rotation_matrix
 from cosfly.geometry.kernels import distances_to_boxes_m
 from cosfly.render.contract import Clothes, Frame, PosedBystander, PosedCar, PosedPerson, other_id
 
@@ -160,3 +162,160 @@ def dress_bystanders(
             looks = look_alike(target, rng) if other.is_look_alike else draw_appearance(rng)
         clothes.append(choose_clothes(rng, looks))
     return DressedBystanders(others, gaits, clothes, rng.random(len(others)))
+
+
+# --- figures ----------------------------------------------------------------------------------------------------------
+
+# A figure of 1.8 m stays within the circle around the target's box (PERSON_HALF_EXTENTS_M), to 3 mm.
+HIP_SWING_RAD, ARM_SWING_RAD, KNEE_BEND_RAD = 0.25, 0.38, 0.65
+HIP_M, KNEE_M, ANKLE_M, SHOULDER_M = 0.93, 0.50, 0.085, 1.45
+SIZES, BREADTHS = {"woman": 0.96, "man": 1.0}, {"woman": 0.84, "man": 1.05}
+# Garments that hang open below the waist: low end, high end, radii ahead and aside, m.
+HEMS = {"jacket": (0.82, 1.12, 0.15, 0.19), "coat": (0.46, 1.14, 0.22, 0.235), "skirt": (0.47, 1.04, 0.24, 0.26)}
+
+
+@dataclass(frozen=True)
+class PersonFigure:
+    """A posed figure, k solids and b bones, m, world.
+
+    shapes: k of ball, rounded (a box), limb (thicker at its upper end), disc, each within half_m (k, 3) of centers_m
+    (k, 3), turned by turns (k, 3, 3); colors: (k, 3) linear RGB; bones_m: (b, 2, 3), the ends of the capsules that cast
+    the shadow; bone_radii_m: (b,).
+    """
+
+    shapes: tuple[str, ...]
+    centers_m: np.ndarray
+    turns: np.ndarray
+    half_m: np.ndarray
+    colors: np.ndarray
+    bones_m: np.ndarray
+    bone_radii_m: np.ndarray
+
+
+@dataclass
+class _Body:
+    """The pieces of a figure in the person's own axes: x forward, y left, z up, feet at 0."""
+
+    solids: list[tuple] = field(default_factory=list)  # (shape, center, half, color, pitch, roll)
+    limbs: list[tuple] = field(default_factory=list)  # (low, high, radius, color)
+    bones: list[tuple] = field(default_factory=list)  # (low, high, radius)
+
+    def solid(
+        self, shape: str, center: list[float], half: list[float], color: np.ndarray, pitch_rad: float = 0.0,
+        roll_rad: float = 0.0,
+    ) -> None:  # fmt: skip
+        self.solids.append((shape, center, half, color, -pitch_rad, roll_rad))
+
+    def limb(self, low: np.ndarray, high: np.ndarray, radius: float, color: np.ndarray) -> None:
+        """Add a limb between two points, thicker at `high`."""
+        self.limbs.append((low, high, radius, color))
+
+    def placed(self, feet_m: np.ndarray, heading_rad: float, size: float) -> PersonFigure:
+        """Return the figure at a place; all pieces at once, four times as fast as one by one."""
+        shapes, centers, half, colors, pitch, roll = zip(*self.solids, strict=True)
+        turns = rotation_matrices(np.column_stack([pitch, np.zeros(len(pitch)), roll]))
+        low, high, radius, limb_colors = (np.array(column) for column in zip(*self.limbs, strict=True))
+        length = np.linalg.norm(high - low, axis=1)
+        z = (high - low) / length[:, None]
+        x = np.stack([z[:, 2], 0.0 * length, -z[:, 0]], axis=1) / np.hypot(z[:, 0], z[:, 2])[:, None]
+        limb_turns = np.stack([x, np.cross(z, x), z], axis=2)
+        limb_half = np.stack([radius, radius, length / 2.0 + 0.6 * radius], axis=1)
+        from_, to, bone_radii = (np.array(column) for column in zip(*self.bones, strict=True))
+        turn = rotation_matrix(0.0, heading_rad, 0.0)
+        return PersonFigure(
+            (*shapes, *["limb"] * len(length)),
+            feet_m + size * np.concatenate([centers, (low + high) / 2.0]) @ turn.T,
+            turn @ np.concatenate([turns, limb_turns]),
+            size * np.concatenate([half, limb_half]),
+            np.concatenate([colors, limb_colors]),
+            feet_m + size * np.stack([from_, to], axis=1) @ turn.T,
+            size * bone_radii,
+        )
+
+
+def figure_of(person: PosedPerson) -> PersonFigure:
+    """Build the figure of a posed person."""
+    figure, swing, clothes = _Body(), person.swing, person.clothes
+    size, breadth = SIZES[clothes.looks.figure], BREADTHS[clothes.looks.figure]
+    sides = ((1.0, person.phase_rad), (-1.0, person.phase_rad + np.pi))
+    feet = [_leg(figure, side, phase, swing, clothes) for side, phase in sides]
+    lift = size * (min(foot[2] for foot in feet) - ANKLE_M)  # the lower foot is on the ground
+    for side, phase in sides:
+        _arm(figure, breadth * side, phase, swing, clothes)
+    _trunk(figure, breadth, swing, clothes)
+    _head(figure, clothes)
+    if clothes.looks.bag == "backpack":  # with two straps
+        figure.solid("rounded", [-0.205, 0.0, 1.24], [0.10, 0.155, 0.22], clothes.color("bag"))
+        for side in (-1.0, 1.0):
+            figure.solid("rounded", [0.0, 0.11 * breadth * side, 1.33], [0.145, 0.025, 0.17], clothes.color("bag"))
+    elif clothes.looks.bag:  # at the right hip, with a strap across
+        figure.solid("rounded", [0.0, -0.285, 0.88], [0.15, 0.075, 0.12], clothes.color("bag"))
+        figure.solid("rounded", [0.0, -0.05, 1.21], [0.15, 0.025, 0.33], clothes.color("bag"), roll_rad=-0.58)
+    return figure.placed(person.hip_m - [0.0, 0.0, TARGET_HEIGHT_M + lift], person.heading_rad, size)
+
+
+def _swung(angle_rad: float, length: float) -> np.ndarray:
+    """Return a vector hanging down, turned forward by an angle."""
+    return length * np.array([np.sin(angle_rad), 0.0, -np.cos(angle_rad)])
+
+
+def _leg(figure: _Body, side: float, phase: float, swing: float, clothes: Clothes) -> np.ndarray:
+    """Add thigh, shin and shoe; return the ankle."""
+    hip = np.array([0.0, 0.09 * side, HIP_M])
+    angle = HIP_SWING_RAD * swing * np.sin(phase)
+    bend = swing * (0.12 + KNEE_BEND_RAD * max(0.0, np.cos(phase)) ** 1.5)  # the leg that swings forward is bent
+    knee = hip + _swung(angle, HIP_M - KNEE_M)
+    ankle = knee + _swung(angle - bend, KNEE_M - ANKLE_M)
+    legs, cloth = clothes.looks.legs, clothes.color("legs")
+    figure.limb(knee, hip, 0.088, clothes.skin if legs == "skirt" else cloth)
+    figure.limb(ankle - [0, 0, 0.02], knee, 0.066, cloth if legs == "trousers" else clothes.skin)
+    toe = 0.5 * (angle - bend)
+    center = ankle + np.array([0.048 * np.cos(toe), 0.0, -0.043 + 0.048 * np.sin(toe)])
+    figure.solid("rounded", center.tolist(), [0.115, 0.048, 0.042], clothes.shoes, pitch_rad=-toe)
+    is_wide = clothes.looks.top == "coat" or legs == "skirt"
+    figure.bones.append((ankle - [0, 0, 0.05], hip, 0.12 if is_wide else 0.085))
+    return ankle
+
+
+def _arm(figure: _Body, side: float, phase: float, swing: float, clothes: Clothes) -> None:
+    shoulder = np.array([0.0, 0.205 * side, SHOULDER_M - 0.03])
+    angle = -ARM_SWING_RAD * swing * np.sin(phase)
+    elbow = shoulder + _swung(angle, 0.29) + [0.0, 0.025 * side, 0.0]
+    wrist = elbow + _swung(angle + 0.18 + 0.3 * swing, 0.25)
+    is_bare = clothes.looks.top == "t_shirt"
+    figure.limb(elbow, shoulder, 0.058, clothes.color("top"))
+    figure.limb(wrist, elbow, 0.041 if is_bare else 0.055, clothes.skin if is_bare else clothes.color("top"))
+    figure.solid("ball", (wrist + np.array([0.01, 0, -0.05])).tolist(), [0.04, 0.03, 0.065], clothes.skin)
+    figure.bones.append((wrist, shoulder, 0.05))
+
+
+def _trunk(figure: _Body, breadth: float, swing: float, clothes: Clothes) -> None:
+    lean, top = 0.03 * swing, clothes.color("top")
+    covered = top if clothes.looks.top in HEMS else clothes.color("legs")
+    figure.solid("rounded", [0.0, 0.0, 0.95], [0.115, 0.165, 0.12], covered)
+    figure.solid("limb", [0.01, 0.0, 1.22], [0.125, 0.195 * breadth, 0.29], top, pitch_rad=lean)
+    figure.solid("ball", [0.015, 0.0, 1.42], [0.10, 0.205 * breadth, 0.085], top, pitch_rad=lean)
+    for slot in ("top", "legs"):
+        if (garment := getattr(clothes.looks, slot)) in HEMS:
+            low, high, ahead, aside = HEMS[garment]
+            middle, half = [0.0, 0.0, (low + high) / 2.0], [ahead, aside, (high - low) / 2.0]
+            figure.solid("limb", middle, half, clothes.color(slot), pitch_rad=np.pi)
+    figure.bones.append((np.array([0.0, 0.0, 0.95]), np.array([0.01, 0.0, 1.36]), 0.17))
+
+
+def _head(figure: _Body, clothes: Clothes) -> None:
+    hat, skin, hair = clothes.looks.hat, clothes.skin, clothes.hair
+    figure.limb(np.array([0.01, 0.0, 1.46]), np.array([0.025, 0.0, 1.60]), 0.055, skin)
+    figure.solid("ball", [0.035, 0.0, 1.665], [0.10, 0.078, 0.125], skin)
+    figure.solid("ball", [0.008, 0.0, 1.68 if hat else 1.70], [0.105, 0.088, 0.10], hair)
+    figure.solid("ball", [0.132, 0.0, 1.65], [0.02, 0.016, 0.025], skin)
+    if clothes.looks.figure == "woman":
+        figure.solid("ball", [-0.055, 0.0, 1.55], [0.075, 0.105, 0.20], hair)
+    if hat:
+        color = clothes.color("hat")
+        figure.solid("ball", [0.01, 0.0, 1.70], [0.118, 0.102, 0.10], color)
+        if hat == "cap":
+            figure.solid("rounded", [0.14, 0.0, 1.70], [0.085, 0.075, 0.012], color, pitch_rad=0.15)
+        else:
+            figure.solid("disc", [0.01, 0.0, 1.69], [0.235, 0.225, 0.012], color)
+    figure.bones.append((np.array([0.02, 0.0, 1.60]), np.array([0.02, 0.0, 1.70]), 0.14 if hat == "brim" else 0.095))

@@ -18,7 +18,7 @@ from cosfly.formats.weather import WeatherParams
 from cosfly.geometry.axes import rotation_matrices, rotation_matrix
 from cosfly.render import contract
 from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, Others, PosedBystander, PosedPerson
-from cosfly.render.figure import figure_of
+from cosfly.render.person import figure_of
 from cosfly.render.surfaces import are_solids, drape, is_draped, layers_of, solids_of
 from cosfly.runtime.errors import EnvironmentMissing, RenderError
 

@@ -14,12 +14,12 @@ from cosfly.formats.frames import SKY_DEPTH_M, Look
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import WeatherParams
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Frame, Others, PosedPerson, check_pose, far_as_sky
-from cosfly.render.figure import figure_of
 from cosfly.render.gl import meshes, movers, programs
 from cosfly.render.gl.parts import DRAW_ORDER, NUM_MATERIALS, PART, CameraView, materials_of
 from cosfly.render.gl.programs import LooseTriangles, Programs, set_uniform
 from cosfly.render.gl.scene import build_scene
 from cosfly.render.gl.weather_pass import WeatherPass, defines
+from cosfly.render.person import figure_of
 from cosfly.runtime.worker import return_freed_memory
 
 SHADOW_SIZE_PX, HEIGHT_SIZE_PX = 2560, 768
@@ -53,16 +53,31 @@ class GlRenderer:
         self._is_software = SOFTWARE in self.device
         self.scene, self.look, self.num_others = build_scene(box_map, num_others, rim), look, num_others
         self.width_px, self.height_px = width_px, height_px
-        with self.context:
+        context, size = self.context, (width_px, height_px)
+        with context:
+            self._color = context.texture(size, 4)
+            self._depth = context.texture(size, 1, dtype="f4")
+            self._tags = context.texture(size, 1, dtype="u4")
+            self._image = context.framebuffer([self._color, self._depth, self._tags], context.depth_renderbuffer(size))
+            self._shadow = context.depth_texture((SHADOW_SIZE_PX, SHADOW_SIZE_PX))
+            self._shadow.compare_func = "<="
+            self._shadow_target = context.framebuffer(depth_attachment=self._shadow)
+            self._height = context.texture((HEIGHT_SIZE_PX, HEIGHT_SIZE_PX), 1, dtype="f4")
+            self._height.filter = (context.NEAREST, context.NEAREST)  # it is smooth already, and this is faster
+            for texture in (self._shadow, self._height):
+                texture.repeat_x = texture.repeat_y = False
+            all_meshes = meshes.all_meshes()
+            self._meshes = [
+                (context.buffer(one.vertices.tobytes()), context.buffer(one.triangles.tobytes())) for one in all_meshes
+            ]
+            self._num_triangles, self._num_waiting = [len(mesh.triangles) for mesh in all_meshes], 0
+            self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}  # made when needed
+            self._loose = LooseTriangles(context, self.scene.loose)
             texts = programs.sources(("part.glsl", "depth.vert.glsl"), ("depth.frag.glsl",))
-            self._depth_program = self.context.program(*texts)
-            self._make_targets()
-            self._make_meshes()
+            self._depth_program = context.program(*texts)
             self._looks: dict[str | None, tuple[Programs, Any, WeatherPass | None]] = {}
             self._use_weather(None)
         self.prepare(*self.scene.bounds())
-
-    # --- set-up ---
 
     def _use_weather(self, define: str | None) -> None:
         """Switch to the programs of fair weather (None), or of a weather with these defines."""
@@ -72,32 +87,6 @@ class GlRenderer:
                 weather = WeatherPass(self.context, self._color, self._depth, made.rain, self.num_others)
             self._looks[define] = made, self.context.vertex_array(made.sky, []), weather
         self._programs, self._sky, self._weather = self._looks[define]
-
-    def _make_targets(self) -> None:
-        size, context = (self.width_px, self.height_px), self.context
-        self._color = context.texture(size, 4)
-        self._depth = context.texture(size, 1, dtype="f4")
-        self._tags = context.texture(size, 1, dtype="u4")
-        self._image = context.framebuffer([self._color, self._depth, self._tags], context.depth_renderbuffer(size))
-        self._shadow = context.depth_texture((SHADOW_SIZE_PX, SHADOW_SIZE_PX))
-        self._shadow.compare_func = "<="
-        self._shadow_target = context.framebuffer(depth_attachment=self._shadow)
-        self._height = context.texture((HEIGHT_SIZE_PX, HEIGHT_SIZE_PX), 1, dtype="f4")
-        self._height.filter = (context.NEAREST, context.NEAREST)  # it is smooth already, and this is faster
-        for texture in (self._shadow, self._height):
-            texture.repeat_x = texture.repeat_y = False
-
-    def _make_meshes(self) -> None:
-        """Upload vertices and triangles of every mesh; vertex arrays are made when needed."""
-        all_meshes = meshes.all_meshes()
-        self._meshes = [
-            tuple(self.context.buffer(part.tobytes()) for part in (mesh.vertices, mesh.triangles))
-            for mesh in all_meshes
-        ]
-        self._num_triangles = [len(mesh.triangles) for mesh in all_meshes]
-        self._num_waiting = 0
-        self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}
-        self._loose = LooseTriangles(self.context, self.scene.loose)
 
     def _array(self, program: Any, mesh: int) -> tuple[Any, Any]:
         """Return vertex array and instance buffer of a program for a mesh."""

@@ -112,8 +112,7 @@ def blob(num_subdivisions: int) -> UnitMesh:
         middles = unit[edges].sum(axis=1)
         unit = np.concatenate([unit, middles / np.linalg.norm(middles, axis=1, keepdims=True)])
         triangles = np.stack([a, ab, ca, b, bc, ab, c, ca, bc, ab, bc, ca], axis=1).reshape(-1, 3)
-    dents = np.abs(
-        np.sin(unit @ [4.1, 2.3, 1.7]) * np.sin(unit @ [-1.9, 4.7, 2.9]) + 0.6 * np.sin(unit @ [7.3, -6.1, 8.2])
-    )
+    waves = [np.sin(unit @ way) for way in ([4.1, 2.3, 1.7], [-1.9, 4.7, 2.9], [7.3, -6.1, 8.2])]
+    dents = np.abs(waves[0] * waves[1] + 0.6 * waves[2])
     radius = 1.0 - 0.24 * dents / dents.max()
     return UnitMesh(np.hstack([unit * radius[:, None], unit]).astype(np.float32), np.array(triangles, np.int32))

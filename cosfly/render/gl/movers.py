@@ -11,10 +11,10 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.geometry.axes import box_corners, rotation_matrix
 from cosfly.render.contract import LAYER_STEP, STANDING_LAYER, Others, PosedCar, PosedPerson
-from cosfly.render.figure import PersonFigure, figure_of
 from cosfly.render.gl import meshes
 from cosfly.render.gl.parts import CLOTH, PART, Boxes, CameraView, Parts, tags
 from cosfly.render.gl.shapes import parts_of
+from cosfly.render.person import PersonFigure, figure_of
 
 SHAPES = {"ball": meshes.SPHERE, "rounded": meshes.ROUNDED, "limb": meshes.LIMB, "disc": meshes.CYLINDER}
 MOST_CAPSULES = 32  # as many as the shader has room for: the nearest to the camera
@@ -129,13 +129,10 @@ def shades_of(
         while touching := [shade for shade in shades if _overlap(shade.rectangle_px, new.rectangle_px)]:
             shades = [shade for shade in shades if not _overlap(shade.rectangle_px, new.rectangle_px)]
             for shade in touching:
-                (ax0, ay0, ax1, ay1), (bx0, by0, bx1, by1) = shade.rectangle_px, new.rectangle_px
-                new = Shade(
-                    (min(ax0, bx0), min(ay0, by0), max(ax1, bx1), max(ay1, by1)),
-                    np.concatenate([shade.points, new.points]),
-                    np.concatenate([shade.capsules, new.capsules]),
-                    shade.has_person or new.has_person,
-                )
+                x0, y0, x1, y1 = zip(shade.rectangle_px, new.rectangle_px, strict=True)
+                points, own = (np.concatenate([shade[k], new[k]]) for k in (1, 2))
+                rectangle = min(x0), min(y0), max(x1), max(y1)
+                new = Shade(rectangle, points, own, shade.has_person or new.has_person)
         shades.append(new)
     return shades
 

@@ -189,10 +189,8 @@ def build_scene(town: BoxMap, num_others: int = 0, rim: BoxMap | None = None) ->
             made = [made[0].select(~lies[rows])]
         found += made
     center, half_m = contract.ground_plane(town, rim)
-    ids = np.full(1, NO_INSTANCE, np.uint16)
-    plane = Boxes(
-        (center - origin)[None], half_m[None], np.eye(3)[None], ids, np.zeros(1), KINDS["Terrain"], np.zeros(1)
-    )
+    ids, none = np.full(1, NO_INSTANCE, np.uint16), np.zeros(1)
+    plane = Boxes((center - origin)[None], half_m[None], np.eye(3)[None], ids, none, KINDS["Terrain"], none)
     found.append(plane.part(meshes.BOX, half_m[None], parts.GRASS, (0.105, 0.14, 0.045), layer=0))
     lying[-1] = found[-1].records
     loose = loose_solids(box_map, solids_of(box_map), origin, all_ids)
