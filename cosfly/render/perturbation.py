@@ -33,24 +33,14 @@ STEP_UP_M = 0.5  # a shifted person may be this much higher or lower than before
 class PerturbationConfig(Config):
     """Settings of the perturbed track; defaults from tab:augmentation_params."""
 
-    position_probability: float = Field(
-        0.6, ge=0, le=1, description="probability that a frame's positions are shifted; 0 for never"
-    )
-    rotation_probability: float = Field(
-        0.6, ge=0, le=1, description="probability that a frame's view is turned; 0 for never"
-    )
+    position_probability: float = Field(0.6, ge=0, le=1, description="share of frames whose positions are shifted")
+    rotation_probability: float = Field(0.6, ge=0, le=1, description="share of frames whose view is turned")
     pedestrian_radius_m: float = Field(2.0, ge=0, description="largest shift of the person on the ground (R_h), m")
     drone_radius_m: float = Field(3.0, ge=0, description="largest shift of the drone (R_d), m")
     view_radius_m: float = Field(2.0, ge=0, description="how far from the person the camera may look, m")
-    max_view_deg: float = Field(
-        5.0, ge=0, le=45, description="largest turn of the view, for yaw and for pitch (theta_max), degrees"
-    )
-    max_roll_deg: float = Field(
-        0.0, ge=0, le=45, description="largest roll of a turned view, degrees; the paper's track has none"
-    )
-    sampling: Literal["cubic", "spherical"] = Field(
-        "spherical", description="offsets evenly in a cube or in a ball of the radius"
-    )
+    max_view_deg: float = Field(5.0, ge=0, le=45, description="largest turn in yaw and in pitch (theta_max), degrees")
+    max_roll_deg: float = Field(0.0, ge=0, le=45, description="largest roll of a turned view, degrees; the paper: none")
+    sampling: Literal["cubic", "spherical"] = Field("spherical", description="offsets evenly in a cube or a ball")
     min_clearance_m: float = Field(
         SAFETY_DISTANCE_M,
         ge=0,

@@ -61,9 +61,7 @@ class RenderConfig(WeatherConfig):
         description="png: float32 without loss in depth_float32.png, an eighth of the size; npy: depth.npy, as in the "
         "public layout",
     )
-    path_index: int | None = Field(
-        None, ge=0, description="draw only the trajectory of this index in the traces; null: all"
-    )
+    path_index: int | None = Field(None, ge=0, description="draw only the trajectory of this index; null: all")
     frame_stride: int = Field(
         1,
         ge=1,
@@ -71,9 +69,7 @@ class RenderConfig(WeatherConfig):
         description="draw every n-th pose; those between are in trajectory.json. With pedestrians.dt_s 0.1: 1 gives "
         "frames and actions at 10 Hz, 5 frames at 2 Hz with actions at 10 Hz",
     )
-    debug: bool = Field(
-        False, description="also write debug.png: boxes, ids and distances projected over the colour picture"
-    )
+    debug: bool = Field(False, description="also write debug.png: boxes, ids and distances over the colours")
     rim: bool = Field(
         False,
         description="draw fields, roads, low houses and a skyline beyond the map, instead of a lawn to the horizon; "

@@ -64,8 +64,6 @@ def open_renderer(
     settings: Config | None = None,
 ) -> Renderer:
     """Open a renderer for one map and at most `num_others` bystanders; settings: the renderer's own, if it has any."""
-    if name not in RENDERERS:
-        raise ConfigError("the renderer is unknown", where="render.backend", got=name, expected=", ".join(RENDERERS))
     module, _, attribute = RENDERERS[name].partition(":")
     own = {} if settings is None else {"settings": settings}
     make = getattr(importlib.import_module(module), attribute)
@@ -103,9 +101,8 @@ def make_track_script(
     before_m, step = looks.before_m[:-1], step_s(planned.time_s)
     before_s = trace.time_s[0] - step * np.arange(len(before_m), 0, -1)
     gait = gait_of(np.vstack([before_m, trace.targets_m]), np.concatenate([before_s, trace.time_s]))
-    shared, others_rng, zoom_rng = (
-        rng_for(seed, "render", f"{looks.path_id}{item}") for item in ("", "/others", "/zoom")
-    )
+    items = (f"{looks.path_id}{part}" for part in ("", "/others", "/zoom"))
+    shared, others_rng, zoom_rng = (rng_for(seed, "render", item) for item in items)
     fov_deg = float(cfg.fovs_deg[int(shared.integers(len(cfg.fovs_deg)))])
     clothes = choose_clothes(shared)
     drawn_others = [other.every(cfg.frame_stride) for other in others]
@@ -268,9 +265,7 @@ def _names(
         place = place_of(Path(kept[0][1].folder))
         town, first = place.town, int(place.trajectory.removeprefix(TRAJECTORY)) - kept[0][0]
     if weather_seed < 0:
-        weather_seed = (
-            next((one.weather_seed for _, one in kept if one.weather_seed is not None), None) or random_seed()
-        )
+        weather_seed = next((one.weather_seed for _, one in kept if one.weather_seed), None) or random_seed()
     return town, {"first_timestamp": first, "weather_seed": weather_seed}
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import Field, field_validator, model_validator
 
@@ -38,6 +38,7 @@ RAIN_EXTINCTION = 0.0045  # per m of the heaviest rain: a visibility of some 700
 # Of clothes against the ground in clear air (CIE76), and how it goes with the light that is left: measured.
 STRONGEST_CONTRAST, CONTRAST_POWER = 75.0, 1.75
 LIT_KINDS = {KINDS[name] for name in ("Poles", "Roads", "Sidewalks")}  # where lamps are
+Preset = TypeVar("Preset", WeatherPreset, TimePreset)
 DEFAULT_SEED = 20260423  # of the paper's production runs (app:weather:coverage)
 
 
@@ -58,12 +59,8 @@ class WeatherConfig(Config):
     )
     weather_name: str | None = Field(None, description="preset of the weather in mode fixed", examples=[*WEATHERS])
     tod_name: str | None = Field(None, description="preset of the time of day in mode fixed", examples=[*TIMES])
-    weather_pool: MayDiffer[Path | None] = Field(
-        None, description="YAML file with weather presets, instead of the 15 that ship"
-    )
-    tod_pool: MayDiffer[Path | None] = Field(
-        None, description="YAML file with times of day, instead of the 4 that ship"
-    )
+    weather_pool: MayDiffer[Path | None] = Field(None, description="YAML file of weather presets instead of the 15")
+    tod_pool: MayDiffer[Path | None] = Field(None, description="YAML file of times of day instead of the 4")
     weather_seed: int = Field(
         DEFAULT_SEED,
         description="seed of random_per_path and by_weight; a negative one draws a seed, which is recorded",
@@ -110,16 +107,10 @@ class WeatherConfig(Config):
         return {name: path for name in ("weather_pool", "tod_pool") if (path := getattr(self, name)) is not None}
 
 
-class WeatherPool(Config):
-    """A file of weather presets, each with all four knobs."""
+class PresetPool(Config, Generic[Preset]):
+    """A file of weather presets or times of day, each with all knobs."""
 
-    presets: dict[str, WeatherPreset] = Field(min_length=1)
-
-
-class TimePool(Config):
-    """A file of times of day, each with both knobs."""
-
-    presets: dict[str, TimePreset] = Field(min_length=1)
+    presets: dict[str, Preset] = Field(min_length=1)
 
 
 @dataclass(frozen=True)
@@ -138,8 +129,9 @@ class Pools:
 def read_pools(cfg: WeatherConfig) -> Pools:
     """Read the files of presets that the settings name, or return the paper's presets."""
     pools: list[Any] = [WEATHERS, TIMES]
-    own: Any = ((cfg.weather_pool, WeatherPool, "weather_name"), (cfg.tod_pool, TimePool, "tod_name"))
-    for i, (path, model, field) in enumerate(own):
+    weathers: Any = (cfg.weather_pool, PresetPool[WeatherPreset], "weather_name")
+    times: Any = (cfg.tod_pool, PresetPool[TimePreset], "tod_name")
+    for i, (path, model, field) in enumerate((weathers, times)):
         if path is None:
             continue
         given = build(model, read_yaml(path), path).presets

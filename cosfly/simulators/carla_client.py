@@ -36,11 +36,9 @@ class CarlaConnection:
     version: str
     town: str
 
-    @contextlib.contextmanager
-    def asking(self, what: str) -> Iterator[None]:
+    def asking(self, what: str) -> contextlib.AbstractContextManager[None]:
         """Convert errors of the client to EnvironmentMissing; `what` describes the failure."""
-        with _server_errors(what, self.endpoint, self.version):
-            yield
+        return _server_errors(what, self.endpoint, self.version)
 
 
 def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:

@@ -31,9 +31,7 @@ class UnrealCvConfig(Config):
 
     host: MayDiffer[str] = Field("127.0.0.1", min_length=1, description="address of the server")
     port: MayDiffer[int] = Field(9000, ge=1, le=65535, description="its port; often 9001 where 9000 is taken")
-    level: str | None = Field(
-        None, pattern=r"^[\w/.-]+$", description="level to open; null uses the open one, as a SimWorld city"
-    )
+    level: str | None = Field(None, pattern=r"^[\w/.-]+$", description="level to open; null uses the open one")
     timeout_s: MayDiffer[float] = Field(60.0, gt=0, description="time limit of an answer, s")
     coord_scale: float = Field(100.0, gt=0, description="Unreal's units in 1 m: centimetres")
 
@@ -90,11 +88,9 @@ class UnrealCvConnection:
     def close(self) -> None:
         self._client.disconnect()
 
-    @contextlib.contextmanager
-    def asking(self, what: str) -> Iterator[None]:
+    def asking(self, what: str) -> contextlib.AbstractContextManager[None]:
         """Convert errors of the connection to EnvironmentMissing; `what` describes the failure."""
-        with _server_errors(what, self.where):
-            yield
+        return _server_errors(what, self.where)
 
 
 def spawned_by_cosfly(names: str) -> list[str]:

@@ -81,13 +81,9 @@ SCANNED = [
 class ViewerConfig(Config):
     """How much of a release or run a page holds."""
 
-    flights: int = Field(
-        100, ge=1, description="most tracks on a page; of more, trajectories spread evenly, both tracks of each"
-    )
+    flights: int = Field(100, ge=1, description="most tracks on a page; of more, whole trajectories, evenly spread")
     frames: int = Field(16, ge=1, description="most frames of a track, among them one of each verdict and decision")
-    picture_px: int = Field(
-        320, ge=32, le=1280, description="width of a colour picture, px; depth and mask have half of it"
-    )
+    picture_px: int = Field(320, ge=32, le=1280, description="width of a colour picture, px; half of it for the others")
     max_mb: int = Field(64, ge=1, description="size of the page, MB; frames lose their pictures to stay below it")
 
 
@@ -294,14 +290,12 @@ def _run_rows(
 
 def _maps(trees: list[Tree], tracks: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
     """Return the boxes around the tracks of each town, where the run has a map."""
-    maps: dict[str, list[dict[str, Any]]] = {}
-    for tree in trees:
-        near: dict[str, list] = defaultdict(list)
-        for track in tracks:
-            if tree.boxes is not None and track["map"].startswith(f"{tree.run}/"):
-                near[track["map"]] += [*track["drone_path"], *track["target_path"]]
-        maps |= {name: boxes_of(read_boxes(tree.boxes), places) for name, places in sorted(near.items()) if tree.boxes}
-    return maps
+    near: dict[str, list] = defaultdict(list)
+    for track in tracks:
+        near[track["map"]] += [*track["drone_path"], *track["target_path"]]
+    maps = {tree.run: tree.boxes for tree in trees if tree.boxes is not None}
+    of_runs = {name: maps.get(name.partition("/")[0]) for name in near}
+    return {name: boxes_of(read_boxes(path), near[name]) for name, path in of_runs.items() if path is not None}
 
 
 # --- tracks, frames and captions on the page --------------------------------------------------------------------------
