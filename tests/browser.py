@@ -1,7 +1,5 @@
 """A headless Chromium over a pair of pipes, for pages that run a script: no driver, no port, no package."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import json
@@ -25,7 +23,6 @@ FLAGS = (
 
 
 def chromium() -> str:
-    """Give the browser's path; skips the test where there is none."""
     found = next((path for name in NAMES if (path := shutil.which(name))), None)
     if found is None:
         pytest.skip("no chromium on this machine (apt-get install chromium)")
@@ -43,7 +40,6 @@ class Page:
         self.said: list[str] = []
 
     def send(self, method: str, **params: Any) -> dict:
-        """Send a command of the devtools protocol and wait for its answer."""
         self.number += 1
         message = {"id": self.number, "method": method, "params": params} | (
             {"sessionId": self.session} if self.session else {}
@@ -81,7 +77,6 @@ class Page:
     def open(
         self, path: Path | str, fragment: str = "", *, width: int = 1400, height: int = 1000, dark: bool = False
     ) -> None:
-        """Load a file or an address in a window of some size, anew."""
         self.send(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
         )
@@ -95,7 +90,6 @@ class Page:
         self.wait("document.readyState === 'complete'")
 
     def run(self, script: str) -> Any:
-        """Evaluate an expression in the page."""
         got = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in got, got["exceptionDetails"]
         return got["result"].get("value")
@@ -114,7 +108,6 @@ class Page:
             self.mouse(kind, x, y, clickCount=count)
 
     def drag(self, begin: tuple[float, float], end: tuple[float, float], button: str = "left", steps: int = 5) -> None:
-        """Press at one place, move in steps, and let go at another."""
         self.mouse("mousePressed", *begin, button, clickCount=1)
         for k in range(1, steps + 1):
             at = [a + (b - a) * k / steps for a, b in zip(begin, end, strict=True)]
@@ -122,20 +115,17 @@ class Page:
         self.mouse("mouseReleased", *end, button, clickCount=1)
 
     def wait(self, script: str) -> None:
-        """Wait until an expression is true."""
         end = time.monotonic() + PATIENCE_S
         while not self.run(script):
             assert time.monotonic() < end, f"never true: {script}; {self.said}"
             time.sleep(0.02)
 
     def picture(self) -> bytes:
-        """Give the whole page as PNG."""
         return base64.b64decode(self.send("Page.captureScreenshot", format="png", captureBeyondViewport=True)["data"])
 
 
 @contextlib.contextmanager
 def browser(folder: Path) -> Iterator[Page]:
-    """Start a browser with a profile of its own; ends with the block."""
     (ours_in, theirs_out), (theirs_in, ours_out) = os.pipe(), os.pipe()
 
     def connect() -> None:  # the protocol's pipes are 3 and 4

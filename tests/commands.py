@@ -1,7 +1,5 @@
 """Commands in this process, as a user types them."""
 
-from __future__ import annotations
-
 from click.testing import Result
 from typer.testing import CliRunner
 

@@ -28,7 +28,6 @@ SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 @pytest.fixture
 def shared_data() -> Path:
-    """The folder of real maps beside the repository; the test is skipped where it is absent."""
     if not SHARED_DATA.is_dir():
         pytest.skip(f"the real maps are not here: {SHARED_DATA}")
     return SHARED_DATA

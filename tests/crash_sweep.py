@@ -7,8 +7,6 @@ after a kill, or nothing was killed.
 It is a process of its own: what it kills are forks, and a fork of a process that has run others' threads may hang.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json
@@ -22,7 +20,6 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 from zlib import crc32
 
 from crashes import run, sweep
@@ -30,9 +27,6 @@ from crashes import run, sweep
 from cosfly.cli import app
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import warm_up
-
-if TYPE_CHECKING:
-    from teacher_server import TeacherServer
 
 TINY = (
     "maps.synthetic.size_m=110", "maps.synthetic.num_blocks=1", "pedestrians.num_paths=1",
@@ -51,13 +45,11 @@ class Place:
     _made: dict[str, str] = field(default_factory=dict)
 
     def given(self, name: str) -> str:
-        """Give the folder or address of an input, which is made when it is first asked for."""
         if name not in self._made:
             self._made[name] = str(INPUTS[name](self))
         return self._made[name]
 
     def do(self, name: str, out: Path, more: str = "") -> Path:
-        """Do the first command of a name."""
         first = COMMANDS[name][0]
         assert isinstance(first, str)
         words = words_of(f"{first} {more}", self, out)
@@ -76,7 +68,6 @@ OWN = {"run": r"[^/]*", "run, more": r"[^/]*", "run, towns": r"((one|two)/)?\.?\
 
 
 def load_all() -> None:
-    """Import and compile here what every child would else for itself."""
     for name in ("caption", "cosfly", "release"):
         for module in pkgutil.walk_packages(importlib.import_module(name).__path__, f"{name}."):
             if not module.name.endswith("__main__"):
@@ -90,7 +81,6 @@ def _base(place: Place) -> Path:
 
 
 def _walk(place: Place) -> Path:
-    """The trajectory of the finished run, as its tree calls it."""
     tree = Path(place.given("base")) / "render"
     return next(tree.glob("Town*/trajectory_*")).relative_to(tree)
 
@@ -123,7 +113,7 @@ def _evaluated(place: Place) -> Path:
     return place.do("distill evaluate", place.root / "evaluated")
 
 
-def _chat_server(place: Place) -> TeacherServer:
+def _chat_server(place: Place):
     from teacher_server import TeacherServer
 
     server = place.stack.enter_context(TeacherServer())
@@ -136,7 +126,6 @@ def _teacher(place: Place) -> str:
 
 
 def _judge(place: Place) -> str:
-    """A judge with all three verdicts, always the same one of a case."""
     from caption.teachers.judge import JUDGEMENTS
 
     server = _chat_server(place)
@@ -183,7 +172,6 @@ SHORT = {  # what commands have in common
 
 
 def copy_stage(place: Place, out: Path, stage: str) -> None:
-    """Put a finished stage into `out`."""
     shutil.copytree(f"{place.given('base')}/{stage}", out, dirs_exist_ok=True)
 
 
@@ -271,7 +259,6 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
 
 
 def words_of(text: str, place: Place, out: Path) -> list[str]:
-    """Give the words of a command of COMMANDS; inputs that it names are made."""
     while found := [name for name in SHORT if f"{{{name}}}" in text]:
         for name in found:
             text = text.replace(f"{{{name}}}", SHORT[name])
@@ -282,7 +269,6 @@ def words_of(text: str, place: Place, out: Path) -> list[str]:
 
 
 def works(name: str, place: Place) -> list[Callable[[], None]]:
-    """Give the commands of a name, to be swept in the folder `out` of the place."""
     out = place.root / "out"
     return [
         partial(given, place, out) if callable(given) else partial(command, words_of(given, place, out))

@@ -6,8 +6,6 @@ cut or made safe, and a name made, changed, linked or removed. What a library wr
 tensors) is one step, its name.
 """
 
-from __future__ import annotations
-
 import builtins
 import io
 import json
@@ -146,7 +144,6 @@ class _Watch:
 
 
 def _place() -> str:
-    """Where in our code a step is made: the two innermost lines."""
     found, frame = list[str](), sys._getframe(2)
     while frame is not None and len(found) < 3:  # type: ignore[redundant-expr]
         name = frame.f_code.co_filename
@@ -158,8 +155,6 @@ def _place() -> str:
 
 @dataclass
 class Ended:
-    """How a run ended: its exit code, negative of a signal; what it said; its steps where they were asked for."""
-
     code: int
     said: str
     steps: list[Step]
@@ -212,8 +207,6 @@ class _Forking:
         return multiprocessing.get_context("fork")
 
 
-# --- what stands in a folder ------------------------------------------------------------------------------------------
-
 TIMES = re.compile(
     rb'"(seconds\w*|peak_memory_mb|planning_ms\w*|times_ms|(mean|p50|p95|max)_ms|latency_s|time|at|speed)": ?'
     rb'(\{[^}]*\}|"[^"]*"|[\d.]+)'
@@ -240,7 +233,6 @@ def _plain(path: Path) -> bytes:
 
 
 def differences(found: dict[str, bytes], expected: dict[str, bytes]) -> list[str]:
-    """Say in which files two folders differ."""
     words = [f"too much: {name}" for name in found.keys() - expected.keys()]
     words += [f"missing: {name}" for name in expected.keys() - found.keys()]
     words += [
@@ -252,7 +244,6 @@ def differences(found: dict[str, bytes], expected: dict[str, bytes]) -> list[str
 
 
 def _first_difference(found: bytes, expected: bytes) -> str:
-    """Show two contents from a little before the first byte on that differs."""
     place = max(next((k for k, (a, b) in enumerate(zip(found, expected, strict=False)) if a != b), len(found)) - 40, 0)
     one, two = (text[place : place + 80] for text in (found, expected))
     return f"{len(found)} bytes, not {len(expected)}, from {place} on {one!r}, not {two!r}"
@@ -291,13 +282,8 @@ def _is_taken(path: Path) -> bool:
     return True
 
 
-# --- the sweep --------------------------------------------------------------------------------------------------------
-
-
 @dataclass
 class Swept:
-    """How many steps an undisturbed run takes, how many runs were killed, and what was wrong after them."""
-
     num_steps: int
     num_killed: int
     wrong: list[str]
@@ -351,7 +337,6 @@ def _run_through(work: Callable[[], object], out: Path) -> Ended:
 
 
 def moments(steps: list[Step]) -> list[Moment]:
-    """Give the moment of each step."""
     counts = Counter[tuple[str, str, str]]()
     found = []
     for step in steps:

@@ -4,8 +4,6 @@ pins.
 They see the packages of this environment (torch among them, which is large) behind their own.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import shutil

@@ -4,8 +4,6 @@ The demands were gathered from the design's contract of the layout and from what
 knows nothing of cosfly's reader.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
@@ -27,7 +25,6 @@ def need(condition: Any, where: object, what: str) -> None:
 
 
 def read_public(root: Path) -> dict[str, dict[str, dict]]:
-    """Give `Town01/trajectory_1` -> trace -> what its trajectory.json holds; every parent must be whole."""
     parents = sorted(root.glob("Town*/trajectory_*"))
     need(parents, root, "no Town*/trajectory_*")
     return {parent.relative_to(root).as_posix(): _parent(parent) for parent in parents}

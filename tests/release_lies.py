@@ -1,7 +1,5 @@
 """Lies about a release, each told with hashes, counts and card made right again. A lie changes the rows in place."""
 
-from __future__ import annotations
-
 import copy
 import math
 import struct
@@ -25,15 +23,11 @@ BOX = ("xmin_px", "ymin_px", "xmax_px", "ymax_px")
 SKY_M = 999.0
 
 
-# --- which rows -------------------------------------------------------------------------------------------------------
-
-
 def flight_of(rows: Rows, one: Row) -> Rows:
     return [row for row in rows if (row["trajectory"], row["variant"]) == (one["trajectory"], one["variant"])]
 
 
 def clean(rows: Rows) -> Rows:
-    """The rows of the first clean flight."""
     return flight_of(rows, next(row for row in rows if row["track"] == "clean"))
 
 
@@ -42,7 +36,6 @@ def perturbed(rows: Rows) -> Rows:
 
 
 def trajectory(rows: Rows) -> Rows:
-    """Both flights of the first trajectory."""
     return [row for row in rows if row["trajectory"] == clean(rows)[0]["trajectory"]]
 
 
@@ -85,9 +78,6 @@ def twin_of(rows: Rows, row: Row) -> Row:
     return next(one for one in clean(rows) if one["frame_index"] == row["frame_index"])
 
 
-# --- what is done to them ---------------------------------------------------------------------------------------------
-
-
 def put(choose: Choose, **values: Any) -> Lie:
     return change(choose, lambda row: row.update(copy.deepcopy(values)))
 
@@ -101,7 +91,6 @@ def change(choose: Choose, what: Callable[[Row], Any]) -> Lie:
 
 
 def alter(choose: Choose, **new_of: Callable[[Any], Any]) -> Lie:
-    """Make of the values of columns new ones."""
     return change(choose, lambda row: row.update({name: of(row[name]) for name, of in new_of.items()}))
 
 
@@ -119,8 +108,6 @@ def swapped_flights(*names: str) -> Lie:
 
 
 def add(name: str, number: float, *members: str) -> Callable[[Row], None]:
-    """Add to a column of numbers, or to members of a group of them."""
-
     def added(row: Row) -> None:
         if members:
             row[name] = row[name] | {member: row[name][member] + number for member in members}
@@ -148,8 +135,6 @@ def projected(row: Row) -> None:
 
 
 def turned(choose: Choose, what: Callable[[Row], Any]) -> Lie:
-    """Change rows and project their targets anew."""
-
     def both(row: Row) -> None:
         what(row)
         projected(row)
@@ -195,8 +180,6 @@ def box_of_person(pixels: np.ndarray) -> dict[str, float] | None:
 
 
 def chunk(name: bytes, data: bytes) -> Callable[[Row], None]:
-    """Add a chunk to a PNG."""
-
     def added(row: Row) -> None:
         old, crc = row["image"]["bytes"], struct.pack(">I", zlib.crc32(name + data))
         row["image"]["bytes"] = old[:33] + struct.pack(">I", len(data)) + name + data + crc + old[33:]
@@ -204,11 +187,7 @@ def chunk(name: bytes, data: bytes) -> Callable[[Row], None]:
     return added
 
 
-# --- lies that take more than a line ----------------------------------------------------------------------------------
-
-
 def another_camera(row: Row) -> None:
-    """A field of view that fits its focal length."""
     row["intrinsics"]["fx"] = row["intrinsics"]["fy"] = row["intrinsics"]["fx"] * 1.2
     row["fov_deg"] = round(math.degrees(2 * math.atan(row["width_px"] / (2 * row["intrinsics"]["fx"]))), 6)
 
@@ -218,7 +197,6 @@ def farther_on_its_line(row: Row) -> None:
 
 
 def mirrored_world(row: Row) -> None:
-    """North and east exchanged: a mirror image."""
     for place in filter(None, (row["pose"], row["target"])):
         place["x_m"], place["y_m"] = place["y_m"], place["x_m"]
     row["pose"]["yaw_deg"] = 90.0 - row["pose"]["yaw_deg"]
@@ -232,7 +210,6 @@ def nobody_followed(row: Row) -> None:
 
 
 def with_poses(own: Rows, others: Rows) -> None:
-    """Give rows the poses of others, and project their targets anew."""
     poses = [dict(other["pose"]) for other in others]
     for row, pose in zip(own, poses, strict=True):
         row["pose"] = pose

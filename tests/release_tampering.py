@@ -1,7 +1,4 @@
-"""A forger's kit: change the rows of a release and make hashes, counts, splits and card right again, as somebody would
-who knows the format."""
-
-from __future__ import annotations
+"""A forger's kit."""
 
 import json
 import shutil
@@ -42,7 +39,6 @@ def _nothing(rows: list[Row]) -> None:
 
 
 def read_all(dataset: Path) -> tuple[ReleaseRecord, list[list[Row]]]:
-    """Give the record, and of each shard all rows with their pictures."""
     record = read_record(dataset / "release.json")
     return record, [pq.read_table(dataset / shard.path).to_pylist() for shard in record.shards]
 
@@ -93,14 +89,12 @@ def forge(
 
 
 def _finished(out: Path, values: dict[str, Any], change_record: Callable[[dict[str, Any]], None]) -> Path:
-    """Write the records as a build does."""
     change_record(values)
     write_records(out, ReleaseRecord.model_validate_json(json.dumps(values)))
     return out
 
 
 def errors_in(folder: Path, level: str = "pixels", **how: Any) -> dict[str, int]:
-    """Verify a folder as the command does; gives the errors by code."""
     report = verify(folder, level=level, reader=read_released, **how)
     return {kind.code: kind.count for kind in report.kinds if kind.severity == "error"}
 
@@ -119,9 +113,6 @@ def _flights(record: ReleaseRecord, rows: list[Row]) -> list[ReleasedFlight]:
     ]  # fmt: skip
 
 
-# --- pictures ---------------------------------------------------------------------------------------------------------
-
-
 def depth_of(row: Row) -> np.ndarray:
     return np.load(BytesIO(row["depth"]))
 
@@ -131,7 +122,6 @@ def set_depth(row: Row, depth: np.ndarray) -> None:
 
 
 def png(pixels: np.ndarray) -> bytes:
-    """PNG bytes of (h, w, 3) RGB."""
     return cv2.imencode(".png", pixels[..., ::-1])[1].tobytes()
 
 

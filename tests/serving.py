@@ -1,7 +1,5 @@
 """Servers of a test on 127.0.0.1, each a thread of its own."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import threading
@@ -26,7 +24,6 @@ class Handler(BaseHTTPRequestHandler):
         self.wfile.write(data)
 
     def answer_range(self, data: bytes) -> bytes:
-        """Send the range of some bytes that was asked for; gives it."""
         begin, end = map(int, self.headers["range"].removeprefix("bytes=").split("-"))
         part = data[begin : end + 1]
         self.send_response(206)

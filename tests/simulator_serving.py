@@ -1,7 +1,5 @@
 """A simulator's server of ours in a process of its own, and an unmodified client in another, which may crash."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 import socket
@@ -33,7 +31,6 @@ def command(town: Path, port: int, *faults: str, protocol: str = "carla") -> lis
 
 @contextlib.contextmanager
 def serving(box_map: BoxMap, folder: Path, *faults: str, protocol: str = "carla") -> Iterator[int]:
-    """Serve a map; gives the port."""
     folder.mkdir(parents=True, exist_ok=True)
     write_boxes(folder / "boxes_3d.json", box_map)
     port = free_port()
@@ -43,7 +40,6 @@ def serving(box_map: BoxMap, folder: Path, *faults: str, protocol: str = "carla"
 
 @contextlib.contextmanager
 def listening(words: list[str]) -> Iterator[None]:
-    """Run a server by its command, once it has told its port."""
     process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None

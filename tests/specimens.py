@@ -4,8 +4,6 @@ Images are painted by a plain NumPy ray caster (a ground plane, some boxes, the 
 boxes and visibilities agree with the poses in `trajectory.json`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,7 +93,6 @@ def make_flight(
     width_px: int = 64,
     height_px: int = 36,
 ) -> tuple[Track, Scene]:
-    """Make a flight behind a walking person (turns, stops, climbs, some occlusion) and the scene round it."""
     rng = np.random.default_rng([seed, 77])
     targets = _walk(num_points, rng)
     positions, rotations = _follow(targets, rng)
@@ -216,7 +213,6 @@ def _annotate(scene: Scene, target: np.ndarray, position: np.ndarray, rotation: 
 
 
 def _visible_share(scene: Scene, target: np.ndarray, position: np.ndarray) -> float:
-    """Share of points along the body's axis that no box hides from the drone."""
     points = target + np.linspace(-0.8, 0.8, 9)[:, None] * np.array([0.0, 0.0, 1.0])
     directions = points - position
     near, far = _slabs(scene.centers, scene.half_extents, position, directions)
@@ -271,7 +267,6 @@ def paint(scene: Scene, flight: Track, i: int) -> tuple[np.ndarray, np.ndarray, 
 
 
 def pack_depth(folder: Path) -> None:
-    """Give all depth in a folder the form that `render` writes."""
     for path in folder.rglob("depth.npy"):
         name, data = depth_file(read_depth(path.parent), "png")
         path.with_name(name).write_bytes(data)

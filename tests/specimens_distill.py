@@ -1,7 +1,5 @@
 """Captions over the specimen playback tree, in both languages, with every kind of record that prepare must sort."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -75,7 +73,6 @@ def make_caption(town: str, trajectory: str, variant: str, frame: int, **changes
 
 
 def prepared(tree: Path, captions: Path, out: Path, *, seed: int = 0, **settings: Any) -> Path:
-    """Make a training set of captions that no record binds to their tree."""
     cfg = PrepareConfig.model_validate({"unbound": "accept", **settings})
     return prepare.run(cfg, [RunSource.of_files(tree, captions)], out, seed=seed)
 
@@ -93,7 +90,6 @@ def write_set(out: Path, splits: Mapping[Split, Iterable[Sample]], trees: Iterab
 
 
 def make_captions(path: Path, tree: Path) -> list[Caption]:
-    """Write captions.jsonl for every window of every flight of the tree and give the captions."""
     captions = []
     for folder in find_tracks(tree):
         flight = read_track(folder)

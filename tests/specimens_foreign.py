@@ -5,8 +5,6 @@ Boolean perturbation flags, a clock that starts late, RGBA pictures, no meta.jso
 projection of its own (left-handed: x forward, y right, z up, yaw clockwise).
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -101,7 +99,6 @@ def _point(i: int, poses: list[dict], people: list[tuple[float, float, float]], 
 
 
 def _project(pose: dict, place: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Pixel and depth of a place, in left-handed axes."""
     pitch, yaw = math.radians(pose["pitch"]), math.radians(pose["yaw"])
     forward = (math.cos(pitch) * math.cos(yaw), math.cos(pitch) * math.sin(yaw), math.sin(pitch))
     right = (-math.sin(yaw), math.cos(yaw), 0.0)

@@ -52,7 +52,6 @@ def scenario_of(world):
 
 
 def first_points(scenario, num):
-    """The beginning of a scenario."""
     reference = {f.name: getattr(scenario.reference, f.name) for f in fields(scenario.reference)}
     reference = TrackingReference(
         **{name: value if isinstance(value, bool) else value[:num] for name, value in reference.items()}

@@ -1,7 +1,5 @@
 """Small releases of the specimen tree, and what they are made of; those of conftest.py are read by many tests."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter, defaultdict
 from pathlib import Path
@@ -62,7 +60,6 @@ def make_caption(flight, index: int, **change) -> Caption:
 
 
 def make_inspection(tree: Path, rejected: dict[str, tuple[str, str]]) -> Inspection:
-    """An inspection of a specimen tree; `rejected` maps a folder name to (result, code)."""
     flights = []
     for folder in find_tracks(tree):
         name = folder.relative_to(tree).as_posix()
@@ -111,7 +108,6 @@ def make_release(root: Path, num_frames: int = 400, window: int = 5, **change) -
 
 
 def release_of(root: Path, window: int = 5, **change) -> Path:
-    """Release `tree/` with a caption of every window and an inspection that accepts all."""
     captions = [
         make_caption(flight, i, window=list(range(i - window + 1, i + 1)))
         for flight in map(read_track, find_tracks(root / "tree"))

@@ -1,7 +1,5 @@
 """Rows of a release, as its shards give them, whose figures can be worked out by hand."""
 
-from __future__ import annotations
-
 from release.columns import CAPTION_FIELDS, COUNTED, POINT, POSE, SCALAR_NAMES
 
 WORDS = {

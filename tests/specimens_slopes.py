@@ -48,8 +48,6 @@ def sloped_town(shape: str) -> BoxMap:
     return on_ground(flat_town(), sampled(shape))
 
 
-# --- a city model on a slope: its coordinates are a register's, its heights rise from 28 to 46 m ---
-
 CITY_EAST_M, CITY_NORTH_M, CITY_LOW_M = 2000.0, 340_000.0, 28.0
 CITY_SIZE_M = (240.0, 200.0)
 
@@ -61,8 +59,6 @@ def city_height_m(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 class _Vertices:
-    """Vertices of a city model in millimetres, from places in metres."""
-
     def __init__(self) -> None:
         self.rows: list[list[int]] = []
 
@@ -71,7 +67,6 @@ class _Vertices:
         return len(self.rows) - 1
 
     def sheet(self, low: tuple[float, float], high: tuple[float, float], step_m: float) -> list:
-        """Triangles that lie on the ground, as surfaces."""
         xs, ys = (np.linspace(low[k], high[k], max(2, round((high[k] - low[k]) / step_m) + 1)) for k in (0, 1))
         number = np.array([[self.add(x, y, float(city_height_m(x, y))) for x in xs] for y in ys])
         a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]

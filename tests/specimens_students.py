@@ -1,7 +1,4 @@
-"""A training set of small pictures, a tiny student, and settings under which it learns in seconds; what a training
-left."""
-
-from __future__ import annotations
+"""A training set of small pictures, a tiny student, and settings under which it learns in seconds."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -26,7 +23,6 @@ TWELVE = {**FAST, "samples_per_step": 4, "batch_size": 2, "epochs": 6, "max_step
 
 
 def make_place(root: Path) -> Path:
-    """A folder with a playback tree, a training set and a tiny student."""
     make_playback_tree(root / "tree", num_flights=3, num_points=7)
     make_captions(root / "captions.jsonl", root / "tree")
     prepared(root / "tree", root / "captions.jsonl", root / "set")
@@ -56,7 +52,6 @@ def inputs_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Path]
 
 
 def features_of(own: Student, inputs: dict[str, Any]) -> Any:
-    """What the tower makes of the pictures among a model's inputs."""
     import torch
 
     found = own.core.get_image_features(inputs["pixel_values"], inputs["image_grid_thw"]).pooler_output
@@ -85,7 +80,6 @@ def run(
 
 
 def begun(place: Path, out: Path, num_steps: int = 7, **settings: Any) -> None:
-    """Leave a training that was stopped after so many steps."""
     from distill.training import fit
 
     steps, real = [], fit.train_step

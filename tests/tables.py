@@ -1,7 +1,5 @@
 """Tables of cases that are one test: a row costs its own work, not a fixture's, and each that fails is named."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ Its answers are a function of the request alone, so that two runs that ask the s
 request by a function (number of the request, body) -> name or None; FAULTS lists the names.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json
@@ -111,7 +109,7 @@ class TeacherServer:
     def url(self) -> str:
         return f"http://127.0.0.1:{self._server.server_address[1]}/v1"
 
-    def __enter__(self) -> TeacherServer:
+    def __enter__(self) -> "TeacherServer":
         self._thread.start()
         return self
 
@@ -120,7 +118,6 @@ class TeacherServer:
         self._server.server_close()
 
     def begin(self, raw: bytes, headers: dict[str, str]) -> int:
-        """Note a request; gives its number."""
         with self._lock:
             self.bodies.append(raw)
             self.headers.append(headers)
@@ -137,18 +134,15 @@ class TeacherServer:
 
 
 def kept_answers(out: Path) -> list[dict]:
-    """Read all that the journals of a run hold, flight by flight."""
     lines = [record for path in sorted((out / "answers").glob("*.jsonl")) for record in Journal(path).read()]
     return [record for record in lines if "key" in record]
 
 
 def refusal(status: int, text: str) -> tuple[int, dict]:
-    """Give a refusal in the form that most servers have for it."""
     return status, {"error": {"message": text, "type": "invalid_request_error", "param": None, "code": status}}
 
 
 def is_mirror(body: dict) -> bool:
-    """Tell whether a request asks for the Chinese mirror."""
     return isinstance(body["messages"][-1]["content"], str)
 
 
@@ -157,7 +151,6 @@ def _decision_by_seed(body: dict) -> str:
 
 
 def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None) -> dict:
-    """Give the fields that an obedient model would write."""
     if is_mirror(body):
         english = json.loads(body["messages"][-1]["content"])
         decision = "hover" if fault == "wrong_mirror_decision" else english["flight_decision"]

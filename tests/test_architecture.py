@@ -66,7 +66,6 @@ def _imports(name: str, path: Path, top_level_only: bool) -> set[str]:
 
 
 def room(name: str) -> str:
-    """Return the layer of a module, one of ROOMS; `axes` is the convention that formats and geometry share."""
     package, _, rest = name.partition(".")
     first = rest.partition(".")[0]
     if package != "cosfly":
@@ -81,7 +80,6 @@ def room(name: str) -> str:
 
 
 def house(name: str) -> str:
-    """The stage or sibling a module belongs to."""
     return ".".join(name.split(".")[: 2 if name.startswith("cosfly.") else 1])
 
 
@@ -90,7 +88,6 @@ def folder(name: str) -> str:
 
 
 def ours(name: str) -> set[str]:
-    """What it imports of ours, but for the version in `cosfly/__init__.py`."""
     return {n for n in imports(name) if n in SOURCES} - {"cosfly"}
 
 
@@ -113,21 +110,18 @@ def test_imports_point_one_way():
 
 
 def test_no_two_folders_import_each_other():
-    """But the front door: `cosfly/__init__.py` and `__main__.py` open what stands behind them."""
     doors = {"cosfly", "cosfly.__main__"}
     arrows = {(folder(a), folder(b)) for a in SOURCES if a not in doors for b in ours(a) if folder(a) != folder(b)}
     assert {tuple(sorted(pair)) for pair in arrows if pair[::-1] in arrows} == set()
 
 
 def test_what_opengl_draws_with_stays_behind_its_renderer():
-    """Meshes, shaders and the figure are one renderer's own: callers and other renderers know the contract only."""
     own = "cosfly.render.gl"
     assert [n for n in SOURCES if not n.startswith(own) and any(m.startswith(own) for m in imports(n))] == []
 
 
 @pytest.mark.parametrize("step", ["prepare", "training", "inference", "evaluation"])
 def test_no_step_of_distill_imports_a_step(step):
-    """They meet in distill/schema.py, and over a student in distill/student/."""
     others = tuple(f"distill.{name}" for name in ("prepare", "training", "inference", "evaluation") if name != step)
     modules = [name for name in SOURCES if name.startswith(f"distill.{step}")]
     assert modules
@@ -194,7 +188,6 @@ def reading_calls(name: str, path: Path) -> set[tuple[str, str]]:
 
 
 def test_only_the_gate_opens_files_to_read_them():
-    """And each exception is needed."""
     assert {
         call for name, path in SOURCES.items() if not name.startswith(GATE) for call in reading_calls(name, path)
     } == ALLOWED_TO_READ
@@ -255,7 +248,6 @@ def test_help_is_instant():
 
 
 def test_settings_bring_no_solver_along():
-    """Every command but help reads the settings of all stages: what these need to work is imported when they do."""
     program = "import sys, cosfly.pipeline.settings; print('LOADED', *sorted(sys.modules))"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     loaded = set(result.stdout.split("LOADED")[1].split())
@@ -279,7 +271,6 @@ def test_an_installed_cosfly_has_every_package_and_every_data_file():
 
 
 def test_foreign_text_is_escaped_in_one_place():
-    """No module escapes on its own, opens a console of its own, or writes a page without the policy of the others."""
     page, console = (
         re.compile(r"html import escape|html\.escape|rich\.markup|jinja2|markupsafe|<!doctype", re.IGNORECASE),
         re.compile(r"Console\("),

@@ -1,7 +1,5 @@
 """Every benchmark of tests/benchmarks at its smallest size: it ends without a traceback and prints its figures."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The action table against hand-made futures, and its invariances."""
 
-from __future__ import annotations
-
 import dataclasses
 from itertools import pairwise
 
@@ -135,8 +133,6 @@ def test_contradiction_of_each_action(decision, motion):
     measured = measure(future(**motion))
     assert TABLE.verdict_of(decision, measured, TABLE.label_of(measured)) == "HARD_CONFLICT"
 
-
-# --- properties -------------------------------------------------------------------------------------------------------
 
 coordinate = st.floats(-6.0, 6.0, allow_nan=False, width=32)
 rows = st.lists(st.tuples(coordinate, coordinate, coordinate), min_size=6, max_size=6)

@@ -1,13 +1,8 @@
 """Runs of an endpoint teacher that stop, go on, retry and show what they do; and the book of answers."""
 
-from __future__ import annotations
-
-import asyncio
 import json
-import random
 import subprocess
 import sys
-from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -18,7 +13,7 @@ from caption.run import asking
 from caption.run.stage import run
 from cosfly.formats.captions import read_captions
 from cosfly.llm import client
-from cosfly.llm.answers import Answer, AnswerBook
+from cosfly.llm.answers import Answer
 from cosfly.runtime.errors import TeacherError
 from specimens import make_playback_tree
 
@@ -57,9 +52,6 @@ def whole(tree, tmp_path_factory) -> bytes:
 
 def keys_of(out: Path) -> list[str]:
     return [record["key"] for record in kept_answers(out)]
-
-
-# --- limits -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_larger_limit_goes_on_where_a_smaller_one_stopped(tree, tmp_path, whole):
@@ -105,9 +97,6 @@ def test_a_budget_stops_the_run_before_it_is_passed_and_a_larger_one_goes_on(tre
     assert len(server.bodies) == 44
 
 
-# --- what failed ------------------------------------------------------------------------------------------------------
-
-
 def test_the_quarantine_is_replayed_alone(tree, tmp_path, whole):
     out = tmp_path / "out"
     bad: set[int] = set()
@@ -134,13 +123,7 @@ def test_the_quarantine_is_replayed_alone(tree, tmp_path, whole):
     assert (out / "manifest.json").exists()
 
 
-# --- the request ------------------------------------------------------------------------------------------------------
-
-
 # --- the display ------------------------------------------------------------------------------------------------------
-
-
-# --- the book of answers ----------------------------------------------------------------------------------------------
 
 
 def flight_name(flight: int) -> str:
@@ -151,28 +134,6 @@ def record(flight: int, window: int, purpose: str = "free/0") -> Answer:
     sample_id = f"{flight_name(flight)}_frame_{window:05d}"
     usage = {"prompt_tokens": 10, "completion_tokens": 2}
     return Answer(key=f"{sample_id}/{purpose}", sample_id=sample_id, purpose=purpose, usage=usage, text="t")
-
-
-def fill(folder: Path, num_flights: int, num_windows: int, unfinished: set[int]) -> None:
-    """Write journals as a run does, the answers of neighbouring flights in any order; an unfinished flight is cut off
-    by a kill."""
-
-    async def write() -> None:
-        book = AnswerBook(folder)
-        order = [(flight, window) for flight in range(num_flights) for window in range(num_windows)]
-        open_count = Counter(dict.fromkeys(range(num_flights), num_windows))
-        rng = random.Random(0)
-        while order:
-            flight, window = order.pop(rng.randrange(min(len(order), num_windows)))
-            await book.put(flight_name(flight), record(flight, window))
-            open_count[flight] -= 1
-            if not open_count[flight] and flight not in unfinished:
-                book.forget(flight_name(flight))
-
-    asyncio.run(write())
-
-
-# --- the disk ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_total_timeout_bounds_all_tries(tree, tmp_path, monkeypatch):

@@ -1,7 +1,4 @@
-"""Claims: true ones of a true sentence pass, and one thing wrong in the sentence or in the claims is a problem that
-names it."""
-
-from __future__ import annotations
+"""Claims."""
 
 import dataclasses
 import re
@@ -101,7 +98,6 @@ def test_a_true_sentence_is_proved_and_one_wrong_word_is_named(language, text, c
     ],
 )  # fmt: skip
 def test_who_cannot_be_made_out_is_not_said_to_be_seen(language, text, claims, state):
-    """Claims of sight are of what a stranger could see: geometry shows the person at t0, the picture does not."""
     facts = dataclasses.replace(FACTS, visibility=("illegible", *FACTS.visibility[1:]))
     assert judged(text, claims_of(claims), language, facts=facts).state == state
 
@@ -134,9 +130,6 @@ def test_a_claim_that_nobody_wrote_is_no_problem_and_a_true_number_that_nobody_c
     # A number in the place of a claim is a problem even where another fact has it.
     assert "uncovered: 20.0 m" in judged("The walker is 20.0 m away.", [DISTANCE]).problems
     assert judged("The walker is 22.0 m away, the drone at 22.0 m.", [DISTANCE, height]).state == "contradicted"
-
-
-FASTER = "comparison:speed@t4=faster; target_speed@t4=1.6 mps"
 
 
 @each(

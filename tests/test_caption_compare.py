@@ -1,12 +1,9 @@
 """What becomes of conflicts: soft ones by their setting, and the four strategies compared on the same ones."""
 
-from __future__ import annotations
-
 import asyncio
 import dataclasses
 from pathlib import Path
 
-import pytest
 from specimens_captions import VOCABULARY
 from tables import each
 
@@ -16,7 +13,7 @@ from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, RepairConfig, WindowConfig
 from caption.teachers.teacher import RuleTeacher
 from cosfly.formats.captions import Caption, Coc
-from specimens import make_flight, make_playback_tree
+from specimens import make_flight
 
 CFG = CaptionConfig(window=WindowConfig(require_images=False))
 
@@ -42,14 +39,6 @@ def test_what_becomes_of_a_soft_conflict(treatment):
             assert (caption.verdict, caption.repair.first_verdict) == ("CONSISTENT", "SOFT_CONFLICT")
 
 
-# --- the four strategies on the same conflicts, by the rule teacher and by a server -----------------------------------
-
-
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory):
-    return make_playback_tree(tmp_path_factory.mktemp("tree"), 3, 30, with_images=False)
-
-
 def coc(text: str) -> Coc:
     return Coc(critical_components=text, reasoning_trace="r", flight_decision="hover")
 
@@ -63,6 +52,3 @@ def test_a_comparison_by_hand():
     found = compare("hint", trials)
     assert (found.num_conflicts, found.repaired, found.consistent) == (3, 2, 1)
     assert (found.asks_per_conflict, found.tokens_per_conflict, found.text_distance) == (2.0, 200.0, 0.375)
-
-
-SETTINGS = {"window": {"require_images": False}}

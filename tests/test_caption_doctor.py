@@ -1,7 +1,5 @@
 """The endpoint's doctor against servers with one defect each, and the plan against a server whose tokens are known."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from typing import Any
@@ -25,7 +23,6 @@ def images_of(body: dict) -> int:
 
 
 def prompt_tokens(body: dict, seen_images: int) -> int:
-    """Words of the text, and a fixed number for each image that the model sees."""
     contents = [message["content"] for message in body["messages"]]
     texts = [part.get("text", "") for content in contents if isinstance(content, list) for part in content]
     texts += [content for content in contents if isinstance(content, str)]
@@ -137,9 +134,6 @@ def test_the_command_exits_with_1_when_unusable():
         assert invoke("caption doctor", server.url).exit_code == 0
     with TeacherServer(respond=patient(max_images=0)) as server:
         assert invoke("caption doctor", server.url).exit_code == 1
-
-
-# --- the plan ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_plan_is_what_the_run_then_takes(tree, tmp_path):

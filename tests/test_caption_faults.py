@@ -4,8 +4,6 @@ A run loses nothing: what a server refuses for a reason of its own ends it and i
 one window is kept in the server's words, and asked again by `--retry-failed`.
 """
 
-from __future__ import annotations
-
 import json
 import threading
 from dataclasses import dataclass
@@ -38,8 +36,6 @@ def tree(tmp_path_factory) -> Path:
 
 @dataclass(frozen=True)
 class Whole:
-    """What an undisturbed run makes, and the seeds of its first questions."""
-
     product: bytes
     seeds: list[int]
 
@@ -58,8 +54,6 @@ def quarantine(out: Path) -> dict[str, dict]:
 
 
 class Switched:
-    """Answers `num_good` requests, then refuses all with pictures in these words until it is mended."""
-
     def __init__(self, status: int, text: str, num_good: int = 3) -> None:
         self.status, self.text, self.num_good, self.num_asked = status, text, num_good, 0
         self._lock = threading.Lock()
@@ -73,8 +67,6 @@ class Switched:
     def mend(self) -> None:
         self.num_good = 10**9
 
-
-# --- the server's fault -----------------------------------------------------------------------------------------------
 
 # What a server says to every window from some time on: status, words, and what the error must say beside them.
 SERVER_FAULTS = {
@@ -123,8 +115,6 @@ def test_a_server_that_refuses_every_window_ends_the_run_and_retry_failed_asks_a
         assert run(cfg, tree, out, retry_failed=True).read_bytes() == whole.product
 
 
-# --- the window's fault -----------------------------------------------------------------------------------------------
-
 # What a server says to some windows while it answers the others: status, words, and the reason they are dropped for.
 WINDOW_FAULTS = {
     "too long": (400, TOO_LONG, "refused_too_long"),
@@ -140,8 +130,6 @@ WINDOW_FAULTS = {
 
 
 class Picky:
-    """Refuses some windows, by the seeds of their first questions."""
-
     def __init__(self, status: int, text: str, seeds: list[int]) -> None:
         self.status, self.text, self.seeds, self.is_on = status, text, seeds, True
 
@@ -170,8 +158,6 @@ def test_what_is_a_windows_fault_costs_that_window_and_is_kept_in_the_servers_wo
         assert reason in page
 
 
-# --- the schema -------------------------------------------------------------------------------------------------------
-
 # How a server that takes no schema says so, and how many requests with one it is sent, one at a time.
 SCHEMA_FAULTS = {
     "by name": (400, "This response_format type is unavailable now", 1),
@@ -191,10 +177,4 @@ def test_a_server_that_refuses_the_schema_is_asked_without_it(tree, tmp_path, na
     assert report_of(tmp_path / "out")["refusals"] == {}
 
 
-# --- room for the answer ----------------------------------------------------------------------------------------------
-
-
 # --- outages ----------------------------------------------------------------------------------------------------------
-
-
-# --- again ------------------------------------------------------------------------------------------------------------

@@ -1,7 +1,4 @@
-"""Captions of somebody else: a file in a teacher's place is judged, reported and recorded as answers are, and asked
-nothing again."""
-
-from __future__ import annotations
+"""Captions of somebody else."""
 
 import json
 from pathlib import Path
@@ -15,14 +12,11 @@ from teacher_server import MODEL, TeacherServer
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import read_foreign
-from cosfly.formats.captions import Caption, Language, read_captions, write_captions
-from cosfly.formats.predictions import Prediction
+from cosfly.formats.captions import Caption, read_captions, write_captions
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
 from cosfly.runtime.errors import InputError
 from distill.inference import stage as infer
-from distill.inference.outcome import make_prediction
-from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import open_split
 from release.package import stage as package
 from release.package.sources import Source
@@ -47,7 +41,6 @@ def tree(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def rules(tree, tmp_path_factory) -> list[Caption]:
-    """The rule teacher's captions: names of the windows, and decisions that the flight does not contradict."""
     return list(read_captions(run(CaptionConfig(), tree, tmp_path_factory.mktemp("rules") / "out")))
 
 
@@ -132,18 +125,6 @@ def test_a_bad_line_names_file_line_and_field(tmp_path, text, field):
         read_foreign(path)
     assert f"{path}:2" in str(caught.value)
     assert field in str(caught.value)
-
-
-# --- a student's predictions ------------------------------------------------------------------------------------------
-
-
-def predicted(caption: Caption, language: Language, text: str | None = None, *, is_finished: bool = True) -> Prediction:
-    """What `distill infer` writes of a sample: the caption's own answer, or another text."""
-    sample = make_sample(caption, language, PrepareConfig())
-    assert not isinstance(sample, str), sample
-    text = sample.answer if text is None else text
-    answer = make_prediction(sample, "test", text, 99, is_finished)
-    return answer.model_copy(update={"model": "base+mine"})
 
 
 def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):

@@ -1,7 +1,5 @@
 """The judge: lenient reading, never an acceptance by accident, never over geometry; its check finds what is planted."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 
@@ -106,11 +104,7 @@ def test_a_judges_tokens_count_in_the_budget_and_are_shown(tree, tmp_path):
     assert f"{1000 * num_asked:,} in, {100 * num_asked:,} out" in (out / "report.html").read_text(encoding="utf-8")
 
 
-# --- the check --------------------------------------------------------------------------------------------------------
-
-
 def few_conflicts():
-    """Twelve of each judgement."""
     return [pair for judgement in JUDGEMENTS for pair in [p for p in gold_conflicts() if p[1] == judgement][:12]]
 
 

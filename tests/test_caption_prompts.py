@@ -1,7 +1,4 @@
-"""Prompts of somebody's own: exported, checked line by line, asked with, kept beside the captions, and followed by
-students."""
-
-from __future__ import annotations
+"""Prompts of somebody's own."""
 
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """References, facts and claims: the fact at an address, worked out by hand for one window, and what holds of it."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from specimens_captions import GAP

@@ -5,8 +5,6 @@ others are what nobody sends by mistake. Each run asks about one window, in two 
 server is mended, and the same command is run again.
 """
 
-from __future__ import annotations
-
 import gzip
 import json
 import time
@@ -47,11 +45,7 @@ def whole(tree, tmp_path_factory) -> bytes:
         return run(settings(server.url), tree, tmp_path_factory.mktemp("whole") / "out").read_bytes()
 
 
-# --- what servers send ------------------------------------------------------------------------------------------------
-
-
 def answer(body: dict, **changes) -> dict:
-    """Give the completion that a good server sends, changed at the top."""
     with_text = json.dumps(obedient_answer(_OBEDIENT, body), ensure_ascii=False)
     choice = {"index": 0, "message": {"role": "assistant", "content": with_text}, "finish_reason": "stop"}
     usage = {"prompt_tokens": 1000, "completion_tokens": 100}
@@ -68,8 +62,6 @@ _OBEDIENT = deciding()
 
 
 def message(**fields) -> Callable[[dict], Sent]:
-    """Send a good completion whose message has these fields."""
-
     def sent(body: dict) -> Sent:
         value = answer(body)
         value["choices"][0]["message"] |= fields
@@ -119,11 +111,6 @@ class Outcome:
 
     words: str = ""
     num_asked: int | None = 2
-
-
-def fine(words: str = "") -> Outcome:
-    """The run finishes, all windows kept."""
-    return Outcome(words)
 
 
 @dataclass(frozen=True)
@@ -228,7 +215,6 @@ def without_tokens(product: bytes) -> list[dict]:
 
 
 def windows_of(out: Path) -> Counter[str]:
-    """Count the windows of a run: kept, dropped by reason, and without an answer by cause."""
     held = [json.loads(line)["code"] for line in (out / "quarantine.jsonl").read_text(encoding="utf-8").splitlines()]
     if not (out / "caption_report.json").exists():
         return Counter(held)
@@ -243,8 +229,6 @@ def expected_windows(outcome: Outcome) -> Counter[str]:
         return Counter([outcome.cause])
     return Counter([outcome.reason if isinstance(outcome, Dropped) else "kept"])
 
-
-# --- the list of models -----------------------------------------------------------------------------------------------
 
 # What is sent in place of the list of models, and what the run says; or that it goes on.
 LISTS: dict[str, tuple] = {
@@ -278,9 +262,6 @@ def test_what_becomes_of_a_run_at_a_list_of_models_like_this(tree, tmp_path, mon
             server.list_models = None  # it is mended
         assert run(settings(server.url), tree, out).read_bytes() == whole
     assert len(server.bodies) == 2
-
-
-# --- what is behind the table -----------------------------------------------------------------------------------------
 
 
 def test_the_key_does_not_follow_a_redirect(tree, tmp_path, monkeypatch):

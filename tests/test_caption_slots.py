@@ -3,8 +3,6 @@
 The oracle of numbers (`measured`) reads the series of `Facts` itself; it shares nothing with the filler but them.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re
@@ -132,9 +130,6 @@ def test_what_is_refused_says_why_and_what_is_allowed(language, text, reason, wo
     assert words in found.complaint
 
 
-# --- good templates are not refused -----------------------------------------------------------------------------------
-
-
 def windows_of(num_flights: int) -> list[Facts]:
     found = []
     for seed in range(num_flights):
@@ -156,8 +151,6 @@ def earned_texts() -> dict[str, list[str]]:
     return found
 
 
-# --- right by construction: the filler against an oracle of its own ---------------------------------------------------
-
 SERIES = {  # slot -> field, digits, unit in both languages
     "speed": ("speed_mps", 2, "m/s", "米/秒"), "altitude": ("altitude_m", 1, "m", "米"), "pitch": ("pitch_deg", 1, "deg",
     "度"),
@@ -169,7 +162,6 @@ WINDOWS = windows_of(4)
 
 
 def measured(facts: Facts, name: str, first: int, last: int | None, aspect: str) -> float | None:
-    """Give a number from the series themselves; None where one of its values is not known."""
     series = getattr(facts, SERIES[name][0])
     first = 1 if name == "speed" and aspect and first == 0 and last else first  # of steps: the first frame has none
     values = series[first : (first if last is None else last) + 1]
@@ -215,9 +207,6 @@ def test_the_numbers_of_both_languages_are_the_facts(facts, chosen):
         assert [float(number) for number, _ in found] == pytest.approx([number for number, _ in expected], abs=1e-6)
 
 
-# --- the mirror -------------------------------------------------------------------------------------------------------
-
-
 def drafts(english: str, chinese: str) -> Draft | Refused:
     en = Coc(critical_components="The walker is {visibility}.", reasoning_trace=english, flight_decision="hover")
     zh = Coc(critical_components="行人{visibility}。", reasoning_trace=chinese, flight_decision="hover")
@@ -257,9 +246,6 @@ def test_a_sentence_is_proved_only_where_its_words_are_true_with_its_slots():
             found = read_sentence(text, language, 5, 0.5)
             assert isinstance(found, Sentence), (text, found)
             assert found.state == "proved", text
-
-
-# --- through the loop -------------------------------------------------------------------------------------------------
 
 
 def claimed(quantity: str, value: str, quote: str, at: str = "t4") -> dict[str, str]:

@@ -1,17 +1,13 @@
 """Stage `caption` with the rule teacher: products, report page, tally, workers, resume, bad input."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
 from collections import Counter
-from html.parser import HTMLParser
 
 import pytest
 
 from caption.run import stage
-from caption.run.ledger import CaptionReport
 from caption.run.stage import run
 from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig
@@ -69,7 +65,6 @@ def test_the_report_adds_up_and_repairs_stay_on_record(done):
 
 
 def test_who_cannot_be_made_out_changes_what_is_said_to_be_seen_and_no_decision(tree, done, tmp_path):
-    """Labels, decisions and verdicts go by geometry; claims of sight by what a stranger could see."""
     before = list(read_captions(done / "captions.jsonl"))
     told = {}
     for legible in (True, False):
@@ -139,36 +134,6 @@ def test_a_perturbed_flight_waits_for_a_clean_one_that_cannot_be_read(tmp_path):
     clean.write_bytes(whole)
     found = list(read_captions(run(CaptionConfig(), tree, tmp_path / "again")))
     assert Counter(caption.label_from for caption in found) == {"flight": 5, "twin": 5}
-
-
-# --- the page of a captioning run -------------------------------------------------------------------------------------
-
-
-class Tags(HTMLParser):
-    """Collects tags and checks that they nest."""
-
-    VOID = ("meta", "img", "br", "line", "rect", "hr")
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.seen: list[tuple[str, dict]] = []
-
-    def handle_starttag(self, tag, attrs):
-        self.seen.append((tag, dict(attrs)))
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.seen.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag):
-        if tag not in self.VOID:
-            assert self.open.pop() == tag
-
-
-def report_of(done):
-    return CaptionReport.model_validate_json((done / "caption_report.json").read_text())
 
 
 @pytest.mark.parametrize("name", ["glossary"])

@@ -1,7 +1,4 @@
-"""A student behind a server as a teacher: asked as it was taught, to the byte; judged, repaired and marked like any
-other."""
-
-from __future__ import annotations
+"""A student behind a server as a teacher: asked as it was taught, to the byte."""
 
 import json
 from collections.abc import Callable
@@ -65,7 +62,6 @@ def captions_of(place: Path, out: Path, url: str, **changes: Any) -> list[Captio
 
 
 def infer_all(place: Path, url: str, out: Path, **changes: Any) -> list[Sample]:
-    """Have every sample answered by `distill infer`; gives them."""
     samples: list[Sample] = []
     for split in ("train", "val", "test"):
         cfg = infer.InferConfig.model_validate({

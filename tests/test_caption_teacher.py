@@ -1,14 +1,11 @@
 """The endpoint teacher against a real server that misbehaves: fault -> what the run must do."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import logging
 import socket
 import time
 from contextlib import nullcontext
-from pathlib import Path
 
 import pytest
 from commands import invoke
@@ -24,7 +21,6 @@ from cosfly.llm.client import KEY_VARIABLE, ConcurrencyLimit
 from cosfly.runtime.errors import CosflyError, NothingKept, TeacherError
 
 KEEP = {"hard_conflict": "keep"}
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def settings(url: str, **changes) -> CaptionConfig:
@@ -33,13 +29,11 @@ def settings(url: str, **changes) -> CaptionConfig:
 
 
 def first(fault: str, count: int = 1):
-    """The fault for the first requests only."""
     return lambda number, body: fault if number < count else None
 
 
 @pytest.mark.parametrize("writing", ["slots", "prose"])
 def test_a_decision_against_its_own_reasoning_is_asked_for_again_with_what_was_wrong(tree, tmp_path, writing):
-    """In every way of writing the action that the reasoning came to stands before the decision."""
     with deciding("ascend", first("wrong_therefore")) as server:
         cfg = settings(server.url, limit=1, repair=KEEP, writing=writing)
         captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
@@ -66,7 +60,6 @@ def test_a_decision_against_its_own_reasoning_is_asked_for_again_with_what_was_w
     ],
 )
 def test_strategies_ask_by_their_rungs(tree, tmp_path, strategy, rungs):
-    """A teacher that insists on hovering: only an enforced decision can mend it."""
     with deciding() as server, nullcontext() if "anchored" in rungs else pytest.raises(NothingKept):
         run(settings(server.url, repair={"strategy": strategy}), tree, tmp_path / "out")
     repaired = [caption for caption in read_captions(tmp_path / "out" / "captions.jsonl") if caption.repair]
@@ -144,9 +137,6 @@ def test_no_command_takes_a_url_that_cannot_be_asked_or_holds_a_secret(tmp_path,
     assert not list(tmp_path.rglob("*"))
 
 
-# --- the limit on concurrency ---
-
-
 def test_the_limit_on_concurrency_halves_and_recovers():
     limit = ConcurrencyLimit(64)
     now_s = time.monotonic()
@@ -176,7 +166,6 @@ def test_a_retry_after_holds_every_request():
 
 
 def test_a_hopeless_teacher_is_stopped_and_its_commonest_reasons_are_explained(tree, tmp_path):
-    """Of its first answers none is accepted; a teacher of whom one was is not stopped, and a setting goes on."""
     cfg = {"stop_after_dropped": 3, "endpoint": {"concurrency": 1}, "repair": KEEP}
     told = r"none of the first 3 answers.*3 structure_.*\(no answer had the fields"
     with deciding("ascend", lambda number, body: "short") as server:

@@ -1,7 +1,4 @@
-"""Evidence and mirror checks: the paper's own sample passes, planted contradictions fail, clean captions raise no
-alarm."""
-
-from __future__ import annotations
+"""Evidence and mirror checks."""
 
 import dataclasses
 import re
@@ -61,12 +58,6 @@ def test_the_papers_own_sample_passes_both_checks():
     assert check_mirror(PAPER_EN, PAPER_ZH, FLIGHT) is None
     assert not any(judged.problems for judged in judge_prose(PAPER_EN, PAPER_FACTS, "en"))
     assert not any(judged.problems for judged in judge_prose(PAPER_ZH, PAPER_FACTS, "zh"))
-
-
-def altered(coc: Coc, old: str, new: str) -> Coc:
-    changed = {name: text.replace(old, new) for name, text in coc.model_dump().items() if name != "flight_decision"}
-    assert changed != {name: getattr(coc, name) for name in changed}, old
-    return Coc(**changed, flight_decision=coc.flight_decision)
 
 
 def pair(en: str, zh: str) -> tuple[Coc, Coc]:
@@ -130,9 +121,6 @@ def test_plain_prose_is_unread_but_for_what_is_surely_wrong():
     assert judge_prose(turned, PAPER_FACTS, "en")[-1].problems == ("decision: The drone should yaw left.",)
 
 
-# --- captions of the rule teacher ------------------------------------------------------------------------
-
-
 @cache
 def clean_captions(num_flights: int) -> list[tuple[Facts, Coc, Coc]]:
     captions = []
@@ -157,9 +145,6 @@ def test_rule_captions_are_one_record_in_two_languages():
         changed = f"{float(number.group()) + 137.77:.2f}"
         bad = zh.model_copy(update={"critical_components": zh.critical_components.replace(number.group(), changed)})
         assert check_mirror(en, bad, flight_numbers(facts)) == "number"
-
-
-# --- the rule teacher -------------------------------------------------------------------------------------------------
 
 
 @each("decision", TOKENS)

@@ -1,7 +1,5 @@
 """Windows, facts, prompts and pictures; above all: nothing of the future reaches a request. Missions, and keyframes."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shutil
@@ -17,14 +15,7 @@ from teacher_server import TeacherServer
 
 from caption.run.stage import run
 from caption.run.windows import as_flown, choose_keyframes, current_frames, cut_future, cut_windows, missed_changes
-from caption.schema import (
-    CaptionConfig,
-    FutureMotion,
-    ImageConfig,
-    ObservedWindow,
-    WindowConfig,
-    observed_frames,
-)
+from caption.schema import CaptionConfig, FutureMotion, ImageConfig, ObservedWindow, WindowConfig, observed_frames
 from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import make_question, question_messages
 from caption.truth.actions import TABLE, measure
@@ -69,7 +60,6 @@ def test_the_observed_type_has_no_future_and_shares_no_memory_with_it(tree):
 
 
 def spoil_future(root, current: int) -> None:
-    """Change every pose, target, flag and picture after a frame."""
     folder = find_tracks(root)[0]
     flight = read_track(folder, strict=False)
     rng = np.random.default_rng(1)
@@ -183,8 +173,6 @@ def test_facts_of_a_hand_made_window(tree):
     assert "Velocity: [0.0, 4.47, 4.47, 4.47, 4.47] m/s" in doubled["en"].user
 
 
-# --- labels of perturbed flights --------------------------------------------------------------------------------------
-
 NUM_POINTS = 160
 
 
@@ -224,7 +212,6 @@ def two_tracks(tmp_path_factory):
 
 
 def flights_of(root) -> tuple[Track, Track]:
-    """The clean and the perturbed flight of a tree of one trajectory."""
     clean, perturbed = (read_track(folder, strict=False) for folder in find_tracks(root))
     return clean, perturbed
 
@@ -257,15 +244,11 @@ def test_both_tracks_have_the_same_labels_where_the_same_was_visible(two_tracks,
     assert np.mean([a != b for (a, _, _), b in zip(pairs, raw, strict=True)]) > 0.2
 
 
-# --- orders of a mission in captions ----------------------------------------------------------------------------------
-
-
 MISSION = Mission("battery", 8, 12, (1.0, 2.0, 30.0))
 
 
 @pytest.fixture(scope="module")
 def ordered(tree, tmp_path_factory):
-    """The same flight with a mission that ends its pursuit at frame 8."""
     root = tmp_path_factory.mktemp("ordered") / "tree"
     shutil.copytree(tree, root)
     write_track(find_tracks(root)[0], dataclasses.replace(flight_in(root), mission=MISSION))
@@ -283,7 +266,6 @@ def test_a_mission_gives_labels_and_is_known_from_its_first_frame_on(tree, order
 
 
 def test_no_label_comes_from_an_order_that_nobody_knows_yet(ordered):
-    """The turn for home, seen from before the order, would be a turn after the walker."""
     windows = list(cut_windows(flight_in(ordered), WindowConfig(require_images=False, future_frames=3)))
     problems = {w.observed.indices[-1]: w.problem for w in windows}
     assert problems == {now: "order_to_come" if now in (5, 6, 7) else None for now in range(4, 13)}
@@ -302,9 +284,6 @@ def test_a_mission_reaches_no_request_before_its_order_stands(tree, ordered):
     for before, after in zip(plain[4:], told[4:], strict=True):
         assert after[0] == before[0] + "\nMission: the battery is down to the reserve for the way home."
         assert after[1] == before[1] + "\n任务状态：电池电量已降至返航储备。"
-
-
-# --- keyframes --------------------------------------------------------------------------------------------------------
 
 
 LABELS = st.lists(st.sampled_from(["track_straight", "hover", None]), max_size=60)

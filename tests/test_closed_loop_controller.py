@@ -28,7 +28,6 @@ HORIZON = 5  # decisions, 2.5 s, as labels look ahead
 
 @pytest.fixture(scope="module")
 def begin():
-    """Gives a flight behind a walker in the open, and its controller."""
     town = town_of()
     airspace = Airspace(RenderConfig(width_px=320, height_px=180, fovs_deg=(90.0,)), town, town)
     walk = walk_along("path_00000", [(0, 0), (60, 0)])

@@ -56,9 +56,6 @@ def attempt(town: Path, out: Path, more: str):
     return invoke(f"fly {TINY} {given} --paths {town}/pedestrians/path.json --out {out} {more}")
 
 
-# --- what is flown ----------------------------------------------------------------------------------------------------
-
-
 def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(town, tmp_path):
     flown = fly(town, tmp_path, "--workers 2 --set fly.most_decisions=12 --student rules")
     assert len(flown) == 3
@@ -118,15 +115,12 @@ def test_a_policy_of_ones_own_flies_as_a_student_that_decides_the_same(town, tmp
     assert "own:Missing" in str(attempt(town, tmp_path / "none", f"{SHORT} --policy own:Missing").exception)
 
 
-# --- answers that are none --------------------------------------------------------------------------------------------
-
 ONE = "--set caption.endpoint.max_tries=1 --set fly.side_by_side=3"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("fault", "answer"),
-    [("wrong_decision", "invalid"), ("wrong_shape", "unreadable"), ("empty_choices", "none")],
+    ("fault", "answer"), [("wrong_decision", "invalid"), ("wrong_shape", "unreadable"), ("empty_choices", "none")]
 )
 def test_what_a_model_answers_wrong_is_its_own_failure_and_the_flight_goes_on(town, tmp_path, fault, answer):
     with TeacherServer(lambda number, body: fault) as server:
@@ -158,7 +152,6 @@ def test_a_model_is_asked_about_all_flights_at_once_and_nothing_twice(town, tmp_
 
 @pytest.fixture(scope="module")
 def student(tmp_path_factory) -> Path:
-    """A tiny student that was taught with the prompts of today, the pictures in colour."""
     root = tmp_path_factory.mktemp("student")
     tree = make_playback_tree(root / "tree", num_flights=3, num_points=11, width_px=160, height_px=90)
     captions = caption_tree(CaptionConfig(), tree, root / "captions")

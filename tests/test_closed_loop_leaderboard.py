@@ -13,7 +13,6 @@ GOOD, BAD = "1111111111", "1111100000"
 
 
 def folder(root, name, seen, *, student=None, **columns):
-    """What `cosfly fly` writes of a student, whose flights show the person as `seen` says."""
     flights = [flight(one, walk=f"path_{k}", **columns) for k, one in enumerate(seen)]
     flights = [one.model_copy(update={"student": student or name}) for one in flights]
     for one in flights:

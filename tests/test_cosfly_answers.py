@@ -3,8 +3,6 @@
 Each case names the kind of server or model that sends it, as public issue threads and manuals show it.
 """
 
-from __future__ import annotations
-
 import json
 import time
 
@@ -43,7 +41,6 @@ def completed(body: bytes) -> Reply | str:
 
 
 def completion(message: object, **choice: object) -> bytes:
-    """Give the body of a completion with this message."""
     return json.dumps({"object": "chat.completion", "choices": [{"index": 0, "message": message, **choice}]}).encode()
 
 
@@ -54,8 +51,6 @@ def assistant(**message: object) -> bytes:
 def called(arguments: object) -> dict:
     return {"id": "call_1", "type": "function", "function": {"name": "chain_of_cause", "arguments": arguments}}
 
-
-# --- HTTP bodies, status 200 ------------------------------------------------------------------------------------------
 
 # Who sends it, what; the text of its final message, or (word) what is said of it: then the request is sent again.
 BODIES: list[tuple[str, bytes, str | tuple[str]]] = [
@@ -177,8 +172,6 @@ def test_whatever_json_a_server_sends_can_be_written(value):
         words.append(found.text if isinstance(found, Reply) else found)
     assert [text.encode().decode() for text in words] == words  # no half of a surrogate pair, which no file takes
 
-
-# --- texts of messages ------------------------------------------------------------------------------------------------
 
 # Who writes it, what; what was taken off it to get GOOD, or the reason why it is refused.
 THINK, FENCE, PROSE = "thinking_tags", "code_fence", "prose_around"
@@ -423,8 +416,6 @@ CUT = [
 def test_an_answer_that_was_cut_off_is_no_draft(text, finish_reason, reason):
     assert parse_answer(text, finish_reason=finish_reason).reason == reason
 
-
-# --- properties -------------------------------------------------------------------------------------------------------
 
 BEFORE = ["", "\ufeff", "Sure {or not}: ", "<think>left {or} right?</think>", "hm " + DRAFT + "</think>", "```json\n",
 "assistant\n", DRAFT, HALF + "\n"]  # fmt: skip

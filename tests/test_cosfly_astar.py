@@ -12,7 +12,6 @@ AXES = [(1, 0), (0, 1), (1, 1), (-1, 1)]
 
 
 def shortest_costs(free: np.ndarray, start: tuple[int, int], classes=None, costs=UNIFORM) -> np.ndarray:
-    """Give the optimal cost to every cell by another library, infinite where there is no route; (ny, nx)."""
     classes = np.zeros(free.shape, dtype=int) if classes is None else classes
     num_y, num_x = free.shape
     rows, columns, weights = [], [], []
@@ -30,7 +29,6 @@ def shortest_costs(free: np.ndarray, start: tuple[int, int], classes=None, costs
 
 
 def problems(free: np.ndarray, route: np.ndarray) -> list[str]:
-    """List what is wrong with a route."""
     found = []
     for (x0, y0), (x1, y1) in zip(route[:-1].tolist(), route[1:].tolist(), strict=True):
         if max(abs(x1 - x0), abs(y1 - y0)) != 1:

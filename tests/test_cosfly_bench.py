@@ -23,13 +23,7 @@ EVENTS = [
     event(0, "worker_started", worker=0, pid=1),
     event(0, "worker_started", worker=1, pid=2),
     event(
-        4,
-        "probe",
-        rss_mib={0: 100.0, 1: 120.0},
-        cores_used=1.0,
-        disk_free_mib=1.0,
-        gpu_percent=40.0,
-        gpu_mib=2048.0,
+        4, "probe", rss_mib={0: 100.0, 1: 120.0}, cores_used=1.0, disk_free_mib=1.0, gpu_percent=40.0, gpu_mib=2048.0
     ),
     event(10, "item_done", worker=0, item="a", status="kept", seconds=8.0, steps=40),
     event(12, "worker_died", worker=1, pid=2, item="b", seconds=9.0, steps=30),
@@ -56,7 +50,6 @@ def test_figures_of_a_run():
 
 
 def test_tables_are_those_of_the_paper():
-    """Two workers twice as fast."""
     about = {"cores_used": 1.5, "peak_memory_mib": 300.0, "restarts": 0, "failed": 0, "seconds": 10.0}
     counts = [{"workers": n, "attempted": 100 * n, "successful": 100 * n} for n in (1, 2)]
     bench = Bench.model_validate({"stage": "render", "cores": 2, "rows": [about | row for row in counts]})
@@ -70,8 +63,6 @@ def test_tables_are_those_of_the_paper():
 
 
 def test_what_lost_workers_had_done_is_counted_and_left_out(tmp_path):
-    """A worker dies after its third step: the item is done again, and the steps are told in the manifest and in the
-    table of stages."""
     items = [Item("a", "once-die", num_steps=3), Item("b", num_steps=3)]
     folder = stage_in(tmp_path)
     finished = run_items(folder, items, make_counting_worker, (tmp_path,), workers=1, watch=Watch(heartbeat_s=0.2))

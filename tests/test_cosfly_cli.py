@@ -46,7 +46,6 @@ def test_what_an_option_does_not_take_is_told_in_words_for_people(capfd, monkeyp
 
 
 def answer(capfd, monkeypatch, *words: str) -> tuple[int, str]:
-    """Run a command in this process; gives its exit code and its last line on the error stream."""
     monkeypatch.setattr(sys, "argv", ["cosfly", *words])
     with pytest.raises(SystemExit) as end:
         cli.main()
@@ -134,9 +133,6 @@ def test_failed_items_make_the_command_exit_1_unless_the_settings_accept_them(ca
         Job(RunConfig()).finish(tmp_path / "product", tmp_path)
     Job(RunConfig(max_failed=1)).finish(tmp_path / "product", tmp_path)
     assert capfd.readouterr().out.count("product") == 2
-
-
-# --- addresses of servers ---------------------------------------------------------------------------------------------
 
 
 def test_an_address_that_holds_a_secret_is_refused_without_it():

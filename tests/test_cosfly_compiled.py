@@ -12,7 +12,6 @@ import cosfly
 
 
 def make_package(root: Path) -> Path:
-    """A package of our name that compiles as ours does."""
     package = root / "src" / "cosfly"
     package.mkdir(parents=True)
     shutil.copy(Path(cosfly.__file__).parent / "__init__.py", package)
@@ -22,7 +21,6 @@ def make_package(root: Path) -> Path:
 
 @pytest.mark.slow
 def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
-    """Its own file stays as it is: numba alone would go on with the old function."""
     package = make_package(tmp_path)
     (package / "upper.py").write_text(
         "from cosfly.runtime.compiled import njit\nfrom cosfly.lower import f\n\n\n"
@@ -46,7 +44,6 @@ def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
 
 
 def test_compiling_is_told_once_and_loading_is_not(tmp_path):
-    """Two functions in a new cache: one line; the second process loads them and says nothing."""
     (tmp_path / "two.py").write_text(
         "import logging\nlogging.basicConfig(level=logging.INFO, format='%(message)s')\n"
         "from cosfly.runtime.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return x + 1\n\n\n"

@@ -75,10 +75,7 @@ def test_a_setting_that_is_not_there_is_told_its_place_or_its_neighbours():
     for given, words in (
         ("altitude_max_m=40", r"altitude_max_m: unknown setting \(did you mean 'plan\.altitude_max_m'\?\)"),
         ("render.altitude_max_m=40", r"render\.altitude_max_m: .*\(did you mean 'plan\.altitude_max_m'\?\)"),
-        (
-            "endpoint.json_schema=false",
-            r"did you mean 'caption\.endpoint' or 'distill\.infer\.endpoint'\?",
-        ),
+        ("endpoint.json_schema=false", r"did you mean 'caption\.endpoint' or 'distill\.infer\.endpoint'\?"),
         ("plan.wokers=2", r"plan\.wokers: unknown setting"),
         ("render.fovs_deg=60", r"render\.fovs_deg: not a list, got 60; write \[60\]"),
     ):
@@ -90,11 +87,7 @@ def test_a_setting_that_is_not_there_is_told_its_place_or_its_neighbours():
         explain(RunConfig(), "plan.mucco")
 
 
-# --- the settings explained -------------------------------------------------------------------------------------------
-
-
 def test_every_setting_is_explained_once_with_its_value():
-    """The plain way to find them: walk the resolved settings."""
     cfg = RunConfig()
 
     def names(group: BaseModel, above: str) -> list[str]:

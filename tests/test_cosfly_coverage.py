@@ -1,7 +1,5 @@
 """What a run covers: counted in bins, added up, and told beside the plain run."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

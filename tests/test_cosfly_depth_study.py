@@ -1,19 +1,11 @@
-"""`cosfly study depth`: the paper's table where it can be worked out by hand, codings that come back, frames that have
-nothing to study."""
-
-from __future__ import annotations
+"""`cosfly study depth`."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosfly.studies.depth import (
-    BITS,
-    Study,
-    quantised,
-    run,
-)
+from cosfly.studies.depth import BITS, Study, quantised, run
 
 NEAR_M, FAR_M = 15.36, 38.32  # tab:depth_format_comparison
 

@@ -80,7 +80,6 @@ def test_an_action_outside_its_bounds_and_a_step_after_the_end_are_refused_in_a_
 
 @pytest.mark.slow
 def test_cheats_do_not_pay(follow):
-    """Going high, staring and crashing early earn less than being behind the person for the whole episode."""
     at = SimpleNamespace(position_m=np.array([0.0, 0, 20]), target_m=np.array([15.0, 0, 1]), target=SimpleNamespace())
     for visible, ended, above_m, low, high in (
         (True, None, 20.0, 1, 1), (False, None, 20.0, 0, 0), (True, None, 1 + NO_REWARD_M, 0, 0),
@@ -130,8 +129,6 @@ def test_lists_are_fixed_and_their_digests_are_those_of_the_document():
         assert (env, len(episodes), len({*episodes})) == (task, 20, 20)
         assert digest[:12] in text, f"{task}: {digest[:12]}"
 
-
-# --- policies ---------------------------------------------------------------------------------------------------------
 
 POLICIES = """
 import os, subprocess, sys, time
@@ -189,7 +186,6 @@ class NoAct: pass
 
 @pytest.fixture
 def ask(follow, tmp_path, monkeypatch):
-    """Gives what a policy of that name answers, four times of one episode and once of the next."""
     (tmp_path / "own.py").write_text(POLICIES)
     monkeypatch.chdir(tmp_path)
     follow.reset(seed=0)

@@ -1,7 +1,5 @@
 """Foreign text: the terminal obeys none of it, pages and cards show it as it is, and no length of it is too long."""
 
-from __future__ import annotations
-
 import copy
 import io
 import re
@@ -39,9 +37,6 @@ HOSTILE = (
 )
 
 
-# --- the terminal -----------------------------------------------------------------------------------------------------
-
-
 @given(st.text(alphabet=st.characters(codec=None), max_size=200))
 def test_a_terminal_is_given_nothing_that_it_obeys(text):
     assert not OBEYED.search(for_terminal(text))
@@ -49,7 +44,6 @@ def test_a_terminal_is_given_nothing_that_it_obeys(text):
 
 
 def printed(monkeypatch, *, is_terminal: bool = True, width: int = 400) -> io.StringIO:
-    """Let the shared console write into memory."""
     stream = io.StringIO()
     terminal = type(shared.console)(stderr=True)
     terminal.file, terminal._force_terminal, terminal.width, terminal.no_color = stream, is_terminal, width, True
@@ -79,12 +73,7 @@ def test_an_error_is_one_short_line_whatever_it_names():
     assert "\n" not in str(error)
 
 
-# --- pages ------------------------------------------------------------------------------------------------------------
-
-
 class Tags(HTMLParser):
-    """Collects the tags of a page with the names of their attributes."""
-
     def __init__(self, page: str) -> None:
         super().__init__()
         self.seen: set[tuple[str, ...]] = set()
@@ -111,7 +100,6 @@ def texts_in(value: Any, path: tuple = ()) -> Iterator[tuple]:
 
 
 def forged(model: type[BaseModel], honest: BaseModel, least: int) -> BaseModel:
-    """Give the same record with every text that can be anything hostile; at least so many can."""
     value = honest.model_dump(mode="json")
     count = 0
     for path in list(texts_in(value)):
@@ -171,8 +159,6 @@ def test_the_page_of_a_captioning_run_shows_forged_captions(tree, tmp_path):
     page = page_html(forged(CaptionReport, report, 1), cards, {}, BudgetConfig(), HOSTILE)
     check_page(page, (done / "report.html").read_text(encoding="utf-8") + '<div class="gone"></div>')
 
-
-# --- the card ---------------------------------------------------------------------------------------------------------
 
 markdown = MarkdownIt("commonmark", {"html": True}).enable("table")
 

@@ -1,7 +1,5 @@
 """Trees of somebody else: some flights, one track, flights behind links, several trees; to captions and a release."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -25,9 +23,6 @@ def names(tree: Path, **choice) -> list[str]:
     return [folder.relative_to(tree).as_posix() for folder in find_tracks(tree, TrackChoice(**choice))]
 
 
-# --- which flights ----------------------------------------------------------------------------------------------------
-
-
 def test_patterns_are_of_folders_and_those_above_them(tree):
     for choice, count in (
         ({}, 8),
@@ -48,10 +43,4 @@ def test_patterns_are_of_folders_and_those_above_them(tree):
         names(tree, match=("*/ORI",), tracks=("perturbed",))
 
 
-# --- links ------------------------------------------------------------------------------------------------------------
-
-
 # --- all the way ------------------------------------------------------------------------------------------------------
-
-
-# --- smaller ----------------------------------------------------------------------------------------------------------

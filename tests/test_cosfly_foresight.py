@@ -7,9 +7,8 @@ from tables import each
 
 from cosfly.geometry import kernels, trajectory_metrics
 from cosfly.planners import foresight, smoothing
-from cosfly.planners.contract import PlanConfig, load_planner
+from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import make_scenario, plan_on
-from cosfly.runtime.seeding import rng_for
 
 CFG = PlanConfig()
 
@@ -27,9 +26,6 @@ def straight_scenario(obstacles, length_m=30.0):
     return make_scenario(walk_along("w", [(0, 0), (length_m, 0)]), obstacles, CFG)
 
 
-# --- lattice ----------------------------------------------------------------------------------------------------------
-
-
 def test_the_wished_places_are_in_the_lattice_and_cost_nothing():
     scenario, _ = scenario_of("corner")
     for climbing in (False, True):
@@ -42,9 +38,6 @@ def test_the_wished_places_are_in_the_lattice_and_cost_nothing():
         assert (made.frames[0], made.frames[-1]) == (0, len(scenario.targets_m) - 1)
         away_m = np.hypot(*(made.places_m - scenario.targets_m[made.frames, None, None])[..., :2].T)
         assert made.radius_max_m == pytest.approx(away_m.max())
-
-
-# --- search -----------------------------------------------------------------------------------------------------------
 
 
 @each("seed", range(2))
@@ -105,9 +98,6 @@ def test_no_sequence_of_places_is_cheaper(seed):
     assert cost == pytest.approx(cheapest_by_trying_all(places, own, longest_m, obstacles, 3.0, *settings))
 
 
-# --- smoothing --------------------------------------------------------------------------------------------------------
-
-
 @each("seed", range(3))
 def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
     obstacles = random_town(seed)
@@ -121,13 +111,6 @@ def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
     assert seen >= seen_raw - 0.01
     assert facts["raw_visibility"] == pytest.approx(seen_raw, abs=1e-4)
     assert trajectory_metrics.derivative_rms(points, 3) <= max(0.3 * trajectory_metrics.derivative_rms(raw, 3), 0.05)
-
-
-# --- whole flights ----------------------------------------------------------------------------------------------------
-
-
-def fly(planner, scenario, obstacles):
-    return load_planner(planner)(scenario, obstacles, CFG, rng_for(0, "plan", scenario.path_id))
 
 
 # --- from where a drone is --------------------------------------------------------------------------------------------

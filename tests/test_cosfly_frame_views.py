@@ -37,8 +37,6 @@ def frame(tree):
     return read_track(find_tracks(tree)[0]).frame_folder(1)
 
 
-# --- what is told and what is shown ---
-
 # Views, layout, largest side: every count of views, orders that are not the usual one, both layouts and sizes.
 SHAPES = [
     (("rgb",), "separate", 640),
@@ -53,13 +51,11 @@ NAMES = {
 
 
 def told_views(text: str, language: Language) -> tuple[str, ...]:
-    """The views that a prompt names, by the order of their names in it."""
     places = {view: text.find(name) for name, view in NAMES[language].items() if name in text}
     return tuple(sorted(places, key=places.__getitem__))
 
 
 def told_count(text: str, language: Language) -> int:
-    """The number of pictures of a frame that a prompt announces."""
     several = {"en": r"given as (\d+) pictures", "zh": r"每帧依次给出 (\d+) 张"}[language]
     found = re.search(several, text)
     if found is None:
@@ -83,7 +79,6 @@ def window(tree) -> Window:
 
 
 def ask(window: Window, cfg: ImageConfig) -> tuple[dict[Language, str], list[np.ndarray]]:
-    """What a teacher is told in both languages, and shown."""
     question = make_question(window.observed, cfg, "prose", VOCABULARY)
     messages, _ = question_messages(question, FrameEncoder(cfg))
     assert messages[1]["content"][-1]["text"] == question.asked["en"].user
@@ -108,7 +103,6 @@ def test_a_teacher_is_told_what_it_is_shown(window):
 
 @each(("views", "layout", "max_side_px"), SHAPES)
 def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, window, views, layout, max_side_px):
-    """The teacher gets all three; the student any of them, in any order."""
     image = {"layout": layout, "max_side_px": max_side_px, "depth_range_m": 40.0}
     cfg = CaptionConfig.model_validate({"image": image, "window": {"require_images": True}})
     cfg = cfg.model_copy(update={"image": cfg.image.model_copy(update={"encoding": "png"})})
@@ -135,14 +129,3 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
         assert kinds == [word for i in range(5) for word in (f"t{i}:", *["picture"] * len(views))] + [text]
         for picture, wanted in zip(sent_pictures(request.messages), expected, strict=True):
             assert np.array_equal(picture, wanted)
-
-
-# --- pixels ---
-
-
-@pytest.fixture(scope="module")
-def large(tmp_path_factory):
-    """A window of a flight in pictures of 640 x 360."""
-    root = tmp_path_factory.mktemp("large")
-    make_playback_tree(root, 1, 10, seed=1, width_px=640, height_px=360, with_augmented=False)
-    return next(cut_windows(read_track(find_tracks(root)[0]), WindowConfig())).observed

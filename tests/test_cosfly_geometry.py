@@ -38,7 +38,6 @@ def test_look_at_puts_the_target_in_the_middle(yaw, pitch):
 
 
 def test_image_axes():
-    """A point to the left is left in the image, a higher point is higher, and behind is nowhere."""
     pose = world_from_camera(np.zeros(3), np.zeros(3))  # looks east
     uv, z = project(np.array([[10.0, 1, 0], [10, 0, 1], [-10, 0, 0]]), pose, intrinsic_matrix(1280, 720, 90))
     assert uv[0, 0] < 640
@@ -48,7 +47,6 @@ def test_image_axes():
 
 
 def test_mirroring_is_its_own_inverse_and_keeps_the_picture():
-    """A scene mirrored with its camera is the mirror picture of the scene: nothing else changes at the door."""
     point, eye, rotation = np.array([12.0, 5.0, 1.0]), np.array([0.0, 1.0, 20.0]), np.array([-40.0, 25.0, 0.0])
     assert_allclose(mirror_poses(mirror_poses(point)), point)
     assert_allclose(mirror_poses(mirror_poses(rotation)), rotation)

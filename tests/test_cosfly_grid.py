@@ -9,19 +9,12 @@ from cosfly.formats.boxes import make_box_map
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.roi import Roi
 from cosfly.geometry.axes import rotation_matrix
-from cosfly.geometry.grid import (
-    OccupancyGrid,
-    blocks_walking,
-    occupancy,
-    roi_mask,
-    surface,
-)
+from cosfly.geometry.grid import OccupancyGrid, blocks_walking, occupancy, roi_mask, surface
 
 BUILDINGS, WATER, ROADS = KINDS["Buildings"], KINDS["Water"], KINDS["Roads"]
 
 
 def grid_of(text: str) -> OccupancyGrid:
-    """Make a grid from rows of text, the first row at the north: # is occupied."""
     rows = [[mark == "#" for mark in row] for row in text.split()]
     return OccupancyGrid(0.0, 0.0, 1.0, np.array(rows[::-1]))
 
@@ -32,9 +25,6 @@ def free_grid(num_x: int, num_y: int, resolution_m: float = 1.0, x_min_m: float 
 
 def one_box(center, half_extents, rotation_deg=(0, 0, 0), kind=BUILDINGS):
     return make_box_map([center], [half_extents], [rotation_deg], [kind])
-
-
-# --- cells and metres -------------------------------------------------------------------------------------------------
 
 
 # --- which boxes, which cells -----------------------------------------------------------------------------------------
@@ -81,9 +71,6 @@ def test_surfaces_near_the_ground_count_and_a_flyover_does_not():
     )
     np.testing.assert_array_equal(surface(box_map, like=free_grid(6, 2)), grid_of("##.... ##....").occupied)
     assert surface(box_map, [WATER], like=free_grid(6, 2)) is None
-
-
-# --- comparing --------------------------------------------------------------------------------------------------------
 
 
 # --- growing, cutting out, connecting ---------------------------------------------------------------------------------

@@ -1,7 +1,5 @@
 """Inspection: clean flights pass, every planted defect is found and named, and the funnel adds up."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re
@@ -47,7 +45,6 @@ NUM_POINTS = 10
 
 
 def plan_of(folder: Path) -> DroneTrace:
-    """The plan that a specimen flight was flown from."""
     flight = read_track(folder)
     n = len(flight)
     return DroneTrace(
@@ -57,7 +54,6 @@ def plan_of(folder: Path) -> DroneTrace:
 
 
 def write_map(workplace: Path, *boxes) -> None:
-    """A road far off and some walls, (center, half) each."""
     rows = [([0.0, 900.0, -1.0], [9.0, 9.0, 0.1]), *boxes]
     kinds = [KINDS["Roads"], *[KINDS["Walls"]] * len(boxes)]
     made = make_box_map([c for c, _ in rows], [h for _, h in rows], np.zeros((len(rows), 3)), kinds)
@@ -72,7 +68,6 @@ def list_files(tree: Path) -> None:
 
 @pytest.fixture(scope="module")
 def specimen(tmp_path_factory) -> Path:
-    """A clean tree with checksums, and its plans; copied before anything is broken."""
     root = tmp_path_factory.mktemp("specimen")
     tree = make_playback_tree(root / "tree", num_flights=2, num_points=NUM_POINTS, width_px=192, height_px=108)
     list_files(tree)
@@ -104,7 +99,6 @@ def first_flight(workplace: Path, variant: str = "ORI") -> Path:
 
 
 def codes_of(inspection, folder: Path) -> dict[str, str]:
-    """code -> severity of the findings of one flight."""
     name = "/".join(folder.parts[-3:])
     flight = next(f for f in inspection.flights if f.folder == name)
     return {issue.code: issue.severity for issue in flight.issues}
@@ -183,11 +177,7 @@ def test_plan_rules(change, code, severity):
     assert {issue.code for issue in report.issues} <= {"prefiltered"}
 
 
-# --- the map ----------------------------------------------------------------------------------------------------------
-
-
 def findings(workplace: Path, cfg: InspectConfig = CFG) -> dict[str, dict[str, str]]:
-    """What was found of the flights of the first trajectory, by variant: code -> severity."""
     shutil.rmtree(workplace / "out", ignore_errors=True)
     with contextlib.suppress(NothingKept):  # then the records say why
         inspect(workplace, cfg)
@@ -196,7 +186,6 @@ def findings(workplace: Path, cfg: InspectConfig = CFG) -> dict[str, dict[str, s
 
 
 def test_each_track_is_measured_against_the_map_by_its_own_poses(workplace):
-    """A post stands in the middle of one perturbed pose, another 2 m beside a clean one."""
     clean, shaken = (read_track(first_flight(workplace, variant)) for variant in ("ORI", "aug_001"))
     i = int(np.argmax(np.linalg.norm(shaken.positions_m - clean.positions_m, axis=1)))
     away = shaken.positions_m[i] - clean.positions_m[i]
@@ -236,7 +225,6 @@ def test_a_post_between_two_poses_is_a_collision(workplace):
 
 @pytest.mark.parametrize(("up_m", "is_hit"), [(0.0, False), (3.0, True)])
 def test_the_way_between_frames_is_the_one_that_was_flown(workplace, up_m, is_hit):
-    """Of a flight whose drawn frames leave poses out, which lie 3 m over the straight line from frame to frame."""
     folder = first_flight(workplace)
     flight = read_track(folder)
     middles = 0.5 * (flight.planned[0] + np.roll(flight.planned[0], -1, axis=0)) + [0.0, 0.0, 3.0, 0.0, 0.0, 0.0]
@@ -274,9 +262,6 @@ def test_a_shift_that_hides_what_the_clean_flight_shows_goes_to_review(workplace
     ]
     edit(first_flight(workplace), at_point("target", "visible", False, int(shifted[0])))  # hidden without the shift too
     assert "hidden_by_shift" not in codes_of(inspect(workplace, cfg, "again"), folder)
-
-
-# --- planted defects --------------------------------------------------------------------------------------------------
 
 
 def edit(folder: Path, change) -> None:
@@ -318,7 +303,6 @@ def at_point(key, name, value, index=3):
 
 
 def record_masks(folder: Path, wrong: dict[int, list[float] | None]) -> None:
-    """Record the box of the person's pixels in every frame, but for some."""
     boxes = [mask_box(read_instance(folder / frame_name(i))[0] == 12) for i in range(NUM_POINTS)]
     told = {i: None if np.isnan(box).any() else box.tolist() for i, box in enumerate(boxes)} | wrong
 
@@ -392,7 +376,6 @@ def with_grain(image: np.ndarray) -> np.ndarray:
 
 
 def paint(folder: Path, color: tuple[int, int, int], *, grain: bool) -> None:
-    """Give all of frame 3 grain, and its largest surface a colour (blue, green, red), with grain or without."""
     surface = largest_surface(folder)
 
     def change(image: np.ndarray) -> np.ndarray:
@@ -405,7 +388,6 @@ def paint(folder: Path, color: tuple[int, int, int], *, grain: bool) -> None:
 
 
 def let_fight(folder: Path) -> None:
-    """Give every other column of the largest surface to another one."""
     surface = largest_surface(folder)
     surface[:, ::2] = False
 
@@ -448,7 +430,6 @@ TO_REVIEW = {
 
 
 def slimmer(image: np.ndarray) -> np.ndarray:
-    """A person of whom the uppermost row of pixels is left."""
     image = image.copy()
     is_person = image[..., 2] == KINDS["Pedestrians"]
     rows = np.flatnonzero(is_person.any(axis=1))
@@ -460,7 +441,6 @@ def slimmer(image: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("form", ["npy", "png"])
 def test_far_is_far(workplace, form):
-    """Beyond 1,000 m is as far as the sky, in anybody's frames: read as such, here and by `release verify`."""
     folder, path = first_flight(workplace), first_flight(workplace) / FRAME / "depth.npy"
     depth, top_row = np.load(path), np.arange(108)[:, None] == 0
     name, data = depth_file(np.where(top_row, np.float32(1000.2), depth), form)
@@ -475,7 +455,6 @@ def test_far_is_far(workplace, form):
 
 
 def test_a_flight_that_its_tree_does_not_list(workplace):
-    """The tree's manifest lists the other flights, and another digest of one."""
     tree, broken, twin = workplace / "tree", first_flight(workplace), first_flight(workplace, "aug_001")
     files = [folder / "trajectory.json" for folder in find_tracks(tree) if folder != broken]
     outputs = [
@@ -492,7 +471,6 @@ def test_a_flight_that_its_tree_does_not_list(workplace):
 
 
 def plant(specimen: Path, root: Path, defects: dict) -> None:
-    """Write a tree with a trajectory for each defect, in its clean track, after one without any; their plans; a map."""
     pair = first_flight(specimen).parent
     plan, plans = plan_of(pair / "ORI"), []
     for number, defect in enumerate(["", *defects]):
@@ -532,7 +510,6 @@ def test_a_planted_defect_is_found_in_that_flight_alone(specimen, tmp_path, subt
 
 
 def test_every_check_has_a_planted_defect():
-    """Codes are found in the sources; `elsewhere` names those whose defects are planted in tests of their own."""
     sources = "".join(path.read_text() for path in Path(frames.__file__).parent.glob("*.py"))
     codes = set(re.findall(r"report\.(?:error|warn)\(\s*\"(\w+)\"", sources)) | {"collision", "clearance"}
     elsewhere = {
@@ -609,10 +586,4 @@ def test_the_funnel_counts_prefiltered_and_unrendered_plans(workplace):
     assert funnel.dropped == {"five_ray_visibility": 1, "smoothness": 1}
 
 
-# --- kernels ----------------------------------------------------------------------------------------------------------
-
-
 boxes = st.tuples(*[st.integers(0, 12)] * 4).map(lambda v: np.array([v[0], v[1], v[0] + v[2], v[1] + v[3]], float))
-
-
-# --- the stage --------------------------------------------------------------------------------------------------------

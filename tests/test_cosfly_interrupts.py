@@ -1,7 +1,5 @@
 """Ctrl-C while requests are in flight, sent to a real process at moments that it names itself."""
 
-from __future__ import annotations
-
 import asyncio
 import signal
 import subprocess

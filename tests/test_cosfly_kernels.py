@@ -8,7 +8,6 @@ from cosfly.geometry.axes import rotation_matrices, rotation_matrix
 
 
 def parts(index):
-    """Centres (k, 3), half extents (k, 3) and rotations (k, 3, 3) of an index."""
     return index.rows[:, :3], index.rows[:, 3:6], index.rows[:, 6:15].reshape(-1, 3, 3)
 
 
@@ -21,7 +20,6 @@ def slow_distances(index, points):
 
 
 def slow_hits(index, start, end, inflate_m=0.0):
-    """(k,) bool: clip the segment by the six planes of each grown box."""
     hits = np.zeros(len(index.rows), dtype=bool)
     for box, (center, half_extent, rotation) in enumerate(zip(*parts(index), strict=True)):
         a = rotation.T @ (start - center)

@@ -144,7 +144,6 @@ TAKING = {
 
 @pytest.mark.parametrize("section", TAKING)
 def test_no_setting_is_ignored(town, monkeypatch, section):
-    """Each setting of a section is read by the function that takes it, or refused."""
     (model, taken, calls), read, is_built = TAKING[section], set(), False
 
     def get(self, name):
@@ -172,7 +171,6 @@ def test_no_setting_is_ignored(town, monkeypatch, section):
 
 
 def test_the_notebook_runs_and_its_numbers_fit():
-    """Its cells, one after another; what it says in the end is true."""
     names: dict = {}
     for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]:
         if cell["cell_type"] == "code":

@@ -57,9 +57,6 @@ def document(model: Model) -> bytes:
     return json.dumps(model).encode()
 
 
-# --- forms: each says the same as city() ---
-
-
 def v11_with_a_group(model: Model) -> Model:
     model = copy.deepcopy(model) | {"version": "1.1"}
     model["CityObjects"]["quarter"] = {"type": "CityObjectGroup", "children": ["house", "other"]}
@@ -176,7 +173,6 @@ def test_an_older_city_model_is_refused_with_the_command_that_upgrades_it(tmp_pa
 
 @pytest.mark.slow
 def test_a_real_sequence_of_buildings_is_read(shared_data: Path):
-    """99 buildings of 3D BAG, CityJSON 1.1: outlines at level 0, parts at 1.2, 1.3 and 2.2."""
     path = shared_data / "tudelft-3dbag" / "extension.city.jsonl.gz"
     box_map, coarse = (
         load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=path, solids=solids, derive_ground=False)))
@@ -188,6 +184,3 @@ def test_a_real_sequence_of_buildings_is_read(shared_data: Path):
     assert set(box_map.kinds) == {KINDS["Buildings"]}
     assert coarse.maxs[:, 2].max() == pytest.approx(26.396 + 0.075, abs=1e-3)  # at level 1.2
     assert box_map.maxs[:, 2].max() == pytest.approx(76.224 + 0.075, abs=1e-3)  # as drawn, at level 2.2
-
-
-# --- grounds ---

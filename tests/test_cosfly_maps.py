@@ -134,7 +134,6 @@ def test_an_asset_without_a_size_is_an_error_or_counted(tmp_path: Path):
 
 
 def overlapping_pairs(buildings: BoxMap, *, with_yaw: bool) -> int:
-    """Pairs whose exact rectangles overlap by more than 5 cm: still do when both have lost 2.5 cm on every side."""
     shapes = [
         footprint(buildings, row, with_yaw=with_yaw).buffer(-0.025, join_style="mitre") for row in range(len(buildings))
     ]
@@ -170,7 +169,6 @@ def test_known_answers_of_the_robotics_worlds(shared_data: Path, world: str, pai
 
 
 def city_model() -> dict:
-    """The city of the table of kinds, two houses of 10 x 6 m and a road; and a lawn with one tall corner."""
     model = two_houses()
     model["vertices"] += [[80_000, 60_000, 2000], [110_000, 60_000, 2000], [80_000, 90_000, 2000]]
     model["vertices"] += [[110_000, 90_000, 10_000]]

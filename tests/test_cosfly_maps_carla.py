@@ -1,7 +1,5 @@
 """Maps of a CARLA server: through the unmodified client from a server of ours, and what is odd in real exports."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -68,7 +66,6 @@ def box(x: float, y: float, half: tuple[float, float, float], yaw: float = 0.0) 
 
 
 def told(**changes) -> CarlaTown:
-    """A town with all that is known to be odd."""
     house = box(10.0, 20.0, (4.0, 3.0, 5.0), 30.0)
     rows = [
         ("Roads", 1, "Road", (0.0, 0.0, -0.1, 30.0, 4.0, 0.2, 0.0, 0.0, 0.0)),

@@ -1,7 +1,5 @@
 """Maps of an UnrealCV server: through the real client over a real socket from a server of ours, and what is odd."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import socket
@@ -30,7 +28,6 @@ pytest.importorskip("unrealcv")
 
 @contextlib.contextmanager
 def beside(box_map: BoxMap, *faults: str):
-    """A server in a thread of this process; gives its port."""
     port = free_port()
     server = UnrealCvServer(box_map, port, faults)
     threading.Thread(target=server.serve, daemon=True).start()

@@ -1,7 +1,5 @@
 """Meshes: read as trimesh reads them, drawn where its rays meet them, hostile ones refused; CityJSON solids."""
 
-from __future__ import annotations
-
 import json
 import os
 import struct

@@ -1,20 +1,12 @@
-"""What a flight teaches a policy: actions that fly the plan, waypoints that lead to it, at the plan's rate and the
-frames'."""
+"""What a flight teaches a policy."""
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 
 from cosfly.formats.segments import Mission, Segment
 from cosfly.formats.traces import DroneTrace
 from cosfly.geometry.axes import rotation_matrices
 from cosfly.geometry.motion import PlannedMotion
-from specimens import make_playback_tree
-
-
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory):
-    return make_playback_tree(tmp_path_factory.mktemp("tree"), num_flights=1, num_points=14)
 
 
 def curve(num: int, dt_s: float = 0.1) -> DroneTrace:
@@ -49,7 +41,6 @@ def test_the_known_answer_of_the_public_release_as_an_action():
 
 
 def test_flying_the_actions_gives_the_plan():
-    """The oracle: velocities turned back into the world by the frame's yaw, step by step."""
     trace = curve(31)
     shown, between = trace.every(5), trace.between(5)
     motion = motion_of(shown.time_s, np.hstack([shown.positions_m, shown.rotations_deg]), between)

@@ -90,7 +90,6 @@ CFG = PedestriansConfig(others=6, look_alikes=2, traffic=6, pace={"walk": 1, "st
 
 @pytest.fixture(scope="module")
 def placed():
-    """(box_map, ground, lanes, walks with their companies)."""
     box_map = crossing_town(("Buildings", (40, 40, 5), (20, 20, 5)), ("Buildings", (-40, 40, 5), (20, 20, 5)))
     ground, lanes = walkable_ground(box_map, CFG), lanes_of(box_map)
     made = []

@@ -1,7 +1,5 @@
 """cosfly/viz/overlay.py and `cosfly view --frame`: boxes, ids and distances over a frame."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -24,11 +24,10 @@ from cosfly.pedestrians.stage import (
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.seeding import rng_for
 
-BUILDINGS, ROADS, WATER = KINDS["Buildings"], KINDS["Roads"], KINDS["Water"]
+BUILDINGS, ROADS = KINDS["Buildings"], KINDS["Roads"]
 
 
 def town(size_m: float = 160.0, *, walls: list = (), seed: int = 4):
-    """Make a square of ground with 40 turned houses and what else is given as (center, half_extents)."""
     rng = np.random.default_rng(seed)
     centers = [[size_m / 2, size_m / 2, -0.1], *np.column_stack([rng.uniform(0, size_m, (40, 2)), np.full(40, 3.0)])]
     extents = [[size_m / 2, size_m / 2, 0.1], *np.column_stack([rng.uniform(1, 5, (40, 2)), np.full(40, 3.0)])]
@@ -42,20 +41,12 @@ def town(size_m: float = 160.0, *, walls: list = (), seed: int = 4):
 
 
 def plain(size_m: float, *walls):
-    """Make a square of ground with walls only, given as (center, half_extents)."""
     centers = [[size_m / 2, size_m / 2, -0.1]] + [center for center, _ in walls]
     extents = [[size_m / 2, size_m / 2, 0.1]] + [half_extents for _, half_extents in walls]
     return make_box_map(centers, extents, np.zeros((len(centers), 3)), [ROADS] + [BUILDINGS] * len(walls))
 
 
-def lawn(size_m: float):
-    box_map = plain(size_m)
-    box_map.kinds[0] = KINDS["Terrain"]
-    return box_map
-
-
 def ground_of(text: str) -> WalkableGround:
-    """Make a ground from rows of part numbers, row 0 first."""
     return ground_in(np.array([[int(mark) for mark in row] for row in text.split()], dtype=np.int32))
 
 

@@ -43,9 +43,6 @@ def test_every_planner_has_its_group_and_every_one_of_the_papers_its_row():
     assert set(ALL_PLANNERS) - set(PAPER) == {"foresight"}
 
 
-# --- the stage --------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
     """A walk round a corner, through whose block minimum jerk finds no way, and one along a wall."""

@@ -34,9 +34,6 @@ def figures(**given):
     return {name: 0.0 for name, _, _ in compare.FIGURES} | given
 
 
-# --- figures ----------------------------------------------------------------------------------------------------------
-
-
 def test_axis_scores_are_the_papers():
     scores = compare.axis_scores({name: figures(**row) for name, row in PAPER.items()})
     for name, expected in SCORES.items():
@@ -58,9 +55,6 @@ def test_deltas_are_the_papers():
     assert table["length_m"] == {"delta": -4.359, "relative_percent": pytest.approx(-4.005, abs=1e-3)}
     assert table["clearance_min_m"]["relative_percent"] == pytest.approx(46.283, abs=0.02)
     assert table["collision_fraction"] == {"delta": 0.0, "relative_percent": None}
-
-
-# --- the stage --------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +107,3 @@ def test_a_walk_that_one_planner_cannot_fly_is_counted(inputs, tmp_path, monkeyp
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
     assert manifest["counts"]["dropped"] == {"no_muco_trajectory": 1}
     assert {(row["id"], row["planner"]) for row in record["skipped"]} == {("into_wall", "all"), ("b", "muco")}
-
-
-# --- the command ------------------------------------------------------------------------------------------------------

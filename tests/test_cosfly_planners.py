@@ -26,9 +26,6 @@ from cosfly.runtime.errors import ResumeError
 CFG = PlanConfig()
 
 
-# --- metrics ----------------------------------------------------------------------------------------------------------
-
-
 def test_uniform_motion_is_perfectly_smooth():
     line = np.outer(np.arange(50), [0.5, -0.2, 0.1])
     assert metrics.derivative_rms(line, 2) == pytest.approx(0, abs=1e-12)
@@ -36,9 +33,6 @@ def test_uniform_motion_is_perfectly_smooth():
     assert metrics.smoothness_score(0, 0) == 1
     assert metrics.length_m(line) == pytest.approx(49 * np.sqrt(0.3))
     assert metrics.speed_max_mps(line) == pytest.approx(2 * np.sqrt(0.3))
-
-
-# --- the loss ---------------------------------------------------------------------------------------------------------
 
 
 def plain_terms(points, problem, obstacles):
@@ -70,7 +64,6 @@ def plain_terms(points, problem, obstacles):
 
 
 def shaken(world, seed=3):
-    """A trajectory behind the target, shaken, so that every term is at work."""
     scenario, obstacles = scenario_of(world)
     problem = muco.make_problem(scenario, CFG)
     points = replace(scenario.reference, ground_distance_m=np.full(len(scenario.targets_m), 18.0)).places_m(
@@ -130,9 +123,6 @@ def test_curvature_is_positive_and_exact_for_the_quadratic_terms():
     np.testing.assert_allclose(matrix @ x, gradient, atol=1e-8)
     assert 0.5 * x @ matrix @ x == pytest.approx(value)
     assert np.linalg.eigvalsh(dense(problem)[0]).min() > -1e-8
-
-
-# --- start ------------------------------------------------------------------------------------------------------------
 
 
 # --- flights ----------------------------------------------------------------------------------------------------------
@@ -241,12 +231,8 @@ def test_the_prefilter_has_three_rules_of_motion_and_sight(name):
     assert planners.drop_reason(worse, CFG, True) == expected[name]
 
 
-# --- the stage --------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
-    """A canyon with three walks that work and one through a wall."""
     folder = tmp_path_factory.mktemp("inputs")
     write_boxes(folder / "map.json", town_of(*CANYON, ((60, -40, 20), (5, 5, 20))))
     walks = [

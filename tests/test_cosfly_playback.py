@@ -27,7 +27,6 @@ def clean(tree):
 
 
 def rewrite(folder, target, change):
-    """Copy a trajectory file to another flight folder, changed."""
     value = json.loads((folder / "trajectory.json").read_text())
     change(value)
     new = target / "Town01" / folder.parent.name / folder.name
@@ -46,7 +45,6 @@ def test_axes_are_carlas_on_disk_and_right_handed_in_memory(clean):
 
 
 def test_poses_and_pictures_agree(tree):
-    """Re-projection self-test: pose, intrinsics and target give the stored pixel; the person is there in the mask."""
     seen = 0
     for folder in find_tracks(tree):
         flight = read_track(folder)

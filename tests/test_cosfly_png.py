@@ -1,7 +1,4 @@
-"""The PNG reader and writer against libraries', on pictures of every filter, packing and number of channels; and what
-damage does."""
-
-from __future__ import annotations
+"""The PNG reader and writer against libraries', on pictures of every filter, packing and number of channels."""
 
 import io
 import struct
@@ -78,9 +75,6 @@ def test_a_picture_that_is_not_what_its_header_says_is_refused():
     for data in refused:
         with pytest.raises(InputError):
             parse_png(data, "x")
-
-
-# --- writing ----------------------------------------------------------------------------------------------------------
 
 
 def drawn(rng: np.random.Generator, height: int, width: int) -> np.ndarray:

@@ -19,7 +19,6 @@ def begin(out: Path, name: str, **inputs: Path) -> StageFolder:
 
 
 def make(out: Path, name: str, files: dict[str, str], **inputs: Path) -> Path:
-    """A finished stage with some files."""
     stage = begin(out, name, **inputs)
     for file, text in files.items():
         write_bytes(out / file, text.encode())
@@ -28,7 +27,6 @@ def make(out: Path, name: str, files: dict[str, str], **inputs: Path) -> Path:
 
 
 def make_tree(out: Path, text: str = "", **inputs: Path) -> Path:
-    """A finished tree of two flights, one frame each."""
     stage = begin(out, "render", **inputs)
     outputs = []
     for flight in ("Town1/trajectory_1/ORI", "Town1/trajectory_2/ORI"):
@@ -44,7 +42,6 @@ def make_tree(out: Path, text: str = "", **inputs: Path) -> Path:
 
 @pytest.fixture
 def run(tmp_path) -> Path:
-    """simplify/, plan/, render/ and caption/, each made of the one before."""
     boxes = make(tmp_path / "simplify", "simplify", {"map.json": "boxes"}) / "map.json"
     traces = make(tmp_path / "plan", "plan", {"traces.json": "flights"}, map=boxes) / "traces.json"
     tree = make_tree(tmp_path / "render", simplified=boxes, traces=traces)

@@ -46,7 +46,6 @@ class Nodes:
         return self._cluster.add_node(**{"num_cpus": 1, "object_store_memory": STORE_BYTES} | settings)
 
     def kill(self, node) -> None:
-        """End a node at once, as a machine that loses power."""
         self._cluster.remove_node(node, allow_graceful=False)
 
     def end(self) -> None:
@@ -91,8 +90,6 @@ def test_workers_that_die_and_stall_once_cost_nothing_but_time(tmp_path, nodes, 
     assert "a speaks of 7" in caplog.text
 
 
-# --- what is made, though workers and nodes are lost ------------------------------------------------------------------
-
 SETTINGS = (
     "pedestrians.num_paths=4", "pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25", "workers=2",
     "render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]", "release.licence=cc-by-4.0",
@@ -100,7 +97,6 @@ SETTINGS = (
 
 
 def make(names: str, *settings: str) -> None:
-    """Make stages of a run in the folder `run` of this one."""
     for stage in pipeline.stages(load(RunConfig, None, [*SETTINGS, *settings]), Path("run")):
         if stage.name in names.split():
             stage.work()
@@ -108,8 +104,6 @@ def make(names: str, *settings: str) -> None:
 
 @contextlib.contextmanager
 def meanwhile(folder: Path, num_done: int, do: Callable[[], object]) -> Iterator[None]:
-    """Do something once so many items of a stage are done, and not all."""
-
     def wait() -> None:
         while sum(event.event == "item_done" for event in read_events(folder)) < num_done:
             time.sleep(0.01)
@@ -128,7 +122,6 @@ def products(root: Path) -> dict[str, bytes]:
 
 
 def kill_worker(folder: Path) -> None:
-    """Send SIGKILL to the worker that was started last."""
     os.kill([event.pid for event in read_events(folder) if event.event in ("worker_started", "restarted")][-1], 9)
 
 
@@ -153,9 +146,6 @@ def test_a_run_has_the_bytes_of_the_local_engine_though_workers_and_nodes_are_lo
         assert sum(event.event in LOSSES for event in events) >= least
         assert all(event.attempt == 1 for event in events if event.event == "retried")
     assert differences(products(tmp_path / "cluster"), products(tmp_path / "local")) == []
-
-
-# --- what will not do -------------------------------------------------------------------------------------------------
 
 
 def refused(tmp_path: Path, words: str, watch: Watch, make: Any = make_worker) -> None:

@@ -40,9 +40,6 @@ class _Dated(Config):
     name: str = ""
 
 
-# --- what is no regular file (hostile contents: tests/test_hostile_files.py) ------------------------------------------
-
-
 def test_a_key_that_is_given_twice_in_a_file_of_ours(tmp_path):
     (tmp_path / "x.json").write_text('{"result": "rejected", "result": "accepted"}')
     assert json_io.read_json(tmp_path / "x.json") == {"result": "accepted"}
@@ -74,9 +71,6 @@ def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path, monke
     ):
         with pytest.raises((InputError, ConfigError), match=path.name):
             read(path)
-
-
-# --- JSON -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -114,9 +108,6 @@ def test_more_brackets_than_a_text_of_its_size_has_are_refused_before_they_are_l
         json_io.parse_json(b"[" + b"{},[]," * 9_999_999 + b"{}]")
 
 
-# --- records of stages ------------------------------------------------------------------------------------------------
-
-
 def _with_line(out: Path, record) -> StageFolder:
     """A stage folder whose journal holds a line with the right checksum: whoever changes a file can change that too."""
     stage = StageFolder.open(out, "demo", config=_Dated(), inputs={}, seed=0)
@@ -134,9 +125,6 @@ def test_a_forged_line_of_a_journal_is_an_error(tmp_path, record):
         list(stage.items())
     with pytest.raises(InputError, match=r"items\.jsonl"):
         StageFolder.open(tmp_path / "out", "demo", config=_Dated(name="other"), inputs={}, seed=0)
-
-
-# --- limits -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_sparse_file_is_refused_before_it_is_read(tmp_path):
@@ -196,9 +184,6 @@ def test_texts_that_a_dictionary_repeats_are_counted_before_they_are_unpacked(tm
     monkeypatch.setattr(tables, "UNPACK_FACTOR", 10_000_000)
     row = next(tables.rows_of(path))
     assert row == pq.read_table(path).slice(0, 1).to_pylist()[0]
-
-
-# --- pictures and arrays ----------------------------------------------------------------------------------------------
 
 
 def _npy(array) -> bytes:
@@ -274,9 +259,6 @@ def test_a_chunk_that_goes_on_beyond_the_file_gets_no_memory(monkeypatch):
         arrays.parse_picture(bytes(picture), "x")
 
 
-# --- links ------------------------------------------------------------------------------------------------------------
-
-
 def _frame(tree: Path) -> Path:
     frame = tree / "Town01/trajectory_1/ORI/frames_playback/frame_00000"
     frame.mkdir(parents=True)
@@ -313,7 +295,6 @@ def test_links_within_a_tree_and_to_a_tree_are_followed(tmp_path):
 
 
 def _linked_flight(tree: Path, elsewhere: Path) -> Path:
-    """A tree whose one flight is a link to a folder below `elsewhere`; gives its frame by the tree's name."""
     frame = _frame(elsewhere)
     (frame / "depth.npy").write_bytes(depth_bytes(np.zeros((4, 4), np.float32)))
     flight = tree / "Town01/trajectory_1/ORI"
@@ -382,8 +363,6 @@ def test_names_that_lead_out_or_nowhere(tmp_path, name):
         files.read_bytes(inside(tmp_path, name))
 
 
-# --- settings ---------------------------------------------------------------------------------------------------------
-
 HOSTILE_YAML = {
     "deep": "[" * 20_000,
     "a tag": "a: !!binary aGk=",
@@ -409,9 +388,6 @@ def test_hostile_settings_are_one_clear_line(tmp_path, case):
 
 def test_a_date_is_the_text_that_it_looks_like():
     assert build(_Dated, apply_overrides({}, ["name=2026-11-22"]), "x").name == "2026-11-22"
-
-
-# --- polygons ---------------------------------------------------------------------------------------------------------
 
 
 def test_crossings_are_counted():

@@ -1,7 +1,5 @@
 """What the table of refusals makes of the texts of real servers, and what the client does with the schema."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from pathlib import Path

@@ -1,7 +1,4 @@
-"""Stage 5 around the renderer: scene parts, ids, the person, projection, perturbation, the stage and its files, the
-gallery."""
-
-from __future__ import annotations
+"""Stage 5 around the renderer."""
 
 import json
 from dataclasses import replace
@@ -50,7 +47,6 @@ SMALL = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0, 90.0], "town": "St
 
 
 def without_gl() -> str:
-    """The reason that there is no OpenGL here, or nothing."""
     try:
         open_renderer("gl", make_box_map([], [], [], []), 16, 16).close()
     except EnvironmentMissing as error:
@@ -60,9 +56,6 @@ def without_gl() -> str:
 
 NO_GL = without_gl()
 needs_gl = pytest.mark.skipif(bool(NO_GL), reason=NO_GL)
-
-
-# --- scene ------------------------------------------------------------------------------------------------------------
 
 
 def test_instance_ids_are_the_boxes_own_where_they_fit():
@@ -83,9 +76,6 @@ def test_boxes_leave_the_ids_of_others_free():
     assert np.isin(ids, [*others, PERSON_ID, 0]).sum() == 0
     assert ids.max() == SHARED_ID
     assert (ids == SHARED_ID).sum() == 25
-
-
-# --- the person -------------------------------------------------------------------------------------------------------
 
 
 @given(
@@ -123,9 +113,6 @@ def test_look_alikes_differ_from_the_target_in_one_thing_and_nobody_looks_just_l
     assert (different[::2] == 1).all()
     assert (different[1::2] >= 1).all()
     assert different[1::2].max() > 1
-
-
-# --- the target in the picture ----------------------------------------------------------------------------------------
 
 
 def test_target_in_the_middle_of_the_picture():
@@ -174,9 +161,6 @@ def test_rendered_visibility_by_hand():
     drawn = blank_frame(half)
     drawn.ids[:, :160] = PERSON_ID
     assert rendered_visibility(drawn, hip, view, pose, CAMERA) == (1.0, 0.0, 0.0), "it does not hide itself"
-
-
-# --- perturbation -----------------------------------------------------------------------------------------------------
 
 
 def planned(n: int = 200, box_map=None) -> Poses:
@@ -238,7 +222,6 @@ def test_the_four_states_come_in_the_papers_shares():
 
 
 def test_a_frame_does_not_depend_on_what_happened_before():
-    """Fallbacks must not shift the random numbers of later frames."""
     free = perturbed(PerturbationConfig(), 40)
     strict = perturbed(PerturbationConfig(min_clearance_m=500.0), 40)
     assert not any(s["position"] == "applied" for s in strict.states)
@@ -279,9 +262,6 @@ def test_a_whole_flight_along_a_planted_wall_keeps_the_planners_clearance(gap_m,
     assert (careless.poses.clearances_m.min() < 2.5) == (gap_m < 6.0), "or the wall would prove nothing"
 
 
-# --- settings ---------------------------------------------------------------------------------------------------------
-
-
 @each(
     ("data", "word"),
     [
@@ -296,9 +276,6 @@ def test_a_whole_flight_along_a_planted_wall_keeps_the_planners_clearance(gap_m,
 def test_bad_settings_are_named(data, word):
     with pytest.raises(ConfigError, match=word):
         build(RenderConfig, data, "test")
-
-
-# --- the stage --------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -382,7 +359,6 @@ class Curtain:
 
 
 def test_a_shift_that_hides_a_seen_target_falls_back(tmp_path):
-    """The person walks towards a curtain and through it. Nobody is pushed behind it early; behind it shifts go on."""
     trace, around = circling(60), Surroundings(make_box_map([], [], [], []))
     size = {"width_px": CAMERA.width_px, "height_px": CAMERA.height_px, "fovs_deg": (90.0,)}
     cfg = RenderConfig(**size, first_timestamp=1_776_000_000, modalities=("rgb",))
@@ -408,9 +384,6 @@ def test_a_shift_that_hides_a_seen_target_falls_back(tmp_path):
     report = json.loads((tmp_path / "perturbation_report.json").read_text())
     assert report["position"]["fallback: target hidden"] == len(fell_back)
     assert make_track_script(trace, 0, "perturbed", "T", around, cfg, 1).perturbed.states == script.perturbed.states
-
-
-# --- gallery ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_walled_in_person_is_not_moved():

@@ -12,7 +12,6 @@ from cosfly.geometry.reprojection import View, compare_views
     [(("Roads", "Roads"), True), (("Roads", "Sidewalks"), False), (("Buildings", "Buildings"), False)],
 )
 def test_of_two_roads_in_one_plane_either_may_show(kinds, is_same):
-    """One camera, one depth, but another id stands there."""
     views = []
     for number, kind in enumerate(kinds):
         instance = np.zeros((90, 160, 3), np.uint8)
@@ -27,7 +26,6 @@ CAMERA = np.array([80.0, 80.0, 80.0, 45.0])
 
 
 def building_at(depth_m: float) -> View:
-    """A picture full of one building's wall."""
     instance = np.zeros((90, 160, 3), np.uint8)
     instance[:] = (KINDS["Buildings"], 7, 0)
     return View(np.full((90, 160), depth_m, np.float32), instance, np.eye(3), np.zeros(3))

@@ -1,7 +1,5 @@
 """The review queue: who decides, what is refused, and what the release makes of it."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -25,7 +23,6 @@ QUEUE = CFG.model_copy(update={"smoothness_min": 1.0})  # the plan of every flig
 
 @pytest.fixture(scope="module")
 def inspected(tmp_path_factory) -> Path:
-    """A tree of two trajectories, and an inspection that left every flight to a person; nobody changes it."""
     root = tmp_path_factory.mktemp("queue")
     tree = make_playback_tree(root / "tree", 2, 6, width_px=96, height_px=54)
     write_map(root)
@@ -35,7 +32,6 @@ def inspected(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def product(inspected, tmp_path) -> Path:
-    """`inspect.json` and its folder, to be worked on."""
     shutil.copytree(inspected.parent, tmp_path / "inspect")
     return tmp_path / "inspect/inspect.json"
 
@@ -62,7 +58,6 @@ def test_decisions_are_on_record_and_the_last_one_counts(product):
 
 
 def test_results_and_funnel_are_those_after_review(product):
-    """Both flights of one trajectory accepted, one of the other rejected: it is as good as its worst."""
     before = product.read_bytes()
     flights = folders_of(product)
     decide(product, "accepted", *flights[:3])

@@ -1,7 +1,5 @@
 """The rim beyond a map: where it begins, whose it is, and that nobody but a renderer knows of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

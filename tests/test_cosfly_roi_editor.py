@@ -1,7 +1,5 @@
 """The editor of regions of interest, in a real browser where one is needed: drawn, saved, walked in; what is refused."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json
@@ -87,7 +85,6 @@ def marks(page: Page, grid_shape: tuple[int, int]) -> np.ndarray:
 
 @pytest.mark.slow
 def test_a_polygon_with_a_hole_is_drawn_saved_and_walked_in(map_file, tmp_path):
-    """By mouse alone: the page's cells are those of `roi_mask`, one by one, and the walks stay on them."""
     out = tmp_path / "roi_polygon.json"
     with serving(map_file, out) as server, browser(tmp_path / "profile") as page:
         ready(page, server)
@@ -131,7 +128,6 @@ def asked(server: PageServer, method: str, path: str, body: bytes = b"", **heade
 
 
 def test_only_our_own_page_is_answered(map_file, tmp_path):
-    """No token, another token, another host's name, another page's request, a path that leads elsewhere: nothing."""
     out = tmp_path / "roi.json"
     body = json.dumps({"points_world": SQUARE}).encode()
     with serving(map_file, out) as server:

@@ -122,7 +122,6 @@ def make_broken_worker(error: Exception):
 
 @pytest.mark.parametrize("error", [InputError("no such map", where="map.json"), KeyError("no such map")])
 def test_an_error_in_the_factory_is_the_stages_error(tmp_path, error):
-    """A bug as well: it must not pass for a worker that was killed for want of memory."""
     arguments = _stage(tmp_path / "s"), _items(("keep", 1), ("keep", 2)), make_broken_worker, (error,)
     with pytest.raises(type(error), match="no such map"):
         run_items(*arguments, workers=2)

@@ -1,7 +1,5 @@
 """The viewer's page of a map in 3D: what is packed is what was read, it stays below its size, and it works in a browser."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re
@@ -58,7 +56,6 @@ def floats(text: str, width: int) -> np.ndarray:
 
 
 def test_what_is_packed_is_what_was_read(place, tmp_path):
-    """Each box by its corners, however it is turned; each flight by its rows."""
     page = run(place / "map.json", tmp_path / "scene.html", traces=planners(place), data=place / "tree")
     data = data_of(page)
     rows = floats(data["boxes"], 12)
@@ -80,7 +77,6 @@ def test_what_is_packed_is_what_was_read(place, tmp_path):
 
 @pytest.mark.slow
 def test_the_page_works_offline_in_a_browser(place, tmp_path):
-    """Kinds, paths and planners on and off; played back; frames and figures of the chosen path; nothing foreign runs."""
     out, files = tmp_path / "scene.html", " ".join(f"--traces {path}" for path in planners(place))
     done = invoke(f"view {place / 'map.json'} --out {out} --data {place / 'tree'} {files}")
     assert done.exit_code == 0, done.output

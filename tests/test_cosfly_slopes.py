@@ -25,9 +25,6 @@ def town(request) -> BoxMap:
     return sloped_town(request.param)
 
 
-# --- the product ---
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_slabs_fill_the_ground_and_hide_nothing_over_it(shape):
     ground, rng = sampled(shape), np.random.default_rng(2)
@@ -53,9 +50,6 @@ def test_a_sloped_map_survives_its_file_and_a_flat_one_says_nothing_of_it(tmp_pa
     assert "ground" not in json.loads((tmp_path / "flat.json").read_text())
 
 
-# --- simplify and walk ---
-
-
 def test_what_stands_on_a_slope_is_in_the_way_and_what_hangs_over_it_is_not(town: BoxMap):
     flat = flat_town()
     is_small = flat.half_extents[:, :2].max(axis=1) < 3.0
@@ -70,17 +64,12 @@ def test_what_stands_on_a_slope_is_in_the_way_and_what_hangs_over_it_is_not(town
     assert tilted.height_at(np.zeros((1, 2)))[0] == pytest.approx(30.0)
 
 
-# --- plan ---
-
-
 def bare(shape: str) -> BoxMap:
-    """A slope with one small block far off, so that nothing but the ground counts."""
     block = make_box_map([[140, 140, 1]], np.ones((1, 3)), np.zeros((1, 3)), [KINDS["Static"]])
     return on_ground(block, sampled(shape))
 
 
 def walk_over(box_map: BoxMap, start: tuple[float, float], goal: tuple[float, float]) -> PedestrianTrajectory:
-    """A straight walk at 1.2 m/s with its feet on the ground."""
     ends = np.array([start, goal], dtype=np.float64)
     time_s = np.arange(0.0, np.linalg.norm(ends[1] - ends[0]) / 1.2, DT_S)
     xy = ends[0] + (ends[1] - ends[0]) * (1.2 * time_s / np.linalg.norm(ends[1] - ends[0]))[:, None]
@@ -104,9 +93,6 @@ def test_flights_count_their_altitude_from_the_ground_under_the_walker(shape: st
     assert over_ground.min() >= cfg.relaxed_safety_m
     assert (trace.clearances_m <= over_ground + 0.1).all()  # the ground is what is nearest
     assert (trace.visibility == 1.0).all()
-
-
-# --- draw ---
 
 
 def rays(camera_pose: np.ndarray, intrinsic: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

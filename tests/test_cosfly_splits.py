@@ -1,7 +1,5 @@
 """cosfly/geometry/splits.py: what one walk is, and splits that share none."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 
@@ -19,7 +17,6 @@ STEP_S = 0.5
 
 
 def walk(num_points: int, *, begin: tuple[float, float] = (0.0, 0.0), heading_deg: float = 0.0, speed_mps: float = 1.4):
-    """A straight walk: times and places of its points."""
     time_s = np.arange(num_points) * STEP_S
     way_m = speed_mps * time_s[:, None] * [np.cos(np.radians(heading_deg)), np.sin(np.radians(heading_deg))]
     return time_s, np.column_stack([way_m + begin, np.full(num_points, 0.9)])
@@ -40,11 +37,7 @@ def groups(*courses: Course) -> list[set[str]]:
     return sorted(found.values(), key=sorted)
 
 
-# --- one walk ---------------------------------------------------------------------------------------------------------
-
-
 def test_perturbed_twins_are_one_walk_once_they_are_read_again(tmp_path):
-    """The person of the perturbed flight was shifted by up to a metre and a half in every frame."""
     clean, _ = make_flight(40, seed=3)
     noisy, _ = make_flight(40, seed=3, variant="aug_001")
     offsets_m = np.random.default_rng(0).uniform(-1.5, 1.5, (40, 3))
@@ -89,9 +82,6 @@ def test_walks_agree_with_a_slow_plain_comparison():
                 walk_id = {name: min(names) if of in names else of for name, of in walk_id.items()}
     assert walks_of(courses) == walk_id
     assert 1 < len(set(walk_id.values())) < 30
-
-
-# --- splits -----------------------------------------------------------------------------------------------------------
 
 
 @given(

@@ -90,7 +90,6 @@ def _open(out, **changes):
 
 
 def _finished(out, tally: Tally | None = None, **changes) -> StageFolder:
-    """A stage with one product and its manifest."""
     stage = _open(out, **changes)
     write_json(out / "product.json", 1)
     stage.finish([out / "product.json"], tally or Tally(input=1, kept=1), extra_fact=7)

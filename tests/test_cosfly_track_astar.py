@@ -12,8 +12,6 @@ from cosfly.planners import line_of_sight as sight
 from cosfly.planners import track_astar
 from cosfly.planners.contract import PlanConfig, TrackAStarConfig
 
-CFG = PlanConfig(planner="track_astar")
-
 
 def random_town(seed):
     """Fifty turned boxes round the origin, some above it, some beside it, one of them small."""
@@ -21,9 +19,6 @@ def random_town(seed):
     centers = np.column_stack([rng.uniform(-60, 60, (50, 2)), rng.uniform(0, 40, 50)])
     halves, turns = rng.uniform(0.2, 9, (50, 3)), rng.uniform(-180, 180, 50)
     return kernels.obstacle_index(town_of(*zip(centers, halves, turns, strict=True)))
-
-
-# --- sight ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -39,9 +34,6 @@ def test_a_look_sees_what_the_kernel_sees(seed):
     expected = kernels.visibility(obstacles, points, np.repeat(target[None], len(points), axis=0))
     np.testing.assert_array_equal(seen, expected)
     assert 0.02 < expected.mean() < 0.98  # the sample holds both
-
-
-# --- search -----------------------------------------------------------------------------------------------------------
 
 
 def cost_of(places, targets, obstacles, cfg, start):
@@ -102,6 +94,3 @@ def test_a_wide_beam_finds_the_cheapest_way(world, monkeypatch):
     assert facts["cost"] == pytest.approx(cost_of(raw[layers], targets, obstacles, cfg, start), abs=1e-6)
     # The plain version grows boxes by the distance; the search, which measures first, may pass a corner more closely.
     assert facts["cost"] <= best + 1e-6
-
-
-# --- flights ----------------------------------------------------------------------------------------------------------

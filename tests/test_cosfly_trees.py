@@ -3,8 +3,6 @@
 QUIRKS is the place for the next thing that a foreign tree does otherwise.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 import os
@@ -42,8 +40,6 @@ from release.record import read_record
 from release.verify.verify import verify
 from specimens import make_playback_tree
 
-# --- the strictest public reader --------------------------------------------------------------------------------------
-
 
 @pytest.fixture(scope="module")
 def ours(tmp_path_factory) -> Path:
@@ -64,7 +60,6 @@ def change_file(folder: Path, change: Callable[[dict], object]) -> None:
 
 
 def copied(tree: Path, target: Path) -> Path:
-    """The same tree by links; a file that is changed must be unlinked first."""
     for file in sorted(path for path in tree.rglob("*") if path.is_file()):
         place = target / file.relative_to(tree)
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -164,7 +159,6 @@ QUIRKS = {
 
 
 def holds(found: object, wanted: object) -> bool:
-    """Tell whether everything that was there before is there still; more may be."""
     if isinstance(wanted, dict):
         return isinstance(found, dict) and all(holds(found.get(key), value) for key, value in wanted.items())
     if isinstance(wanted, list):
@@ -205,7 +199,6 @@ def _check_quirk(folder: Path, name: str, quirk: Quirk) -> None:
 
 
 def in_public_form(value: dict) -> dict:
-    """Leave out what is written in the public form whatever it was."""
     value.pop("trace_dir")
     value |= {key: value[key] or {} for key in ("augmentation", "source")}
     for point in value["points"]:
@@ -245,7 +238,6 @@ def test_the_clean_twin_is_found_by_what_it_says_it_is(foreign, tmp_path):
 
 @pytest.fixture(scope="module")
 def way(tmp_path_factory) -> Path:
-    """A foreign tree of two towns, inspected, captioned, prepared and released."""
     root = tmp_path_factory.mktemp("way")
     tree = write_foreign_tree(
         root / "tree", towns=("Town01", "Town10HD_Opt"), trajectories=("trajectory_1777083733",), num_points=13

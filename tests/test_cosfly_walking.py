@@ -67,7 +67,6 @@ def test_stops_change_when_a_place_is_reached_and_not_which(seed, count):
 @settings(max_examples=60)
 @given(st.integers(0, 10**6), st.integers(1, 30), st.sampled_from(sorted(PACES)), st.floats(0.5, 20.0))
 def test_every_way_arrives(seed, count, name, cell_m):
-    """However coarse the cells and short the route: no two neighbours are stops, or a piece would take for ever."""
     route = np.column_stack([cell_m * np.arange(count + 1), np.zeros(count + 1)])
     way = take_pace(route, PACES[name], np.random.default_rng(seed))
     speeds = np.where(way.stops_s > 0, 0.0, 1.2)

@@ -1,7 +1,5 @@
 """Weather and time of day: presets, modes, seeds, pools, records, coverage; a picture changes, its labels never."""
 
-from __future__ import annotations
-
 import hashlib
 import random
 
@@ -33,9 +31,6 @@ SMALL = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0], "town": "Street",
 
 def config(**settings) -> RenderConfig:
     return build(RenderConfig, settings, "test")
-
-
-# --- presets, modes, seeds --------------------------------------------------------------------------------------------
 
 
 def test_the_presets_are_those_of_the_paper():
@@ -116,14 +111,8 @@ def test_a_bad_pool_is_one_error_with_all_its_problems(tmp_path):
         read_pools(config(**RANDOM, weather_pool=str(tmp_path / "none.yaml")))
 
 
-# --- light and fog in numbers -----------------------------------------------------------------------------------------
-
-
 def params(weather: str = "clear", time: str = "noon", **knobs: float) -> WeatherParams:
     return resolved(WEATHERS[weather], TIMES[time]).model_copy(update=knobs)
-
-
-# --- pictures ---------------------------------------------------------------------------------------------------------
 
 
 def town():
@@ -173,13 +162,6 @@ def test_labels_never_change_and_every_pair_of_presets_is_another_picture(render
     again = drawn(renderer, None)
     np.testing.assert_array_equal(again.rgb, plain.rgb, err_msg="fair weather is what it was before")
     np.testing.assert_array_equal(drawn(renderer, params("heavy_rain", "night")).rgb, pictures["heavy_rain", "night"])
-
-
-def brightness(rgb: np.ndarray, where: np.ndarray) -> float:
-    return float(rgb[where].mean())
-
-
-# --- files ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -64,8 +64,6 @@ def test_workers_that_die_all_the_time_end_the_stage(tmp_path):
     assert work_on(tmp_path, ["nothing"] * 31, workers=1).tally.kept == 31
 
 
-# --- what the parent's end leaves behind ------------------------------------------------------------------------------
-
 PROGRAM = """
 import sys; sys.path.insert(0, {tests!r})
 from pathlib import Path
@@ -84,7 +82,6 @@ if __name__ == "__main__":
 
 
 def start_program(folder: Path, until: Sequence[str] = ("0.pid", "1.pid"), **options) -> subprocess.Popen:
-    """Start a command whose two workers hang, and wait until these files are there: else until they do."""
     program = folder / "program.py"
     program.write_text(PROGRAM.format(tests=str(Path(__file__).parent), folder=str(folder)))
     parent = subprocess.Popen([sys.executable, str(program)], **options)

@@ -16,13 +16,12 @@ from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import read_json, read_model
 from cosfly.runtime.run_dir import read_manifest
-from cosfly.worldgen.plan import OBJECTS, PLAN_FORMAT, NamedObject, WorldPlan
+from cosfly.worldgen.plan import OBJECTS, PLAN_FORMAT, WorldPlan
 from cosfly.worldgen.rules import plan_by_rules
 from cosfly.worldgen.stage import WorldConfig, check_world, run
 from cosfly.worldgen.town import build
 
 PROMPTS = list(csv.DictReader(Path(__file__).with_name("world_prompts.tsv").open(), delimiter="\t"))
-SMALL = WorldPlan(blocks_along=2, block_m=46.0, objects=[NamedObject(name="fountain")])
 COUNTS = {"two": 2, "three": 3, "twelve": 12}
 
 

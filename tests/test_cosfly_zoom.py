@@ -1,7 +1,4 @@
-"""cosfly/render/camera.py: levels of zoom, changes between them, and who reads the camera of a frame; what cannot be
-drawn."""
-
-from __future__ import annotations
+"""cosfly/render/camera.py: levels of zoom, changes between them, and who reads the camera of a frame."""
 
 import json
 from dataclasses import replace
@@ -35,9 +32,6 @@ def zoomed(num_frames: int, seed: int = 0, segments: tuple[Segment, ...] = (), *
     return zoomed_deg(110.0, LEVELS, zoom, np.arange(num_frames) * 0.5, segments, np.random.default_rng(seed))
 
 
-# --- levels -----------------------------------------------------------------------------------------------------------
-
-
 def test_a_field_of_view_outside_0_to_180_is_an_error_and_any_inside_is_taken():
     for fov in (0.0, -30.0, 180.0, 200.0, float("nan")):
         with pytest.raises(ConfigError, match=r"fovs_deg"):
@@ -46,11 +40,7 @@ def test_a_field_of_view_outside_0_to_180_is_an_error_and_any_inside_is_taken():
         assert build(RenderConfig, {"fovs_deg": [fov]}, "test").fovs_deg == (fov,)
 
 
-# --- changes ----------------------------------------------------------------------------------------------------------
-
-
 def test_a_flight_goes_from_level_to_level():
-    """Parts of 10 s: a level for 20 frames, then a change over 2 s, 4 frames, to another one."""
     fovs = zoomed(60, part_s=10.0, ramp_s=2.0)
     assert np.allclose(fovs[:21], 110.0)
     for begin in (24, 44):
@@ -61,9 +51,6 @@ def test_a_flight_goes_from_level_to_level():
     assert fovs[24] != pytest.approx(fovs[44])
     focal = 1.0 / np.tan(np.radians(fovs) / 2.0)
     assert focal[22] == pytest.approx(np.sqrt(focal[20] * focal[24])), "halfway the picture is halfway larger"
-
-
-# --- trajectory.json --------------------------------------------------------------------------------------------------
 
 
 def zooming(num_points: int = 8):
@@ -97,9 +84,6 @@ def test_the_cameras_of_a_flight_survive_the_file(tmp_path):
     assert read_track(folder).intrinsics is None
 
 
-# --- a tree that zooms ------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def zoomed_tree(tmp_path_factory) -> tuple[Path, list[Path]]:
     folder = tmp_path_factory.mktemp("zoomed")
@@ -122,9 +106,6 @@ def test_every_frame_tells_the_camera_it_was_drawn_with(zoomed_tree):
             assert meta.intrinsic == camera.intrinsic.tolist()
             assert meta.fov_deg == pytest.approx(camera.fov_deg, abs=1e-6)
             assert meta.focal_length_35mm_mm == pytest.approx(camera.focal_35mm_mm, abs=1e-6)
-
-
-# --- what cannot be drawn ---------------------------------------------------------------------------------------------
 
 
 def moved(trace: DroneTrace, name: str, frame: int, place: tuple[float, float, float]) -> DroneTrace:

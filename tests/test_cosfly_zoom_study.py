@@ -1,7 +1,5 @@
 """cosfly/studies/zoom.py: the same flights at every level, and optical against digital zoom."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -19,15 +17,9 @@ from cosfly.studies.zoom import enlarged_fov_deg, tree_of
 LEVELS = [110.0, 60.0, 30.0]
 
 
-# --- pictures ---------------------------------------------------------------------------------------------------------
-
-
 def test_a_longer_lens_shows_the_middle_as_large():
     longer_deg = enlarged_fov_deg(110.0, 5.0)
     assert np.tan(np.radians(longer_deg / 2)) == pytest.approx(np.tan(np.radians(55)) / 5)
-
-
-# --- the study --------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +37,6 @@ def studied(tmp_path_factory) -> tuple[Path, str]:
 @pytest.mark.slow
 @needs_gl
 def test_the_target_grows_as_the_lens_does(studied):
-    """In the middle of the picture sizes go as focal lengths, and what hides the person does not change."""
     out, _ = studied
     found = json.loads((out / "zoom_study.json").read_text())
     levels = found["levels"]

@@ -17,13 +17,7 @@ from cosfly.runtime.run_dir import Tally
 
 SWEEP = Path(__file__).with_name("crash_sweep.py")
 # Of the commands that need a finished run, those that are swept here.
-OF_A_RUN = (
-    *("pedestrians", "inspect review", "caption, limited"),
-    "release build",
-)
-
-
-# --- the harness finds what is wrong ----------------------------------------------------------------------------------
+OF_A_RUN = (*("pedestrians", "inspect review", "caption, limited"), "release build")
 
 
 def careless(out: Path) -> None:
@@ -71,9 +65,6 @@ def test_a_product_without_its_records_that_another_stage_would_take_is_found(tm
     assert called_complete(tmp_path / "killed", [tmp_path / "whole"]) == ["s/product.json is taken by the next stage"]
 
 
-# --- the commands -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "asked",
     [
@@ -90,7 +81,6 @@ def test_killed_commands_go_on(asked):
 
 
 def test_every_command_that_writes_is_in_the_sweep():
-    """But for those that only tell, or measure: a measurement that was broken off is not gone on with."""
     told = {
         "list", "show", "doctor", "config check", "config show", "release verify", "caption doctor",
         "caption judge-check", "roi edit",

@@ -34,7 +34,6 @@ def test_directives_are_options_of_sbatch_and_stand_before_any_command():
 
 
 def commands_of(tmp_path: Path, arguments: list[str], job: dict[str, str]) -> list[list[str]]:
-    """Run the script with commands that only say themselves; gives those of cosfly."""
     for name, text in TOOLS.items():
         (tmp_path / name).write_text(f"#!/bin/bash\n{text}\n")
         (tmp_path / name).chmod(0o755)
@@ -44,7 +43,6 @@ def commands_of(tmp_path: Path, arguments: list[str], job: dict[str, str]) -> li
 
 
 def parsed(words: list[str]) -> str:
-    """Give them to the command's parser, which refuses an option that there is not; gives the command's name."""
     group = typer.main.get_command(app)
     command = group.commands[words[0]]  # type: ignore[attr-defined]
     command.make_context(words[0], words[1:])

@@ -1,7 +1,5 @@
 """distill/prepare: captions to leak-free splits, and which windows stay."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter
@@ -99,7 +97,6 @@ def test_which_captions_teach_and_how_much():
 
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory):
-    """A caption with a prompt as `cosfly caption` makes it."""
     from caption.run.stage import run as caption_run
     from caption.schema import CaptionConfig
     from cosfly.formats.captions import read_captions
@@ -184,7 +181,6 @@ def test_run_counts_what_it_leaves_out(tree, tmp_path):
 
 
 def test_the_walk_of_a_flight_decides_its_split_and_not_its_name(tmp_path):
-    """The same walks under other timestamps, in another build of the town and in another run."""
     runs = []
     for number, (town, shift) in enumerate((("Town03", 0), ("Town03_Opt", 7), ("Town03", 9))):
         run = tmp_path / f"run_{number}"
@@ -216,11 +212,7 @@ def test_captions_that_no_record_binds_to_their_tree_are_refused(tree, captions,
         stage.run(PrepareConfig(), [RunSource.of_files(tree, captions)], tmp_path / "set")
 
 
-# --- choice ---------------------------------------------------------------------------------------------------------
-
-
 def windows_of(counts: dict[str, int]) -> list[tuple[str, str]]:
-    """Name as many windows of each decision: (decision, sample_id)."""
     return [(decision, f"{decision}_{i}") for decision, count in counts.items() for i in range(count)]
 
 
@@ -237,10 +229,7 @@ def balanced(windows: list[tuple[str, str]], seed: int = 0) -> list[tuple[str, s
     return [window for window in windows if keeps(last_rank, seed, *window)]
 
 
-@given(
-    counts=st.dictionaries(st.sampled_from(TOKENS), st.integers(1, 60), min_size=1),
-    seed=st.integers(0, 3),
-)
+@given(counts=st.dictionaries(st.sampled_from(TOKENS), st.integers(1, 60), min_size=1), seed=st.integers(0, 3))
 @bounded(max_examples=40)
 def test_each_decision_keeps_what_it_has_up_to_the_bound_in_any_order(counts, seed):
     windows = windows_of(counts)

@@ -1,7 +1,5 @@
 """distill: greedy decoding against the library's own `generate`, token by token, on a random student in float32."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -33,7 +31,7 @@ def student(tmp_path_factory) -> Student:
 
 
 @pytest.fixture(scope="module")
-def rows(student) -> list[Asked]:
+def rows(student) -> list["Asked"]:
     """Prompts of 1 to 140 tokens with 0 to 5 pictures of two sizes."""
     rng = np.random.default_rng(4)
     return [make_row(student, rng, *size) for size in [(5, 2), (40, 1), (120, 5), (17, 3), (1, 0), (60, 0), (2, 1)]]
@@ -41,8 +39,6 @@ def rows(student) -> list[Asked]:
 
 @dataclass(frozen=True)
 class Asked(EncodedSample):
-    """A prompt with its pictures."""
-
     pictures: dict[str, torch.Tensor]
 
 
@@ -75,7 +71,6 @@ def given(student: Student, rows: Sequence[Asked]) -> dict[str, torch.Tensor]:
 
 
 def generated(student: Student, rows: Sequence[Asked], most: int = MOST, **more) -> list[Completion]:
-    """The same by the library."""
     inputs = given(student, rows)
     with torch.inference_mode():
         output = student.model.generate(
@@ -120,8 +115,6 @@ class EvenTokens:
 
 
 class Even(LogitsProcessor):
-    """The same for `generate`."""
-
     def __init__(self, end: int, num_prompt: int) -> None:
         self.end, self.num_prompt = end, num_prompt
 

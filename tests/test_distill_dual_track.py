@@ -1,7 +1,5 @@
 """distill/prepare/dual_track.py: windows over both tracks of a flight."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,4 @@
-"""distill/evaluation: numbers that can be checked by hand, intervals beside scipy's, and BERTScore on a tiny local
-encoder."""
-
-from __future__ import annotations
+"""distill/evaluation."""
 
 import json
 import re
@@ -19,22 +16,8 @@ from cosfly.inspection.blind_baseline import LEAST_WINDOWS
 from cosfly.runtime.json_io import dump_json
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
 from distill.evaluation.floors import Floors, coc_of, majority
-from distill.evaluation.measure import (
-    STUDENT,
-    measure,
-    pair_up,
-    read_report,
-    text_of,
-)
-from distill.evaluation.scores import (
-    STATES,
-    VERDICTS,
-    ScoredAnswer,
-    Scores,
-    differences_of,
-    figures_of,
-    score_answers,
-)
+from distill.evaluation.measure import STUDENT, measure, pair_up, read_report, text_of
+from distill.evaluation.scores import STATES, VERDICTS, ScoredAnswer, Scores, differences_of, figures_of, score_answers
 from distill.evaluation.stage import EvaluateConfig, run
 from distill.inference.outcome import failed_prediction, make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
@@ -231,7 +214,6 @@ def test_a_rule_and_a_network_that_see_no_picture_beat_the_majority(samples):
 
 
 def test_what_was_drawn_after_the_window_is_counted_apart(samples):
-    """Half of the samples: right in one of these and in all others; where nobody knows there is no figure."""
     ahead = [None, True, True, True, True, False, False, False]
     wrong = [sample.model_copy(update={"drawn_ahead": a}) for sample, a in zip(samples, ahead, strict=True)]
     answers = [ScoredAnswer(coc_of(sample)) for sample in wrong]
@@ -247,7 +229,6 @@ def test_what_was_drawn_after_the_window_is_counted_apart(samples):
 
 @pytest.fixture
 def place(tmp_path, samples) -> Path:
-    """A training set of two languages and two walks, and the predictions of its test split."""
     both = [*samples, *(sample_of(frame, "zh") for frame in FRAMES)]
     known = {"contradicted": ("ascend",)}
     both = [sample.model_copy(update={"walk": f"walk_{k % 2}", **known}) for k, sample in enumerate(both)]
@@ -316,7 +297,6 @@ def encoder(tmp_path_factory) -> Path:
 
 
 def test_scores_are_those_of_the_library(encoder):
-    """Texts of very different lengths, doubles, one longer than the model reads."""
     import bert_score
 
     texts = [text for frame in FRAMES for text in (text_of(coc_of(sample_of(frame))), sample_of(frame, "zh").answer)]

@@ -1,7 +1,4 @@
-"""Students asked through an engine: what is sent, what is kept, and what happens when nobody answers. Needs no
-torch."""
-
-from __future__ import annotations
+"""Students asked through an engine: what is sent, what is kept, and what happens when nobody answers."""
 
 import base64
 import io
@@ -66,7 +63,6 @@ def test_a_server_is_asked_as_the_student_was_taught(place, tmp_path):
 
 
 def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
-    """And the command ends with status 1; run again, it asks about that sample alone."""
     words = ["distill", "infer", "--dataset", place / "set", "--data", place / "tree", "--engine", "endpoint"]
     words += ["--out", tmp_path / "out", "--set", "distill.infer.split=train"]
     words += ["--set", "distill.infer.endpoint.max_tries=1"]

@@ -1,7 +1,5 @@
 """Students that answer in this process: batches, pictures, kills, full memory, constrained answers."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
@@ -45,7 +43,6 @@ def place(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def clean(place) -> Path:
-    """The predictions of a run that nothing disturbed."""
     return answer(place, place / "clean")
 
 
@@ -163,7 +160,6 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_a_merged_student_sees_pictures_as_it_was_taught(place, tmp_path):
-    """Its processor is the base's, which keeps more of a picture than the training did."""
     adapter = Path(shutil.copytree(place / "trained" / "adapter", tmp_path / "few" / "adapter"))
     for name in (CHAT_FORMAT_FILE, ADAPTER_FACTS):
         (adapter / name).write_text(json.dumps(json.loads((adapter / name).read_text()) | {"max_pixels": 32 * 32}))

@@ -1,10 +1,5 @@
 """distill: faster code for parts of a student against the library's, and which code is chosen when."""
 
-from __future__ import annotations
-
-import importlib.util
-import sys
-
 import pytest
 from tables import each
 
@@ -68,20 +63,3 @@ def test_a_tower_attends_to_pictures_of_one_size_at_once_and_gives_the_same(grid
         found.append([output, *(p.grad for p in tower.parameters())])
     for ours, wanted in zip(*found, strict=True):
         assert torch.allclose(ours, wanted, atol=1e-5, rtol=1e-4)
-
-
-@pytest.fixture
-def installed(monkeypatch):
-    """Say which packages are installed; what is put among the loaded ones goes with the test."""
-
-    def install(*packages: str) -> None:
-        for package in ("fla", "causal_conv1d"):
-            monkeypatch.delitem(sys.modules, package, raising=False)
-        real = importlib.util.find_spec
-        monkeypatch.setattr(
-            importlib.util, "find_spec",
-            lambda name, *more: (name in packages or None) if name in ("fla", "causal_conv1d") else real(name, *more),
-        )  # fmt: skip
-
-    monkeypatch.setattr(sys, "modules", dict(sys.modules))
-    return install

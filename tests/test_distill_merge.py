@@ -1,7 +1,5 @@
 """distill merge: an adapter in its base's weights, against the base with the adapter beside it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -6,8 +6,6 @@ otherwise, takes thoughts from their own field alone, and begins its system text
 is off.
 """
 
-from __future__ import annotations
-
 import pytest
 
 pytest.importorskip("torch", reason="needs the extra distill")

@@ -1,7 +1,5 @@
 """distill: student, encoding, training and inference on a tiny random Qwen3.5 model."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
@@ -28,14 +26,12 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def trained(place, tmp_path_factory) -> Path:
-    """The output folder of a training of 12 steps without a break."""
     out = tmp_path_factory.mktemp("trained")
     run(place, out)
     return out
 
 
 def test_processor_agrees_with_the_library_one(place):
-    """The library's own processor, taught to live without videos, gives the same tokens and patches."""
     from transformers import Qwen3VLProcessor
 
     class WithoutVideos(Qwen3VLProcessor):
@@ -130,8 +126,6 @@ def test_adapter_reloads_equal(place, trained):
 
 @pytest.mark.slow
 def test_stopped_and_continued_is_the_same(place, tmp_path):
-    """Stop after 7 of 8 steps, cut a line of the log short, damage a newer checkpoint, then go on: the same log and the
-    same adapter."""
     out, whole, settings = tmp_path / "out", tmp_path / "whole", {"max_steps": 8}
     begun(place, out, **settings)
     assert sorted(path.name for path in (out / "checkpoints").iterdir()) == ["step_00000005", "step_00000006"]
@@ -151,7 +145,6 @@ def test_stopped_and_continued_is_the_same(place, tmp_path):
 
 @pytest.mark.slow
 def test_a_student_that_overfits_answers_right(place, tmp_path):
-    """The whole way: two samples learned by heart come back as the answers they were, parsed."""
     learnt = samples_of(place)[:2]
     write_set(tmp_path / "set", {"train": learnt, "val": learnt}, [place / "tree"])
     settings = {**FAST, "lora_rank": 16, "schedule": "cosine", "batch_size": 2, "samples_per_step": 2, "epochs": 80}
@@ -166,7 +159,6 @@ def test_a_student_that_overfits_answers_right(place, tmp_path):
 
 
 def test_positions_are_the_librarys(place):
-    """For every sample, and for pictures of two shapes between texts of all lengths."""
     own = load(place)
     rows = [encode_text(own, sample) for sample in samples_of(place)]
     for row in rows:

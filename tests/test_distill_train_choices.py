@@ -1,7 +1,4 @@
-"""distill: what a training can be: in full, of random weights, of texts alone; what it is told before, and when it
-ends."""
-
-from __future__ import annotations
+"""distill: what a training can be: in full, of random weights, of texts alone."""
 
 import json
 
@@ -23,8 +20,6 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_a_model_trained_in_full_is_a_whole_folder(place, tmp_path):
-    """transformers loads weights, tokenizer, picture processor, chat template and generation settings, and the tower is
-    as it was."""
     from transformers import AutoModelForImageTextToText, AutoTokenizer, GenerationConfig
 
     folder = run(place, tmp_path / "out", method="full", max_steps=4, learning_rate=1e-3)
@@ -46,8 +41,6 @@ def test_a_model_trained_in_full_is_a_whole_folder(place, tmp_path):
 
 @pytest.mark.slow
 def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path):
-    """A rate that soon makes it worse: the product is the checkpoint of the best validation, also when it is run
-    again."""
     settings = {"learning_rate": 5.0, "validate_every_steps": 1, "patience": 2, "keep_checkpoints": 1, "max_steps": 12}
     out = tmp_path / "out"
     run(place, out, **settings)

@@ -1,7 +1,4 @@
-"""distill: what goes wrong in a training ends in one clear line or a recorded skip, and the last good checkpoint
-stays."""
-
-from __future__ import annotations
+"""distill."""
 
 import json
 import os
@@ -83,7 +80,6 @@ for pid, _ in in_order(lambda order: (os.getpid(), bytes(10_000_000)), range(100
 
 @pytest.mark.slow
 def test_workers_end_with_a_training_that_was_killed(tmp_path):
-    """Those that had something to hand over stayed for ever, and held the lock of the folder."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     with subprocess.Popen(
         [sys.executable, "-c", WORKERS], stdout=subprocess.PIPE, text=True, env=environment

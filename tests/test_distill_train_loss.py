@@ -1,7 +1,4 @@
-"""distill: the loss against the library's own, samples in batches against samples alone, features of pictures against
-none kept."""
-
-from __future__ import annotations
+"""distill."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +26,6 @@ FOUR = {"max_steps": 4, "validation_samples": 0, "learning_rate": 1e-3}
 
 
 def seen(place: Path, own: Student, count: int) -> tuple[list[EncodedSample], torch.Tensor]:
-    """Some samples, and what the tower makes of their pictures."""
     samples = samples_of(place)[:count]
     return [encode_text(own, s) for s in samples], features_of(own, inputs_of(own, samples, trees_of(place)))
 
@@ -54,8 +50,6 @@ def test_the_chunked_loss_is_the_plain_one_with_its_gradients(chunk):
 
 
 def test_loss_and_gradients_are_those_of_the_library(place):
-    """The library's own forward pass with labels: the same mean over answer tokens, and the same gradient of every
-    adapted weight."""
     own = train.add_adapter(load(place), TrainConfig(**FAST), 0)
     with torch.no_grad():  # a fresh adapter's second matrix is zero, which would hide the first one's gradient
         for name, parameter in own.model.named_parameters():
@@ -81,7 +75,6 @@ def test_loss_and_gradients_are_those_of_the_library(place):
 
 
 def test_a_sample_in_a_batch_has_its_loss_alone(place):
-    """Neither padding nor neighbours reach it, in linear attention, convolution or full attention."""
     own = load(place)
     rows, features = seen(place, own, 4)
     parts = features.split([int((row.prompt_ids == own.image_token_id).sum()) for row in rows])

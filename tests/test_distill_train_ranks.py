@@ -1,7 +1,4 @@
-"""distill: many processes of one training, on a CPU over gloo, give what one gives; and what becomes of them when one
-dies."""
-
-from __future__ import annotations
+"""distill: many processes of one training, on a CPU over gloo, give what one gives."""
 
 import json
 import os
@@ -31,14 +28,12 @@ SETTINGS = {**TWELVE, "learning_rate": 1e-3, "validation_answers": True, "max_ne
 
 @pytest.fixture(scope="module")
 def alone(place, tmp_path_factory) -> Path:
-    """What one process gives."""
     out = tmp_path_factory.mktemp("alone") / "out"
     assert finish(start(place, out, 1)) == [0]
     return out
 
 
 def start(place: Path, out: Path, size: int, **changes: object) -> list[subprocess.Popen]:
-    """Start the processes of a training as a launcher would."""
     settings = [f"distill.train.{name}={json.dumps(value)}" for name, value in {**SETTINGS, **changes}.items()]
     command = [*COSFLY, "distill", "train", "--student", str(place / "student"), "--out", str(out)]
     command += ["--dataset", str(place / "set"), "--data", str(place / "tree")]
@@ -55,7 +50,6 @@ def finish(processes: list[subprocess.Popen]) -> list[int]:
 
 
 def wait_for_steps(out: Path, count: int) -> None:
-    """Wait until the log tells of so many steps."""
     deadline_s = time.monotonic() + 120
     while not (out / "log.jsonl").exists() or len(losses_of_whole_lines(out)) < count:
         assert time.monotonic() < deadline_s

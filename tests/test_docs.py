@@ -22,7 +22,6 @@ REFERENCE = (ROOT / "docs/commands.md").read_text(encoding="utf-8")
 
 
 def commands(command: Any, path: tuple[str, ...] = ()) -> list[tuple[tuple[str, ...], Any]]:
-    """All commands that can be run, with their words."""
     found = []
     children = getattr(command, "commands", {})  # a group has them; Typer brings its own click
     if path and (not children or command.invoke_without_command):
@@ -86,8 +85,6 @@ def test_ci_runs_a_command_of_the_readme():
     assert f"`{command}`" in README
 
 
-# --- the documents and the disk ---------------------------------------------------------------------------------------
-
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FOLDERS = ("cosfly", "caption", "distill", "release", "configs", "tests")
 CODE = "\n".join(p.read_text(encoding="utf-8") for f in FOLDERS[:4] for p in sorted((ROOT / f).rglob("*.py")))
@@ -130,9 +127,6 @@ def test_every_file_of_the_files_page_is_written_by_code():
     }  # named by a loop; a user's own
     assert len(names) > 40
     assert sorted(name for name in names - elsewhere if f'{name}"' not in CODE and f"{name}'" not in CODE) == []
-
-
-# --- the site, and versions -------------------------------------------------------------------------------------------
 
 
 def test_the_site_is_built_without_a_warning(tmp_path):

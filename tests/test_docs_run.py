@@ -1,9 +1,4 @@
-"""Every command of the documentation runs, page after page in one folder, as somebody would who reads along. Small
-settings stand in the place of large ones, a server of the tests in that of a teacher's, and what a
-reader brings (a map, a public tree, a student) is made beforehand.
-"""
-
-from __future__ import annotations
+"""Every command of the documentation runs, page after page in one folder, as somebody would who reads along."""
 
 import csv
 import glob
@@ -94,10 +89,7 @@ SMALL = {
     "distill infer": _set(
         *("distill.infer.max_samples=2", "distill.infer.max_new_tokens=8", "distill.infer.max_pixels=4096")
     ),
-    "distill evaluate": _set(
-        "distill.evaluate.bertscore.en.layer=2",
-        "distill.evaluate.bertscore.zh.layer=2",
-    ),
+    "distill evaluate": _set("distill.evaluate.bertscore.en.layer=2", "distill.evaluate.bertscore.zh.layer=2"),
 }
 
 
@@ -110,7 +102,6 @@ class Place:
     ports: dict[str, int]  # of simulators, by those in the documents
 
     def make(self, text: str) -> None:
-        """Make what a command takes for given and nobody has made yet."""
         for name, maker in BROUGHT.items():
             path = self.root / name.removeprefix("file:")
             if name in text and not path.exists():
@@ -118,7 +109,6 @@ class Place:
                 maker(self.root, path)
 
     def words(self, text: str) -> list[str]:
-        """The words of a command as a shell gives them on, with what is small in place of what is large."""
         text = text.replace("http://localhost:8000", self.teacher).replace(" /shared/", f" {self.root}/shared/")
         for told, port_here in self.ports.items():
             text = re.sub(rf"(port[ =]){told}\b", rf"\g<1>{port_here}", text)
@@ -127,7 +117,6 @@ class Place:
         return [*words, *SMALL.get(small or "", [])]
 
     def clear(self, text: str) -> None:
-        """Take away what another command of the documents left where this one will write."""
         words = shlex.split(text, comments=True)
         if "--out" not in words:
             return
@@ -150,7 +139,6 @@ def copy_of(path: str) -> Callable[[Path, Path], object]:
 
 
 def _table(root: Path, target: Path) -> None:
-    """A small town as a table of boxes."""
     town = invent(SyntheticConfig(size_m=120.0, num_blocks=1), 0)
     with target.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -219,7 +207,6 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
 
 
 def small_run(name: str) -> dict[str, Any]:
-    """A configuration that ships, with two towns, two short walks and pictures of a stamp."""
     value = yaml.safe_load(shipped(f"{name}.yaml").read_text(encoding="utf-8"))
     value.setdefault("pedestrians", {}).update(num_paths=2, min_distance_m=25, max_distance_m=40)
     value.setdefault("render", {}).update(width_px=160, height_px=90)
@@ -230,7 +217,6 @@ def small_run(name: str) -> dict[str, Any]:
 
 
 def answer(body: dict) -> tuple[int, dict] | None:
-    """A judge's verdict, and what `doctor` asks; captions are the server's own."""
     text = json.dumps(body)
     if "REJECT_REGEN" in text:
         verdict = json.dumps({"verdict": "FIX_LABEL", "reason": "the text argues for the label"})

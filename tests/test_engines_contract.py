@@ -6,8 +6,6 @@ finished in any order, a dead engine raises an Exception of its own, and `disabl
 backend is named.
 """
 
-from __future__ import annotations
-
 import asyncio
 import importlib.util
 import json
@@ -43,8 +41,6 @@ SAMPLING = EndpointConfig(max_tries=1, max_tokens=64)
 
 
 class PlainEngine:
-    """The engine of the recipe in docs/extending.md: a function of the request, in this process."""
-
     kind, where, model = "endpoint", "plain", ""
 
     def __init__(self) -> None:
@@ -179,9 +175,6 @@ def test_the_engine_of_the_recipe_captions_a_flight(tree, tmp_path: Path, monkey
     assert engine.num_closed == 1
 
 
-# --- the vLLM engine without vLLM -------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def model(tmp_path):
     folder = tmp_path / "model-2b"
@@ -196,8 +189,6 @@ def output(text: str, num_prompt: int = 1280, finish_reason: str = "stop") -> Si
 
 
 class Recorded:
-    """Keeps its keyword arguments, as the parameter classes do."""
-
     def __init__(self, **values) -> None:
         self.values = values
         if "top_kk" in values:

@@ -39,7 +39,6 @@ def crowd(rng: np.random.Generator) -> tuple[dict[int, Appearance], SeenFrame]:
 
 
 def stands_apart(relation: str, picture: SeenFrame, number: int, rivals: list[int]) -> bool:
-    """Tell by the columns alone whether a relation is true of one and no rival."""
     where = {n: int(np.nonzero(picture.ids == n)[1][0]) for n in (number, *rivals)}
     if relation in ("left", "right"):
         sign = 1 if relation == "left" else -1

@@ -1,7 +1,5 @@
 """Files of strangers, one property for each reader: whatever the bytes, it reads them or says why not in one line."""
 
-from __future__ import annotations
-
 import json
 import random
 import re
@@ -109,8 +107,6 @@ def specimens(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-# --- what stands in the place of an honest file -----------------------------------------------------------------------
-
 WHOLE = [
     b"", b"\0", b"null", b"[]", b"{}", b'"word"', b"[" * 100_000, b'{"a":' * 50_000, b"\xff" * 1000, b"7" * 5000,
     "{}".encode("utf-16"), b"PAR1" + b"\0" * 40 + b"\xff\xff\xff\x7fPAR1", b"\x1f\x8b\x08\0", b"[[]," * 50_000,
@@ -170,7 +166,6 @@ def _other_value(data: bytes, rng: Random) -> bytes:
 
 
 def _other_size(data: bytes, rng: Random) -> bytes:
-    """Give a PNG another header, with the right checksum."""
     sizes = (0, 1, 7000, 32_000, 2**31 - 1, 2**32 - 1)
     header = b"IHDR" + struct.pack(">II", rng.choice(sizes), rng.choice(sizes)) + data[24:29]
     return data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]

@@ -56,7 +56,6 @@ def products(folder: Path) -> dict[str, str]:
 
 
 def begin(base: Path, out: Path, stage: str) -> Path:
-    """Copy the stages before `stage`, and what makes of the folder a run."""
     for name in STAGES[: STAGES.index(stage)]:
         shutil.copytree(base / name, out / name)
     shutil.copy(base / "run.yaml", out)
@@ -87,7 +86,6 @@ def test_every_stage_is_complete_and_adds_up(base):
 
 
 def test_a_run_goes_on_by_its_folder_or_its_settings_whatever_is_begun(tmp_path, monkeypatch):
-    """Before its first stage, or of towns before their release, no stage stands beside run.yaml."""
     asked = []
     monkeypatch.setattr(pipeline, "run", lambda cfg, out, **_: asked.append(out) or [])
     for number, (config, begun) in enumerate(
@@ -159,8 +157,6 @@ def test_other_settings_are_refused_by_name_and_nothing_is_touched(base, tmp_pat
     assert not (out / ".lock").exists(), "who failed holds nobody up"
 
 
-# --- what if a file were changed? -------------------------------------------------------------------------------------
-
 # Made for people, or the record of another file: nothing reads them as a product.
 UNBOUND = {
     "run.yaml",
@@ -204,7 +200,6 @@ def tampered(base, tmp_path_factory):
 
 
 def kinds_of(out: Path) -> dict[str, list[Path]]:
-    """The files of a run that records hold, by their path with numbers taken out."""
     kinds: dict[str, list[Path]] = {}
     for path in sorted(p for p in out.rglob("*") if p.is_file() and p.name not in UNBOUND):
         kinds.setdefault(re.sub(r"\d+", "N", path.relative_to(out).as_posix()), []).append(path)
@@ -253,8 +248,6 @@ def test_two_workers_give_the_same_products(base, tmp_path, stage):
     work(tiny(workers=2), out, stage)
     assert products(out / stage) == products(base / stage)
 
-
-# --- several towns ----------------------------------------------------------------------------------------------------
 
 TOWNS = """
 towns={

@@ -78,7 +78,6 @@ def check_flight(name: str, world: str) -> None:
 
 @EACH_PLANNER
 def test_the_same_seed_gives_the_same_flight_and_inputs_stay_as_they_are(name):
-    """Planned twice: alone, and by the stage with a generator of the same seed."""
     box_map, corners = WORLDS["tower_midway"]
     walk, obstacles, cfg = walk_along("w", corners), kernels.obstacle_index(box_map), PlanConfig(planner=name)
     scenario = make_scenario(walk, obstacles, cfg)
@@ -93,7 +92,6 @@ def test_the_same_seed_gives_the_same_flight_and_inputs_stay_as_they_are(name):
 
 @EACH_PLANNER
 def test_the_time_step_is_the_pedestrians(name, subtests):
-    """Speed limit, metrics and duration count in the pedestrian trajectory's own step."""
     for dt_s in (0.25, 1.0):
         with subtests.test(dt_s=dt_s):
             check_time_step(name, dt_s)

@@ -66,9 +66,6 @@ def labels_of(trace):
     return Counter(found)
 
 
-# --- the table --------------------------------------------------------------------------------------------------------
-
-
 @each("name", TABLE)
 def test_a_style_shows_the_decisions_that_it_is_for(name):
     counts = Counter()
@@ -81,9 +78,6 @@ def test_a_style_shows_the_decisions_that_it_is_for(name):
     share = {label: number / counts.total() for label, number in counts.items()}
     assert sum(share.get(label, 0) for label in TABLE[name].purpose) >= 0.3
     assert len(TABLE[name].purpose) == 1 or all(label in share for label in TABLE[name].purpose if "_left" not in label)
-
-
-# --- flights ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -136,16 +130,12 @@ def test_a_style_that_the_map_does_not_hold_is_dropped_or_followed_and_says_why(
     assert plan_trajectory(STRAIGHT, walled, fallback, 0).drop_reason is None
 
 
-# --- ranges -----------------------------------------------------------------------------------------------------------
-
-
 # --- the shipped towns ------------------------------------------------------------------------------------------------
 
 ORDERS, DECISIONS_LEAST, STYLE_MOST = {"break_off", "return_to_home"}, 0.02, 0.3
 
 
 def flights_of(cfg):
-    """The kept flights of all towns of a configuration, planned from their maps and walks."""
     for name in cfg.towns:
         town = cfg.of_town(name)
         box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map
@@ -197,9 +187,6 @@ def test_diverse_shows_each_decision_and_all_heights_and_distances_whatever_the_
     assert np.mean([px < LEGIBLE_HEIGHT_PX for trace in kept for px in heights_px(trace, cfg.render)]) <= 0.05
 
 
-# --- searching --------------------------------------------------------------------------------------------------------
-
-
 def test_reacquire_loses_the_walker_and_finds_again_and_looks_where_it_lost_it():
     traces = [plan_trajectory(STRAIGHT, HOUSE, styled(REACQUIRE), seed) for seed in range(6)]
     trace = max((trace for trace in traces if trace.drop_reason is None), key=lambda t: (t.visibility == 0).sum())
@@ -211,9 +198,6 @@ def test_reacquire_loses_the_walker_and_finds_again_and_looks_where_it_lost_it()
     assert aside[lost].max() > 3  # nobody tells it where the walker is
     assert aside[trace.visibility > 0].max() < 1e-3
     assert labels_of(trace)["search_to_reacquire_target"] >= 2
-
-
-# --- missions ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_mission_ends_the_pursuit_at_home_and_looks_ahead():
@@ -241,7 +225,6 @@ def test_a_mission_ends_the_pursuit_at_home_and_looks_ahead():
 
 @pytest.mark.parametrize("planner", PLANNERS)
 def test_the_way_home_arrives_and_holds_past_what_stands_between(planner):
-    """A tower stands between the end of the pursuit and home; the pursuit went round it."""
     tower = kernels.obstacle_index(town_of(((20, 20, 60), (8, 8, 60))))
     walk = walk_along("round", [(0, 0), (50, 0), (50, 50)])
     trace = plan_trajectory(walk, tower, styled(RETURN_HOME, planner=planner, track_astar={"beam": 256}), 0)
@@ -253,6 +236,3 @@ def test_the_way_home_arrives_and_holds_past_what_stands_between(planner):
     assert speeds[trace.mission.home_frame :].max() <= 6.5
     assert np.linalg.norm(np.diff(trace.positions_m, n=2, axis=0), axis=1).max() / 0.25 <= 5.0 + 1e-6
     assert trace.metrics["clearance_min_m"] >= 2.5 - 1e-3
-
-
-# --- settings ---------------------------------------------------------------------------------------------------------

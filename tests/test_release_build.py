@@ -1,7 +1,4 @@
-"""Building a release: what goes together, what is refused, what a kill and a mended flight leave, and what its readers
-get."""
-
-from __future__ import annotations
+"""Building a release."""
 
 import json
 import shutil
@@ -42,7 +39,6 @@ def material(tmp_path_factory) -> Path:
 
 
 def make_material(root: Path, num_walks: int, towns: tuple[str, ...] = ("Town01",)) -> Path:
-    """Write a tree with a caption of every window and an inspection that accepts all."""
     tree = make_playback_tree(root / "tree", num_walks, POINTS, width_px=48, height_px=27, towns=towns)
     flights = map(read_track, find_tracks(tree))
     write_captions(root / "captions.jsonl", [make_caption(f, i) for f in flights for i in range(4, POINTS - 1)])
@@ -52,13 +48,11 @@ def make_material(root: Path, num_walks: int, towns: tuple[str, ...] = ("Town01"
 
 @pytest.fixture(scope="module")
 def few(tmp_path_factory) -> Path:
-    """The material of two walks."""
     return make_material(tmp_path_factory.mktemp("few"), 2)
 
 
 @pytest.fixture
 def copy(few, tmp_path) -> Path:
-    """A copy of it that may be changed."""
     return shutil.copytree(few, tmp_path / "material")
 
 
@@ -74,9 +68,6 @@ def record_of(material: Path, out: Path, cfg: ReleaseConfig | None = None) -> Re
 def table_of(folder: Path, columns: list[str]) -> list[dict]:
     record = read_record(folder / "release.json")
     return [row for shard in record.shards for row in pq.read_table(folder / shard.path, columns=columns).to_pylist()]
-
-
-# --- what goes together -----------------------------------------------------------------------------------------------
 
 
 def test_splits_share_no_walk_and_no_twins(material, tmp_path):
@@ -123,9 +114,6 @@ def test_a_public_tree_without_an_inspection_is_released(tmp_path):
     assert record.history.captions.released > 0
 
 
-# --- what a row and the record hold -----------------------------------------------------------------------------------
-
-
 def test_the_record_says_where_it_comes_from_and_nothing_of_this_machine(copy, tmp_path):
     def local(lines):
         for line in lines:
@@ -144,9 +132,6 @@ def test_the_record_says_where_it_comes_from_and_nothing_of_this_machine(copy, t
         assert b"/home/somebody" not in data
         assert str(tmp_path).encode() not in data
     assert {row["teacher_model"] for row in table_of(tmp_path / "r/dataset", ["teacher_model"])} == {"teacher-7", None}
-
-
-# --- what is refused, with all that is wrong --------------------------------------------------------------------------
 
 
 def first_flight(root: Path) -> Path:
@@ -184,8 +169,6 @@ def interlaced(pixels: np.ndarray) -> bytes:
 
 
 def other_kind(frame_file: str, kind: str):
-    """Give what writes a picture anew in another form of PNG, with the same pixels as far as that can be."""
-
     def change(root: Path) -> None:
         path = first_flight(root) / "frames_playback/frame_00005" / frame_file
         picture = Image.fromarray(parse_picture(path.read_bytes(), path)[..., ::-1])
@@ -207,7 +190,6 @@ def captions_of(change):
 
 
 def caption(**values):
-    """Give what changes the first caption."""
     return captions_of(lambda lines: lines[0].update(values))
 
 
@@ -279,9 +261,6 @@ def test_captions_that_nothing_binds_to_the_tree_are_refused(few, tmp_path):
         run(split_cfg(unbound="refuse"), [source_of(few)], tmp_path / "r")
 
 
-# --- kills, and a second run ------------------------------------------------------------------------------------------
-
-
 def test_after_a_failed_flight_the_finished_shards_are_not_done_again(tmp_path, monkeypatch):
     copy = make_material(tmp_path / "material", 3)
     from release.package import config
@@ -307,9 +286,6 @@ def test_after_a_failed_flight_the_finished_shards_are_not_done_again(tmp_path, 
     monkeypatch.setattr(package, "name_shards", look)
     assert all_bytes(run(split_cfg(), [source_of(copy)], tmp_path / "r")) == all_bytes(whole)
     assert sum(kept.get(name) == time_ns for name, time_ns in before.items()) >= len(before) - 1
-
-
-# --- its readers ------------------------------------------------------------------------------------------------------
 
 
 def test_every_released_caption_has_its_whole_window(tmp_path):

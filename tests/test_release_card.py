@@ -1,13 +1,10 @@
 """The card's numbers: counted row by row, merged, flat in memory; what the card says of them; and `croissant.json`."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import math
 import re
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +21,6 @@ from release.columns import POINT
 from release.record import read_record
 from release.verify.verify import verify
 
-ROOT = Path(__file__).resolve().parents[1]
 ROWS = [make_row(i, variant, f"trajectory_{k}") for k in (1, 2) for variant in ("ORI", "aug_001") for i in range(12)]
 
 
@@ -32,9 +28,6 @@ def numbers_of(rows: list[dict], num_frames: int | None = 12):
     counted = RowCounts()
     counted.add(rows)
     return counted.numbers([], num_frames)
-
-
-# --- numbers ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_flight_is_as_long_as_it_is_without_its_perturbation():
@@ -54,9 +47,6 @@ def test_rows_counted_in_pieces_give_the_same_numbers(cuts, groups):
         for first in range(begin, end, groups):
             total.add(ROWS[first : min(first + groups, end)])
     assert total.numbers([], 12) == numbers_of(ROWS)
-
-
-# --- the card ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +70,6 @@ def test_every_snippet_of_the_card_runs(record, built, tmp_path, monkeypatch):
     assert window["prompt"]
     assert window["caption"]
     assert len(values["places"]) == min(10, values["poses"].num_rows)
-
-
-# --- `croissant.json` -------------------------------------------------------------------------------------------------
 
 
 def test_a_changed_word_of_it_is_found(dataset, tmp_path):

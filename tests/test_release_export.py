@@ -1,7 +1,5 @@
 """A release in other formats: nothing is lost on the way, whatever interrupts it, and what cannot be is refused."""
 
-from __future__ import annotations
-
 import io
 import json
 import shutil
@@ -13,12 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from public_reader import read_public
-from specimens_release import (
-    NUM_POINTS,
-    all_bytes,
-    make_release,
-    rows_by_id,
-)
+from specimens_release import NUM_POINTS, all_bytes, make_release, rows_by_id
 from tables import each
 
 from cosfly.formats.playback import read_track
@@ -30,9 +23,9 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import CHECKSUMS, read_checksums, sha256_file
 from cosfly.runtime.json_io import read_model
 from release.columns import POSE
-from release.export.contract import FORMATS, ExportConfig, ExportUnit, Files, FormatFacts
+from release.export.contract import FORMATS, ExportConfig
 from release.export.lerobot import runs_of, states
-from release.export.source import ReleasedRows, Span, open_release, rows_of_flight, scan
+from release.export.source import ReleasedRows, Span, open_release, scan
 from release.export.stage import EXPORT_FORMAT, ExportRecord
 from release.export.stage import run as export
 
@@ -43,7 +36,6 @@ def config(format: str, **more) -> ExportConfig:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
-    """tree/ and dataset/, a release of every frame of it."""
     root = tmp_path_factory.mktemp("whole")
     make_release(root)
     return root
@@ -60,11 +52,7 @@ def spread(tmp_path_factory) -> Path:
     return make_release(tmp_path_factory.mktemp("spread"), num_frames=8, window=1)
 
 
-# --- the playback tree ------------------------------------------------------------------------------------------------
-
-
 def assert_same_flight(found: Path, given: Path, frames: list[int] | None = None) -> None:
-    """Every number and every picture of a flight, or of some frames of it."""
     a, b = read_track(given), read_track(found, strict=frames is None)
     kept = np.arange(len(a)) if frames is None else np.array(frames)
     records = (a, b), (a.target, b.target), (a.perturbation, b.perturbation)
@@ -96,9 +84,6 @@ def test_tree_to_release_to_tree_loses_nothing(whole, dataset, tmp_path):
     about = read_model(product / "export.json", ExportRecord, EXPORT_FORMAT)
     assert about.coordinates["handedness"] == "left"
     assert read_town_map(product / "Town01").licence == about.maps[0].licence
-
-
-# --- WebDataset -------------------------------------------------------------------------------------------------------
 
 
 def test_webdataset_holds_every_row_and_byte(dataset, tmp_path):
@@ -150,9 +135,6 @@ def test_webdataset_opens_it(dataset, tmp_path):
     assert len(list(first_two)) == 2
 
 
-# --- LeRobot: what needs no LeRobot -----------------------------------------------------------------------------------
-
-
 def flight_of(frames: list[int]) -> ReleasedRows:
     flight = ReleasedRows("r", "Town01", "trajectory_1", "ORI", "train", [Span("s", 0, 0, len(frames))])
     flight.frames, flight.times = [np.array(frames, dtype=np.int32)], [np.array(frames) * 0.5]
@@ -191,9 +173,6 @@ def test_splits_reach_every_format(two_splits, tmp_path):
     assert info["splits"] == {"train": f"0:{episodes}", "validation": f"{episodes}:6"}
 
 
-# --- whatever the format ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("format", FORMATS)
 def test_the_same_bytes_with_one_process_and_with_two(format, dataset, tmp_path):
@@ -219,28 +198,6 @@ def test_an_export_says_where_it_came_from_and_whose_it_is(format, dataset, tmp_
     assert about.coordinates["handedness"] in readme
 
 
-def plan(release, flights, cfg):
-    """A toy format, as docs/extending.md describes it: the poses of each flight as CSV."""
-    return [ExportUnit(flight.name, len(flight), flights=(flight,)) for flight in flights]
-
-
-def write(release, unit, folder, cfg):
-    files, (flight,) = Files(folder), unit.flights
-    poses = [row["pose"] for row in rows_of_flight(release, flight, ["pose"])]
-    lines = [",".join(repr(value) for value in pose.values()) for pose in poses]
-    files.put(f"{unit.name.replace('/', '__')}.csv", "\n".join(lines).encode())
-    return files.written(lines=len(lines))
-
-
-def finish(release, units, written, folder, cfg):
-    files = Files(folder)
-    files.put("lines.txt", str(sum(one.facts["lines"] for one in written)).encode())
-    return FormatFacts(version="1", codings={"pose": "CSV"}, how_to_open="open(...)", files=files.digests)
-
-
-# --- what is no release -----------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def broken(dataset, tmp_path) -> Path:
     return shutil.copytree(dataset, tmp_path / "broken")
@@ -263,7 +220,6 @@ def test_shards_that_escape_or_have_other_names_are_refused(broken, tmp_path, pa
 
 
 def rewrite(folder: Path, change) -> None:
-    """Change the rows of the first shard."""
     path = next((folder / "data").glob("*.parquet"))
     table = pq.read_table(path)
     rows = table.to_pylist()
@@ -300,9 +256,6 @@ def test_a_unit_that_fails_publishes_nothing(broken, tmp_path, change, words):
     assert words in failures
     assert '"bug"' not in failures
     assert not (tmp_path / "out/webdataset").exists()
-
-
-# --- the command ------------------------------------------------------------------------------------------------------
 
 
 # --- verified ---------------------------------------------------------------------------------------------------------

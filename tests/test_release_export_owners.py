@@ -1,7 +1,5 @@
 """Exports opened by LeRobot, in an environment of its own."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

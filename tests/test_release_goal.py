@@ -35,7 +35,6 @@ def flights(crowded_tree) -> list[tuple[FlightRows, Path]]:  # noqa: F811
 
 
 def told(rows: list[Row], folder: Path) -> list[str]:
-    """Give what is found of the goal of a flight's rows."""
     flight, findings = FlightRows("a/b/c/d", rows), Findings()
     for i in range(len(rows)):
         files = {file: frame_path(folder / f"frames_playback/frame_{i:05d}", name) for file, name in FILE_NAMES.items()}
@@ -47,7 +46,6 @@ def told(rows: list[Row], folder: Path) -> list[str]:
 
 
 def changed(flight: FlightRows, says: list[str] | None = None, people: People | None = None, **values) -> list[Row]:
-    """Tell another goal, its words and all."""
     says, people = says or list(flight.goal.says), people or flight.people
     words = {f"goal_{language}": text for language, text in words_of(says, people.target).items()}
     new = {**words, "goal_says": says, "people": json.dumps(asdict(people))} | values

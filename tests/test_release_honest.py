@@ -6,8 +6,6 @@ short flights that shares maps, walks and plans with the kinds of its map. The t
 its end, so that one run names everything that is wrong.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -127,8 +125,6 @@ KINDS = {
 
 
 def stages(cfg: RunConfig, out: Path) -> list[pipeline.Stage]:
-    """Give the stages of a run, which do their work in this process: workers take longer to start than these
-    flights."""
     with mock.patch.object(pipeline, "worker_options", return_value={"workers": 0}):
         return pipeline.stages(cfg, out)
 
@@ -139,8 +135,6 @@ def work(stages: list[pipeline.Stage]) -> None:
 
 
 class Runs:
-    """Runs of kinds, below one folder; those of one map share its first stages."""
-
     def __init__(self, root: Path, data: Path, teacher_url: str) -> None:
         self._root, self._data, self._teacher_url = root, data, teacher_url
         self._made = dict[str, Path]()
@@ -154,7 +148,6 @@ class Runs:
         return load(RunConfig, None if config is None else CONFIGS / f"{config}.yaml", texts)
 
     def made(self, kind: str) -> Path:
-        """Give the release of a kind."""
         if kind not in self._made:
             self._made[kind] = self._make(kind, *KINDS[kind])
         return self._made[kind]
@@ -184,7 +177,6 @@ def runs(tmp_path_factory) -> Iterator[Runs]:
 
 
 def test_honest_releases_of_every_kind_verify(runs, capsys):
-    """All kinds, and then what was found in which."""
     wrong = []
     for kind in KINDS:
         begun = time.monotonic()
@@ -198,9 +190,6 @@ def test_honest_releases_of_every_kind_verify(runs, capsys):
             print(f"\n{kind}: {time.monotonic() - begun:.0f} s", *lines, sep="\n    ", end="", flush=True)
     assert len(KINDS) >= 30
     assert not wrong, "\n".join(wrong)
-
-
-# --- lies -------------------------------------------------------------------------------------------------------------
 
 
 def depth_of_all(factor: float, offset_m: float) -> Lie:

@@ -1,7 +1,5 @@
 """Packaging: what is in the folder, that other people's tools open it, and that verify finds what is wrong with it."""
 
-from __future__ import annotations
-
 import io
 import os
 import re
@@ -18,9 +16,7 @@ from specimens_release import CFG, all_bytes, build, make_inspection, rewrite_ca
 
 from cosfly.formats.boxes import MapHeader
 from cosfly.formats.frames import read_depth, read_instance, read_rgb
-from cosfly.formats.inspection import (
-    write_inspection,
-)
+from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback import read_track
 from cosfly.formats.town import write_town_map
 from cosfly.runtime.errors import ConfigError, InputError
@@ -37,7 +33,6 @@ UNLICENSED = CFG.model_copy(update={"licence": None})
 
 @pytest.fixture
 def dataset(built, tmp_path) -> Path:
-    """A copy that may be broken."""
     return shutil.copytree(built, tmp_path / "dataset")
 
 
@@ -47,14 +42,6 @@ def loaded(built, tmp_path_factory):
     datasets = pytest.importorskip("datasets")
     cache = tmp_path_factory.mktemp("cache")
     return datasets.load_dataset(str(built), split="train", cache_dir=str(cache))
-
-
-def rows_of(folder: Path) -> list[dict]:
-    record = read_record(folder / "release.json")
-    return [row for shard in record.shards for row in pq.read_table(folder / shard.path).to_pylist()]
-
-
-# --- what is in it ----------------------------------------------------------------------------------------------------
 
 
 def test_load_dataset_gives_pictures_poses_and_both_languages(loaded, release_inputs):
@@ -117,9 +104,6 @@ def test_numbers_against_a_slow_oracle(loaded, built):
     assert numbers["files"]["bytes"] == sum(p.stat().st_size for p in (built / "data").iterdir())
 
 
-# --- whose it is ------------------------------------------------------------------------------------------------------
-
-
 def with_maps(release_inputs: Path, copy: Path, **licences: str) -> Path:
     shutil.copytree(release_inputs, copy)
     for town, licence in licences.items():
@@ -156,14 +140,10 @@ def test_a_release_without_a_licence_is_refused(release_inputs, tmp_path, licenc
     assert not (tmp_path / "r" / "dataset").exists()
 
 
-# --- several runs -----------------------------------------------------------------------------------------------------
-
-
 OTHER_TOWNS = {"Town01": "Town03", "Town02": "Town04"}
 
 
 def other_run(release_inputs: Path, target: Path, rename: dict[str, str] = OTHER_TOWNS) -> Path:
-    """Give a run like another, its town folders renamed, and captions and inspection with them."""
     shutil.copytree(release_inputs, target)
     for old, new in rename.items():
         (target / "tree" / old).rename(target / "tree" / new)
@@ -214,14 +194,8 @@ def test_shards_lose_nothing_and_keep_the_order(sizes, target):
         assert sum(sizes[i] for i in group[:-1]) < target
 
 
-# --- the stage --------------------------------------------------------------------------------------------------------
-
-
 def test_same_bytes_with_two_workers(release_inputs, built, tmp_path):
     assert all_bytes(build(release_inputs, tmp_path / "two", workers=2)) == all_bytes(built)
-
-
-# --- verify -----------------------------------------------------------------------------------------------------------
 
 
 def test_one_changed_digit_of_the_card_fails_wherever_it_stands(dataset):

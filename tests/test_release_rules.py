@@ -1,7 +1,5 @@
 """Which frames are released: runs that are spread evenly, whole windows, never padded."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,7 +11,6 @@ WINDOW = 5
 
 
 def runs_of(chosen: np.ndarray) -> list[int]:
-    """Lengths of the runs of consecutive frames."""
     return [len(run) for run in np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)]
 
 

@@ -1,7 +1,4 @@
-"""The statistics: figures against those of whole flights, tables against rows counted by hand, pages that show no
-foreign text as markup."""
-
-from __future__ import annotations
+"""The statistics."""
 
 import numpy as np
 import pytest
@@ -48,13 +45,7 @@ def test_motion_is_that_of_the_plan_whatever_the_perturbation(seed, num):
     assert flight.jerk_rms_mps3 == pytest.approx(derivative_rms(plan, 3), rel=1e-6)
 
 
-# --- pictures ---------------------------------------------------------------------------------------------------------
-
-
 # --- pages ------------------------------------------------------------------------------------------------------------
-
-
-# --- a whole release --------------------------------------------------------------------------------------------------
 
 
 def test_a_release_is_counted_again(built, tmp_path):

@@ -1,7 +1,4 @@
-"""`release verify`: what honest releases get, what lies it finds that make everything else right again, and what
-hostile files do to it."""
-
-from __future__ import annotations
+"""`release verify`."""
 
 import json
 import math
@@ -64,9 +61,6 @@ def dataset(honest, tmp_path) -> Path:
     return shutil.copytree(honest, tmp_path / "dataset")
 
 
-# --- honest -----------------------------------------------------------------------------------------------------------
-
-
 @each("level", ["structure", "rows", "pixels"])
 def test_an_honest_release_passes(honest, level):
     report = verify(honest, level=level, reader=read_released)
@@ -75,7 +69,6 @@ def test_an_honest_release_passes(honest, level):
 
 
 def test_a_release_that_the_kit_wrote_again_passes(honest, tmp_path):
-    """Else every lie below would be found for the kit's own faults."""
     assert errors_in(forge(honest, tmp_path / "again", lambda rows: None)) == {}
 
 
@@ -108,9 +101,6 @@ def test_a_snapshot_of_the_hubs_cache_passes(honest, tmp_path):
 def test_trees_pass_ours_and_the_public_layout(honest_run, tmp_path):
     assert errors_in(honest_run / "render") == {}
     assert errors_in(write_foreign_tree(tmp_path / "public")) == {}
-
-
-# --- lies -------------------------------------------------------------------------------------------------------------
 
 
 # One of each kind of check; all of them take a minute and more.
@@ -148,7 +138,6 @@ RECORD_LIES = {
 
 
 def _seed_of_other_splits(record: dict) -> int:
-    """The first seed under which the walks of the record stand in other splits."""
     told = record["splits"]
     walks = {flight["walk"]: flight["split"] for flight in record["flights"]}
     return next(seed for seed in range(100) if split_groups(walks, told["fractions"], seed, "walks") != walks)
@@ -158,9 +147,6 @@ def _seed_of_other_splits(record: dict) -> int:
 def test_a_lie_of_the_record_is_found(honest, tmp_path, name):
     forged = forge(honest, tmp_path / "forged", change_record=RECORD_LIES[name])
     assert errors_in(forged, "rows"), name
-
-
-# --- hostile files ----------------------------------------------------------------------------------------------------
 
 
 def large_png(width: int, height: int) -> bytes:
@@ -182,7 +168,6 @@ def shard_of(folder: Path) -> Path:
 
 
 def instead(path: Path, make) -> None:
-    """Put something in the place of a file."""
     path.unlink()
     make(path)
 
@@ -282,7 +267,6 @@ def test_odd_rows_are_findings_and_no_traceback(honest, tmp_path, name):
 
 
 def _rows_alone(honest: Path, out: Path, change) -> Path:
-    """Change rows and nothing else."""
     shutil.rmtree(out, ignore_errors=True)
     shutil.copytree(honest, out)
     record, shards = read_all(out)
@@ -294,9 +278,6 @@ def _rows_alone(honest: Path, out: Path, change) -> Path:
     entry["shards"][0]["bytes"] = path.stat().st_size
     (out / "release.json").write_text(json.dumps(entry))
     return out
-
-
-# --- what it tells ----------------------------------------------------------------------------------------------------
 
 
 def test_the_command_tells_people_and_machines(honest, tmp_path):
@@ -311,9 +292,6 @@ def test_the_command_tells_people_and_machines(honest, tmp_path):
     assert {path: path.read_bytes() for path in forged.rglob("*") if path.is_file()} == before
     assert invoke("release verify", honest, "--level structure").exit_code == 0
     assert invoke("release verify", honest, "--level all").exit_code == 2
-
-
-# --- trees --
 
 
 @pytest.fixture(scope="module")

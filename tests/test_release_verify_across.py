@@ -1,7 +1,5 @@
 """Parts of `release verify`: flights against each other, neighbouring pictures, and what is measured in one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -46,9 +44,6 @@ def test_flights_that_do_not_fit_each_other_are_found(change, codes):
     assert [code for _, code in findings.kinds] == codes
 
 
-# --- what neighbouring pictures of a flight say of each other, and what the ground beside the feet --------------------
-
-
 WHOLE = Agreement(
     seen=2000, agree=2000, hidden=0, through=0, same=2000, planes=1700, shifted=0, renamed=0, error=0.0,
     error_flat=0.0, error_standing=0.0, seen_back=2000, through_back=0
@@ -90,9 +85,6 @@ def test_planes_keep_their_place_through_a_flight(name, error, is_found):
     flight = FlightRows("run/Town/trajectory/ORI", [{"frame_index": 0}])
     scene._judge_scale(flight, [(0, 1, replace(WHOLE, **{name: error}))] * 9, findings)
     assert [kind.code for kind in findings.kinds.values()] == ["scene_depth"] * is_found
-
-
-# --- release/verify/pixels.py -----------------------------------------------------------------------------------------
 
 
 FAR_M = np.float32(1000.0)

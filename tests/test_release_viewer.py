@@ -1,7 +1,5 @@
 """The viewer: what it chooses, how large it gets, that foreign text stays text, and that it works in a browser."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json
@@ -78,9 +76,6 @@ def data_of(text: str) -> dict:
     return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)[1])
 
 
-# --- what goes in -----------------------------------------------------------------------------------------------------
-
-
 def test_a_run_is_shown_as_it_is(page):
     data = data_of(page.read_text(encoding="utf-8"))
     assert len(data["flights"]) == 4
@@ -150,7 +145,6 @@ def test_a_release_is_shown_as_its_rows_say(built, tmp_path):
 
 
 def test_a_page_keeps_its_size(run_folder, tmp_path):
-    """Noise does not compress: with all pictures the page would have three times what it may."""
     tree = make_playback_tree(tmp_path / "tree", 1, 24, width_px=320, height_px=180, with_augmented=False)
     rng = np.random.default_rng(0)
     for path in tree.rglob("rgb.png"):
@@ -164,9 +158,6 @@ def test_a_page_keeps_its_size(run_folder, tmp_path):
     assert 0 < bare < 24
     assert any(f"{bare} of 24 shown frames have no pictures" in note for note in data["notes"])
     assert [len(flight["frames"]) for flight in data["flights"]] == [24]
-
-
-# --- in a browser -----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """The map from above for the editor of regions: at its place in the world, by the embedded renderer and by CARLA."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -21,7 +19,6 @@ from cosfly.viz.topview import TopView
 
 
 def pond(ground_z_m: float, yaw_deg: float) -> BoxMap:
-    """Water that lies across tiles, on a lawn."""
     half = [(60.0, 45.0, 0.1), (30.0, 12.0, 0.1)]
     centers = [(3.0, 1.0, ground_z_m - 0.1), (8.0, -4.0, ground_z_m - 0.1)]
     kinds = [KINDS["Terrain"], KINDS["Water"]]

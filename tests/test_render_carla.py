@@ -1,7 +1,5 @@
 """Frames of a CARLA server: through the unmodified client from a server of ours, against the embedded renderer's."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
@@ -104,7 +102,6 @@ def test_a_tree_is_the_embedded_renderers_frame_by_frame(tmp_path):
 
 
 def _same_but_for_the_person(ours: tuple, theirs: tuple, *, exact: bool) -> None:
-    """Depth within the encoding's step, kinds and ids equal; perturbed poses are rounded on the wire: edges move."""
     _, name, rgb, depth, kinds, ids, meta = ours
     _, _, their_rgb, their_depth, their_kinds, their_ids, their_meta = theirs
     rest = (ids != PERSON_ID) & (their_ids != PERSON_ID)
@@ -151,9 +148,6 @@ def test_a_person_is_drawn_where_it_stands_and_zoom_takes_other_cameras(tmp_path
     assert (ours.ids != theirs.ids)[rest].sum() == 0
 
 
-# --- what goes wrong --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_lost_late_double_and_disordered_pictures_change_nothing(tmp_path):
     inputs = flown(tmp_path / "in", 1, 5)
@@ -197,7 +191,6 @@ def test_a_server_that_dies_is_named_and_the_run_goes_on_with_the_next(tmp_path)
 
 @pytest.mark.slow
 def test_a_server_that_we_start_is_started_again(tmp_path):
-    """The first dies after some ticks; two workers have ports of their own."""
     inputs = flown(tmp_path / "in", 2, 5)
     write_boxes(tmp_path / "boxes_3d.json", street())
     port = free_port()
@@ -215,8 +208,6 @@ def test_a_server_that_we_start_is_started_again(tmp_path):
 
 
 def _in_weather(port: int) -> tuple:
-    """A picture in a night of rain by CARLA and by the embedded renderer, one in the found weather, and knobs read
-    back."""
     import carla
 
     settings, found = build(CarlaRenderConfig, {"port": port, **QUICK}, "test"), street()

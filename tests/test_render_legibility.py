@@ -1,7 +1,5 @@
 """Whether a person can be made out: contrast, size and visibility, of the picture as written."""
 
-from __future__ import annotations
-
 import json
 
 from tables import each
@@ -32,7 +30,6 @@ def test_legible_is_what_the_bounds_say(change, is_legible):
 
 @needs_gl
 def test_legibility_is_of_the_picture_as_written(tmp_path):
-    """In dense fog the person is visible, and nobody can make them out."""
     boxes, simplified, traces = write_inputs(tmp_path, [circling(3)])
     size = {"width_px": 320, "height_px": 180, "fovs_deg": [60], "tracks": ["clean"]}
     fog = {"thickest": {"cloudiness": 90.0, "precipitation": 0.0, "fog_density": 100.0, "fog_distance": 1.0}}

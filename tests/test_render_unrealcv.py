@@ -1,7 +1,5 @@
 """Frames of an UnrealCV server: through the real client from a server of ours, against the embedded renderer's."""
 
-from __future__ import annotations
-
 import json
 import time
 from pathlib import Path
@@ -37,7 +35,6 @@ QUICK = {"timeout_s": 20.0, "settle_delay_s": 0.02}
 
 
 def exported() -> BoxMap:
-    """The street as `maps unrealcv` gives it."""
     with beside(street()) as port:
         return unrealcv_export.load(UnrealCvMapConfig(port=port), 0)
 
@@ -59,7 +56,6 @@ def opened(port: int, box_map: BoxMap, **own):
 
 
 def schema_of(value: object) -> object:
-    """Names and types, without values."""
     if isinstance(value, dict):
         return {name: schema_of(one) for name, one in value.items()}
     if isinstance(value, list):
@@ -160,9 +156,6 @@ def test_a_camera_that_falls_is_found(monkeypatch):
         with pytest.raises(RenderError, match=told):
             renderer.render(pose, intrinsic_matrix(160, 90, 60.0), None)
         renderer.close()
-
-
-# --- what goes wrong --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -5,8 +5,6 @@ Tolerance between processes: the default renderer gives identical bytes on one m
 differ by one level of colour in 0.5 % of the pixels, and by 5 mm of depth away from silhouettes.
 """
 
-from __future__ import annotations
-
 import concurrent.futures
 import contextlib
 import functools
@@ -149,7 +147,6 @@ def traced(box_map: BoxMap, plane_z_m: float, pose: np.ndarray, intrinsic: np.nd
 
 
 def away_from_silhouettes(depth: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    """Pixels whose neighbours all lie on the same face of the same box: one id, and depth 1 / z linear in the image."""
     inverse = 1.0 / depth
     bent = np.abs(cv2.Laplacian(inverse, cv2.CV_64F)) > 1e-9
     label = ids.astype(np.float32)
@@ -279,8 +276,6 @@ FAR_OFF_M = np.array([50_000.137, -50_000.291, 0.0])  # no whole numbers, which 
 def test_depth_of_the_default_renderer_to_a_fifth_of_a_millimetre(
     software, least_m, most_m, bound_m, offset_m, monkeypatch
 ):
-    """At 30 m and at 500 m, on slanted faces too; where the map reaches to a box a hundred kilometres off; and as on
-    hardware that snaps."""
     monkeypatch.setattr("cosfly.render.gl.backend.SOFTWARE", software)
     near = [(least_m + 5.37, 12.3 * k, 3.1) for k in range(-2, 3)]
     far = [(k, y, 10.0) for k, y in ((most_m - 50.0, -80.0), (most_m - 45.0, 0.0), (most_m - 60.0, 90.0))]
@@ -327,7 +322,6 @@ def test_types_ranges_and_sky(renderer):
 
 
 def test_what_stands_as_far_as_the_sky_is_sky(renderer_name):
-    """A layer moves the clip plane: without more, ground of up to 1,000.7 m is drawn, and depth ends at 1,000."""
     kinds = ["Terrain", "Roads", "Sidewalks", "Buildings"]
     centers = [(200.0 * k - 300.0, 700.0, -0.1) for k in range(len(kinds))]
     halves = [(100.0, 700.0, 0.1)] * 3 + [(100.0, 700.0, 3.0)]
@@ -368,7 +362,6 @@ def test_the_person_is_drawn_in_the_projected_box(renderer):
 
 
 def test_a_person_under_a_tree_is_seen_from_the_side_and_hidden_from_above(renderer_name):
-    """Each tree is one box from the ground up, which the person stands in; `plants_of` says where its crown begins."""
     hip = np.array([0.0, 0.0, 0.9])
     trees = make_box_map(
         [(-1.5, 0.0, 3.0), (1.5, 0.0, 3.0)], [(2.0, 2.0, 3.0)] * 2, np.zeros((2, 3)), [KINDS["Vegetation"]] * 2
@@ -426,7 +419,6 @@ def _resident_mib() -> float:
 
 
 def _growth_mib(name: str) -> float:
-    """Of renderers that are dropped, not closed; the first ones load and compile what stays."""
     resident_mib = []
     for _ in range(8):
         _digest(open_renderer(name, street(), *SIZE))
@@ -464,7 +456,6 @@ def _digest_in_process(name: str) -> str:
 
 
 def test_the_checker_of_this_file_can_fail():
-    """The reference rejects a picture taken half a pixel to the side."""
     pose, intrinsic = pose_towards(*VIEWS[0][:2]), intrinsic_matrix(*SIZE, 60.0)
     depth, _, ids = traced(street(), -0.1, pose, intrinsic)
     shifted = intrinsic + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
@@ -478,7 +469,6 @@ def test_settings_name_the_renderers_of_the_table():
 
 @pytest.fixture(scope="module")
 def flights(tmp_path_factory):
-    """Gives the tree that a renderer draws of two flights; each is drawn once."""
     folder = tmp_path_factory.mktemp("flights")
     inputs = write_inputs(folder / "in", [circling(4), behind_a_wall()])
 
@@ -538,7 +528,6 @@ def test_a_missing_extra_is_named(monkeypatch):
 
 
 def test_a_second_renderer_without_libraries_names_the_packages(monkeypatch):
-    """PyOpenGL is there and fails to load libEGL, which is an ImportError too."""
     pytest.importorskip("pyrender")
 
     def fail(*_):
@@ -548,8 +537,6 @@ def test_a_second_renderer_without_libraries_names_the_packages(monkeypatch):
     with pytest.raises(EnvironmentMissing, match=r"EGL.*libEGL\.so\.1.*apt-get install libegl1 libgl1 libgl1-mesa-dri"):
         open_renderer("pyrender", street(), *SIZE)
 
-
-# --- others -----------------------------------------------------------------------------------------------------------
 
 BESIDE = PosedBystander(
     other_id(0), PosedPerson(HIP + np.array([1.2, 0.6, 0.0]), 0.2, 0.4, 1.0, choose_clothes(np.random.default_rng(4)))
@@ -603,7 +590,6 @@ def test_who_stands_before_the_target_hides_it_and_is_told_from_the_map(renderer
 
 
 def test_nobody_else_has_the_ids_of_others(renderer_name):
-    """A box with the highest id that boxes may have gives it up to an other."""
     boxes = make_box_map([(0.0, 4.0, 1.0)], [(1.0, 1.0, 1.0)], np.zeros((1, 3)), [KINDS["Buildings"]], [MAX_BOX_ID])
     pose, intrinsic = pose_towards((0.0, -10.0, 3.0), (0.0, 2.0, 1.0)), intrinsic_matrix(*SIZE, 60.0)
     try:

@@ -1,7 +1,5 @@
 """The CARLA server of the tests, through the unmodified client of CARLA 0.9.16 over a real socket."""
 
-from __future__ import annotations
-
 import queue
 import time
 from concurrent.futures.process import BrokenProcessPool
@@ -15,14 +13,7 @@ from test_renderers_contract import street
 from cosfly.formats.kinds import KINDS
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.render.stage import open_renderer
-from cosfly.simulators.conventions import (
-    DEPTH_STEP_M,
-    camera_rotation_deg,
-    depth_of,
-    tags_of,
-    unreal_pose,
-    world_pose,
-)
+from cosfly.simulators.conventions import DEPTH_STEP_M, camera_rotation_deg, depth_of, tags_of, unreal_pose, world_pose
 
 pytest.importorskip("carla")
 SIZE = (160, 96)
@@ -44,7 +35,6 @@ def carla_transform(carla, position_m, rotation_deg):
 
 
 def cameras(carla, world, names=KINDS_OF_CAMERA):
-    """Spawn a camera of each kind; gives what they send, (frame, BGRA) each."""
     library, actors, inboxes = world.get_blueprint_library(), [], {}
     for name in names:
         blueprint = library.find(f"sensor.camera.{name}")
@@ -66,7 +56,6 @@ def lead(carla, world) -> None:
 
 
 def look(port: int) -> dict:
-    """One tick with a walker and four cameras; what the client was told."""
     carla, client, world = connected(port)
     lead(carla, world)
     library = world.get_blueprint_library()
@@ -132,7 +121,6 @@ def test_a_walker_goes_where_its_control_leads_it(seen):
 
 
 def test_pictures_are_the_embedded_renderers(seen):
-    """But for the person, whose ids and clothes are the server's."""
     renderer = open_renderer("gl", street(), *SIZE)
     frame = renderer.render(world_from_camera(np.array(EYE), np.array(TURN)), intrinsic_matrix(*SIZE, 60.0), None)
     renderer.close()
@@ -164,11 +152,7 @@ def test_depth_and_poses_survive_their_encodings():
         np.testing.assert_array_equal(np.concatenate([position, rotation]), [1.0, 2.0, 3.0, *turn])
 
 
-# --- faults -----------------------------------------------------------------------------------------------------------
-
-
 def frames_of(port: int, num_ticks: int) -> tuple[list[int], str]:
-    """How the depth camera's messages come: of which ticks, in their order; and what the client says at the end."""
     carla, client, world = connected(port)
     lead(carla, world)
     (camera,), inboxes = cameras(carla, world, ["depth"])

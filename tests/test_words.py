@@ -52,7 +52,6 @@ def files(*endings: str) -> list[str]:
 
 
 def first_words(source: str) -> list[tuple[str, str]]:
-    """Return (function, first word of its docstring) for public functions and methods that are no properties."""
     found = []
     for node in ast.walk(ast.parse(source)):
         if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) or node.name.startswith("_"):

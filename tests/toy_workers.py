@@ -18,8 +18,6 @@ def stage_in(path: Path) -> StageFolder:
 
 
 def make_worker(folder: Path):
-    """The payload begins with what goes wrong: `once-` in the first attempt only."""
-
     def work(item: Item) -> Outcome:
         what = item.payload[0]
         mark = folder / f"{item.item_id}.begun"

@@ -8,8 +8,6 @@ need no rendering.
 The walker counts as visible where a ray of five reaches it and the camera looks that way.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time
@@ -47,7 +45,6 @@ Windows = tuple[np.ndarray, np.ndarray, np.ndarray]  # pasts (n, d), labels (n,)
 
 
 def flights_of(cfg: RunConfig, name: str) -> Iterator[DroneTrace]:
-    """The kept flights of a town, planned from its map and walks as the stages do."""
     town = cfg.of_town(name)
     box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map
     ground, ids = walkable_ground(box_map, town.pedestrians), map(walk_id, range(town.pedestrians.num_paths))
@@ -62,7 +59,6 @@ def flights_of(cfg: RunConfig, name: str) -> Iterator[DroneTrace]:
 
 
 def flight_of(trace: DroneTrace) -> Track:
-    """A plan as a flight of a playback tree."""
     pitch, yaw = np.degrees(look_at(trace.positions_m, trace.targets_m))
     aside = np.abs(wrap_deg(yaw - trace.rotations_deg[:, 1])), np.abs(pitch - trace.rotations_deg[:, 0])
     visible = (trace.visibility > 0) & (aside[0] < HALF_VIEW_DEG[0]) & (aside[1] < HALF_VIEW_DEG[1])
@@ -75,7 +71,6 @@ def flight_of(trace: DroneTrace) -> Track:
 
 
 def windows_of(cfg: RunConfig, names: list[str]) -> Windows:
-    """The labelled windows of some towns, as a caption campaign cuts them."""
     cut, numbers = WindowConfig(), {name: k for k, name in enumerate(TOKENS)}
     found = []
     for flight in (flight_of(trace) for name in names for trace in flights_of(cfg, name)):

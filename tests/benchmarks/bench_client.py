@@ -6,8 +6,6 @@ beforehand: one loop with one client and its pool of connections, one with a cli
 per second of all and the ratio to the faster loop, once with pictures encoded beforehand and once encoded on the way.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import contextlib

@@ -11,8 +11,6 @@ pictures), features (ours, the pictures looked at before), plain (the same, no s
 flash-linear-attention does not compute in float32: `--check` has PyTorch's own functions do it.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Callable
@@ -63,7 +61,6 @@ def make_batch(shape: str, count: int) -> Batch:
 
 
 def generate(student: Student, batch: Batch, num_tokens: int) -> list[str]:
-    """Answer by the library's own way."""
     inputs = prompt_batch(student, batch.rows)
     inputs["pixel_values"] = torch.cat(batch.patches).to(student.device, student.dtype)
     with torch.inference_mode():

@@ -9,8 +9,6 @@ Planning is done first and not counted; starting workers, maps, drawing and deci
 alone are counted, from the second on.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import tempfile

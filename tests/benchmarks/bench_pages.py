@@ -3,8 +3,6 @@
 `python tests/benchmarks/bench_pages.py`: a minute. WebGL is drawn by the processor there.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 import threading
@@ -27,7 +25,6 @@ TURNS = 3
 
 
 def opened_s(page: Page, address: Path | str) -> float:
-    """Give the least time until the page says that it is ready."""
     times = []
     for _ in range(TURNS):
         start = time.perf_counter()
@@ -38,7 +35,6 @@ def opened_s(page: Page, address: Path | str) -> float:
 
 
 def frames_per_s(page: Page, counter: str, button: str) -> float:
-    """Drag for a while and count what is drawn."""
     before, start = page.run(counter), time.perf_counter()
     for _ in range(4):
         page.drag((700, 500), (400, 350), button, steps=60)

@@ -4,8 +4,6 @@ Dijkstra and L-BFGS-B, shapely's tree.
 python tests/benchmarks/bench_planning.py [--maps a b c] [--planners muco ...]
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 from dataclasses import dataclass
@@ -35,14 +33,11 @@ from cosfly.simplify.passes import SimplifyConfig, clusters, simplify
 SHORT_POINTS = 121  # the paper's SimWorld flight
 
 
-# --- Step 2 and Step 3 ------------------------------------------------------------------------------------------------
-
 WALKS = PedestriansConfig(num_paths=scenes.NUM_WALKS)
 BIG_M = (3784 * 0.5, 2357 * 0.5)  # the largest map of the paper
 
 
 def peer_clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:
-    """The clusters of Step 2 by shapely's STRtree and scipy's connected components."""
     grown = shapely.box(mins[:, 0] - gap_m, mins[:, 1] - gap_m, maxs[:, 0] + gap_m, maxs[:, 1] + gap_m)
     one, other = shapely.STRtree(shapely.box(mins[:, 0], mins[:, 1], maxs[:, 0], maxs[:, 1])).query(grown)
     near = (mins[one, 2] <= maxs[other, 2] + gap_m) & (mins[other, 2] <= maxs[one, 2] + gap_m)
@@ -84,7 +79,6 @@ def octile_graph(walkable: np.ndarray) -> coo_array:
 
 
 def stage_a(box_map: BoxMap) -> tuple:
-    """Grid to A* without files and pictures: the ground and the walks."""
     ground = walkable_ground(box_map, WALKS)
     names = [f"path_{k:05d}" for k in range(WALKS.num_paths)]
     return ground, [make_pedestrian(name, ground, WALKS, rng_for(scenes.SEED, "pedestrians", name)) for name in names]
@@ -128,13 +122,8 @@ def ground_stages() -> None:
     walking(simple)
 
 
-# --- Step 4 -----------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Scene:
-    """Twenty scenarios on one map."""
-
     name: str
     obstacles: BoxIndex
     scenarios: list[Scenario]
@@ -165,7 +154,6 @@ def make_scenes(wanted: list[str]) -> list[Scene]:
 
 
 def measure(scene: Scene, planner: str, cfg: PlanConfig) -> list:
-    """Times and quality of one planner over a scene."""
     plan = load_planner(planner)
     times, facts, failed = [], [], 0
     for scenario in scene.scenarios:

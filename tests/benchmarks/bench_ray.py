@@ -7,8 +7,6 @@
 The cluster is one of several processes on this machine. Writes below the folder of --work only.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import logging
@@ -63,14 +61,12 @@ def stages(out: Path, cfg: RayConfig | None) -> dict[str, pipeline.Stage]:
 
 
 def begin(work: Path) -> Path:
-    """Make a run up to its flights, which every measurement then copies."""
     for name in ("maps", "simplify", "pedestrians", "plan"):
         stages(work / "base/run", None)[name].work()
     return work / "base/run"
 
 
 def render(base: Path, place: Path, cfg: RayConfig | None) -> list[Event]:
-    """Render the flights of a run in a copy, in the folder `run` of a place."""
     shutil.copytree(base, place / "run")
     before = Path.cwd()
     os.chdir(place)  # so that paths in records are the same
@@ -82,7 +78,6 @@ def render(base: Path, place: Path, cfg: RayConfig | None) -> list[Event]:
 
 
 def spans(events: list[Event]) -> tuple[float, float, int]:
-    """Give the seconds until the first item has begun, those of all work after it, and the frames."""
     done = [event for event in events if event.event == "item_done"]
     first_s = min(event.at_s - (event.seconds or 0.0) for event in done)
     return first_s - events[0].at_s, done[-1].at_s - first_s, sum(event.steps or 0 for event in done)

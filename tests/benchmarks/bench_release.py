@@ -10,8 +10,6 @@ as a shard is: the least that any copy does. It goes through the page cache, as 
 the file system can. Both read files that are in the page cache.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import hashlib
@@ -93,13 +91,11 @@ def _paint_files(folder: Path, flight: Track, scene: Scene, i: int) -> Path:
 
 
 def cpu_seconds() -> float:
-    """Of this process and of all that it has started and seen end."""
     usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
 def build(root: Path, out: Path, files: tuple[FrameFile, ...], workers: int) -> float:
-    """Build a release; gives the seconds."""
     cfg = ReleaseConfig(licence="cc0-1.0", unbound="accept", modalities=files, num_frames=FRAMES_RELEASED)
     start_s = time.perf_counter()
     run(cfg, [Source("bench", root / "tree", root / "captions.jsonl")], out, workers=workers)
@@ -131,7 +127,6 @@ def copy_flight(folder: Path, target: Path, num_digests: int) -> int:
 
 
 def copy(tree: Path, out: Path, workers: int, num_digests: int) -> tuple[float, int]:
-    """Copy the pictures; gives seconds and bytes."""
     out.mkdir()
     flights = find_tracks(tree)
     start_s = time.perf_counter()

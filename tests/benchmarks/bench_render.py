@@ -11,8 +11,6 @@ frames.
 flight a process. On a machine with a GPU the same commands use it (the device is printed).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -78,7 +76,6 @@ print(json.dumps([count, time.process_time() - used_s, time.perf_counter() - sta
 
 
 def make_inputs(root: Path, num_flights: int) -> dict[str, Path]:
-    """Maps and flights, a folder each."""
     folders = {}
     for name, raw in (("town", scenes.town()), ("city", scenes.city())):
         if raw is None:
@@ -95,7 +92,6 @@ def make_inputs(root: Path, num_flights: int) -> dict[str, Path]:
 
 
 def views(traces: list[DroneTrace], num_frames: int) -> list[tuple]:
-    """Cameras and posed people, evenly along the flights."""
     found = []
     for trace in traces:
         gait, clothes = gait_of(trace.targets_m, trace.time_s), choose_clothes(np.random.default_rng(0))
@@ -109,9 +105,6 @@ def views(traces: list[DroneTrace], num_frames: int) -> list[tuple]:
 def prepare(renderer: Renderer, trace: DroneTrace) -> None:
     places = np.concatenate([trace.positions_m, trace.targets_m])
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M)
-
-
-# --- where the time goes ----------------------------------------------------------------------------------------------
 
 
 class Parts:
@@ -172,9 +165,6 @@ def parts(folder: Path, num_frames: int) -> tuple[str, list[Any]]:
     return device, [used[name] / num_frames for name in names]
 
 
-# --- to disk ----------------------------------------------------------------------------------------------------------
-
-
 def to_disk(folder: Path, out: Path, workers: int, num_points: int) -> list[float]:
     """Draw and write a flight with each of some processes at once, as the stage's workers do. Gives frames, CPU ms a
     frame, frames/s."""
@@ -200,9 +190,6 @@ def to_disk(folder: Path, out: Path, workers: int, num_points: int) -> list[floa
     found = [json.loads(process.communicate()[0]) for process in running]
     count = sum(frames for frames, _, _ in found)
     return [count, 1e3 * sum(used_s for _, used_s, _ in found) / count, sum(n / clock_s for n, _, clock_s in found)]
-
-
-# --- size and time ----------------------------------------------------------------------------------------------------
 
 
 def tiles(num_frames: int) -> list[list[Any]]:
@@ -249,9 +236,6 @@ def memory(num_frames: int) -> list[list[Any]]:
         if not rows or done - rows[-1][0] >= num_frames // 10:
             rows.append([done, resident_mib()])
     return [[count, mib, 100.0 * (mib / rows[min(1, len(rows) - 1)][1] - 1.0)] for count, mib in rows]
-
-
-# --- the stage with more and more workers -----------------------------------------------------------------------------
 
 
 def workers_table(folder: Path, counts: list[int], num_points: int) -> list[list[Any]]:

@@ -14,8 +14,6 @@ length. Pictures are noise in memory: what reading takes tells `cosfly distill t
 log). The first steps compile kernels and are not counted.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time
@@ -95,7 +93,6 @@ def make_student(shape: str, device: str, dtype: Any, seed: int = 0) -> Student:
 
 
 def make_rows(shape: str, count: int, seed: int) -> list[tuple[EncodedSample, list[FramePicture]]]:
-    """Samples whose lengths differ by a few per cent, as captions' do; a frame stands in five windows."""
     rng, size_px = np.random.default_rng(seed), SIZES_PX[shape]
     grid, vocabulary = (1, size_px[1] // 16, size_px[0] // 16), SHAPES[shape]["vocab_size"]
     rows = []
@@ -131,7 +128,6 @@ def plain_loss(student: Student, rows: list[EncodedSample], patches: Any) -> Any
 
 
 def backward(student: Student, way: str, rows: list, features: VisionFeatures, chunk: int) -> float:
-    """Compute loss and gradients of a micro-batch."""
     encoded, pictures = [row for row, _ in rows], [picture for _, found in rows for picture in found]
     if way == "plain":
         with student.computing():

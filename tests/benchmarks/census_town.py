@@ -6,8 +6,6 @@ Streets run on a grid of 6 x 5 blocks; four blocks are parks, two are squares, t
 with alleys between.
 """
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -35,7 +33,6 @@ Place = tuple[float, float, int]  # x, y, and the axis along which the kerb runs
 
 
 def census_town(name: str, seed: int) -> BoxMap:
-    """Build the town of a seed; counts by kind are CENSUS whatever the seed."""
     boxes = BoxList()
     columns, rows = _streets(0), _streets(1)
     blocks = [
@@ -62,13 +59,11 @@ def census_town(name: str, seed: int) -> BoxMap:
 
 
 def _streets(axis: int) -> np.ndarray:
-    """Low edges of the streets across one axis."""
     half, count = SIZE_M[axis] / 2 - EDGE_M, NUM_BLOCKS[axis]
     return np.linspace(-half, half - STREET_M, count + 1)
 
 
 def _ground(boxes: BoxList, rows: np.ndarray) -> None:
-    """Terrain in strips over the whole map, and a tram line along one street."""
     edges = np.linspace(-SIZE_M[0] / 2, SIZE_M[0] / 2, CENSUS["Terrain"] + 1)
     for low, high in itertools.pairwise(edges):
         boxes.span("Terrain", (low, -SIZE_M[1] / 2), (high, SIZE_M[1] / 2), -0.5, 0.0)
@@ -78,11 +73,7 @@ def _ground(boxes: BoxList, rows: np.ndarray) -> None:
         boxes.span("RailTrack", (low_x, middle + side - 0.05), (high_x, middle + side + 0.05), -0.15, 0.02)
 
 
-# --- blocks -----------------------------------------------------------------------------------------------------------
-
-
 def _houses(boxes: BoxList, built: list[Block], rng: np.random.Generator) -> None:
-    """Three by three houses a block. A house is a body with a hut on its roof and a room inside; some have a wing."""
     num_wings = CENSUS["Buildings"] - 3 * HOUSES_PER_SIDE**2 * len(built)
     houses = [(block, ix, iy) for block in built for ix in range(HOUSES_PER_SIDE) for iy in range(HOUSES_PER_SIDE)]
     with_wing = set(rng.permutation(len(houses))[:num_wings].tolist())
@@ -101,7 +92,6 @@ def _houses(boxes: BoxList, built: list[Block], rng: np.random.Generator) -> Non
 
 
 def _walls(boxes: BoxList, built: list[Block]) -> None:
-    """A wall that closes one alley of a block half, block after block."""
     for number in range(CENSUS["Walls"]):
         low, high = built[number % len(built)]
         size = (high - low - (HOUSES_PER_SIDE - 1) * ALLEY_M) / HOUSES_PER_SIDE
@@ -110,7 +100,6 @@ def _walls(boxes: BoxList, built: list[Block]) -> None:
 
 
 def _park_fences(boxes: BoxList, parks: list[Block]) -> None:
-    """Panels of six metres round the parks, with gates between."""
     per_park = CENSUS["Fences"] // len(parks)
     for low, high in parks:
         center, half = (low + high) / 2, (high - low) / 2 - 0.5
@@ -132,9 +121,6 @@ def _kiosks(boxes: BoxList, squares: list[Block], rng: np.random.Generator) -> N
         center = low + (high - low) * np.array([0.14 + 0.18 * column, 0.16 + 0.22 * row]) + rng.uniform(-1, 1, 2)
         boxes.add("Static", center, (3.0, 2.6), 0.0, 2.7, yaw_deg=rng.uniform(-12, 12))
         boxes.add("Static", center, (1.2, 1.0), 0.1, 1.5)
-
-
-# --- streets ----------------------------------------------------------------------------------------------------------
 
 
 def _kerb_places(columns: np.ndarray, rows: np.ndarray, rng: np.random.Generator) -> list[Place]:
@@ -204,7 +190,6 @@ def _trees(boxes: BoxList, parks: list[Block], kerbs: list[Place], rng: np.rando
 def _crown(
     boxes: BoxList, place: np.ndarray, height: float, radius: float, num_leaves: int, rng: np.random.Generator
 ) -> None:
-    """Boxes within an ellipsoid between 2.6 m and the tree's height."""
     directions = rng.normal(size=(num_leaves, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     shares = directions * np.cbrt(rng.uniform(0.0, 1.0, (num_leaves, 1)))

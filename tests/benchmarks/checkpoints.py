@@ -8,8 +8,6 @@ Writes DIR/NAME/, as `cosfly fly` does, for each checkpoint and prints `NAME=acc
 flights (those of the planner, captioned by the rules) whose label it answers. For one map; give all to `leaderboard`.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace

@@ -11,8 +11,6 @@ The student is a network of two hidden layers on the numbers of its prompt, behi
 into an answer. Beside each round stands a `control`, which gets as many old windows again as the round has new ones.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

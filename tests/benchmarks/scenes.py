@@ -1,8 +1,6 @@
 """What the benchmarks measure on, and how: three maps, walks over them, CPU times, tables. Writes nothing into the
 repository."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -57,7 +55,6 @@ def tiled(box_map: BoxMap, columns: int, rows: int) -> BoxMap:
 
 
 def cut_to(box_map: BoxMap, size_m: tuple[float, float]) -> BoxMap:
-    """The boxes that lie within `size_m` of the map's low corner."""
     low, _ = box_map.bounds()
     return box_map.select((box_map.maxs[:, :2] <= low[:2] + np.array(size_m)).all(axis=1))
 
@@ -104,7 +101,6 @@ def one_thread_and_machine() -> None:
 
 
 def print_table(title: str, names: list[str], rows: list[list[Any]]) -> None:
-    """Print a Markdown table."""
     print(f"{title}\n\n| " + " | ".join(names) + " |\n|" + "---|" * len(names))
     for row in rows:
         print("| " + " | ".join(f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in row) + " |")

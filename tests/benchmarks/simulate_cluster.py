@@ -7,8 +7,6 @@ Simulated: items of a stage that one driver hands out to workers, which are lost
 storage and teachers that serve so many requests a second. Not simulated: the network, storage that slows down early.
 """
 
-from __future__ import annotations
-
 import argparse
 import heapq
 import json
@@ -147,9 +145,6 @@ def simulate(items_s: Sequence[float], on: Cluster, rng: np.random.Generator, op
     return Result(total, lost, given_up, busy)
 
 
-# --- what it is fitted to ---------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Profile:
     """A run of one town: frames of each flight; by stage seconds of each item, a frame (plan: a flight), and until a
@@ -160,7 +155,7 @@ class Profile:
     start_s: dict[str, float]
 
     @classmethod
-    def of(cls, run: Path) -> Profile:
+    def of(cls, run: Path) -> "Profile":
         frames, seconds, start_s = list[int](), {}, {}
         for name in STAGES:
             events = read_events(run / name) or read_events(run.parent / name)  # one release of several towns
@@ -202,9 +197,6 @@ def driver(engines: dict[str, Watch]) -> dict[str, float]:
         found = {name: (used_s(2200, watch) - used_s(200, watch)) / 2000 for name, watch in engines.items()}
         lines_s = timeit.repeat(lambda: journal.append({"id": "path_00000/ORI"}), number=500, repeat=3)
         return found | {"journal": min(lines_s) / 500}
-
-
-# --- what is simulated ------------------------------------------------------------------------------------------------
 
 
 def paper_rows(rng: np.random.Generator) -> list[list]:
@@ -257,7 +249,6 @@ def many_runs(profile: Profile, on: Cluster, flights: int, rng: np.random.Genera
 
 
 def row_of(name: str, on: Cluster, found: dict[str, Result]) -> list:
-    """Give wall time, cost, losses, and what of that which is there once is busy longest, and its share of a stage."""
     hours = sum(one.seconds for one in found.values()) / 3600
     usd = on.nodes * hours * NODE_USD_H
     if on.teachers and "caption" in found:
@@ -273,7 +264,6 @@ def row_of(name: str, on: Cluster, found: dict[str, Result]) -> list:
 
 
 def asked(profile: Profile, rng: np.random.Generator) -> dict[str, list[float]]:
-    """What more and more nodes would ask of what is there once, over what it can, in runs that nothing holds up."""
     mean, found = float(np.mean(profile.frames)), list[dict[str, float]]()
     for nodes in (1, 4, 10, 40, 100, 400, 1000):
         results, workers = whole_run(profile, Cluster(nodes), 100 * nodes, rng), nodes * NODE_WORKERS

@@ -1,7 +1,5 @@
 """Run a server over a map: `python tests/simulators MAP --port N [PROTOCOL [FAULT]...]`."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

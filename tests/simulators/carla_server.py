@@ -1,7 +1,5 @@
 """A CARLA 0.9.16 server, as LibCarla speaks: msgpack-RPC at a port, streams of sensors at the next."""
 
-from __future__ import annotations
-
 import itertools
 import socket
 import struct
@@ -89,7 +87,6 @@ class CarlaServer(Server):
                 self.calls.put((connection, number, method, arguments))
 
     def answer(self, connection: socket.socket, number: int, method: str, arguments: list) -> None:
-        """Answer one call; the first argument is the client's metadata."""
         try:
             value = self._answers[method](*arguments[1:])
             result = [[False]] if value is None else [[1, value]]
@@ -185,12 +182,10 @@ def depth_picture(depth_m: np.ndarray) -> np.ndarray:
 
 
 def _bgra(red: np.ndarray, green: np.ndarray, blue: np.ndarray) -> np.ndarray:
-    """Return a picture of their low bytes, (h, w, 4) uint8."""
     return np.stack([blue, green, red, np.full_like(red, 255)], axis=-1).astype(np.uint8)
 
 
 def _objects_of(town: BoxMap) -> list:
-    """Return transform, bounding box, id, name and label of each box."""
     found, halves, ids, kinds = [], town.half_extents.tolist(), town.ids.tolist(), town.kinds.tolist()
     for row in range(len(town)):
         pose = unreal_pose(town.centers[row], town.rotations_deg[row])

@@ -1,7 +1,5 @@
 """What both servers share: the loop that answers, who moves, pictures by the embedded renderer, and planted faults."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import queue
@@ -56,8 +54,6 @@ def clothes_of(model: str) -> Any:
 
 
 class Server:
-    """A town. Threads queue what clients ask, and one thread answers."""
-
     def __init__(self, town: BoxMap, faults: Sequence[str]) -> None:
         self.town, self.num_ticks, self.calls = town, 0, queue.SimpleQueue[tuple]()
         self.movers, self.weather = dict[Any, Mover](), None
@@ -82,7 +78,6 @@ class Server:
             os._exit(1)
 
     def due(self, name: str, sensor: str = "") -> float:
-        """Return the seconds of the fault of this name that happens now; 0: there is none."""
         for planted, its_sensor, tick, plus, seconds in self._faults:
             goes_on = plus or name in ("hang", "unhealthy")
             is_now = self.num_ticks == int(tick) or (goes_on and self.num_ticks > int(tick))
@@ -91,7 +86,6 @@ class Server:
         return 0.0
 
     def faulty(self, message: bytes, sensor: str) -> list[bytes]:
-        """Return what is sent in place of a sensor's message."""
         if self.due("drop", sensor):
             return []
         message = message[:40] if self.due("malformed", sensor) else message
@@ -122,7 +116,6 @@ class Server:
 
 
 def listen(port: int, talk: Callable[[socket.socket], None]) -> None:
-    """Talk with everybody who connects, each in a thread."""
     listener = socket.create_server(("127.0.0.1", port))
 
     def accept() -> None:

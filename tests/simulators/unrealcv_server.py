@@ -1,7 +1,5 @@
 """An UnrealCV server: text commands and their answers at one port, one client at a time."""
 
-from __future__ import annotations
-
 import io
 import re
 import socket
@@ -69,7 +67,6 @@ class UnrealCvServer(Server):
             send(connection, _framed(message))
 
     def _done(self, command: str) -> bytes:
-        """Do one command and return its text, or the bytes of a picture."""
         now_s = time.monotonic()
         for mover in self.movers.values() if not self._paused else ():
             mover.step(now_s - self._since_s)
