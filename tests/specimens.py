@@ -67,14 +67,9 @@ def make_playback_tree(
         town = towns[index % len(towns)]
         for variant in ("ORI", "aug_001") if with_augmented else ("ORI",):
             flight, scene = make_flight(
-                num_points,
-                seed=seed + index,
-                town=town,
-                trajectory=f"trajectory_{FIRST_SECOND + 1000 * index}",
-                variant=variant,
-                width_px=width_px,
-                height_px=height_px,
-            )
+                num_points, seed=seed + index, town=town, trajectory=f"trajectory_{FIRST_SECOND + 1000 * index}",
+                variant=variant, width_px=width_px, height_px=height_px,
+            )  # fmt: skip
             folder = root / town / flight.trajectory / variant
             write_track(folder, flight)
             if with_images:
@@ -113,14 +108,8 @@ def make_flight(
     bbox = np.array([view[0] for view in views])
     visibility = np.array([view[3] for view in views])
     flight = Track(
-        town=town,
-        trajectory=trajectory,
-        variant=variant,
-        camera=camera,
-        time_s=np.arange(num_points) * DT_S,
-        positions_m=positions,
-        rotations_deg=rotations,
-        targets_m=targets,
+        town=town, trajectory=trajectory, variant=variant, camera=camera, time_s=np.arange(num_points) * DT_S,
+        positions_m=positions, rotations_deg=rotations, targets_m=targets,
         target=TargetRecord(
             in_view=~np.isnan(bbox[:, 0]),
             visible=visibility >= 0.3,
@@ -137,7 +126,7 @@ def make_flight(
             "algorithm": "muco",
         },
         is_original=variant == "ORI",
-    )
+    )  # fmt: skip
     return flight, scene
 
 
@@ -298,11 +287,7 @@ def _meta(flight: Track, i: int, num_pixels: int) -> FrameMeta:
         num_pixels=num_pixels,
     )
     return FrameMeta(
-        index=i,
-        time_s=float(flight.time_s[i]),
-        town=flight.town,
-        trajectory=flight.trajectory,
-        variant=flight.variant,
+        index=i, time_s=float(flight.time_s[i]), town=flight.town, trajectory=flight.trajectory, variant=flight.variant,
         camera=camera_meta(flight.camera, 0.3, SKY_DEPTH_M),
         drone_pose=np.hstack([flight.positions_m[i], flight.rotations_deg[i]]),
         target=target,
@@ -313,4 +298,4 @@ def _meta(flight: Track, i: int, num_pixels: int) -> FrameMeta:
             target_position=nowhere,
             drone_rotation=nowhere,
         ),
-    )
+    )  # fmt: skip

@@ -88,14 +88,11 @@ def _motion(num_points: int, k: int, is_clean: bool) -> tuple[list[dict], list[t
 def _point(i: int, poses: list[dict], people: list[tuple[float, float, float]], start_s: float, is_clean: bool) -> dict:
     following = {axis: poses[i + 1][axis] for axis in "xyz"} if i + 1 < len(poses) else None
     return {
-        "index": i,
-        "is_perturbed": not is_clean,
+        "index": i, "is_perturbed": not is_clean,
         "perturbation": {"drone_position": not is_clean, "drone_rotation": not is_clean},
-        "timing": {"trace_timestamp": start_s + 0.5 * i, "sim_timestamp": 100.0 + i},
-        "drone_pose": poses[i],
-        "nav_waypoint": {"t1_world": following},
-        "target": None if i == NOBODY else _target(poses[i], people[i]),
-    }
+        "timing": {"trace_timestamp": start_s + 0.5 * i, "sim_timestamp": 100.0 + i}, "drone_pose": poses[i],
+        "nav_waypoint": {"t1_world": following}, "target": None if i == NOBODY else _target(poses[i], people[i]),
+    }  # fmt: skip
 
 
 def _project(pose: dict, place: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -113,14 +110,9 @@ def _target(pose: dict, place: tuple[float, float, float]) -> dict:
     half = 0.9 * FOCAL / depth  # their person is not as large as ours
     box = {"xmin": u - half / 3, "ymin": v - half, "xmax": u + half / 3, "ymax": v + half}
     return {
-        "enabled": True,
-        "visible": True,
-        "in_view": True,
-        "depth": depth,
-        "world_location": dict(zip(("x", "y", "z"), place, strict=True)),
-        "image_uv": [u, v],
-        "bbox_2d": box,
-    }
+        "enabled": True, "visible": True, "in_view": True, "depth": depth,
+        "world_location": dict(zip(("x", "y", "z"), place, strict=True)), "image_uv": [u, v], "bbox_2d": box,
+    }  # fmt: skip
 
 
 def _write_frame(folder: Path, pose: dict, point: dict, files: tuple[str, ...]) -> None:

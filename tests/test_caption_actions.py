@@ -28,14 +28,10 @@ def future(
     speed = float(np.linalg.norm([forward, left, up]) / 2.5)
     steps = np.arange(6)[:, None] * np.array([*target_step, 0.0])
     return FutureMotion(
-        indices=(5, 6, 7, 8, 9),
-        time_s=np.arange(6) * 0.5,
-        positions_m=positions,
-        yaw_deg=k[:, 0] * turn_deg,
-        targets_m=np.array([*target, 0.9]) + steps,
-        visible=np.full(6, bool(visible)),
+        indices=(5, 6, 7, 8, 9), time_s=np.arange(6) * 0.5, positions_m=positions, yaw_deg=k[:, 0] * turn_deg,
+        targets_m=np.array([*target, 0.9]) + steps, visible=np.full(6, bool(visible)),
         speed_before_mps=speed if before_mps is None else before_mps,
-    )
+    )  # fmt: skip
 
 
 LABELS = [
@@ -143,14 +139,11 @@ angles = st.lists(st.floats(-20.0, 20.0, allow_nan=False, width=32), min_size=6,
 def futures(draw) -> FutureMotion:
     targets = np.array(draw(rows)) + np.array([15.0, 0.0, 0.0])
     return FutureMotion(
-        indices=(5, 6, 7, 8, 9),
-        time_s=np.arange(6) * 0.5,
-        positions_m=np.array(draw(rows)),
-        yaw_deg=np.array(draw(angles)),
-        targets_m=targets,
+        indices=(5, 6, 7, 8, 9), time_s=np.arange(6) * 0.5, positions_m=np.array(draw(rows)),
+        yaw_deg=np.array(draw(angles)), targets_m=targets,
         visible=np.array(draw(st.lists(st.booleans(), min_size=6, max_size=6))),
         speed_before_mps=draw(st.floats(0.0, 5.0)),
-    )
+    )  # fmt: skip
 
 
 def judged(motion) -> tuple[str | None, dict[str, str]]:
@@ -200,12 +193,9 @@ def test_moving_the_world_and_the_clock_changes_nothing(drawn, turn_deg, shift, 
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     moved = dataclasses.replace(
-        drawn,
-        positions_m=drawn.positions_m @ turn.T + shift,
-        targets_m=drawn.targets_m @ turn.T + shift,
-        yaw_deg=(drawn.yaw_deg + turn_deg + 180.0) % 360.0 - 180.0,
-        time_s=drawn.time_s + later_s,
-    )
+        drawn, positions_m=drawn.positions_m @ turn.T + shift, targets_m=drawn.targets_m @ turn.T + shift,
+        yaw_deg=(drawn.yaw_deg + turn_deg + 180.0) % 360.0 - 180.0, time_s=drawn.time_s + later_s,
+    )  # fmt: skip
     if not is_near_a_threshold(measure(drawn)):
         assert judged(measure(drawn)) == judged(measure(moved))
 

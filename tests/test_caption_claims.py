@@ -84,36 +84,30 @@ def test_a_true_sentence_is_proved_and_one_wrong_word_is_named(language, text, c
     names_the_wrong_words(language, text, claims_of(claims), errors)
 
 
-@each(
-    ("language", "text", "claims", "state"),
-    [
-        ("en", "At t0 the person is hard to make out, at t4 in full view.", "visibility@t0=illegible; visibility@t4=visible", "proved"),
-        ("zh", "目标在 t0 时难以辨认。", "visibility@t0=illegible", "proved"),
-        ("en", "At t0 the person is barely visible.", "visibility@t0=illegible", "proved"),
-        ("en", "At t0 the person is visible.", "visibility@t0=visible", "contradicted"),
-        ("en", "At t0 the person is in full view.", "visibility@t0=illegible", "contradicted"),
-        ("zh", "目标在 t0 时清晰可见。", "visibility@t0=illegible", "contradicted"),
-        ("en", "At t0 the person is visible, the drone does 4.0 m/s.", "speed@t4=4.0 mps", "contradicted"),
-        ("en", "At t3 the person is hard to make out, the drone does 4.0 m/s.", "speed@t4=4.0 mps", "contradicted"),
-    ],
-)  # fmt: skip
+@each(("language", "text", "claims", "state"), [
+    ("en", "At t0 the person is hard to make out, at t4 in full view.", "visibility@t0=illegible; visibility@t4=visible", "proved"),
+    ("zh", "目标在 t0 时难以辨认。", "visibility@t0=illegible", "proved"),
+    ("en", "At t0 the person is barely visible.", "visibility@t0=illegible", "proved"),
+    ("en", "At t0 the person is visible.", "visibility@t0=visible", "contradicted"),
+    ("en", "At t0 the person is in full view.", "visibility@t0=illegible", "contradicted"),
+    ("zh", "目标在 t0 时清晰可见。", "visibility@t0=illegible", "contradicted"),
+    ("en", "At t0 the person is visible, the drone does 4.0 m/s.", "speed@t4=4.0 mps", "contradicted"),
+    ("en", "At t3 the person is hard to make out, the drone does 4.0 m/s.", "speed@t4=4.0 mps", "contradicted"),
+])  # fmt: skip
 def test_who_cannot_be_made_out_is_not_said_to_be_seen(language, text, claims, state):
     facts = dataclasses.replace(FACTS, visibility=("illegible", *FACTS.visibility[1:]))
     assert judged(text, claims_of(claims), language, facts=facts).state == state
 
 
-@each(
-    ("wrong", "words"),
-    [
-        ("distance@t4=18.4 m", "false: distance@t4 = 18.4 m"),
-        ("distance@t3=18.0 m", "false: distance@t3"),
-        ("distance@t4=18.0 km", "false"),
-        ("distance@t4=far", "false"),
-        ("distance@t7=18.0 m", "unobserved frame: distance@t7"),
-        ("range@t4=18.0 m", "unknown quantity: range@t4"),
-        ("height_over_target@t4=18.0 m", "unknown fact"),
-    ],
-)
+@each(("wrong", "words"), [
+    ("distance@t4=18.4 m", "false: distance@t4 = 18.4 m"),
+    ("distance@t3=18.0 m", "false: distance@t3"),
+    ("distance@t4=18.0 km", "false"),
+    ("distance@t4=far", "false"),
+    ("distance@t7=18.0 m", "unobserved frame: distance@t7"),
+    ("range@t4=18.0 m", "unknown quantity: range@t4"),
+    ("height_over_target@t4=18.0 m", "unknown fact"),
+])  # fmt: skip
 def test_a_wrong_claim_is_named(wrong, words):
     assert words in " ".join(judged("The walker is 18.0 m away.", [claim(wrong)]).problems)
 
@@ -132,17 +126,14 @@ def test_a_claim_that_nobody_wrote_is_no_problem_and_a_true_number_that_nobody_c
     assert judged("The walker is 22.0 m away, the drone at 22.0 m.", [DISTANCE, height]).state == "contradicted"
 
 
-@each(
-    ("planned", "modality", "decision", "is_problem"),
-    [
-        ("decision=yaw_left_to_follow", "predicted", "yaw_left_to_follow", False),
-        ("decision=yaw_left_to_follow", "predicted", "yaw_right_to_follow", True),
-        ("side:yaw=left", "predicted", "yaw_left_to_follow", False),
-        ("side:yaw=left", "predicted", "yaw_right_to_follow", True),
-        ("side:yaw=left", "hypothetical", "yaw_left_to_follow", False),
-        ("side:yaw=left", "observed", "yaw_left_to_follow", True),  # the nose went right
-    ],
-)
+@each(("planned", "modality", "decision", "is_problem"), [
+    ("decision=yaw_left_to_follow", "predicted", "yaw_left_to_follow", False),
+    ("decision=yaw_left_to_follow", "predicted", "yaw_right_to_follow", True),
+    ("side:yaw=left", "predicted", "yaw_left_to_follow", False),
+    ("side:yaw=left", "predicted", "yaw_right_to_follow", True),
+    ("side:yaw=left", "hypothetical", "yaw_left_to_follow", False),
+    ("side:yaw=left", "observed", "yaw_left_to_follow", True),  # the nose went right
+])  # fmt: skip
 def test_a_plan_is_held_against_the_decision(planned, modality, decision, is_problem):
     plan = "So the nose should now turn to the left without delay."
     reasons = judged(plan, [claim(planned, modality=modality)], decision=decision)

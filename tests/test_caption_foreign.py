@@ -87,16 +87,13 @@ def test_a_contradiction_is_on_record_and_drops_its_window_where_the_settings_sa
     assert [caption.drop_reason for caption in dropped[:2]] == ["evidence", None]
 
 
-@each(
-    ("changes", "reason"),
-    [
-        ({"therefore": "return_to_home"}, "decision_against_reasoning"),
-        ({"decision": "do a barrel roll"}, "structure_decision_not_in_closed_set"),
-        ({"zh": ZH | {"flight_decision": "return_to_home"}}, "bilingual_decision"),
-        ({"zh": EN | {"flight_decision": "hover"}}, "bilingual_structure_"),
-        ({"en": EN | {"reasoning_trace": "So.", "flight_decision": "hover"}}, "structure_reasoning_trace_too_short"),
-    ],
-)
+@each(("changes", "reason"), [
+    ({"therefore": "return_to_home"}, "decision_against_reasoning"),
+    ({"decision": "do a barrel roll"}, "structure_decision_not_in_closed_set"),
+    ({"zh": ZH | {"flight_decision": "return_to_home"}}, "bilingual_decision"),
+    ({"zh": EN | {"flight_decision": "hover"}}, "bilingual_structure_"),
+    ({"en": EN | {"reasoning_trace": "So.", "flight_decision": "hover"}}, "structure_reasoning_trace_too_short"),
+])  # fmt: skip
 def test_what_is_wrong_with_a_caption_drops_its_window(tree, rules, tmp_path, changes, reason):
     if reason.startswith("bilingual_structure"):
         changes = {"zh": {"critical_components": "短", "reasoning_trace": "短", "flight_decision": "hover"}}

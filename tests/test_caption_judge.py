@@ -29,22 +29,19 @@ def tree(tmp_path_factory):
     return make_playback_tree(tmp_path_factory.mktemp("tree"), 2, 18)
 
 
-@each(
-    ("text", "verdict"),
-    [
-        ('{"verdict": "FIX_LABEL", "reason": "the text argues for the label"}', "FIX_LABEL"),
-        ('```json\n{"verdict": "REJECT_REGEN", "reason": "wrong"}\n```', "REJECT_REGEN"),
-        ("ACCEPT_ALTERNATIVE", UNJUDGED),
-        ("", UNJUDGED),
-        ('{"verdict": "ACCEPT", "reason": "fine"}', UNJUDGED),
-        ('{"verdict": "ACCEPT_ALTERNATIVE"}', UNJUDGED),
-        ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": " "}', UNJUDGED),
-        ('{"verdict": ["ACCEPT_ALTERNATIVE"], "reason": "x"}', UNJUDGED),
-        ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": "x"} {"verdict": "REJECT_REGEN", "reason": "y"}', "REJECT_REGEN"),
-        ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": ', UNJUDGED),
-        ('["ACCEPT_ALTERNATIVE"]', UNJUDGED),
-    ],
-)
+@each(("text", "verdict"), [
+    ('{"verdict": "FIX_LABEL", "reason": "the text argues for the label"}', "FIX_LABEL"),
+    ('```json\n{"verdict": "REJECT_REGEN", "reason": "wrong"}\n```', "REJECT_REGEN"),
+    ("ACCEPT_ALTERNATIVE", UNJUDGED),
+    ("", UNJUDGED),
+    ('{"verdict": "ACCEPT", "reason": "fine"}', UNJUDGED),
+    ('{"verdict": "ACCEPT_ALTERNATIVE"}', UNJUDGED),
+    ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": " "}', UNJUDGED),
+    ('{"verdict": ["ACCEPT_ALTERNATIVE"], "reason": "x"}', UNJUDGED),
+    ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": "x"} {"verdict": "REJECT_REGEN", "reason": "y"}', "REJECT_REGEN"),
+    ('{"verdict": "ACCEPT_ALTERNATIVE", "reason": ', UNJUDGED),
+    ('["ACCEPT_ALTERNATIVE"]', UNJUDGED),
+])  # fmt: skip
 def test_reading_a_judgement(text, verdict):
     assert parse_judgement(text)[0] == verdict
 
@@ -78,8 +75,7 @@ def test_a_label_is_put_in_where_the_text_allows_it(tree, tmp_path):
     assert fixed
     for caption in fixed:
         assert caption.repair.rung == caption.repair.strategy == "fix_label"
-        assert caption.repair.asks == 0
-        assert caption.repair.first_decision == "hover"
+        assert (caption.repair.asks, caption.repair.first_decision) == (0, "hover")
         assert caption.en.flight_decision == caption.zh.flight_decision == caption.label
 
 

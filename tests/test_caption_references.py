@@ -12,42 +12,39 @@ from cosfly.formats.captions import Claim
 FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0))
 
 
-@each(
-    ("address", "fact"),
-    [
-        ("distance", Fact(18.0, "m", 1)),
-        ("distance@t0", Fact(20.0, "m", 1)),
-        ("distance@t3", "unknown_fact"),
-        ("distance@t5", "unobserved_frame"),
-        ("change:distance", Fact(-2.0, "m", 1)),
-        ("change:distance@t0-t2", Fact(1.0, "m", 1)),
-        ("change:distance@t3-t4", "unknown_fact"),
-        ("growth:box_height", Fact(20.0, "percent", 0)),
-        ("rate:altitude@t3-t4", Fact(2.0, "mps", 1)),
-        ("rate:yaw@t2-t4", Fact(7.0, "dps", 1)),
-        ("climb_rate@t2", Fact(1.0, "mps", 2)),
-        ("mean:speed", Fact(2.88, "mps", 2)),
-        ("max:speed", Fact(4.0, "mps", 2)),
-        ("min:speed@t2-t4", Fact(2.5, "mps", 2)),
-        ("speed@t0", "unknown_fact"),
-        ("mean:target_speed", Fact(1.6, "mps", 2)),
-        ("speed_ratio", Fact(2.5, "times", 2)),
-        ("change:target_heading", Fact(-30.0, "deg", 1)),
-        ("side:target_heading", Fact("right")),
-        ("side:yaw", Fact("left")),
-        ("side:offset_x", Fact("left")),
-        ("side:offset_x@t1", Fact("centred")),
-        ("side:offset_y", Fact("below")),
-        ("trend:speed", Fact("increasing")),
-        ("trend:pitch", Fact("steady")),
-        ("trend:distance", Fact("decreasing")),
-        ("comparison:speed", Fact("faster")),
-        ("visibility@t3", Fact("occluded")),
-        ("target_motion", Fact("walking")),
-        ("drone_motion", Fact("moving")),
-        ("heading", "unknown_fact"),
-    ],
-)
+@each(("address", "fact"), [
+    ("distance", Fact(18.0, "m", 1)),
+    ("distance@t0", Fact(20.0, "m", 1)),
+    ("distance@t3", "unknown_fact"),
+    ("distance@t5", "unobserved_frame"),
+    ("change:distance", Fact(-2.0, "m", 1)),
+    ("change:distance@t0-t2", Fact(1.0, "m", 1)),
+    ("change:distance@t3-t4", "unknown_fact"),
+    ("growth:box_height", Fact(20.0, "percent", 0)),
+    ("rate:altitude@t3-t4", Fact(2.0, "mps", 1)),
+    ("rate:yaw@t2-t4", Fact(7.0, "dps", 1)),
+    ("climb_rate@t2", Fact(1.0, "mps", 2)),
+    ("mean:speed", Fact(2.88, "mps", 2)),
+    ("max:speed", Fact(4.0, "mps", 2)),
+    ("min:speed@t2-t4", Fact(2.5, "mps", 2)),
+    ("speed@t0", "unknown_fact"),
+    ("mean:target_speed", Fact(1.6, "mps", 2)),
+    ("speed_ratio", Fact(2.5, "times", 2)),
+    ("change:target_heading", Fact(-30.0, "deg", 1)),
+    ("side:target_heading", Fact("right")),
+    ("side:yaw", Fact("left")),
+    ("side:offset_x", Fact("left")),
+    ("side:offset_x@t1", Fact("centred")),
+    ("side:offset_y", Fact("below")),
+    ("trend:speed", Fact("increasing")),
+    ("trend:pitch", Fact("steady")),
+    ("trend:distance", Fact("decreasing")),
+    ("comparison:speed", Fact("faster")),
+    ("visibility@t3", Fact("occluded")),
+    ("target_motion", Fact("walking")),
+    ("drone_motion", Fact("moving")),
+    ("heading", "unknown_fact"),
+])  # fmt: skip
 def test_the_fact_at_an_address(address, fact):
     reference = parse_reference(address)
     assert reference is not None
@@ -55,13 +52,10 @@ def test_the_fact_at_an_address(address, fact):
     assert parse_reference(str(reference)) == reference
 
 
-@each(
-    "address",
-    [
-        "", "colour", "distance@now", "distance@t0-t4", "trend:visibility", "side:distance", "sum:distance", "change:",
-        "x" * 9,
-    ],
-)  # fmt: skip
+@each("address", [
+    "", "colour", "distance@now", "distance@t0-t4", "trend:visibility", "side:distance", "sum:distance", "change:",
+    "x" * 9,
+])  # fmt: skip
 def test_what_names_nothing(address):
     assert parse_reference(address) is None
 
@@ -73,24 +67,21 @@ def test_a_series_that_ends_where_it_began_has_no_trend():
         assert word_holds("mixed", parse_reference("trend:distance"), facts)
 
 
-@each(
-    ("quantity", "at", "value", "unit", "state"),
-    [
-        ("distance", "t4", 18.0, "m", "proved"),
-        ("distance", "t4", 18, "m", "proved"),
-        ("distance", "t4", 18.4, "m", "contradicted"),
-        ("speed_ratio", None, 2.5, "times", "proved"),
-        ("mean:speed", None, 3, "mps", "proved"),  # rounded to what was written
-        ("mean:speed", None, 2.9, "mps", "proved"),
-        ("mean:speed", None, 2.8, "mps", "contradicted"),
-        ("distance", "t4", 18.0, "mps", "contradicted"),
-        ("distance", "t9", 18.0, "m", "unobserved_frame"),
-        ("distance", "t3", 18.0, "m", "unknown_fact"),
-        ("colour", None, "red", None, "unknown_reference"),
-        ("trend:speed", None, "increasing", None, "proved"),
-        ("trend:speed", None, "decreasing", None, "contradicted"),
-        ("trend:speed", None, 3.0, None, "contradicted"),
-    ],
-)
+@each(("quantity", "at", "value", "unit", "state"), [
+    ("distance", "t4", 18.0, "m", "proved"),
+    ("distance", "t4", 18, "m", "proved"),
+    ("distance", "t4", 18.4, "m", "contradicted"),
+    ("speed_ratio", None, 2.5, "times", "proved"),
+    ("mean:speed", None, 3, "mps", "proved"),  # rounded to what was written
+    ("mean:speed", None, 2.9, "mps", "proved"),
+    ("mean:speed", None, 2.8, "mps", "contradicted"),
+    ("distance", "t4", 18.0, "mps", "contradicted"),
+    ("distance", "t9", 18.0, "m", "unobserved_frame"),
+    ("distance", "t3", 18.0, "m", "unknown_fact"),
+    ("colour", None, "red", None, "unknown_reference"),
+    ("trend:speed", None, "increasing", None, "proved"),
+    ("trend:speed", None, "decreasing", None, "contradicted"),
+    ("trend:speed", None, 3.0, None, "contradicted"),
+])  # fmt: skip
 def test_a_claim_against_the_facts(quantity, at, value, unit, state):
     assert judge_claim(Claim(sentence="C1", quantity=quantity, at=at, value=value, unit=unit), FACTS) == state

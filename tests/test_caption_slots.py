@@ -39,48 +39,42 @@ def filled(
     return sentence if isinstance(sentence, Refused) else Filler(facts, decision, language).fill(sentence)
 
 
-@each(
-    ("template", "text"),
-    [
-        ("The gap {trend:distance} from {distance@t0} to {distance}.", "The gap decreases from 20.0 m to 18.0 m."),
-        ("The gap is {trending:distance}.", "The gap is decreasing."),
-        ("The gap is now {trend:distance}.", "The gap is now decreasing."),
-        ("The gap has {trend:distance} to {distance}.", "The gap has decreased to 18.0 m."),
-        ("A {trend:speed} pace and a {trend:distance} gap.", "An increasing pace and a decreasing gap."),
-        ("It lies {offset_x} to the {side:offset_x} of the middle.", "It lies 64 px to the left of the middle."),
-        ("An offset of {offset_x} is large.", "An offset of -64 px is large."),  # no slot says its side
-        ("The nose swung {yaw} {side:yaw}, at {yaw_rate}.", "The nose swung 10.0 deg right, at -8.0 deg/s."),
-        ("It was {yaw@t2} to the {side:yaw@t2} at t2.", "It was 3.0 deg to the left at t2."),
-        ("The height {trend:altitude} by {change:altitude}.", "The height increases by 2.0 m."),
-        ("The box measures {box@t4} now, {box@t0} then.", "The box measures 36 x 72 px now, 30 x 60 px then."),
-        ("The box {trend:box_height} by {growth:box_height}.", "The box increases by 20%."),
-        ("Pitch is {pitch} here.", "Pitch is -40.3 deg here."),
-        ("It was {visibility@t3} at t3.", "It was occluded at t3."),
-        ("The drone is {comparison:speed} the walker.", "The drone is faster than the walker."),
-        ("The drone is {comparison:speed} than the walker.", "The drone is faster than the walker."),
-        ("The drone is {comparison:speed}.", "The drone is faster."),
-        ("The gap is {distance} m wide.", "The gap is 18.0 m wide."),  # the unit once
-        ("At {speed} m/s it flies.", "At 4.00 m/s it flies."),
-        ("It should {decision}, to the {side:decision}.", "It should yaw right to follow, to the right."),
-        ("{Distance @ t0} it was.", "20.0 m it was."),
-        ("The walker {target_motion} and is {target_motion}.", "The walker walks and is walking."),
-    ],
-)
+@each(("template", "text"), [
+    ("The gap {trend:distance} from {distance@t0} to {distance}.", "The gap decreases from 20.0 m to 18.0 m."),
+    ("The gap is {trending:distance}.", "The gap is decreasing."),
+    ("The gap is now {trend:distance}.", "The gap is now decreasing."),
+    ("The gap has {trend:distance} to {distance}.", "The gap has decreased to 18.0 m."),
+    ("A {trend:speed} pace and a {trend:distance} gap.", "An increasing pace and a decreasing gap."),
+    ("It lies {offset_x} to the {side:offset_x} of the middle.", "It lies 64 px to the left of the middle."),
+    ("An offset of {offset_x} is large.", "An offset of -64 px is large."),  # no slot says its side
+    ("The nose swung {yaw} {side:yaw}, at {yaw_rate}.", "The nose swung 10.0 deg right, at -8.0 deg/s."),
+    ("It was {yaw@t2} to the {side:yaw@t2} at t2.", "It was 3.0 deg to the left at t2."),
+    ("The height {trend:altitude} by {change:altitude}.", "The height increases by 2.0 m."),
+    ("The box measures {box@t4} now, {box@t0} then.", "The box measures 36 x 72 px now, 30 x 60 px then."),
+    ("The box {trend:box_height} by {growth:box_height}.", "The box increases by 20%."),
+    ("Pitch is {pitch} here.", "Pitch is -40.3 deg here."),
+    ("It was {visibility@t3} at t3.", "It was occluded at t3."),
+    ("The drone is {comparison:speed} the walker.", "The drone is faster than the walker."),
+    ("The drone is {comparison:speed} than the walker.", "The drone is faster than the walker."),
+    ("The drone is {comparison:speed}.", "The drone is faster."),
+    ("The gap is {distance} m wide.", "The gap is 18.0 m wide."),  # the unit once
+    ("At {speed} m/s it flies.", "At 4.00 m/s it flies."),
+    ("It should {decision}, to the {side:decision}.", "It should yaw right to follow, to the right."),
+    ("{Distance @ t0} it was.", "20.0 m it was."),
+    ("The walker {target_motion} and is {target_motion}.", "The walker walks and is walking."),
+])  # fmt: skip
 def test_what_a_template_becomes(template, text):
     assert filled(template) == text
 
 
-@each(
-    ("template", "text"),
-    [
-        ("水平距离从 {distance@t0}{trend:distance}到 {distance}。", "水平距离从 20.0 米减小到 18.0 米。"),
-        ("目标位于画面中心{side:offset_x}侧 {offset_x} 处。", "目标位于画面中心左侧 64 像素处。"),
-        ("边界框为 {box@t4}。", "边界框为 36 × 72 像素。"),
-        ("无人机{comparison:speed}目标，因此{decision}。", "无人机快于目标，因此向右偏航跟随。"),
-        ("t3 时目标{visibility@t3}。", "t3 时目标被遮挡。"),
-        ("高度为 {altitude} 米。", "高度为 22.0 米。"),
-    ],
-)
+@each(("template", "text"), [
+    ("水平距离从 {distance@t0}{trend:distance}到 {distance}。", "水平距离从 20.0 米减小到 18.0 米。"),
+    ("目标位于画面中心{side:offset_x}侧 {offset_x} 处。", "目标位于画面中心左侧 64 像素处。"),
+    ("边界框为 {box@t4}。", "边界框为 36 × 72 像素。"),
+    ("无人机{comparison:speed}目标，因此{decision}。", "无人机快于目标，因此向右偏航跟随。"),
+    ("t3 时目标{visibility@t3}。", "t3 时目标被遮挡。"),
+    ("高度为 {altitude} 米。", "高度为 22.0 米。"),
+])  # fmt: skip
 def test_what_a_chinese_template_becomes(template, text):
     assert filled(template, "zh") == text
 
@@ -215,20 +209,17 @@ def drafts(english: str, chinese: str) -> Draft | Refused:
     return WAY.read_mirror(Parsed(zh), first, FACTS)
 
 
-@each(
-    ("english", "chinese", "reason"),
-    [
-        ("The gap {trend:distance} to {distance}.", "距离{trend:distance}到 {distance}。", None),
-        ("With {distance} the gap {trend:distance}.", "距离{trend:distance}，为 {distance}。", None),  # another order
-        ("The gap is {distance}. It should {decision}.", "距离为 {distance}，应{decision}。", "sentences"),
-        ("The gap {trend:distance} to {distance}.", "距离为 {distance}。", "slots"),
-        ("The gap is {distance}.", "距离为 {slant}。", "slots"),
-        ("The gap is {distance@t0}.", "距离为 {distance}。", "slots"),
-        ("The gap is {distance}.", "The gap is {distance}。", "script"),
-        ("The gap is {distance}.", "距离为 {distance}，约二十米。", "slots_number_outside"),
-        ("The altitude is {altitude}.", "海拔为 {altitude}。", "glossary"),
-    ],
-)
+@each(("english", "chinese", "reason"), [
+    ("The gap {trend:distance} to {distance}.", "距离{trend:distance}到 {distance}。", None),
+    ("With {distance} the gap {trend:distance}.", "距离{trend:distance}，为 {distance}。", None),  # another order
+    ("The gap is {distance}. It should {decision}.", "距离为 {distance}，应{decision}。", "sentences"),
+    ("The gap {trend:distance} to {distance}.", "距离为 {distance}。", "slots"),
+    ("The gap is {distance}.", "距离为 {slant}。", "slots"),
+    ("The gap is {distance@t0}.", "距离为 {distance}。", "slots"),
+    ("The gap is {distance}.", "The gap is {distance}。", "script"),
+    ("The gap is {distance}.", "距离为 {distance}，约二十米。", "slots_number_outside"),
+    ("The altitude is {altitude}.", "海拔为 {altitude}。", "glossary"),
+])  # fmt: skip
 def test_the_mirror_holds_the_same_slots_sentence_by_sentence(english, chinese, reason):
     found = drafts(english, chinese)
     assert (found.reason if isinstance(found, Refused) else None) == reason
@@ -257,30 +248,27 @@ FASTER, SLOWER = (partial(claimed, "comparison:speed", value) for value in ("fas
 STEADY = partial(claimed, "trend:pitch", "steady", at="t0-t4")
 
 
-@each(
-    ("language", "reasons", "claims", "state"),
-    [
-        ("en", "The drone at {speed} outpaces the walker.", [FASTER("outpaces")], "proved"),
-        ("en", "The drone at {speed} outpaces the walker.", [SLOWER("outpaces")], "contradicted"),
-        ("en", "The drone at {speed} outpaces the walker.", [], "unread"),
-        ("en", "The drone at {speed} outpaces the lazy walker.", [FASTER("outpaces")], "unread"),  # not covered
-        ("en", "The drone at {speed} outpaces the walker.", [FASTER("outruns")], "unread"),  # not what stands there
-        ("en", "The drone at {speed} outpaces the walker.", [STEADY("outpaces")], "unread"),  # of another kind
-        ("en", "The drone at {speed} is outpaced by the walker.", [FASTER("is outpaced by")], "unread"),
-        ("en", "The drone at {speed} is not outpacing the walker.", [FASTER("is not outpacing")], "unread"),
-        ("en", "The walker outpaces the drone at {speed}.", [FASTER("outpaces")], "unread"),  # the other order
-        ("en", "The walker at {speed} is what the drone outpaces.", [FASTER("outpaces")], "unread"),  # not its slot
-        ("en", "The pitch is steady.", [STEADY("is steady")], "proved"),
-        ("en", "The altitude of {altitude} is steady.", [STEADY("is steady")], "unread"),  # another series
-        ("en", "The altitude is steady.", [STEADY("The altitude is steady")], "unread"),
-        ("en", "The pitch is steady.", [{**STEADY("is steady"), "quantity": "trend:distance"}], "contradicted"),
-        ("en", "The pitch is steady.", "is steady", "unread"),  # no list
-        ("zh", "俯仰角为 {pitch}，保持稳定。", [STEADY("保持稳定")], "proved"),
-        ("zh", "俯仰角为 {pitch}，保持稳定。", [], "unread"),
-        ("zh", "高度为 {altitude}，保持稳定。", [STEADY("保持稳定")], "unread"),
-        ("zh", "距离为 {distance}，行人站立不动。", [claimed("target_motion", "standing", "站立不动")], "contradicted"),
-    ],
-)
+@each(("language", "reasons", "claims", "state"), [
+    ("en", "The drone at {speed} outpaces the walker.", [FASTER("outpaces")], "proved"),
+    ("en", "The drone at {speed} outpaces the walker.", [SLOWER("outpaces")], "contradicted"),
+    ("en", "The drone at {speed} outpaces the walker.", [], "unread"),
+    ("en", "The drone at {speed} outpaces the lazy walker.", [FASTER("outpaces")], "unread"),  # not covered
+    ("en", "The drone at {speed} outpaces the walker.", [FASTER("outruns")], "unread"),  # not what stands there
+    ("en", "The drone at {speed} outpaces the walker.", [STEADY("outpaces")], "unread"),  # of another kind
+    ("en", "The drone at {speed} is outpaced by the walker.", [FASTER("is outpaced by")], "unread"),
+    ("en", "The drone at {speed} is not outpacing the walker.", [FASTER("is not outpacing")], "unread"),
+    ("en", "The walker outpaces the drone at {speed}.", [FASTER("outpaces")], "unread"),  # the other order
+    ("en", "The walker at {speed} is what the drone outpaces.", [FASTER("outpaces")], "unread"),  # not its slot
+    ("en", "The pitch is steady.", [STEADY("is steady")], "proved"),
+    ("en", "The altitude of {altitude} is steady.", [STEADY("is steady")], "unread"),  # another series
+    ("en", "The altitude is steady.", [STEADY("The altitude is steady")], "unread"),
+    ("en", "The pitch is steady.", [{**STEADY("is steady"), "quantity": "trend:distance"}], "contradicted"),
+    ("en", "The pitch is steady.", "is steady", "unread"),  # no list
+    ("zh", "俯仰角为 {pitch}，保持稳定。", [STEADY("保持稳定")], "proved"),
+    ("zh", "俯仰角为 {pitch}，保持稳定。", [], "unread"),
+    ("zh", "高度为 {altitude}，保持稳定。", [STEADY("保持稳定")], "unread"),
+    ("zh", "距离为 {distance}，行人站立不动。", [claimed("target_motion", "standing", "站立不动")], "contradicted"),
+])  # fmt: skip
 def test_a_word_beside_slots_needs_a_claim_that_holds(language, reasons, claims, state):
     coc = Coc(critical_components="{visibility}", reasoning_trace=reasons, flight_decision="hover")
     if language == "en":
@@ -291,8 +279,7 @@ def test_a_word_beside_slots_needs_a_claim_that_holds(language, reasons, claims,
         found = WAY.read_mirror(Parsed(coc, more={"claims": claims}), first, FACTS)
     assert isinstance(found, Draft), found
     [_, judged] = WAY.judge(found, FACTS, language)
-    assert judged.state == state
-    assert (state == "contradicted") == bool(judged.problems)
+    assert (judged.state, state == "contradicted") == (state, bool(judged.problems))
     asked_again = isinstance(claims, list) and len(found.template.claims or ()) > 0 and state == "unread"
     assert bool(found.doubt) >= asked_again
 
@@ -342,16 +329,13 @@ def test_a_refused_answer_is_mended_when_it_is_told_what_was_wrong(tree, tmp_pat
     assert all('"18.5"' in text and "reasoning_trace, sentence 1" in text for text in complaints)
 
 
-@each(
-    ("reasons", "reason"),
-    [
-        ("The gap of 18.5 m calls for nothing.", "slots_number_outside"),
-        ("The gap of {gap} calls for this decision.", "slots_unknown_reference"),
-        ("The walker is on the left of the road there.", "slots_pole_outside"),
-        ("The decision is to ascend, given all of this.", "slots_pole_outside"),
-        ("The drone should move forward, given all of this.", "decision_against_reasoning"),
-    ],
-)
+@each(("reasons", "reason"), [
+    ("The gap of 18.5 m calls for nothing.", "slots_number_outside"),
+    ("The gap of {gap} calls for this decision.", "slots_unknown_reference"),
+    ("The walker is on the left of the road there.", "slots_pole_outside"),
+    ("The decision is to ascend, given all of this.", "slots_pole_outside"),
+    ("The drone should move forward, given all of this.", "decision_against_reasoning"),
+])  # fmt: skip
 def test_an_answer_that_stays_wrong_drops_its_window_for_that_reason(tree, tmp_path, reasons, reason):
     with writing_server(reasons) as server, pytest.raises(NothingKept):
         run(settings(server.url, limit=2), tree, tmp_path / "out")

@@ -39,10 +39,8 @@ def test_every_window_is_one_line_sorted_and_labelled_from_geometry(tree, done):
     assert {caption.sample_id: caption.label for caption in captions} == expected
     assert len(captions) == 6 * 9
     for caption in captions:
-        assert caption.teacher.kind == "rules"
-        assert caption.window[-1] == caption.frame_index
-        assert caption.future[0] == caption.frame_index + 1
-        assert caption.status == "accepted"
+        assert (caption.teacher.kind, caption.window[-1]) == ("rules", caption.frame_index)
+        assert (caption.future[0], caption.status) == (caption.frame_index + 1, "accepted")
         assert caption.verdict != "HARD_CONFLICT"
         assert caption.en.flight_decision == caption.zh.flight_decision
 
@@ -86,8 +84,7 @@ def test_who_cannot_be_made_out_changes_what_is_said_to_be_seen_and_no_decision(
         text, chinese = (getattr(other, language).critical_components for language in ("en", "zh"))
         assert not re.search(r"visible|partly|in the image|image centre", text)
         assert not re.search("可见|部分遮挡|画面", chinese)
-        assert ("hard to make out" in text) == ("难以辨认" in chinese)
-        assert other.checks.evidence == "ok"
+        assert ("hard to make out" in text, other.checks.evidence) == ("难以辨认" in chinese, "ok")
 
 
 def test_a_product_never_loses_captions(tmp_path):

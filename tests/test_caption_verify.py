@@ -68,28 +68,25 @@ def pair(en: str, zh: str) -> tuple[Coc, Coc]:
     )
 
 
-@each(
-    ("en", "zh", "reason"),
-    [
-        ("the target is on the left", "目标在左侧", None),
-        ("the target is on the left", "目标在右侧", "polarity_side"),
-        ("the target is right now on the left", "目标此刻在左侧", None),
-        ("about 3 m to the left", "左侧 3 米左右", None),
-        ("the drone climbs", "无人机下降", "polarity_vertical"),
-        ("the drone ascends", "无人机上升", None),
-        ("the gap decreases", "间距增大", "polarity_trend"),
-        ("the target is visible", "目标被遮挡", "polarity_visibility"),
-        ("the target is visible", "目标不可见", "polarity_visibility"),
-        ("the target is not visible", "目标不可见", None),
-        ("the target is not occluded", "目标无遮挡", None),
-        ("the target is occluded", "目标未被遮挡", "polarity_visibility"),
-        ("it turns left, then right, then left", "先向左，再向右，再向右", "polarity_side"),
-        ("the target is 12.5 m away", "目标在 12.5 米处", None),
-        ("the target is 12.5 m away", "目标在 15.2 米处", "number"),
-        ("the target is 12.5 m away", "目标速度 12.5 米/秒", "number"),  # same digits, another unit
-        ("over 5 frames", "在五帧中", None),
-    ],
-)
+@each(("en", "zh", "reason"), [
+    ("the target is on the left", "目标在左侧", None),
+    ("the target is on the left", "目标在右侧", "polarity_side"),
+    ("the target is right now on the left", "目标此刻在左侧", None),
+    ("about 3 m to the left", "左侧 3 米左右", None),
+    ("the drone climbs", "无人机下降", "polarity_vertical"),
+    ("the drone ascends", "无人机上升", None),
+    ("the gap decreases", "间距增大", "polarity_trend"),
+    ("the target is visible", "目标被遮挡", "polarity_visibility"),
+    ("the target is visible", "目标不可见", "polarity_visibility"),
+    ("the target is not visible", "目标不可见", None),
+    ("the target is not occluded", "目标无遮挡", None),
+    ("the target is occluded", "目标未被遮挡", "polarity_visibility"),
+    ("it turns left, then right, then left", "先向左，再向右，再向右", "polarity_side"),
+    ("the target is 12.5 m away", "目标在 12.5 米处", None),
+    ("the target is 12.5 m away", "目标在 15.2 米处", "number"),
+    ("the target is 12.5 m away", "目标速度 12.5 米/秒", "number"),  # same digits, another unit
+    ("over 5 frames", "在五帧中", None),
+])  # fmt: skip
 def test_mirror_check(en, zh, reason):
     assert check_mirror(*pair(en, zh), {}) == reason
 

@@ -146,10 +146,8 @@ def test_facts_of_a_hand_made_window(tree):
     assert facts.speed_mps == (None, 2.24, 2.24, 2.24, 2.24)  # sqrt(1 + 0.25) / 0.5
     assert facts.altitude_m == (20.0, 19.5, 19.0, 18.5, 18.0)
     assert facts.yaw_deg == (0.0, 1.0, 2.0, 3.0, 4.0)  # across the seam at 180
-    assert facts.distance_m == (15.0,) * 5
-    assert facts.target_speed_mps == 2.0
-    assert facts.target_turn_deg == 0.0
-    assert (facts.box_width_px[-1], facts.box_height_px[-1]) == (20, 60)
+    assert (facts.distance_m, facts.target_speed_mps) == ((15.0,) * 5, 2.0)
+    assert (facts.target_turn_deg, facts.box_width_px[-1], facts.box_height_px[-1]) == (0.0, 20, 60)
     assert (facts.offset_x_px[-1], facts.offset_y_px[-1]) == (30, 10)
     assert facts.visibility == ("visible", "visible", "partly_occluded", "occluded", "out_of_view")
     prompt = make_question(window, ImageConfig(), "prose", VOCABULARY).prompts["en"].user
@@ -182,13 +180,9 @@ def two_tracks(tmp_path_factory):
     times."""
     clean, scene = make_flight(NUM_POINTS, seed=5)
     boxes = make_box_map(
-        scene.centers,
-        scene.half_extents,
-        np.zeros_like(scene.centers),
-        scene.kinds,
-        scene.ids,
+        scene.centers, scene.half_extents, np.zeros_like(scene.centers), scene.kinds, scene.ids,
         MapHeader(ground_z_m=0.0),
-    )
+    )  # fmt: skip
     planned = Poses(clean.positions_m, clean.rotations_deg, clean.targets_m, np.full(NUM_POINTS, 5.0))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PerturbationConfig, "frame_margin", 0.0)

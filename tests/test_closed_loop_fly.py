@@ -137,8 +137,7 @@ def test_what_a_model_answers_wrong_is_its_own_failure_and_the_flight_goes_on(to
 def test_a_model_is_asked_about_all_flights_at_once_and_nothing_twice(town, tmp_path):
     with TeacherServer(delay_s=0.2) as server:
         flown = fly(town, tmp_path, f"{SHORT} {ONE} --student {server.url}")
-        assert server.most_at_once == 3
-        assert len(server.bodies) == 3 * 6
+        assert (server.most_at_once, len(server.bodies)) == (3, 3 * 6)
         first = server.bodies[0]
         assert json.loads(first)["messages"][1]["content"][1]["type"] == "image_url"
         for path in (tmp_path / "manifest.json", tmp_path / "items.jsonl", *(tmp_path / EPISODES).glob("*.json")):

@@ -73,14 +73,11 @@ def test_redrawn_frames_show_what_the_student_saw(town, tmp_path):  # noqa: F811
 
 
 @pytest.mark.slow
-@each(
-    ("more", "reason"),
-    [
-        ("--set plan.safety_distance_m=25 --set plan.relaxed_safety_m=25", "too_near"),
-        ("--set plan.speed_max_mps=0.2", "no_path"),
-        ("", "crashes"),
-    ],
-)
+@each(("more", "reason"), [
+    ("--set plan.safety_distance_m=25 --set plan.relaxed_safety_m=25", "too_near"),
+    ("--set plan.speed_max_mps=0.2", "no_path"),
+    ("", "crashes"),
+])  # fmt: skip
 def test_why_nothing_can_be_shown_there_is_counted(town, tmp_path, monkeypatch, more, reason):  # noqa: F811
     fly(town, tmp_path / "flown", f"{STUDENT} --set fly.most_decisions=12")
     if reason == "crashes":

@@ -51,13 +51,10 @@ def test_a_past_is_the_same_wherever_and_whenever_it_was(seed):
     assert not np.array_equal(past_of(flight, range(5), True), here)
 
 
-@pytest.mark.parametrize(
-    ("steps_m", "first", "last"),
-    [
-        ([0.6] * 8 + [0.0] * 4, 3, 7),  # it stops on the way to frame 8
-        ([0.0] * 8 + [0.6] * 4, 3, 7),  # it sets off
-    ],
-)
+@pytest.mark.parametrize(("steps_m", "first", "last"), [
+    ([0.6] * 8 + [0.0] * 4, 3, 7),  # it stops on the way to frame 8
+    ([0.0] * 8 + [0.6] * 4, 3, 7),  # it sets off
+])  # fmt: skip
 def test_who_stops_or_sets_off_within_the_labels_future_was_drawn_ahead(steps_m, first, last):
     flight = flight_of(straight(steps_m))
     found = [now for now in range(1, NUM - 5) if is_drawn_ahead(flight, now, now + 5, False)]

@@ -37,16 +37,13 @@ def test_what_the_reasoning_leads_to_stands_before_the_decision():
     assert len(schema["properties"]["therefore"]["enum"]) == 17
 
 
-@each(
-    ("fields", "outcome"),
-    [
-        ({"therefore": "Track straight"}, "track_straight"),
-        ({}, "missing_field"),
-        ({"therefore": "go on"}, "therefore_not_in_closed_set"),
-        ({"therefore": ["hover"]}, "therefore_not_in_closed_set"),
-        ({"therefore": "hover", "claims": []}, "extra_field"),
-    ],
-)
+@each(("fields", "outcome"), [
+    ({"therefore": "Track straight"}, "track_straight"),
+    ({}, "missing_field"),
+    ({"therefore": "go on"}, "therefore_not_in_closed_set"),
+    ({"therefore": ["hover"]}, "therefore_not_in_closed_set"),
+    ({"therefore": "hover", "claims": []}, "extra_field"),
+])  # fmt: skip
 def test_further_fields_are_those_that_were_asked_for(fields, outcome):
     parsed = parse_answer(changed(**fields), more=("therefore",))
     assert outcome == (parsed.therefore if parsed.coc else parsed.reason)

@@ -44,8 +44,7 @@ def test_flights_add_up(flights):
 def test_each_is_told_beside_the_plain_run(flights):
     total = Coverage.total([coverage_of(flight) for flight in flights])
     page = coverage_html(total)
-    assert page.count("<svg") == len(AXES)
-    assert page.count("<polyline") == len(AXES)
+    assert (page.count("<svg"), page.count("<polyline")) == (len(AXES), len(AXES))
     assert {row[0] for row in shares(total, "styles")} == {"follow"}
     assert shares(total, "labels") == []  # nobody captioned them
     assert all(plain != "-" for _, _, plain in ranges(total))

@@ -207,14 +207,11 @@ def ask(follow, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "wanted"),
-    [
-        ("Token", "ok"), ("Command", "ok"), ("Word", "invalid"), ("Beyond", "invalid"), ("Seventeen", "invalid"), ("Nothing", "unreadable"), ("Object", "unreadable"), ("Raises", "none"),
-        ("Dies", "none"), ("Quits", "none"), ("Never", "late"), ("BadReset", "none"),
-        ("Complex", "unreadable"), ("Forged", "none"), ("Mistyped", "none"), ("Huge", "none"), ("Closes", "none"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("name", "wanted"), [
+    ("Token", "ok"), ("Command", "ok"), ("Word", "invalid"), ("Beyond", "invalid"), ("Seventeen", "invalid"), ("Nothing", "unreadable"), ("Object", "unreadable"), ("Raises", "none"),
+    ("Dies", "none"), ("Quits", "none"), ("Never", "late"), ("BadReset", "none"),
+    ("Complex", "unreadable"), ("Forged", "none"), ("Mistyped", "none"), ("Huge", "none"), ("Closes", "none"),
+])  # fmt: skip
 def test_what_a_policy_does_is_told_as_its_answer(ask, name, wanted):
     assert [one.answer for one in ask(name, 60.0 if wanted != "late" else 0.4)] == [wanted] * 5
 

@@ -32,8 +32,7 @@ def test_boxes_round_trip(tmp_path_factory, n, seed):
     back = read_boxes(path)
     for name in ("centers", "half_extents", "rotations_deg"):
         assert_allclose(getattr(back, name), getattr(boxes, name), atol=1e-6)
-    assert back.kinds.tolist() == boxes.kinds.tolist()
-    assert back.ids.tolist() == boxes.ids.tolist()
+    assert (back.kinds.tolist(), back.ids.tolist()) == (boxes.kinds.tolist(), boxes.ids.tolist())
     assert back.name == "T"
     first = path.read_bytes()
     write_boxes(path, back)

@@ -144,30 +144,20 @@ def test_checksums_that_the_tree_lists_cannot_be_taken_away(workplace):
     assert [(issue.code, issue.where) for issue in report.issues] == [("missing_file", CHECKSUMS)]
 
 
-@each(
-    ("change", "code", "severity"),
-    [
-        ({"positions": 3.0}, "acceleration", "error"),
-        ({"positions": 3.0}, "jerk", "error"),
-        ({"positions": 1.0}, "smoothness", "warning"),
-        ({"drop_reason": "low_visibility"}, "prefiltered", "error"),
-    ],
-)
+@each(("change", "code", "severity"), [
+    ({"positions": 3.0}, "acceleration", "error"),
+    ({"positions": 3.0}, "jerk", "error"),
+    ({"positions": 1.0}, "smoothness", "warning"),
+    ({"drop_reason": "low_visibility"}, "prefiltered", "error"),
+])  # fmt: skip
 def test_plan_rules(change, code, severity):
     n = 40
     positions = np.zeros((n, 3))
     positions[:, 0] = np.arange(n) + change.get("positions", 0.0) * (np.arange(n) % 2)  # a zigzag along the way
     trace = DroneTrace(
-        "p",
-        "muco",
-        np.arange(n) * 0.5,
-        positions,
-        np.zeros((n, 3)),
-        positions,
-        np.full(n, 0.9),
-        np.ones(n),
+        "p", "muco", np.arange(n) * 0.5, positions, np.zeros((n, 3)), positions, np.full(n, 0.9), np.ones(n),
         drop_reason=change.get("drop_reason"),
-    )
+    )  # fmt: skip
     report = Report()
     check_plan(trace, InspectConfig(), report, {})
     assert {issue.code: issue.severity for issue in report.issues}.get(code) == severity
@@ -528,17 +518,13 @@ def other_at(place_m, kind: str = "Pedestrians", number: int = 7) -> BystanderMe
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("beside", "shift_m", "codes"),
-    [
-        ("drone", (0.0, 0.0, -1.0), {"clearance"}),
-        ("drone", (0.0, 0.0, -8.0), set()),
-        ("target", (0.4, 0.0, 0.0), {"collision"}),
-        ("target", (0.7, 0.0, 0.0), set()),
-        ("kind", (50.0, 0.0, 0.0), {"broken_annotation"}),
-    ],
-    ids=["at_the_drone", "below_the_drone", "in_the_person", "beside_the_person", "a_tree"],
-)
+@pytest.mark.parametrize(("beside", "shift_m", "codes"), [
+    ("drone", (0.0, 0.0, -1.0), {"clearance"}),
+    ("drone", (0.0, 0.0, -8.0), set()),
+    ("target", (0.4, 0.0, 0.0), {"collision"}),
+    ("target", (0.7, 0.0, 0.0), set()),
+    ("kind", (50.0, 0.0, 0.0), {"broken_annotation"}),
+], ids=["at_the_drone", "below_the_drone", "in_the_person", "beside_the_person", "a_tree"])  # fmt: skip
 def test_others_keep_clear_of_drone_and_person(workplace, beside, shift_m, codes):
     flight, report, metrics = read_track(first_flight(workplace)), Report(), {}
     place_m = (flight.positions_m if beside == "drone" else flight.targets_m)[3] + np.array(shift_m)
@@ -559,8 +545,7 @@ def test_an_unreadable_flight_is_a_counted_failure_while_others_go_on(workplace)
     found = inspect(workplace)
     assert codes_of(found, twin) == {"unreadable": "error"}, "it is measured against the clean flight"
     flight = next(f for f in found.flights if f.folder.endswith(f"{broken.parent.name}/ORI"))
-    assert flight.result == "rejected"
-    assert flight.reason == "unreadable"
+    assert (flight.result, flight.reason) == ("rejected", "unreadable")
     assert "points[3].drone_pose.x" in flight.issues[0].got
     manifest = read_json(workplace / "out" / "manifest.json")
     assert manifest["counts"] == {"input": 4, "kept": 2, "dropped": {}, "failed": {"input": 2}}

@@ -265,13 +265,10 @@ def scene_map(folder: Path) -> BoxMap:
     assert house is not None
     write_meshes(folder / "house.glb", {"house": house, "unused": house})
     rows = [
-        ("Roads", (0, 0, -0.1), (60, 5, 0.1), 0.0, None),
-        ("Buildings", (5, 10, 3.5), (5, 4, 3.5), 0.0, None),
-        ("Buildings", (5, 15, 3.5), (5, 1, 3.5), 0.0, None),
-        ("Static", (-6, 6, 2.0), (3, 1, 2.0), 30.0, None),
-        ("Static", (14, 3, 1.0), (1, 1, 1.0), 0.0, None),
-        ("Walls", (-4, 14, 1), (6, 0.2, 1.0), 5.0, None),
-    ]
+        ("Roads", (0, 0, -0.1), (60, 5, 0.1), 0.0, None), ("Buildings", (5, 10, 3.5), (5, 4, 3.5), 0.0, None),
+        ("Buildings", (5, 15, 3.5), (5, 1, 3.5), 0.0, None), ("Static", (-6, 6, 2.0), (3, 1, 2.0), 30.0, None),
+        ("Static", (14, 3, 1.0), (1, 1, 1.0), 0.0, None), ("Walls", (-4, 14, 1), (6, 0.2, 1.0), 5.0, None),
+    ]  # fmt: skip
     box_map = make_box_map(
         [row[1] for row in rows], [row[2] for row in rows], [(0.0, row[3], 0.0) for row in rows],
         [KINDS[row[0]] for row in rows], [7, 40, 41, 9, 300, 12],

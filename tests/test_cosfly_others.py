@@ -24,12 +24,9 @@ PERSON, CAR = "Pedestrians", "Car"
 def crossing_town(*more: tuple[str, tuple, tuple]) -> BoxMap:
     """Two carriageways of 8 m that cross at the origin, pavement all about; more: (kind, center, half_extents)."""
     rows = [
-        ("Sidewalks", (0, 0, -0.2), (80, 80, 0.15)),
-        ("Roads", (0, 0, -0.1), (80, 4, 0.1)),
-        ("Roads", (0, 42, -0.1), (4, 38, 0.1)),
-        ("Roads", (0, -42, -0.1), (4, 38, 0.1)),
-        *more,
-    ]
+        ("Sidewalks", (0, 0, -0.2), (80, 80, 0.15)), ("Roads", (0, 0, -0.1), (80, 4, 0.1)),
+        ("Roads", (0, 42, -0.1), (4, 38, 0.1)), ("Roads", (0, -42, -0.1), (4, 38, 0.1)), *more,
+    ]  # fmt: skip
     kinds = [KINDS[row[0]] for row in rows]
     header = MapHeader(name="Crossing")
     return make_box_map(

@@ -19,13 +19,9 @@ from cosfly.runtime.io import read_checksums
 from cosfly.viz.gallery import four_panels
 
 SETTINGS = {
-    "width_px": 320,
-    "height_px": 180,
-    "fovs_deg": [60.0],
-    "town": "Street",
-    "tracks": ["clean"],
+    "width_px": 320, "height_px": 180, "fovs_deg": [60.0], "town": "Street", "tracks": ["clean"],
     "first_timestamp": 1776000000,
-}
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -73,16 +73,13 @@ def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path, monke
             read(path)
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        (b'{"a": 1e308, "b": -1e-999, "c": 123456789012345678901234567890}',
-        [1e308, -0.0, 123456789012345678901234567890]),
-        (b'{"a": 0.1000000000000000055511151231257827021181583404541015625}', [0.1]),
-        (b'\xef\xbb\xbf{"a": "e9999 \\ud83d\\ude00"}', ["e9999 \U0001f600"]),
-        (b'{"a": ' + b"[" * 60 + b"]" * 60 + b"}", None),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("text", "value"), [
+    (b'{"a": 1e308, "b": -1e-999, "c": 123456789012345678901234567890}',
+    [1e308, -0.0, 123456789012345678901234567890]),
+    (b'{"a": 0.1000000000000000055511151231257827021181583404541015625}', [0.1]),
+    (b'\xef\xbb\xbf{"a": "e9999 \\ud83d\\ude00"}', ["e9999 \U0001f600"]),
+    (b'{"a": ' + b"[" * 60 + b"]" * 60 + b"}", None),
+])  # fmt: skip
 def test_honest_json_passes(tmp_path, text, value):
     (tmp_path / "x.json").write_bytes(text)
     found = json_io.read_json(tmp_path / "x.json")
@@ -208,19 +205,15 @@ def test_arrays_are_read_as_numpy_reads_them(tmp_path, order):
 GOOD = _npy(np.zeros((7, 5), np.float32))
 
 
-@each(
-    "data",
-    [
-        GOOD[:-1], GOOD + b"\0", GOOD[:40], b"", GOOD.replace(b"(7, 5)", b"(5, 7, 1)"), GOOD.replace(b"<f4", b"<f8"),
-        GOOD.replace(b"<f4", b"|O4"),
-        GOOD.replace(b"<f4", b"<q9"), GOOD.replace(b"(7, 5)", b"(-7,-5)"),
-        GOOD.replace(b"(7, 5)", b"(" + b"9" * 99 + b",)"), _npy(np.array([{}], object)),
-        _npy(np.zeros((7, 5), ">f4")), GOOD[:8] + b"\xff\xff" + GOOD[10:], GOOD[:6] + b"\7" + GOOD[7:],
-        _npy(np.zeros(3, [("a", "<f4")])),
-        _npy(np.zeros((0, 5), np.float32)).replace(b"(0, 5)", b"(0, %d)" % 2**61),
-    ],
-    ids=str,
-)  # fmt: skip
+@each("data", [
+    GOOD[:-1], GOOD + b"\0", GOOD[:40], b"", GOOD.replace(b"(7, 5)", b"(5, 7, 1)"), GOOD.replace(b"<f4", b"<f8"),
+    GOOD.replace(b"<f4", b"|O4"),
+    GOOD.replace(b"<f4", b"<q9"), GOOD.replace(b"(7, 5)", b"(-7,-5)"),
+    GOOD.replace(b"(7, 5)", b"(" + b"9" * 99 + b",)"), _npy(np.array([{}], object)),
+    _npy(np.zeros((7, 5), ">f4")), GOOD[:8] + b"\xff\xff" + GOOD[10:], GOOD[:6] + b"\7" + GOOD[7:],
+    _npy(np.zeros(3, [("a", "<f4")])),
+    _npy(np.zeros((0, 5), np.float32)).replace(b"(0, 5)", b"(0, %d)" % 2**61),
+], ids=str)  # fmt: skip
 def test_other_arrays_are_refused(data):
     with pytest.raises(InputError):
         arrays.parse_array(data, "x", dtype=np.float32, ndim=2)

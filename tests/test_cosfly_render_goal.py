@@ -48,8 +48,7 @@ def test_what_a_wall_hides_is_not_said(y_m, says_legs):
     goal = find_goal(people, 3, draw, intrinsic, pose[:3, :3])
     renderer.close()
     assert goal is not None
-    assert goal.frame == 3
-    assert ("legs" in goal.says) == says_legs
+    assert (goal.frame, "legs" in goal.says) == (3, says_legs)
     assert bool({*goal.says} & {*SIDES, *LANDMARKS}) != says_legs  # where they are hidden, a place is said
 
 

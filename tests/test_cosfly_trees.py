@@ -214,8 +214,7 @@ def test_nobody_is_no_target(foreign):
     flight = read_track(find_tracks(foreign)[0])
     assert np.isnan(flight.targets_m[NOBODY]).all()
     assert not flight.target.visible[NOBODY]
-    assert flight.target.visible.sum() == len(flight) - 1
-    assert flight.time_s[0] == 7.5
+    assert (flight.target.visible.sum(), flight.time_s[0]) == (len(flight) - 1, 7.5)
 
 
 def test_the_clean_twin_is_found_by_what_it_says_it_is(foreign, tmp_path):
@@ -281,8 +280,7 @@ def test_a_foreign_tree_gives_samples_and_a_release(way):
     assert verify(way / "release").is_ok
     record = read_record(way / "release/dataset/release.json")
     assert record.numbers.flights_by_track == {"clean": 2, "perturbed": 2}
-    assert record.numbers.captions.frames_with == 4 * 4
-    assert record.history.captions.released == 4 * 4
+    assert (record.numbers.captions.frames_with, record.history.captions.released) == (4 * 4, 4 * 4)
 
 
 def test_of_a_foreign_tree_what_was_inspected_is_released_and_nothing_else(tmp_path):

@@ -36,8 +36,7 @@ def config(**settings) -> RenderConfig:
 def test_the_presets_are_those_of_the_paper():
     assert len(WEATHERS) * len(TIMES) == 60
     knobs = {name: tuple(preset.model_dump().values()) for name, preset in WEATHERS.items()}
-    assert knobs["heavy_rain"] == (95, 90, 25, 20)
-    assert knobs["dust_haze"] == (70, 0, 70, 12)
+    assert (knobs["heavy_rain"], knobs["dust_haze"]) == ((95, 90, 25, 20), (70, 0, 70, 12))
     assert sum(map(sum, knobs.values())) == 530 + 685 + 370 + 437  # of the table's four columns
     times = {name: tuple(time.model_dump().values()) for name, time in TIMES.items()}
     assert times == {"morning": (15, 90), "noon": (75, 180), "dusk": (0, 270), "night": (-30, 0)}
@@ -70,13 +69,9 @@ def test_off_is_the_default_and_leaves_no_trace():
 
 def test_fixed_takes_the_named_presets():
     params = {
-        "cloudiness": 95,
-        "precipitation": 90,
-        "fog_density": 25,
-        "fog_distance": 20,
-        "sun_altitude_angle": -30,
+        "cloudiness": 95, "precipitation": 90, "fog_density": 25, "fog_distance": 20, "sun_altitude_angle": -30,
         "sun_azimuth_angle": 0,
-    }
+    }  # fmt: skip
     wanted = {"mode": "fixed", "weather_name": "heavy_rain", "tod_name": "night", "params": params}
     for name in ("heavy_rain", "heavy rain", "Heavy-Rain"):
         cfg = config(weather_mode="fixed", weather_name=name, tod_name="night")

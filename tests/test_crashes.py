@@ -65,14 +65,11 @@ def test_a_product_without_its_records_that_another_stage_would_take_is_found(tm
     assert called_complete(tmp_path / "killed", [tmp_path / "whole"]) == ["s/product.json is taken by the next stage"]
 
 
-@pytest.mark.parametrize(
-    "asked",
-    [
-        pytest.param(("caption prompts",), id="at every step"),
-        pytest.param(("maps",), id="of a stage", marks=pytest.mark.slow),
-        pytest.param(("--few", "--twice", *OF_A_RUN), id="twice", marks=pytest.mark.timeout(1800)),
-    ],
-)
+@pytest.mark.parametrize("asked", [
+    pytest.param(("caption prompts",), id="at every step"),
+    pytest.param(("maps",), id="of a stage", marks=pytest.mark.slow),
+    pytest.param(("--few", "--twice", *OF_A_RUN), id="twice", marks=pytest.mark.timeout(1800)),
+])  # fmt: skip
 @pytest.mark.slow
 def test_killed_commands_go_on(asked):
     done = subprocess.run([sys.executable, SWEEP, *asked], capture_output=True, text=True, check=False)

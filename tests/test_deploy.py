@@ -52,18 +52,15 @@ def parsed(words: list[str]) -> str:
 RUN = ["diverse", "shared/run"]
 
 
-@each(
-    ("arguments", "job", "commands"),
-    [
-        (RUN, {"SLURM_JOB_NUM_NODES": "1", "SLURM_CPUS_PER_TASK": "16"}, ["run"]),
-        (RUN, {"SLURM_JOB_NUM_NODES": "2", "SLURM_JOB_NODELIST": "n[1-2]", "SLURM_JOB_ID": "77"}, ["run"]),
-        (
-            [*RUN, "grid", "park"],
-            {"SLURM_ARRAY_TASK_ID": "1", "SLURM_CPUS_PER_TASK": "16"},
-            ["maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption"],
-        ),
-    ],
-)
+@each(("arguments", "job", "commands"), [
+    (RUN, {"SLURM_JOB_NUM_NODES": "1", "SLURM_CPUS_PER_TASK": "16"}, ["run"]),
+    (RUN, {"SLURM_JOB_NUM_NODES": "2", "SLURM_JOB_NODELIST": "n[1-2]", "SLURM_JOB_ID": "77"}, ["run"]),
+    (
+        [*RUN, "grid", "park"],
+        {"SLURM_ARRAY_TASK_ID": "1", "SLURM_CPUS_PER_TASK": "16"},
+        ["maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption"],
+    ),
+])  # fmt: skip
 def test_every_command_of_the_script_is_one_that_cosfly_takes(tmp_path, arguments, job, commands):
     found = commands_of(tmp_path, arguments, job)
     assert [parsed(words) for words in found] == commands

@@ -260,8 +260,7 @@ def test_a_limit_is_exact_and_each_decision_has_its_share_in_any_order(counts, p
 
     kept, left, limit = limited(windows)
     wanted = int(part * len(left))
-    assert len(kept) == min(wanted, len(left))
-    assert (limit is None) == (wanted >= len(left))
+    assert (len(kept), limit is None) == (min(wanted, len(left)), wanted >= len(left))
     before, after = (Counter(decision for _, decision, _ in found) for found in (left, kept))
     assert all(abs(after[name] - len(kept) / len(left) * count) < 1 for name, count in before.items())
     assert set(limited(windows[::-1])[0]) == set(kept)

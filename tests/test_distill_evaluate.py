@@ -165,8 +165,7 @@ def test_paired_differences(samples):
 
     count, found = compared(worse)
     accuracy, right = found["accuracy"], [(each.answer == each.reference).mean() for each in (one, worse)]
-    assert count == len(one)
-    assert accuracy.value == pytest.approx(right[0] - right[1])
+    assert (count, accuracy.value) == (len(one), pytest.approx(right[0] - right[1]))
     assert (accuracy.low > 0, accuracy.p) == (True, 1 / 2000)
     # The same samples in another order, and a few of them: keys pair, not places.
     order = rng.permutation(len(one))

@@ -103,8 +103,7 @@ def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path):
     run(place, tmp_path / "out", dataset=dataset, max_steps=1)
     counts = json.loads((tmp_path / "out" / "manifest.json").read_text())["counts"]
     assert counts["dropped"] == {"special_token": 2, "too_long": 1, "unfit_picture": 1}
-    assert counts["kept"] == len(good)
-    assert counts["input"] == len(good) + 4
+    assert (counts["kept"], counts["input"]) == (len(good), len(good) + 4)
     told = (tmp_path / "out" / "preflight.json").read_text()
     assert "long/en" in told or "long/zh" in told
     assert "at most 4096" in told

@@ -89,14 +89,11 @@ def test_a_sample_in_a_batch_has_its_loss_alone(place):
         assert float(total) == pytest.approx(row.weight * float(nats[0]), rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("changes", "feature_memory_gb", "logit_chunk"),
-    [
-        ({"batch_size": 3}, 0.0, 512),
-        ({"gradient_checkpointing": True}, 2e-5, 9),  # three pictures have room
-        pytest.param({"data_workers": 2}, 16.0, 512, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("changes", "feature_memory_gb", "logit_chunk"), [
+    ({"batch_size": 3}, 0.0, 512),
+    ({"gradient_checkpointing": True}, 2e-5, 9),  # three pictures have room
+    pytest.param({"data_workers": 2}, 16.0, 512, marks=pytest.mark.slow),
+])  # fmt: skip
 def test_what_changes_how_and_not_what_gives_the_same_losses(
     place, plain, tmp_path, monkeypatch, changes, feature_memory_gb, logit_chunk
 ):

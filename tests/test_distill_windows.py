@@ -49,8 +49,7 @@ def test_a_tree_and_its_release_give_the_same_windows(place, language):
     for i, found in enumerate(tree._places):
         ours, theirs = tree[i], release[numbers[found.flight[1:], found.window]]
         assert np.array_equal(ours["frames"], theirs["frames"])
-        assert ours["prompt"] == theirs["prompt"]
-        assert ours["caption"] == theirs["caption"]
+        assert (ours["prompt"], ours["caption"]) == (theirs["prompt"], theirs["caption"])
         assert ours["facts"].keys() == theirs["facts"].keys() == FACTS.keys()
         for name, values in ours["facts"].items():
             assert np.allclose(values, theirs["facts"][name], rtol=0, atol=1e-9, equal_nan=True), name
@@ -77,8 +76,7 @@ def test_pytorch_loads_them_with_two_workers(place, source):
     loader = torch.utils.data.DataLoader(windows, batch_size=4, num_workers=2)
     seen = []
     for batch in loader:
-        assert batch["frames"].shape[1:] == (5, 3, 27, 48)
-        assert batch["frames"].dtype == torch.uint8
+        assert (batch["frames"].shape[1:], batch["frames"].dtype) == ((5, 3, 27, 48), torch.uint8)
         assert batch["facts"]["target"].shape[1:] == (5, 3)
         seen += batch["sample_id"]
     assert seen == [windows[i]["sample_id"] for i in range(len(windows))]

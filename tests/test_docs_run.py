@@ -180,30 +180,19 @@ def _others_captions(root: Path, target: Path) -> None:
 # What a reader brings: path, as a command names it -> what makes it. The longer path before the shorter.
 BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "CosFly-Track": lambda root, target: write_foreign_tree(target, trajectories=("trajectory_1", "trajectory_2")),
-    "town.csv": _table,
-    "town.geojson": _geojson,
-    "file:captions.jsonl": _others_captions,
-    "../shared/data/simworld-progen/progen_world.json": _world,
-    "../shared/data/delft-bgt-lod1/delft.json.gz": _delft,
-    "data/a/progen_world.json": _world,
-    "data/b/progen_world.json": _world,
-    "data/a/Bbox.json": _world,
-    "data/b/Bbox_total.json": copy_of("data/b/Bbox.json"),
-    "runs/town1": copy_of("runs/diverse/grid"),
-    "runs/town2": copy_of("runs/diverse/old_town"),
-    "work/flown0": copy_of("work/random"),
-    "work/flown1": copy_of("work/rules"),
-    "work/copy": copy_of("work/release"),
-    "work/unlabelled/render": copy_of("work/render"),
-    "Qwen/Qwen3.5-2B": lambda root, target: make_tiny_student(target),
+    "town.csv": _table, "town.geojson": _geojson, "file:captions.jsonl": _others_captions,
+    "../shared/data/simworld-progen/progen_world.json": _world, "../shared/data/delft-bgt-lod1/delft.json.gz": _delft,
+    "data/a/progen_world.json": _world, "data/b/progen_world.json": _world, "data/a/Bbox.json": _world,
+    "data/b/Bbox_total.json": copy_of("data/b/Bbox.json"), "runs/town1": copy_of("runs/diverse/grid"),
+    "runs/town2": copy_of("runs/diverse/old_town"), "work/flown0": copy_of("work/random"),
+    "work/flown1": copy_of("work/rules"), "work/copy": copy_of("work/release"),
+    "work/unlabelled/render": copy_of("work/render"), "Qwen/Qwen3.5-2B": lambda root, target: make_tiny_student(target),
     "models/Qwen3.5-2B": lambda root, target: make_tiny_student(target),
     "models/roberta-large": lambda root, target: make_encoder(target),
     "models/bert-base-chinese": lambda root, target: make_encoder(target),
-    "work/evaluation-4B": copy_of("work/evaluation-2B"),
-    "work/text": copy_of("work/both"),
-    "work/pictures": copy_of("work/both"),
-    "work/middle": copy_of("work/both"),
-}
+    "work/evaluation-4B": copy_of("work/evaluation-2B"), "work/text": copy_of("work/both"),
+    "work/pictures": copy_of("work/both"), "work/middle": copy_of("work/both"),
+}  # fmt: skip
 
 
 def small_run(name: str) -> dict[str, Any]:

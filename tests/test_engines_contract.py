@@ -285,8 +285,7 @@ def test_the_engine_gets_our_images_and_no_free_whitespace(model):
     assert arguments["model"] == str(model)
     assert arguments["limit_mm_per_prompt"] == {"image": 15, "video": 0}
     assert arguments["structured_outputs_config"] == {"backend": "xgrammar", "disable_any_whitespace": True}
-    assert arguments["max_model_len"] == 8192
-    assert arguments["gdn_prefill_backend"] == "triton"
+    assert (arguments["max_model_len"], arguments["gdn_prefill_backend"]) == (8192, "triton")
     tiled = engine_of(model, image={"layout": "tiled"}).arguments()
     assert tiled["limit_mm_per_prompt"] == {"image": 5, "video": 0}
     assert "max_model_len" not in tiled
@@ -324,12 +323,10 @@ def test_requests_join_while_others_are_answered_and_every_answer_is_kept(stand_
     cfg = vllm_settings(model, vllm={"batch": 6}, endpoint={"extra_body": {"chat_template_kwargs": template}})
     path = run(cfg, tree, tmp_path / "out")
     captions = list(read_captions(path))
-    assert len(captions) == 5
-    assert {caption.teacher.kind for caption in captions} == {"vllm"}
+    assert (len(captions), {caption.teacher.kind for caption in captions}) == (5, {"vllm"})
     assert {caption.teacher.model for caption in captions} == {"model-2b"}
     assert all(caption.usage == Usage(prompt_tokens=2560, completion_tokens=14) for caption in captions)
-    assert len(stand_in.asked) == 10
-    assert stand_in.templates == [template] * 10
+    assert (len(stand_in.asked), stand_in.templates) == (10, [template] * 10)
     assert 2 <= max(stand_in.open_at_step) <= 6  # together, and never more than were allowed
     (tmp_path / "out" / "manifest.json").unlink()
     assert run(cfg, tree, tmp_path / "out").read_bytes() == path.read_bytes()

@@ -31,20 +31,16 @@ def test_a_record_is_read_as_it_was_written_and_tells_lead_and_decisions_apart(t
     write_episode(path, record())
     found = read_episode(path)
     assert found == record()
-    assert found.num_lead == 2
-    assert [f.answer for f in found.decisions] == ["ok", "late"]
+    assert (found.num_lead, [f.answer for f in found.decisions]) == (2, ["ok", "late"])
     assert [f.time_s for f in found.flown] == [1.5, 2.0]  # what came of the two decisions
 
 
-@each(
-    ("change", "words"),
-    [
-        ({"frames": [{"time_s": 0.5}]}, "missing|required"),
-        ({"ended": "tired"}, "finished"),
-        ({"num_walk_frames": 1}, "2 frames of a trajectory of 1"),
-        ({"colour": "red"}, "[Ee]xtra"),
-    ],
-)
+@each(("change", "words"), [
+    ({"frames": [{"time_s": 0.5}]}, "missing|required"),
+    ({"ended": "tired"}, "finished"),
+    ({"num_walk_frames": 1}, "2 frames of a trajectory of 1"),
+    ({"colour": "red"}, "[Ee]xtra"),
+])  # fmt: skip
 def test_a_record_that_cannot_be_is_refused(tmp_path, change, words):
     path = tmp_path / "one.json"
     write_episode(path, record())

@@ -24,15 +24,9 @@ from cosfly.runtime.run_dir import read_failures
 from release.verify.verify import verify
 
 TINY = [
-    "pedestrians.num_paths=2",
-    "pedestrians.min_distance_m=15",
-    "pedestrians.max_distance_m=25",
-    "render.width_px=160",
-    "render.height_px=90",
-    "render.fovs_deg=[60]",
-    "caption.window.stride=4",
-    "workers=1",
-]
+    "pedestrians.num_paths=2", "pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25", "render.width_px=160",
+    "render.height_px=90", "render.fovs_deg=[60]", "caption.window.stride=4", "workers=1",
+]  # fmt: skip
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")
 
 
@@ -159,16 +153,9 @@ def test_other_settings_are_refused_by_name_and_nothing_is_touched(base, tmp_pat
 
 # Made for people, or the record of another file: nothing reads them as a product.
 UNBOUND = {
-    "run.yaml",
-    "summary.json",
-    "contact_sheet.png",
-    "viewer.html",
-    "stage.json",
-    "manifest.json",
-    "items.jsonl",
-    "failures.jsonl",
-    "events.jsonl",
-}
+    "run.yaml", "summary.json", "contact_sheet.png", "viewer.html", "stage.json", "manifest.json", "items.jsonl",
+    "failures.jsonl", "events.jsonl",
+}  # fmt: skip
 CHANGES = {
     "edited": lambda data, other: data[:-2] + bytes([data[-2] ^ 1]) + data[-1:],
     "cut": lambda data, other: data[: len(data) // 2],
@@ -179,18 +166,15 @@ CHANGES = {
 PICTURES = ("rgb.png", "depth_float32.png", "instance.png")
 REFUSED_BY = {
     "maps/boxes_Nd.json": ("simplify", "render"),
-    "simplify/stepN_simplified.json": ("pedestrians", "plan", "render", "inspect"),
-    "pedestrians/path.json": ("plan",),
-    "plan/drone_trace.json": ("render", "inspect"),
-    "render/Town_SynthTown/instance_ids.json": ("caption", "release"),
+    "simplify/stepN_simplified.json": ("pedestrians", "plan", "render", "inspect"), "pedestrians/path.json": ("plan",),
+    "plan/drone_trace.json": ("render", "inspect"), "render/Town_SynthTown/instance_ids.json": ("caption", "release"),
     "render/Town_SynthTown/map.json": ("caption", "release"),
     "render/Town_SynthTown/trajectory_N/ORI/trajectory.json": ("caption", "release"),
     "render/Town_SynthTown/trajectory_N/aug_N/trajectory.json": ("caption", "release"),
     "render/Town_SynthTown/trajectory_N/ORI/checksums.shaN": ("caption", "release"),
     "render/Town_SynthTown/trajectory_N/aug_N/checksums.shaN": ("caption", "release"),
-    "inspect/inspect.json": ("release",),
-    "caption/captions.jsonl": ("release",),
-}
+    "inspect/inspect.json": ("release",), "caption/captions.jsonl": ("release",),
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -236,18 +236,15 @@ def tell_size(folder: Path, path: Path) -> None:
     change_record(folder, change)
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda rows: rows[3].update(image=None), "a frame without its picture"),
-        (lambda rows: rows[3]["image"].update(bytes=b"GIF89a"), "no PNG"),
-        (lambda rows: rows[3].update(depth=None), "a frame without its picture"),
-        (lambda rows: rows[3]["pose"].update(x_m=float("inf")), "not finite"),
-        (lambda rows: rows[3].update(width_px=None), "without a value"),
-        (lambda rows: rows[3].update(sample_id="../../escaped"), "no name of a file"),
-        (lambda rows: rows[3].update(sample_id=rows[2]["sample_id"]), "two frames of one name"),
-    ],
-)
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda rows: rows[3].update(image=None), "a frame without its picture"),
+    (lambda rows: rows[3]["image"].update(bytes=b"GIF89a"), "no PNG"),
+    (lambda rows: rows[3].update(depth=None), "a frame without its picture"),
+    (lambda rows: rows[3]["pose"].update(x_m=float("inf")), "not finite"),
+    (lambda rows: rows[3].update(width_px=None), "without a value"),
+    (lambda rows: rows[3].update(sample_id="../../escaped"), "no name of a file"),
+    (lambda rows: rows[3].update(sample_id=rows[2]["sample_id"]), "two frames of one name"),
+])  # fmt: skip
 def test_a_unit_that_fails_publishes_nothing(broken, tmp_path, change, words):
     rewrite(broken, change)
     with pytest.raises(InputError, match="could not be exported"):

@@ -65,11 +65,8 @@ MAPS = {
 
 def weather(name: str, time_of_day: str) -> list[str]:
     return [
-        "render.look={}",
-        "render.weather_mode=fixed",
-        f"render.weather_name={name}",
-        f"render.tod_name={time_of_day}",
-    ]
+        "render.look={}", "render.weather_mode=fixed", f"render.weather_name={name}", f"render.tod_name={time_of_day}",
+    ]  # fmt: skip
 
 
 SMALL, HD = ["render.width_px=160", "render.height_px=90"], ["render.width_px=1280", "render.height_px=720"]

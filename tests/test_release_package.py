@@ -45,8 +45,7 @@ def loaded(built, tmp_path_factory):
 
 
 def test_load_dataset_gives_pictures_poses_and_both_languages(loaded, release_inputs):
-    assert len(loaded) == 4 * 8
-    assert set(loaded["town"]) == {"Town01", "Town02"}
+    assert (len(loaded), set(loaded["town"])) == (4 * 8, {"Town01", "Town02"})
     for row in (loaded[0], loaded[9], loaded[31]):
         folder = release_inputs / "tree" / row["town"] / row["trajectory"] / row["variant"]
         flight, i = read_track(folder), row["frame_index"]
@@ -74,8 +73,7 @@ def test_load_dataset_gives_pictures_poses_and_both_languages(loaded, release_in
     assert row["decision"] == row["caption_en_flight_decision"] == row["caption_zh_flight_decision"]
     assert row["teacher_kind"] == "rules"
     for row in captioned:
-        assert row["writing"] == "slots"
-        assert row["caption_picture_px"] == [96, 54]
+        assert (row["writing"], row["caption_picture_px"]) == ("slots", [96, 54])
         assert row["sentence_states_zh"] is None
     bare = loaded.filter(lambda row: not row["has_caption"])
     assert bare[0]["caption_en_reasoning_trace"] is None
@@ -218,10 +216,8 @@ def test_the_account_names_every_flight_and_caption(built):
         "found": 6, "inspected": 6, "released": 4, "left_out": {"rejected: missing_file": 1, "review: stray_frame": 1},
     }  # fmt: skip
     captions = history["captions"]
-    assert captions["read"] == 6 * 8
-    assert captions["dropped"] == {"hard_conflict": 6}
+    assert (captions["read"], captions["dropped"]) == (6 * 8, {"hard_conflict": 6})
     assert captions["flight_left_out"] == 2 * 7
     # Of 12 frames 2 to 9 are released; captions stand at 4 to 10, and each needs the four frames before its own.
-    assert captions["released"] == 4 * 4
-    assert captions["window_not_whole"] == 4 * 2
+    assert (captions["released"], captions["window_not_whole"]) == (4 * 4, 4 * 2)
     assert captions["frame_not_selected"] == 4

@@ -41,19 +41,16 @@ def test_a_window_of_one_frame_gives_the_even_stride_of_the_paper(num_points, nu
         assert chosen.tolist() == [k * (num_points - 1) // (num_frames - 1) for k in range(num_frames)]
 
 
-@each(
-    ("num_points", "num_frames", "window", "expected"),
-    [
-        (10, 4, 1, [0, 3, 6, 9]),
-        (5, 3, 1, [0, 2, 4]),
-        (7, 1, 1, [3]),
-        (0, 3, 5, []),
-        (3, 3, 5, [0, 1, 2]),
-        (12, 8, 5, [2, 3, 4, 5, 6, 7, 8, 9]),  # one run, in the middle
-        (20, 12, 2, [0, 1, 2, 3, 4, 5, 14, 15, 16, 17, 18, 19]),  # two runs of six
-        (20, 13, 2, [0, 1, 2, 3, 4, 5, 13, 14, 15, 16, 17, 18, 19]),
-    ],
-)
+@each(("num_points", "num_frames", "window", "expected"), [
+    (10, 4, 1, [0, 3, 6, 9]),
+    (5, 3, 1, [0, 2, 4]),
+    (7, 1, 1, [3]),
+    (0, 3, 5, []),
+    (3, 3, 5, [0, 1, 2]),
+    (12, 8, 5, [2, 3, 4, 5, 6, 7, 8, 9]),  # one run, in the middle
+    (20, 12, 2, [0, 1, 2, 3, 4, 5, 14, 15, 16, 17, 18, 19]),  # two runs of six
+    (20, 13, 2, [0, 1, 2, 3, 4, 5, 13, 14, 15, 16, 17, 18, 19]),
+])  # fmt: skip
 def test_by_hand(num_points, num_frames, window, expected):
     assert select_frames(num_points, num_frames, window).tolist() == expected
 

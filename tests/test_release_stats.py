@@ -54,8 +54,7 @@ def test_a_release_is_counted_again(built, tmp_path):
     written = Stats.model_validate({k: v for k, v in read_json(tmp_path / "stats.json").items() if k != "coverage"})
     tables = {table.key: {row[0]: row[1:] for row in table.rows} for table in written.tables}
     numbers = read_json(built / "release.json")["numbers"]
-    assert len(tables) == len(written.tables)
-    assert tables["release"]["frames"] == [numbers["frames"]]
+    assert (len(tables), tables["release"]["frames"]) == (len(written.tables), [numbers["frames"]])
     assert tables["release"]["trajectories"] == [numbers["trajectories"]]
     assert tables["release"]["captions"] == [numbers["captions"]["frames_with"]]
     assert {name: row[0] for name, row in tables["decisions"].items() if row[0]} == numbers["captions"]["frames_by"][

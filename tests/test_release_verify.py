@@ -80,14 +80,11 @@ def test_processes_find_what_one_finds(honest, tmp_path):
     assert str(one) == str(two)
 
 
-@each(
-    ("add", "expected"),
-    [
-        (lambda place: place.symlink_to("/etc/hostname"), {"unreadable": 1}),
-        (lambda place: write_bytes(place / "more.bin", b"anything"), {"unexpected": 1}),
-        (os.mkfifo, {"unreadable": 1}),
-    ],
-)
+@each(("add", "expected"), [
+    (lambda place: place.symlink_to("/etc/hostname"), {"unreadable": 1}),
+    (lambda place: write_bytes(place / "more.bin", b"anything"), {"unexpected": 1}),
+    (os.mkfifo, {"unreadable": 1}),
+])  # fmt: skip
 def test_a_licence_is_a_file_of_the_folder(honest, tmp_path, add, expected):
     folder = shutil.copytree(honest, tmp_path / "release")
     add(folder / "LICENSE")
@@ -240,12 +237,9 @@ ODD_ROWS = {
     "a PNG of 60,000 x 60,000": picture("image", large_png(60_000, 60_000)),
     "an instance of 60,000 x 60,000": picture("instance", large_png(60_000, 60_000)),
     "a PNG that unpacks to less": picture("image", large_png(160, 90)),
-    "an array of 4 TB": picture("depth", large_array()),
-    "no bytes": picture("image", b""),
-    "no depth": picture("depth", b""),
-    "text for a picture": picture("instance", b"hello" * 100),
-    "an instance cut short": picture("instance", MASK[:-30]),
-    "depth in double": picture("depth", double_depth()),
+    "an array of 4 TB": picture("depth", large_array()), "no bytes": picture("image", b""),
+    "no depth": picture("depth", b""), "text for a picture": picture("instance", b"hello" * 100),
+    "an instance cut short": picture("instance", MASK[:-30]), "depth in double": picture("depth", double_depth()),
     "a flat depth": change(at(everything, 1), lambda r: set_depth(r, np.full((90, 160), 7.0, np.float32))),
     "no pose": put(at(everything, 2), pose=None),
     "hardly anything": change(at(everything, 2), lambda r: r.update(dict.fromkeys(r.keys() - KEPT))),
@@ -253,7 +247,7 @@ ODD_ROWS = {
     "no focal length": put(everything, intrinsics=dict.fromkeys(INTRINSICS, 0.0)),
     "no focal length in the last frame": change(at(everything, -1), lambda r: r["intrinsics"].update(fx=0.0)),
     "people infinitely far away": change(everything, lambda r: r["target"].update(x_m=math.inf)),
-}
+}  # fmt: skip
 
 
 @pytest.mark.slow

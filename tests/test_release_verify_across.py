@@ -31,13 +31,10 @@ def flight(number: int, **values) -> Summary:
     return Summary(**(told | values))
 
 
-@each(
-    ("change", "codes"),
-    [
-        ({}, []), ({"split": "test"}, []), ({"split": "test", "walk": "1"}, ["leak"]),
-        ({"pair": "run/Town01/trajectory_9/ORI"}, ["pair"]), ({"pair": "run/Town01/trajectory_1/ORI"}, ["pair"]),
-    ],
-)  # fmt: skip
+@each(("change", "codes"), [
+    ({}, []), ({"split": "test"}, []), ({"split": "test", "walk": "1"}, ["leak"]),
+    ({"pair": "run/Town01/trajectory_9/ORI"}, ["pair"]), ({"pair": "run/Town01/trajectory_1/ORI"}, ["pair"]),
+])  # fmt: skip
 def test_flights_that_do_not_fit_each_other_are_found(change, codes):
     findings = Findings()
     check_across([flight(1), flight(2, **change)], by_town=False, both=False, findings=findings)
@@ -50,17 +47,14 @@ WHOLE = Agreement(
 )  # fmt: skip
 
 
-@each(
-    ("change", "code"),
-    [
-        ({}, None), ({"renamed": 34}, "scene_instance"), ({"same": 1800}, "scene_instance"),
-        ({"shifted": 20}, "scene_depth"),
-        ({"agree": 200, "hidden": 1800, "same": 200}, None), ({"through": 60}, "scene_depth"),
-        ({"through_back": 60}, "scene_depth"),
-        ({"error": 0.001}, "scene_depth"),
-        ({"error_flat": 0.0001, "error_standing": 0.001}, None),
-    ],
-)  # fmt: skip
+@each(("change", "code"), [
+    ({}, None), ({"renamed": 34}, "scene_instance"), ({"same": 1800}, "scene_instance"),
+    ({"shifted": 20}, "scene_depth"),
+    ({"agree": 200, "hidden": 1800, "same": 200}, None), ({"through": 60}, "scene_depth"),
+    ({"through_back": 60}, "scene_depth"),
+    ({"error": 0.001}, "scene_depth"),
+    ({"error_flat": 0.0001, "error_standing": 0.001}, None),
+])  # fmt: skip
 def test_neighbouring_frames_show_one_world(change, code):
     found = [WHOLE] * 20
     found[12] = replace(WHOLE, **change)
@@ -112,6 +106,4 @@ def _frame(seed, size=(45, 77), *, sky=True):
 def test_every_pixel_is_counted(seed, sky):
     depth, mask = _frame(seed, sky=sky)
     found, (counts, box) = survey(depth, mask), _obvious(depth, mask)
-    assert list(found[:-1]) == counts
-    assert found.box.tolist() == box
-    assert (found.num_odd_sky > 0) == sky
+    assert (list(found[:-1]), found.box.tolist(), found.num_odd_sky > 0) == (counts, box, sky)

@@ -89,8 +89,7 @@ def test_a_run_is_shown_as_it_is(page):
         None,
     )
     by_index = {frame["index"]: frame["caption"] for frame in flight["frames"]}
-    assert len(by_index) == 12
-    assert by_index[7]["verdict"] == "HARD_CONFLICT"
+    assert (len(by_index), by_index[7]["verdict"]) == (12, "HARD_CONFLICT")
     assert by_index[9]["dropped"] == "hard_conflict"
     states = [sentence["state"] for sentence in by_index[7]["texts"]["zh"]]
     assert states == ["proved", "contradicted"]

@@ -67,24 +67,17 @@ HIP = np.array([4.0, -3.0, 0.9])
 def street(offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> BoxMap:
     """Kinds that are drawn as their whole box: their depth can be computed. Ids are not in order and not contiguous."""
     rows = [
-        ("Roads", (0, 0, -0.1), (60, 5, 0.1), 0.0),
-        ("Sidewalks", (0, -9, -0.05), (60, 4, 0.15), 0.0),
-        ("Buildings", (10, 14, 6), (8, 5, 6.0), 20.0),
-        ("Buildings", (-14, 16, 4), (6, 6, 4.0), -35.0),
-        ("Walls", (-6, -16, 1), (12, 0.2, 1.0), 5.0),
-        ("Terrain", (0, 40, -0.3), (60, 35, 0.2), 0.0),
-    ]
+        ("Roads", (0, 0, -0.1), (60, 5, 0.1), 0.0), ("Sidewalks", (0, -9, -0.05), (60, 4, 0.15), 0.0),
+        ("Buildings", (10, 14, 6), (8, 5, 6.0), 20.0), ("Buildings", (-14, 16, 4), (6, 6, 4.0), -35.0),
+        ("Walls", (-6, -16, 1), (12, 0.2, 1.0), 5.0), ("Terrain", (0, 40, -0.3), (60, 35, 0.2), 0.0),
+    ]  # fmt: skip
     ids = [7, 300, 4000, 12, 55, 9]
     centers = np.array([row[1] for row in rows], dtype=float) + offset_m
     rotations = [(0.0, row[3], 0.0) for row in rows]
     return make_box_map(
-        centers,
-        [row[2] for row in rows],
-        rotations,
-        [KINDS[row[0]] for row in rows],
-        ids,
+        centers, [row[2] for row in rows], rotations, [KINDS[row[0]] for row in rows], ids,
         MapHeader(name="street", ground_z_m=offset_m[2]),
-    )
+    )  # fmt: skip
 
 
 def circling(n: int = 6, path_id: str = "path_000", drop_reason: str | None = None) -> DroneTrace:
@@ -476,13 +469,9 @@ def flights(tmp_path_factory):
     def drawn(name: str) -> Path:
         opened(name, street()).close()  # skips where it cannot run
         settings = {
-            "backend": name,
-            "width_px": 320,
-            "height_px": 180,
-            "fovs_deg": [60.0],
-            "town": "Street",
+            "backend": name, "width_px": 320, "height_px": 180, "fovs_deg": [60.0], "town": "Street",
             "first_timestamp": 1776000000,
-        }
+        }  # fmt: skip
         return run(build(RenderConfig, settings, "test"), *inputs, folder / name, seed=5)
 
     return drawn

@@ -107,8 +107,7 @@ def seen(tmp_path_factory):
 
 
 def test_a_client_is_given_the_town(seen):
-    assert seen["maps"] == ["/Game/Carla/Maps/street"]
-    assert seen["name"] == "Carla/Maps/street"
+    assert (seen["maps"], seen["name"]) == (["/Game/Carla/Maps/street"], "Carla/Maps/street")
     assert seen["is_led"]
     assert [(row[0], row[2]) for row in seen["objects"]] == [(4000, "Buildings"), (12, "Buildings")]
     assert [row[3:] for row in seen["objects"]] == [(-14.0, -20.0), (-16.0, 35.0)], "left-handed axes"
@@ -176,17 +175,13 @@ def frames_of(port: int, num_ticks: int) -> tuple[list[int], str]:
 ALL_OF_MESSAGES = ("drop:depth@3", "drop:rgb@4", "duplicate@4", "reorder:depth@5", "delay:depth@7=1", "drop@9+")
 
 
-@pytest.mark.parametrize(
-    ("faults", "num_ticks", "came", "error"),
-    [
-        (ALL_OF_MESSAGES, 9, [1, 3, 3, 5, 4, 7, 6], ""),
-        (["late@3=4"], 3, [1, 2], "time-out of 3000ms"),
-        (["unhealthy@3"], 3, [1, 2, 3], "time-out of 3000ms"),
-        (["hang@3"], 3, [1, 2], "time-out of 3000ms"),
-        (["die@3"], 3, [1], "time-out of 3000ms"),
-    ],
-    ids=["messages", "late", "unhealthy", "hang", "die"],
-)
+@pytest.mark.parametrize(("faults", "num_ticks", "came", "error"), [
+    (ALL_OF_MESSAGES, 9, [1, 3, 3, 5, 4, 7, 6], ""),
+    (["late@3=4"], 3, [1, 2], "time-out of 3000ms"),
+    (["unhealthy@3"], 3, [1, 2, 3], "time-out of 3000ms"),
+    (["hang@3"], 3, [1, 2], "time-out of 3000ms"),
+    (["die@3"], 3, [1], "time-out of 3000ms"),
+], ids=["messages", "late", "unhealthy", "hang", "die"])  # fmt: skip
 @pytest.mark.slow
 def test_planted_faults(faults, num_ticks, came, error, tmp_path):
     with serving(street(), tmp_path, *faults) as port:

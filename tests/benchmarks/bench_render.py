@@ -154,14 +154,8 @@ def parts(folder: Path, num_frames: int) -> tuple[str, list[Any]]:
     used = measured.used_ms
     used["draw"] = used.pop("render") - used["read back, soften, split"]
     names = (
-        "draw",
-        "read back, soften, split",
-        "PNG of colours",
-        "PNG of kinds and ids",
-        "depth packed",
-        "hash",
-        "write",
-    )
+        "draw", "read back, soften, split", "PNG of colours", "PNG of kinds and ids", "depth packed", "hash", "write",
+    )  # fmt: skip
     return device, [used[name] / num_frames for name in names]
 
 

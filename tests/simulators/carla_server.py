@@ -46,32 +46,26 @@ class CarlaServer(Server):
         self._held: dict[int, list[bytes]] = {}  # messages that are sent after the next one
         name, actors, detailed = f"Carla/Maps/{town.name}", self.movers, [[*row, [], True, False] for row in ATTRIBUTES]
         self._answers: dict[str, Callable[..., Any]] = {
-            "version": lambda: CARLA_VERSION,
-            "get_available_maps": lambda: [f"/Game/{name}"],
-            "load_new_episode": self._load,
-            "get_episode_info": lambda: [1, [self._token(EPISODE_STREAM)]],
-            "get_sensor_token": lambda stream: [self._token(stream)],
-            "get_episode_settings": lambda: self.settings,
+            "version": lambda: CARLA_VERSION, "get_available_maps": lambda: [f"/Game/{name}"],
+            "load_new_episode": self._load, "get_episode_info": lambda: [1, [self._token(EPISODE_STREAM)]],
+            "get_sensor_token": lambda stream: [self._token(stream)], "get_episode_settings": lambda: self.settings,
             "set_episode_settings": lambda settings: setattr(self, "settings", settings) or self.frame,
-            "get_map_info": lambda: [name, []],
-            "get_map_data": lambda: ROADS,
-            "get_weather_parameters": lambda: self.told_weather,
-            "set_weather_parameters": self._set_weather,
+            "get_map_info": lambda: [name, []], "get_map_data": lambda: ROADS,
+            "get_weather_parameters": lambda: self.told_weather, "set_weather_parameters": self._set_weather,
             "get_environment_objects": lambda label: [one for one in self._objects if label in (one[-1], ANY_LABEL)],
             "get_all_level_BBs": lambda label: [one[1] for one in self._objects if label in (one[-1], ANY_LABEL)],
             "get_actor_definitions": lambda: [
                 [k, name, name.replace(".", ","), detailed] for k, name in enumerate(MODELS)
             ],
             "get_actors_by_id": lambda numbers: [self._actor(n) for n in numbers if n in actors],
-            "spawn_actor": self._spawn,
-            "destroy_actor": lambda number: actors.pop(number, None) is not None,
+            "spawn_actor": self._spawn, "destroy_actor": lambda number: actors.pop(number, None) is not None,
             "set_actor_transform": lambda number, to: actors[number].pose.__setitem__(slice(6), [*to[0], *to[1]]),
             "get_actor_bounding_box": lambda number: self._actor(number)[3],
             "apply_control_to_walker": lambda number, to: vars(actors[number]).update(direction=to[0], speed_mps=to[1]),
             **{name: lambda *_: [] for name in ("get_required_files", "query_lights_state")},
             **{f"set_actor_{name}": lambda *_: None for name in ("collisions", "enable_gravity", "simulate_physics")},
             "tick_cue": lambda: self.count() or self._tick(),
-        }
+        }  # fmt: skip
         listen(port, self._read_calls)
         listen(port + 1, self._read_subscription)
 

@@ -117,12 +117,9 @@ def _objects_of(town: BoxMap) -> dict[str, dict[str, str]]:
     objects = {}
     for name, (x0, y0, z0), (x1, y1, z1), (x, y, _, *turn) in zip([*names, GROUND], lows, highs, poses, strict=True):
         objects[name] = {
-            "uclass_name": f"{name.split('_')[0]}_C",
-            "bounds": _text(np.array([x0, -y1, z0, x1, -y0, z1]) * CM_PER_M),
-            "location": _text(np.array([x, y, z0]) * CM_PER_M),
-            "rotation": _text(turn),
-            "scale": _text([1.0] * 3),
-        }
+            "uclass_name": f"{name.split('_')[0]}_C", "bounds": _text(np.array([x0, -y1, z0, x1, -y0, z1]) * CM_PER_M),
+            "location": _text(np.array([x, y, z0]) * CM_PER_M), "rotation": _text(turn), "scale": _text([1.0] * 3),
+        }  # fmt: skip
     return objects
 
 
