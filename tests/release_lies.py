@@ -166,10 +166,6 @@ def with_ids(of: Callable[[np.ndarray, np.ndarray], Any], *, box: bool = False) 
     return changed
 
 
-def with_colours(of: Callable[[np.ndarray, Row], bytes]) -> Callable[[Row], None]:
-    return lambda row: row["image"].update(bytes=of(pixels_of(row, "image"), row))
-
-
 def box_of_person(pixels: np.ndarray) -> dict[str, float] | None:
     """Give `target_mask_bbox` of an instance image."""
     rows, columns = np.nonzero((pixels[..., 1] == 255) & (pixels[..., 2] == 255))
@@ -270,10 +266,6 @@ def walk_of_nobody(rows: Rows) -> None:
     put(lambda _: [row for row in rows if row["walk"] == walk], walk=new)(rows)
 
 
-def as_jpeg(pixels: np.ndarray, row: Row) -> bytes:
-    return cv2.imencode(".jpg", pixels)[1].tobytes()
-
-
 def noise(depth: np.ndarray, row: Row) -> np.ndarray:
     return depth * np.random.default_rng(0).normal(1.0, 0.003, depth.shape)
 
@@ -348,7 +340,10 @@ LIES_OF_PIXELS: dict[str, Lie] = {
     "second_person_far_away": change(middle_seen, with_ids(second_person, box=True)),
     "ids_of_things_exchanged": ids_of_things_exchanged,
     "frame_mirrored_with_its_boxes": change(middle_seen, frame_mirrored_with_its_boxes),
-    "jpeg_under_a_png_name": change(at(clean, 2), with_colours(as_jpeg)),
+    "jpeg_under_a_png_name": change(
+        at(clean, 2),
+        lambda r: r["image"].update(bytes=cv2.imencode(".jpg", pixels_of(r, "image"))[1].tobytes()),
+    ),
 }  # fmt: skip
 # name -> the lie, and whether only pixels tell it
 LIES = {name: (lie, False) for name, lie in LIES_OF_ROWS.items()} | {

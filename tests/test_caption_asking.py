@@ -126,12 +126,8 @@ def test_the_quarantine_is_replayed_alone(tree, tmp_path, whole):
 # --- the display ------------------------------------------------------------------------------------------------------
 
 
-def flight_name(flight: int) -> str:
-    return f"trajectory_{flight}_ORI"
-
-
 def record(flight: int, window: int, purpose: str = "free/0") -> Answer:
-    sample_id = f"{flight_name(flight)}_frame_{window:05d}"
+    sample_id = f"{f'trajectory_{flight}_ORI'}_frame_{window:05d}"
     usage = {"prompt_tokens": 10, "completion_tokens": 2}
     return Answer(key=f"{sample_id}/{purpose}", sample_id=sample_id, purpose=purpose, usage=usage, text="t")
 

@@ -28,13 +28,9 @@ def settings(url: str, **changes) -> CaptionConfig:
     return quick(url, **{"repair": {}, "endpoint": endpoint, **changes})
 
 
-def first(fault: str, count: int = 1):
-    return lambda number, body: fault if number < count else None
-
-
 @pytest.mark.parametrize("writing", ["slots", "prose"])
 def test_a_decision_against_its_own_reasoning_is_asked_for_again_with_what_was_wrong(tree, tmp_path, writing):
-    with deciding("ascend", first("wrong_therefore")) as server:
+    with deciding("ascend", (lambda number, body: "wrong_therefore" if number < 1 else None)) as server:
         cfg = settings(server.url, limit=1, repair=KEEP, writing=writing)
         captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
     assert [c.status for c in captions] == ["accepted"]

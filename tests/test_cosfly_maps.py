@@ -140,12 +140,8 @@ def overlapping_pairs(buildings: BoxMap, *, with_yaw: bool) -> int:
     return sum(one.intersects(other) for one, other in combinations(shapes, 2))
 
 
-def progen_city(shared_data: Path) -> BoxMap:
-    return simworld(SimWorldConfig(world=shared_data / "simworld-progen" / "progen_world.json"))
-
-
 def test_known_answer_no_buildings_overlap_with_yaw_and_19_pairs_without(shared_data: Path):
-    city = progen_city(shared_data)
+    city = simworld(SimWorldConfig(world=shared_data / "simworld-progen" / "progen_world.json"))
     buildings = boxes_of(city, "Buildings")
     assert len(buildings) == 66
     assert overlapping_pairs(buildings, with_yaw=True) == 0

@@ -78,11 +78,6 @@ def message(page: Page) -> str:
     return page.run("document.getElementById('message').textContent")
 
 
-def marks(page: Page, grid_shape: tuple[int, int]) -> np.ndarray:
-    """Alpha of the page's cells, south up."""
-    return np.array(page.run("[...window.editor.marks()]"), dtype=np.uint8).reshape(grid_shape)[::-1]
-
-
 @pytest.mark.slow
 def test_a_polygon_with_a_hole_is_drawn_saved_and_walked_in(map_file, tmp_path):
     out = tmp_path / "roi_polygon.json"
@@ -101,7 +96,7 @@ def test_a_polygon_with_a_hole_is_drawn_saved_and_walked_in(map_file, tmp_path):
         page.wait("document.getElementById('message').className === 'accepted'")
         roi = read_roi(out)
         ground = walkable_ground(town(), CFG, roi)
-        found = marks(page, ground.walkable.shape)
+        found = np.array(page.run("[...window.editor.marks()]"), dtype=np.uint8).reshape(ground.walkable.shape)[::-1]
         assert page.run("document.getElementById('figure-used').textContent") == f"{ground.counts['cells_used']:,}"
         assert not page.said
     [polygon] = roi.rings()

@@ -35,17 +35,13 @@ def place(tmp_path_factory) -> Path:
     return root
 
 
-def by_window(windows: Windows) -> dict[tuple, int]:
-    return {(p.flight[1:], p.window): i for i, p in enumerate(windows._places)}
-
-
 @pytest.mark.parametrize("language", ["en", "zh"])
 def test_a_tree_and_its_release_give_the_same_windows(place, language):
     tree = Windows(place / "tree", place / "captions.jsonl", language=language)
     release = Windows(place / "release", language=language)
     assert len(tree) == len(release) == 6 * (NUM_POINTS - 6)
     assert tree.left_out == {"dropped_hard_conflict": 6}
-    numbers = by_window(release)
+    numbers = {(p.flight[1:], p.window): i for i, p in enumerate(release._places)}
     for i, found in enumerate(tree._places):
         ours, theirs = tree[i], release[numbers[found.flight[1:], found.window]]
         assert np.array_equal(ours["frames"], theirs["frames"])

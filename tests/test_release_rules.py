@@ -10,10 +10,6 @@ from release.rules import select_frames
 WINDOW = 5
 
 
-def runs_of(chosen: np.ndarray) -> list[int]:
-    return [len(run) for run in np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)]
-
-
 @given(st.integers(0, 3000), st.integers(1, 800), st.integers(1, 12))
 def test_so_many_frames_in_order(num_points, num_frames, window):
     chosen = select_frames(num_points, num_frames, window)
@@ -29,7 +25,7 @@ def test_runs_and_the_gaps_between_them_differ_by_one_at_most(num_points, num_fr
     chosen = select_frames(num_points, num_frames, window)
     gaps = np.diff(chosen)[np.diff(chosen) > 1]
     if len(gaps) and num_points - num_frames >= len(gaps) + 1 and gaps.min() > 2:  # no two runs have grown together
-        lengths = runs_of(chosen)
+        lengths = [len(run) for run in np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)]
         assert max(lengths) - min(lengths) <= 1
         assert gaps.max() - gaps.min() <= 1
 

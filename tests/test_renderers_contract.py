@@ -407,15 +407,11 @@ def test_another_process_gives_the_same_picture_and_closing_a_renderer_leaves_ot
     assert here == there, "see the tolerance at the top: on one machine and driver it is zero"
 
 
-def _resident_mib() -> float:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
-
-
 def _growth_mib(name: str) -> float:
     resident_mib = []
     for _ in range(8):
         _digest(open_renderer(name, street(), *SIZE))
-        resident_mib.append(_resident_mib())
+        resident_mib.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20)
     return resident_mib[-1] - resident_mib[1]
 
 
