@@ -56,7 +56,6 @@ bench.TURNS, bench.census_town = 1, lambda name, seed: cosfly.load_map(seed=seed
     Smallest("bench_render", "parts --frames 2", r"CPU ms a frame", SMALL_TOWN),
     Smallest("bench_render", "disk --workers 1 --frames 2", r"To disk[^|]*\|.*\n.*\n\| town", SMALL_TOWN),
     Smallest("bench_render", "memory --frames 20", r"Memory", SMALL_TOWN),
-    Smallest("bench_render", "workers --workers 1 --frames 2", r"The render stage", SMALL_TOWN),
     Smallest("bench_training", "--batch 1 --steps 1", r'"tokens_per_s": \d'),
     Smallest("bench_training", "--check", r'"relative_difference_of_gradients": \d'),
     Smallest("checkpoints", "--map RUN/maps/boxes_3d.json --simplified RUN/simplify/step2_simplified.json "

@@ -5,7 +5,6 @@ frames.
     python tests/benchmarks/bench_render.py disk --workers 2               # the stage as it is used
     python tests/benchmarks/bench_render.py tiles                          # the SimWorld city 12 x 12
     python tests/benchmarks/bench_render.py memory --frames 5000
-    python tests/benchmarks/bench_render.py workers                        # 1, 2, 4, 6: the paper's tab:render_scaling
 
 1280x720, all files, the synthetic town and the SimWorld city, flights of the default planner; `disk` at 90 degrees, one
 flight a process. On a machine with a GPU the same commands use it (the device is printed).
@@ -32,10 +31,8 @@ from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.geometry.kernels import obstacle_index
-from cosfly.pipeline.bench import row_of
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_trajectory
-from cosfly.render import stage as render_stage
 from cosfly.render import track as flight
 from cosfly.render.contract import Renderer
 from cosfly.render.person import choose_clothes, gait_of
@@ -47,9 +44,7 @@ from cosfly.runtime.events import read_events
 from cosfly.runtime.run_dir import read_manifest
 
 SIZE = (1280, 720)
-PAPER = {1: (1.07, 46.3, 7.5), 2: (1.43, 58.6, 10.6), 4: (2.55, 86.8, 24.3), 6: (2.68, 91.6, 34.0)}  # frames/s, %, GiB
 FOVS_DEG = (60.0, 90.0)
-NUM_FLIGHTS = 6  # of `workers`, each on two tracks: twelve items, which 1, 2, 4 and 6 workers share evenly
 FILES = ("boxes_3d.json", "drone_trace.json")
 REPOSITORY = Path(__file__).resolve().parents[2]
 WORKER = """
@@ -232,31 +227,10 @@ def memory(num_frames: int) -> list[list[Any]]:
     return [[count, mib, 100.0 * (mib / rows[min(1, len(rows) - 1)][1] - 1.0)] for count, mib in rows]
 
 
-def workers_table(folder: Path, counts: list[int], num_points: int) -> list[list[Any]]:
-    """Run the stage on the same flights, both tracks, 1280x720, once for each count of workers. Figures of a GPU are
-    those of its events; of a machine without one they are missing."""
-    traces = read_traces(folder / FILES[1])
-    simplified = folder / "step2_simplified.json"
-    write_boxes(simplified, scenes.simplified(read_boxes(folder / FILES[0])))
-    stride = max(1, round(np.mean([len(trace.time_s) for trace in traces]) / num_points))
-    cfg = RenderConfig(width_px=SIZE[0], height_px=SIZE[1], fovs_deg=(90.0,), frame_stride=stride)
-    rows: list[list[Any]] = []
-    for count in counts:
-        with tempfile.TemporaryDirectory(dir=folder) as out:
-            render_stage.run(cfg, folder / FILES[0], simplified, folder / FILES[1], Path(out), workers=count)
-            row = row_of(read_events(Path(out)), read_manifest(Path(out)), count, counts_frames=True)
-        speed_up = row.per_s / rows[0][3] if rows else 1.0
-        gpu = [row.gpu_percent, row.gpu_gib]
-        use = [row.cores_used, row.peak_memory_mib / count, *("-" if one is None else one for one in gpu)]
-        rows.append([count, row.seconds, row.successful, row.per_s, speed_up, *use, *PAPER.get(count, ("", "", ""))])
-        print(rows[-1], flush=True)
-    return rows
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("parts", "disk", "tiles", "memory", "workers"))
-    parser.add_argument("--frames", type=int, help="frames of a measurement; of `disk` and `workers`, of each flight")
+    parser.add_argument("what", choices=("parts", "disk", "tiles", "memory"))
+    parser.add_argument("--frames", type=int, help="frames of a measurement; of `disk`, of each flight")
     parser.add_argument("--workers", type=int, nargs="+")
     given = parser.parse_args()
     scenes.one_thread_and_machine()
@@ -267,17 +241,6 @@ def main() -> None:
         return
     if given.what == "memory":
         scenes.print_table("Memory", ["frames", "MiB", "% over the second row"], memory(given.frames or 5000))
-        return
-    if given.what == "workers":
-        counts = given.workers or [*PAPER]
-        with tempfile.TemporaryDirectory() as root:
-            folder = make_inputs(Path(root), NUM_FLIGHTS)["town"]
-            renderer: Any = open_renderer("gl", read_boxes(folder / FILES[0]), *SIZE)
-            title = f"The render stage, {2 * NUM_FLIGHTS} flights of two tracks, {renderer.device}"
-            renderer.close()
-            names = ["workers", "s", "frames", "frames/s", "speed-up", "cores", "MiB a worker", "GPU %", "GPU GiB"]
-            names += ["paper: frames/s", "GPU %", "GPU GiB"]
-            scenes.print_table(title, names, workers_table(folder, counts, given.frames or 94))
         return
     given.workers = given.workers or [2]
     with tempfile.TemporaryDirectory() as root:
