@@ -72,7 +72,7 @@ class Switched:
 SERVER_FAULTS = {
     "a lower image limit": (400, IMAGES, "--limit-mm-per-prompt"),
     "no vision": (500, "image input is not supported - hint: if this is unexpected, you may need to provide the mmproj",
-    "--mmproj"),
+        "--mmproj"),
     "another model": (404, f"The model `{MODEL}` does not exist.", "check URL and model"),
     "a parameter": (400, "Unsupported parameter: 'max_tokens' is not supported with this model.", "extra_body"),
     "no credit": (429, "You exceeded your current quota. insufficient_quota", "account"),
@@ -120,7 +120,7 @@ WINDOW_FAULTS = {
     "too long": (400, TOO_LONG, "refused_too_long"),
     "too long, llama.cpp": (500, "Context size has been exceeded.", "refused_too_long"),
     "too long, LM Studio": (200, "Trying to keep the first 9136 tokens when context the overflows. However, the model "
-    "is loaded with context length of only 4096 tokens.", "refused_too_long"),
+        "is loaded with context length of only 4096 tokens.", "refused_too_long"),
     "filtered": (400, FILTERED, "refused_content"),
     "flagged": (403, "Your chosen model requires moderation and your input was flagged.", "refused_content"),
     "a picture": (400, "cannot identify image file <_io.BytesIO object at 0x7f2a>", "refused_400"),

@@ -147,7 +147,7 @@ def earned_texts() -> dict[str, list[str]]:
 
 SERIES = {  # slot -> field, digits, unit in both languages
     "speed": ("speed_mps", 2, "m/s", "米/秒"), "altitude": ("altitude_m", 1, "m", "米"), "pitch": ("pitch_deg", 1, "deg",
-    "度"),
+        "度"),
     "yaw": ("yaw_deg", 1, "deg", "度"), "distance": ("distance_m", 1, "m", "米"), "slant": ("slant_m", 1, "m", "米"),
     "box_width": ("box_width_px", 0, "px", "像素"), "offset_x": ("offset_x_px", 0, "px", "像素"),
     "travelled": ("travelled_m", 1, "m", "米"), "bearing": ("bearing_deg", 1, "deg", "度"),

@@ -55,7 +55,7 @@ def a_caption(number):
     teacher = {"kind": "rules", "model": "rules-1", "settings": {"seed": 0}}
     return Caption(
         sample_id=f"t_ORI_frame_{number:05d}", town="T", trajectory="t", variant="ORI", frame_index=number, window=[0,
-        1, 2, 3, 4],
+            1, 2, 3, 4],
         future=[5], prompt=prompt, prompt_hash="h", picture_px=(64, 36), teacher=teacher, usage={"prompt_tokens": 1},
         attempts=1,
         en=Coc(**GOOD), zh=Coc(**GOOD), label_from="flight", label="ascend",

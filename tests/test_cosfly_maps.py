@@ -76,7 +76,7 @@ def test_the_census_town_has_the_papers_counts_and_simplifies_to_a_few_thousand(
 @each(
     ("given", "words"),
     [({"preset": "rivers"}, "did you mean 'river'"), ({"preset": ["park"]}, "valid string"),
-     ({"num_blocks": 6}, "raise size_m")],
+        ({"num_blocks": 6}, "raise size_m")],
 )  # fmt: skip
 def test_a_wrong_town_is_a_config_error(given, words):
     with pytest.raises(ConfigError, match=words):

@@ -226,7 +226,7 @@ def city_file(path: Path) -> Path:
         "CityObjects": {
             "house": {"type": "Building", "geometry": house},
             "road": {"type": "Road", "geometry": [{"type": "MultiSurface", "lod": "1",
-            "boundaries": [[[10, 11, 12, 13]]]}]},
+                "boundaries": [[[10, 11, 12, 13]]]}]},
         },
     }))  # fmt: skip
     return path
@@ -312,8 +312,8 @@ def test_depth_and_ids_are_those_of_trimesh_rays(tmp_path: Path, name: str) -> N
     solids = solids_of(box_map)
     boxes = [
         trimesh.creation.box(2 * box_map.half_extents[row],
-        trimesh.transformations.translation_matrix(box_map.centers[row])
-        @ trimesh.transformations.rotation_matrix(np.radians(box_map.rotations_deg[row, 1]), (0, 0, 1)))
+            trimesh.transformations.translation_matrix(box_map.centers[row])
+            @ trimesh.transformations.rotation_matrix(np.radians(box_map.rotations_deg[row, 1]), (0, 0, 1)))
         for row in (0, 5)
     ]  # fmt: skip
     x, y, z = [*scene_origin(box_map)[:2], plane_z_m(box_map) - GROUND_PLANE_DROP_M]

@@ -18,9 +18,9 @@ CFG = CompareConfig()
 # tab:appendix_h_tastar_muco_delta and tab:appendix_h_four_axis_scores of the paper.
 PAPER = {
     "track_astar": {"five_ray_mean": 0.979, "length_m": 104.479, "accel_rms_mps2": 0.673, "jerk_rms_mps3": 0.919,
-     "clearance_min_m": 4.029},
+        "clearance_min_m": 4.029},
     "muco": {"five_ray_mean": 0.894, "length_m": 108.838, "accel_rms_mps2": 0.738, "jerk_rms_mps3": 0.773,
-     "clearance_min_m": 2.754},
+        "clearance_min_m": 2.754},
     "spline": {"five_ray_mean": 0.618, "length_m": 85.73, "jerk_rms_mps3": 1.433, "clearance_min_m": 1.775},
 }  # fmt: skip
 SCORES = {
@@ -43,7 +43,7 @@ def test_axis_scores_are_the_papers():
 def test_a_planner_that_collides_does_not_set_the_shortest_path_and_is_less_safe():
     means = {name: figures(**row) for name, row in PAPER.items()}
     means["jerk"] = figures(five_ray_mean=0.624, length_m=84.4, jerk_rms_mps3=1.732, collision_fraction=0.002,
-     clearance_min_m=1.137)  # fmt: skip
+        clearance_min_m=1.137)  # fmt: skip
     scores = compare.axis_scores(means)
     assert scores["spline"]["path_efficiency"] == 1.0
     assert scores["jerk"]["path_efficiency"] == pytest.approx(1.016, abs=1e-3)

@@ -75,7 +75,7 @@ def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path, monke
 
 @pytest.mark.parametrize(("text", "value"), [
     (b'{"a": 1e308, "b": -1e-999, "c": 123456789012345678901234567890}',
-    [1e308, -0.0, 123456789012345678901234567890]),
+        [1e308, -0.0, 123456789012345678901234567890]),
     (b'{"a": 0.1000000000000000055511151231257827021181583404541015625}', [0.1]),
     (b'\xef\xbb\xbf{"a": "e9999 \\ud83d\\ude00"}', ["e9999 \U0001f600"]),
     (b'{"a": ' + b"[" * 60 + b"]" * 60 + b"}", None),
@@ -168,7 +168,7 @@ def test_very_many_equal_rows_are_refused_before_they_are_read(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("within", [lambda texts: texts, lambda texts: pa.StructArray.from_arrays([texts], ["x"]),
-lambda texts: pa.ListArray.from_arrays(range(3_001), texts)])  # fmt: skip
+    lambda texts: pa.ListArray.from_arrays(range(3_001), texts)])  # fmt: skip
 @pytest.mark.parametrize("kind", [pa.string(), pa.binary()])
 def test_texts_that_a_dictionary_repeats_are_counted_before_they_are_unpacked(tmp_path, monkeypatch, within, kind):
     """300 kB of such a shard took 3.7 GB."""

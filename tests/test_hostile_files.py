@@ -57,7 +57,7 @@ CITY = {
 }  # fmt: skip
 WORLD = {"base_map": "x", "nodes": [{
     "id": "a", "instance_name": "BP_Tree1_C", "properties": {"location": {"x": 100, "y": 200, "z": 0},
-    "orientation": {"pitch": 0, "yaw": 0, "roll": 0}, "scale": {"x": 1, "y": 1, "z": 1}},
+        "orientation": {"pitch": 0, "yaw": 0, "roll": 0}, "scale": {"x": 1, "y": 1, "z": 1}},
 }]}  # fmt: skip
 ANSWER = {
     "critical_components": "A pedestrian walks ahead on the pavement.",

@@ -128,7 +128,7 @@ def test_a_release_takes_the_licence_of_its_maps_unless_told_and_names_them(rele
 @pytest.mark.parametrize(
     ("licences", "got"),
     [({}, "Town01: unknown, Town02: unknown"), ({"Town01": "mit"}, "Town02: unknown"),
-     ({"Town01": "mit", "Town02": "cc0-1.0"}, "Town01: mit, Town02: cc0-1.0")],
+        ({"Town01": "mit", "Town02": "cc0-1.0"}, "Town01: mit, Town02: cc0-1.0")],
 )  # fmt: skip
 def test_a_release_without_a_licence_is_refused(release_inputs, tmp_path, licences, got):
     source = with_maps(release_inputs, tmp_path / "in", **licences)

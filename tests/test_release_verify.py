@@ -230,7 +230,7 @@ def picture(column: str, data: bytes):
 
 
 KEPT = {"sample_id", "run", "town", "trajectory", "variant", "frame_index", "image", "instance", "depth", "split",
- "walk", "pair",
+    "walk", "pair",
         "width_px", "height_px", "track", "time_s", "fov_deg", "pose", "has_caption"}  # fmt: skip
 MASK = instance_bytes(np.zeros((90, 160), np.uint8), np.zeros((90, 160), np.uint16))
 ODD_ROWS = {

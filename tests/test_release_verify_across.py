@@ -71,7 +71,7 @@ def test_neighbouring_frames_show_one_world(change, code):
 @each(
     ("name", "error", "is_found"),
     [("error_flat", 1e-6, False), ("error_flat", 8e-5, True), ("error_standing", 3e-5, False),
-     ("error_standing", 1.8e-4, True)],
+        ("error_standing", 1.8e-4, True)],
 )  # fmt: skip
 def test_planes_keep_their_place_through_a_flight(name, error, is_found):
     """8e-5 is of depth set off by 0.3 m, 1.8e-4 of depth scaled by 2 %."""
