@@ -123,9 +123,6 @@ def test_the_quarantine_is_replayed_alone(tree, tmp_path, whole):
     assert (out / "manifest.json").exists()
 
 
-# --- the display ------------------------------------------------------------------------------------------------------
-
-
 def record(flight: int, window: int, purpose: str = "free/0") -> Answer:
     sample_id = f"{f'trajectory_{flight}_ORI'}_frame_{window:05d}"
     usage = {"prompt_tokens": 10, "completion_tokens": 2}

@@ -6,13 +6,12 @@ one window is kept in the server's words, and asked again by `--retry-failed`.
 
 import json
 import threading
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from specimens_captions import deciding, report_of, settings
 from tables import each
-from teacher_server import MODEL, TeacherServer, is_mirror, refusal
+from teacher_server import MODEL, is_mirror, refusal
 
 from caption.run.stage import run
 from cosfly.formats.captions import read_captions
@@ -25,27 +24,18 @@ FILTERED = "The response was filtered due to the prompt triggering Azure OpenAI'
 NOT_KNOWN = "Something about this request is not as it should be."
 
 
-def hovering(respond=None, **options) -> TeacherServer:
-    return deciding(respond=respond, **options)
-
-
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory) -> Path:
     return make_playback_tree(tmp_path_factory.mktemp("tree"), 2, 14, with_augmented=False)  # 2 flights of 5 windows
 
 
-@dataclass(frozen=True)
-class Whole:
-    product: bytes
-    seeds: list[int]
-
-
 @pytest.fixture(scope="module")
-def whole(tree, tmp_path_factory) -> Whole:
-    with hovering() as server:
+def whole(tree, tmp_path_factory) -> tuple[bytes, list[int]]:
+    """Give what an undisturbed run makes, and the seeds of what it asks in English."""
+    with deciding() as server:
         path = run(settings(server.url), tree, tmp_path_factory.mktemp("whole") / "out")
     bodies = [json.loads(body) for body in server.bodies]
-    return Whole(path.read_bytes(), sorted(body["seed"] for body in bodies if not is_mirror(body)))
+    return path.read_bytes(), sorted(body["seed"] for body in bodies if not is_mirror(body))
 
 
 def quarantine(out: Path) -> dict[str, dict]:
@@ -64,9 +54,6 @@ class Switched:
             is_good = is_mirror(body) or self.num_asked <= self.num_good
         return None if is_good else refusal(self.status, self.text)
 
-    def mend(self) -> None:
-        self.num_good = 10**9
-
 
 # What a server says to every window from some time on: status, words, and what the error must say beside them.
 SERVER_FAULTS = {
@@ -83,7 +70,7 @@ SERVER_FAULTS = {
 def test_what_is_the_servers_fault_ends_the_run_and_is_no_windows(tree, tmp_path, whole, name):
     status, text, words = SERVER_FAULTS[name]
     out, behaviour = tmp_path / "out", Switched(status, text)
-    with hovering(behaviour) as server:
+    with deciding(respond=behaviour) as server:
         with pytest.raises(TeacherError) as caught:
             run(settings(server.url), tree, out)
         assert text in str(caught.value)
@@ -94,8 +81,8 @@ def test_what_is_the_servers_fault_ends_the_run_and_is_no_windows(tree, tmp_path
         assert quarantine(out) == {}
         parts = [caption for path in (out / "parts").glob("*") for caption in read_captions(path)]
         assert [caption.checks.refusal for caption in parts if caption.checks.refusal] == []
-        behaviour.mend()
-        assert run(settings(server.url), tree, out).read_bytes() == whole.product
+        behaviour.num_good = 10**9
+        assert run(settings(server.url), tree, out).read_bytes() == whole[0]
 
 
 def test_a_server_that_refuses_every_window_ends_the_run_and_retry_failed_asks_again(
@@ -103,16 +90,16 @@ def test_a_server_that_refuses_every_window_ends_the_run_and_retry_failed_asks_a
 ):
     monkeypatch.setattr("caption.run.asking.STOP_AFTER_FAILURES", 3)
     out, behaviour = tmp_path / "out", Switched(400, NOT_KNOWN)
-    with hovering(behaviour) as server:
+    with deciding(respond=behaviour) as server:
         cfg = settings(server.url, endpoint={"concurrency": 1})
         with pytest.raises(TeacherError) as caught:
             run(cfg, tree, out)
         assert NOT_KNOWN in str(caught.value)
         assert not (out / "manifest.json").exists()
         assert {held["code"] for held in quarantine(out).values()} == {"refused_400"}
-        behaviour.mend()
+        behaviour.num_good = 10**9
         run(cfg, tree, out)
-        assert run(cfg, tree, out, retry_failed=True).read_bytes() == whole.product
+        assert run(cfg, tree, out, retry_failed=True).read_bytes() == whole[0]
 
 
 # What a server says to some windows while it answers the others: status, words, and the reason they are dropped for.
@@ -129,19 +116,11 @@ WINDOW_FAULTS = {
 }  # fmt: skip
 
 
-class Picky:
-    def __init__(self, status: int, text: str, seeds: list[int]) -> None:
-        self.status, self.text, self.seeds, self.is_on = status, text, seeds, True
-
-    def __call__(self, body: dict) -> tuple[int, dict] | None:
-        return refusal(self.status, self.text) if self.is_on and body["seed"] in self.seeds else None
-
-
 @each("name", WINDOW_FAULTS)
 def test_what_is_a_windows_fault_costs_that_window_and_is_kept_in_the_servers_words(tree, tmp_path, whole, name):
     status, text, reason = WINDOW_FAULTS[name]
     out = tmp_path / "out"
-    with hovering(Picky(status, text, whole.seeds[:1])) as server:
+    with deciding(respond=lambda body: refusal(status, text) if body["seed"] == whole[1][0] else None) as server:
         path = run(settings(server.url), tree, out)
         assert report_of(out)["windows"] == {"input": 10, "kept": 9, "dropped": {reason: 1}, "failed": {}}
         assert report_of(out)["structured"] == {"json_schema": 9, "none": 1}  # nobody else lost the schema
@@ -158,23 +137,14 @@ def test_what_is_a_windows_fault_costs_that_window_and_is_kept_in_the_servers_wo
         assert reason in page
 
 
-# How a server that takes no schema says so, and how many requests with one it is sent, one at a time.
-SCHEMA_FAULTS = {
-    "by name": (400, "This response_format type is unavailable now", 1),
-    "by name, 422": (422, "response_format.type `json_schema` is unavailable now", 1),
-    "by name, with 200": (200, "response_format is not supported by this provider", 1),
-}  # fmt: skip
-
-
-@each("name", SCHEMA_FAULTS)
-def test_a_server_that_refuses_the_schema_is_asked_without_it(tree, tmp_path, name):
-    status, text, num_refused = SCHEMA_FAULTS[name]
-    with hovering(lambda body: refusal(status, text) if "response_format" in body else None) as server:
+@each(("status", "text"), [
+    (400, "This response_format type is unavailable now"), (422, "response_format.type `json_schema` is unavailable now"),
+    (200, "response_format is not supported by this provider"),
+])  # fmt: skip
+def test_a_server_that_refuses_the_schema_is_asked_without_it(tree, tmp_path, status, text):
+    with deciding(respond=lambda body: refusal(status, text) if "response_format" in body else None) as server:
         run(settings(server.url, limit=4, endpoint={"concurrency": 1, "max_tries": 1}), tree, tmp_path / "out")
-    assert sum(b"response_format" in body for body in server.bodies) == num_refused
-    assert len(server.bodies) == 8 + num_refused
+    assert sum(b"response_format" in body for body in server.bodies) == 1
+    assert len(server.bodies) == 8 + 1
     assert report_of(tmp_path / "out")["structured"] == {"plain": 4}
     assert report_of(tmp_path / "out")["refusals"] == {}
-
-
-# --- outages ----------------------------------------------------------------------------------------------------------

@@ -5,9 +5,7 @@ import dataclasses
 from specimens_captions import GAP
 from tables import each
 
-from caption.truth.claims import judge_claim
 from caption.truth.references import Fact, look_up, parse_reference, word_holds
-from cosfly.formats.captions import Claim
 
 FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0))
 
@@ -65,23 +63,3 @@ def test_a_series_that_ends_where_it_began_has_no_trend():
         facts = dataclasses.replace(FACTS, distance_m=distance_m)
         assert look_up(parse_reference("trend:distance"), facts) == Fact("mixed")
         assert word_holds("mixed", parse_reference("trend:distance"), facts)
-
-
-@each(("quantity", "at", "value", "unit", "state"), [
-    ("distance", "t4", 18.0, "m", "proved"),
-    ("distance", "t4", 18, "m", "proved"),
-    ("distance", "t4", 18.4, "m", "contradicted"),
-    ("speed_ratio", None, 2.5, "times", "proved"),
-    ("mean:speed", None, 3, "mps", "proved"),  # rounded to what was written
-    ("mean:speed", None, 2.9, "mps", "proved"),
-    ("mean:speed", None, 2.8, "mps", "contradicted"),
-    ("distance", "t4", 18.0, "mps", "contradicted"),
-    ("distance", "t9", 18.0, "m", "unobserved_frame"),
-    ("distance", "t3", 18.0, "m", "unknown_fact"),
-    ("colour", None, "red", None, "unknown_reference"),
-    ("trend:speed", None, "increasing", None, "proved"),
-    ("trend:speed", None, "decreasing", None, "contradicted"),
-    ("trend:speed", None, 3.0, None, "contradicted"),
-])  # fmt: skip
-def test_a_claim_against_the_facts(quantity, at, value, unit, state):
-    assert judge_claim(Claim(sentence="C1", quantity=quantity, at=at, value=value, unit=unit), FACTS) == state

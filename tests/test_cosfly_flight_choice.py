@@ -41,6 +41,3 @@ def test_patterns_are_of_folders_and_those_above_them(tree):
         names(tree, match=("Town9",))
     with pytest.raises(InputError, match="no flight of the tree is of this track; got perturbed"):
         names(tree, match=("*/ORI",), tracks=("perturbed",))
-
-
-# --- all the way ------------------------------------------------------------------------------------------------------

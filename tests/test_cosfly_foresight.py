@@ -113,9 +113,6 @@ def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
     assert trajectory_metrics.derivative_rms(points, 3) <= max(0.3 * trajectory_metrics.derivative_rms(raw, 3), 0.05)
 
 
-# --- from where a drone is --------------------------------------------------------------------------------------------
-
-
 @each(
     ("place_m", "velocity_mps"),
     [((-20, 0, 20), (1.2, 0, 0)), ((45, 3, 24), (-6, 0, 2)), ((-60, 0, 30), (-9, 0, 0)), ((5, 2, 12), (0, 0, -2))],

@@ -27,9 +27,6 @@ def one_box(center, half_extents, rotation_deg=(0, 0, 0), kind=BUILDINGS):
     return make_box_map([center], [half_extents], [rotation_deg], [kind])
 
 
-# --- which boxes, which cells -----------------------------------------------------------------------------------------
-
-
 def test_only_boxes_at_a_persons_height_block(subtests):
     for bottom_m, top_m, kind, blocks in [
         (0.0, 3.0, BUILDINGS, True),
@@ -71,9 +68,6 @@ def test_surfaces_near_the_ground_count_and_a_flyover_does_not():
     )
     np.testing.assert_array_equal(surface(box_map, like=free_grid(6, 2)), grid_of("##.... ##....").occupied)
     assert surface(box_map, [WATER], like=free_grid(6, 2)) is None
-
-
-# --- growing, cutting out, connecting ---------------------------------------------------------------------------------
 
 
 def test_roi_with_holes_and_several_rings_equals_shapely():

@@ -10,7 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 from tables import each
 
 from cosfly.formats.boxes import make_box_map, read_boxes, write_boxes
@@ -254,14 +253,10 @@ def test_a_shift_that_hides_what_the_clean_flight_shows_goes_to_review(workplace
     assert "hidden_by_shift" not in codes_of(inspect(workplace, cfg, "again"), folder)
 
 
-def edit(folder: Path, change) -> None:
-    edit_json(folder / "trajectory.json", change)
-
-
-def edit_json(path: Path, change) -> None:
-    value = read_json(path)
+def edit(folder: Path, change, name: str = "trajectory.json") -> None:
+    value = read_json(folder / name)
     change(value)
-    path.write_text(json.dumps(value))
+    (folder / name).write_text(json.dumps(value))
 
 
 def edit_image(path: Path, change) -> None:
@@ -343,7 +338,7 @@ DEFECTS = {
     "target_missing in the picture": lambda f: edit(f, at_point("target", "image_uv", None)),
     "teleport": lambda f: edit(f, lambda t: t["points"][3]["drone_pose"].update(x=99.0)),
     "missing_file that is listed": lambda f: (f / FRAME / "meta.json").unlink(),
-    "broken_annotation of another frame": lambda f: edit_json(f / FRAME / "meta.json", lambda m: m.update(index=4)),
+    "broken_annotation of another frame": lambda f: edit(f / FRAME, lambda m: m.update(index=4), "meta.json"),
     "wrong_format of instances": lambda f: edit_image(f / FRAME / "instance.png", lambda image: image[:54, :96]),
     "broken_image in grey": lambda f: cv2.imwrite(
         str(f / FRAME / "rgb.png"), np.arange(192 * 108, dtype=np.uint8).reshape(108, 192)
@@ -532,11 +527,8 @@ def test_others_keep_clear_of_drone_and_person(workplace, beside, shift_m, codes
     told = BystandersMeta(target_hidden_by_others=0.25, target_hidden_by_map=0.0, others=[other])
     check_bystanders(flight, {3: told, 4: told.model_copy(update={"others": []})}, 2.5, report, metrics)
     assert {issue.code for issue in report.issues} == codes
-    assert (metrics["num_others"], metrics["occluded_by_others_share"], metrics["hidden_by_others_max"]) == (
-        1,
-        1.0,
-        0.25,
-    )
+    told = [metrics[name] for name in ("num_others", "occluded_by_others_share", "hidden_by_others_max")]
+    assert told == [1, 1.0, 0.25]
 
 
 def test_an_unreadable_flight_is_a_counted_failure_while_others_go_on(workplace):
@@ -569,6 +561,3 @@ def test_the_funnel_counts_prefiltered_and_unrendered_plans(workplace):
     funnel = inspect(workplace).funnel.trajectories
     assert (funnel.planned, funnel.rendered, funnel.not_rendered) == (5, 2, 1)
     assert funnel.dropped == {"five_ray_visibility": 1, "smoothness": 1}
-
-
-boxes = st.tuples(*[st.integers(0, 12)] * 4).map(lambda v: np.array([v[0], v[1], v[0] + v[2], v[1] + v[3]], float))

@@ -161,9 +161,6 @@ def test_known_answers_of_the_robotics_worlds(shared_data: Path, world: str, pai
     assert overlapping_pairs(buildings, with_yaw=False) == pairs
 
 
-# --- cityjson ---------------------------------------------------------------------------------------------------------
-
-
 def city_model() -> dict:
     model = two_houses()
     model["vertices"] += [[80_000, 60_000, 2000], [110_000, 60_000, 2000], [80_000, 90_000, 2000]]

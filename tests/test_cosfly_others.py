@@ -80,8 +80,6 @@ def test_others_round_trip_and_bad_files(tmp_path):
         read_bystanders(path)
 
 
-# --- placing ----------------------------------------------------------------------------------------------------------
-
 CFG = PedestriansConfig(others=6, look_alikes=2, traffic=6, pace={"walk": 1, "stop_and_look": 1, "turn_back": 1})
 
 

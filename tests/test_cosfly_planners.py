@@ -125,9 +125,6 @@ def test_curvature_is_positive_and_exact_for_the_quadratic_terms():
     assert np.linalg.eigvalsh(dense(problem)[0]).min() > -1e-8
 
 
-# --- flights ----------------------------------------------------------------------------------------------------------
-
-
 @each("world", WORLDS)
 def test_the_loss_never_rises_and_the_flight_is_safe(world):
     scenario, obstacles = scenario_of(world)

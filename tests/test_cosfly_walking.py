@@ -11,8 +11,6 @@ from cosfly.pedestrians.speed_model import (
     take_pace,
 )
 
-# --- speed ------------------------------------------------------------------------------------------------------------
-
 
 def test_even_speed_gives_even_steps_and_ends_at_the_goal():
     polyline = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.3]])

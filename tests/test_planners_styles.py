@@ -130,8 +130,6 @@ def test_a_style_that_the_map_does_not_hold_is_dropped_or_followed_and_says_why(
     assert plan_trajectory(STRAIGHT, walled, fallback, 0).drop_reason is None
 
 
-# --- the shipped towns ------------------------------------------------------------------------------------------------
-
 ORDERS, DECISIONS_LEAST, STYLE_MOST = {"break_off", "return_to_home"}, 0.02, 0.3
 
 

@@ -253,6 +253,3 @@ def test_a_unit_that_fails_publishes_nothing(broken, tmp_path, change, words):
     assert words in failures
     assert '"bug"' not in failures
     assert not (tmp_path / "out/webdataset").exists()
-
-
-# --- verified ---------------------------------------------------------------------------------------------------------

@@ -45,9 +45,6 @@ def test_motion_is_that_of_the_plan_whatever_the_perturbation(seed, num):
     assert flight.jerk_rms_mps3 == pytest.approx(derivative_rms(plan, 3), rel=1e-6)
 
 
-# --- pages ------------------------------------------------------------------------------------------------------------
-
-
 def test_a_release_is_counted_again(built, tmp_path):
     result = invoke("release stats", built.parent, "--out", tmp_path, "--pixels 5")
     assert result.exit_code == 0, result.output
