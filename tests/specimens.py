@@ -55,14 +55,7 @@ def make_playback_tree(
     with_images: bool = True,
     with_augmented: bool = True,
 ) -> Path:
-    """Write a playback tree and give its root.
-
-    Args:
-        num_flights: trajectories; each has `ORI` and, unless told otherwise, `aug_001`.
-        num_points: frames of each flight, DT_S apart.
-        towns: the trajectories take turns.
-        with_images: False writes `trajectory.json` only.
-    """
+    """Write a playback tree of trajectories, whose towns take turns, and give its root."""
     for index in range(num_flights):
         town = towns[index % len(towns)]
         for variant in ("ORI", "aug_001") if with_augmented else ("ORI",):
@@ -92,13 +85,10 @@ def make_flight(
     targets = _walk(num_points, rng)
     positions, rotations = _follow(targets, rng)
     scene = _scene(targets, positions, rng)
-    zero = np.zeros((num_points, 3))
-    drone_offsets, rotation_offsets, is_perturbed = zero, zero.copy(), np.zeros(num_points, dtype=bool)
-    if variant != "ORI":
-        noise = np.random.default_rng([seed, 78])
-        drone_offsets = noise.uniform(-0.4, 0.4, (num_points, 3))
-        rotation_offsets = noise.uniform(-1.5, 1.5, (num_points, 3))
-        is_perturbed = np.ones(num_points, dtype=bool)
+    noise, zero = np.random.default_rng([seed, 78]), np.zeros((num_points, 3))
+    drone_offsets, rotation_offsets = (noise.uniform(-most, most, zero.shape) for most in (0.4, 1.5))
+    if variant == "ORI":
+        drone_offsets, rotation_offsets = zero, zero.copy()
     aimed_before = look_at(positions, targets)
     positions, rotations = positions + drone_offsets, rotations + rotation_offsets
     # A shifted camera is aimed anew, as the renderer aims it.
@@ -111,19 +101,12 @@ def make_flight(
         town=town, trajectory=trajectory, variant=variant, camera=camera, time_s=np.arange(num_points) * DT_S,
         positions_m=positions, rotations_deg=rotations, targets_m=targets,
         target=TargetRecord(
-            in_view=~np.isnan(bbox[:, 0]),
-            visible=visibility >= 0.3,
-            depth_m=np.array([view[2] for view in views]),
-            uv=np.array([view[1] for view in views]),
-            bbox=bbox,
-            visibility=visibility,
+            in_view=~np.isnan(bbox[:, 0]), visible=visibility >= 0.3, depth_m=np.array([view[2] for view in views]),
+            uv=np.array([view[1] for view in views]), bbox=bbox, visibility=visibility,
         ),
-        perturbation=Perturbation(is_perturbed, drone_offsets, rotation_offsets, zero.copy()),
+        perturbation=Perturbation(np.full(num_points, variant != "ORI"), drone_offsets, rotation_offsets, zero.copy()),
         source={
-            "path_index": seed,
-            "scenario_id": f"specimen_{seed}",
-            "scenario_name": "specimen",
-            "algorithm": "muco",
+            "path_index": seed, "scenario_id": f"specimen_{seed}", "scenario_name": "specimen", "algorithm": "muco",
         },
         is_original=variant == "ORI",
     )  # fmt: skip
@@ -230,7 +213,7 @@ def paint(scene: Scene, flight: Track, i: int) -> tuple[np.ndarray, np.ndarray, 
     halves = np.vstack([scene.half_extents, PERSON_HALF_EXTENTS_M])
     colors = np.vstack([scene.colors, [200, 40, 40]])
     kinds = np.append(scene.kinds, KINDS["Pedestrians"])
-    ids = np.append(scene.ids, PERSON_ID)
+    own_ids = np.append(scene.ids, PERSON_ID)
     near, far = _slabs(centers, halves, origin, directions)
     near = np.where((near <= far) & (near > 0), near, np.inf)
     with np.errstate(divide="ignore"):
@@ -245,14 +228,10 @@ def paint(scene: Scene, flight: Track, i: int) -> tuple[np.ndarray, np.ndarray, 
     rgb = np.where(on_box[:, None], colors[first], rgb)
     rgb = np.where(is_sky[:, None], [150, 180, 220], rgb)
     semantic = np.where(is_sky, KINDS["Sky"], np.where(on_box, kinds[first], KINDS["Terrain"]))
-    instance = np.where(on_box & ~is_sky, ids[first], 0)
+    instance = np.where(on_box & ~is_sky, own_ids[first], 0)
     depth = np.where(is_sky, SKY_DEPTH_M, depth).astype(np.float32)
-    return (
-        rgb.reshape(h, w, 3).astype(np.uint8),
-        depth.reshape(h, w),
-        semantic.reshape(h, w).astype(np.uint8),
-        instance.reshape(h, w).astype(np.uint16),
-    )
+    rgb, ids = rgb.reshape(h, w, 3).astype(np.uint8), instance.reshape(h, w).astype(np.uint16)
+    return rgb, depth.reshape(h, w), semantic.reshape(h, w).astype(np.uint8), ids
 
 
 def pack_depth(folder: Path) -> None:

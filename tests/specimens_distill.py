@@ -37,38 +37,24 @@ def make_caption(town: str, trajectory: str, variant: str, frame: int, **changes
     english, chinese = ENGLISH[decision], CHINESE[decision]
     fields = {
         "sample_id": sample_id(f"{trajectory}_{variant}", frame),
-        "town": town,
-        "trajectory": trajectory,
-        "variant": variant,
-        "frame_index": frame,
+        "town": town, "trajectory": trajectory, "variant": variant, "frame_index": frame,
         "window": list(range(frame - WINDOW + 1, frame + 1)),
         "future": list(range(frame + 1, frame + 1 + WINDOW)),
         "prompt": {
-            "en": Prompt(
-                system="You fly the drone.", user=f"Five frames end at {frame}. {PICTURES_MARK} Answer with JSON."
-            ),
-            "zh": Prompt(system="你驾驶无人机。", user=f"五帧，最后一帧为{frame}。{PICTURES_MARK}请用JSON回答。"),
+            "en": Prompt(system="You fly the drone.", user=f"Five frames end at {frame}. {PICTURES_MARK} Answer."),
+            "zh": Prompt(system="你驾驶无人机。", user=f"五帧，最后一帧为{frame}。{PICTURES_MARK}请回答。"),
         },
-        "prompt_hash": "0" * 64,
-        "picture_px": (64, 36),  # the size of the specimen tree
+        "prompt_hash": "0" * 64, "picture_px": (64, 36),  # the size of the specimen tree
         "teacher": {"kind": "rules", "model": "rules", "settings": {"seed": 0}},
-        "usage": {"prompt_tokens": 0, "completion_tokens": 0},
-        "attempts": 1,
-        "en": Coc(
-            critical_components=f"The pedestrian {english[0]}, about {10 + frame} m ahead.",
-            reasoning_trace=f"The pedestrian {english[1]}.",
-            flight_decision=decision,
-        ),
-        "zh": Coc(
-            critical_components=f"行人{chinese[0]}，距离约{10 + frame}米。",
-            reasoning_trace=f"行人{chinese[1]}。",
-            flight_decision=decision,
-        ),
-        "label_from": "flight" if variant == "ORI" else "twin",
-        "label": None if frame % 3 == 0 else decision,
+        "usage": {"prompt_tokens": 0, "completion_tokens": 0}, "attempts": 1, "status": "accepted",
+        "label_from": "flight" if variant == "ORI" else "twin", "label": None if frame % 3 == 0 else decision,
         "verdict": "ABSTAIN" if frame % 3 == 0 else "CONSISTENT",  # as geometry cannot tell
-        "status": "accepted",
-    }
+    }  # fmt: skip
+    for language, first, last in (
+        ("en", f"The pedestrian {english[0]}, about {10 + frame} m ahead.", f"The pedestrian {english[1]}."),
+        ("zh", f"行人{chinese[0]}，距离约{10 + frame}米。", f"行人{chinese[1]}。"),
+    ):
+        fields[language] = Coc(critical_components=first, reasoning_trace=last, flight_decision=decision)
     return Caption.model_validate({**fields, **changes})
 
 

@@ -76,11 +76,8 @@ def test_who_cannot_be_made_out_changes_what_is_said_to_be_seen_and_no_decision(
     assert [one.model_dump() for one in told[True]] == [one.model_dump() for one in before], "nothing is said anew"
     assert any("visible" in one.en.critical_components for one in before)
     for one, other in zip(before, told[False], strict=True):
-        assert (one.label, one.verdict, one.en.flight_decision) == (
-            other.label,
-            other.verdict,
-            other.en.flight_decision,
-        )
+        found = one.label, one.verdict, one.en.flight_decision
+        assert found == (other.label, other.verdict, other.en.flight_decision)
         text, chinese = (getattr(other, language).critical_components for language in ("en", "zh"))
         assert not re.search(r"visible|partly|in the image|image centre", text)
         assert not re.search("可见|部分遮挡|画面", chinese)

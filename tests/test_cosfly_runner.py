@@ -50,12 +50,8 @@ MIXED = (("keep", 2), ("drop", "short"), ("fail", "x"), ("keep", 3), ("bug", "y"
 
 def test_everything_is_counted(tmp_path):
     finished = run_items(_stage(tmp_path / "s"), _items(*MIXED), make_worker, (tmp_path / "log",))
-    assert finished.tally.model_dump() == {
-        "input": 6,
-        "kept": 2,
-        "dropped": {"short": 2},
-        "failed": {"bug": 1, "input": 1},
-    }
+    found = finished.tally.model_dump()
+    assert found == {"input": 6, "kept": 2, "dropped": {"short": 2}, "failed": {"bug": 1, "input": 1}}
     assert [record.id for record in finished.kept] == ["i0", "i3"]
     failures = (tmp_path / "s/failures.jsonl").read_text()
     assert "got x" in failures

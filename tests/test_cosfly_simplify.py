@@ -273,13 +273,8 @@ def test_stage_writes_map_report_and_picture(tmp_path: Path):
     write_boxes(source, boxes)
     product = run(SimplifyConfig(), source, tmp_path / "out")
     simplified = read_boxes(product)
-    assert [p.name for p in simplified.header.passes] == [
-        "input",
-        "merge",
-        "crop_tree",
-        "crop_below_ground",
-        "prune_nested",
-    ]
+    found = [p.name for p in simplified.header.passes]
+    assert found == ["input", "merge", "crop_tree", "crop_below_ground", "prune_nested"]
     report = json.loads((tmp_path / "out/simplify_report.json").read_text())
     assert report["num_boxes"] == {"raw": 120, "simplified": len(simplified)}
     assert report["passes"][-1]["counts"] == simplified.counts()

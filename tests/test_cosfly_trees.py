@@ -101,8 +101,6 @@ def test_the_public_reader_can_refuse(ours, tmp_path, subtests):
         read_public(tree)
 
 
-# --- names
-# --- quirks of trees
 @dataclass(frozen=True)
 class Quirk:
     """A change of a foreign `trajectory.json`; is_strict: whether the layout still holds."""
@@ -225,7 +223,6 @@ def test_the_clean_twin_is_found_by_what_it_says_it_is(foreign, tmp_path):
         read_twin(shaken)
 
 
-# --- the whole way of a foreign tree
 @pytest.fixture(scope="module")
 def way(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("way")

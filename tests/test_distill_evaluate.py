@@ -88,11 +88,8 @@ def test_measured_numbers_by_hand(samples):
     )
     assert (found["accuracy"].count, found["accuracy_parsed"].count) == (8, 6)
     assert (found["accuracy"].low, found["accuracy"].high) == (None, None)  # of one walk
-    assert {name: (figure.value, figure.count) for name, figure in by_decision.items()} == {
-        "track_straight": (2 / 4, 4),
-        "yaw_left_to_follow": (1 / 2, 2),
-        "slow_down": (1 / 2, 2),
-    }
+    told = {name: (figure.value, figure.count) for name, figure in by_decision.items()}
+    assert told == {"track_straight": (2 / 4, 4), "yaw_left_to_follow": (1 / 2, 2), "slow_down": (1 / 2, 2)}
 
 
 def test_failures_are_no_wrong_answers(samples):

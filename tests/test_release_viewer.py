@@ -82,12 +82,8 @@ def test_a_run_is_shown_as_it_is(page):
     assert {flight["map"] for flight in data["flights"]} == {"one/Town01", "one/Town02"}
     assert {box["kind"] for box in data["maps"]["one/Town01"]} == {"Buildings", "Vegetation"}  # the third is 900 m away
     flight = data["flights"][1]
-    assert (flight["track"], flight["num_frames"], flight["num_captions"], flight["split"]) == (
-        "perturbed",
-        NUM_POINTS,
-        19,
-        None,
-    )
+    found = flight["track"], flight["num_frames"], flight["num_captions"], flight["split"]
+    assert found == ("perturbed", NUM_POINTS, 19, None)
     by_index = {frame["index"]: frame["caption"] for frame in flight["frames"]}
     assert (len(by_index), by_index[7]["verdict"]) == (12, "HARD_CONFLICT")
     assert by_index[9]["dropped"] == "hard_conflict"
@@ -134,10 +130,8 @@ def test_a_release_is_shown_as_its_rows_say(built, tmp_path):
         assert bool(caption) == row["has_caption"]
         if caption:
             assert caption["verdict"] == row["verdict"]
-            assert [sentence["text"] for sentence in caption["texts"]["en"]] == [
-                row["caption_en_critical_components"],
-                row["caption_en_reasoning_trace"],
-            ]
+            found = [sentence["text"] for sentence in caption["texts"]["en"]]
+            assert found == [row["caption_en_critical_components"], row["caption_en_reasoning_trace"]]
     two = data_of(run(built, tmp_path / "two.html", ViewerConfig(flights=2, frames=1)).read_text(encoding="utf-8"))
     assert len(two["flights"]) <= 2
     assert any("flights are shown" in note for note in two["notes"])
@@ -189,11 +183,8 @@ def test_the_page_opens_offline_and_shows_pictures_map_and_captions(tab, page):
     assert tab.run("document.body.dataset.ready") == "yes"
     assert tab.run(COUNT) == "48 of 48 frames"
     assert tab.run("[...document.images].length") == 3
-    assert tab.run("Promise.all([...document.images].map((one) => one.decode().then(() => one.naturalWidth)))") == [
-        64,
-        32,
-        32,
-    ]
+    found = tab.run("Promise.all([...document.images].map((one) => one.decode().then(() => one.naturalWidth)))")
+    assert found == [64, 32, 32]
     assert "2 boxes, 3 ways" in tab.run("document.getElementById('plan').getAttribute('aria-label')")
     assert [url for url in tab.requests if not url.startswith(("data:", "about:"))] == [page.absolute().as_uri()]
     assert tab.said == []

@@ -31,8 +31,6 @@ from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig, clusters, simplify
 
 SHORT_POINTS = 121  # the paper's SimWorld flight
-
-
 WALKS = PedestriansConfig(num_paths=scenes.NUM_WALKS)
 BIG_M = (3784 * 0.5, 2357 * 0.5)  # the largest map of the paper
 
@@ -141,8 +139,7 @@ def make_scenes(wanted: list[str]) -> list[Scene]:
     if city is not None:
         simple = scenes.simplified(city)
         walks = scenes.walks_on(simple, ground="paved")
-        tiles = {"b": (1, 1), "c": (12, 12)}
-        for key, (columns, rows) in tiles.items():
+        for key, (columns, rows) in {"b": (1, 1), "c": (12, 12)}.items():
             if key not in wanted:
                 continue
             obstacles = obstacle_index(scenes.tiled(simple, columns, rows))
@@ -175,10 +172,9 @@ def measure(scene: Scene, planner: str, cfg: PlanConfig) -> list:
     table, all_ms = np.array(facts, dtype=float), np.array(times)
     return [
         scene.name, planner, len(scene.obstacles.rows), f"{len(facts)} + {failed}", round(table[:, 0].mean()),
-        float(all_ms.mean()),
-        float(np.percentile(all_ms, 95)), float(all_ms.max()), f"{table[:, 1].mean():.3f}", f"{table[:, 1].min():.3f}",
-        f"{table[:, 2].min():.2f}", int(table[:, 3].sum()), f"{int(table[:, 4].sum())} of {len(facts)}",
-        float(table[:, 5].mean()),
+        float(all_ms.mean()), float(np.percentile(all_ms, 95)), float(all_ms.max()), f"{table[:, 1].mean():.3f}",
+        f"{table[:, 1].min():.3f}", f"{table[:, 2].min():.2f}", int(table[:, 3].sum()),
+        f"{int(table[:, 4].sum())} of {len(facts)}", float(table[:, 5].mean()),
         f"{table[:, 6].mean():.2f} / {table[:, 7].mean():.2f}",
     ]  # fmt: skip
 
@@ -202,26 +198,15 @@ def compare_with_scipy(scene: Scene, cfg: PlanConfig) -> list:
             value = evaluate(points, problem, scene.obstacles, unmasked, state)
             return value, (state.gradient + state.visibility_gradient)[1:-1].reshape(-1)
 
-        bounds = [
-            pair for low, _, high in problem.altitudes[1:-1] for pair in ((None, None), (None, None), (low, high))
-        ]
-        peer_ms, peer = scenes.cpu_ms(
-            lambda f=first, call=loss_and_gradient, b=bounds: minimize(
-                call, f[1:-1].reshape(-1), jac=True, method="L-BFGS-B", bounds=b,
-                options={"maxiter": 3000, "maxfun": 6000}
-            )
-        )  # fmt: skip
-        rows.append(
-            (
-                ms,
-                peer_ms,
-                solver["loss_end"] / peer.fun,
-                solver["iterations"],
-                solver["evaluations"],
-                peer.nfev,
-                ruled["loss_end"] / peer.fun,
-            )
-        )
+        heights = [(low, high) for low, _, high in problem.altitudes[1:-1]]
+        asked = {
+            "jac": True, "method": "L-BFGS-B", "options": {"maxiter": 3000, "maxfun": 6000},
+            "bounds": [pair for height in heights for pair in ((None, None), (None, None), height)],
+        }  # fmt: skip
+        start = first[1:-1].reshape(-1)
+        peer_ms, peer = scenes.cpu_ms(lambda f=loss_and_gradient, x=start, a=asked: minimize(f, x, **a))
+        counts = solver["iterations"], solver["evaluations"], peer.nfev
+        rows.append((ms, peer_ms, solver["loss_end"] / peer.fun, *counts, ruled["loss_end"] / peer.fun))
     table = np.array(rows)
     return [
         scene.name, float(table[:, 0].mean()), float(table[:, 1].mean()),
@@ -249,8 +234,7 @@ def main() -> None:
     print()
     names = [
         "map", "planner", "obstacles", "flights + failed", "points", "mean ms", "p95 ms", "max ms", "visibility",
-        "worst",
-        "clearance, m", "collisions", "smooth", "length, m", "acceleration / jerk, RMS",
+        "worst", "clearance, m", "collisions", "smooth", "length, m", "acceleration / jerk, RMS",
     ]  # fmt: skip
     scenes.print_table("planning, start included", names, rows)
     names = [

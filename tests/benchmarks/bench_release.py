@@ -39,19 +39,13 @@ from release.package.sources import Source
 from release.package.stage import run
 from specimens import Scene, make_flight, paint
 
-NUM_POOL, NUM_POINTS, NUM_WORKERS = (
-    8,
-    700,
-    2,
-)  # pictures; frames of a flight, as the paper's have, of which 400 are released
+# Pictures; frames of a flight, as the paper's have, of which 400 are released.
+NUM_POOL, NUM_POINTS, NUM_WORKERS = 8, 700, 2
 FRAMES_RELEASED = 400
 STORED: tuple[FrameFile, ...] = ("rgb", "instance")  # as they are; depth is compressed
 SIZES = {"speed": (1280, 720), "memory": (32, 18)}
 MB = 1e6
-COPIES = {
-    "plain copy": 0,
-    "copy, 2 digests": 2,
-}  # of each byte: its file's, held against its record, and that of what is written
+COPIES = {"plain copy": 0, "copy, 2 digests": 2}  # of each byte: its file's, and that of what is written
 
 
 def make_tree(root: Path, num_released: int, size_px: tuple[int, int]) -> Path:
@@ -106,7 +100,7 @@ def copy_flight(folder: Path, target: Path, num_digests: int) -> int:
     """Copy the first FRAMES_RELEASED frames of a flight into one file; gives its bytes.
 
     Args:
-        num_digests: 0; 1: a sha256 of each file; 2: and one of what is written.
+        num_digests: 0; 2: a sha256 of each file, and one of what is written.
     """
     whole = hashlib.sha256()
     with open(target, "wb") as out:
@@ -118,8 +112,7 @@ def copy_flight(folder: Path, target: Path, num_digests: int) -> int:
                         continue
                     data = picture.read()
                 hashlib.sha256(data).digest()
-                if num_digests > 1:
-                    whole.update(data)
+                whole.update(data)
                 out.write(data)
         out.flush()
         os.fsync(out.fileno())
@@ -140,9 +133,7 @@ def copy(tree: Path, out: Path, workers: int, num_digests: int) -> tuple[float, 
 def measure_speed(num_frames: int, folder: Path, rounds: int) -> None:
     tree = make_tree(folder, num_frames, SIZES["speed"])
     print(f"{'':24}{'seconds':>9}{'CPU s':>9}{'MB':>9}{'MB/s':>9}{'frames/s':>10}")
-    shares: dict[str, list[tuple[float, float]]] = {
-        name: [] for name in COPIES
-    }  # of the copy's rate: on the clock, by CPU
+    shares = {name: list[tuple[float, float]]() for name in COPIES}  # of the copy's rate: on the clock, by CPU
     for number in range(rounds):
         rows = []
         for name in list(reversed((*COPIES, "build")))[:: -1 if number % 2 else 1]:  # none always has the quieter disk
@@ -156,9 +147,8 @@ def measure_speed(num_frames: int, folder: Path, rounds: int) -> None:
             shutil.rmtree(out)
             os.sync()
         for name, seconds, stored, used_s in rows:
-            print(
-                f"{name:24}{seconds:9.2f}{used_s:9.2f}{stored:9.0f}{stored / seconds:9.0f}{num_frames / seconds:10.0f}"
-            )
+            rate, pace = stored / seconds, num_frames / seconds
+            print(f"{name:24}{seconds:9.2f}{used_s:9.2f}{stored:9.0f}{rate:9.0f}{pace:10.0f}")
         rates = {name: (stored / seconds, stored / used_s) for name, seconds, stored, used_s in rows}
         for name, own in shares.items():
             own.append((rates["build"][0] / rates[name][0], rates["build"][1] / rates[name][1]))

@@ -4,12 +4,11 @@ samples.
     P=tests/benchmarks/bench_training.py
     python $P --shape 2b --batch 16              on an accelerator
     python $P --batch 2 --steps 3                on a CPU: a tiny shape, to see that it runs
-    python $P --shape 2b --batch 8 --way plain   plain transformers and peft, for comparison
     torchrun --nproc-per-node 4 $P --shape 2b --batch 64 --micro 16
     python $P --shape 2b --check                 loss and gradients against plain, in float32; `--kept FILE` keeps them
     python $P --shape 2b --check --dtype bfloat16 --kept FILE    bfloat16 and the fast kernels against what was kept
 
-`--way ours` takes the project's own steps: features of pictures kept, logits for a few answer tokens at a time, rows by
+Steps are the project's own: features of pictures kept, logits for a few answer tokens at a time, rows by
 length. Pictures are noise in memory: what reading takes tells `cosfly distill train` on a tree (`waited_share` in its
 log). The first steps compile kernels and are not counted.
 """
@@ -53,6 +52,7 @@ WORDS = {"2b": (660, 250), "tiny": (80, 40)}  # of prompt and answer
 PICTURES = 5
 IMAGE, END, PAD, FIRST_WORD = 3, 1, 0, 10  # token numbers of the made-up vocabulary
 WARM_UP = 3
+ANSWER_TOKENS = 512  # whose logits exist at a time
 
 
 class Words:
@@ -127,7 +127,7 @@ def plain_loss(student: Student, rows: list[EncodedSample], patches: Any) -> Any
     return student.model(**inputs, pixel_values=patches.to(student.device), use_cache=False).loss * count
 
 
-def backward(student: Student, way: str, rows: list, features: VisionFeatures, chunk: int) -> float:
+def backward(student: Student, way: str, rows: list, features: VisionFeatures) -> float:
     encoded, pictures = [row for row, _ in rows], [picture for _, found in rows for picture in found]
     if way == "plain":
         with student.computing():
@@ -135,7 +135,7 @@ def backward(student: Student, way: str, rows: list, features: VisionFeatures, c
     else:
         plan = features.plan()
         features.take([noise_of(picture, student.dtype) for picture in features.wanted(plan, pictures)])
-        loss, _ = answer_loss(student, encoded, features.of(pictures), chunk)
+        loss, _ = answer_loss(student, encoded, features.of(pictures), ANSWER_TOKENS)
     loss.backward()
     features.end_step()
     return float(loss.detach())
@@ -143,15 +143,9 @@ def backward(student: Student, way: str, rows: list, features: VisionFeatures, c
 
 def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
     shape, dtype = arguments.shape, compute_dtype(arguments.dtype, ranks.device)
-    cfg = TrainConfig(
-        batch_size=arguments.micro or arguments.batch, samples_per_step=arguments.batch,
-        gradient_checkpointing=arguments.checkpointing,
-    )  # fmt: skip
+    cfg = TrainConfig(batch_size=arguments.micro or arguments.batch, samples_per_step=arguments.batch)
     student = add_adapter(make_student(shape, ranks.device, dtype), cfg, 0)
-    if arguments.way == "ours" and arguments.norms == "fused":
-        fuse_norms(student.core)
-    if cfg.gradient_checkpointing:
-        student.model.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
+    fuse_norms(student.core)
     student.model.train()
     optimizer = make_optimizer(student, cfg)
     parameters = [p for p in student.model.parameters() if p.requires_grad]
@@ -163,7 +157,7 @@ def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
         ranks.total([0.0])  # all begin a step together
         begun_s = time.perf_counter()
         for start in range(0, len(rows), cfg.batch_size):
-            backward(student, arguments.way, rows[start : start + cfg.batch_size], features, arguments.chunk)
+            backward(student, "ours", rows[start : start + cfg.batch_size], features)
         ranks.add_gradients(parameters)
         torch.nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()
@@ -175,11 +169,11 @@ def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
             tokens += sum(len(row) for row, _ in rows)
     (all_tokens,) = ranks.total([float(tokens)])
     return {
-        "way": arguments.way, "shape": shape, "parameters": sum(p.numel() for p in student.model.parameters()),
+        "shape": shape, "parameters": sum(p.numel() for p in student.model.parameters()),
         "processes": ranks.size, "samples_per_step": arguments.batch, "batch_size": cfg.batch_size,
-        "dtype": str(dtype),
-        "step_s": round(seconds / arguments.steps, 4), "tokens_per_s": round(all_tokens / seconds, 1),
-        "memory_gb": round(used_gb(ranks.device), 2), "pictures_looked_at": features.num_encoded,
+        "dtype": str(dtype), "step_s": round(seconds / arguments.steps, 4),
+        "tokens_per_s": round(all_tokens / seconds, 1), "memory_gb": round(used_gb(ranks.device), 2),
+        "pictures_looked_at": features.num_encoded,
     }  # fmt: skip
 
 
@@ -197,7 +191,7 @@ def check(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
     rows = make_rows(arguments.shape, 2, 0)
 
     def gradients_of(way: str) -> dict[str, torch.Tensor]:
-        loss = backward(student, way, rows, VisionFeatures(student), arguments.chunk)
+        loss = backward(student, way, rows, VisionFeatures(student))
         gradients = {name: parameter.grad.float().cpu() for name, parameter in learned.items()}
         student.model.zero_grad(set_to_none=True)
         return {"loss": torch.tensor(loss)} | gradients
@@ -231,15 +225,11 @@ def check(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shape", choices=SHAPES, default="tiny")
-    parser.add_argument("--way", choices=("ours", "plain"), default="ours")
     parser.add_argument("--batch", type=int, default=4, help="samples of a step, over all processes")
     parser.add_argument("--micro", type=int, default=0, help="samples of a forward pass; 0: all of the step")
-    parser.add_argument("--chunk", type=int, default=512, help="answer tokens whose logits exist at a time")
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--dtype", choices=("auto", "float32", "bfloat16"), default="auto")
-    parser.add_argument("--checkpointing", action="store_true")
     parser.add_argument("--same", action="store_true", help="the same samples in every step: all features are kept")
-    parser.add_argument("--norms", choices=("fused", "library"), default="fused", help="of ours, who computes norms")
     parser.add_argument("--check", action="store_true")
     parser.add_argument("--kept", help="a safetensors file of a float32 check's gradients and adapter")
     arguments = parser.parse_args()
