@@ -1,6 +1,5 @@
 """A headless Chromium over a pair of pipes, for pages that run a script: no driver, no port, no package."""
 
-import base64
 import contextlib
 import json
 import os
@@ -74,16 +73,9 @@ class Page:
         line, self.buffer = self.buffer.split(b"\0", 1)
         return json.loads(line)
 
-    def open(
-        self, path: Path | str, fragment: str = "", *, width: int = 1400, height: int = 1000, dark: bool = False
-    ) -> None:
-        self.send(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
-        )
-        self.send(
-            "Emulation.setEmulatedMedia",
-            features=[{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}],
-        )
+    def open(self, path: Path | str, fragment: str = "") -> None:
+        self.send("Emulation.setDeviceMetricsOverride", width=1400, height=1000, deviceScaleFactor=1, mobile=False)
+        self.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
         self.send("Page.navigate", url="about:blank")
         self.wait("location.href === 'about:blank'")  # a page that follows at once is answered never, now and then
         self.send("Page.navigate", url=(path if isinstance(path, str) else path.absolute().as_uri()) + fragment)
@@ -94,18 +86,17 @@ class Page:
         assert "exceptionDetails" not in got, got["exceptionDetails"]
         return got["result"].get("value")
 
-    def press(self, key: str, modifiers: int = 0) -> None:
-        """Press a key; modifiers: 2 is Ctrl, 8 Shift."""
+    def press(self, key: str) -> None:
         for kind in ("keyDown", "keyUp"):
-            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key, modifiers=modifiers)
+            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key)
 
     def mouse(self, kind: str, x: float, y: float, button: str = "left", **more: Any) -> None:
         """Move, press, release or turn the wheel: kind is mouseMoved, mousePressed, mouseReleased, mouseWheel."""
         self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, **more)
 
-    def click(self, x: float, y: float, count: int = 1) -> None:
+    def click(self, x: float, y: float) -> None:
         for kind in ("mousePressed", "mouseReleased"):
-            self.mouse(kind, x, y, clickCount=count)
+            self.mouse(kind, x, y, clickCount=1)
 
     def drag(self, begin: tuple[float, float], end: tuple[float, float], button: str = "left", steps: int = 5) -> None:
         self.mouse("mousePressed", *begin, button, clickCount=1)
@@ -119,9 +110,6 @@ class Page:
         while not self.run(script):
             assert time.monotonic() < end, f"never true: {script}; {self.said}"
             time.sleep(0.02)
-
-    def picture(self) -> bytes:
-        return base64.b64decode(self.send("Page.captureScreenshot", format="png", captureBeyondViewport=True)["data"])
 
 
 @contextlib.contextmanager

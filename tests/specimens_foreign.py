@@ -26,7 +26,6 @@ def write_foreign_tree(
     trajectories: tuple[str, ...] = ("trajectory_1777083733",),
     variants: tuple[str, str] = ("ORI", "aug_001"),
     num_points: int = 16,
-    start_s: float = 7.5,
     files: tuple[str, ...] = ("rgb.png", "depth.npy", "instance.png"),
 ) -> Path:
     """Write every trajectory into every town, clean and perturbed, and give the root."""
@@ -35,7 +34,7 @@ def write_foreign_tree(
             is_clean = variant == variants[0]
             folder = root / town / trajectory / variant
             poses, people = _motion(num_points, k, is_clean)
-            points = [_point(i, poses, people, start_s, is_clean) for i in range(num_points)]
+            points = [_point(i, poses, people, 7.5, is_clean) for i in range(num_points)]
             for i, point in enumerate(points):
                 _write_frame(folder / "frames_playback" / f"frame_{i:05d}", poses[i], point, files)
             folder.joinpath("trajectory.json").write_text(json.dumps(_header(variant, is_clean, k, points)))

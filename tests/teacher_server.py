@@ -1,14 +1,11 @@
 """A real HTTP server on 127.0.0.1 that speaks chat completions and misbehaves on demand.
 
 Its answers are a function of the request alone, so that two runs that ask the same get the same. A fault is chosen per
-request by a function (number of the request, body) -> name or None; FAULTS lists the names.
+request by a function (number of the request, body) -> name or None.
 """
 
 import contextlib
-import hashlib
 import json
-import socket
-import struct
 import threading
 import time
 from collections.abc import Callable
@@ -33,28 +30,12 @@ CHINESE = {
     "reasoning_trace": "视线通畅且运动规律，因此该动作可将目标保持在画面内。",
 }
 
-# Faults of the transport and the protocol; the rest are faults of the text.
-STATUS_FAULTS = {"429": 429, "500": 500, "503": 503, "401": 401, "404": 404, "413": 413}
+# Faults of the text; those of the protocol are a status, "empty_choices", "echo_key" and "wrong_therefore".
 TEXT_FAULTS: dict[str, Callable[[dict], str]] = {
-    "prose": lambda answer: "Here is my decision:\n" + json.dumps(answer) + "\nI hope this helps.",
-    "fence": lambda answer: "```json\n" + json.dumps(answer) + "\n```",
-    "thinking": lambda answer: "<think>{maybe}</think>" + json.dumps(answer),
-    "control": lambda answer: json.dumps(answer).replace("pedestrian", "pedes\x0ftrian"),
-    "comma": lambda answer: json.dumps(answer)[:-1] + ",}",
     "wrong_shape": lambda answer: json.dumps({"decision": answer["flight_decision"], "why": "because"}),
     "wrong_decision": lambda answer: json.dumps(answer | {"flight_decision": "do a barrel roll"}),
     "short": lambda answer: json.dumps(answer | {"reasoning_trace": "ok"}),
-    "cut": lambda answer: json.dumps(answer)[:60],
-    "no_room": lambda answer: json.dumps(answer)[:60],
-    "empty_text": lambda answer: "",
 }
-FAULTS = (
-    *STATUS_FAULTS, *TEXT_FAULTS, "reset", "truncated_body", "not_json", "false_gzip", "empty_choices", "null_content",
-    "slow", "drip",
-    "schema_refused", "schema_ignored", "wrong_mirror_decision", "wrong_mirror_number", "wrong_therefore",
-    "echo_key",
-)  # fmt: skip
-
 Fault = Callable[[int, dict], str | None]
 
 
@@ -84,7 +65,6 @@ class TeacherServer:
         respond: Callable[[dict], tuple[int, dict] | Sent | Wild | None] | None = None,
         model_facts: dict | None = None,
         list_models: Callable[[], Sent | Wild | None] | None = None,
-        port: int = 0,
     ) -> None:
         """
         Args:
@@ -101,7 +81,7 @@ class TeacherServer:
         self.most_at_once = 0
         self.active = 0
         self._lock = threading.Lock()
-        self._server = ThreadingHTTPServer(("127.0.0.1", port), _handler(self))
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(self))
         self._server.daemon_threads = True
         self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
 
@@ -129,9 +109,6 @@ class TeacherServer:
         with self._lock:
             self.active -= 1
 
-    def digests(self) -> list[str]:
-        return [hashlib.sha256(body).hexdigest() for body in self.bodies]
-
 
 def kept_answers(out: Path) -> list[dict]:
     lines = [record for path in sorted((out / "answers").glob("*.jsonl")) for record in Journal(path).read()]
@@ -153,16 +130,10 @@ def _decision_by_seed(body: dict) -> str:
 def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None) -> dict:
     if is_mirror(body):
         english = json.loads(body["messages"][-1]["content"])
-        decision = "hover" if fault == "wrong_mirror_decision" else english["flight_decision"]
-        reasons = CHINESE["reasoning_trace"]
-        if fault == "wrong_mirror_number":
-            reasons = reasons.replace("。", "，距离为 77.7 米。")
-        return {**CHINESE, "reasoning_trace": reasons, "flight_decision": decision}
+        return {**CHINESE, "flight_decision": english["flight_decision"]}
     schema = body.get("response_format", {}).get("json_schema", {}).get("schema", {})
     allowed = schema.get("properties", {}).get("flight_decision", {}).get("enum", TOKENS)
-    decision = server.decision(body)
-    if len(allowed) == 1 and fault != "schema_ignored":
-        decision = allowed[0]
+    decision = allowed[0] if len(allowed) == 1 else server.decision(body)
     therefore = "hover" if fault == "wrong_therefore" and decision != "hover" else decision
     fields = {"therefore": therefore} if "therefore" in json.dumps(body) else {}  # students are not asked for it
     # Students are asked in both languages.
@@ -200,67 +171,27 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
 
         def _complete(self, number: int, body: dict) -> None:
             fault = server.fault(number, body)
-            assert fault is None or fault in FAULTS, fault
             time.sleep(server.delay_s)
             responded = server.respond(body) if server.respond is not None else None
             if responded is not None:
                 self._send_anything(responded)
-            elif fault in STATUS_FAULTS:
-                extra = {"Retry-After": "0.05"} if fault == "429" else {}
-                self._send(STATUS_FAULTS[fault], {"error": {"message": f"planted {fault}"}}, extra)
+            elif fault is not None and fault.isdecimal():
+                self._send(int(fault), {"error": {"message": f"planted {fault}"}})
             elif fault == "echo_key":
                 self._send(401, {"error": {"message": f"bad key {self.headers['Authorization']}"}})
-            elif fault == "schema_refused" and "response_format" in body:
-                self._send(400, {"error": {"message": "response_format is not supported"}})
-            elif fault == "reset":
-                # SO_LINGER 0: close sends RST, which the client sees as "connection reset by peer".
-                self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-                self.connection.close()
-                self.close_connection = True
-            elif fault == "not_json":
-                self._send_bytes(200, b"<html>hello</html>")
-            elif fault == "false_gzip":
-                self._send_bytes(200, b"hello", {"Content-Encoding": "gzip"})
             elif fault == "empty_choices":
                 self._send(200, {"choices": []})
-            elif fault == "null_content":
-                self._send(200, {"choices": [{"message": {"role": "assistant", "content": None}}]})
             else:
-                if fault == "slow":
-                    time.sleep(1.0)
                 self._send_answer(body, fault)
 
         def _send_answer(self, body: dict, fault: str | None) -> None:
-            answer = {} if server.text else obedient_answer(server, body, fault)
             write = TEXT_FAULTS.get(fault or "", lambda value: json.dumps(value, ensure_ascii=False))
-            choice = {
-                "index": 0,
-                "message": {"role": "assistant", "content": server.text(body) if server.text else write(answer)},
-            }
-            choice["finish_reason"] = "length" if fault in ("cut", "no_room") else "stop"
-            usage = {"prompt_tokens": 1000, "completion_tokens": body["max_tokens"] if fault == "cut" else 100}
-            reply = {
-                "id": "x", "object": "chat.completion", "model": body["model"], "choices": [choice], "usage": usage,
-            }  # fmt: skip
-            data = json.dumps(reply, ensure_ascii=False).encode()
-            if fault == "truncated_body":
-                self._send_bytes(200, data[: len(data) // 2])
-            elif fault == "drip":
-                self._drip(data)
-            else:
-                self._send_bytes(200, data)
-
-        def _drip(self, data: bytes) -> None:
-            """Send a byte now and then: a limit on the silence between two bytes never ends it."""
-            self.send_response(200)
-            self.send_header("Content-Length", str(len(data)))
-            self.end_headers()
-            try:
-                for at in range(len(data)):
-                    self.wfile.write(data[at : at + 1])
-                    time.sleep(0.05)
-            except OSError:
-                self.close_connection = True
+            text = server.text(body) if server.text else write(obedient_answer(server, body, fault))
+            choice = {"index": 0, "message": {"role": "assistant", "content": text}, "finish_reason": "stop"}
+            usage = {"prompt_tokens": 1000, "completion_tokens": 100}
+            reply = {"id": "x", "object": "chat.completion", "model": body["model"]}
+            reply |= {"choices": [choice], "usage": usage}
+            self._send_bytes(200, json.dumps(reply, ensure_ascii=False).encode())
 
         def _send_anything(self, sent: tuple[int, dict] | Sent | Wild) -> None:
             if isinstance(sent, Sent):

@@ -10,7 +10,7 @@ from teacher_server import TeacherServer
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig, JudgeConfig
-from caption.teachers.judge import JUDGEMENTS, UNJUDGED, check_judge, gold_conflicts, parse_judgement
+from caption.teachers.judge import JUDGEMENTS, UNJUDGED, check_judge, gold_conflicts, judge_messages, parse_judgement
 from cosfly.formats.captions import read_captions
 from cosfly.runtime.errors import TeacherError
 from specimens import make_playback_tree
@@ -79,6 +79,13 @@ def test_a_label_is_put_in_where_the_text_allows_it(tree, tmp_path):
         assert caption.en.flight_decision == caption.zh.flight_decision == caption.label
 
 
+def test_a_label_is_not_put_under_a_text_that_states_another_decision(tree, tmp_path):
+    captions, _, _ = judged(tree, tmp_path / "out", lambda body: '{"verdict": "FIX_LABEL", "reason": "replace it"}')
+    asked = [c for c in captions if c.judge]  # of the rule teacher, whose text names its decision
+    assert asked
+    assert all(c.judge.overruled_by == "text" and c.repair.rung == "anchored" for c in asked)
+
+
 def test_a_judges_tokens_count_in_the_budget_and_are_shown(tree, tmp_path):
     out, reject = tmp_path / "out", '{"verdict": "REJECT_REGEN", "reason": "no"}'
     with judging_server(lambda body: reject) as server:  # each judgement: 1,000 tokens in, 100 out
@@ -100,16 +107,15 @@ def test_a_judges_tokens_count_in_the_budget_and_are_shown(tree, tmp_path):
     assert f"{1000 * num_asked:,} in, {100 * num_asked:,} out" in (out / "report.html").read_text(encoding="utf-8")
 
 
-def few_conflicts():
-    return [pair for judgement in JUDGEMENTS for pair in [p for p in gold_conflicts() if p[1] == judgement][:12]]
+def test_the_check_tells_a_perfect_judge_and_one_that_always_says_the_same():
+    gold = [pair for judgement in JUDGEMENTS for pair in [p for p in gold_conflicts() if p[1] == judgement][:12]]
+    right = {judge_messages(case, VOCABULARY)[1]["content"]: verdict for case, verdict in gold}
 
-
-def say(verdict):
-    return json.dumps({"verdict": verdict, "reason": "because"})
-
-
-def checked(answer):
-    with judging_server(answer) as server:
-        found = asyncio.run(check_judge(JudgeConfig(url=server.url), VOCABULARY, few_conflicts()))
+    def checked(answer):
+        with judging_server(lambda body: json.dumps({"verdict": answer(body), "reason": "because"})) as server:
+            found = asyncio.run(check_judge(JudgeConfig(url=server.url), VOCABULARY, gold))
         assert server.most_at_once > 4  # not one after the other
-        return found
+        return found.agreement, found.num_unjudged, found.num_moved, found.first_share
+
+    assert checked(lambda body: right[body["messages"][1]["content"]]) == (1.0, 0, 0, pytest.approx(1 / 3))
+    assert checked(lambda body: JUDGEMENTS[0]) == (pytest.approx(1 / 3), 0, 0, pytest.approx(1 / 3))

@@ -34,8 +34,8 @@ def trees(tmp_path_factory) -> dict[bool, Path]:
     }
 
 
-def frame_of(tree: Path, index: int = 1) -> Path:
-    return read_track(find_tracks(tree)[0]).frame_folder(index)
+def frame_of(tree: Path) -> Path:
+    return read_track(find_tracks(tree)[0]).frame_folder(1)
 
 
 @needs_gl

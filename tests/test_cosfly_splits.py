@@ -16,9 +16,9 @@ from specimens import make_flight
 STEP_S = 0.5
 
 
-def walk(num_points: int, *, begin: tuple[float, float] = (0.0, 0.0), heading_deg: float = 0.0, speed_mps: float = 1.4):
+def walk(num_points: int, *, begin: tuple[float, float] = (0.0, 0.0), heading_deg: float = 0.0):
     time_s = np.arange(num_points) * STEP_S
-    way_m = speed_mps * time_s[:, None] * [np.cos(np.radians(heading_deg)), np.sin(np.radians(heading_deg))]
+    way_m = 1.4 * time_s[:, None] * [np.cos(np.radians(heading_deg)), np.sin(np.radians(heading_deg))]
     return time_s, np.column_stack([way_m + begin, np.full(num_points, 0.9)])
 
 

@@ -11,7 +11,6 @@ from test_renderers_contract import circling, write_inputs
 
 from cosfly.formats.frames import read_meta
 from cosfly.formats.playback import read_track, write_track
-from cosfly.formats.segments import Segment
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.tracks import find_tracks
 from cosfly.render.camera import ZoomConfig, zoomed_deg
@@ -27,9 +26,9 @@ SMALL = {"width_px": 160, "height_px": 90, "town": "Street", "first_timestamp": 
 DYNAMIC = {"mode": "dynamic", "part_s": 2.0, "ramp_s": 1.0}
 
 
-def zoomed(num_frames: int, seed: int = 0, segments: tuple[Segment, ...] = (), **settings: float) -> np.ndarray:
+def zoomed(num_frames: int, **settings: float) -> np.ndarray:
     zoom = ZoomConfig.model_validate({"mode": "dynamic", **settings})
-    return zoomed_deg(110.0, LEVELS, zoom, np.arange(num_frames) * 0.5, segments, np.random.default_rng(seed))
+    return zoomed_deg(110.0, LEVELS, zoom, np.arange(num_frames) * 0.5, (), np.random.default_rng(0))
 
 
 def test_a_field_of_view_outside_0_to_180_is_an_error_and_any_inside_is_taken():

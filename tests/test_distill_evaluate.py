@@ -233,9 +233,9 @@ def place(tmp_path, samples) -> Path:
     return tmp_path
 
 
-def write_predictions(place: Path, records: list[Prediction], name: str = "predictions.jsonl") -> None:
+def write_predictions(place: Path, records: list[Prediction]) -> None:
     lines = [dump_json(record.model_dump(mode="json")) for record in records]
-    (place / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (place / "predictions.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 CFG = EvaluateConfig()
