@@ -2,8 +2,6 @@
 
 import copy
 import math
-import struct
-import zlib
 from collections.abc import Callable
 from typing import Any
 
@@ -175,14 +173,6 @@ def box_of_person(pixels: np.ndarray) -> dict[str, float] | None:
     return dict(zip(BOX, map(float, edges), strict=True))
 
 
-def chunk(name: bytes, data: bytes) -> Callable[[Row], None]:
-    def added(row: Row) -> None:
-        old, crc = row["image"]["bytes"], struct.pack(">I", zlib.crc32(name + data))
-        row["image"]["bytes"] = old[:33] + struct.pack(">I", len(data)) + name + data + crc + old[33:]
-
-    return added
-
-
 def another_camera(row: Row) -> None:
     row["intrinsics"]["fx"] = row["intrinsics"]["fy"] = row["intrinsics"]["fx"] * 1.2
     row["fov_deg"] = round(math.degrees(2 * math.atan(row["width_px"] / (2 * row["intrinsics"]["fx"]))), 6)
@@ -264,10 +254,6 @@ def walk_of_nobody(rows: Rows) -> None:
     walk = clean(rows)[0]["walk"]
     new = walk[:-1] + ("0" if walk[-1] != "0" else "1")
     put(lambda _: [row for row in rows if row["walk"] == walk], walk=new)(rows)
-
-
-def noise(depth: np.ndarray, row: Row) -> np.ndarray:
-    return depth * np.random.default_rng(0).normal(1.0, 0.003, depth.shape)
 
 
 def second_person(pixels: np.ndarray, ids: np.ndarray) -> None:

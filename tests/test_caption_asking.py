@@ -13,7 +13,6 @@ from caption.run import asking
 from caption.run.stage import run
 from cosfly.formats.captions import read_captions
 from cosfly.llm import client
-from cosfly.llm.answers import Answer
 from cosfly.runtime.errors import TeacherError
 from specimens import make_playback_tree
 
@@ -121,12 +120,6 @@ def test_the_quarantine_is_replayed_alone(tree, tmp_path, whole):
     assert (out / "quarantine.jsonl").read_text() == ""
     assert path.read_bytes() == whole
     assert (out / "manifest.json").exists()
-
-
-def record(flight: int, window: int, purpose: str = "free/0") -> Answer:
-    sample_id = f"{f'trajectory_{flight}_ORI'}_frame_{window:05d}"
-    usage = {"prompt_tokens": 10, "completion_tokens": 2}
-    return Answer(key=f"{sample_id}/{purpose}", sample_id=sample_id, purpose=purpose, usage=usage, text="t")
 
 
 def test_the_total_timeout_bounds_all_tries(tree, tmp_path, monkeypatch):

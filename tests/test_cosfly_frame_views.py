@@ -32,11 +32,6 @@ def tree(tmp_path_factory):
     return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 10, with_augmented=False)
 
 
-@pytest.fixture(scope="module")
-def frame(tree):
-    return read_track(find_tracks(tree)[0]).frame_folder(1)
-
-
 # Views, layout, largest side: every count of views, orders that are not the usual one, both layouts and sizes.
 SHAPES = [
     (("rgb",), "separate", 640),

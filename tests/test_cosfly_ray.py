@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
 from crashes import contents, differences
@@ -148,9 +147,9 @@ def test_a_run_has_the_bytes_of_the_local_engine_though_workers_and_nodes_are_lo
     assert differences(products(tmp_path / "cluster"), products(tmp_path / "local")) == []
 
 
-def refused(tmp_path: Path, words: str, watch: Watch, make: Any = make_worker) -> None:
+def refused(tmp_path: Path, words: str, watch: Watch) -> None:
     with pytest.raises(EnvironmentMissing, match=words) as caught:
-        run_items(stage_in(tmp_path), items_of("nothing"), make, (tmp_path / "s",), workers=1, watch=watch)
+        run_items(stage_in(tmp_path), items_of("nothing"), make_worker, (tmp_path / "s",), workers=1, watch=watch)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "s/manifest.json").exists()
 

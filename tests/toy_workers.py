@@ -76,13 +76,6 @@ def make_idle_worker(folder: Path):
     return work
 
 
-def make_broken_worker():
-    class Local(Exception):  # no process but this one can make another
-        pass
-
-    raise Local("the GPU is on fire")
-
-
 def make_talking_worker():
     def work(item: Item) -> Outcome:
         logging.getLogger("cosfly.demo").info("%s speaks of %d", item.item_id, 7)
