@@ -76,10 +76,6 @@ def load_all() -> None:
     warm_up(PlanConfig(planner="foresight"))
 
 
-def _base(place: Place) -> Path:
-    return place.do("run", place.root / "base")
-
-
 def _walk(place: Place) -> Path:
     tree = Path(place.given("base")) / "render"
     return next(tree.glob("Town*/trajectory_*")).relative_to(tree)
@@ -93,36 +89,12 @@ def _students(place: Place) -> Path:
     return make_place(place.root / "students")
 
 
-def _flown(place: Place) -> Path:
-    return place.do("fly", place.root / "flown")
-
-
-def _erred(place: Place) -> Path:
-    return place.do("fly", place.root / "erred", "--student random")
-
-
-def _trained(place: Place) -> Path:
-    return place.do("distill train", place.root / "trained")
-
-
-def _inferred(place: Place) -> Path:
-    return place.do("distill infer", place.root / "inferred")
-
-
-def _evaluated(place: Place) -> Path:
-    return place.do("distill evaluate", place.root / "evaluated")
-
-
 def _chat_server(place: Place):
     from teacher_server import TeacherServer
 
     server = place.stack.enter_context(TeacherServer())
     server._server.handle_error = lambda *_: None  # type: ignore[method-assign]  # of one that asked and was killed
     return server
-
-
-def _teacher(place: Place) -> str:
-    return _chat_server(place).url
 
 
 def _judge(place: Place) -> str:
@@ -145,9 +117,14 @@ def _simulator(protocol: str, place: Place) -> int:
 
 
 INPUTS: dict[str, Callable[[Place], object]] = {
-    "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated,
-    "erred": _erred, "flown": _flown, "walk": _walk, "teacher": _teacher, "judge": _judge,
-    "carla": partial(_simulator, "carla"), "unrealcv": partial(_simulator, "unrealcv"),
+    "base": lambda place: place.do("run", place.root / "base"), "walk": _walk, "students": _students,
+    "trained": lambda place: place.do("distill train", place.root / "trained"),
+    "inferred": lambda place: place.do("distill infer", place.root / "inferred"),
+    "evaluated": lambda place: place.do("distill evaluate", place.root / "evaluated"),
+    "flown": lambda place: place.do("fly", place.root / "flown"),
+    "erred": lambda place: place.do("fly", place.root / "erred", "--student random"),
+    "teacher": lambda place: _chat_server(place).url, "judge": _judge, "carla": partial(_simulator, "carla"),
+    "unrealcv": partial(_simulator, "unrealcv"),
 }  # fmt: skip
 
 TRAINING = (
