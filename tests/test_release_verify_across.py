@@ -1,14 +1,9 @@
-"""Parts of `release verify`: flights against each other, neighbouring pictures, and what is measured in one."""
-
-from dataclasses import replace
+"""Parts of `release verify`: flights against each other, and what is measured in a picture."""
 
 import numpy as np
 import pytest
 from tables import each
 
-from cosfly.geometry.reprojection import Agreement
-from release.flight_rows import FlightRows
-from release.verify import scene
 from release.verify.across import Summary, check_across
 from release.verify.findings import Findings
 from release.verify.scene import PERSON, SKY, survey
@@ -39,46 +34,6 @@ def test_flights_that_do_not_fit_each_other_are_found(change, codes):
     findings = Findings()
     check_across([flight(1), flight(2, **change)], by_town=False, both=False, findings=findings)
     assert [code for _, code in findings.kinds] == codes
-
-
-WHOLE = Agreement(
-    seen=2000, agree=2000, hidden=0, through=0, same=2000, planes=1700, shifted=0, renamed=0, error=0.0,
-    error_flat=0.0, error_standing=0.0, seen_back=2000, through_back=0
-)  # fmt: skip
-
-
-@each(("change", "code"), [
-    ({}, None), ({"renamed": 34}, "scene_instance"), ({"same": 1800}, "scene_instance"),
-    ({"shifted": 20}, "scene_depth"),
-    ({"agree": 200, "hidden": 1800, "same": 200}, None), ({"through": 60}, "scene_depth"),
-    ({"through_back": 60}, "scene_depth"),
-    ({"error": 0.001}, "scene_depth"),
-    ({"error_flat": 0.0001, "error_standing": 0.001}, None),
-])  # fmt: skip
-def test_neighbouring_frames_show_one_world(change, code):
-    found = [WHOLE] * 20
-    found[12] = replace(WHOLE, **change)
-    rows = [
-        {"frame_index": k, "target_mask_bbox": dict.fromkeys(("xmin_px", "ymin_px", "xmax_px", "ymax_px"), 9.0)}
-        for k in range(21)
-    ]
-    findings = Findings()
-    pairs = [(k, 1, pair) for k, pair in enumerate(found, 1)]
-    scene._judge_pairs(FlightRows("run/Town/trajectory/ORI", rows, given_id="trajectory_ORI"), pairs, findings)
-    assert [kind.code for kind in findings.kinds.values()] == [code] * (code is not None)
-
-
-@each(
-    ("name", "error", "is_found"),
-    [("error_flat", 1e-6, False), ("error_flat", 8e-5, True), ("error_standing", 3e-5, False),
-        ("error_standing", 1.8e-4, True)],
-)  # fmt: skip
-def test_planes_keep_their_place_through_a_flight(name, error, is_found):
-    """8e-5 is of depth set off by 0.3 m, 1.8e-4 of depth scaled by 2 %."""
-    findings = Findings()
-    flight = FlightRows("run/Town/trajectory/ORI", [{"frame_index": 0}])
-    scene._judge_scale(flight, [(0, 1, replace(WHOLE, **{name: error}))] * 9, findings)
-    assert [kind.code for kind in findings.kinds.values()] == ["scene_depth"] * is_found
 
 
 FAR_M = np.float32(1000.0)
