@@ -27,22 +27,6 @@ def edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new), encoding="utf-8")
 
 
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory) -> Path:
-    return make_playback_tree(tmp_path_factory.mktemp("tree"), 3, 14)
-
-
-@pytest.fixture
-def mine(tmp_path) -> Path:
-    """Prompts with another system text and another order of lines, which say the same things."""
-    folder = export(tmp_path / "mine")
-    for name in ("system_en", "system_zh", "system_slots_en", "system_prose_en"):
-        with (folder / f"{name}.txt").open("a", encoding="utf-8") as file:
-            file.write(OWN_LINE + "\n")
-    edit(folder / "user_en.txt", "Velocity: [$speed]", "SPEED [${speed}] 100 % $$1")
-    return folder
-
-
 def test_what_is_exported_is_what_ships(tmp_path):
     folder = tmp_path / "mine"
     result = invoke("caption prompts --export", folder)
@@ -77,8 +61,13 @@ def test_all_problems_are_told_at_once(tmp_path, caplog):
         own_prompts(tmp_path / "nowhere")
 
 
-def test_captions_are_asked_with_them_and_keep_them(tree, mine, tmp_path):
-    out = tmp_path / "out"
+def test_captions_are_asked_with_them_and_keep_them(tmp_path):
+    """Another system text and another order of lines, which say the same things."""
+    mine, tree, out = export(tmp_path / "mine"), make_playback_tree(tmp_path / "tree", 3, 14), tmp_path / "out"
+    for name in ("system_en", "system_zh", "system_slots_en", "system_prose_en"):
+        with (mine / f"{name}.txt").open("a", encoding="utf-8") as file:
+            file.write(OWN_LINE + "\n")
+    edit(mine / "user_en.txt", "Velocity: [$speed]", "SPEED [${speed}] 100 % $$1")
     product = run(CaptionConfig(prompts=mine), tree, out, workers=2)
     for caption in read_captions(product):
         assert caption.prompt["en"].system.endswith(OWN_LINE.replace("$$", "$"))

@@ -55,12 +55,6 @@ def ground_in(parts: np.ndarray) -> WalkableGround:
     return WalkableGround(grid, grid, parts, np.zeros(parts.shape, np.uint8), Ground.flat(0.0), costs_of(1, 1))
 
 
-@pytest.fixture
-def map_file(tmp_path: Path) -> Path:
-    write_boxes(tmp_path / "step2_simplified.json", town())
-    return tmp_path / "step2_simplified.json"
-
-
 def write_roi(path: Path, points: list) -> Path:
     path.write_text(json.dumps({"description": "", "closed": True, "points_world": points}))
     return path
@@ -159,7 +153,9 @@ def test_a_detour_is_given_up_and_counted():
     assert sum(w.retries["detour"] for w in free_walks) == 0
 
 
-def test_the_stage_writes_paths_report_and_picture(map_file, tmp_path):
+def test_the_stage_writes_paths_report_and_picture(tmp_path):
+    write_boxes(tmp_path / "step2_simplified.json", town())
+    map_file = tmp_path / "step2_simplified.json"
     roi = write_roi(tmp_path / "roi.json", [[2, 2], [158, 2], [158, 140], [2, 140]])
     product = run(PedestriansConfig(num_paths=3), map_file, tmp_path / "out", seed=7, roi=roi)
     paths = read_paths(product)

@@ -70,21 +70,16 @@ def inputs(tmp_path_factory):
     return folder / "map.json", folder / "path.json"
 
 
-@pytest.fixture(scope="module")
-def made(inputs, tmp_path_factory):
-    out = tmp_path_factory.mktemp("made") / "compare"
+def test_the_record_is_what_the_flights_are(inputs, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out") / "compare"
     compare.run(CFG, *inputs, out)
-    return out
-
-
-def test_the_record_is_what_the_flights_are(made):
-    record = json.loads((made / "compare.json").read_text())
-    manifest = json.loads((made / "manifest.json").read_text())
+    record = json.loads((out / "compare.json").read_text())
+    manifest = json.loads((out / "manifest.json").read_text())
     assert manifest["counts"] == {"input": 3, "kept": 2, "dropped": {}, "failed": {"no_path": 1}}
     assert record["skipped"][0]["id"] == "into_wall"
     assert [row["id"] for row in record["scenarios"]] == ["a", "b"]
     for planner in ("track_astar", "muco"):
-        traces = read_traces(made / f"drone_trace_{planner}.json")
+        traces = read_traces(out / f"drone_trace_{planner}.json")
         assert {trace.planner for trace in traces} == {planner}
         seen = np.mean([trace.visibility.mean() for trace in traces])
         assert record["means"][planner]["five_ray_mean"] == pytest.approx(seen, abs=1e-4)

@@ -228,8 +228,7 @@ def test_the_prefilter_has_three_rules_of_motion_and_sight(name):
     assert planners.drop_reason(worse, CFG, True) == expected[name]
 
 
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory):
+def test_stage_counts_failures_and_does_the_others(tmp_path, tmp_path_factory):
     folder = tmp_path_factory.mktemp("inputs")
     write_boxes(folder / "map.json", town_of(*CANYON, ((60, -40, 20), (5, 5, 20))))
     walks = [
@@ -239,10 +238,7 @@ def inputs(tmp_path_factory):
         walk_along("c", [(90, 0), (50, 0)]),
     ]
     write_paths(folder / "path.json", walks, {"map": "hand", "seed": 0})
-    return folder / "map.json", folder / "path.json"
-
-
-def test_stage_counts_failures_and_does_the_others(inputs, tmp_path):
+    inputs = folder / "map.json", folder / "path.json"
     product = planners.run(CFG, *inputs, tmp_path / "plan")
     traces = read_traces(product)
     assert [trace.path_id for trace in traces] == ["a", "b", "c"]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cosfly.pipeline.reproduce import OF_RELEASE, MissingFile, Paper, Places, read_paper
+from cosfly.pipeline.reproduce import OF_RELEASE, MissingFile, Places, read_paper
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import write_json
@@ -34,12 +34,8 @@ TABLES = """
 LABELS = [f"fig:{name}" for name in FIGURES.split()] + [f"tab:{name}" for name in TABLES.split()]
 
 
-@pytest.fixture(scope="module")
-def paper() -> Paper:
-    return read_paper()
-
-
-def test_every_table_and_figure_of_the_paper_is_told_or_left_out_with_why(paper):
+def test_every_table_and_figure_of_the_paper_is_told_or_left_out_with_why():
+    paper = read_paper()
     told = [*paper.settings, *paper.tables, *(table.also for table in paper.tables.values())]
     told += [SHAPES[key][1] for key in OF_RELEASE]
     left = [label for labels in paper.left_out for label in labels.split(", ")]

@@ -42,11 +42,6 @@ from specimens import make_playback_tree
 
 
 @pytest.fixture(scope="module")
-def ours(tmp_path_factory) -> Path:
-    return make_playback_tree(tmp_path_factory.mktemp("ours"), 1, 6)
-
-
-@pytest.fixture(scope="module")
 def foreign(tmp_path_factory) -> Path:
     return write_foreign_tree(tmp_path_factory.mktemp("foreign"))
 
@@ -85,7 +80,8 @@ DEMANDS = {
 }
 
 
-def test_the_public_reader_can_refuse(ours, tmp_path, subtests):
+def test_the_public_reader_can_refuse(tmp_path, subtests, tmp_path_factory):
+    ours = make_playback_tree(tmp_path_factory.mktemp("ours"), 1, 6)
     tree = copied(ours, tmp_path / "tree")
     path = find_tracks(tree)[0] / "trajectory.json"
     whole = path.read_text()

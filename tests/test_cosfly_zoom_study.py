@@ -1,7 +1,6 @@
 """cosfly/studies/zoom.py: the same flights at every level, and optical against digital zoom."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,8 +21,9 @@ def test_a_longer_lens_shows_the_middle_as_large():
     assert np.tan(np.radians(longer_deg / 2)) == pytest.approx(np.tan(np.radians(55)) / 5)
 
 
-@pytest.fixture(scope="module")
-def studied(tmp_path_factory) -> tuple[Path, str]:
+@pytest.mark.slow
+@needs_gl
+def test_the_target_grows_as_the_lens_does(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
     boxes, simplified, traces = write_inputs(folder / "inputs", [circling(6), circling(5, "path_002"), IN_THE_WALL])
     words = f"study zoom --map {boxes} --simplified {simplified} --traces {traces} --out {folder / 'out'} --every 2"
@@ -31,12 +31,7 @@ def studied(tmp_path_factory) -> tuple[Path, str]:
     sets = [word for setting in settings.split() for word in ("--set", setting)]
     result = CliRunner().invoke(app, [*words.split(), "--workers", "0", *sets])
     assert result.exit_code == 0, result.output
-    return folder / "out", result.output
-
-
-@pytest.mark.slow
-@needs_gl
-def test_the_target_grows_as_the_lens_does(studied):
+    studied = folder / "out", result.output
     out, _ = studied
     found = json.loads((out / "zoom_study.json").read_text())
     levels = found["levels"]

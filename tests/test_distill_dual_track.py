@@ -30,11 +30,6 @@ def dataset(tree, tmp_path_factory) -> Path:
     return dual_track.run(DualTrackConfig(val_fraction=0.25, test_fraction=0.25), [tree], out)
 
 
-@pytest.fixture
-def own_tree(tree, tmp_path) -> Path:
-    return Path(shutil.copytree(tree, tmp_path / "run" / "render"))
-
-
 def samples(dataset: Path) -> dict[str, list[TrackSample]]:
     return {split: list(read_track_samples(dataset, split)) for split in SPLITS}
 
@@ -76,7 +71,8 @@ def test_a_window_holds_both_tracks_frame_by_frame(tree, dataset):
         )
 
 
-def test_a_bad_flight_stops_no_other(own_tree, tmp_path):
+def test_a_bad_flight_stops_no_other(tmp_path, tree):
+    own_tree = Path(shutil.copytree(tree, tmp_path / "run" / "render"))
     flights = sorted(own_tree.glob("*/*/aug_001"))
     (flights[0] / "trajectory.json").write_text("{")
     shutil.rmtree(flights[1].parent / "ORI")

@@ -287,12 +287,8 @@ def make_encoder(folder: Path) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def encoder(tmp_path_factory) -> Path:
-    return make_encoder(tmp_path_factory.mktemp("bert") / "encoder")
-
-
-def test_scores_are_those_of_the_library(encoder):
+def test_scores_are_those_of_the_library(tmp_path_factory):
+    encoder = make_encoder(tmp_path_factory.mktemp("bert") / "encoder")
     import bert_score
 
     texts = [text for frame in FRAMES for text in (text_of(coc_of(sample_of(frame))), sample_of(frame, "zh").answer)]

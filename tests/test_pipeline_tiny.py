@@ -177,12 +177,6 @@ REFUSED_BY = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def tampered(base, tmp_path_factory):
-    """A copy of the run for tests that change a file and put it back."""
-    return shutil.copytree(base, tmp_path_factory.mktemp("tampered") / "run")
-
-
 def kinds_of(out: Path) -> dict[str, list[Path]]:
     kinds: dict[str, list[Path]] = {}
     for path in sorted(p for p in out.rglob("*") if p.is_file() and p.name not in UNBOUND):
@@ -202,7 +196,8 @@ def changed(paths: list[Path], change: str) -> Iterator[Path]:
         paths[0].write_bytes(data)
 
 
-def test_a_changed_file_is_refused_by_the_stages_that_read_it(tampered):
+def test_a_changed_file_is_refused_by_the_stages_that_read_it(base, tmp_path_factory):
+    tampered = shutil.copytree(base, tmp_path_factory.mktemp("tampered") / "run")
     kinds = kinds_of(tampered)
     cases = [(kind, stage) for kind, stages in REFUSED_BY.items() for stage in stages]
     for (kind, stage), change in zip(cases, itertools.cycle(CHANGES)):

@@ -49,12 +49,8 @@ def test_rows_counted_in_pieces_give_the_same_numbers(cuts, groups):
     assert total.numbers([], 12) == numbers_of(ROWS)
 
 
-@pytest.fixture(scope="module")
-def record(built):
-    return read_record(built / "release.json")
-
-
-def test_every_snippet_of_the_card_runs(record, built, tmp_path, monkeypatch):
+def test_every_snippet_of_the_card_runs(built, tmp_path, monkeypatch):
+    record = read_record(built / "release.json")
     datasets = pytest.importorskip("datasets")
     monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
     values: dict = {"FOLDER": str(built)}

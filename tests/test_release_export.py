@@ -46,12 +46,6 @@ def dataset(whole) -> Path:
     return whole / "release" / "dataset"
 
 
-@pytest.fixture(scope="module")
-def spread(tmp_path_factory) -> Path:
-    """Eight frames of each flight, which are spread evenly, as there are no windows to keep."""
-    return make_release(tmp_path_factory.mktemp("spread"), num_frames=8, window=1)
-
-
 def assert_same_flight(found: Path, given: Path) -> None:
     a, b = read_track(given), read_track(found)
     records = (a, b), (a.target, b.target), (a.perturbation, b.perturbation)
@@ -149,7 +143,8 @@ def test_a_state_is_the_motion_that_led_to_a_frame():
     assert np.allclose(states(rows), expected)
 
 
-def test_a_flight_with_gaps_is_several_episodes(spread, tmp_path):
+def test_a_flight_with_gaps_is_several_episodes(tmp_path, tmp_path_factory):
+    spread = make_release(tmp_path_factory.mktemp("spread"), num_frames=8, window=1)
     product = export(config("lerobot"), spread, tmp_path / "out")
     info = json.loads((product / "meta/info.json").read_text())
     episodes = pq.read_table(product / "meta/episodes").to_pylist()

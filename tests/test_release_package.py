@@ -31,11 +31,6 @@ from release.verify.verify import verify
 UNLICENSED = CFG.model_copy(update={"licence": None})
 
 
-@pytest.fixture
-def dataset(built, tmp_path) -> Path:
-    return shutil.copytree(built, tmp_path / "dataset")
-
-
 @pytest.fixture(scope="module")
 def loaded(built, tmp_path_factory):
     os.environ["HF_HUB_OFFLINE"] = "1"
@@ -196,7 +191,8 @@ def test_same_bytes_with_two_workers(release_inputs, built, tmp_path):
     assert all_bytes(build(release_inputs, tmp_path / "two", workers=2)) == all_bytes(built)
 
 
-def test_one_changed_digit_of_the_card_fails_wherever_it_stands(dataset):
+def test_one_changed_digit_of_the_card_fails_wherever_it_stands(built, tmp_path):
+    dataset = shutil.copytree(built, tmp_path / "dataset")
     card = dataset / "README.md"
     text = card.read_text(encoding="utf-8")
     places = [match.start() for match in re.finditer(r"\d", text)]
