@@ -101,10 +101,6 @@ def swapped(choose: Choose, a: int, b: int, *names: str) -> Lie:
     return lambda rows: swap(choose(rows)[a], choose(rows)[b], *names)
 
 
-def swapped_flights(*names: str) -> Lie:
-    return lambda rows: [swap(a, b, *names) for a, b in zip(clean(rows), other_flight(rows), strict=False)] and None
-
-
 def add(name: str, number: float, *members: str) -> Callable[[Row], None]:
     def added(row: Row) -> None:
         if members:
@@ -246,10 +242,6 @@ def frame_mirrored_with_its_boxes(row: Row) -> None:
     box["xmin_px"], box["xmax_px"] = width - box["xmax_px"], width - box["xmin_px"]
 
 
-def another_split(row: Row) -> None:
-    row["split"] = "test" if row["split"] != "test" else "train"
-
-
 def walk_of_nobody(rows: Rows) -> None:
     walk = clean(rows)[0]["walk"]
     new = walk[:-1] + ("0" if walk[-1] != "0" else "1")
@@ -300,7 +292,7 @@ LIES_OF_ROWS: dict[str, Lie] = {
         not_hovering, **dict.fromkeys((*DECISIONS, "label"), "hover"), verdict="CONSISTENT"
     ),
     "hard_conflict_called_soft": change(at(captioned, 1), hard_conflict_called_soft),
-    "split_that_leaks": change(clean, another_split),
+    "split_that_leaks": alter(clean, split=lambda old: "test" if old != "test" else "train"),
     "walk_of_nobody": walk_of_nobody,
     "pair_lost": put(clean, pair=None),
 }  # fmt: skip
@@ -309,7 +301,8 @@ LIES_OF_PIXELS: dict[str, Lie] = {
     "another_camera_all_along": turned(clean, another_camera),
     "box_against_mask": change(at(seen, 1), add("target_mask_bbox", 2.0, "xmin_px", "xmax_px")),
     "target_far_behind_on_its_line": turned(seen, farther_on_its_line),
-    "poses_of_two_flights_exchanged": swapped_flights(*POSES),
+    "poses_of_two_flights_exchanged": lambda rows: [
+        swap(a, b, *POSES) for a, b in zip(clean(rows), other_flight(rows), strict=False)] and None,
     "world_turned": turned(clean, mirrored_world),
     "depth_of_neighbours_exchanged": swapped(perturbed, 4, 5, "depth"),
     "depth_of_the_twin": lambda rows: swap(shifted(rows)[0], twin_of(rows, shifted(rows)[0]), "depth"),

@@ -73,7 +73,7 @@ class TeacherServer:
             list_models: gives what is sent in place of that list; None: the list.
         """
         self.fault, self.models, self.delay_s = fault or (lambda number, body: None), models, delay_s
-        self.decision = decision or _decision_by_seed
+        self.decision = decision or (lambda body: TOKENS[body.get("seed", 0) % len(TOKENS)])
         self.respond, self.model_facts, self.list_models = respond, model_facts or {}, list_models
         self.text: Callable[[dict], str] | None = None  # answers with any text at all, for instance a judge's
         self.bodies: list[bytes] = []
@@ -121,10 +121,6 @@ def refusal(status: int, text: str) -> tuple[int, dict]:
 
 def is_mirror(body: dict) -> bool:
     return isinstance(body["messages"][-1]["content"], str)
-
-
-def _decision_by_seed(body: dict) -> str:
-    return TOKENS[body.get("seed", 0) % len(TOKENS)]
 
 
 def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None) -> dict:

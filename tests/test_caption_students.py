@@ -14,7 +14,7 @@ from teacher_server import TeacherServer
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.students import as_taught
-from cosfly.formats.captions import Caption, read_captions
+from cosfly.formats.captions import read_captions
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE, read_chat_format, write_chat_format
 from cosfly.runtime.errors import ConfigError
 from distill.inference import stage as infer
@@ -57,10 +57,6 @@ def settings(url: str, folder: Path, **changes: Any) -> CaptionConfig:
     })  # fmt: skip
 
 
-def captions_of(place: Path, out: Path, url: str, **changes: Any) -> list[Caption]:
-    return list(read_captions(run(settings(url, place / "trained", **changes), place / "tree", out)))
-
-
 def infer_all(place: Path, url: str, out: Path, **changes: Any) -> list[Sample]:
     samples: list[Sample] = []
     for split in ("train", "val", "test"):
@@ -82,7 +78,8 @@ def test_requests_are_those_of_infer_to_the_byte(place, tmp_path, constrained):
         assert {sample.language for sample in samples} == {"en", "zh"}
         server.bodies.clear()
         student = {"folder": place / "trained", "constrained": constrained}
-        captions = captions_of(place, tmp_path / "captions", server.url, student=student)
+        cfg = settings(server.url, place / "trained", student=student)
+        captions = list(read_captions(run(cfg, place / "tree", tmp_path / "captions")))
         windows = {sample.sample_id for sample in samples}
         assert windows <= {caption.sample_id for caption in captions}
         assert asked <= set(server.bodies)  # and further windows, which the training set left out

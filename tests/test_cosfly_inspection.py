@@ -523,7 +523,9 @@ def other_at(place_m, kind: str = "Pedestrians", number: int = 7) -> BystanderMe
 def test_others_keep_clear_of_drone_and_person(workplace, beside, shift_m, codes):
     flight, report, metrics = read_track(first_flight(workplace)), Report(), {}
     place_m = (flight.positions_m if beside == "drone" else flight.targets_m)[3] + np.array(shift_m)
-    other = other_at(place_m, "Vegetation" if beside == "kind" else "Pedestrians")
+    kind = KINDS["Vegetation" if beside == "kind" else "Pedestrians"]
+    seen = {"world_location": np.asarray(place_m, float), "yaw": 0.0, "half_extents_m": (0.3, 0.3, 0.9)}
+    other = BystanderMeta(instance_id=7, semantic_id=kind, num_pixels=0, **seen)
     told = BystandersMeta(target_hidden_by_others=0.25, target_hidden_by_map=0.0, others=[other])
     check_bystanders(flight, {3: told, 4: told.model_copy(update={"others": []})}, 2.5, report, metrics)
     assert {issue.code for issue in report.issues} == codes

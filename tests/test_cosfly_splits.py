@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosfly.formats.playback import Track, read_track, write_track
+from cosfly.formats.playback import read_track, write_track
 from cosfly.geometry.splits import SPLITS, Course, assign_splits, walks_of
 from cosfly.runtime.errors import InputError
 from specimens import make_flight
@@ -22,12 +22,8 @@ def walk(num_points: int, *, begin: tuple[float, float] = (0.0, 0.0), heading_de
     return time_s, np.column_stack([way_m + begin, np.full(num_points, 0.9)])
 
 
-def course(name: str, points, town: str = "Town01", part: slice = slice(None)) -> Course:
-    return Course(name, town, points[0][part], points[1][part])
-
-
-def course_of(flight: Track, name: str = "") -> Course:
-    return Course(name or flight.trajectory, flight.town, flight.time_s, flight.walked_m)
+def course(name: str, points) -> Course:
+    return Course(name, "Town01", *points)
 
 
 def groups(*courses: Course) -> list[set[str]]:
@@ -46,7 +42,7 @@ def test_perturbed_twins_are_one_walk_once_they_are_read_again(tmp_path):
     for flight in (clean, shifted):
         write_track(tmp_path / "Town01" / flight.trajectory / flight.variant, flight)
     read = [read_track(tmp_path / "Town01" / clean.trajectory / variant) for variant in ("ORI", "aug_001")]
-    one, other = (course_of(flight, flight.variant) for flight in read)
+    one, other = (Course(flight.variant, flight.town, flight.time_s, flight.walked_m) for flight in read)
     assert groups(one, other) == [{"ORI", "aug_001"}]
     assert groups(one, replace(other, target_m=read[1].targets_m)) == [{"ORI"}, {"aug_001"}]  # the shift was real
 

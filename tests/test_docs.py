@@ -109,12 +109,8 @@ def test_paths_exist(page):
             rf"(?<![\w./-])(?:{'|'.join((*FOLDERS, 'docs'))})/[\w./-]*(?:\.(?:py|glsl|txt|md|yaml)\b|/(?![\w<*]))", text
         )
     )
-    assert sorted(word for word in words if not (ROOT / word).exists() and not is_made_by_a_run(word)) == []
-
-
-def is_made_by_a_run(word: str) -> bool:
-    """`release/dataset/` is a folder of a run, not of the repository."""
-    return word in ("release/dataset/", "caption/answers/")
+    of_a_run = {"release/dataset/", "caption/answers/"}  # and not of the repository
+    assert sorted(word for word in words - of_a_run if not (ROOT / word).exists()) == []
 
 
 def test_every_file_of_the_files_page_is_written_by_code():

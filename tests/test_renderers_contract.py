@@ -603,10 +603,6 @@ def with_others(folder: Path, num: int, trace: DroneTrace) -> Path:
     return folder / "others.json"
 
 
-def _red_px(frame: Path) -> int:
-    return int((read_view(frame, "segmentation") == PEDESTRIAN_RGB).all(axis=-1).sum())
-
-
 def test_a_flight_with_others_tells_of_them_in_every_frame(renderer_name, tmp_path):
     opened(renderer_name, street()).close()
     trace = circling(6)
@@ -627,7 +623,8 @@ def test_a_flight_with_others_tells_of_them_in_every_frame(renderer_name, tmp_pa
                 meta.target.visibility + meta.others.target_hidden_by_others + meta.others.target_hidden_by_map
                 == pytest.approx(1.0, abs=1e-5)
             )
-            assert _red_px(flight.frame_folder(i)) == meta.target.num_pixels, "the target alone is red for students"
+            is_red = (read_view(flight.frame_folder(i), "segmentation") == PEDESTRIAN_RGB).all(axis=-1)
+            assert is_red.sum() == meta.target.num_pixels, "the target alone is red for students"
             assert meta.others.others[1].yaw == pytest.approx(-np.degrees(0.3), abs=1e-3), "the tree's axes are CARLA's"
     product = inspect_tree(
         InspectConfig(five_ray_mean_min=0, clearance_min_m=0), inputs[1], inputs[2], tree, tmp_path / "inspect"
