@@ -2,12 +2,13 @@
 
 import json
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 from commands import invoke
 from specimens_captions import VOCABULARY, deciding, report_of, settings
 from tables import each
-from teacher_server import ENGLISH, TeacherServer
+from teacher_server import ENGLISH, TeacherServer, refusal
 
 from caption.run.forecast import make_forecast
 from caption.run.stage import run
@@ -29,60 +30,45 @@ def prompt_tokens(body: dict, seen_images: int) -> int:
     return sum(len(text.split()) for text in texts) + TOKENS_PER_IMAGE * seen_images
 
 
-def patient(
-    *,
-    obeys_schema: bool = True,
-    refuses_schema: bool = False,
-    max_images: int = 15,
-    sees_images: int = 99,
-    thinks: bool = False,
-    counts: bool = True,
-    context: int = CONTEXT,
-    shortens: bool = False,
-    empty: bool = False,
-    status: int = 400,
-    in_parts: bool = False,
-    takes_null: bool = True,
-) -> Callable[[dict], tuple[int, dict]]:
-    """A server's behaviour: what it answers to any request.
+# A sound endpoint. shortens: the answer to fit the context, in silence. status: of a refusal for too many pictures.
+# in_parts: the answer is a list of parts. takes_null: where a field may be null.
+SOUND = {
+    "obeys_schema": True, "refuses_schema": False, "max_images": 15, "sees_images": 99, "thinks": False, "counts": True,
+    "context": CONTEXT, "shortens": False, "empty": False, "status": 400, "in_parts": False, "takes_null": True,
+}  # fmt: skip
 
-    shortens: the answer to fit the context, in silence.
-    status: of a refusal for too many pictures. in_parts: the answer is a list of parts. takes_null: where a field may
-    be null.
-    """
+
+def patient(**defects: Any) -> Callable[[dict], tuple[int, dict]]:
+    """A server's behaviour: what it answers to any request."""
+    own = SimpleNamespace(**SOUND | defects)
 
     def respond(body: dict) -> tuple[int, dict]:
         num_images = images_of(body)
-        if None in body.values() and not takes_null:
-            return 400, {"error": {"message": "Input should be a valid number"}}
-        tokens = prompt_tokens(body, min(num_images, sees_images))
-        if num_images > max_images:
-            return status, {"error": {"message": f"At most {max_images} image(s) may be provided in one prompt."}}
-        if tokens + (0 if shortens else body["max_tokens"]) > context:
-            return 400, {"error": {"message": f"This model's maximum context length is {context} tokens"}}
+        if None in body.values() and not own.takes_null:
+            return refusal(400, "Input should be a valid number")
+        tokens = prompt_tokens(body, min(num_images, own.sees_images))
+        if num_images > own.max_images:
+            return refusal(own.status, f"At most {own.max_images} image(s) may be provided in one prompt.")
+        if tokens + (0 if own.shortens else body["max_tokens"]) > own.context:
+            return refusal(400, f"This model's maximum context length is {own.context} tokens")
         wanted = body.get("response_format", {}).get("json_schema", {}).get("schema")
-        if wanted and refuses_schema:
-            return 400, {"error": {"message": "response_format is not supported"}}
+        if wanted and own.refuses_schema:
+            return refusal(400, "response_format is not supported")
         text = "I am fine, thank you."
-        if wanted and obeys_schema:
-            names = wanted["properties"]
-            odd = {"animal": ODD_WORD, "legs": 7}
+        if wanted and own.obeys_schema:
             plain = {**ENGLISH, **dict.fromkeys(("therefore", "flight_decision"), "hover")}
-            text = json.dumps(odd if "animal" in names else plain)
+            text = json.dumps({"animal": ODD_WORD, "legs": 7} if "animal" in wanted["properties"] else plain)
         elif isinstance(body["messages"][-1]["content"], list) and body["messages"][0]["role"] == "system":
             text = "Here it is: " + json.dumps(dict.fromkeys(ENGLISH, "hover"))
+        text = "" if own.empty else text
         message: dict[str, Any] = {"role": "assistant", "content": text}
-        if thinks:
+        if own.thinks:
             message["reasoning_content"] = "Let me think about that."
-        if empty:
-            message["content"] = ""
-        if in_parts:
-            message["content"] = [{"type": "text", "text": message["content"]}]
-        is_cut = shortens and tokens + body["max_tokens"] > context
-        reply = {"choices": [{"message": message, "finish_reason": "length" if is_cut else "stop"}]}
-        if counts:
-            reply["usage"] = {"prompt_tokens": tokens, "completion_tokens": 5}  # type: ignore[assignment]
-        return 200, reply
+        if own.in_parts:
+            message["content"] = [{"type": "text", "text": text}]
+        is_cut = own.shortens and tokens + body["max_tokens"] > own.context
+        usage = {"usage": {"prompt_tokens": tokens, "completion_tokens": 5}} if own.counts else {}
+        return 200, {"choices": [{"message": message, "finish_reason": "length" if is_cut else "stop"}], **usage}
 
     return respond
 
