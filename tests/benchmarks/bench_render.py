@@ -40,8 +40,6 @@ from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import make_track_script, open_renderer
 from cosfly.render.track import MARGIN_M, render_track
-from cosfly.runtime.events import read_events
-from cosfly.runtime.run_dir import read_manifest
 
 SIZE = (1280, 720)
 FOVS_DEG = (60.0, 90.0)
