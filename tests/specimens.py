@@ -253,28 +253,17 @@ def _write_frame(folder: Path, flight: Track, scene: Scene, i: int) -> None:
 def _meta(flight: Track, i: int, num_pixels: int) -> FrameMeta:
     nowhere = np.zeros(3)
     target = TargetMeta(
-        world_location=flight.targets_m[i],
-        half_extents_m=PERSON_HALF_EXTENTS_M,
-        instance_id=PERSON_ID,
-        semantic_id=KINDS["Pedestrians"],
-        image_uv=None,
-        bbox_2d=None,
-        depth_m=float(flight.target.depth_m[i]),
-        in_view=bool(flight.target.in_view[i]),
-        visible=bool(flight.target.visible[i]),
-        visibility=float(flight.target.visibility[i]),
-        num_pixels=num_pixels,
-    )
+        world_location=flight.targets_m[i], half_extents_m=PERSON_HALF_EXTENTS_M, instance_id=PERSON_ID,
+        semantic_id=KINDS["Pedestrians"], image_uv=None, bbox_2d=None, depth_m=float(flight.target.depth_m[i]),
+        in_view=bool(flight.target.in_view[i]), visible=bool(flight.target.visible[i]),
+        visibility=float(flight.target.visibility[i]), num_pixels=num_pixels,
+    )  # fmt: skip
     return FrameMeta(
         index=i, time_s=float(flight.time_s[i]), town=flight.town, trajectory=flight.trajectory, variant=flight.variant,
         camera=camera_meta(flight.camera, 0.3, SKY_DEPTH_M),
-        drone_pose=np.hstack([flight.positions_m[i], flight.rotations_deg[i]]),
-        target=target,
+        drone_pose=np.hstack([flight.positions_m[i], flight.rotations_deg[i]]), target=target,
         perturbation=PerturbationMeta(
-            position="none",
-            rotation="none",
-            drone_position=nowhere,
-            target_position=nowhere,
+            position="none", rotation="none", drone_position=nowhere, target_position=nowhere,
             drone_rotation=nowhere,
         ),
     )  # fmt: skip

@@ -506,13 +506,6 @@ def test_every_check_has_a_planted_defect():
     assert codes == planted | elsewhere
 
 
-def other_at(place_m, kind: str = "Pedestrians", number: int = 7) -> BystanderMeta:
-    return BystanderMeta(
-        instance_id=number, semantic_id=KINDS[kind], world_location=np.asarray(place_m, float), yaw=0.0,
-        half_extents_m=(0.3, 0.3, 0.9), num_pixels=0,
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize(("beside", "shift_m", "codes"), [
     ("drone", (0.0, 0.0, -1.0), {"clearance"}),
     ("drone", (0.0, 0.0, -8.0), set()),
