@@ -20,8 +20,6 @@ from cosfly.planners.stage import plan_trajectory
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.errors import ConfigError
 
-TOKENS = TOKENS
-LABELS = TABLE
 CONTROLS = read_controls(CONTROLLER_FILE, TOKENS)
 HORIZON = 5  # decisions, 2.5 s, as labels look ahead
 
@@ -66,7 +64,7 @@ def test_a_decision_that_is_flown_for_its_horizon_shows_what_its_own_rule_asks_f
     if token in ("break_off", "return_to_home"):  # orders of a mission; who leaves without one leaves the person
         assert motion.approach_m <= -Thresholds().approach_m
         return
-    shown, _ = LABELS.shown[token]
+    shown, _ = TABLE.shown[token]
     assert shown(motion) >= 1.0, (token, shown(motion), motion)
 
 
