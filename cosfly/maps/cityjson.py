@@ -68,9 +68,7 @@ class CityJsonConfig(Config):
     credits: str = Field("", description="attribution: the model's makers, one sentence or more")
     tool: str = Field("CityJSON", description="tool and version that made the file, for the records")
     solids: bool = Field(True, description="draw solids with their own roofs and walls; planners use the boxes")
-    derive_ground: bool = Field(
-        True, description="derive pavement, asphalt and lawn from the buildings of a model without streets and squares"
-    )
+    derive_ground: bool = Field(True, description="derive streets, pavements and lawn for a model that has no streets")
 
     def inputs(self) -> dict[str, Path]:
         return {"city_model": required(self.path, "maps.cityjson.path")}

@@ -23,7 +23,7 @@ _STEP_Y = np.array([0, 1, 0, -1, 1, 1, -1, -1], dtype=np.int64)
 UNIFORM = np.ones((1, 4), dtype=np.int64)
 
 _UNSEEN, _OPEN, _CLOSED = 0, 1, 2
-TOTAL, TO_GO = range(2)  # columns of the heap's keys
+TOTAL, TO_GO, CELL = range(3)  # columns of the heap
 STRAIGHT, DIAGONAL = range(2)  # columns of the steps
 
 
@@ -76,18 +76,16 @@ def _search(free, origin, target, state, steps, from_direction, classes, costs, 
     halves: a step costs the sum of its two cells."""
     num_y, num_x = free.shape
     target_x, target_y = target % num_x, target // num_x
-    # Estimated total cost, then cost still to go: depth first in a tie.
-    heap_key = np.empty((1024, 2), dtype=np.float64)
-    heap_cell = np.empty(1024, dtype=np.int64)
+    heap = np.empty((1024, 3), dtype=np.float64)  # estimated total, then cost to go: depth first in a tie; the cell
     size = int64(0)
 
     state[origin] = _OPEN
     steps[origin, STRAIGHT] = steps[origin, DIAGONAL] = 0
     from_direction[origin] = -1
-    heap_key, heap_cell, size = _push(heap_key, heap_cell, size, 0.0, 0.0, origin)
+    heap, size = _push(heap, size, 0.0, 0.0, origin)
     while size > 0:
-        cell = heap_cell[0]
-        size = _pop(heap_key, heap_cell, size)
+        cell = int64(heap[0, CELL])
+        size = _pop(heap, size)
         if state[cell] == _CLOSED:
             continue  # an outdated entry of a cell that was improved
         state[cell] = _CLOSED
@@ -119,57 +117,53 @@ def _search(free, origin, target, state, steps, from_direction, classes, costs, 
             left_straight = least * max(apart_x, apart_y) - left_diagonal
             total = (straight + left_straight) + (diagonal + left_diagonal) * SQRT2
             to_go = left_straight + left_diagonal * SQRT2
-            heap_key, heap_cell, size = _push(heap_key, heap_cell, size, total, to_go, neighbour)
+            heap, size = _push(heap, size, total, to_go, neighbour)
     return False
 
 
 @njit(cache=True)
-def _push(heap_key, heap_cell, size, total, to_go, cell):  # pragma: no cover (compiled)
-    """Add an entry to the heap, growing it when full; return the arrays and the new size."""
-    if size == len(heap_cell):
-        grown_key, grown_cell = np.empty((2 * size, 2)), np.empty(2 * size, dtype=np.int64)
-        for k in range(size):
-            grown_key[k, TOTAL], grown_key[k, TO_GO] = heap_key[k, TOTAL], heap_key[k, TO_GO]
-            grown_cell[k] = heap_cell[k]
-        heap_key, heap_cell = grown_key, grown_cell
+def _push(heap, size, total, to_go, cell):  # pragma: no cover (compiled)
+    """Add an entry to the heap, growing it when full; return the heap and the new size."""
+    if size == len(heap):
+        grown = np.empty((2 * size, 3))
+        grown[:size] = heap
+        heap = grown
     place = size
     while place > 0:
         parent = (place - 1) // 2
-        if not _is_before(total, to_go, heap_key[parent, TOTAL], heap_key[parent, TO_GO]):
+        if not _is_before(total, to_go, heap[parent, TOTAL], heap[parent, TO_GO]):
             break
-        _move(heap_key, heap_cell, parent, place)
+        _move(heap, parent, place)
         place = parent
-    heap_key[place, TOTAL], heap_key[place, TO_GO], heap_cell[place] = total, to_go, cell
-    return heap_key, heap_cell, size + 1
+    heap[place, TOTAL], heap[place, TO_GO], heap[place, CELL] = total, to_go, cell
+    return heap, size + 1
 
 
 @njit(cache=True)
-def _pop(heap_key, heap_cell, size):  # pragma: no cover (compiled)
+def _pop(heap, size):  # pragma: no cover (compiled)
     """Remove the first entry of the heap; return the new size."""
     size -= 1
-    total, to_go, cell = heap_key[size, TOTAL], heap_key[size, TO_GO], heap_cell[size]
+    total, to_go = heap[size, TOTAL], heap[size, TO_GO]
     place = 0
     while True:
         child = 2 * place + 1
         if child >= size:
             break
         other = child + 1
-        if other < size and _is_before(
-            heap_key[other, TOTAL], heap_key[other, TO_GO], heap_key[child, TOTAL], heap_key[child, TO_GO]
-        ):
+        if other < size and _is_before(heap[other, TOTAL], heap[other, TO_GO], heap[child, TOTAL], heap[child, TO_GO]):
             child = other
-        if not _is_before(heap_key[child, TOTAL], heap_key[child, TO_GO], total, to_go):
+        if not _is_before(heap[child, TOTAL], heap[child, TO_GO], total, to_go):
             break
-        _move(heap_key, heap_cell, child, place)
+        _move(heap, child, place)
         place = child
-    heap_key[place, TOTAL], heap_key[place, TO_GO], heap_cell[place] = total, to_go, cell
+    _move(heap, size, place)
     return size
 
 
 @njit(cache=True)
-def _move(heap_key, heap_cell, source, place):  # pragma: no cover (compiled)
-    heap_key[place, TOTAL], heap_key[place, TO_GO] = heap_key[source, TOTAL], heap_key[source, TO_GO]
-    heap_cell[place] = heap_cell[source]
+def _move(heap, source, place):  # pragma: no cover (compiled)
+    for column in range(3):
+        heap[place, column] = heap[source, column]
 
 
 @njit(cache=True)

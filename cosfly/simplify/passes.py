@@ -183,7 +183,7 @@ class SimplifyConfig(Config):
 
     merge: bool = Field(True, description="replace clusters of neighbouring boxes by one box")
     merge_by: Literal["gap", "center"] = Field(
-        "gap", description="neighbours: boxes with gaps below merge_gap_m on every axis, or centres so near (SimWorld)"
+        "gap", description="neighbours have near faces, or near centres (SimWorld)"
     )
     # Largest gap on every axis between neighbours by kind, m; None: kinds that are not merged. Canopy parts of
     # simulators are closer than 2 m, wall segments of one building closer than 5 m.
@@ -195,9 +195,7 @@ class SimplifyConfig(Config):
     )
     min_canopy_fill: float = Field(0.5, ge=0.0, le=1.0, description="the same for vegetation, whose crowns are round")
     crop_tree: bool = Field(True, description="split vegetation into trunk and lifted canopy")
-    crop_strategy: Literal["fixed", "adaptive"] = Field(
-        "fixed", description="fixed: split at cut_height_m; adaptive: cut tall vegetation into low pieces (SimWorld)"
-    )
+    crop_strategy: Literal["fixed", "adaptive"] = Field("fixed", description="one cut, or low pieces (SimWorld)")
     cut_height_m: ClassVar[float] = 2.0  # height over the ground of the split, m
     lift_m: ClassVar[float] = 0.5  # how far the canopy is lifted over the cut, m
     trunk: Literal["stem", "full"] = Field("stem", description="below the cut: stems, or full footprints (paper)")
@@ -206,9 +204,7 @@ class SimplifyConfig(Config):
     adaptive_height_m: ClassVar[float] = 5.0  # adaptive: higher vegetation is cut, m
     cell_size_m: ClassVar[float] = 0.5  # adaptive: width of the stem below the lowest cut, m
     crop_below_ground: bool = Field(True, description="drop boxes, except surfaces, with their top below the ground")
-    below_ground: Literal["drop", "clip"] = Field(
-        "drop", description="drop: keep other boxes whole; clip: cut off the part of a box below the ground (SimWorld)"
-    )
+    below_ground: Literal["drop", "clip"] = Field("drop", description="clip: also cut boxes at the ground (SimWorld)")
     prune_nested: bool = Field(True, description="drop boxes inside another of the same kind")
     nested_tolerance_m: float = Field(0.01, ge=0.0, description="how far a nested box may stick out, m")
 
