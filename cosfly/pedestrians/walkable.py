@@ -69,7 +69,7 @@ class PedestriansConfig(Config):
     pace: dict[str, float] = Field({PLAIN_PACE: 1.0}, description=f"share of each pace, to a quota: {', '.join(PACES)}")
     hurry_speed_mps: float = Field(1.6, ge=SLOWEST_SPEED_MPS, description="cruising speed of paces that hurry, m/s")
     others: int = Field(0, ge=0, le=500, description="bystanders around each pedestrian trajectory")
-    look_alikes: int = Field(0, ge=0, le=500, description="bystanders with clothes that differ in one thing only")
+    look_alikes: int = Field(0, ge=0, le=500, description="bystanders dressed as the target but for one thing")
     traffic: int = Field(0, ge=0, le=500, description="cars around each trajectory, where the map has straight roads")
     others_reach_m: ClassVar[float] = 40.0  # greatest distance of bystanders and cars from the trajectory, m
     dt_s: float = Field(
