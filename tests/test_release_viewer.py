@@ -105,10 +105,8 @@ def test_the_page_asks_for_nothing_and_names_its_script(page):
     assert "unsafe-eval" not in policy
     assert len(re.findall(r"<script", text)) == 2  # the data and ours: no text opened a third
     assert not re.search(r"(src|href)=[\"']?(https?:)?//", text)
-    assert all(
-        f"{word}(" not in script[-1] for word in ("innerHTML", "insertAdjacentHTML", "document.write", "eval", "fetch")
-    )
     assert "innerHTML" not in script[-1]
+    assert all(f"{word}(" not in script[-1] for word in ("insertAdjacentHTML", "document.write", "eval", "fetch"))
 
 
 def test_a_release_is_shown_as_its_rows_say(built, tmp_path):

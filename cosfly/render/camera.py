@@ -16,14 +16,12 @@ from cosfly.formats.segments import Segment
 from cosfly.geometry.axes import box_corners, focal_px, mask_box, project
 from cosfly.render.contract import NEAR_M, PERSON_ID, Frame
 from cosfly.runtime.config import Config
+from cosfly.viz.overlay import EDGES
 
 DEPTH_TOLERANCE_M = 0.05  # something this little in front of the target's box does not hide it
 NO_IDS = np.empty(0, np.int64)
 RING_LEAST_PX = 4  # around a person, for the contrast of colours
 MOST_SAMPLES = 40_000  # rays through the target's box; more are thinned evenly
-
-# Pairs of corners (order of geometry.box_corners) that an edge of the box joins.
-_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ def view_target(target_m: np.ndarray, camera_pose: np.ndarray, camera: Camera) -
     corners = box_corners(target_m, np.array(PERSON_HALF_EXTENTS_M))
     corners = (corners - camera_pose[:3, 3]) @ camera_pose[:3, :3]
     seen = [corner for corner in corners if corner[2] >= NEAR_M]  # of the part beyond the near plane
-    for a, b in _EDGES:
+    for a, b in EDGES:
         za, zb = corners[a, 2], corners[b, 2]
         if (za < NEAR_M) != (zb < NEAR_M):
             seen.append(corners[a] + (corners[b] - corners[a]) * (NEAR_M - za) / (zb - za))

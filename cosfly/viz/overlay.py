@@ -20,7 +20,7 @@ LEAST_SHARE = 5e-4  # of the picture: smaller boxes are skipped
 MOST_LABELS = 16  # of the largest boxes
 FAR_PX = 20_000.0  # lines end this far beyond the picture
 # Pairs of corners, in the order of geometry.box_corners, that an edge of a box joins.
-_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
+EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
 
 
 class _Box(NamedTuple):
@@ -97,7 +97,7 @@ def _lines(
     """Project the edges of a box, clipped at the near plane, to pairs of pixels."""
     points = (corners_m - camera_pose[:3, 3]) @ camera_pose[:3, :3]
     lines = []
-    for a, b in _EDGES:
+    for a, b in EDGES:
         ends = np.stack([points[a], points[b]])
         (za, zb) = ends[:, 2]
         if max(za, zb) <= near_m:
