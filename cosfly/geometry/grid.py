@@ -91,24 +91,18 @@ def blocks_walking(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M) -> np.n
     return (is_in_interval & ~box_map.is_any_of(GROUND_KINDS)) | (box_map.kinds == WATER)
 
 
-def occupancy(
-    box_map: BoxMap,
-    *,
-    resolution_m: float = RESOLUTION_M,
-    height_m: float = HUMAN_HEIGHT_M,
-    like: OccupancyGrid | None = None,
-) -> OccupancyGrid:
+def occupancy(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M, like: OccupancyGrid | None = None) -> OccupancyGrid:
     """Return the grid whose cells under boxes are occupied.
 
     A cell is occupied if the part of a box between the ground and `height_m` overlaps it by more than TOUCH_M. Boxes
     are rasterised exactly with their rotation, not as their axis-aligned bounds.
 
     Args:
-        like: Use this grid's cells instead of the map's own bounds and `resolution_m`, so that two maps can be
-            compared; boxes outside are ignored.
+        like: Use this grid's cells, not those of `empty_grid`, so that two maps can be compared; boxes outside are
+            ignored.
     Source: Step 3 of the paper (sec:step3).
     """
-    grid = empty_grid(box_map, resolution_m) if like is None else replace(like, occupied=np.zeros_like(like.occupied))
+    grid = empty_grid(box_map) if like is None else replace(like, occupied=np.zeros_like(like.occupied))
     boxes = box_map.select(blocks_walking(box_map, height_m=height_m))
     is_water = boxes.kinds == WATER
     lowest, highest = box_map.ground.range_under(boxes.mins, boxes.maxs)
