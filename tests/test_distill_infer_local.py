@@ -166,7 +166,8 @@ def test_noise_under_a_teachers_schema_parses_too(place, seed):
     llguidance = pytest.importorskip("llguidance")
     from llguidance.hf import from_tokenizer
 
-    schema, tokenizer = answer_schema(more=more_fields(WAY)), load_student(place / "student", device="cpu").tokenizer
+    schema = answer_schema(more=more_fields(WAY))
+    tokenizer = load_student(place / "student", device="cpu", max_pixels=ADAPTER_PIXELS).tokenizer
     grammar = llguidance.LLMatcher.grammar_from_json_schema(schema, defaults={"whitespace_flexible": False})
     matcher, ids = llguidance.LLMatcher(from_tokenizer(tokenizer), grammar), list[int]()
     rng, quote = np.random.default_rng(seed), tokenizer.convert_tokens_to_ids('"')  # which ends a string
