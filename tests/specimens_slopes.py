@@ -101,10 +101,8 @@ def sloped_city(*, terrain: bool = True, streets: bool = True) -> dict:
     for row in range(3 if streets else 0):
         y = 43.0 + 45.0 * row
         sheet = {
-            "type": "MultiSurface",
-            "lod": "1",
-            "boundaries": vertices.sheet((0.0, y), (CITY_SIZE_M[0], y + 8.0), 8.0),
-        }
+            "type": "MultiSurface", "lod": "1", "boundaries": vertices.sheet((0.0, y), (CITY_SIZE_M[0], y + 8.0), 8.0),
+        }  # fmt: skip
         objects[f"street {row}"] = {"type": "Road", "geometry": [sheet]}
     if streets:
         wall = vertices.sheet((5.0, 20.0), (5.6, 180.0), 5.0)

@@ -104,13 +104,11 @@ def test_what_is_wrong_with_a_caption_drops_its_window(tree, rules, tmp_path, ch
 
 
 BAD = [
-    ('{"sample_id": "a"}', "en"),
-    ("[1]", ":2"),
-    ("{broken", ":2"),
+    ('{"sample_id": "a"}', "en"), ("[1]", ":2"), ("{broken", ":2"),
     ('{"sample_id": "a", "en": {"critical_components": 7}}', "en.critical_components"),
     (json.dumps({"sample_id": "a", "en": EN | {"flight_decision": "hover"}, "colour": "red"}), "colour"),
     (json.dumps({"sample_id": "first", "en": EN | {"flight_decision": "hover"}}), "sample_id"),
-]
+]  # fmt: skip
 
 
 @each(("text", "field"), BAD)

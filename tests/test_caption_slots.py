@@ -107,13 +107,11 @@ REFUSED = [
         "slots_no_side",
         "neither side",
     ),
-    ("zh", "距离为 18.0 米。", "slots_number_outside", "18.0"),
-    ("zh", "距离约十八米。", "slots_number_outside", "十八米"),
-    ("zh", "目标在左侧。", "slots_pole_outside", "左"),
-    ("zh", "目标不{visibility}。", "slots_negated", "negate"),
+    ("zh", "距离为 18.0 米。", "slots_number_outside", "18.0"), ("zh", "距离约十八米。", "slots_number_outside", "十八米"),
+    ("zh", "目标在左侧。", "slots_pole_outside", "左"), ("zh", "目标不{visibility}。", "slots_negated", "negate"),
     ("zh", "距离{trend:distanc}。", "slots_unknown_reference", "table of facts"),
     ("zh", "速度为 {speed} 米。", "slots_unit_outside", "米/秒"),
-]
+]  # fmt: skip
 
 
 @each(("language", "text", "reason", "words"), REFUSED)

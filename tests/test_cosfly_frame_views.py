@@ -34,11 +34,9 @@ def tree(tmp_path_factory):
 
 # Views, layout, largest side: every count of views, orders that are not the usual one, both layouts and sizes.
 SHAPES = [
-    (("rgb",), "separate", 640),
-    (("depth", "rgb"), "tiled", 40),
-    (("segmentation", "rgb", "depth"), "separate", 40),
+    (("rgb",), "separate", 640), (("depth", "rgb"), "tiled", 40), (("segmentation", "rgb", "depth"), "separate", 40),
     (("depth", "segmentation", "rgb"), "tiled", 640),
-]
+]  # fmt: skip
 NAMES = {
     "en": {"RGB": "rgb", "depth": "depth", "segmentation": "segmentation", "enlarged": "middle"},
     "zh": {"RGB": "rgb", "深度": "depth", "分割": "segmentation", "放大": "middle"},

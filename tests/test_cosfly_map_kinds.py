@@ -36,11 +36,9 @@ def city() -> Model:
     road = [[80_000, 40_000, 2000], [140_000, 40_000, 2000], [140_000, 46_000, 2000], [80_000, 46_000, 2000]]
     solid = {"type": "Solid", "lod": "1.2"}
     return {
-        "type": "CityJSON",
-        "version": "2.0",
+        "type": "CityJSON", "version": "2.0",
         "metadata": {"referenceSystem": "https://www.opengis.net/def/crs/EPSG/0/7415"},
-        "transform": {"scale": [0.001] * 3, "translate": [0.0, 0.0, 0.0]},
-        "vertices": house + other + road,
+        "transform": {"scale": [0.001] * 3, "translate": [0.0, 0.0, 0.0]}, "vertices": house + other + road,
         "CityObjects": {
             "house": {"type": "Building", "children": ["part"]},
             "part": {"type": "BuildingPart", "parents": ["house"], "geometry": [solid | {"boundaries": [shell]}]},
@@ -50,7 +48,7 @@ def city() -> Model:
                 "geometry": [{"type": "MultiSurface", "lod": "1", "boundaries": [[[16, 17, 18, 19]]]}],
             },
         },
-    }
+    }  # fmt: skip
 
 
 def document(model: Model) -> bytes:

@@ -94,11 +94,9 @@ def test_people_walk_where_the_settings_say(ground, columns):
     # 80 m of road, 40 m of lawn, 30 m of nothing up to a far wall; boxes of 30 m by 0.2 m.
     kinds = [ROADS, KINDS["Terrain"], BUILDINGS]
     box_map = make_box_map(
-        [[40, 50, -0.1], [100, 50, 0.1], [149.95, 50, 5]],
-        [[40, 50, 0.1], [20, 50, 0.1], [0.05, 50, 1]],
-        np.zeros((3, 3)),
-        kinds,
-    )
+        [[40, 50, -0.1], [100, 50, 0.1], [149.95, 50, 5]], [[40, 50, 0.1], [20, 50, 0.1], [0.05, 50, 1]],
+        np.zeros((3, 3)), kinds,
+    )  # fmt: skip
     found = walkable_ground(box_map, PedestriansConfig(ground=ground))
     assert np.count_nonzero(found.parts) == columns * 200
     assert not found.parts[:, columns:].any()
@@ -178,11 +176,9 @@ def test_the_stage_writes_paths_report_and_picture(tmp_path):
 def test_a_path_that_fails_is_counted_and_the_others_go_on(tmp_path):
     # A yard of 40 m beside a field: starts in the yard have no goal 60 m off.
     box_map = plain(
-        120.0,
-        ((41.0, 60.0, 1.0), (1.0, 60.0, 1.0)),
-        ((20.0, 41.0, 1.0), (20.0, 1.0, 1.0)),
+        120.0, ((41.0, 60.0, 1.0), (1.0, 60.0, 1.0)), ((20.0, 41.0, 1.0), (20.0, 1.0, 1.0)),
         ((20.0, 80.0, 1.0), (20.0, 38.0, 1.0)),
-    )
+    )  # fmt: skip
     write_boxes(tmp_path / "map.json", box_map)
     cfg = PedestriansConfig(num_paths=12, num_retries=0, min_distance_m=60)
     product = run(cfg, tmp_path / "map.json", tmp_path / "out")

@@ -49,10 +49,8 @@ def inputs(tmp_path_factory):
     folder, (box_map, corners) = tmp_path_factory.mktemp("inputs"), WORLDS["corner"]
     write_boxes(folder / "map.json", box_map)
     walks = [
-        walk_along("round", corners),
-        walk_along("along", [(-30, 0), (0, 0)]),
-        walk_along("more", [(0, 0), (9, 0)]),
-    ]
+        walk_along("round", corners), walk_along("along", [(-30, 0), (0, 0)]), walk_along("more", [(0, 0), (9, 0)]),
+    ]  # fmt: skip
     write_paths(folder / "path.json", walks, {"map": "hand", "seed": 0})
     return folder / "map.json", folder / "path.json"
 

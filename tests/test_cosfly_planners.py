@@ -105,11 +105,9 @@ def test_gradient_is_the_derivative_of_the_loss():
 def test_curvature_is_positive_and_exact_for_the_quadratic_terms():
     points, problem, obstacles = shaken("empty")
     quadratic = problem._replace(
-        weights=problem.weights * np.array([0, 1, 1, 0, 0, 0, 0]),
-        pitch_weight=0.0,
-        bearing_weight=0.0,
+        weights=problem.weights * np.array([0, 1, 1, 0, 0, 0, 0]), pitch_weight=0.0, bearing_weight=0.0,
         altitude_weights=np.array([0, 0, 8.0, 0]),
-    )
+    )  # fmt: skip
     state, unmasked = loss.make_state(len(points), 0), np.zeros(len(points), dtype=bool)
 
     def dense(problem):
@@ -232,11 +230,9 @@ def test_stage_counts_failures_and_does_the_others(tmp_path, tmp_path_factory):
     folder = tmp_path_factory.mktemp("inputs")
     write_boxes(folder / "map.json", town_of(*CANYON, ((60, -40, 20), (5, 5, 20))))
     walks = [
-        walk_along("a", [(0, 0), (40, 0)]),
-        walk_along("b", [(30, 2), (70, 2), (72, -2)]),
-        walk_along("into_wall", [(60, -50), (60, -30)]),
-        walk_along("c", [(90, 0), (50, 0)]),
-    ]
+        walk_along("a", [(0, 0), (40, 0)]), walk_along("b", [(30, 2), (70, 2), (72, -2)]),
+        walk_along("into_wall", [(60, -50), (60, -30)]), walk_along("c", [(90, 0), (50, 0)]),
+    ]  # fmt: skip
     write_paths(folder / "path.json", walks, {"map": "hand", "seed": 0})
     inputs = folder / "map.json", folder / "path.json"
     product = planners.run(CFG, *inputs, tmp_path / "plan")

@@ -141,11 +141,9 @@ def test_target_behind_and_beside_the_camera_is_not_in_view():
 
 def blank_frame(depth: np.ndarray) -> Frame:
     return Frame(
-        np.zeros((*depth.shape, 3), np.uint8),
-        depth.astype(np.float32),
-        np.zeros(depth.shape, np.uint8),
+        np.zeros((*depth.shape, 3), np.uint8), depth.astype(np.float32), np.zeros(depth.shape, np.uint8),
         np.zeros(depth.shape, np.uint16),
-    )
+    )  # fmt: skip
 
 
 def test_rendered_visibility_by_hand():
@@ -253,26 +251,20 @@ def test_a_whole_flight_along_a_planted_wall_keeps_the_planners_clearance(gap_m,
     assert moved.count("applied") > 0.15 * len(moved)
     assert ("fallback: drone clearance" in moved) == (gap_m < 6.0)
     careless = perturb(
-        before,
-        [CAMERA] * len(before.positions_m),
-        Surroundings(wall),
-        PerturbationConfig(min_clearance_m=0.6),
+        before, [CAMERA] * len(before.positions_m), Surroundings(wall), PerturbationConfig(min_clearance_m=0.6),
         np.random.default_rng(1),
-    )
+    )  # fmt: skip
     assert (careless.poses.clearances_m.min() < 2.5) == (gap_m < 6.0), "or the wall would prove nothing"
 
 
-@each(
-    ("data", "word"),
-    [
-        ({"fovs_deg": [0]}, "field of view"),
-        ({"fovs_deg": []}, "fovs_deg"),
-        ({"tracks": ["clean", "clean"]}, "twice"),
-        ({"town": "../x"}, "letters"),
-        ({"widht_px": 3}, "width_px"),
-        ({"perturbation": {"sampling": "square"}}, "sampling"),
-    ],
-)
+@each(("data", "word"), [
+    ({"fovs_deg": [0]}, "field of view"),
+    ({"fovs_deg": []}, "fovs_deg"),
+    ({"tracks": ["clean", "clean"]}, "twice"),
+    ({"town": "../x"}, "letters"),
+    ({"widht_px": 3}, "width_px"),
+    ({"perturbation": {"sampling": "square"}}, "sampling"),
+])  # fmt: skip
 def test_bad_settings_are_named(data, word):
     with pytest.raises(ConfigError, match=word):
         build(RenderConfig, data, "test")

@@ -52,18 +52,15 @@ def random_map(seed: int, count: int, size_m: float = 30.0) -> BoxMap:
     return make_box_map(centers, rng.uniform(0.2, 3.0, (count, 3)), rotations, kinds, ids)
 
 
-@each(
-    ("kind", "gap", "count"),
-    [
-        ("Vegetation", (2.0, 0, 0), 1),  # a gap equal to the threshold counts
-        ("Vegetation", (2.001, 0, 0), 2),
-        ("Vegetation", (0, 0, 2.5), 2),  # every axis must be near
-        ("Vegetation", (-0.5, -0.5, -0.5), 1),  # overlap
-        ("Buildings", (5.0, 0, 0), 1),
-        ("Buildings", (5.0, 5.1, 0), 2),
-        ("Static", (0.0, 0, 0), 2),  # not merged by default
-    ],
-)
+@each(("kind", "gap", "count"), [
+    ("Vegetation", (2.0, 0, 0), 1),  # a gap equal to the threshold counts
+    ("Vegetation", (2.001, 0, 0), 2),
+    ("Vegetation", (0, 0, 2.5), 2),  # every axis must be near
+    ("Vegetation", (-0.5, -0.5, -0.5), 1),  # overlap
+    ("Buildings", (5.0, 0, 0), 1),
+    ("Buildings", (5.0, 5.1, 0), 2),
+    ("Static", (0.0, 0, 0), 2),  # not merged by default
+])  # fmt: skip
 def test_merge_follows_the_gap_rule(kind, gap, count):
     shift = np.where(np.array(gap) == 0, 0.0, 1.0 + np.array(gap))
     pair = box_map((kind, (0, 0, 0), (1, 1, 1)), (kind, shift, shift + 1))
@@ -128,15 +125,12 @@ def test_the_guard_keeps_a_street_between_two_askew_rows_and_the_papers_rule_doe
     assert walkable[1] > 0.9 * cross_validate(street, street)["raw_walkable_m2"]
 
 
-@each(
-    ("rectangle", "share"),
-    [
-        ((0.5, 0.5, 1.0, 0.0, 0.5, 0.5), 1.0),
-        ((0.25, 0.5, 1.0, 0.0, 0.25, 0.5), 0.5),
-        ((0.5, 0.5, np.sqrt(0.5), np.sqrt(0.5), np.sqrt(0.125), np.sqrt(0.125)), 0.5),  # a square on its corner
-        ((5.0, 5.0, 1.0, 0.0, 0.5, 0.5), 0.0),
-    ],
-)
+@each(("rectangle", "share"), [
+    ((0.5, 0.5, 1.0, 0.0, 0.5, 0.5), 1.0),
+    ((0.25, 0.5, 1.0, 0.0, 0.25, 0.5), 0.5),
+    ((0.5, 0.5, np.sqrt(0.5), np.sqrt(0.5), np.sqrt(0.125), np.sqrt(0.125)), 0.5),  # a square on its corner
+    ((5.0, 5.0, 1.0, 0.0, 0.5, 0.5), 0.0),
+])  # fmt: skip
 def test_fill_share(rectangle, share):
     assert fill_share(np.array([rectangle]), np.zeros(2), np.ones(2)) == pytest.approx(share, abs=0.02)
 
@@ -215,16 +209,13 @@ def test_clipping_cuts_off_what_lies_below_the_ground():
     np.testing.assert_array_equal(stays.half_extents, leaning.select(leaning.maxs[:, 2] > 0).half_extents)
 
 
-@each(
-    ("inner", "kind", "kept"),
-    [
-        (((1, 1, 1), (2, 2, 2)), "Buildings", [1]),
-        (((1, 1, 1), (2, 2, 10.009)), "Buildings", [1]),  # within the tolerance of a centimetre
-        (((1, 1, 1), (2, 2, 10.011)), "Buildings", [1, 2]),
-        (((1, 1, 1), (2, 2, 2)), "Static", [1, 2]),  # another kind
-        (((0, 0, 0), (10, 10, 10)), "Buildings", [1]),  # equal: the smaller id stays
-    ],
-)
+@each(("inner", "kind", "kept"), [
+    (((1, 1, 1), (2, 2, 2)), "Buildings", [1]),
+    (((1, 1, 1), (2, 2, 10.009)), "Buildings", [1]),  # within the tolerance of a centimetre
+    (((1, 1, 1), (2, 2, 10.011)), "Buildings", [1, 2]),
+    (((1, 1, 1), (2, 2, 2)), "Static", [1, 2]),  # another kind
+    (((0, 0, 0), (10, 10, 10)), "Buildings", [1]),  # equal: the smaller id stays
+])  # fmt: skip
 def test_nested_boxes_of_one_kind_go(inner, kind, kept):
     boxes = box_map(("Buildings", (0, 0, 0), (10, 10, 10)), (kind, *inner))
     assert prune_nested(boxes, 0.01).ids.tolist() == kept

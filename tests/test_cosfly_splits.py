@@ -81,11 +81,9 @@ def test_walks_agree_with_a_slow_plain_comparison():
 
 
 @given(
-    num_groups=st.integers(3, 60),
-    val=st.sampled_from([0.0, 0.01, 0.1, 0.45]),
-    test=st.sampled_from([0.0, 0.01, 0.2, 0.45]),
-    seed=st.integers(0, 5),
-)
+    num_groups=st.integers(3, 60), val=st.sampled_from([0.0, 0.01, 0.1, 0.45]),
+    test=st.sampled_from([0.0, 0.01, 0.2, 0.45]), seed=st.integers(0, 5),
+)  # fmt: skip
 def test_splits_cover_all_and_none_is_empty(num_groups, val, test, seed):
     shares = {"val": val, "test": test}
     names = [f"walk_{i}" for i in range(num_groups)]

@@ -124,14 +124,12 @@ def listed(point: dict) -> None:
 
 
 QUIRKS = {
-    "as it is": Quirk(lambda v: None),
-    "no target anywhere": Quirk(each(lambda p: p.update(target=None))),
+    "as it is": Quirk(lambda v: None), "no target anywhere": Quirk(each(lambda p: p.update(target=None))),
     "a target that is disabled": Quirk(each(lambda p: p.update(target={"enabled": False, "world_location": None}))),
     "targets left out": Quirk(each(lambda p: p.pop("target")), is_strict=False),
     "no waypoint at the end": Quirk(lambda v: v["points"][-1].update(nav_waypoint=None), is_strict=False),
     "no waypoints": Quirk(each(lambda p: p.pop("nav_waypoint")), is_strict=False),
-    "waypoints as lists": Quirk(each(listed)),
-    "waypoints and flat times": Quirk(old_times, is_strict=False),
+    "waypoints as lists": Quirk(each(listed)), "waypoints and flat times": Quirk(old_times, is_strict=False),
     "trace_dir is another's": Quirk(lambda v: v.update(trace_dir="aug_002"), is_strict=False),
     "perturbation left out": Quirk(each(lambda p: p.pop("perturbation"))),
     "perturbation is null": Quirk(each(lambda p: p.update(perturbation=None))),
@@ -143,7 +141,7 @@ QUIRKS = {
     "boxes as lists": Quirk(each(lambda p: p["target"] and p["target"].update(bbox_2d=[1, 2, 3, 4]))),
     "a pixel as an object": Quirk(each(lambda p: p["target"] and p["target"].update(image_uv={"u": 1.0, "v": 2.0}))),
     "unknown keys": Quirk(lambda v: v.update(weather={"sun": [1, None]}, points=[p | {"imu": 1} for p in v["points"]])),
-}
+}  # fmt: skip
 
 
 def holds(found: object, wanted: object) -> bool:

@@ -105,10 +105,8 @@ def test_a_prompt_of_which_nothing_can_be_read_is_refused_in_words(prompt):
 
 
 PLANNED = {
-    "blocks_along": 2,
-    "block_m": 46.0,
-    "objects": [{"name": "statue", "count": 1}, {"name": "unicorn", "count": 2}],
-}
+    "blocks_along": 2, "block_m": 46.0, "objects": [{"name": "statue", "count": 1}, {"name": "unicorn", "count": 2}],
+}  # fmt: skip
 
 
 def planned_by(answer: str, out: Path, seed: int = 0, **more):

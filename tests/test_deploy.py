@@ -18,11 +18,9 @@ SBATCH = {  # options of sbatch (its manual page), and what may follow
     "output": r"[\w%./-]+", "open-mode": "append|truncate", "requeue": "",
 }  # fmt: skip
 TOOLS = {
-    "srun": 'while [[ $1 == --* ]]; do shift; done; exec "$@"',
-    "scontrol": "printf 'n1\\nn2\\n'",
-    "ray": '[[ $1 != status ]] || printf " 1 node_a\\n 1 node_b\\n"',
-    "sleep": ":",
-}
+    "srun": 'while [[ $1 == --* ]]; do shift; done; exec "$@"', "scontrol": "printf 'n1\\nn2\\n'",
+    "ray": '[[ $1 != status ]] || printf " 1 node_a\\n 1 node_b\\n"', "sleep": ":",
+}  # fmt: skip
 
 
 def test_directives_are_options_of_sbatch_and_stand_before_any_command():

@@ -240,11 +240,9 @@ def test_each_decision_keeps_what_it_has_up_to_the_bound_in_any_order(counts, se
 
 
 @given(
-    counts=st.dictionaries(st.sampled_from(TOKENS), st.integers(1, 60), min_size=1),
-    part=st.floats(0.0, 1.2),
-    seed=st.integers(0, 2),
-    is_balanced=st.booleans(),
-)
+    counts=st.dictionaries(st.sampled_from(TOKENS), st.integers(1, 60), min_size=1), part=st.floats(0.0, 1.2),
+    seed=st.integers(0, 2), is_balanced=st.booleans(),
+)  # fmt: skip
 @bounded(max_examples=40)
 def test_a_limit_is_exact_and_each_decision_has_its_share_in_any_order(counts, part, seed, is_balanced):
     """Half of the flights are cut first, as those of train are."""

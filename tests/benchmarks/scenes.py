@@ -45,13 +45,11 @@ def tiled(box_map: BoxMap, columns: int, rows: int) -> BoxMap:
     shifts = np.array([(column * step[0], row * step[1], 0.0) for row in range(rows) for column in range(columns)])
     count, tiles = len(box_map), len(shifts)
     return BoxMap(
-        (box_map.centers[None] + shifts[:, None]).reshape(-1, 3),
-        np.tile(box_map.half_extents, (tiles, 1)),
-        np.tile(box_map.rotations_deg, (tiles, 1)),
-        np.tile(box_map.kinds, tiles),
+        (box_map.centers[None] + shifts[:, None]).reshape(-1, 3), np.tile(box_map.half_extents, (tiles, 1)),
+        np.tile(box_map.rotations_deg, (tiles, 1)), np.tile(box_map.kinds, tiles),
         np.arange(1, count * tiles + 1, dtype=np.uint64),
         box_map.header.model_copy(update={"name": f"{box_map.name}{columns}x{rows}"}),
-    )
+    )  # fmt: skip
 
 
 def cut_to(box_map: BoxMap, size_m: tuple[float, float]) -> BoxMap:
