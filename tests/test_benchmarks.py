@@ -5,7 +5,6 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -20,63 +19,54 @@ scenes.town, scenes.city = lambda seed=0: cosfly.load_map(seed=seed), lambda: No
 DRAWN_SMALL = "--set render.width_px=160 --set render.height_px=90 --set fly.tree=false --set fly.most_decisions=6"
 
 
-@dataclass(frozen=True)
-class Smallest:
-    """words: arguments, with RUN for a finished run and OUT for a new directory. before: what makes the constants of
-    the module `bench` smaller. figures: a pattern of what is printed."""
-
-    name: str
-    words: str
-    figures: str
-    before: str = ""
-
-
+# A benchmark; arguments, with RUN for a finished run and OUT for a new directory; a pattern of what is printed; and
+# what makes the constants of the module `bench` smaller.
 CASES = (
-    Smallest("bench_blind", "", r"\| old_town and market \| [1-9]", """
+    ("bench_blind", "", r"\| old_town and market \| [1-9]", """
 plain = bench.load
 bench.load = lambda model, path, told: plain(model, path, [*told, "pedestrians.num_paths=2"])
 """),
-    Smallest("bench_client", "--windows 40 --concurrency 8", r"encoded on the way .* requests/s .* ratio 0\.\d+"),
-    Smallest("bench_decoding", "--batch 1 --tokens 4 --repeats 1", r"generate"),
-    Smallest("bench_decoding", "--check --batch 1 --tokens 4", r"\d"),
-    Smallest("bench_flying", "--flights 2 --decisions 4 --workers 1", r"\d+ decisions in .* a second"),
-    Smallest("bench_flying", "--envs", r"2 side by side: .* steps a second",
+    ("bench_client", "--windows 40 --concurrency 8", r"encoded on the way .* requests/s .* ratio 0\.\d+"),
+    ("bench_decoding", "--batch 1 --tokens 4 --repeats 1", r"generate"),
+    ("bench_decoding", "--check --batch 1 --tokens 4", r"\d"),
+    ("bench_flying", "--flights 2 --decisions 4 --workers 1", r"\d+ decisions in .* a second"),
+    ("bench_flying", "--envs", r"2 side by side: .* steps a second",
              "import cosfly.envs.episodes; cosfly.envs.episodes.NUM_DECISIONS = 4"),
-    Smallest("bench_pages", "", r"turns at \d+ frames/s", """
+    ("bench_pages", "", r"turns at \d+ frames/s", """
 import cosfly
 bench.TURNS, bench.census_town = 1, lambda name, seed: cosfly.load_map(seed=seed)
 """),
-    Smallest("bench_planning", "--maps a --planners track_astar muco", r"the same loss from the same start",
+    ("bench_planning", "--maps a --planners track_astar muco", r"the same loss from the same start",
              SMALL_TOWN + "scenes.NUM_WALKS, bench.WALKS = 2, bench.WALKS.model_copy(update={'num_paths': 2})"),
-    Smallest("bench_ray", "render --rounds 1", r"ray / local, by rounds: .*differences: \[\]"),
-    Smallest("bench_ray", "memory --counts 10", r"ray, 10 items: driver .* items/s"),
-    Smallest("bench_release", "speed 8 --rounds 1", r"depth, one core: \d+ MB/s",
+    ("bench_ray", "render --rounds 1", r"ray / local, by rounds: .*differences: \[\]"),
+    ("bench_ray", "memory --counts 10", r"ray, 10 items: driver .* items/s"),
+    ("bench_release", "speed 8 --rounds 1", r"depth, one core: \d+ MB/s",
              "bench.NUM_POINTS, bench.NUM_POOL, bench.FRAMES_RELEASED, bench.SIZES['speed'] = 8, 1, 4, (160, 90)"),
-    Smallest("bench_release", "memory 800", r"800 frames: main"),
-    Smallest("bench_render", "parts --frames 2", r"CPU ms a frame", SMALL_TOWN),
-    Smallest("bench_render", "disk --workers 1 --frames 2", r"To disk[^|]*\|.*\n.*\n\| town", SMALL_TOWN),
-    Smallest("bench_render", "memory --frames 20", r"Memory", SMALL_TOWN),
-    Smallest("bench_training", "--batch 1 --steps 1", r'"tokens_per_s": \d'),
-    Smallest("bench_training", "--check", r'"relative_difference_of_gradients": \d'),
-    Smallest("checkpoints", "--map RUN/maps/boxes_3d.json --simplified RUN/simplify/step2_simplified.json "
+    ("bench_release", "memory 800", r"800 frames: main"),
+    ("bench_render", "parts --frames 2", r"CPU ms a frame", SMALL_TOWN),
+    ("bench_render", "disk --workers 1 --frames 2", r"To disk[^|]*\|.*\n.*\n\| town", SMALL_TOWN),
+    ("bench_render", "memory --frames 20", r"Memory", SMALL_TOWN),
+    ("bench_training", "--batch 1 --steps 1", r'"tokens_per_s": \d'),
+    ("bench_training", "--check", r'"relative_difference_of_gradients": \d'),
+    ("checkpoints", "--map RUN/maps/boxes_3d.json --simplified RUN/simplify/step2_simplified.json "
              "--paths RUN/pedestrians/path.json --captions RUN/caption/captions.jsonl --walks 1 --out OUT",
              r"noise-0=[01]\.\d+", "bench.NOISE = (0.0,)"),
-    Smallest("dagger_rounds", f"--train RUN --test RUN --out OUT {DRAWN_SMALL}", r"control1 success",
+    ("dagger_rounds", f"--train RUN --test RUN --out OUT {DRAWN_SMALL}", r"control1 success",
              "bench.STEPS = 5"),
-    Smallest("simulate_cluster", "RUN --flights 2000", r"2,000 flights"),
+    ("simulate_cluster", "RUN --flights 2000", r"2,000 flights"),
 )  # fmt: skip
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.name} {case.words.partition(' ')[0]}")
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case[0]} {case[1].partition(' ')[0]}")
 def test_a_benchmark_prints_its_figures(case, built_once, tmp_path):
-    if case.name == "bench_pages" and not any(map(shutil.which, BROWSERS)):
+    name, words, figures, before = (*case, "")[:4]
+    if name == "bench_pages" and not any(map(shutil.which, BROWSERS)):
         pytest.skip("there is no Chromium on this machine")
-    words = case.words
     if "RUN" in words:
         words = words.replace("RUN", str(built_once("tiny_run", make_tiny_run) / "run"))
-    arguments = [f"{case.name}.py", *words.replace("OUT", str(tmp_path / "out")).split()]
-    program = f"import sys, {case.name} as bench\n{case.before}\nsys.argv = {arguments!r}\nbench.main()\n"
+    arguments = [f"{name}.py", *words.replace("OUT", str(tmp_path / "out")).split()]
+    program = f"import sys, {name} as bench\n{before}\nsys.argv = {arguments!r}\nbench.main()\n"
     paths = [str(FOLDER), str(FOLDER.parent), str(FOLDER.parents[1])]
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False,
@@ -84,9 +74,9 @@ def test_a_benchmark_prints_its_figures(case, built_once, tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
     assert "Traceback" not in done.stderr
-    assert re.search(case.figures, done.stdout), done.stdout[-3000:]
+    assert re.search(figures, done.stdout), done.stdout[-3000:]
 
 
 def test_every_benchmark_is_run():
     programs = {path.stem for path in FOLDER.glob("*.py") if '__name__ == "__main__"' in path.read_text()}
-    assert {case.name for case in CASES} == programs
+    assert {name for name, *_ in CASES} == programs
