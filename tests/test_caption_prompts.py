@@ -61,6 +61,7 @@ def test_all_problems_are_told_at_once(tmp_path, caplog):
         own_prompts(tmp_path / "nowhere")
 
 
+@pytest.mark.slow
 def test_captions_are_asked_with_them_and_keep_them(tmp_path):
     """Another system text and another order of lines, which say the same things."""
     mine, tree, out = export(tmp_path / "mine"), make_playback_tree(tmp_path / "tree", 3, 14), tmp_path / "out"

@@ -56,6 +56,7 @@ def attempt(town: Path, out: Path, more: str):
     return invoke(f"fly {TINY} {given} --paths {town}/pedestrians/path.json --out {out} {more}")
 
 
+@pytest.mark.slow
 def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(town, tmp_path):
     flown = fly(town, tmp_path, "--workers 2 --set fly.most_decisions=12 --student rules")
     assert len(flown) == 3

@@ -43,6 +43,7 @@ def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
     assert len(list((tmp_path / "cache" / "cosfly").iterdir())) == 2
 
 
+@pytest.mark.slow
 def test_compiling_is_told_once_and_loading_is_not(tmp_path):
     (tmp_path / "two.py").write_text(
         "import logging\nlogging.basicConfig(level=logging.INFO, format='%(message)s')\n"

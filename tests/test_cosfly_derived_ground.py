@@ -75,6 +75,7 @@ def test_a_city_model_without_streets_gets_it_and_the_same_bytes_twice(tmp_path:
     assert load_map(cfg).header.derived_ground == 0
 
 
+@pytest.mark.slow
 def test_people_of_a_foreign_city_of_buildings_alone_walk_on_its_pavements(shared_data: Path):
     path = shared_data / "tudelft-3dbag" / "extension.city.jsonl.gz"
     box_map = load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=path, solids=False)))

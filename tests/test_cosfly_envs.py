@@ -44,9 +44,8 @@ def flown(env, seed, actions):
     return frames, rewards
 
 
-@pytest.mark.parametrize(
-    "task", [pytest.param(task, marks=() if task == FOLLOW else pytest.mark.slow) for task in TASKS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
 def test_an_environment_is_as_gymnasium_wants_it_without_a_warning(task):
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -51,6 +51,7 @@ def same_boxes(exported: BoxMap, town: BoxMap) -> None:
         np.testing.assert_allclose(ours, theirs, atol=1e-5, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_served_town_comes_back_as_it_is(tmp_path):
     town = invent(SyntheticConfig(), 3)
     with serving(town, tmp_path / "town", protocol="unrealcv") as port:

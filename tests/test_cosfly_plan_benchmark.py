@@ -62,6 +62,7 @@ def made(inputs, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_what_is_not_flown_is_counted_and_stays_in_every_table(made):
     found = json.loads((made / "benchmark.json").read_text())
     assert (found["scenarios"], list(found["infeasible"])) == (["round", "along"], ["round"])

@@ -169,6 +169,7 @@ def papers_losses(points, problem, obstacles, cfg, num_steps):
     return np.array(losses), num_infeasible
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", ["corner", "tower_midway"])
 def test_the_papers_optimizer_is_the_one_that_is_printed(world, monkeypatch):
     """It overshoots, goes on all the same, over infeasible trajectories too, and gives the last feasible one, not

@@ -72,6 +72,7 @@ def make_crowded_tree(folder):
     run(cfg, *write_inputs(folder / "in", traces), folder / "out", seed=2, others=folder / "others.json")
 
 
+@pytest.mark.slow
 @needs_gl
 def test_of_all_in_a_crowd_a_goal_means_the_target_alone(crowded_tree):
     tree = crowded_tree

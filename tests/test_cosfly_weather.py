@@ -172,6 +172,7 @@ def trees(tmp_path_factory):
     ], inputs
 
 
+@pytest.mark.slow
 def test_records_stand_in_every_file_and_labels_are_those_of_fair_weather(trees):
     (off, drawn_tree), _ = trees
     cfg = config(**RANDOM)

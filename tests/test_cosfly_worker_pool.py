@@ -116,6 +116,7 @@ def test_a_signal_ends_a_command_and_its_workers_in_one_line(tmp_path, until, nu
     assert text.splitlines() == [f"error: {word}; finished work is kept; run the same command again to resume"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc")
 @pytest.mark.parametrize("gap_s", [0.0, 0.002, 0.01])
 def test_a_second_signal_that_breaks_off_the_ending_ends_the_workers_too(tmp_path, gap_s):

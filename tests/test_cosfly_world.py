@@ -45,6 +45,7 @@ def test_a_prompt_gives_a_valid_world_with_each_named_object(row):
                                                  or f"{name}es" in row["prompt"] else 1)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_world_read_by_the_importer_is_the_one_that_was_laid_out(tmp_path):
     cfg = WorldConfig(prompt="a small village with a hospital, a church and a lawn")
     world = SimWorldConfig(world=run(cfg, tmp_path / "w", seed=3))

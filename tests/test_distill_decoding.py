@@ -92,6 +92,7 @@ def test_a_batch_of_different_lengths_has_the_tokens_of_generate(student, rows):
     assert {answer.num_tokens for answer in found} == {MOST}
 
 
+@pytest.mark.slow
 def test_a_row_has_the_same_answer_alone_and_among_others(student, rows):
     together = decode(student, rows, max_tokens=MOST)
     assert [decode(student, [row], max_tokens=MOST)[0] for row in rows] == together

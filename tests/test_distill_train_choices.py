@@ -19,6 +19,7 @@ from distill.training.settings import TrainConfig  # noqa: E402
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
+@pytest.mark.slow
 def test_a_model_trained_in_full_is_a_whole_folder(place, tmp_path):
     from transformers import AutoModelForImageTextToText, AutoTokenizer, GenerationConfig
 

@@ -24,6 +24,7 @@ from distill.training.settings import TrainConfig  # noqa: E402
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
+@pytest.mark.slow
 def test_a_picture_that_does_not_decode_costs_its_samples(place, tmp_path):
     """Its header is right, so only the step that needs it finds out; the others are learnt from, and once more the
     same."""
@@ -43,6 +44,7 @@ def test_a_picture_that_does_not_decode_costs_its_samples(place, tmp_path):
     assert log == log_of(tmp_path / "two")
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_another_student_is_refused(place, tmp_path):
     begun(place, tmp_path / "out")
     newest = newest_checkpoint(tmp_path / "out" / "checkpoints")

@@ -60,6 +60,7 @@ def work(cfg: RunConfig, out: Path, stage: str) -> None:
     next(s for s in pipeline.stages(cfg, out) if s.name == stage).work()
 
 
+@pytest.mark.slow
 def test_the_licence_of_the_map_reaches_the_card(base):
     card = (base / "release/dataset/README.md").read_text(encoding="utf-8")
     assert "license: apache-2.0\n" in card
@@ -205,6 +206,7 @@ def test_a_changed_file_is_refused_by_the_stages_that_read_it(base, tmp_path_fac
             work(tiny(), tampered, stage)
 
 
+@pytest.mark.slow
 def test_no_changed_picture_reaches_a_release(base, tmp_path):
     out = begin(base, tmp_path / "run", "release")
     flights = find_tracks(out / "render")

@@ -75,6 +75,7 @@ def test_a_changed_word_of_it_is_found(dataset, tmp_path):
     assert not verify(broken).is_ok
 
 
+@pytest.mark.slow
 def test_mlcroissant_loads_every_row(dataset):
     mlcroissant = pytest.importorskip("mlcroissant", reason="extra dev")
     rows = rows_by_id(dataset)

@@ -138,6 +138,7 @@ def test_a_state_is_the_motion_that_led_to_a_frame():
     assert np.allclose(states(rows), expected)
 
 
+@pytest.mark.slow
 def test_a_flight_with_gaps_is_several_episodes(tmp_path, tmp_path_factory):
     spread = make_release(tmp_path_factory.mktemp("spread"), num_frames=8, window=1)
     product = export(config("lerobot"), spread, tmp_path / "out")

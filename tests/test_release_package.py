@@ -187,10 +187,12 @@ def test_shards_lose_nothing_and_keep_the_order(sizes, target):
         assert sum(sizes[i] for i in group[:-1]) < target
 
 
+@pytest.mark.slow
 def test_same_bytes_with_two_workers(release_inputs, built, tmp_path):
     assert all_bytes(build(release_inputs, tmp_path / "two", workers=2)) == all_bytes(built)
 
 
+@pytest.mark.slow
 def test_one_changed_digit_of_the_card_fails_wherever_it_stands(built, tmp_path):
     dataset = shutil.copytree(built, tmp_path / "dataset")
     card = dataset / "README.md"

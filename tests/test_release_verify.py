@@ -140,6 +140,7 @@ def _seed_of_other_splits(record: dict) -> int:
     return next(seed for seed in range(100) if split_groups(walks, told["fractions"], seed, "walks") != walks)
 
 
+@pytest.mark.slow
 @each("name", [name for name in RECORD_LIES if name != "splits by town"])
 def test_a_lie_of_the_record_is_found(honest, tmp_path, name):
     forged = forge(honest, tmp_path / "forged", change_record=RECORD_LIES[name])
@@ -274,6 +275,7 @@ def _rows_alone(honest: Path, out: Path, change) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_the_command_tells_people_and_machines(honest, tmp_path):
     forged = forge(honest, tmp_path / "forged", LIES["visibility_above_one"][0])
     before = {path: path.read_bytes() for path in forged.rglob("*") if path.is_file()}
