@@ -24,9 +24,8 @@ from cosfly.formats.places import tree_of_track
 from cosfly.formats.png import areas_png, colours_png, floats_of, floats_png
 from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import mirror_poses
-from cosfly.runtime.arrays import PNG_SIGNATURE, parse_array_header, read_picture
+from cosfly.runtime.arrays import PNG_SIGNATURE, parse_array, read_picture
 from cosfly.runtime.config import Config
-from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import read_bytes
 from cosfly.runtime.json_io import FileFormat, Record, dump_json, read_model
 
@@ -304,11 +303,7 @@ def depth_values(data: bytes | memoryview, where: Path) -> np.ndarray:
     if data[: len(PNG_SIGNATURE)] == PNG_SIGNATURE:
         depth = floats_of(data, where)
     else:
-        header = parse_array_header(memoryview(data), where, what="depth image")
-        if header.dtype != np.float32 or len(header.shape) != 2:
-            raise InputError("not a depth image", where=where, got=str(header), expected="float32 of 2 dimensions")
-        values = np.frombuffer(data, np.float32, offset=header.offset)
-        depth = values.reshape(header.shape, order="F" if header.is_fortran else "C")
+        depth = parse_array(data, where, dtype=np.float32, ndim=2, what="depth image", copy=False)
     is_beyond = SKY_DEPTH_M < depth.max(initial=0.0) < np.inf
     return np.minimum(depth, np.float32(SKY_DEPTH_M)) if is_beyond else depth
 

@@ -57,30 +57,20 @@ def parse_array_header(data: memoryview, where: str | Path, *, what: str = "arra
     return _header(bytes(data[: MOST_HEADER_BYTES + 12]), len(data), where, what)
 
 
-def read_array(path: Path, *, dtype: type, ndim: int, what: str = "array", tree: Path | None = None) -> np.ndarray:
-    """Read a `.npy` file of a known type and number of dimensions."""
-    with open_file(path, what=what, tree=tree) as file, disk_errors(path, what):
-        header = _header(file.read(MOST_HEADER_BYTES + 12), os.fstat(file.fileno()).st_size, path, what)
-        _check_kind(header, path, dtype, ndim, what)
-        file.seek(header.offset)
-        values: np.ndarray = np.fromfile(file, dtype, math.prod(header.shape))
-    if values.size != math.prod(header.shape):
-        raise InputError(f"the {what} became shorter while it was read", where=path)
-    return values.reshape(header.shape, order="F" if header.is_fortran else "C")
+def parse_array(
+    data: bytes | memoryview, where: str | Path, *, dtype: type, ndim: int, what: str = "array", copy: bool = True
+) -> np.ndarray:
+    """Return the array of the bytes of a `.npy` file of a known type and number of dimensions.
 
-
-def parse_array(data: bytes, where: str | Path, *, dtype: type, ndim: int, what: str = "array") -> np.ndarray:
-    """Return the array of the bytes of a `.npy` file."""
+    copy: False returns a view of the bytes, which cannot be written to.
+    """
     header = parse_array_header(memoryview(data), where, what=what)
-    _check_kind(header, where, dtype, ndim, what)
-    return np.ndarray(header.shape, dtype, data, header.offset, order="F" if header.is_fortran else "C").copy("K")
-
-
-def _check_kind(header: ArrayHeader, where: str | Path, dtype: type, ndim: int, what: str) -> None:
     if header.dtype != dtype or len(header.shape) != ndim:
         expected = f"{np.dtype(dtype)} of {ndim} dimensions"
         raise InputError(f"not a {what}", where=where, got=str(header), expected=expected)
     check_pixels(math.prod(header.shape), where, str(header.shape))
+    values: np.ndarray = np.ndarray(header.shape, dtype, data, header.offset, order="F" if header.is_fortran else "C")
+    return values.copy("K") if copy else values
 
 
 def _header(start: bytes, size: int, where: str | Path, what: str) -> ArrayHeader:

@@ -23,7 +23,7 @@ from typing import Any
 
 import numba
 from numba import boolean, int64
-from numba.core import caching, event
+from numba.core import caching
 
 from cosfly.runtime.io import read_bytes
 
@@ -49,7 +49,9 @@ class _SharedCache(caching.FunctionCache):
                     self._lock = open(path, "w")  # noqa: SIM115
                     fcntl.flock(self._lock, fcntl.LOCK_EX)
             found = super().load_overload(sig, target_context)  # another process may have compiled it meanwhile
-            if found is not None:
+            if found is None:
+                log.info("compiling kernels, once on this machine (planning: about 30 s); kept in %s", self.cache_path)
+            else:
                 self._release_lock()
         return found
 
@@ -90,21 +92,9 @@ def _use_own_cache(caches: Path) -> None:
         numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
 
 
-class _CompileListener(event.Listener):
-    """Logs that kernels are compiled, which happens once per machine; later they are loaded from the cache."""
-
-    def on_start(self, event: event.Event) -> None:
-        place = numba.config.CACHE_DIR or "__pycache__"  # type: ignore[attr-defined]
-        log.info("compiling kernels, once on this machine (planning: about 30 s); kept in %s", place)
-
-    def on_end(self, event: event.Event) -> None:
-        """Log nothing."""
-
-
 # One line: a process compiles several functions, and so does each of its workers, whose records come here too.
 _num_records = itertools.count()
 log.addFilter(lambda record: next(_num_records) == 0)
-event.register("numba:compile", _CompileListener())
 
 if "NUMBA_CACHE_DIR" not in os.environ:
     _use_own_cache(Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "cosfly")

@@ -6,9 +6,9 @@ import contextlib
 import logging
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -79,10 +79,7 @@ def set_levels(level: int) -> None:
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
 
-class Advance(Protocol):
-    """Advances a bar and sets the words next to it."""
-
-    def __call__(self, count: int, words: str = "") -> None: ...
+Advance = Callable[..., None]  # advance(count, words=""): moves a bar and sets the words next to it
 
 
 @contextlib.contextmanager

@@ -7,9 +7,8 @@ import os
 import shutil
 import time
 from collections.abc import Mapping
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -131,25 +130,14 @@ def process_stat(pid: int) -> list[bytes]:
 def gpu_use() -> dict[str, float]:
     """Return `gpu_percent`, the mean load of the machine's NVIDIA devices, and `gpu_mib`, their memory in use; empty
     where there is none."""
-    nvml, loads, used_mib = _nvml(), list[float](), 0.0
-    if nvml is None:
-        return {}
+    import pynvml as nvml
+
+    loads, used_mib = list[float](), 0.0
     with contextlib.suppress(nvml.NVMLError, nvml.NVMLLibraryMismatchError):
+        nvml.nvmlInit()  # only the first has something to do
         for index in range(nvml.nvmlDeviceGetCount()):
             with contextlib.suppress(nvml.NVMLError):  # a virtual device, or a missing right
                 device = nvml.nvmlDeviceGetHandleByIndex(index)
                 used_mib += nvml.nvmlDeviceGetMemoryInfo(device).used / MEBIBYTE
                 loads.append(nvml.nvmlDeviceGetUtilizationRates(device).gpu)
     return {"gpu_percent": round(sum(loads) / len(loads), 1), "gpu_mib": round(used_mib, 1)} if loads else {}
-
-
-@lru_cache(maxsize=1)
-def _nvml() -> Any:
-    """Return the library of the NVIDIA driver; None where there is none, or no device."""
-    import pynvml
-
-    try:
-        pynvml.nvmlInit()
-    except pynvml.NVMLError:
-        return None
-    return pynvml

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -123,7 +123,7 @@ def _object_of(member: Any) -> dict[str, Any] | None:
     """Return a member that is an object, or one as a JSON text."""
     if isinstance(member, str) and member.lstrip().startswith("{"):
         try:
-            found = _Reader().read(member.strip(), 0)
+            found = _reader()(member.strip(), 0)
         except (ValueError, RecursionError):
             return None
         return None if found.problem else found.value
@@ -158,8 +158,7 @@ class _Message:
 
 
 def _read_message(text: str) -> _Message:
-    reader = _Reader()
-    message, at, num_scanned = _Message(), 0, 0
+    read, message, at, num_scanned = _reader(), _Message(), 0, 0
     while mark := _MARK.search(text, at):
         at = mark.end()
         if mark.lastgroup == "opens":
@@ -173,7 +172,7 @@ def _read_message(text: str) -> _Message:
             message = _Message(at, has_thoughts=True)
         else:
             try:
-                message.objects.append(reader.read(text, mark.start()))
+                message.objects.append(read(text, mark.start()))
                 at = message.objects[-1].end
             except (ValueError, RecursionError) as error:
                 # It has a key in quotes, or is not closed: it was meant as an object.
@@ -186,34 +185,32 @@ def _read_message(text: str) -> _Message:
     return message
 
 
-class _Reader:
-    """Reads JSON objects, and notes the reason why a value is refused."""
+def _reader() -> Callable[[str, int], _Object]:
+    """Return a function that reads the object at a place of a text, and notes the reason why its value is refused."""
+    problems = list[str]()
 
-    def __init__(self) -> None:
-        self._problem: str | None = None
-        self._decoder = json.JSONDecoder(
-            object_pairs_hook=self._members,
-            parse_int=lambda digits: int(digits) if len(digits) <= MAX_DIGITS else self._finite(digits),
-            parse_float=self._finite,
-            parse_constant=self._finite,
-            strict=False,
-        )
+    def members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(value := dict(pairs)) < len(pairs):
+            problems.append("duplicate_key")
+        return value
 
-    def read(self, text: str, start: int) -> _Object:
-        self._problem = None
-        value, end = self._decoder.raw_decode(text, start)
+    def finite(word: str) -> float:
+        if not abs(value := float(word)) < float("inf"):
+            problems.append("not_finite")
+        return value
+
+    def whole(digits: str) -> float:
+        return int(digits) if len(digits) <= MAX_DIGITS else finite(digits)
+
+    decoder = json.JSONDecoder(
+        object_pairs_hook=members, parse_int=whole, parse_float=finite, parse_constant=finite, strict=False
+    )
+
+    def read(text: str, start: int) -> _Object:
+        problems.clear()
+        value, end = decoder.raw_decode(text, start)
         if is_deep(value):
             raise RecursionError
-        return _Object(value, start, end, self._problem)
+        return _Object(value, start, end, problems[-1] if problems else None)
 
-    def _members(self, members: list[tuple[str, Any]]) -> dict[str, Any]:
-        value = dict(members)
-        if len(value) < len(members):
-            self._problem = "duplicate_key"
-        return value
-
-    def _finite(self, word: str) -> float:
-        value = float(word)
-        if not abs(value) < float("inf"):
-            self._problem = "not_finite"
-        return value
+    return read

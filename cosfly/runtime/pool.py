@@ -38,18 +38,7 @@ from cosfly.runtime.io import remove_partials
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.ray_engine import ALL_ROOM, Cluster, RayConfig, RayTransport
 from cosfly.runtime.run_dir import Failed, ItemRecord, Kept, StageFolder, Tally, read_item, write_failures
-from cosfly.runtime.worker import (
-    Abort,
-    Item,
-    Message,
-    Sign,
-    Start,
-    Work,
-    WorkerOptions,
-    attempt,
-    signals_held_back,
-    work_through,
-)
+from cosfly.runtime.worker import Item, Message, Sign, Start, Work, attempt, signals_held_back, work_through
 
 log = logging.getLogger(__name__)
 
@@ -176,7 +165,7 @@ def _in_this_process(
 def _in_processes(
     stage: StageFolder, items: Sequence[Item], start: Start, workers: int, watch: Watch, progress: _Progress
 ) -> Generator[tuple[int, ItemRecord], None, None]:
-    start_transport: Callable[[WorkerOptions], Transport] = LocalTransport
+    start_transport: Callable[[float, int, int], Transport] = LocalTransport
     if watch.ray is not None:
         cluster = Cluster(watch.ray, stage.path)
         start_transport, workers = cluster.start_transport, cluster.room if workers == ALL_ROOM else workers
@@ -231,10 +220,11 @@ class LocalTransport:
 
     node: str | None = None
 
-    def __init__(self, worker_options: WorkerOptions) -> None:
+    def __init__(self, heartbeat_s: float, log_level: int, place: int) -> None:
         context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
         self.connection, there = context.Pipe()
-        self._process = context.Process(target=work_through, args=(there, worker_options), daemon=True)
+        args = (there, os.getpid(), heartbeat_s, log_level, place)  # few: this process waits until they are read
+        self._process = context.Process(target=work_through, args=args, daemon=True)
         resource_tracker.ensure_running()  # else the first worker starts it, and with it ends the holding back
         with signals_held_back():
             self._process.start()
@@ -314,7 +304,7 @@ class WorkerPool:
     watch: Watch
     events: EventLog
     on_steps: Callable[[Item, int], None]
-    start_transport: Callable[[WorkerOptions], Transport]
+    start_transport: Callable[[float, int, int], Transport]
     num_lost: int = 0
     _num_done: int = 0
     _seconds: deque[float] = field(default_factory=lambda: deque(maxlen=ITEMS_REMEMBERED))
@@ -380,8 +370,8 @@ class WorkerPool:
         return None
 
     def _start(self, place: int) -> _Worker:
-        worker_options = WorkerOptions(os.getpid(), self.watch.heartbeat_s, logging.getLogger().level, place)
-        worker = self._workers[place] = _Worker(place, self.start_transport(worker_options))
+        transport = self.start_transport(self.watch.heartbeat_s, logging.getLogger().level, place)
+        worker = self._workers[place] = _Worker(place, transport)
         threading.Thread(target=_attend, args=(worker, self.start, self._messages), daemon=True).start()
         return worker
 
@@ -396,11 +386,11 @@ class WorkerPool:
         attempt = worker.attempt
         if message is None:
             yield from self._lose(worker, "worker_died")
-        elif isinstance(message, Abort):
-            error, node = message.error, worker.transport.node
-            if node is not None and isinstance(error, CosflyError):
-                error.where = f"node {node}" if error.where is None else f"node {node}: {error.where}"
-            raise error
+        elif isinstance(message, Exception):
+            node = worker.transport.node
+            if node is not None and isinstance(message, CosflyError):
+                message.where = f"node {node}" if message.where is None else f"node {node}: {message.where}"
+            raise message
         elif isinstance(message, logging.LogRecord):
             logging.getLogger(message.name).handle(message)
         elif attempt is None or (isinstance(message, Sign) and message.item_id != attempt.item.item_id):
@@ -499,10 +489,10 @@ def _attend(worker: _Worker, start: Start, messages: queue.SimpleQueue) -> None:
                 message = transport.receive()
                 worker.has_reported = True
                 messages.put((worker, message))
-                if isinstance(message, Abort | ItemRecord):
+                if isinstance(message, Exception | ItemRecord):
                     break
         transport.send(None)
     except (EOFError, OSError):
         messages.put((worker, None))
     except Exception as error:  # an item that does not pickle, a message that does not unpickle
-        messages.put((worker, Abort(error)))
+        messages.put((worker, error))

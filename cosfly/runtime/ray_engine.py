@@ -15,7 +15,6 @@ import signal
 import sys
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from cosfly.runtime.config import Config
 from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.events import Vitals
 from cosfly.runtime.io import sha256_file
-from cosfly.runtime.worker import Item, Message, Start, WorkerOptions
+from cosfly.runtime.worker import Item, Message, Start
 
 log = logging.getLogger(__name__)
 
@@ -72,12 +71,11 @@ class Cluster:
             raise EnvironmentMissing(what, got=f"nodes of {got}", expected=self.needs, fix=fix)
         self._actor = self._ray.remote(_host())
 
-    def start_transport(self, worker_options: WorkerOptions) -> RayTransport:
-        """Request a worker on any node."""
-        host, options = self._actor.options(**self._takes).remote(), astuple(worker_options)[1:]
-        of_stage = str(self._folder), self._record, os.getcwd()
+    def start_transport(self, *options: Any) -> RayTransport:
+        """Request a worker on any node; options as for `pool.LocalTransport`."""
+        host, of_stage = self._actor.options(**self._takes).remote(), (str(self._folder), self._record, os.getcwd())
         started = host.start.remote(options, *of_stage, sys.path, cosfly.__version__)
-        return RayTransport(self._ray, host, started, worker_options.place, self.needs)
+        return RayTransport(self._ray, host, started, options[-1], self.needs)
 
 
 class RayTransport:
@@ -168,7 +166,6 @@ def _host() -> type:
                 return node, None, {"what": "another cosfly", "got": got, "expected": version, "fix": fix}
             from cosfly.runtime.io import sha256_file
             from cosfly.runtime.pool import LocalTransport
-            from cosfly.runtime.worker import WorkerOptions
 
             try:
                 os.chdir(cwd)
@@ -185,7 +182,7 @@ def _host() -> type:
             vars(sys.modules["__main__"]).pop("__file__", None)  # Ray's own, which a spawned process would run again
             self.heartbeat_s = options[0]
             self.inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()  # a worker that still imports reads nothing
-            self.worker = LocalTransport(WorkerOptions(os.getpid(), *options))
+            self.worker = LocalTransport(*options)
             threading.Thread(target=self._send, daemon=True).start()
             return node, self.worker.pid, None
 

@@ -481,14 +481,8 @@ def fingerprint(path: Path) -> str:
 def folder_digests(folder: Path) -> dict[str, str]:
     """Return the sha256 of each file of a track by its name: from `checksums.sha256` where it is listed there."""
     listed = read_checksums(folder) if (folder / CHECKSUMS).is_file() else {}
-    known, root = listed.keys() | {CHECKSUMS}, f"{folder}{os.sep}"
-    found = (  # of thousands of files: as text, paths take three times as long
-        f"{above}{os.sep}{name}".removeprefix(root).replace(os.sep, "/")
-        for above, _, names in os.walk(folder)
-        for name in names
-    )
-    others = (name for name in found if name not in known and (folder / name).is_file())
-    return listed | {name: sha256_file(folder / name) for name in others}
+    found = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    return listed | {name: sha256_file(folder / name) for name in found if name != CHECKSUMS and name not in listed}
 
 
 def recorded_digests(folder: Path) -> dict[str, str]:

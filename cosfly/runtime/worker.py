@@ -113,46 +113,30 @@ class Sign:
     num_steps: int
 
 
-@dataclass(frozen=True)
-class Abort:
-    """The stage cannot go on: a fatal error, or the worker cannot be made."""
-
-    error: Exception
-
-
-Message = Sign | Abort | logging.LogRecord | ItemRecord
-
-
-@dataclass(frozen=True)
-class WorkerOptions:
-    """The options of a worker process. Small: a process that starts its worker waits until they are read."""
-
-    parent_pid: int
-    heartbeat_s: float
-    log_level: int
-    place: int = 0
+# An exception: the stage cannot go on, because of a fatal error or because the worker cannot be made.
+Message = Sign | Exception | logging.LogRecord | ItemRecord
 
 
 # --- the process ------------------------------------------------------------------------------------------------------
 
 
-def work_through(connection: Connection, worker_options: WorkerOptions) -> None:
+def work_through(connection: Connection, parent_pid: int, heartbeat_s: float, log_level: int, place: int) -> None:
     """Receive a Start, then do items until None comes; records, heartbeats and log lines go back through the pipe."""
     global _place
-    end_with_parent(worker_options.parent_pid)
+    end_with_parent(parent_pid)
     for number in LEFT_TO_THE_PARENT:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_THE_PARENT)
     sender = _Sender(connection)
     logging.getLogger().handlers = [sender]
-    set_levels(worker_options.log_level)
-    _place = worker_options.place
+    set_levels(log_level)
+    _place = place
     with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
         # A frame's arrays are megabytes each; pages that are freed and asked for again are cleared one by one.
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(MMAP_THRESHOLD, GREATEST_KEPT_BYTES)
         mallopt(TRIM_THRESHOLD, MOST_KEPT_BYTES)
-    threading.Thread(target=sender.send_heartbeats, args=(worker_options.heartbeat_s,), daemon=True).start()
+    threading.Thread(target=sender.send_heartbeats, args=(heartbeat_s,), daemon=True).start()
     try:
         make: Start | None = _received(connection)
         work = make() if make else None
@@ -168,7 +152,7 @@ def work_through(connection: Connection, worker_options: WorkerOptions) -> None:
             if type(error).__module__ != "builtins":  # many of those do not cross the pipe; their words do
                 error = RuntimeError(f"a bug in a worker: {type(error).__name__}: {error}")
             error.add_note(traceback.format_exc())  # a bug keeps its traceback, which does not cross the pipe
-        sender.send(Abort(error))
+        sender.send(error)
 
 
 def _received(connection: Connection) -> Any:
