@@ -426,9 +426,9 @@ def _check_same(out: Path, record: StageRecord, resume: Resume) -> None:
         old, new = found.inputs.get(name), record.inputs.get(name)
         if old is None or new is None or old.sha256 != new.sha256:
             differences.append(f"the input {name} ({new.path if new else 'none'}) has changed")
-    both = found.package_files.keys() & record.package_files.keys()
-    changed = (name for name in sorted(both) if found.package_files[name] != record.package_files[name])
-    if differences := [*differences, *(f"the {name} changed" for name in changed)]:
+    files = record.package_files
+    differences += [f"the {name} changed" for name, own in found.package_files.items() if files.get(name, own) != own]
+    if differences:
         what, fix = "the folder holds work made with other settings or inputs", "choose another --out, or restore them"
         raise ResumeError(what, where=out, got="; ".join(differences), fix=fix)
     if found.code_version != record.code_version:
@@ -445,10 +445,8 @@ def flattened(config: Any, prefix: str = "") -> dict[str, Any]:
     """Return every value of nested objects by its dotted path."""
     if not isinstance(config, dict) or not config:
         return {prefix: config}
-    flat: dict[str, Any] = {}
-    for key, value in config.items():
-        flat.update(flattened(value, f"{prefix}.{key}" if prefix else str(key)))
-    return flat
+    parts = (flattened(value, f"{prefix}.{key}".removeprefix(".")) for key, value in config.items())
+    return {name: value for part in parts for name, value in part.items()}
 
 
 def _check_outputs_exist(out: Path, manifest: Manifest) -> None:
