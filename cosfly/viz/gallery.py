@@ -125,10 +125,9 @@ def _row(track: Track) -> np.ndarray:
     tiles += [np.zeros_like(tiles[0])] * (NUM_RGB_TILES - len(tiles))
     middle = track.frame_folder(frames[len(frames) // 2])
     for view in ("depth", "segmentation"):
-        if frame_path(middle, VIEW_FILES[view]).is_file():
-            tiles.append(_tile(read_view(middle, view), view))
-        else:
-            tiles.append(_tile(np.zeros_like(tiles[0]), f"no {VIEW_FILES[view]}"))
+        is_there = frame_path(middle, VIEW_FILES[view]).is_file()
+        picture = read_view(middle, view) if is_there else np.zeros_like(tiles[0])
+        tiles.append(_tile(picture, view if is_there else f"no {VIEW_FILES[view]}"))
     strip = np.full((22, TILE_PX[0] * len(tiles), 3), 24, np.uint8)
     visible = f"target visible in {int(track.target.visible.sum())} of {len(track)} frames"
     fov = " to ".join(dict.fromkeys(f"{fov:.0f}" for fov in track.fovs_deg))

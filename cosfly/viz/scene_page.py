@@ -34,7 +34,7 @@ MB = 1024 * 1024
 # 1 is opaque.
 OPACITIES = {"Buildings": 0.5, "Vegetation": 0.35, "Walls": 0.6, "Bridge": 0.6}
 LAYER_M = 0.02  # between coplanar surfaces
-MOST_MATRIX_CELLS = 64_000_000
+MOST_MATRIX_CELLS, MOST_PATHS = 64_000_000, 100
 
 
 @dataclass
@@ -59,7 +59,6 @@ def run(
     paths: Path | None = None,
     traces: Sequence[Path] = (),
     data: Path | None = None,
-    most_paths: int = 100,
     picture_px: int = 320,
     max_mb: float = 24.0,
 ) -> Path:
@@ -67,8 +66,7 @@ def run(
     returns its path.
 
     Args:
-        most_paths: Only the first are shown. picture_px: Width of frames. max_mb: Size of the page; frames are skipped
-            evenly to stay below it.
+        picture_px: Width of frames. max_mb: Size of the page; frames are skipped evenly to stay below it.
 
     Raises:
         InputError: If a file cannot be read, or the page is too large without any frame.
@@ -82,9 +80,9 @@ def run(
         notes.append(f"{len(drawn_tracks) - len(own):,} tracks are of other towns")
     tracks += [_of_drawn(drawn) for drawn in own]
     names = list(dict.fromkeys([path.path_id for path in pedestrians] + [track.path for track in tracks]))
-    if len(names) > most_paths:
-        notes.append(f"{most_paths:,} of {len(names):,} paths are shown")
-    known = names[:most_paths]
+    known = names[:MOST_PATHS]
+    if len(names) > MOST_PATHS:
+        notes.append(f"{MOST_PATHS:,} of {len(names):,} paths are shown")
     tracks = [track for track in tracks if track.path in known]
     content: dict[str, Any] = {
         **_boxes(box_map),
