@@ -1,7 +1,5 @@
 """cosfly/closed_loop/controller.py: what a decision is flown as, held against the rules that decisions are judged by."""
 
-from collections import deque
-
 import numpy as np
 import pytest
 from specimens_planning import town_of, walk_along
@@ -70,10 +68,10 @@ def test_a_decision_that_is_flown_for_its_horizon_shows_what_its_own_rule_asks_f
 
 @each("command", [(99.0, 0, 0, 0, 0), (0, 0, 0, float("nan"), 0), (0, 0)])
 def test_a_command_that_cannot_be_flown_is_the_students_failure_and_the_drone_hovers(begin, command):
-    flight, controller, moment = begin()
-    under_way = OpenEpisode("path_00000", flight, controller, deque([moment]))
+    flight, _, moment = begin()
+    under_way = OpenEpisode("path_00000", flight, read_controls(CONTROLLER_FILE, TOKENS), 1)
     under_way.step(EngineDecision("ok", command=np.array(command)))
-    [frame] = under_way.frames
+    frame = under_way.frames[-1]
     assert (frame.answer, frame.action, frame.command[:4]) == ("invalid", None, (0, 0, 0, 0))
     assert under_way.moments[-1].index == moment.index + 1
 

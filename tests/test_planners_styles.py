@@ -24,7 +24,7 @@ from cosfly.pedestrians.walkable import walkable_ground
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.planners.maneuver_plan import draw_maneuvers
-from cosfly.planners.reacquire import finds_again
+from cosfly.planners.reference_trajectory import finds_again
 from cosfly.planners.stage import draw_styles_of, make_scenario, plan_trajectory, screens_of, style_rng
 from cosfly.planners.styles import FOLLOW, NAMES, REACQUIRE, RETURN_HOME, TABLE
 from cosfly.render.camera import view_target

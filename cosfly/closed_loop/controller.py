@@ -6,7 +6,6 @@ keeps its aim: the point ahead, at hip height, at which it looked when the episo
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Literal
 
@@ -20,9 +19,7 @@ from cosfly.geometry.axes import look_at, wrap_deg
 from cosfly.geometry.motion import in_axes_of
 from cosfly.runtime.config import Config, build, read_yaml
 from cosfly.runtime.errors import ConfigError
-from cosfly.runtime.json_io import FileFormat
 
-CONTROLLER_FORMAT = FileFormat("cosfly.controller", "1.0", "controller")
 AIM_MOST_M = 100.0  # distance of the aim of a camera that looks at the horizon
 
 
@@ -43,10 +40,8 @@ class Control(Config):
 class ControlTable(Config):
     """The file of the table."""
 
-    schema_: str = Field(alias="schema", pattern=f"^{CONTROLLER_FORMAT.schema}$", description="format of the file")
-    schema_version: str = Field(
-        pattern=f"^{re.escape(CONTROLLER_FORMAT.version)}$", description="version of the format"
-    )
+    schema_: Literal["cosfly.controller"] = Field(alias="schema", description="format of the file")
+    schema_version: Literal["1.0"] = Field(description="version of the format")
     actions: dict[str, Control] = Field(min_length=1, description="action -> command")
 
 
@@ -54,9 +49,7 @@ def read_controls(path: Path, tokens: tuple[str, ...]) -> dict[str, Control]:
     """Read a table, which needs a row for each token."""
     found = build(ControlTable, read_yaml(path), path).actions
     if lacking := [token for token in tokens if token not in found]:
-        raise ConfigError(
-            "decisions without a row in the table", where=path, got=", ".join(lacking), fix="add the rows"
-        )
+        raise ConfigError("decisions without a row", where=path, got=", ".join(lacking), fix="add the rows")
     return found
 
 

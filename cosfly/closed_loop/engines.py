@@ -43,7 +43,6 @@ from distill.inference.stage import InferConfig, Inputs, local_answers
 from distill.schema import Sample
 
 NO_SET = "decision_not_in_closed_set"  # of readable answers with an unknown decision
-FILES = frozenset({*FILE_NAMES.values()})
 
 
 @dataclass(frozen=True)
@@ -67,12 +66,13 @@ class Observation:
 
 
 class DecisionEngine(Protocol):
-    """An engine. name: in records. num_frames: most frames of an observation. `decide`: one decision for each."""
+    """An engine. name: in records. num_frames: most frames of an observation."""
 
     name: str
     num_frames: int
 
-    def decide(self, observations: Sequence[Observation]) -> list[EngineDecision]: ...
+    def decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:
+        """Return one decision for each observation."""
 
 
 def open_engine(cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed: int, answers: Path) -> DecisionEngine:
@@ -131,8 +131,11 @@ class PromptedEngine:
     trained one (`caption.student.folder`) gets the prompts and pictures of its training. All episodes at once."""
 
     def __init__(self, cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed: int, answers: Path) -> None:
-        folder = _training_folder(cfg)
-        update: dict[str, Any] = {"teacher": "rules" if cfg.engine == "transformers" else cfg.student}
+        is_local, place = cfg.engine == "transformers", Path(cfg.student.partition(":")[2])
+        folder = cfg.adapter or place if is_local else cfg.as_student  # with the chat format of a trained student
+        if cfg.engine == "vllm" and (place / CHAT_FORMAT_FILE).is_file():
+            folder = folder or place
+        update: dict[str, Any] = {"teacher": "rules" if is_local else cfg.student}
         if folder is not None:
             update["student"] = caption.student.model_copy(update={"folder": folder})
         self.vocabulary = vocabulary_of(caption)
@@ -149,10 +152,10 @@ class PromptedEngine:
 
     def decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:
         """Ask about all episodes at once."""
-        return self._runner.run(self._decide(observations))
+        return self._runner.run(self._ask_all([self._question(observation) for observation in observations]))
 
-    async def _decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:
-        return await asyncio.gather(*(self._ask(self._question(observation)) for observation in observations))
+    async def _ask_all(self, questions: Sequence[Question]) -> list[EngineDecision]:
+        return await asyncio.gather(*map(self._ask, questions))
 
     async def _ask(self, question: Question) -> EngineDecision:
         begun_s = time.monotonic()
@@ -173,9 +176,8 @@ class PromptedEngine:
         more = {} if self.cfg.student.folder is not None else more_fields(question.way)
         parsed = parse_answer(text, more=tuple(more), finish_reason=finish_reason, optional=question.way.optional)
         if parsed.coc is None:
-            return EngineDecision(
-                "invalid" if parsed.reason == NO_SET else "unreadable", None, text[:MOST_WORDS], answer_s
-            )
+            answer: Answer = "invalid" if parsed.reason == NO_SET else "unreadable"
+            return EngineDecision(answer, None, text[:MOST_WORDS], answer_s)
         draft = question.way.read(parsed, question.facts)
         coc = draft.coc if isinstance(draft, Draft) else parsed.coc
         words = f"{coc.critical_components} {coc.reasoning_trace}"[:MOST_WORDS]
@@ -185,23 +187,21 @@ class PromptedEngine:
         place, moments = observation.simulation.place, observation.moments
         targets = [moment.target for moment in moments]
         bystanders = [[moment.bystanders.get(BYSTANDER_COLUMNS[k]) for k in (0, 1, 4)] for moment in moments]
+        poses = ("time_s", "position_m", "rotation_deg", "target_m")
         frames = observed_frames(
-            np.array([moment.time_s for moment in moments]),
-            np.array([moment.position_m for moment in moments]),
-            np.array([moment.rotation_deg for moment in moments]),
-            np.array([moment.target_m for moment in moments]),
+            *(np.array([getattr(moment, name) for moment in moments]) for name in poses),
             np.array([target.image_uv or [math.nan] * 2 for target in targets]),
             np.array([target.mask_bbox_2d or [math.nan] * 4 for target in targets]),
             *(np.array([getattr(target, name) for target in targets]) for name in ("in_view", "visible", "visibility")),
             np.array([bool(target.legible) for target in targets]),
             *np.array(bystanders, dtype=np.float64).T,
         )
-        folders = [self._folder(place, moment) for moment in moments]
-        indices = tuple(moment.index for moment in moments)
-        name = sample_id(f"{place[1]}_{place[2]}", indices[-1])
-        height_px, width_px, _ = moments[-1].frame.rgb.shape
-        files = (FILES,) * len(folders)
-        window = ObservedWindow(name, *place, indices, width_px, height_px, frames, tuple(folders), files)
+        folders, indices = (
+            tuple(one) for one in zip(*((self._folder(place, m), m.index) for m in moments), strict=True)
+        )
+        name, (height_px, width_px, _) = sample_id(f"{place[1]}_{place[2]}", indices[-1]), moments[-1].frame.rgb.shape
+        files = (frozenset(FILE_NAMES.values()),) * len(moments)
+        window = ObservedWindow(name, *place, indices, width_px, height_px, frames, folders, files)
         return make_question(window, self.cfg.image, self.cfg.writing, self.vocabulary)
 
     def _folder(self, place: tuple[str, str, str], moment: Moment) -> Path:
@@ -220,14 +220,6 @@ class PromptedEngine:
         return folder
 
 
-def _training_folder(cfg: FlyConfig) -> Path | None:
-    """Return the folder with a student's chat format, if there is one."""
-    place = Path(cfg.student.partition(":")[2])
-    if cfg.engine == "transformers":
-        return cfg.adapter or place
-    return cfg.as_student or (place if cfg.engine == "vllm" and (place / CHAT_FORMAT_FILE).is_file() else None)
-
-
 class LocalEngine(PromptedEngine):
     """A student in this process (distill/inference); all episodes are one batch."""
 
@@ -236,9 +228,8 @@ class LocalEngine(PromptedEngine):
         inputs = Inputs((), trees, model, cfg.adapter)
         self._local, self.name = local_answers(infer, inputs, self._book), inputs.name
 
-    async def _decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:
+    async def _ask_all(self, questions: Sequence[Question]) -> list[EngineDecision]:
         begun_s = time.monotonic()
-        questions = [self._question(observation) for observation in observations]
         found = [one async for one in self._local.answers(map(self._sample, questions), lambda count, told="": None)]
         answer_s = time.monotonic() - begun_s  # of the whole batch
         if answer_s > self.limit_s:

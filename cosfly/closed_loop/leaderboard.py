@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from cosfly.closed_loop.measures import MEASURES, SHARES, figures_of, score_measured
 from cosfly.closed_loop.settings import BASELINES
@@ -20,7 +19,7 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes, write_bytes
-from cosfly.runtime.json_io import FileFormat, write_model
+from cosfly.runtime.json_io import FileFormat, Record, write_model
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.runtime.seeding import rng_for
 from cosfly.viz.frame_views import thumbnail
@@ -38,11 +37,7 @@ class LeaderboardConfig(Config):
     rounds: bool = False
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Standing(_Strict):
+class Standing(Record):
     """One student of a table. gain: of a round, the change of its figures from the round before."""
 
     name: str
@@ -51,14 +46,14 @@ class Standing(_Strict):
     gain: dict[str, Figure] | None = None
 
 
-class StudentTable(_Strict):
+class StudentTable(Record):
     """Students with the same episodes. episodes: digest of each folder's episodes."""
 
     episodes: tuple[str, ...]
     standings: tuple[Standing, ...]
 
 
-class Leaderboard(_Strict):
+class Leaderboard(Record):
     """`leaderboard.json`."""
 
     tables: tuple[StudentTable, ...]
@@ -125,10 +120,8 @@ def tables_of(students: Mapping[str, StudentFolders], cfg: LeaderboardConfig, se
 # --- the page ---------------------------------------------------------------------------------------------------------
 
 
-def shown(name: str, figure: Figure, *, signed: bool = False) -> str:
-    """Return a figure with its interval as text."""
-    sign, digits = "+" if signed else "", ".1%" if name in SHARES else ".2f"
-    return shown_as(f"{{:{sign}{digits}}}", figure)
+def _shown(name: str, figure: Figure, *, signed: bool = False) -> str:
+    return shown_as(f"{{:{'+' * signed}{'.1%' if name in SHARES else '.2f'}}}", figure)
 
 
 def page_of(board: Leaderboard, students: Mapping[str, StudentFolders]) -> str:
@@ -143,7 +136,7 @@ def page_of(board: Leaderboard, students: Mapping[str, StudentFolders]) -> str:
         tables.append({"table": table, "chart": bars(groups), "strips": strips})
     return page(
         "cosfly/closed_loop/leaderboard.html", title="Closed loop", style=STYLE, tables=tables, measures=MEASURES,
-        headline=HEADLINE, shown=shown, colors=COLORS, width_px=STRIP_PX,
+        headline=HEADLINE, shown=_shown, colors=COLORS, width_px=STRIP_PX,
     )  # fmt: skip
 
 

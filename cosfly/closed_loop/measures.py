@@ -4,14 +4,13 @@ Success is our definition: the drone followed to the end of the pedestrian traje
 last LOSS_S, and the drone ended within BAND_M of it. EVT-Bench (TrackVLA, its public code) requires the same at the
 episode's end, facing the target at 1 to 3 m, and ends an episode at a collision or after 20 steps beyond 4 m; DAT's
 success rate is the share of time with a visible target (our `in_view`). UAV-Track VLA reports 61.76 % success and
-269.65
-tracked frames on far pedestrians in CARLA without a definition that we could find, so the figures are not comparable.
+269.65 tracked frames on far pedestrians in CARLA without a definition that we could find: these are not comparable.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from itertools import groupby, pairwise
 from typing import Any
 
@@ -58,7 +57,7 @@ MEASURES = {
 SHARES = {"success", "in_view", "in_picture", "lost", "reacquired", "in_band", "crashed", "left", "no_decision"}
 
 
-def measure(record: Episode, trained_on: Iterable[str] | None = None) -> EpisodeScore:
+def measure(record: Episode, trained_on: Collection[str] | None = None) -> EpisodeScore:
     """Measure one episode. trained_on: towns of the student's training, None if unknown.
 
     Frames after an early end count as frames without a visible target.
@@ -68,9 +67,8 @@ def measure(record: Episode, trained_on: Iterable[str] | None = None) -> Episode
     loss_frames = max(1, round(LOSS_S / dt_s))
     runs = [(is_seen, len(list(run))) for is_seen, run in groupby(frame.visible for frame in flown)]
     begins = np.cumsum([0, *(count for _, count in runs)])[:-1].tolist()
-    losses = [
-        (begin, count) for (seen, count), begin in zip(runs, begins, strict=True) if not seen and count >= loss_frames
-    ]
+    hidden = [(begin, count) for (seen, count), begin in zip(runs, begins, strict=True) if not seen]
+    losses = [(begin, count) for begin, count in hidden if count >= loss_frames]
     found = [count for begin, count in losses if begin + count < num]
     is_lost = not runs[-1][0] and runs[-1][1] >= loss_frames
     in_band = [BAND_M[0] <= frame.distance_m <= BAND_M[1] for frame in flown]
@@ -103,9 +101,9 @@ def measure(record: Episode, trained_on: Iterable[str] | None = None) -> Episode
         "no_decision": (len(decisions) - answers["ok"], len(decisions)),
         "decision_s": (sum(times), len(times)),
     }
-    towns = None if trained_on is None else set(trained_on)
-    training = "unknown" if towns is None else "trained on" if record.town in towns else "never trained on"
-    style = record.style
+    style, training = record.style, "unknown"
+    if trained_on is not None:
+        training = "trained on" if record.town in trained_on else "never trained on"
     return EpisodeScore(
         episode=record.episode, town=record.town, walk=f"{record.map_sha256[:12]}/{record.walk}",
         groups={
@@ -138,29 +136,21 @@ def score_episodes(records: Iterable[Episode], *, trained_on: Sequence[str] | No
     if len(students) != 1:
         got = "; ".join(" ".join(filter(None, words)) for words in sorted(students)[:3]) or "no episode"
         raise InputError("these are not episodes of one student on one list", where="episodes", got=got)
-    (student, engine, listed), digest = students.pop(), sha256_bytes(dump_json(sorted(digests)).encode())
     measured.sort(key=lambda one: (one.town, one.episode))
-    return score_measured(
-        measured, seed, student=student, engine=engine, episodes_sha256=digest, list_sha256=listed or None,
-        trained_on=trained_on,
-    )  # fmt: skip
+    about = dict(zip(("student", "engine", "list_sha256"), (word or None for word in students.pop()), strict=True))
+    digest = sha256_bytes(dump_json(sorted(digests)).encode())
+    return score_measured(measured, seed, episodes_sha256=digest, trained_on=trained_on, **about)
 
 
 def score_measured(measured: Sequence[EpisodeScore], seed: int, **about: Any) -> Score:
     """Score measured episodes, of one map or several. about: the fields of Score that are not computed here."""
-    by: dict[str, dict[str, dict[str, Figure]]] = {}
-    for kind in GROUPS:
-        groups = {
-            name: [one for one in measured if one.groups[kind] == name]
-            for name in sorted({one.groups[kind] for one in measured})
-        }
-        by[kind] = {name: figures_of(group, _score_rng(seed)) for name, group in groups.items()}
-    figures = figures_of(measured, _score_rng(seed))
+    by: dict[str, dict[str, dict[str, Figure]]] = {kind: {} for kind in GROUPS}
+    for kind, groups in by.items():
+        for name in sorted({one.groups[kind] for one in measured}):
+            group = [one for one in measured if one.groups[kind] == name]
+            groups[name] = figures_of(group, rng_for(seed, "score", "draws"))
+    figures = figures_of(measured, rng_for(seed, "score", "draws"))
     return Score(**about, confidence=CONFIDENCE, resamples=RESAMPLES, figures=figures, by=by, flights=tuple(measured))
-
-
-def _score_rng(seed: int) -> np.random.Generator:
-    return rng_for(seed, "score", "draws")
 
 
 def figures_of(

@@ -62,12 +62,8 @@ class Policy:
     num_frames = 1
 
     def __init__(self, spec: str, limit_s: float, seed: int) -> None:
-        """
-        Args:
-            spec: module:Class, importable from the working directory.
-        """
-        self.name, self._limit_s, self._seed = spec, limit_s, seed
-        self._episode = ""
+        """Start the process of `spec`, a module:Class that is importable from the working directory."""
+        self.name, self._limit_s, self._seed, self._episode = spec, limit_s, seed, ""
         self._process: subprocess.Popen | None = None
         self._failure: EngineDecision | None = None
         self._start()
@@ -84,9 +80,9 @@ class Policy:
         self._num_late, self._awaits_reply = 0, True
         answer, message = self._ask(None, START_LIMIT_S)
         if answer != "ok":
+            what, got = "the policy cannot be created", f"{self.name}: {message}"
             expected = "module:Class with reset(goal, seed) and act(observation), importable from here"
-            got = f"{self.name}: {message}"
-            raise InputError("the policy cannot be created", where="--policy", got=got, expected=expected)
+            raise InputError(what, where="--policy", got=got, expected=expected)
 
     def close(self) -> int | None:
         """End the process and its children; return its exit status."""
@@ -122,10 +118,9 @@ class Policy:
             return EngineDecision(answer, words=str(value)[:MOST_WORDS], answer_s=answer_s)
         if isinstance(value, int) and 0 <= value < len(TOKENS):
             value = TOKENS[value]
-        if isinstance(value, str):
-            if value in TOKENS:
-                return EngineDecision("ok", value, answer_s=answer_s)
-        elif isinstance(value, list):
+        if isinstance(value, str) and value in TOKENS:
+            return EngineDecision("ok", value, answer_s=answer_s)
+        if isinstance(value, list):
             command, drone = np.array(value), observation.simulation.drone
             low, high = drone.bounds
             if command.shape == low.shape and (command >= low).all() and (command <= high).all():
@@ -176,12 +171,15 @@ def serve(fd: int, parent_pid: int, spec: str) -> None:
     def send(answer: str, value: Any = "") -> None:
         connection.send_bytes(json.dumps([answer, value]).encode())
 
+    def failed(error: Exception) -> tuple[str, str]:
+        return "none", f"{type(error).__name__}: {error}"[:MOST_WORDS]
+
     try:
         module, _, name = spec.partition(":")
         policy = getattr(importlib.import_module(module), name)()
         calls: dict[str, Callable[..., Any]] = {"reset": policy.reset, "act": policy.act}
     except Exception as error:
-        send("none", f"{type(error).__name__}: {error}"[:MOST_WORDS])
+        send(*failed(error))
         return
     send("ok")
     while True:
@@ -193,7 +191,7 @@ def serve(fd: int, parent_pid: int, spec: str) -> None:
             value = calls[name](*arguments)
             reply = _plain(value) if name == "act" else ("ok", "")
         except Exception as error:
-            reply = "none", f"{type(error).__name__}: {error}"[:MOST_WORDS]
+            reply = failed(error)
         send(*reply)
 
 

@@ -22,7 +22,7 @@ from caption.truth.actions import TABLE, measure
 from cosfly.closed_loop.engines import PlannerEngine
 from cosfly.closed_loop.measures import LOSS_S
 from cosfly.closed_loop.stage import PLAN, TRACES, TREE, ClosedLoopConfig, flown_trace
-from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, Moment, as_drawn
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, as_drawn
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.episodes import Episode, EpisodeFrame, episode_file, read_episode, read_score
 from cosfly.formats.traces import ARRAYS, DroneTrace, Excerpt, read_traces, write_traces
@@ -41,16 +41,9 @@ CAPTIONS = "caption"
 
 
 def run(
-    cfg: ClosedLoopConfig,
-    flown: Path,
-    boxes: Path,
-    simplified: Path,
-    out: Path,
-    *,
-    workers: int = 1,
-    watch: Watch = Watch(),
-    resume: Resume = "if-same",
-) -> Path:
+    cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Path, out: Path, *, workers: int = 1,
+    watch: Watch = Watch(), resume: Resume = "if-same",
+) -> Path:  # fmt: skip
     """Read a folder of `cosfly fly` and its map; write `drone_trace.json`, the playback tree `render/` of the planner's
     continuations, and the teacher's `caption/` of it. Return the output directory.
 
@@ -132,7 +125,17 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
             advance()
         if simulation.ended != "finished":
             return Outcome(drop_reason="crashes")
-        reasons = _reasons(record, i, _motion(moments[num.num_frames - 2 :][: num.future_frames + 2], simulation.dt_s))
+        before, *after = moments[num.num_frames - 2 :][: num.future_frames + 2]
+        future = FutureMotion(
+            indices=tuple(moment.index for moment in after[1:]),
+            time_s=np.array([moment.time_s for moment in after]),
+            positions_m=np.array([moment.position_m for moment in after]),
+            yaw_deg=np.array([moment.rotation_deg[1] for moment in after]),
+            targets_m=np.array([moment.target_m for moment in after]),
+            visible=np.array([moment.target.visible for moment in after]),
+            speed_before_mps=float(np.linalg.norm(after[0].position_m - before.position_m)) / simulation.dt_s,
+        )
+        reasons = _reasons(record, i, future)
         if relabel.mistakes_only and not reasons:
             return Outcome(drop_reason="no_mistake")
         poses = simulation.poses
@@ -150,20 +153,6 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
         return Outcome({"trace": trace.as_json(), "reasons": reasons})
 
     return work
-
-
-def _motion(moments: Sequence[Moment], dt_s: float) -> FutureMotion:
-    """Return the motion after the second of some moments; the first gives the speed before it."""
-    before, *after = moments
-    return FutureMotion(
-        indices=tuple(moment.index for moment in after[1:]),
-        time_s=np.array([moment.time_s for moment in after]),
-        positions_m=np.array([moment.position_m for moment in after]),
-        yaw_deg=np.array([moment.rotation_deg[1] for moment in after]),
-        targets_m=np.array([moment.target_m for moment in after]),
-        visible=np.array([moment.target.visible for moment in after]),
-        speed_before_mps=float(np.linalg.norm(after[0].position_m - before.position_m)) / dt_s,
-    )
 
 
 def _planned_on(plan: DroneTrace, flown: Sequence[EpisodeFrame], space: Airspace, cfg: PlanConfig) -> DroneTrace:

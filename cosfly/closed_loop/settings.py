@@ -65,8 +65,7 @@ class RelabelConfig(Config):
 
 
 CONTROLLER_FILE = Path(__file__).with_name("controller.yaml")
-BASELINES = ("track_straight", "random")
-MODELS = ("endpoint", "vllm", "transformers")
+BASELINES, MODELS = ("track_straight", "random"), ("endpoint", "vllm", "transformers")
 ENGINES = ("rules", *MODELS, "policy", *BASELINES, "planner")
 KINDS = (
     "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR or policy:MODULE:CLASS; the baselines track_straight and "

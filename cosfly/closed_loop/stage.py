@@ -10,10 +10,10 @@ import logging
 import os
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -69,30 +69,21 @@ class ClosedLoopConfig(Config):
     infer: InferConfig
 
 
-@dataclass
 class OpenEpisode:
     """An episode in progress. moments: as many as the student sees; frames: the record so far."""
 
-    episode: str
-    simulation: ClosedLoopTrajectory
-    controller: Controller
-    moments: deque[Moment]
-    frames: list[EpisodeFrame] = field(default_factory=list)
-
-    @classmethod
-    def begin(
-        cls, episode: str, simulation: ClosedLoopTrajectory, controls: dict[str, Control], num_frames: int
-    ) -> Self:
+    def __init__(
+        self, episode: str, simulation: ClosedLoopTrajectory, controls: dict[str, Control], num_frames: int
+    ) -> None:
         """Start an episode and record its lead frames."""
         plan, lead = simulation.planned, simulation.reset()
-        controller = Controller(controls, simulation.drone, lead[-1])
-        begun = cls(episode, simulation, controller, deque(lead, num_frames))
+        self.episode, self.simulation, self.frames = episode, simulation, list[EpisodeFrame]()
+        self.controller, self.moments = Controller(controls, simulation.drone, lead[-1]), deque(lead, num_frames)
         poses = np.hstack([plan.positions_m, plan.rotations_deg])
         between = np.empty((len(poses), 0, 6))
         flown = PlannedMotion(plan.time_s, poses, between, plan.rotations_deg[:, 1], plan.positions_m).action
         for moment, command in zip(lead[:-1], flown, strict=False):
-            begun.note(moment, EngineDecision("lead"), command, float(plan.clearances_m[moment.index]))
-        return begun
+            self.note(moment, EngineDecision("lead"), command, float(plan.clearances_m[moment.index]))
 
     def note(self, moment: Moment, decision: EngineDecision, command: np.ndarray | None, clearance_m: float) -> None:
         """Record a frame."""
@@ -120,7 +111,7 @@ class OpenEpisode:
         self.moments.append(reached)
 
     def record(self, about: dict[str, Any]) -> Episode:
-        """Record the last frame, and return the record. about: fields that all episodes share."""
+        """Record the last frame and return the record. about: fields that all episodes share."""
         simulation, plan, last = self.simulation, self.simulation.planned, self.moments[-1]
         camera = simulation.script.cameras[0]
         self.note(last, EngineDecision("end"), None, last.clearance_m)
@@ -151,7 +142,7 @@ class EpisodeRunner:
         """Fly episodes to their ends and write each record; episodes with a record are skipped."""
         controls, num_frames, about = self.controls, self.engine.num_frames, self.about | {"map_sha256": map_sha256}
         missing = {name: opened for name, opened in episodes.items() if not episode_file(self.out, name).exists()}
-        open_ones = [OpenEpisode.begin(name, opened(), controls, num_frames) for name, opened in missing.items()]
+        open_ones = [OpenEpisode(name, opened(), controls, num_frames) for name, opened in missing.items()]
         while open_ones:
             observations = [Observation(one.episode, one.simulation, tuple(one.moments)) for one in open_ones]
             for one, decision in zip(open_ones, self.engine.decide(observations), strict=True):
@@ -164,18 +155,9 @@ class EpisodeRunner:
 
 
 def run(
-    cfg: ClosedLoopConfig,
-    boxes: Path,
-    simplified: Path,
-    paths: Path,
-    out: Path,
-    *,
-    seed: int = 0,
-    workers: int = 1,
-    watch: Watch = Watch(),
-    resume: Resume = "if-same",
-    others: Path | None = None,
-) -> Path:
+    cfg: ClosedLoopConfig, boxes: Path, simplified: Path, paths: Path, out: Path, *, seed: int = 0, workers: int = 1,
+    watch: Watch = Watch(), resume: Resume = "if-same", others: Path | None = None,
+) -> Path:  # fmt: skip
     """Read a map, its obstacles, pedestrian trajectories and bystanders; write `plan/`, `episodes/`, the flown
     `drone_trace.json`, `score.json` and, if set, the playback tree `render/`. Return the output directory.
 
@@ -197,43 +179,32 @@ def run(
     )  # fmt: skip
     if not stage.is_complete:
         plans = planning.run(cfg.plan, simplified, paths, out / PLAN, **common)
-        _fly_all(stage, cfg, (boxes, simplified, plans, others), seed, workers, watch)
+        num = 1 if cfg.fly.asks_model else workers
+        worker_args = (cfg, (boxes, simplified, plans, others), stage.path, seed, num)
+        traces = read_traces(plans)
+        reasons = [trace.drop_reason or (len(trace.time_s) <= cfg.fly.lead_frames and "too_short") for trace in traces]
+        flown = [n for n, reason in enumerate(reasons) if not reason]
+        dropped = Counter(str(reason) for reason in reasons if reason)
+        if not flown:
+            expected = f"an accepted plan of more than fly.lead_frames={cfg.fly.lead_frames} frames"
+            raise stage.nothing_kept(Tally(input=len(traces), dropped=dropped), expected=expected)
+        ordered = sorted(flown, key=lambda n: (Airspace.area_of(traces[n].targets_m), n))
+        items, most = [], min(cfg.fly.batch, -(-len(flown) // num))
+        for batch in (ordered[k : k + most] for k in range(0, len(ordered), most)):
+            steps = sum(len(_cut(traces[n], cfg.fly).time_s) - cfg.fly.lead_frames for n in batch)
+            items.append(Item(f"{traces[batch[0]].path_id} and {len(batch) - 1}", batch, steps))
+        run_items(stage, items, make_worker, worker_args, workers=num, watch=watch)
+        names = [traces[n].path_id for n in flown]
+        finish_episodes(stage, cfg.fly, seed, names, dropped, obstacle_index(read_boxes(simplified)))
     if cfg.fly.tree:
         rendering.run(as_drawn(cfg.render, seed), boxes, simplified, out / TRACES, out / TREE, others=others, **common)
     return out
 
 
-Inputs = tuple[Path, Path, Path, Path | None]  # boxes, simplified, plans, bystanders
-
-
-def _fly_all(stage: StageFolder, cfg: ClosedLoopConfig, inputs: Inputs, seed: int, workers: int, watch: Watch) -> None:
-    traces, num = read_traces(inputs[2]), 1 if cfg.fly.asks_model else workers
-    reasons = [trace.drop_reason or (len(trace.time_s) <= cfg.fly.lead_frames and "too_short") for trace in traces]
-    numbers, dropped = (
-        [n for n, reason in enumerate(reasons) if not reason],
-        Counter(str(one) for one in reasons if one),
-    )
-    if not numbers:
-        expected = f"an accepted plan of more than fly.lead_frames={cfg.fly.lead_frames} frames"
-        raise stage.nothing_kept(Tally(input=len(traces), dropped=dropped), expected=expected)
-    ordered = sorted(numbers, key=lambda n: (Airspace.area_of(traces[n].targets_m), n))
-    items, most = [], min(cfg.fly.batch, -(-len(numbers) // num))
-    for batch in [ordered[k : k + most] for k in range(0, len(ordered), most)]:
-        steps = sum(len(_cut(traces[n], cfg.fly).time_s) - cfg.fly.lead_frames for n in batch)
-        items.append(Item(f"{traces[batch[0]].path_id} and {len(batch) - 1}", batch, steps))
-    run_items(stage, items, make_worker, (cfg, inputs, stage.path, seed, num), workers=num, watch=watch)
-    obstacles = obstacle_index(read_boxes(inputs[1]))
-    finish_episodes(stage, cfg.fly, seed, [traces[n].path_id for n in numbers], dropped, obstacles)
-
-
 def finish_episodes(
-    stage: StageFolder,
-    fly: FlyConfig,
-    seed: int,
-    episodes: Sequence[str],
-    dropped: Counter[str] | None = None,
-    obstacles: BoxIndex | None = None,
-) -> None:
+    stage: StageFolder, fly: FlyConfig, seed: int, episodes: Sequence[str],
+    dropped: Counter[str] | None = None, obstacles: BoxIndex | None = None,
+) -> None:  # fmt: skip
     """Write the score of the flown episodes and, with the obstacles of one map, `drone_trace.json`; end the stage."""
     files = [path for name in episodes if (path := episode_file(stage.path, name)).exists()]
     dropped, failed = dropped or Counter(), +Counter({"flights": len(episodes) - len(files)})
@@ -257,13 +228,14 @@ def finish_episodes(
     )  # fmt: skip
 
 
-def make_worker(cfg: ClosedLoopConfig, inputs: Inputs, out: Path, seed: int, num: int) -> Work:
+def make_worker(
+    cfg: ClosedLoopConfig, inputs: tuple[Path, Path, Path, Path | None], out: Path, seed: int, num: int
+) -> Work:
     """Open a renderer and an engine in this process; return the function that flies the episodes of an item."""
     boxes, simplified, plans, others = inputs
     runner, traces = EpisodeRunner(cfg, out, seed, num), read_traces(plans)
-    bystanders, num_others = rendering.bystanders_of(others, traces)
+    (bystanders, num_others), map_sha256 = rendering.bystanders_of(others, traces), sha256_file(boxes)
     space = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed, num_others=num_others)
-    map_sha256 = sha256_file(boxes)
 
     def opened(n: int) -> ClosedLoopTrajectory:
         cast, flown = bystanders.get(traces[n].path_id, ()), _cut(traces[n], cfg.fly)
@@ -301,14 +273,9 @@ def trace_of(record: Episode, obstacles: BoxIndex) -> DroneTrace:
 
 
 def flown_trace(
-    obstacles: BoxIndex,
-    time_s: np.ndarray,
-    poses: np.ndarray,
-    targets_m: np.ndarray,
-    clearances_m: np.ndarray,
-    ground_m: np.ndarray,
-    **about: Any,
-) -> DroneTrace:
+    obstacles: BoxIndex, time_s: np.ndarray, poses: np.ndarray, targets_m: np.ndarray, clearances_m: np.ndarray,
+    ground_m: np.ndarray, **about: Any,
+) -> DroneTrace:  # fmt: skip
     """Return n flown frames as a drone trajectory. poses: (n, 6); targets_m: (n, 3); others (n,); about: its fields."""
     seen = visibility(obstacles, poses[:, :3], targets_m)
     metrics = trajectory_metrics(poses[:, :3], targets_m, seen, clearances_m, ground_m, step_s(time_s))

@@ -37,9 +37,8 @@ AREA_M, AREA_STEP_M = 420.0, 200.0  # size and spacing of the areas that are lit
 
 def as_drawn(cfg: RenderConfig, seed: int) -> RenderConfig:
     """Return the render settings of an episode and its tree: the clean track, with the seed's weather."""
-    return cfg.model_copy(
-        update={"tracks": ("clean",), "weather_seed": cfg.weather_seed if cfg.weather_seed >= 0 else seed}
-    )
+    weather_seed = cfg.weather_seed if cfg.weather_seed >= 0 else seed
+    return cfg.model_copy(update={"tracks": ("clean",), "weather_seed": weather_seed})
 
 
 class Airspace:
@@ -73,12 +72,6 @@ class Airspace:
             self.renderer.prepare(np.append(middle - half, low[2]), np.append(middle + half, high[2]), weather)
             self._lit = wanted
 
-    def has_left(self, position_m: np.ndarray) -> bool:
-        """Return whether a drone is LEAVES_M outside the map."""
-        low, high = self.bounds_m
-        outside = np.maximum(low - position_m, position_m - high)[:2]
-        return bool((outside > LEAVES_M).any())
-
 
 @dataclass(frozen=True)
 class Moment:
@@ -108,16 +101,9 @@ class ClosedLoopTrajectory:
     returns the next frame; `ended`: how the episode ended, None before. `script`: what is drawn."""
 
     def __init__(
-        self,
-        airspace: Airspace,
-        planned: DroneTrace,
-        *,
-        number: int = 0,
-        num_lead: int = 5,
-        drone: Drone = Drone(),
-        lost_s: float = 0.0,
-        others: Sequence[Bystander] = (),
-    ) -> None:
+        self, airspace: Airspace, planned: DroneTrace, *, number: int = 0, num_lead: int = 5, drone: Drone = Drone(),
+        lost_s: float = 0.0, others: Sequence[Bystander] = (),
+    ) -> None:  # fmt: skip
         """
         Args:
             planned: a plan; its first num_lead frames (2 or more) are flown, the others give the target's positions.
@@ -163,7 +149,7 @@ class ClosedLoopTrajectory:
         if self.ended is not None or (problem := self.drone.problem_of(command)):
             raise ValueError(f"the episode has ended: {self.ended}" if self.ended else problem)
         places, yaw_deg, pitch_deg = self._path(np.asarray(command, dtype=np.float64))
-        i = self.index + 1
+        (low, high), i = self.airspace.bounds_m, self.index + 1
         gaps, _, _ = swept_distances(self.airspace.surroundings.obstacles, places, CLEARANCE_CAP_M)
         over_ground = places[:, 2] - self.airspace.ground.height_at(places)
         gaps = np.minimum(gaps[:-1], np.minimum(over_ground[:-1], over_ground[1:]))  # of each part of the path
@@ -177,7 +163,7 @@ class ClosedLoopTrajectory:
         self._unseen_s = 0.0 if moment.target.visible else self._unseen_s + self.dt_s
         if clearance_m < self.drone.radius_m:
             self.ended = "crashed"
-        elif self.airspace.has_left(places[-1]):
+        elif (np.maximum(low - places[-1], places[-1] - high)[:2] > LEAVES_M).any():
             self.ended = "left"
         elif i == len(self.planned.time_s) - 1:
             self.ended = "finished"

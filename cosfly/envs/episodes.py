@@ -9,10 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, Moment
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.bystanders import Bystander
 from cosfly.formats.pedestrian_paths import walk_id
@@ -24,7 +25,7 @@ from cosfly.pedestrians.lanes import Lane, lanes_of
 from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, walkable_ground
 from cosfly.planners.contract import PlanConfig
-from cosfly.planners.reacquire import first_loss
+from cosfly.planners.reference_trajectory import first_loss
 from cosfly.planners.stage import plan_trajectory, screens_of
 from cosfly.planners.styles import REACQUIRE
 from cosfly.render.settings import RenderConfig
@@ -54,7 +55,7 @@ TASKS = {
 REACQUIRES = "cosfly/Reacquire-v0"
 
 
-class BenchmarkTown(Record):
+class BenchmarkTown(NamedTuple):
     """A town by name and seed."""
 
     name: str
@@ -63,11 +64,11 @@ class BenchmarkTown(Record):
 
 
 HELD_OUT = {
-    f"HeldOut_{preset}": BenchmarkTown(name=f"HeldOut_{preset}", preset=preset, seed=90_001 + k)
+    f"HeldOut_{preset}": BenchmarkTown(f"HeldOut_{preset}", preset, 90_001 + k)
     for k, preset in enumerate(("grid", "old_town", "towers", "park", "river"))
 }
 TRAINING = tuple(
-    BenchmarkTown(name=f"Training_{preset}_{seed}", preset=preset, seed=seed)
+    BenchmarkTown(f"Training_{preset}_{seed}", preset, seed)
     for preset in PRESETS if preset != "small_town" for seed in range(7_001, 7_009)
 )  # fmt: skip
 
@@ -83,13 +84,11 @@ def read_list(name: str) -> tuple[str, tuple[tuple[str, int], ...], str]:
     env, _, listed = name.partition("-v0")
     env, listed = f"{env}-v0", listed.strip("/") or "test"
     known = read_model(EPISODES_FILE, EpisodeLists, EPISODES_FORMAT).lists
-    if env not in known:
-        what = f"unknown environment{nearest(name, known)}"
-        raise InputError(what, where="--env", got=name, expected=", ".join(known))
-    if listed not in known[env]:
-        raise InputError("unknown list", where=f"--env {env}", got=listed, expected=", ".join(known[env]))
-    episodes = known[env][listed]
-    task = [env, [[HELD_OUT[town].model_dump(), number] for town, number in episodes], SIZE_PX, FOV_DEG, NUM_DECISIONS]
+    episodes = known.get(env, {}).get(listed)
+    if episodes is None:
+        what = "unknown list" if env in known else f"unknown environment{nearest(name, known)}"
+        raise InputError(what, where="--env", got=name, expected=", ".join(known.get(env, known)))
+    task = [env, [[HELD_OUT[town]._asdict(), number] for town, number in episodes], SIZE_PX, FOV_DEG, NUM_DECISIONS]
     return env, episodes, sha256_bytes(dump_json(task).encode())
 
 
@@ -143,14 +142,6 @@ class BenchmarkEpisode:
     num_lead: int
     others: tuple[Bystander, ...]
 
-    @property
-    def name(self) -> str:
-        return episode_id(self.world.town.name, self.number)
-
-    def begins_well(self, now: Moment) -> bool:
-        """Return whether the first frame fits the task: the target is visible, or must be found again."""
-        return now.target.visible != (self.task == REACQUIRES)
-
     def simulation(self, airspace: Airspace) -> ClosedLoopTrajectory:
         """Open the episode."""
         return ClosedLoopTrajectory(airspace, self.plan, number=self.number, num_lead=self.num_lead, others=self.others)
@@ -165,23 +156,18 @@ def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisod
         plan = plan_trajectory(walk, world.obstacles, planning, town.seed, world.screens)
     except NoPathError:
         return None
-    num_lead, turned_deg = LEAD_FRAMES, 0.0
+    num_lead, rotations_deg, others = LEAD_FRAMES, plan.rotations_deg.copy(), tuple[Bystander, ...]()
     if task == REACQUIRES:
         dt_s = float(plan.time_s[1])
         lost = None if plan.instead_of else first_loss(plan.visibility, dt_s, AFTER_LOSS * dt_s)
         if lost is not None and lost + AFTER_LOSS > LEAD_FRAMES // 2:
             num_lead = lost + AFTER_LOSS
         else:
-            turned_deg = float(rng_for(town.seed, "reacquire", name).uniform(*TURNED_DEG))
+            rotations_deg[:num_lead, 1] += float(rng_for(town.seed, "reacquire", name).uniform(*TURNED_DEG))
     if plan.drop_reason is not None or len(plan.time_s) < num_lead + NUM_DECISIONS:
         return None
     end = num_lead + NUM_DECISIONS
-    plan = plan.until(end)
-    if turned_deg:
-        rotations = plan.rotations_deg.copy()
-        rotations[:num_lead, 1] += turned_deg
-        plan = replace(plan, rotations_deg=rotations)
-    others = tuple[Bystander, ...]()
+    plan = replace(plan, rotations_deg=rotations_deg).until(end)
     if cfg.has_others:
         rng = rng_for(town.seed, "pedestrians", f"{name}/others")
         there = bystanders_of(walk, world.ground, world.lanes, cfg, rng).others

@@ -12,16 +12,8 @@ from cosfly.closed_loop.controller import Controller, read_controls
 from cosfly.closed_loop.policy import STATE_HIGH, STATE_LOW, observe
 from cosfly.closed_loop.settings import CONTROLLER_FILE, Drone
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, Moment
-from cosfly.envs.episodes import (
-    HELD_OUT,
-    SIZE_PX,
-    TRAINING,
-    TRIES,
-    BenchmarkEpisode,
-    episode_of,
-    read_list,
-    world_of,
-)
+from cosfly.envs import episodes as benchmark
+from cosfly.envs.episodes import SIZE_PX, BenchmarkEpisode, world_of
 from cosfly.formats.captions import TOKENS
 from cosfly.render.contract import FAR_M
 from cosfly.runtime.errors import ConfigError, InputError
@@ -53,15 +45,9 @@ class FollowEnv(gymnasium.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012
 
     def __init__(
-        self,
-        task: str,
-        *,
-        actions: str = "decisions",
-        episodes: str = "train",
-        depth: bool = False,
-        size_px: tuple[int, int] = SIZE_PX,
-        render_mode: str | None = None,
-    ) -> None:
+        self, task: str, *, actions: str = "decisions", episodes: str = "train", depth: bool = False,
+        size_px: tuple[int, int] = SIZE_PX, render_mode: str | None = None,
+    ) -> None:  # fmt: skip
         """
         Args:
             actions: decisions or velocities.
@@ -71,11 +57,10 @@ class FollowEnv(gymnasium.Env):
         if actions not in ("decisions", "velocities"):
             raise ConfigError("unknown kind of actions", where=task, got=actions, expected="decisions or velocities")
         self.task, self.size_px, self.has_depth, self.render_mode = task, (size_px[0], size_px[1]), depth, render_mode
-        self.listed = None if episodes == "train" else read_list(f"{task}/{episodes}")[1]
-        self.drone, self.tokens = Drone(), TOKENS
-        self._controls = read_controls(CONTROLLER_FILE, self.tokens)
+        self.listed = None if episodes == "train" else benchmark.read_list(f"{task}/{episodes}")[1]
+        self.drone, self._controls = Drone(), read_controls(CONTROLLER_FILE, TOKENS)
         low, high = (bound.astype(np.float32) for bound in self.drone.bounds)
-        self.action_space = spaces.Discrete(len(self.tokens)) if actions == "decisions" else spaces.Box(low, high)
+        self.action_space = spaces.Discrete(len(TOKENS)) if actions == "decisions" else spaces.Box(low, high)
         width_px, height_px = self.size_px
         seen: dict[str, spaces.Space] = {
             "rgb": spaces.Box(0, 255, (height_px, width_px, 3), np.uint8),
@@ -99,15 +84,14 @@ class FollowEnv(gymnasium.Env):
                 expected = f"0 to {len(self.listed) - 1}"
                 raise InputError("the list has no such episode", where=self.task, got=repr(k)[:40], expected=expected)
             town, number = self.listed[k]
-            if not self._begin(episode_of(self.task, world_of(HELD_OUT[town]), number)):
+            if not self._begin(benchmark.episode_of(self.task, world_of(benchmark.HELD_OUT[town]), number)):
                 raise InputError("the episode cannot be flown", where=f"{self.task}: {town}", got=str(number))
         else:
-            world = world_of(TRAINING[int(self.np_random.integers(len(TRAINING)))])
-            numbers = self.np_random.integers(100_000, size=TRIES).tolist()
-            if not any(self._begin(episode_of(self.task, world, number)) for number in numbers):
+            world = world_of(benchmark.TRAINING[int(self.np_random.integers(len(benchmark.TRAINING)))])
+            numbers = self.np_random.integers(100_000, size=benchmark.TRIES).tolist()
+            if not any(self._begin(benchmark.episode_of(self.task, world, number)) for number in numbers):
                 raise InputError("no trajectory of the town can be an episode", where=self.task, got=world.town.name)
-        assert self._simulation is not None
-        return observe(self._simulation, self._now, depth=self.has_depth), self._info()
+        return self._seen(), self._info()
 
     def _begin(self, episode: BenchmarkEpisode | None) -> bool:
         """Start an episode; return whether it is suitable."""
@@ -119,7 +103,7 @@ class FollowEnv(gymnasium.Env):
         self._episode, self._simulation = episode, episode.simulation(self._airspace)
         self._now = self._simulation.reset()[-1]
         self._controller = Controller(self._controls, self.drone, self._now)
-        return episode.begins_well(self._now)
+        return self._now.target.visible != (self.task == benchmark.REACQUIRES)  # else it must be found again
 
     def step(self, action: Any) -> tuple[dict, float, bool, bool, dict]:
         """Fly an action for 0.5 s. terminated: crashed or left the map; truncated: the episode is over."""
@@ -129,20 +113,25 @@ class FollowEnv(gymnasium.Env):
             got, expected = repr(action)[:120], repr(self.action_space)
             raise InputError("the action is outside its bounds", where=self.task, got=got, expected=expected)
         if isinstance(self.action_space, spaces.Discrete):
-            command = self._controller.command(self.tokens[int(action)], self._now)
+            command = self._controller.command(TOKENS[int(action)], self._now)
         else:
             command = self.drone.within_speed(np.asarray(action, dtype=np.float64))
         self._now = self._simulation.step(command)
-        ended = self._simulation.ended
-        seen = observe(self._simulation, self._now, depth=self.has_depth)
-        return seen, reward_of(self._now, ended), ended in ("crashed", "left"), ended == "finished", self._info()
+        ended, reward = self._simulation.ended, reward_of(self._now, self._simulation.ended)
+        return self._seen(), reward, ended in ("crashed", "left"), ended == "finished", self._info()
+
+    def _seen(self) -> dict[str, Any]:
+        assert self._simulation is not None
+        return observe(self._simulation, self._now, depth=self.has_depth)
 
     def _info(self) -> dict[str, Any]:
         """Return measures of the present frame, which a policy must not use."""
+        assert self._episode is not None
+        assert self._simulation is not None
         now, target = self._now, self._now.target
         return {
-            "episode": self._episode.name if self._episode else "",
-            "ended": (self._simulation.ended if self._simulation else None) or "",
+            "episode": benchmark.episode_id(self._episode.world.town.name, self._episode.number),
+            "ended": self._simulation.ended or "",
             "in_view": target.in_view, "visible": target.visible, "visibility": target.visibility,
             "distance_m": now.distance_m, "height_m": now.height_m, "clearance_m": now.clearance_m,
         }  # fmt: skip

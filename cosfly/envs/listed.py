@@ -8,16 +8,7 @@ from pathlib import Path
 
 from cosfly.closed_loop.stage import ClosedLoopConfig, EpisodeRunner, finish_episodes
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory
-from cosfly.envs.episodes import (
-    EPISODES_FILE,
-    HELD_OUT,
-    NUM_DECISIONS,
-    BenchmarkWorld,
-    episode_id,
-    episode_of,
-    read_list,
-    world_of,
-)
+from cosfly.envs import episodes as benchmark
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Resume, StageFolder
@@ -39,39 +30,39 @@ def run(
         InputError: The environment, list or policy does not exist.
         TeacherError: The student's engine cannot be used.
     """
-    _, episodes, _ = read_list(cfg.env)
-    files = {"controller": cfg.fly.table, "episodes": EPISODES_FILE}
+    _, episodes, _ = benchmark.read_list(cfg.env)
+    files = {"controller": cfg.fly.table, "episodes": benchmark.EPISODES_FILE}
     stage = StageFolder.open(out, "fly", config=cfg, inputs={}, seed=seed, resume=resume, package_files=files)
     if not stage.is_complete:
         num, items = 1 if cfg.fly.asks_model else workers, []
         for town, listed in groupby(episodes, key=lambda one: one[0]):
             numbers = [number for _, number in listed]
             for batch in (numbers[k : k + cfg.fly.batch] for k in range(0, len(numbers), cfg.fly.batch)):
-                items.append(Item(f"{town} {batch[0]}", (town, batch), NUM_DECISIONS * len(batch)))
+                items.append(Item(f"{town} {batch[0]}", (town, batch), benchmark.NUM_DECISIONS * len(batch)))
         run_items(stage, items, make_worker, (cfg, stage.path, seed, num), workers=num, watch=watch)
-        finish_episodes(stage, cfg.fly, seed, [episode_id(*episode) for episode in episodes])
+        finish_episodes(stage, cfg.fly, seed, [benchmark.episode_id(*episode) for episode in episodes])
     return out
 
 
 def make_worker(cfg: ListConfig, out: Path, seed: int, num: int) -> Work:
     """Open an engine in this process; return the function that flies some episodes of a town."""
-    task, _, digest = read_list(cfg.env)
+    task, _, digest = benchmark.read_list(cfg.env)
     runner = EpisodeRunner(cfg, out, seed, num, list_sha256=digest)
 
     @lru_cache(maxsize=1)
-    def airspace_of(town: str) -> tuple[BenchmarkWorld, Airspace]:
-        world = world_of(HELD_OUT[town])
+    def airspace_of(town: str) -> tuple[benchmark.BenchmarkWorld, Airspace]:
+        world = benchmark.world_of(benchmark.HELD_OUT[town])
         return world, world.airspace(task)
 
     def opened(town: str, number: int) -> ClosedLoopTrajectory:
         world, space = airspace_of(town)
-        if (episode := episode_of(task, world, number)) is None:
-            raise InputError("an episode that cannot be flown", where=f"{cfg.env}: {episode_id(town, number)}")
+        if (episode := benchmark.episode_of(task, world, number)) is None:
+            raise InputError("the episode cannot be flown", where=f"{cfg.env}: {town}", got=str(number))
         return episode.simulation(space)
 
     def work(item: Item) -> Outcome:
         town, numbers = item.payload
-        episodes = {episode_id(town, number): partial(opened, town, number) for number in numbers}
+        episodes = {benchmark.episode_id(town, number): partial(opened, town, number) for number in numbers}
         return runner.fly(episodes, airspace_of(town)[0].sha256)
 
     return work

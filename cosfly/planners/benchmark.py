@@ -12,8 +12,11 @@ collision + 0.35 clearance within 0.0001; path length, acceleration and jerk hav
 from __future__ import annotations
 
 import importlib.util
+import io
+import itertools
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,17 +24,19 @@ import numpy as np
 from pydantic import Field
 
 from cosfly.formats.boxes import BoxMap
+from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
+from cosfly.geometry.axes import CORNER_SIGNS, rotation_matrices
 from cosfly.planners import compare
-from cosfly.planners.compare import AXES, FIGURES, INTERVAL_PERCENT, NAMES, NUM_RESAMPLES, CompareConfig, PlannedItem
-from cosfly.planners.contract import ALL_PLANNERS, planner_notes, title_of
-from cosfly.planners.stage import make_items, read_inputs
+from cosfly.planners.compare import AXES, AXES_AND_MEAN, FIGURES, NAMES, CompareConfig, Means, PlannedItem, interval
+from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, planner_notes, title_of
+from cosfly.planners.overview import color_of
 from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, write_json
-from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import Resume, StageFolder, result_of
+from cosfly.runtime.pool import Watch
+from cosfly.runtime.run_dir import Resume, StageFolder
 from cosfly.runtime.seeding import rng_for
-from cosfly.viz.tables import TextTable
+from cosfly.viz.tables import TextTable, cells
 
 log = logging.getLogger(__name__)
 
@@ -79,8 +84,6 @@ PAPER = {planner: PaperRow(*row) for planner, row in _PRINTED.items()}
 PAPER_SHORTEST_M = 85.73  # to which the paper normalises path efficiency
 PAPER_GROUPS = dict(zip(list(GROUPS)[1:], (0.9364, 0.6205, 0.6083, 0.6075), strict=True))  # visibility
 
-Means = dict[str, dict[str, float]]  # planner -> mean figures
-
 
 class BenchmarkConfig(CompareConfig):
     """Settings of a benchmark: those of a comparison, and the number of scenarios."""
@@ -93,16 +96,9 @@ class BenchmarkConfig(CompareConfig):
 
 
 def run(
-    cfg: BenchmarkConfig,
-    simplified_map: Path,
-    paths: Path,
-    out: Path,
-    *,
-    seed: int = 0,
-    workers: int = 0,
-    watch: Watch = Watch(),
-    resume: Resume = "if-same",
-) -> Path:
+    cfg: BenchmarkConfig, simplified_map: Path, paths: Path, out: Path, *, seed: int = 0, workers: int = 0,
+    watch: Watch = Watch(), resume: Resume = "if-same",
+) -> Path:  # fmt: skip
     """Read a simplified map and `path.json`; write `benchmark.json`, its tables and the figures.
 
     A pedestrian trajectory that no planner can follow, such as one through a house, is a failure and no scenario.
@@ -114,27 +110,20 @@ def run(
         InputError: If an input file is invalid.
         NothingKept: If no planner finds any trajectory.
     """
-    cfg = _without_missing(cfg)
-    inputs = {"map": simplified_map, "paths": paths}
+    cfg, inputs, product = _without_missing(cfg), {"map": simplified_map, "paths": paths}, out / "benchmark.json"
     stage = StageFolder.open(out, "plan_benchmark", config=cfg, inputs=inputs, seed=seed, resume=resume)
-    product, page = out / "benchmark.json", out / "benchmark.md"
     if stage.is_complete:
         return product
-    box_map, pedestrians = read_inputs(simplified_map, paths)
-    items = make_items(pedestrians[: cfg.scenarios], cfg, seed)
-    done = run_items(stage, items, compare.make_worker, (cfg, simplified_map, seed, True), workers=workers, watch=watch)
-    if not done.tally.kept:
-        raise stage.nothing_kept(done.tally, expected="a pedestrian trajectory that a planner follows")
-    planned = {record.id: result_of(record, PlannedItem) for record in done.kept}
-    header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
+    box_map, _, done, planned, header = compare.plan_all(
+        stage, cfg, simplified_map, paths, seed, most=cfg.scenarios, keeps_all=True, workers=workers, watch=watch
+    )
     found = header | summarize(planned, cfg.planners, rng_for(seed, "plan_benchmark", "intervals"))
     found["notes"] = planner_notes(cfg.planners, cfg)
     write_json(product, {**FORMAT.header, **found})
-    write_bytes(page, markdown(found).encode())
-    pictures = _pictures(found, planned, box_map)
-    for name, picture in pictures.items():
-        write_bytes(out / name, picture)
-    outputs = [product, page, *(out / name for name in pictures)]
+    pages = {"benchmark.md": markdown(found).encode()} | draw_figures(found, planned, box_map)
+    for name, data in pages.items():
+        write_bytes(out / name, data)
+    outputs = [product, *(out / name for name in pages)]
     stage.finish(outputs, done.tally, timings=compare.timings(planned.values(), cfg.planners))
     return product
 
@@ -150,17 +139,7 @@ def _without_missing(cfg: BenchmarkConfig) -> BenchmarkConfig:
     return cfg.model_copy(update={"planners": tuple(name for name in cfg.planners if name not in sampling)})
 
 
-def _pictures(found: dict[str, Any], planned: dict[str, PlannedItem], box_map: BoxMap) -> dict[str, bytes]:
-    """Draw the figures; none, with a warning, where matplotlib is not installed."""
-    if importlib.util.find_spec("matplotlib") is None:
-        log.warning("matplotlib is not installed; no figures are drawn; %s", INSTALL)
-        return {}
-    from cosfly.planners.benchmark_figures import draw
-
-    return draw(found, planned, box_map)
-
-
-# --- figures ----------------------------------------------------------------------------------------------------------
+# --- tables -----------------------------------------------------------------------------------------------------------
 
 
 def summarize(planned: dict[str, PlannedItem], planners: tuple[str, ...], rng: np.random.Generator) -> dict[str, Any]:
@@ -171,51 +150,42 @@ def summarize(planned: dict[str, PlannedItem], planners: tuple[str, ...], rng: n
     """
     traces = [item.read_traces(path_id) for path_id, item in planned.items()]
     figures = {p: [compare.trajectory_figures(t[p]) if p in t else None for t in traces] for p in planners}
-    tables = {p: np.array([_row(one) for one in rows]) for p, rows in figures.items()}
-    means = _means(tables, np.arange(len(planned)))
-    samples = rng.integers(len(planned), size=(NUM_RESAMPLES, len(planned)))
-    axes, axes_drawn = compare.axis_scores(means), [compare.axis_scores(_means(tables, sample)) for sample in samples]
+    # Figures that a missing trajectory does not have are NaN.
+    tables = {
+        p: np.array([[(one or NO_TRAJECTORY).get(n, np.nan) for n in NAMES] for one in figures[p]]) for p in figures
+    }
+    means, (axes, *drawn) = compare.mean_figures(tables), compare.drawn_scores(tables, rng)
+    both_found = all(p in means and np.isfinite(list(means[p].values())).all() for p in PAIR)
+    groups = {group: [means[p] for p in members if p in means] for group, members in GROUPS.items()}
     return {
         "scenarios": list(planned),
         "infeasible": {path_id: item.errors for path_id, item in planned.items() if item.errors},
         "figures": figures,
-        "means": {p: {name: _number(value) for name, value in row.items()} for p, row in means.items()},
+        "means": {p: _finite(row) for p, row in means.items()},
         "shortest_mean_m": round(compare.shortest_mean_m(means), 4),
         "axes": {
-            p: {"scores": row, "intervals": {axis: _interval([drawn[p][axis] for drawn in axes_drawn]) for axis in row}}
+            p: {"scores": row, "intervals": {axis: interval([one[p][axis] for one in drawn]) for axis in row}}
             for p, row in axes.items()
         },
-        "deltas": _deltas(means),
+        "deltas": compare.deltas(*(means[p] for p in PAIR)) if both_found else {},
         "ranking": _ranking(means),
-        "groups": _groups(means),
+        "groups": {
+            group: {
+                "num_planners": len(rows),
+                "figures": _finite({name: float(np.mean([row[name] for row in rows])) for name in NAMES}),
+            }
+            for group, rows in groups.items()
+            if rows
+        },
     }
 
 
-def _deltas(means: Means) -> dict[str, dict[str, float | None]]:
-    """Return TA*+Smooth minus MuCO; empty where one of them did not run or found no trajectory."""
-    if not all(p in means and np.isfinite(list(means[p].values())).all() for p in PAIR):
-        return {}
-    return compare.deltas(*(means[p] for p in PAIR))
+def _finite(figures: dict[str, float]) -> dict[str, float | None]:
+    return {name: round(value, 4) if np.isfinite(value) else None for name, value in figures.items()}
 
 
-def _row(figures: dict[str, float] | None) -> list[float]:
-    """Return figures in the order of NAMES, NaN where a missing trajectory has none."""
-    return [figures[name] if figures else NO_TRAJECTORY.get(name, np.nan) for name in NAMES]
-
-
-def _means(tables: dict[str, np.ndarray], sample: np.ndarray) -> Means:
-    """Average over sampled scenarios; infinite where a planner found none of their trajectories."""
-    found = {}
-    for planner, table in tables.items():
-        rows = table[sample]
-        counts = (~np.isnan(rows)).sum(axis=0)
-        means = np.where(counts > 0, np.nansum(rows, axis=0) / np.maximum(counts, 1), np.inf)
-        found[planner] = dict(zip(NAMES, means.tolist(), strict=True))
-    return found
-
-
-def _normalized(means: Means) -> np.ndarray:
-    """Return (planners, criteria) from 0, the worst, to 1, the best; all 1 where there is no difference."""
+def _ranking(means: Means) -> dict[str, dict[str, Any]]:
+    """Return rank, weighted score and criteria from 0, the worst, to 1, the best; 1 where there is no difference."""
     columns = []
     for figure, more_is_better, _ in CRITERIA.values():
         values = np.array([row[figure] for row in means.values()])
@@ -223,11 +193,7 @@ def _normalized(means: Means) -> np.ndarray:
         low, span = values[known].min(), np.ptp(values[known])
         share = (values - low) / span if span > 0 else np.full(len(values), float(more_is_better))
         columns.append(np.where(known, share if more_is_better else 1.0 - share, 0.0))
-    return np.stack(columns, axis=1)
-
-
-def _ranking(means: Means) -> dict[str, dict[str, Any]]:
-    normalized, planners = _normalized(means), list(means)
+    normalized, planners = np.stack(columns, axis=1), list(means)
     scores = (normalized @ [weight for *_, weight in CRITERIA.values()]).round(4)
     return {
         planners[k]: {
@@ -239,91 +205,202 @@ def _ranking(means: Means) -> dict[str, dict[str, Any]]:
     }
 
 
-def _groups(means: Means) -> dict[str, dict[str, Any]]:
-    """Return the mean figures of each group of planners."""
-    rows = {}
-    for group, all_members in GROUPS.items():
-        if members := [planner for planner in all_members if planner in means]:
-            figures = {name: _number(float(np.mean([means[p][name] for p in members]))) for name in NAMES}
-            rows[group] = {"num_planners": len(members), "figures": figures}
-    return rows
-
-
-def _interval(values: list[float]) -> tuple[float, float]:
-    low, high = np.percentile(np.nan_to_num(np.asarray(values, dtype=np.float64)), INTERVAL_PERCENT)
-    return round(float(low), 4), round(float(high), 4)
-
-
-def _number(value: float) -> float | None:
-    return round(value, 4) if np.isfinite(value) else None
-
-
-# --- tables of text ---------------------------------------------------------------------------------------------------
-
-
 def markdown(found: dict[str, Any]) -> str:
     """Return the tables of the paper, with its figures next to ours, as a page of text."""
     parts = [f"# Planners on {len(found['scenarios'])} scenarios of {found['map']}, seed {found['seed']}"]
     parts += [f"{title_of(planner)}: {note}." for planner, note in found["notes"].items()]
-    for table in text_tables(found):
-        if table.rows:
-            parts.append("## " + table.title.replace("*", "\\*") + f"\n\n{table.markdown()}")
-    return "\n\n".join(parts)
-
-
-def _cells(values: Iterable[float | None], digits: int = 3) -> list[str]:
-    return ["-" if value is None else f"{value:.{digits}f}" for value in values]
+    tables = [table for table in text_tables(found) if table.rows]
+    return "\n\n".join([*parts, *(f"## {t.title}\n\n".replace("*", "\\*") + t.markdown() for t in tables)])
 
 
 def _printed(planner: str, *names: str) -> list[str]:
     """Return the paper's figures of a planner."""
-    digits = {"num_free": 0, "clearance_m": 2}
-    row = PAPER.get(planner)
-    return [cell for name in names for cell in _cells([getattr(row, name, None)], digits.get(name, 3))]
+    digits, row = {"num_free": 0, "clearance_m": 2}, PAPER.get(planner)
+    return [cell for name in names for cell in cells([getattr(row, name, None)], digits.get(name, 3))]
 
 
 def text_tables(found: dict[str, Any]) -> Iterator[TextTable]:
     """Yield the tables of `benchmark.json` as text: axes, deltas, weighted score, feasibility, groups."""
-    means, rows = found["means"], []
-    for p, row in sorted(found["axes"].items(), key=lambda entry: -entry[1]["scores"]["mean"]):
-        spread = " to ".join(_cells(row["intervals"]["mean"]))
-        ours = _cells(means[p][name] for name in ("collision_fraction", "clearance_min_m"))
-        scores = _cells(row["scores"][axis] for axis in (*AXES, "mean"))
-        rows.append([title_of(p), *scores, spread, *_printed(p, "axes_mean"), *ours])
+    means = found["means"]
+
+    def ours(planner: str, *names: str) -> list[str]:
+        return cells(means[planner][name] for name in names)
+
     columns = ["visibility", "efficiency", "smoothness", "safety", "mean", "95 %", "paper", "collision", "clearance"]
     shortest = f"{found['shortest_mean_m']:.2f} m (paper: {PAPER_SHORTEST_M} m)"
-    yield TextTable(f"Four axes; efficiency to the shortest mean, {shortest}", ["planner", *columns], rows)
-
-    rows = []
-    for name, words, digits in FIGURES if found["deltas"] else ():
-        delta = found["deltas"][name]
-        values = _cells([*(means[p][name] for p in PAIR), delta["delta"]], digits)
-        rows.append([words, *values, *_cells([delta["relative_percent"]], 1)])
-    yield TextTable(" minus ".join(map(title_of, PAIR)), ["figure", *map(title_of, PAIR), "delta", "%"], rows)
-
-    rows = []
-    for p, place in found["ranking"].items():
-        scores = _cells([place["score"], *place["normalized"].values()])
-        rows.append([f"{place['rank']} {title_of(p)}", *scores, *_printed(p, "weighted")])
+    yield TextTable(f"Four axes; efficiency to the shortest mean, {shortest}", ["planner", *columns], [
+        [
+            title_of(p), *cells(row["scores"][axis] for axis in AXES_AND_MEAN),
+            " to ".join(cells(row["intervals"]["mean"])), *_printed(p, "axes_mean"),
+            *ours(p, "collision_fraction", "clearance_min_m"),
+        ]
+        for p, row in sorted(found["axes"].items(), key=lambda entry: -entry[1]["scores"]["mean"])
+    ])  # fmt: skip
+    yield TextTable(" minus ".join(map(title_of, PAIR)), ["figure", *map(title_of, PAIR), "delta", "%"], [
+        [
+            words, *cells([*(means[p][name] for p in PAIR), found["deltas"][name]["delta"]], digits),
+            *cells([found["deltas"][name]["relative_percent"]], 1),
+        ]
+        for name, words, digits in FIGURES if found["deltas"]
+    ])  # fmt: skip
     words = ", ".join(f"{weight:g} {name}" for name, (*_, weight) in CRITERIA.items())
     title = f"Weighted score: {words}; each from the worst, 0, to the best, 1"
-    yield TextTable(title, ["planner", "score", *CRITERIA, "paper"], rows)
-
+    yield TextTable(title, ["planner", "score", *CRITERIA, "paper"], [
+        [f"{row['rank']} {title_of(p)}", *cells([row["score"], *row["normalized"].values()]), *_printed(p, "weighted")]
+        for p, row in found["ranking"].items()
+    ])  # fmt: skip
     rows = []
     for p, figures in found["figures"].items():
         fractions = [one["collision_fraction"] for one in figures if one]
-        ours = _cells(means[p][name] for name in ("collision_fraction", "five_ray_mean", "clearance_min_m"))
         counts = [f"{count} of {len(figures)}" for count in (len(fractions), fractions.count(0.0))]
-        rows.append([title_of(p), GROUP_OF[p], *counts, *ours, *_printed(p, "num_free", "visibility", "clearance_m")])
+        own = ours(p, "collision_fraction", "five_ray_mean", "clearance_min_m")
+        rows.append([title_of(p), GROUP_OF[p], *counts, *own, *_printed(p, "num_free", "visibility", "clearance_m")])
     columns = ["found", "free of collisions", "collision", "visibility", "clearance"]
     printed = ["paper: free of 20", "paper: visibility", "paper: clearance"]
     title = "Feasibility; a missing trajectory collides and sees nothing"
     yield TextTable(title, ["planner", "group", *columns, *printed], rows)
-
-    rows = []
     names = ("five_ray_mean", "blocked_fraction", "collision_fraction", "clearance_min_m", "length_m")
-    for group, own in found["groups"].items():
-        cells = [*(own["figures"][name] for name in names), PAPER_GROUPS.get(group)]
-        rows.append([group, str(own["num_planners"]), *_cells(cells)])
     columns = ["visibility", "blocked", "collision", "clearance", "length", "paper: visibility"]
-    yield TextTable("Groups; clearance and length in m", ["group", "planners", *columns], rows)
+    yield TextTable("Groups; clearance and length in m", ["group", "planners", *columns], [
+        [group, str(own["num_planners"]), *cells([*(own["figures"][name] for name in names), PAPER_GROUPS.get(group)])]
+        for group, own in found["groups"].items()
+    ])  # fmt: skip
+
+
+# --- figures ----------------------------------------------------------------------------------------------------------
+# Each target-aware planner has its own color; generic planners are gray.
+
+GRAY = "#9a9a9a"
+# Scenarios shown in 3D; boxes are drawn within this margin of the trajectories and from this height on.
+NUM_SHOWN, ROOM_M, LEAST_M = 4, 10.0, 5.0
+FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
+
+
+def draw_figures(found: dict[str, Any], planned: dict[str, PlannedItem], box_map: BoxMap) -> dict[str, bytes]:
+    """Return the figures, file name -> PNG; none, with a warning, where matplotlib is not installed.
+
+    Those of TA*+Smooth against MuCO are drawn only where both found trajectories.
+    """
+    if importlib.util.find_spec("matplotlib") is None:
+        log.warning("matplotlib is not installed; no figures are drawn; %s", INSTALL)
+        return {}
+    from matplotlib.figure import Figure
+
+    figures: dict[str, tuple[tuple[float, float], Callable[..., None]]] = {
+        "axes_radar.png": ((8.0, 9.0), _radar), "axes_bars.png": ((13.0, 5.5), _bars),
+        "axes_pairs.png": ((13.5, 8.0), _pairs),
+    }  # fmt: skip
+    if found["deltas"]:
+        figures["deltas.png"] = (9.0, 4.5), _deltas
+        figures["trajectories_3d.png"] = (14.0, 11.0), partial(_trajectories, planned=planned, box_map=box_map)
+    pictures = {}
+    for name, (size, draw) in figures.items():
+        figure, file = Figure(figsize=size, dpi=110, layout="constrained"), io.BytesIO()
+        draw(figure, found)
+        figure.savefig(file, format="png", metadata={"Software": None})
+        pictures[name] = file.getvalue()
+    return pictures
+
+
+def _color(planner: str) -> Any:
+    return np.array(color_of(planner)) / 255.0 if planner in PLANNERS else GRAY
+
+
+def _radar(figure: Any, found: dict[str, Any]) -> None:
+    """Draw the four axes of our planners and the paper's seven as polygons (fig:appendix_h_alg3d_measured)."""
+    primary = [p for p in found["axes"] if p not in PAPER or PAPER[p].axes_mean is not None]
+    axes, angles = figure.add_subplot(projection="polar"), np.arange(len(AXES)) * 2.0 * np.pi / len(AXES)
+    for planner in primary or found["axes"]:
+        scores = found["axes"][planner]["scores"]
+        style = {"edgecolor": _color(planner), "lw": 2.0, "label": f"{title_of(planner)}: mean {scores['mean']:.3f}"}
+        axes.fill(angles, [scores[name] for name in AXES], facecolor="none", **style)
+    axes.set_xticks(angles, [name.replace("_", " ") for name in AXES])
+    axes.set_ylim(0.0, 1.0)
+    figure.legend(loc="outside lower center", ncols=3)
+
+
+def _bars(figure: Any, found: dict[str, Any]) -> None:
+    axes, places, width = figure.add_subplot(), np.arange(len(found["axes"])), 0.8 / len(AXES_AND_MEAN)
+    shades = ("#3a6ea5", "#8fb8de", "#7fb069", "#e6aa68", "#303030")
+    for k, (name, shade) in enumerate(zip(AXES_AND_MEAN, shades, strict=True)):
+        values = np.array([row["scores"][name] for row in found["axes"].values()])
+        spans = np.array([row["intervals"][name] for row in found["axes"].values()])
+        whiskers = np.clip([values - spans[:, 0], spans[:, 1] - values], 0.0, None)
+        style = {"yerr": whiskers, "error_kw": {"lw": 0.8}, "color": shade, "label": name.replace("_", " ")}
+        axes.bar(places + (k - 2) * width, values, width, **style)
+    printed = {k: PAPER[p].axes_mean for k, p in enumerate(found["axes"]) if p in PAPER}
+    shown = [(k + 2 * width, value) for k, value in printed.items() if value is not None]
+    if shown:
+        axes.plot(*zip(*shown, strict=True), "D", color="#d1495b", ms=5, label="mean in the paper")
+    axes.set_xticks(places, [title_of(planner) for planner in found["axes"]], rotation=35, ha="right")
+    axes.set_title("Four axes, with 95 % bootstrap intervals over scenarios")
+    figure.legend(loc="outside right upper")
+
+
+def _pairs(figure: Any, found: dict[str, Any]) -> None:
+    for place, (one, other) in enumerate(itertools.combinations(AXES, 2), 1):
+        axes = figure.add_subplot(2, 3, place)
+        for planner, row in found["axes"].items():
+            style = {"ms": 8, "label": title_of(planner)} if planner in PLANNERS else {"ms": 5}
+            axes.plot(row["scores"][one], row["scores"][other], "o", color=_color(planner), **style)
+        axes.set(xlabel=one.replace("_", " "), ylabel=other.replace("_", " "))
+        axes.margins(0.2)
+        axes.grid(alpha=0.3)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=len(PLANNERS))
+    figure.suptitle("The axes in pairs; gray: generic planners")
+
+
+def _deltas(figure: Any, found: dict[str, Any]) -> None:
+    """Draw relative changes with their sign set so that TA*+Smooth is better on the right."""
+    more_is_better = {"five_ray_mean", "clearance_min_m", "smoothness_score"}
+    shown = {"blocked_fraction", "length_m", "accel_rms_mps2", "jerk_rms_mps3"} | more_is_better
+    axes, rows = figure.add_subplot(), []
+    for name, title, _ in reversed(FIGURES):
+        base = found["means"]["muco"][name]
+        if name in shown and base:
+            sign = 100.0 / base * (1.0 if name in more_is_better else -1.0)
+            words = title if name in more_is_better else f"less {title}"
+            rows.append((words, sign * (found["deltas"][name]["delta"] or 0.0)))
+    for place, (_, change) in enumerate(rows):
+        axes.barh(place, change, color=_color("track_astar") if change >= 0 else _color("muco"))
+        axes.annotate(f"{change:+.1f} %", (max(change, 0.0), place), xytext=(6, -4), textcoords="offset points")
+    axes.axvline(0.0, color="black", lw=0.8)
+    axes.set_yticks(range(len(rows)), [words for words, _ in rows])
+    axes.margins(x=0.15)
+    axes.set_xlabel("relative to MuCO, %; to the right TA* + Smooth is better")
+    axes.set_title("TA* + Smooth against MuCO")
+
+
+def _trajectories(figure: Any, found: dict[str, Any], planned: dict[str, PlannedItem], box_map: BoxMap) -> None:
+    """Draw the scenarios in which the visibility of TA*+Smooth exceeds that of MuCO most."""
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    from cosfly.geometry.kernels import NO_OBSTACLE_KINDS
+
+    def gain(path_id: str) -> float:
+        one, other = (found["figures"][planner][found["scenarios"].index(path_id)] or {} for planner in PAIR)
+        return one.get("five_ray_mean", 0.0) - other.get("five_ray_mean", 0.0)
+
+    for place, path_id in enumerate(sorted(planned, key=gain, reverse=True)[:NUM_SHOWN], 1):
+        traces = planned[path_id].read_traces(path_id)
+        points = np.concatenate([trace.positions_m for trace in traces.values()])
+        targets = next(iter(traces.values())).targets_m
+        low, high = np.minimum(points.min(axis=0), targets.min(axis=0)), points.max(axis=0)
+        axes = figure.add_subplot(2, 2, place, projection="3d")
+        near = (np.abs(box_map.centers - (low + high) / 2) <= (high - low) / 2 + ROOM_M)[:, :2].all(axis=1)
+        near &= ~box_map.is_any_of(NO_OBSTACLE_KINDS) & (box_map.half_extents[:, 2] >= LEAST_M / 2.0)
+        turns = rotation_matrices(np.radians(box_map.rotations_deg[near]))
+        corners = np.einsum("kij,ksj->ksi", turns, CORNER_SIGNS * box_map.half_extents[near][:, None])
+        faces = (corners + box_map.centers[near][:, None])[:, FACES, :].reshape(-1, 4, 3)
+        axes.add_collection3d(Poly3DCollection(faces, facecolor="#b9b9b9", edgecolor="#909090", lw=0.2, alpha=0.12))
+        for planner, trace in reversed(traces.items()):
+            style = {"lw": 2.2, "label": title_of(planner)} if planner in PLANNERS else {"lw": 0.8}
+            axes.plot(*trace.positions_m.T, color=_color(planner), **style)
+        axes.plot(*targets.T, "--", color="black", lw=1.5, label="pedestrian")
+        low[2] = targets[:, 2].min() - TARGET_HEIGHT_M
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+        axes.set_box_aspect(high - low, zoom=1.15)
+        axes.locator_params(nbins=5)
+        axes.set_title(f"{path_id}: visibility {gain(path_id):+.3f}")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    figure.suptitle("Largest gains in visibility of TA* + Smooth over MuCO; gray: generic planners")

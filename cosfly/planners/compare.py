@@ -21,17 +21,16 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.formats.traces import DroneTrace, write_traces
 from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, PlanConfig, known_planner, planner_notes, title_of
-from cosfly.planners.overview import draw_pedestrians
+from cosfly.planners.overview import draw_compared
 from cosfly.planners.stage import load_obstacles, make_items, plan_trajectory, read_inputs, warm_up
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, read_object, write_json
-from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import Dropped, Failed, ItemRecord, Resume, StageFolder, read_manifest, result_of
+from cosfly.runtime.pool import ItemOutcomes, Watch, run_items
+from cosfly.runtime.run_dir import Dropped, Failed, Resume, StageFolder, read_manifest, result_of
 from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.worker import Item, Outcome, Work
-from cosfly.viz.tables import TextTable
-from cosfly.viz.topview import add_caption, draw_dot, draw_line, draw_text, png_bytes
+from cosfly.viz.tables import TextTable, cells
 
 FORMAT = FileFormat("cosfly.plan_compare", "2.1")
 CLEARANCE_SCALE_M = 5.0  # a clearance of this or more is full safety
@@ -52,7 +51,10 @@ FIGURES = (
 )
 NAMES = [name for name, _, _ in FIGURES]
 AXES = ("visibility", "path_efficiency", "smoothness", "safety")
+AXES_AND_MEAN = (*AXES, "mean")
 NUM_RESAMPLES, INTERVAL_PERCENT = 1000, (2.5, 97.5)  # of pedestrian trajectories, for intervals (Efron 1979)
+
+Means = dict[str, dict[str, float]]  # planner -> mean figures or scores
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
@@ -60,72 +62,64 @@ NUM_RESAMPLES, INTERVAL_PERCENT = 1000, (2.5, 97.5)  # of pedestrian trajectorie
 
 def trajectory_figures(trace: DroneTrace) -> dict[str, float]:
     """Return the figures of FIGURES of one drone trajectory."""
-    figures = {name: float(trace.metrics[name]) for name in NAMES if name in trace.metrics}
-    figures["blocked_fraction"] = round(1.0 - figures["five_ray_mean"], 4)
-    figures["collision_fraction"] = round(float((trace.clearances_m < 0).mean()), 4)
-    return {name: figures[name] for name in NAMES}
+    blocked, collides = 1.0 - trace.metrics["five_ray_mean"], float((trace.clearances_m < 0).mean())
+    figures = trace.metrics | {"blocked_fraction": round(blocked, 4), "collision_fraction": round(collides, 4)}
+    return {name: float(figures[name]) for name in NAMES}
 
 
-def shortest_mean_m(means: dict[str, dict[str, float]]) -> float:
+def mean_figures(tables: dict[str, np.ndarray], sample: np.ndarray | slice = slice(None)) -> Means:
+    """Average tables (n, figures) over sampled rows; NaN is ignored, and a column without a number is infinite."""
+    found = {}
+    for planner, table in tables.items():
+        rows = table[sample]
+        counts = (~np.isnan(rows)).sum(axis=0)
+        means = np.where(counts > 0, np.nansum(rows, axis=0) / np.maximum(counts, 1), np.inf)
+        found[planner] = dict(zip(NAMES, means.tolist(), strict=True))
+    return found
+
+
+def shortest_mean_m(means: Means) -> float:
     """Return the shortest mean length of planners without collisions, or of all where every planner collides."""
     free = [figures["length_m"] for figures in means.values() if figures["collision_fraction"] == 0]
     return min(free or [figures["length_m"] for figures in means.values()])
 
 
-def axis_scores(means: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
-    """Return the four axis scores and their mean for each planner (tab:appendix_h_four_axis_scores).
-
-    Args:
-        means: planner -> mean figures.
-    """
+def axis_scores(means: Means) -> Means:
+    """Return the four axis scores and their mean for each planner (tab:appendix_h_four_axis_scores)."""
     shortest_m, scores = shortest_mean_m(means), {}
     for planner, figures in means.items():
         clear = float(np.clip(figures["clearance_min_m"] / CLEARANCE_SCALE_M, 0.0, 1.0))
-        axes = {
-            "visibility": figures["five_ray_mean"],
-            "path_efficiency": shortest_m / figures["length_m"] if figures["length_m"] > 0 else 1.0,
-            "smoothness": 1.0 / (1.0 + figures["jerk_rms_mps3"]),
-            "safety": (1.0 - figures["collision_fraction"]) * clear,
-        }
-        axes["mean"] = sum(axes.values()) / len(axes)
-        scores[planner] = {name: round(value, 4) for name, value in axes.items()}
+        efficiency = shortest_m / figures["length_m"] if figures["length_m"] > 0 else 1.0
+        smoothness, safety = 1.0 / (1.0 + figures["jerk_rms_mps3"]), (1.0 - figures["collision_fraction"]) * clear
+        axes = [figures["five_ray_mean"], efficiency, smoothness, safety]
+        rounded = [round(value, 4) for value in (*axes, sum(axes) / len(axes))]
+        scores[planner] = dict(zip(AXES_AND_MEAN, rounded, strict=True))
     return scores
 
 
-def axis_differences(
-    figures: dict[str, list[dict[str, float]]], rng: np.random.Generator
-) -> dict[str, dict[str, dict]]:
-    """Return the first planner's axis scores minus each other planner's, with bootstrap 95 % intervals.
-
-    Args:
-        figures: planner -> figures of the same pedestrian trajectories in the same order.
-    """
-    first, *others = figures
-    tables = {planner: np.array([list(row.values()) for row in rows]) for planner, rows in figures.items()}
-    num = len(tables[first])
+def drawn_scores(tables: dict[str, np.ndarray], rng: np.random.Generator) -> list[Means]:
+    """Return the axis scores of all rows of tables (n, figures), then those of rows drawn with replacement."""
+    num = len(next(iter(tables.values())))
     samples = [np.arange(num), *rng.integers(num, size=(NUM_RESAMPLES, num))]
-    scores = [
-        axis_scores({k: dict(zip(NAMES, table[sample].mean(axis=0), strict=True)) for k, table in tables.items()})
-        for sample in samples
-    ]
-    differences: dict[str, dict[str, dict]] = {other: {} for other in others}
-    for other in others:
-        for axis in (*AXES, "mean"):
-            found, *drawn = (score[first][axis] - score[other][axis] for score in scores)
-            low, high = np.percentile(drawn, INTERVAL_PERCENT)
-            row = {"difference": found, "low": low, "high": high}
-            differences[other][axis] = {name: round(float(value), 4) for name, value in row.items()}
-    return differences
+    return [axis_scores(mean_figures(tables, sample)) for sample in samples]
+
+
+def interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
+    """Return the 95 % interval of drawn values."""
+    low, high = np.percentile(np.nan_to_num(np.asarray(values, dtype=np.float64)), INTERVAL_PERCENT)
+    return round(float(low), 4), round(float(high), 4)
 
 
 def deltas(first: dict[str, float], second: dict[str, float]) -> dict[str, dict[str, float | None]]:
     """Return difference and relative difference in percent for each figure; None where the second's is 0."""
-    table: dict[str, dict[str, float | None]] = {}
-    for name in NAMES:
-        change = first[name] - second[name]
-        relative = round(100.0 * change / second[name], 3) if second[name] else None
-        table[name] = {"delta": round(change, 4), "relative_percent": relative}
-    return table
+    changes = {name: first[name] - second[name] for name in NAMES}
+    return {
+        name: {
+            "delta": round(change, 4),
+            "relative_percent": round(100.0 * change / second[name], 3) if second[name] else None,
+        }
+        for name, change in changes.items()
+    }
 
 
 def win_rates(first: list[dict[str, float]], second: list[dict[str, float]]) -> dict[str, dict[str, float]]:
@@ -138,8 +132,7 @@ def win_rates(first: list[dict[str, float]], second: list[dict[str, float]]) -> 
         "clearance_larger": [a["clearance_min_m"] > b["clearance_min_m"] for a, b in pairs],
         "both_collision_free": [a["collision_fraction"] == b["collision_fraction"] == 0 for a, b in pairs],
     }
-    num = len(pairs)
-    return {name: {"count": sum(won), "of": num, "rate": round(sum(won) / num, 4)} for name, won in wins.items()}
+    return {name: {"count": sum(w), "of": len(w), "rate": round(sum(w) / len(w), 4)} for name, w in wins.items()}
 
 
 def summarize(traces: dict[str, list[DroneTrace]], rng: np.random.Generator) -> dict:
@@ -153,21 +146,28 @@ def summarize(traces: dict[str, list[DroneTrace]], rng: np.random.Generator) -> 
     """
     first, *others = traces
     figures = {planner: [trajectory_figures(trace) for trace in own] for planner, own in traces.items()}
-    means = {
-        p: {name: round(float(np.mean([row[name] for row in rows])), 4) for name in NAMES}
-        for p, rows in figures.items()
-    }
+    tables = {planner: np.array([list(row.values()) for row in rows]) for planner, rows in figures.items()}
+    means = {p: {name: round(mean, 4) for name, mean in row.items()} for p, row in mean_figures(tables).items()}
+    scores = drawn_scores(tables, rng)
+
+    def difference(other: str, axis: str) -> dict[str, float]:
+        found, *drawn = (score[first][axis] - score[other][axis] for score in scores)
+        return dict(zip(("difference", "low", "high"), (round(found, 4), *interval(drawn)), strict=True))
+
     return {
         "means": means,
         "deltas": {other: deltas(means[first], means[other]) for other in others},
         "axes": axis_scores(means),
-        "axis_differences": axis_differences(figures, rng),
+        "axis_differences": {other: {axis: difference(other, axis) for axis in AXES_AND_MEAN} for other in others},
         "win_rates": {other: win_rates(figures[first], figures[other]) for other in others},
         "scenarios": [
             {"id": trace.path_id, **{planner: rows[i] for planner, rows in figures.items()}}
             for i, trace in enumerate(traces[first])
         ],
     }
+
+
+# --- stage ------------------------------------------------------------------------------------------------------------
 
 
 class CompareConfig(PlanConfig):
@@ -186,95 +186,6 @@ class CompareConfig(PlanConfig):
         return known
 
 
-# --- stage ------------------------------------------------------------------------------------------------------------
-
-
-def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int, keeps_all: bool = False) -> Work:
-    """Load the map once; return the function that plans for one pedestrian trajectory with each planner.
-
-    Args:
-        keeps_all: Keep an item although a planner failed.
-    """
-    obstacles, screens = load_obstacles(simplified_map)
-    settings = {name: cfg.model_copy(update={"planner": name}) for name in cfg.planners}
-    for own in settings.values():
-        warm_up(own)
-
-    def work(item: Item) -> Outcome:
-        pedestrian, styles = item.payload
-        traces: dict[str, dict] = {}
-        errors: dict[str, NoPathError] = {}
-        times_ms: dict[str, float] = {}
-        for name, own in settings.items():
-            begin_s = time.perf_counter()
-            try:
-                traces[name] = plan_trajectory(pedestrian, obstacles, own, seed, screens, styles).as_json()
-            except NoPathError as error:
-                errors[name] = error
-            times_ms[name] = round(1000.0 * (time.perf_counter() - begin_s), 2)
-        if len(errors) == len(settings):
-            raise errors[cfg.planners[0]]
-        dropped = f"no_{next(iter(errors))}_trajectory" if errors and not keeps_all else None
-        result = {"traces": traces, "errors": {k: str(e) for k, e in errors.items()}, "times_ms": times_ms}
-        return Outcome(result, dropped)
-
-    return work
-
-
-def run(
-    cfg: CompareConfig,
-    simplified_map: Path,
-    paths: Path,
-    out: Path,
-    *,
-    seed: int = 0,
-    workers: int = 0,
-    watch: Watch = Watch(),
-    resume: Resume = "if-same",
-) -> Path:
-    """Read a simplified map and `path.json`; write `compare.json`, each planner's traces and a picture.
-
-    A pedestrian trajectory that a planner cannot follow is dropped with that planner's name; one that no planner can
-    follow is a failure.
-
-    Returns:
-        The path of `compare.json`.
-    Raises:
-        InputError: If an input file is invalid.
-        NothingKept: If there is no pedestrian trajectory that all planners follow.
-    """
-    inputs = {"map": simplified_map, "paths": paths}
-    stage = StageFolder.open(out, "plan_compare", config=cfg, inputs=inputs, seed=seed, resume=resume)
-    product = out / "compare.json"
-    if stage.is_complete:
-        return product
-    box_map, pedestrians = read_inputs(simplified_map, paths)
-    items = make_items(pedestrians, cfg, seed)
-    finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers, watch=watch)
-    if not finished.tally.kept:
-        raise stage.nothing_kept(finished.tally, expected="a pedestrian trajectory that all planners follow")
-    shared = {record.id: result_of(record, PlannedItem) for record in finished.kept}
-    by_path = [planned.read_traces(path_id) for path_id, planned in shared.items()]
-    traces = {name: [own[name] for own in by_path] for name in cfg.planners}
-    header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
-    summary = {
-        "planners": {name: ALL_PLANNERS[name] for name in traces},
-        "notes": planner_notes(cfg.planners, cfg),
-        **summarize(traces, rng_for(seed, "plan_compare", "intervals")),
-        "skipped": _skipped(finished.records),
-    }
-    write_json(product, {**FORMAT.header, **header, **summary})
-    outputs = [product]
-    for name, own in traces.items():
-        outputs.append(out / f"drone_trace_{name}.json")
-        write_traces(outputs[-1], own, {**header, "planner": name})
-    outputs.append(out / "compare_overlay.png")
-    compared = [pedestrian for pedestrian in pedestrians if pedestrian.path_id in shared]
-    write_bytes(outputs[-1], draw_overlay(box_map, compared, traces))
-    stage.finish(outputs, finished.tally, timings=timings(shared.values(), cfg.planners))
-    return product
-
-
 class PlannedItem(BaseModel):
     """Journal entry of one pedestrian trajectory, by planner."""
 
@@ -287,10 +198,105 @@ class PlannedItem(BaseModel):
         return {name: DroneTrace.from_json(t, f"items.jsonl: {path_id}: {name}") for name, t in self.traces.items()}
 
 
-def _skipped(records: Iterable[ItemRecord]) -> list[dict[str, str]]:
+def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int, keeps_all: bool) -> Work:
+    """Load the map once; return the function that plans for one pedestrian trajectory with each planner.
+
+    Args:
+        keeps_all: Keep an item although a planner failed.
+    """
+    obstacles, screens = load_obstacles(simplified_map)
+    settings = {name: cfg.model_copy(update={"planner": name}) for name in cfg.planners}
+    for own in settings.values():
+        warm_up(own)
+
+    def work(item: Item) -> Outcome:
+        pedestrian, styles = item.payload
+        planned, errors = PlannedItem(traces={}, errors={}, times_ms={}), list[NoPathError]()
+        for name, own in settings.items():
+            begin_s = time.perf_counter()
+            try:
+                trace = plan_trajectory(pedestrian, obstacles, own, seed, screens, styles)
+                planned.traces[name] = trace.as_json()
+            except NoPathError as error:
+                errors.append(error)
+                planned.errors[name] = str(error)
+            planned.times_ms[name] = round(1000.0 * (time.perf_counter() - begin_s), 2)
+        if not planned.traces:
+            raise errors[0]
+        dropped = f"no_{next(iter(planned.errors))}_trajectory" if errors and not keeps_all else None
+        return Outcome(planned.model_dump(), dropped)
+
+    return work
+
+
+Planned = tuple[BoxMap, list[PedestrianTrajectory], ItemOutcomes, dict[str, PlannedItem], dict[str, Any]]
+
+
+def plan_all(
+    stage: StageFolder, cfg: CompareConfig, simplified_map: Path, paths: Path, seed: int, *, most: int | None = None,
+    keeps_all: bool = False, **pool: Any,
+) -> Planned:  # fmt: skip
+    """Plan for each pedestrian trajectory, or the first `most`, with each planner.
+
+    Args:
+        pool: `workers` and `watch` of `run_items`.
+    Returns:
+        Map, pedestrian trajectories, work items, the kept ones by id, and the head of the product.
+    """
+    box_map, pedestrians = read_inputs(simplified_map, paths)
+    items = make_items(pedestrians[:most], cfg, seed)
+    done = run_items(stage, items, make_worker, (cfg, simplified_map, seed, keeps_all), **pool)
+    if not done.tally.kept:
+        who = "a planner follows" if keeps_all else "all planners follow"
+        raise stage.nothing_kept(done.tally, expected=f"a pedestrian trajectory that {who}")
+    header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
+    return box_map, pedestrians, done, {one.id: result_of(one, PlannedItem) for one in done.kept}, header
+
+
+def run(
+    cfg: CompareConfig, simplified_map: Path, paths: Path, out: Path, *, seed: int = 0, workers: int = 0,
+    watch: Watch = Watch(), resume: Resume = "if-same",
+) -> Path:  # fmt: skip
+    """Read a simplified map and `path.json`; write `compare.json`, each planner's traces and a picture.
+
+    A pedestrian trajectory that a planner cannot follow is dropped with that planner's name; one that no planner can
+    follow is a failure.
+
+    Returns:
+        The path of `compare.json`.
+    Raises:
+        InputError: If an input file is invalid.
+        NothingKept: If there is no pedestrian trajectory that all planners follow.
+    """
+    inputs, product = {"map": simplified_map, "paths": paths}, out / "compare.json"
+    stage = StageFolder.open(out, "plan_compare", config=cfg, inputs=inputs, seed=seed, resume=resume)
+    if stage.is_complete:
+        return product
+    box_map, pedestrians, done, shared, header = plan_all(
+        stage, cfg, simplified_map, paths, seed, workers=workers, watch=watch
+    )
+    by_path = [planned.read_traces(path_id) for path_id, planned in shared.items()]
+    traces = {name: [own[name] for own in by_path] for name in cfg.planners}
+    summary = {
+        "planners": {name: ALL_PLANNERS[name] for name in traces},
+        "notes": planner_notes(cfg.planners, cfg),
+        **summarize(traces, rng_for(seed, "plan_compare", "intervals")),
+        "skipped": _skipped(done),
+    }
+    write_json(product, {**FORMAT.header, **header, **summary})
+    outputs = [product, *(out / f"drone_trace_{name}.json" for name in traces), out / "compare_overlay.png"]
+    for path, (name, own) in zip(outputs[1:], traces.items(), strict=False):
+        write_traces(path, own, {**header, "planner": name})
+    compared = [pedestrian for pedestrian in pedestrians if pedestrian.path_id in shared]
+    write_bytes(outputs[-1], draw_compared(box_map, compared, traces))
+    stage.finish(outputs, done.tally, timings=timings(shared.values(), cfg.planners))
+    return product
+
+
+def _skipped(done: ItemOutcomes) -> Iterable[dict[str, str]]:
     """Return the pedestrian trajectories that are not compared, with the planners that failed and their reasons."""
     rows = []
-    for record in records:
+    for record in done.records:
         if isinstance(record, Failed):
             rows.append({"id": record.id, "planner": "all", "message": record.message})
         elif isinstance(record, Dropped):
@@ -299,7 +305,7 @@ def _skipped(records: Iterable[ItemRecord]) -> list[dict[str, str]]:
     return rows
 
 
-def timings(items: Collection[PlannedItem], planners: Sequence[str]) -> dict[str, dict[str, float]]:
+def timings(items: Collection[PlannedItem], planners: Sequence[str]) -> Means:
     """Return planning times, which are written to the manifest only because they differ from run to run."""
     table = {}
     for name in planners:
@@ -310,42 +316,6 @@ def timings(items: Collection[PlannedItem], planners: Sequence[str]) -> dict[str
     return table
 
 
-# --- picture ----------------------------------------------------------------------------------------------------------
-
-# RGB: the paper's blue and orange, then others that differ in brightness too.
-PALETTE = (
-    (30, 100, 210), (235, 120, 20), (20, 150, 90), (150, 60, 170), (120, 90, 60), (20, 170, 190), (200, 40, 60),
-    (110, 110, 110),
-)  # fmt: skip
-LEGEND_PX = 160  # of one planner
-
-
-def color_of(planner: str) -> tuple[int, int, int]:
-    """Return a planner's color, the same in every comparison."""
-    return PALETTE[list(ALL_PLANNERS).index(planner) % len(PALETTE)]
-
-
-def draw_overlay(
-    box_map: BoxMap, pedestrians: list[PedestrianTrajectory], traces: dict[str, list[DroneTrace]]
-) -> bytes:
-    """Draw pedestrian trajectories (dark) and the trajectories of each planner over the map; return PNG bytes."""
-    picture, view = draw_pedestrians(box_map, pedestrians, [trace for own in traces.values() for trace in own])
-    for planner, own in traces.items():
-        for trace in own:
-            line = view.pixels(trace.positions_m)
-            draw_line(picture, line, color_of(planner), 2, halo=5)
-            draw_dot(picture, line[0], 5, color_of(planner))
-    picture = add_caption(picture, f"{box_map.name}: {len(pedestrians)} pedestrians (dark); dots are starts")
-    x, y = float(picture.shape[1] - LEGEND_PX * len(traces)), 25.0
-    for planner in traces:
-        draw_line(picture, np.array([[x, y - 5], [x + 34, y - 5]]), color_of(planner), 3)
-        x = draw_text(picture, title_of(planner), x + 42, y) + 18
-    return png_bytes(picture)
-
-
-# --- tables -----------------------------------------------------------------------------------------------------------
-
-
 def text_tables(product: Path) -> list[TextTable]:
     """Read `compare.json` and its manifest as text tables: figures, axes, and the first planner's wins."""
     found, times = read_object(product, what="comparison"), read_manifest(product.parent).facts["timings"]
@@ -353,16 +323,16 @@ def text_tables(product: Path) -> list[TextTable]:
     titles, minus = [title_of(planner) for planner in planners], [f"minus {title_of(other)}" for other in others]
     figures, axes = [], []
     for name, words, digits in FIGURES:
-        figures.append([words, *(f"{found['means'][planner][name]:.{digits}f}" for planner in planners)])
+        figures.append([words, *cells((found["means"][planner][name] for planner in planners), digits)])
         for change in (found["deltas"][other][name] for other in others):
             relative = change["relative_percent"]
             figures[-1] += [f"{change['delta']:+.{digits}f}", "n/a" if relative is None else f"{relative:+.1f}"]
-    means_ms = [f"{times[planner]['mean_ms']:.1f}" for planner in planners]
+    means_ms = cells((times[planner]["mean_ms"] for planner in planners), 1)
     figures.append(["planning time (ms)", *means_ms, *[""] * 2 * len(others)])
-    for name in (*AXES, "mean"):
+    for name in AXES_AND_MEAN:
         rows = [found["axis_differences"][other][name] for other in others]
         apart = [f"{row['difference']:+.3f} ({row['low']:+.3f} to {row['high']:+.3f})" for row in rows]
-        axes.append([name.replace("_", " "), *(f"{found['axes'][p][name]:.3f}" for p in planners), *apart])
+        axes.append([name.replace("_", " "), *cells(found["axes"][p][name] for p in planners), *apart])
     rates = found["win_rates"]
     wins = [
         [name.replace("_", " "), *(f"{rates[o][name]['count']} of {rates[o][name]['of']}" for o in others)]

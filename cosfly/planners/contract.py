@@ -48,10 +48,10 @@ REFERENCES = {
     "bspline_prm": "cosfly.planners.reference.sampling:plan_bspline_prm",
     "elastic_band": "cosfly.planners.reference.optimization:plan_elastic_band",
     "minimum_jerk": "cosfly.planners.reference.optimization:plan_minimum_jerk",
-    "astar": "cosfly.planners.reference.grid_search:plan_astar",
-    "weighted_astar": "cosfly.planners.reference.grid_search:plan_weighted",
-    "theta_star": "cosfly.planners.reference.grid_search:plan_theta",
-    "visibility_astar": "cosfly.planners.reference.visibility_astar:plan",
+    "astar": "cosfly.planners.reference.graph_search:plan_astar",
+    "weighted_astar": "cosfly.planners.reference.graph_search:plan_weighted",
+    "theta_star": "cosfly.planners.reference.graph_search:plan_theta",
+    "visibility_astar": "cosfly.planners.reference.graph_search:plan_visibility",
     "potential_field": "cosfly.planners.reference.optimization:plan_potential_field",
     "chomp": "cosfly.planners.reference.optimization:plan_chomp",
     "trajopt": "cosfly.planners.reference.optimization:plan_trajopt",
@@ -152,17 +152,12 @@ class PlanConfig(Config):
         "`cosfly plan benchmark` has generic ones",
     )
     safety_distance_m: float = Field(SAFETY_DISTANCE_M, gt=0, description="nominal distance to obstacles, m")
-    relaxed_safety_m: float = Field(
-        RELAXED_SAFETY_M, gt=0, description="distance kept where the nominal one is impossible, m"
-    )
+    relaxed_safety_m: float = Field(RELAXED_SAFETY_M, gt=0, description="distance where that is impossible, m")
     altitude_min_m: float = Field(20.0, gt=0, description="least altitude of the style follow, m")
     altitude_preferred_m: float = Field(20.0, gt=0, description="preferred altitude of the style follow, m")
     altitude_max_m: float = Field(100.0, gt=0, description="greatest altitude, m")
     behind_distance_m: float = Field(
-        20.0,
-        gt=0,
-        description="horizontal distance to the target of the style follow, m: throughout for foresight, at the start "
-        "for others",
+        20.0, gt=0, description="horizontal distance of the style follow, m; at the start only for muco and track_astar"
     )
     speed_max_mps: float = Field(10.0, gt=0, description="greatest speed between two waypoints, m/s")
     accel_max_mps2: float = Field(
@@ -172,32 +167,22 @@ class PlanConfig(Config):
     five_ray_mean_min: float = Field(
         FIVE_RAY_MEAN_MIN, ge=0, le=1, description="drop a trajectory of lower mean five-ray visibility; 0: never"
     )
-    accel_rms_max_mps2: ClassVar[float] = (
-        ACCEL_RMS_MAX_MPS2  # a trajectory of greater RMS acceleration is dropped, m/s^2
-    )
-    jerk_rms_max_mps3: ClassVar[float] = JERK_RMS_MAX_MPS3  # a trajectory of greater RMS jerk is dropped, m/s^3
+    accel_rms_max_mps2: ClassVar[float] = ACCEL_RMS_MAX_MPS2  # a trajectory of greater RMS acceleration is dropped
+    jerk_rms_max_mps3: ClassVar[float] = JERK_RMS_MAX_MPS3  # a trajectory of greater RMS jerk is dropped
     styles: dict[str, float] = Field(
-        {FOLLOW: 1.0},
-        description="share of each manoeuvre style, by name; shares need not add up to one",
-        examples=[*NAMES],
+        {FOLLOW: 1.0}, description="share of each manoeuvre style; shares need not add up to one", examples=[*NAMES]
     )
     style_ranges: dict[str, dict[str, Range]] = Field(
-        {},
-        description="style -> range -> [least, greatest]: replaces ranges of the table of styles, for example "
-        "{side: {altitude_m: [11, 13]}}",
+        {}, description="[least, greatest] instead of the table's ranges, such as {side: {altitude_m: [11, 13]}}"
     )
     segment_s: float = Field(
-        0.0,
-        ge=0,
-        description="approximate length of a segment of one style, s; 0: one style a trajectory",
+        0.0, ge=0, description="approximate length of a segment of one style, s; 0: one style a trajectory"
     )
     styles_fallback: Literal["drop", "follow"] = Field(
         "drop", description="where the map cannot hold a style: drop the trajectory, or use follow; both are counted"
     )
-    muco: MucoConfig = Field(default_factory=MucoConfig, description="the MuCO optimiser")
-    track_astar: TrackAStarConfig = Field(
-        default_factory=TrackAStarConfig, description="TA*+Smooth, with our smoothing"
-    )
+    muco: MucoConfig = Field(MucoConfig(), description="the MuCO optimiser")
+    track_astar: TrackAStarConfig = Field(TrackAStarConfig(), description="TA*+Smooth, with our smoothing")
 
     _is_known = field_validator("planner")(known_planner)
 
@@ -230,8 +215,7 @@ class PlanConfig(Config):
         if not self.altitude_min_m <= self.altitude_preferred_m <= self.altitude_max_m:
             wrong.append("altitude_min_m, altitude_preferred_m and altitude_max_m must be in ascending order")
         for name, row in self._rows().items():
-            highest_m = max(row.altitude_m[1], (row.altitude_end_m or row.altitude_m)[1])
-            if highest_m > self.altitude_max_m:
+            if (highest_m := row.altitude_range_m[1]) > self.altitude_max_m:
                 wrong.append(f"style_ranges.{name} goes up to {highest_m:g} m, above altitude_max_m")
             if (fastest_mps := max(map(abs, row.round_mps))) >= self.speed_max_mps:
                 wrong.append(f"style_ranges.{name}.round_mps is up to {fastest_mps:g}, no less than speed_max_mps")
@@ -253,8 +237,7 @@ class PlanConfig(Config):
     @property
     def styles_floor_m(self) -> float:
         """Return the least altitude of styles other than follow."""
-        lows = [min(row.altitude_m[0], (row.altitude_end_m or row.altitude_m)[0]) for row in self._rows().values()]
-        return min(ALTITUDE_LEAST_M, self.altitude_min_m, *lows)
+        return min(ALTITUDE_LEAST_M, self.altitude_min_m, *(row.altitude_range_m[0] for row in self._rows().values()))
 
     def remarks(self) -> list[str]:
         """Return remarks on settings of altitude and distance that apply to some of the trajectories only."""

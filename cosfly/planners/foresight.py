@@ -103,12 +103,12 @@ def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
 
 def _links(rings: np.ndarray) -> np.ndarray:
     """Return the numbers of the rings next to each, outwards and up, (r, r): itself first, then -1."""
-    levels = np.searchsorted(np.unique(rings[:, 1]), rings[:, 1])
-    links = np.full((len(rings), len(rings)), -1)
+    outwards, levels = rings[:, 0], np.searchsorted(np.unique(rings[:, 1]), rings[:, 1])
+    near = (abs(outwards[:, None] - outwards) <= 1) & (abs(levels[:, None] - levels) <= 1)
+    np.fill_diagonal(near, False)
+    links = np.full(near.shape, -1)
     for ring in range(len(rings)):
-        near = (abs(rings[:, 0] - rings[ring, 0]) <= 1) & (abs(levels - levels[ring]) <= 1)
-        near[ring] = False
-        found = [ring, *np.flatnonzero(near)]
+        found = [ring, *np.flatnonzero(near[ring]).tolist()]
         links[ring, : len(found)] = found
     return links
 
@@ -148,32 +148,27 @@ def search_trajectory(
     own[~scenario.reference.keeps_sight[frames]] = 0.0
     own += lattice.costs.reshape(own.shape)
     longest_m = SPEED_SHARE * cfg.speed_max_mps * scenario.dt_s * np.diff(frames, prepend=frames[0])
-    chosen = _cheapest(
-        places, own, gaps, longest_m, aloft, clearance_m, lattice.links, num_azimuths, lattice.max_turn, WAY_COST
-    )
-    if chosen[0] < 0:
-        return None
-    return scenario.between(frames, places[np.arange(len(frames)), chosen])
+    links, max_turn = lattice.links, lattice.max_turn
+    chosen = _cheapest(places, own, gaps, longest_m, aloft, clearance_m, links, num_azimuths, max_turn, WAY_COST)
+    return None if chosen[0] < 0 else scenario.between(frames, places[np.arange(len(frames)), chosen])
 
 
 def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) -> BoxIndex:
     """Index the boxes that may be within REACH_M of a place: most boxes end far below a drone."""
-    rows, aside_m = obstacles.rows, lattice.radius_max_m + REACH_M
-    (low_x, low_y), (high_x, high_y) = targets_m[:, :2].min(axis=0) - aside_m, targets_m[:, :2].max(axis=0) + aside_m
+    rows, flat, aside_m = obstacles.rows, targets_m[:, :2], lattice.radius_max_m + REACH_M
     keep = rows[:, HIGH_Z] >= lattice.places_m[:, :, 0, 2].min() - REACH_M
-    keep &= (rows[:, HIGH_X] >= low_x) & (rows[:, LOW_X] <= high_x)
-    keep &= (rows[:, HIGH_Y] >= low_y) & (rows[:, LOW_Y] <= high_y)
+    keep &= (rows[:, [HIGH_X, HIGH_Y]] >= flat.min(axis=0) - aside_m).all(axis=1)
+    keep &= (rows[:, [LOW_X, LOW_Y]] <= flat.max(axis=0) + aside_m).all(axis=1)
     rows = rows[keep]
     return index_boxes(rows[:, :3], rows[:, 3:6], rows[:, 6:15].reshape(-1, 3, 3), cell_m=2.0 * REACH_M)
 
 
 @njit(cache=True)
 def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps, hidden):
-    """Write the distance of each place to the nearest box, at most `reach_m`, and the hidden share of the target, both
-    (m, c).
+    """Write the distance of each place to the nearest box, at most `reach_m`, and the hidden share of the target.
 
-    Places nearer than `clearance_m` keep their value of `hidden`. aloft: rows of the boxes of `index` within `reach_m`
-    of places.
+    Both are (m, c); places nearer than `clearance_m` keep their `hidden`. aloft: rows of the boxes of `index` within
+    `reach_m` of places.
     """
     near = np.empty(len(aloft), dtype=np.int64)
     for key in range(len(places)):
@@ -204,8 +199,7 @@ def _cheapest(places, own, gaps, longest_m, index, clearance_m, links, num_azimu
     """Return the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
     places: (m, c, 3), c = rings * azimuths. own: (m, c) cost of a place. gaps: (m, c) m. longest_m: (m,) move into each
-    key frame.
-    links: (rings, r) previous rings, the first -1 ends the list.
+    key frame. links: (rings, r) previous rings, the first -1 ends the list.
     """
     num_keys, num_places, one = len(places), places.shape[1], np.empty(1, dtype=np.int64)
     cost, came_from = np.empty((num_keys, num_places)), np.empty((num_keys, num_places), dtype=np.int64)

@@ -6,7 +6,7 @@ HELD_RATIO of its distance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING
@@ -18,8 +18,7 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.formats.segments import FOLLOW, MISSION_KINDS, Mission, MissionKind, Segment
 from cosfly.geometry.axes import look_at
 from cosfly.planners.contract import PlanConfig, Scenario, TrackingReference
-from cosfly.planners.reacquire import finds_again, reacquire_reference
-from cosfly.planners.reference_trajectory import ROUNDING_S, reference_of
+from cosfly.planners.reference_trajectory import ROUNDING_S, finds_again, reacquire_reference, reference_of
 from cosfly.planners.styles import OTHER_SIDE, REACQUIRE, RETURN_HOME, ROWS, WHOLE, suits
 from cosfly.runtime.seeding import draw_to_quota
 
@@ -29,8 +28,7 @@ if TYPE_CHECKING:
 
 HELD_DEG, HELD_RATIO, HELD_SHARE = 25.0, 1.4, 0.7
 POINTS_LEAST = 4  # of a segment
-NO_HIDING_PLACE, NOT_FOUND_AGAIN, NOT_HELD = "no_hiding_place", "not_lost_and_found", "style_not_held"
-NO_TIME = "no_time_for_home"
+NOT_HELD = "style_not_held"
 
 
 @dataclass(frozen=True)
@@ -67,8 +65,7 @@ def draw_styles(
     """
     parts_of = {style: share for style, share in cfg.styles.items() if style not in WHOLE}
     parts_share = sum(parts_of.values())
-    if parts_share == 0:
-        parts_of = {FOLLOW: 1.0}  # precedes `return_home`
+    parts_of = parts_of if parts_share else {FOLLOW: 1.0}  # which precedes `return_home`
     for style, other in zip([*parts_of], mirrored([*parts_of]), strict=True):
         if style != other:
             parts_of[style] = parts_of[other] = parts_of[style] / 2.0
@@ -98,17 +95,17 @@ def draw_styles(
     return [names + ([last] if last else []) for names, last in zip(drawn, lasts, strict=True)]
 
 
-def _unevenness_mps(pedestrian: PedestrianTrajectory, points: np.ndarray) -> float:
-    return float(np.std(pedestrian.speeds_mps[points]))
-
-
 def _straightness(pedestrian: PedestrianTrajectory, points: np.ndarray) -> float:
     steps_m = np.diff(pedestrian.positions_m[points, :2], axis=0)
     return float(np.hypot(*steps_m.sum(axis=0)) / max(float(np.hypot(*steps_m.T).sum()), 1e-9))
 
 
 # What suits a style -> its measure in a segment, in the order in which segments are assigned.
-MEASURES = {"uneven": _unevenness_mps, "straight": _straightness, "": lambda pedestrian, points: 0.0}
+MEASURES: dict[str, Callable[[PedestrianTrajectory, np.ndarray], float]] = {
+    "uneven": lambda pedestrian, points: float(np.std(pedestrian.speeds_mps[points])),
+    "straight": _straightness,
+    "": lambda pedestrian, points: 0.0,
+}
 
 
 def mirrored(names: Sequence[str]) -> list[str]:
@@ -126,10 +123,8 @@ def draw_maneuvers(
     num = len(scenario.targets_m)
     if names[-1] == REACQUIRE:
         reference = reacquire_reference(scenario, obstacles, screens, cfg, rng)
-        segment = Segment(REACQUIRE, 0, num, keeps_sight=False)
-        if reference is None:
-            return ManeuverPlan(scenario.reference, (segment,), impossible=NO_HIDING_PLACE)
-        return ManeuverPlan(reference, (segment,))
+        impossible, whole = None if reference else "no_hiding_place", Segment(REACQUIRE, 0, num, keeps_sight=False)
+        return ManeuverPlan(reference or scenario.reference, (whole,), impossible=impossible)
     names, goes_home = [name for name in names if name != RETURN_HOME], names[-1] == RETURN_HOME
     cuts = np.linspace(0, num, len(names) + 1).round().astype(int).tolist()
     plain = [name.removeprefix(OTHER_SIDE) for name in names]
@@ -151,7 +146,7 @@ def why_not_held(maneuvers: ManeuverPlan, scenario: Scenario, positions_m: np.nd
     if maneuvers.impossible is not None or not maneuvers.segments:
         return maneuvers.impossible
     if maneuvers.searches:
-        return None if finds_again(seen, scenario.dt_s) else NOT_FOUND_AGAIN
+        return None if finds_again(seen, scenario.dt_s) else "not_lost_and_found"
     pursued = None if maneuvers.mission is None else maneuvers.mission.at_frame
     return None if _is_held(maneuvers.reference, scenario, positions_m)[:pursued].mean() >= HELD_SHARE else NOT_HELD
 
@@ -224,19 +219,18 @@ def end_with_order(
         legs = _legs_home(positions_m[: at + 1], scenario.targets_m[at], obstacles, cfg, dt_s)
     if at + sum(map(len, legs)) > in_time:
         whole = Segment(RETURN_HOME, 0, num, keeps_sight=False)
-        return replace(maneuvers, impossible=NO_TIME, segments=(whole,)), positions_m
+        return replace(maneuvers, impossible="no_time_for_home", segments=(whole,)), positions_m
     way = np.vstack([positions_m[: at + 1], *legs])
     positions = np.vstack([way, np.tile(way[-1], (num - len(way), 1))])
     share = np.clip((np.arange(num) - at) * dt_s / (2.0 * ROUNDING_S), 0.0, 1.0)[:, None]  # the pursuit stays
     positions += share * (gaussian_filter1d(positions, ROUNDING_S / dt_s, axis=0, mode="nearest") - positions)
     home_m = np.round(positions_m[0], 4)
-    mission = Mission(maneuvers.order, at, at + len(legs[0]), (float(home_m[0]), float(home_m[1]), float(home_m[2])))
+    mission = Mission(maneuvers.order, at, at + len(legs[0]), tuple(home_m.tolist()))
     before = tuple(Segment(p.style, p.begin, min(p.end, at)) for p in maneuvers.segments if p.begin < at)
     segments = (*before, Segment(RETURN_HOME, at, num, keeps_sight=False))
     reference = replace(maneuvers.reference, keeps_sight=maneuvers.reference.keeps_sight & (np.arange(num) < at))
-    return replace(maneuvers, reference=reference, segments=segments, mission=mission), repair_to_limits(
-        positions, scenario, obstacles, cfg
-    )
+    maneuvers = replace(maneuvers, reference=reference, segments=segments, mission=mission)
+    return maneuvers, repair_to_limits(positions, scenario, obstacles, cfg)
 
 
 def _legs_home(
@@ -258,10 +252,8 @@ def _legs_home(
         free = are_free(corners[-1], trail_m[:left])
         left = int(np.argmax(free)) if free.any() else left - 1
         corners.append(trail_m[left])
-    return [
-        _positions_along(np.stack([here, aside]), LEAVES_MPS, dt_s),
-        _positions_along(np.stack(corners), HOME_MPS, dt_s),
-    ]
+    legs = ((np.stack([here, aside]), LEAVES_MPS), (np.stack(corners), HOME_MPS))
+    return [_positions_along(leg, most_mps, dt_s) for leg, most_mps in legs]
 
 
 def _positions_along(corners_m: np.ndarray, most_mps: float, dt_s: float) -> np.ndarray:
@@ -296,20 +288,17 @@ def view_of(
     Args:
         positions_m, targets_m: (n, 3). seen: (n,) five-ray visibility.
     """
-    pitch, yaw = look_at(positions_m, targets_m)
     if maneuvers.mission is not None:
-        return _turned_home(pitch, yaw, positions_m, maneuvers.mission.at_frame, dt_s)
+        return _turned_home(positions_m, targets_m, maneuvers.mission.at_frame, dt_s)
     if maneuvers.searches:
-        return _searching(pitch, yaw, positions_m, targets_m, seen, dt_s)
-    return pitch, yaw
+        return _searching(positions_m, targets_m, seen, dt_s)
+    return look_at(positions_m, targets_m)
 
 
-def _turned_home(
-    pitch: np.ndarray, yaw: np.ndarray, positions_m: np.ndarray, at: int, dt_s: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _turned_home(positions_m: np.ndarray, targets_m: np.ndarray, at: int, dt_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Turn into the direction of motion from frame `at` on, at most at HOME_TURN_DPS."""
     velocity, step = np.gradient(positions_m[:, :2], dt_s, axis=0), np.radians(HOME_TURN_DPS) * dt_s
-    pitch, yaw = pitch.copy(), yaw.copy()
+    pitch, yaw = look_at(positions_m, targets_m)
     for i in range(at + 1, len(yaw)):
         moves = np.hypot(*velocity[i]) >= STANDING_MPS
         wanted = np.arctan2(velocity[i, 1], velocity[i, 0]) if moves else yaw[i - 1]
@@ -319,24 +308,21 @@ def _turned_home(
 
 
 def _searching(
-    pitch: np.ndarray, yaw: np.ndarray, positions_m: np.ndarray, targets_m: np.ndarray, seen: np.ndarray, dt_s: float
+    positions_m: np.ndarray, targets_m: np.ndarray, seen: np.ndarray, dt_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Look where the target was lost while it is hidden: the drone does not know what it does not see."""
-    aims, since, last = targets_m.copy(), np.zeros(len(seen)), 0
-    speeds = np.gradient(targets_m, dt_s, axis=0) if len(targets_m) > 1 else np.zeros_like(targets_m)
-    for i in range(len(seen)):
-        last = i if seen[i] > 0 else last
-        since[i] = (i - last) * dt_s
-        aims[i] = targets_m[last] + speeds[last] * min(since[i], GOES_ON_S)
-    pitch, yaw = look_at(positions_m, aims)
-    sweep = np.radians(SWEEP_DEG) * np.sin(2.0 * np.pi * np.maximum(since - GOES_ON_S, 0.0) / SWEEP_S)
-    return _eased(pitch, since > 0, dt_s), _wrapped(_eased(np.unwrap(yaw) + sweep, since > 0, dt_s))
+    frames = np.arange(len(seen))
+    last = np.maximum.accumulate(np.where(seen > 0, frames, 0))
+    since_s = (frames - last) * dt_s
+    speeds = np.gradient(targets_m, dt_s, axis=0)
+    pitch, yaw = look_at(positions_m, targets_m[last] + speeds[last] * np.minimum(since_s, GOES_ON_S)[:, None])
+    sweep = np.radians(SWEEP_DEG) * np.sin(2.0 * np.pi * np.maximum(since_s - GOES_ON_S, 0.0) / SWEEP_S)
+
+    def eased(angles: np.ndarray) -> np.ndarray:
+        return np.where(since_s > 0, gaussian_filter1d(angles, TURNS_S / dt_s, mode="nearest"), angles)
+
+    return eased(pitch), _wrapped(eased(np.unwrap(yaw) + sweep))
 
 
 def _wrapped(angles: np.ndarray) -> np.ndarray:
     return np.arctan2(np.sin(angles), np.cos(angles))
-
-
-def _eased(angles: np.ndarray, where: np.ndarray, dt_s: float) -> np.ndarray:
-    """Smooth angles (n,) where the view does not look at the target."""
-    return np.where(where, gaussian_filter1d(angles, TURNS_S / dt_s, mode="nearest"), angles)

@@ -49,34 +49,29 @@ def make_scenario(pedestrian: PedestrianTrajectory, obstacles: BoxIndex, cfg: Pl
     from cosfly.geometry.kernels import segments_hit
     from cosfly.planners.reference_trajectory import follow
 
-    targets = pedestrian.positions_m + np.array([0.0, 0.0, TARGET_HEIGHT_M])
-    where = pedestrian.path_id
+    targets, where = pedestrian.positions_m + np.array([0.0, 0.0, TARGET_HEIGHT_M]), pedestrian.path_id
     if len(targets) < 2:
         raise NoPathError("the pedestrian trajectory has one point only", where=where, expected="two points or more")
-    dt_s = step_s(pedestrian.time_s)
-    uneven = np.abs(np.diff(pedestrian.time_s) - max(dt_s, 0.0)) > 1e-3
+    dt_s, steps_s = step_s(pedestrian.time_s), np.diff(pedestrian.time_s)
+    uneven = np.abs(steps_s - max(dt_s, 0.0)) > 1e-3
     if dt_s <= 0 or uneven.any():
         place = int(np.argmax(uneven)) + 1
-        raise NoPathError(
-            "time stamps do not increase in equal steps", where=f"{where}: t[{place}]",
-            got=f"a step of {np.diff(pedestrian.time_s)[place - 1]:g} s", expected=f"{abs(dt_s):g} s, the median",
-        )  # fmt: skip
-    if np.abs(targets).max() > COORDINATE_MAX_M:
-        raise NoPathError(
-            "a coordinate is too large", where=where, got=f"{np.abs(targets).max():g} m",
-            expected=f"at most {COORDINATE_MAX_M:g} m", fix="move the map's origin near the pedestrian trajectories",
-        )  # fmt: skip
+        what, got = (
+            "time stamps do not increase in equal steps",
+            f"a step of {np.diff(pedestrian.time_s)[place - 1]:g} s",
+        )
+        expected = f"{abs(dt_s):g} s, the median"
+        raise NoPathError(what, where=f"{where}: t[{place}]", got=got, expected=expected)
+    if (farthest_m := np.abs(targets).max()) > COORDINATE_MAX_M:
+        expected, fix = f"at most {COORDINATE_MAX_M:g} m", "move the map's origin near the pedestrian trajectories"
+        raise NoPathError("a coordinate is too large", where=where, got=f"{farthest_m:g} m", expected=expected, fix=fix)
     hits = segments_hit(obstacles, targets[:-1], targets[1:])
     if hits.any():
-        place = targets[int(np.argmax(hits))]
-        raise NoPathError(
-            "the pedestrian trajectory passes through an obstacle", where=where,
-            got=f"{int(hits.sum())} steps inside a box, the first at ({place[0]:.1f}, {place[1]:.1f})",
-            fix="plan on the map that the pedestrian trajectories were made for",
-        )  # fmt: skip
-    return Scenario(
-        pedestrian.path_id, targets, np.array(pedestrian.positions_m[:, 2]), follow(targets, cfg, dt_s), dt_s
-    )
+        x, y, _ = targets[int(np.argmax(hits))]
+        what, got = "the pedestrian trajectory passes through an obstacle", f"{int(hits.sum())} steps inside a box"
+        fix = "plan on the map that the pedestrian trajectories were made for"
+        raise NoPathError(what, where=where, got=f"{got}, the first at ({x:.1f}, {y:.1f})", fix=fix)
+    return Scenario(where, targets, np.array(pedestrian.positions_m[:, 2]), follow(targets, cfg, dt_s), dt_s)
 
 
 def draw_styles_of(pedestrians: Sequence[PedestrianTrajectory], cfg: PlanConfig, seed: int) -> list[list[str]]:
@@ -105,20 +100,20 @@ def plan_trajectory(
     styles = styles or draw_styles_of([pedestrian], cfg, seed)[0]
     for attempt in range(TRIES):
         maneuvers = draw_maneuvers(styles, scenario, obstacles, screens, cfg, style_rng(pedestrian, seed, attempt))
-        found: DroneTrace | NoPathError
+        found, problem = None, None
         try:
             found = _plan_once(pedestrian, scenario, maneuvers, obstacles, screens, cfg, seed)
         except NoPathError as error:
-            found = error
-        if not maneuvers.segments or (isinstance(found, DroneTrace) and found.drop_reason is None):
+            problem = error
+        if not maneuvers.segments or (found and found.drop_reason is None):
             break
         styles = mirrored(styles)  # a wall may block one side only
     is_last = not maneuvers.segments or cfg.styles_fallback == "drop"
-    if isinstance(found, DroneTrace) and (is_last or found.drop_reason is None):
+    if found and (is_last or found.drop_reason is None):
         return found
-    if isinstance(found, NoPathError) and is_last:
-        raise found
-    reason, not_held = ("no_path", None) if isinstance(found, NoPathError) else (found.drop_reason, found.not_held)
+    if problem and is_last:
+        raise problem
+    reason, not_held = (found.drop_reason, found.not_held) if found else ("no_path", None)
     follow = _plan_once(pedestrian, scenario, ManeuverPlan(scenario.reference), obstacles, screens, cfg, seed)
     return replace(follow, instead_of=f"{maneuvers.styles}: {reason}", not_held=not_held)
 
@@ -139,14 +134,13 @@ def plan_on(
     from cosfly.planners.foresight import plan
     from cosfly.planners.reference_trajectory import continued_reference, follow
 
-    ground_m = targets_m[:, 2] - TARGET_HEIGHT_M
+    ground_m, rng = targets_m[:, 2] - TARGET_HEIGHT_M, rng_for(0, "plan", path_id)  # from which nothing is drawn
     scenario = Scenario(path_id, targets_m, ground_m, follow(targets_m, cfg, dt_s), dt_s, past_m)
     scenario = replace(scenario, reference=continued_reference(scenario, cfg))
     try:
-        return plan(scenario, obstacles, cfg, rng_for(0, "plan", path_id)).positions_m
+        return plan(scenario, obstacles, cfg, rng).positions_m
     except NoPathError:
-        turning = replace(scenario, turns_back=True)
-        return plan(turning, obstacles, cfg, rng_for(0, "plan", path_id)).positions_m
+        return plan(replace(scenario, turns_back=True), obstacles, cfg, rng).positions_m
 
 
 def style_rng(pedestrian: PedestrianTrajectory, seed: int, attempt: int = 0) -> np.random.Generator:
@@ -172,11 +166,9 @@ def _plan_once(
     targets = np.round(scenario.targets_m, 4)
     clearances, _, _ = swept_distances(obstacles, positions, CLEARANCE_CAP_M)
     if clearances.min() < cfg.relaxed_safety_m - CLEARANCE_TOLERANCE_M:
-        raise NoPathError(
-            f"planner {cfg.planner} found no trajectory that is free of collisions", where=pedestrian.path_id,
-            got=f"a least clearance of {clearances.min():.2f} m",
-            expected=f"at least {cfg.relaxed_safety_m:g} m everywhere",
-        )  # fmt: skip
+        what, got = "no trajectory that is free of collisions", f"a least clearance of {clearances.min():.2f} m"
+        where, expected = pedestrian.path_id, f"at least {cfg.relaxed_safety_m:g} m everywhere"
+        raise NoPathError(f"planner {cfg.planner} found {what}", where=where, got=got, expected=expected)
     seen, is_judged = visibility(obstacles, positions, targets), maneuvers.reference.keeps_sight
     seen_past_screens = visibility(screens, positions, targets) if maneuvers.searches else seen
     pitch, yaw = view_of(maneuvers, positions, targets, seen_past_screens, scenario.dt_s)
@@ -185,37 +177,25 @@ def _plan_once(
     reason = drop_reason(metrics, cfg, made.is_converged, checks_visibility=bool(is_judged.any()))
     reason = reason or why_not_held(maneuvers, scenario, positions, seen_past_screens)
     return DroneTrace(
-        path_id=pedestrian.path_id,
-        planner=cfg.planner,
-        time_s=pedestrian.time_s,
-        positions_m=positions,
-        rotations_deg=np.degrees(np.stack([pitch, yaw, np.zeros_like(yaw)], axis=1)),
-        targets_m=targets,
-        visibility=seen,
-        clearances_m=clearances,
-        metrics=metrics,
-        solver=made.solver,
-        drop_reason=reason,
+        path_id=pedestrian.path_id, planner=cfg.planner, time_s=pedestrian.time_s, positions_m=positions,
+        rotations_deg=np.degrees(np.stack([pitch, yaw, np.zeros_like(yaw)], axis=1)), targets_m=targets,
+        visibility=seen, clearances_m=clearances, metrics=metrics, solver=made.solver, drop_reason=reason,
         not_held=describe_not_held(maneuvers, scenario, positions, obstacles, cfg) if reason == NOT_HELD else None,
-        segments=maneuvers.segments,
-        mission=maneuvers.mission,
-        pace=pedestrian.pace,
-    )
+        segments=maneuvers.segments, mission=maneuvers.mission, pace=pedestrian.pace,
+    )  # fmt: skip
 
 
 def drop_reason(
     metrics: dict[str, float], cfg: PlanConfig, is_converged: bool, *, checks_visibility: bool = True
 ) -> str | None:
     """Return why the filter before rendering rejects a trajectory, None if it passes (sec:step6, sec:dataset_stats)."""
-    if not is_converged:
-        return "not_converged"
-    if checks_visibility and metrics["five_ray_mean"] < cfg.five_ray_mean_min:
-        return "low_visibility"
-    if metrics["accel_rms_mps2"] > cfg.accel_rms_max_mps2:
-        return "high_acceleration"
-    if metrics["jerk_rms_mps3"] > cfg.jerk_rms_max_mps3:
-        return "high_jerk"
-    return None
+    reasons = {
+        "not_converged": not is_converged,
+        "low_visibility": checks_visibility and metrics["five_ray_mean"] < cfg.five_ray_mean_min,
+        "high_acceleration": metrics["accel_rms_mps2"] > cfg.accel_rms_max_mps2,
+        "high_jerk": metrics["jerk_rms_mps3"] > cfg.jerk_rms_max_mps3,
+    }
+    return next((reason for reason, applies in reasons.items() if applies), None)
 
 
 # --- stage ------------------------------------------------------------------------------------------------------------
@@ -282,16 +262,9 @@ def make_items(pedestrians: Sequence[PedestrianTrajectory], cfg: PlanConfig, see
 
 
 def run(
-    cfg: PlanConfig,
-    simplified_map: Path,
-    paths: Path,
-    out: Path,
-    *,
-    seed: int = 0,
-    workers: int = 0,
-    watch: Watch = Watch(),
-    resume: Resume = "if-same",
-) -> Path:
+    cfg: PlanConfig, simplified_map: Path, paths: Path, out: Path, *, seed: int = 0, workers: int = 0,
+    watch: Watch = Watch(), resume: Resume = "if-same",
+) -> Path:  # fmt: skip
     """Read a simplified map and `path.json`; write `drone_trace.json` and `plan.png`.
 
     Trajectories that the filter drops are written too, with their reason; a pedestrian trajectory without a drone
@@ -325,21 +298,15 @@ def run(
             log.warning("%s: style_not_held: %s", trace.path_id, trace.not_held)
     write_traces(product, traces, header)
     write_bytes(picture, draw_trajectories(box_map, pedestrians, traces))
-    seconds = [record.seconds for record in records]
-    stage.finish([product, picture], finished.tally, **_facts(box_map, traces, seconds))
-    return product
-
-
-def _facts(box_map: BoxMap, traces: list[DroneTrace], seconds: list[float]) -> dict:
-    """Return what the manifest records beyond the counts; planning times are written there and not to the product."""
-    times_ms = 1000.0 * np.array(seconds)
+    times_ms = 1000.0 * np.array([record.seconds for record in records])  # not in the product, which is reproducible
     names = ("five_ray_mean", "clearance_min_m", "altitude_mean_m", "target_distance_mean_m", "smoothness_score")
-    return {
-        "num_boxes": len(box_map),
-        "planning_ms": {"mean": round(float(times_ms.mean()), 1), "max": round(float(times_ms.max()), 1)},
+    stage.finish(
+        [product, picture], finished.tally, num_boxes=len(box_map),
+        planning_ms={"mean": round(float(times_ms.mean()), 1), "max": round(float(times_ms.max()), 1)},
         **_styles_flown(traces),
-        "means": {name: round(float(np.mean([trace.metrics[name] for trace in traces])), 4) for name in names},
-    }
+        means={name: round(float(np.mean([trace.metrics[name] for trace in traces])), 4) for name in names},
+    )  # fmt: skip
+    return product
 
 
 def _styles_flown(traces: list[DroneTrace]) -> dict:

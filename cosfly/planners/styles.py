@@ -46,6 +46,12 @@ class Style:
     pace_mps: Range = (4.0, 4.0)
     suits: str = ""
 
+    @property
+    def altitude_range_m(self) -> Range:
+        """Return the least and greatest altitude at start and end."""
+        ends = (*self.altitude_m, *(self.altitude_end_m or ()))
+        return min(ends), max(ends)
+
 
 # Slant distances are 10 to 60 m. Below some 8 m in the plane, a low drone could not keep up around a bend.
 TABLE: dict[str, Style] = {
@@ -70,22 +76,20 @@ TABLE: dict[str, Style] = {
     "top": Style(("track_straight",), (20.0, 26.0), (50.0, 54.0), (150.0, 210.0)),
 }  # fmt: skip
 
-# Ranges of reacquire.py: where the target is lost, and from where the drone searches.
+# Ranges of `reacquire`: where the target is lost, and from where the drone searches.
 HIDING = Style(
     ("search_to_reacquire_target",), (18.0, 42.0), (8.0, 16.0), ground_distance_end_m=(8.0, 16.0), climb_m=(12.0, 26.0)
 )
 
 NAMES = (FOLLOW, *TABLE, REACQUIRE, RETURN_HOME)
 WHOLE = (REACQUIRE, RETURN_HOME)  # styles of whole trajectories; the others are of segments
+ROWS: dict[str, Style] = TABLE | {REACQUIRE: HIDING}
 
 
 def suits(name: str) -> str:
     """Return what kind of pedestrian a style suits."""
     row = ROWS.get(name.removeprefix(OTHER_SIDE))
     return "" if row is None else row.suits
-
-
-ROWS: dict[str, Style] = TABLE | {REACQUIRE: HIDING}
 
 
 def with_ranges(row: Style, ranges: Mapping[str, Range]) -> Style:

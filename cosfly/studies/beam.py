@@ -13,16 +13,9 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field
 
-from cosfly.planners.compare import INTERVAL_PERCENT, NUM_RESAMPLES
+from cosfly.planners.compare import NUM_RESAMPLES, interval
 from cosfly.planners.contract import PlanConfig
-from cosfly.planners.stage import (
-    load_obstacles,
-    make_items,
-    make_scenario,
-    plan_trajectory,
-    read_inputs,
-    warm_up,
-)
+from cosfly.planners.stage import load_obstacles, make_items, make_scenario, plan_trajectory, read_inputs, warm_up
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.json_io import FileFormat, write_json
 from cosfly.runtime.pool import run_items
@@ -87,8 +80,8 @@ def make_worker(cfg: BeamConfig, simplified_map: Path, seed: int) -> Work:
 
     def work(item: Item) -> Outcome:
         pedestrian, styles = item.payload
-        planned = {str(beam): plan(pedestrian, styles, cfg.at_beam(beam)).model_dump() for beam in cfg.beams}
-        return Outcome({"flown": planned})
+        planned = {str(beam): plan(pedestrian, styles, cfg.at_beam(beam)) for beam in cfg.beams}
+        return Outcome(_Result(flown=planned).model_dump())
 
     return work
 
@@ -106,9 +99,8 @@ def run(
     Raises:
         InputError: An input is malformed. NothingKept: There is no pedestrian trajectory.
     """
-    inputs = {"map": simplified_map, "paths": paths}
+    inputs, product = {"map": simplified_map, "paths": paths}, out / "beam_study.json"
     stage = StageFolder.open(out, "beam_study", config=cfg, inputs=inputs, seed=seed, resume=resume)
-    product = out / "beam_study.json"
     if stage.is_complete:
         return product
     items = make_items(read_inputs(simplified_map, paths)[1], cfg, seed)
@@ -135,16 +127,15 @@ def summarize(planned: dict[int, list[Planned]], rng: np.random.Generator) -> di
     """
     rows = {}
     for beam, many in planned.items():
-        both = [
-            (a.figures, b.figures) for a, b in zip(many, planned[PAPER_BEAM], strict=True) if a.figures and b.figures
-        ]
+        pairs = zip(many, planned[PAPER_BEAM], strict=True)
+        both = [(a.figures, b.figures) for a, b in pairs if a.figures and b.figures]
         draws = rng.integers(max(len(both), 1), size=(NUM_RESAMPLES, len(both)))
         figures = {}
         for figure in FIGURES if both else ():
             own, base = (np.array([pair[k][figure] for pair in both]) for k in (0, 1))
-            low, high = np.percentile((own - base)[draws].mean(axis=1), INTERVAL_PERCENT)
-            found = {"mean": own.mean(), "difference": (own - base).mean(), "low": low, "high": high}
-            figures[figure] = {part: round(float(value), 4) for part, value in found.items()}
+            low, high = interval((own - base)[draws].mean(axis=1))
+            mean, difference = (round(float(values.mean()), 4) for values in (own, own - base))
+            figures[figure] = {"mean": mean, "difference": difference, "low": low, "high": high}
         kept = sum(one.reason is None for one in many)
         rows[beam] = {"walks": len(many), "kept": kept, "figures": figures}
     return rows

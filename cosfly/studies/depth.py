@@ -23,16 +23,18 @@ from cosfly.viz.topview import Color, add_caption, draw_line, draw_text, png_byt
 
 FORMAT = FileFormat("cosfly.depth_study", "2.0")
 BITS = (8, 10, 12, 16)
-SINGLE = "32-bit float"
 ENTROPY_BINS = 8192  # of the frame's range, the same for all codings: nearly all exact values of a float differ
 CM = 100.0
 KB = 1024.0  # bytes, as in the paper's column
 PANEL_PX = (480, 270)  # width, height
 PROFILE_COLORS: dict[str, Color] = {"truth": (30, 30, 30), "10-bit": (240, 150, 40), "8-bit": (215, 60, 50)}
-COLUMNS = [
-    "coding", "unique values", "max error, cm", "mean error, cm", "RMSE, cm", "PSNR, dB", "entropy, bits",
-    "edge correlation", "size, KB of 1,024 bytes",
-]  # fmt: skip
+# Field of CodingRow -> column of the table and form of its numbers.
+COLUMNS = {
+    "coding": ("coding", "{}"), "unique": ("unique values", "{:,}"), "max_cm": ("max error, cm", "{:.4g}"),
+    "mean_cm": ("mean error, cm", "{:.4g}"), "rmse_cm": ("RMSE, cm", "{:.4g}"), "psnr_db": ("PSNR, dB", "{:.1f}"),
+    "entropy_bits": ("entropy, bits", "{:.2f}"), "edges": ("edge correlation", "{:.6f}"),
+    "kilobytes": ("size, KB of 1,024 bytes", "{:,.0f}"),
+}  # fmt: skip
 
 
 class CodingRow(BaseModel):
@@ -72,32 +74,27 @@ def run(frame: Path, out: Path) -> Study:
     Raises:
         InputError: There is no depth image, its unit is not metres, or it holds fewer than two different depths.
     """
-    file = frame_path(frame, "depth.npy") if frame.is_dir() else frame
-    truth = read_depth(frame) if frame.is_dir() else _read_npy(frame)
+    is_folder = frame.is_dir()
+    file, truth = (frame_path(frame, "depth.npy"), read_depth(frame)) if is_folder else (frame, _read_npy(frame))
     truth = np.where(np.isfinite(truth), truth, truth.dtype.type(INVALID_DEPTH_M))
     measured = (truth != INVALID_DEPTH_M) & (truth != SKY_DEPTH_M)
     known = truth[measured]
     if not known.size or known.min() == known.max() or known.min() < 0:
         got = f"{known.min():g} to {known.max():g} m" if known.size else "no measured pixel"
-        raise InputError(
-            "the depth image has too few depths for a study", where=file, got=got, expected="at least two, above 0 m"
-        )
+        what, expected = "the depth image has too few depths for a study", "at least two, above 0 m"
+        raise InputError(what, where=file, got=got, expected=expected)
     decoded = {f"{bits}-bit": quantised(truth, measured, bits)[1] for bits in BITS}
-    decoded[SINGLE] = truth.astype(np.float32).astype(np.float64)
-    sizes = dict(zip(decoded, (*BITS, 32), strict=True))
+    decoded["32-bit float"] = truth.astype(np.float32).astype(np.float64)
+    sizes = zip(decoded.items(), (*BITS, 32), strict=True)
     study = Study(
-        frame="/".join(file.absolute().parts[-2:]),
-        width_px=truth.shape[1],
-        height_px=truth.shape[0],
-        truth=str(truth.dtype),
-        min_m=float(known.min()),
-        max_m=float(known.max()),
+        frame="/".join(file.absolute().parts[-2:]), width_px=truth.shape[1], height_px=truth.shape[0],
+        truth=str(truth.dtype), min_m=float(known.min()), max_m=float(known.max()),
         share_measured=float(measured.mean()),
-        rows=[_row(coding, values, sizes[coding], truth, measured) for coding, values in decoded.items()],
-    )
+        rows=[_row(coding, bits, values, truth, measured) for (coding, values), bits in sizes],
+    )  # fmt: skip
     write_model(out / "depth_study.json", study, FORMAT)
     write_bytes(out / "depth_study.md", markdown(study).encode())
-    rgb = read_rgb(frame) if frame.is_dir() and (frame / "rgb.png").exists() else None
+    rgb = read_rgb(frame) if is_folder and (frame / "rgb.png").exists() else np.full((*truth.shape, 3), 255, np.uint8)
     write_bytes(out / "depth_study.png", draw_study(rgb, truth, measured, decoded))
     return study
 
@@ -107,14 +104,9 @@ def _read_npy(file: Path) -> np.ndarray:
     data = read_bytes(file, what="depth image")
     kind = parse_array_header(memoryview(data), file, what="depth image").dtype
     if kind.kind in "iu":
+        what, expected = "the unit of the depth image is not known", "float32 or float64"
         fix = 'save metres, for instance np.save("depth.npy", image / 1000.0) for millimetres'
-        raise InputError(
-            "the unit of the depth image is not known",
-            where=file,
-            got=str(kind),
-            expected="float32 or float64",
-            fix=fix,
-        )
+        raise InputError(what, where=file, got=str(kind), expected=expected, fix=fix)
     dtype = np.float64 if kind == np.float64 else np.float32
     return parse_array(data, file, dtype=dtype, ndim=2, what="depth image")
 
@@ -131,35 +123,28 @@ def quantised(truth: np.ndarray, measured: np.ndarray, bits: int) -> tuple[np.nd
     return codes, np.where(measured, low + codes * step_m, truth.astype(np.float64))
 
 
-def _row(coding: str, values: np.ndarray, bits: int, truth: np.ndarray, measured: np.ndarray) -> CodingRow:
+def _row(coding: str, bits: int, values: np.ndarray, truth: np.ndarray, measured: np.ndarray) -> CodingRow:
     """Return the figures of one coding, which decodes to `values`, (h, w) m."""
     known, came_back = truth[measured].astype(np.float64), values[measured]
     errors = np.abs(came_back - known)
-    rmse = float(np.sqrt(np.mean(errors**2)))
-    low, high = float(known.min()), float(known.max())
+    rmse, low, high = float(np.sqrt(np.mean(errors**2))), float(known.min()), float(known.max())
     counts = np.histogram(came_back, bins=ENTROPY_BINS, range=(low, high))[0]
     shares = counts[counts > 0] / counts.sum()
     return CodingRow(
-        coding=coding,
-        unique=len(np.unique(came_back)),
-        max_cm=float(errors.max()) * CM,
-        mean_cm=float(errors.mean()) * CM,
-        rmse_cm=rmse * CM,
+        coding=coding, unique=len(np.unique(came_back)), max_cm=float(errors.max()) * CM,
+        mean_cm=float(errors.mean()) * CM, rmse_cm=rmse * CM,
         psnr_db=20.0 * float(np.log10((high - low) / rmse)) if rmse else None,
-        entropy_bits=float(-(shares * np.log2(shares)).sum()),
-        edges=edge_correlation(values, truth.astype(np.float64), measured),
-        kilobytes=truth.size * bits / 8.0 / KB,
-    )
+        entropy_bits=float(-(shares * np.log2(shares)).sum()), kilobytes=truth.size * bits / 8.0 / KB,
+        edges=_edge_correlation(values, truth.astype(np.float64), measured),
+    )  # fmt: skip
 
 
-def edge_correlation(values: np.ndarray, truth: np.ndarray, measured: np.ndarray) -> float:
+def _edge_correlation(values: np.ndarray, truth: np.ndarray, measured: np.ndarray) -> float:
     """Return Pearson's correlation of Sobel gradient lengths where the whole 3 x 3 window is measured; 1 if nowhere."""
     window = np.ones((3, 3), np.uint8)
     inner = cv2.erode(measured.astype(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    lengths = [
-        np.hypot(cv2.Sobel(image, cv2.CV_64F, 1, 0), cv2.Sobel(image, cv2.CV_64F, 0, 1))[inner]
-        for image in (values, truth)
-    ]
+    slopes = [[cv2.Sobel(image, cv2.CV_64F, *axis) for axis in ((1, 0), (0, 1))] for image in (values, truth)]
+    lengths = [np.hypot(*pair)[inner] for pair in slopes]
     if not inner.any() or min(length.std() for length in lengths) == 0:
         return 1.0
     return float(np.corrcoef(lengths)[0, 1])
@@ -169,52 +154,38 @@ def markdown(study: Study) -> str:
     """Return the table of the study in the paper's columns."""
     rows = []
     for row in study.rows:
-        errors = [f"{value:.4g}" for value in (row.max_cm, row.mean_cm, row.rmse_cm)]
-        psnr = "no error" if row.psnr_db is None else f"{row.psnr_db:.1f}"
-        rest = [psnr, f"{row.entropy_bits:.2f}", f"{row.edges:.6f}", f"{row.kilobytes:,.0f}"]
-        rows.append([row.coding, f"{row.unique:,}", *errors, *rest])
+        values = [(getattr(row, name), form) for name, (_, form) in COLUMNS.items()]
+        rows.append(["no error" if value is None else form.format(value) for value, form in values])
     source = f"`{study.frame}`, {study.width_px} x {study.height_px} px, {study.min_m:.2f} to {study.max_m:.2f} m"
     measured = f"{study.share_measured:.1%} of the pixels measured; errors against {study.truth}."
-    return f"Depth of {source}, {measured}\n\n{TextTable('', COLUMNS, rows).markdown()}"
+    table = TextTable("", [title for title, _ in COLUMNS.values()], rows)
+    return f"Depth of {source}, {measured}\n\n{table.markdown()}"
 
 
-def draw_study(
-    rgb: np.ndarray | None, truth: np.ndarray, measured: np.ndarray, decoded: dict[str, np.ndarray]
-) -> bytes:
+def draw_study(rgb: np.ndarray, truth: np.ndarray, measured: np.ndarray, decoded: dict[str, np.ndarray]) -> bytes:
     """Draw the frame, its depth, the error of 8 bits and the middle row; return a PNG.
 
     Args:
-        rgb: (h, w, 3) uint8, or None. truth: (h, w) m. measured: (h, w) bool.
-        decoded: name of a coding -> the depth that it decodes to.
+        rgb: (h, w, 3) uint8. truth: (h, w) m. measured: (h, w) bool. decoded: coding -> the depth that it decodes to.
     """
     errors = np.where(measured, np.abs(decoded["8-bit"] - truth), 0.0)
     level = np.round(errors / (errors.max() or 1.0) * 255.0).astype(np.uint8)
-    high = float(truth[measured].max())
-    panels = {
-        "(a) colours": np.full((*truth.shape, 3), 255, np.uint8) if rgb is None else rgb,
-        f"(b) float32, inferno reversed, to {high:.0f} m": depth_colors(truth.astype(np.float32), high),
-        f"(c) error of 8 bits: up to {errors.max() * CM:.2g} cm": cv2.cvtColor(
-            cv2.applyColorMap(level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB
-        ),
-        "(d) middle row": _profile(truth, measured, decoded),
-    }
-    tiles = [
-        add_caption(cv2.resize(panel, PANEL_PX, interpolation=cv2.INTER_AREA), title) for title, panel in panels.items()
-    ]
-    return png_bytes(np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[2:])]))
-
-
-def _profile(truth: np.ndarray, measured: np.ndarray, decoded: dict[str, np.ndarray]) -> np.ndarray:
-    """Draw the depth along the middle row: the reference, and what 8 and 10 bits make of it."""
-    y = truth.shape[0] // 2
-    columns = np.flatnonzero(measured[y])
-    panel = np.full((PANEL_PX[1], PANEL_PX[0], 3), 255, np.uint8)
-    low, high = float(truth[measured].min()), float(truth[measured].max())
-    left = 10
+    low, high, y = float(truth[measured].min()), float(truth[measured].max()), truth.shape[0] // 2
+    columns, profile, left = np.flatnonzero(measured[y]), np.full((*PANEL_PX[::-1], 3), 255, np.uint8), 10
     for name, color in PROFILE_COLORS.items():
         depth = (truth if name == "truth" else decoded[name])[y, columns].astype(np.float64)
         rows = PANEL_PX[1] - 10.0 - (depth - low) / (high - low) * (PANEL_PX[1] - 40.0)
         if len(columns) > 1:
-            draw_line(panel, np.stack([columns * PANEL_PX[0] / truth.shape[1], rows], axis=1), color)
-        left = draw_text(panel, name, left, 18, 0.45, color) + 16
-    return panel
+            draw_line(profile, np.stack([columns * PANEL_PX[0] / truth.shape[1], rows], axis=1), color)
+        left = draw_text(profile, name, left, 18, 0.45, color) + 16
+    panels = {
+        "(a) colours": rgb,
+        f"(b) float32, inferno reversed, to {high:.0f} m": depth_colors(truth.astype(np.float32), high),
+        f"(c) error of 8 bits: up to {errors.max() * CM:.2g} cm": np.ascontiguousarray(
+            cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1]
+        ),
+        "(d) middle row": profile,
+    }
+    sized = {title: cv2.resize(panel, PANEL_PX, interpolation=cv2.INTER_AREA) for title, panel in panels.items()}
+    tiles = [add_caption(panel, title) for title, panel in sized.items()]
+    return png_bytes(np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[2:])]))

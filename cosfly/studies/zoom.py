@@ -53,15 +53,12 @@ def tree_of(out: Path, fov_deg: float) -> Path:
 def run(
     cfg: RenderConfig, boxes: Path, simplified: Path, traces: Path, out: Path, *, every: int = 2, **options: Any
 ) -> Path:
-    """Read both maps and `drone_trace.json`; write a playback tree per level, `zoom_study.json` and two pictures.
+    """Read both maps and `drone_trace.json`; write a playback tree per level, `zoom_study.json`, whose path is
+    returned, and two pictures.
 
     Args:
         every: Every how many poses of a track are drawn.
         options: `seed`, `workers`, `watch` and `resume` of the render stage.
-
-    Returns:
-        The path of `zoom_study.json`.
-
     Raises:
         NothingKept: No trajectory could be drawn.
     """
@@ -77,48 +74,39 @@ def run(
     wide_deg, wide = next(iter(levels.items()))
     first = wide[0]
     (longer,) = draw(enlarged_fov_deg(wide_deg, MAGNIFICATION), first.source["path_index"])
-    write_bytes(out / "zoom_levels.png", draw_levels(levels))
-    write_bytes(out / "zoom_fidelity.png", draw_fidelity(first, longer))
+    write_bytes(out / "zoom_levels.png", _draw_levels(levels))
+    write_bytes(out / "zoom_fidelity.png", _draw_fidelity(first, longer))
     rows = [_level_row(camera_of(cfg, fov), tracks) for fov, tracks in levels.items()]
     settings = cfg.model_dump(mode="json") | {"every": every}
     write_json(out / "zoom_study.json", {**FORMAT.header, "town": first.town, "settings": settings, "levels": rows})
     return out / "zoom_study.json"
 
 
-def track_figures(track: Track) -> dict[str, Any]:
+def _track_figures(track: Track) -> dict[str, Any]:
     """Return the counts of frames of a track and its means by figure; None where no frame shows the target."""
-    seen = np.flatnonzero(track.target.visibility > 0)
-    boxes, masks = track.target.bbox, track.target.mask_bbox
-    assert masks is not None, "the render stage writes it"
-    rows = [
-        (
-            boxes[i, 2] - boxes[i, 0],
-            boxes[i, 3] - boxes[i, 1],
-            track.target.visibility[i],
-            0.0 if np.isnan(masks[i]).any() else box_iou(boxes[i], masks[i]),
-        )
-        for i in seen
-    ]
-    means = np.array(rows).mean(axis=0).round(4).tolist() if rows else [None] * len(FIGURES)
+    seen, boxes = np.flatnonzero(track.target.visibility > 0), track.target.bbox
+    masks = np.full_like(boxes, np.nan) if track.target.mask_bbox is None else track.target.mask_bbox
+    quality = [0.0 if np.isnan(masks[i]).any() else box_iou(boxes[i], masks[i]) for i in seen]
+    rows = np.column_stack([boxes[seen, 2:] - boxes[seen, :2], track.target.visibility[seen], quality])
+    means = rows.mean(axis=0).round(4).tolist() if len(rows) else [None] * len(FIGURES)
     return {"frames": len(track), "frames_visible": len(rows), **dict(zip(FIGURES, means, strict=True))}
 
 
 def _level_row(camera: Camera, tracks: list[Track]) -> dict[str, Any]:
     """Return the row of a level: mean and standard deviation over tracks, and the figures of each track."""
-    by_flight = {track.source["scenario_id"]: track_figures(track) for track in tracks}
+    by_flight = {track.source["scenario_id"]: _track_figures(track) for track in tracks}
     row: dict[str, Any] = {
-        "level": level_name(camera.fov_deg),
-        "fov_deg": round(camera.fov_deg, 6),
-        "focal_length_px": round(camera.focal_px, 2),
-        "focal_length_35mm_mm": round(camera.focal_35mm_mm, 2),
+        "level": level_name(camera.fov_deg), "fov_deg": round(camera.fov_deg, 6),
+        "focal_length_px": round(camera.focal_px, 2), "focal_length_35mm_mm": round(camera.focal_35mm_mm, 2),
         "flights": len(tracks),
         **{name: sum(one[name] for one in by_flight.values()) for name in ("frames", "frames_visible")},
-    }
+    }  # fmt: skip
     for name in FIGURES:
         known = [one[name] for one in by_flight.values() if one[name] is not None]
         std = float(np.std(known, ddof=1)) if len(known) > 1 else 0.0
-        mean_std = (round(float(np.mean(known)), 4), round(std, 4)) if known else (None, None)
-        row[name] = dict(zip(("mean", "std"), mean_std, strict=True))
+        row[name] = {"mean": None, "std": None}
+        if known:
+            row[name] = {"mean": round(float(np.mean(known)), 4), "std": round(std, 4)}
     return row | {"by_flight": by_flight}
 
 
@@ -137,18 +125,17 @@ def text_table(product: dict[str, Any]) -> TextTable:
     return TextTable("Zoom (mean ± standard deviation over tracks)", columns, rows)
 
 
-def best_frame(track: Track) -> int:
-    """Return the index of the frame that shows most of the target."""
-    return int(np.argmax(np.nan_to_num(track.target.visibility)))
+def _best_frame(track: Track) -> int:
+    return int(np.argmax(np.nan_to_num(track.target.visibility)))  # which shows most of the target
 
 
-def draw_levels(levels: dict[float, list[Track]]) -> bytes:
+def _draw_levels(levels: dict[float, list[Track]]) -> bytes:
     """Draw one frame of up to four tracks, one row each, at every level (fig:zoom_demo); return a PNG."""
     wide = next(iter(levels.values()))
     picked = np.unique(np.linspace(0, len(wide) - 1, min(len(wide), MOST_SHOWN)).round().astype(int))
     rows = []
     for k in picked.tolist():
-        i, tiles = best_frame(wide[k]), []
+        i, tiles = _best_frame(wide[k]), []
         for fov, tracks in levels.items():
             rgb, title = read_rgb(tracks[k].frame_folder(i)).copy(), f"{level_name(fov)} {fov:g} deg"
             if tracks[k].target.in_view[i]:
@@ -160,15 +147,15 @@ def draw_levels(levels: dict[float, list[Track]]) -> bytes:
     return rgb_bytes(np.vstack(rows))
 
 
-def draw_fidelity(wide: Track, longer: Track) -> bytes:
+def _draw_fidelity(wide: Track, longer: Track) -> bytes:
     """Draw a wide picture, digital enlargements of its middle, and the optical one (fig:zoom_fidelity)."""
-    rgb, optical = (read_rgb(track.frame_folder(best_frame(wide))) for track in (wide, longer))
+    rgb, optical = (read_rgb(track.frame_folder(_best_frame(wide))) for track in (wide, longer))
     size, half = np.array(rgb.shape[1::-1]), 0.5 / MAGNIFICATION
     low, high = (np.round(size * share).astype(int).tolist() for share in (0.5 - half, 0.5 + half))
     marked = cv2.rectangle(rgb.copy(), low, high, CROP_COLOR, max(2, int(size[0]) // 400))
     tiles = [_tile(marked, PANEL_WIDTH_PX, f"{wide.camera.fov_deg:.3g} deg, 1.0x")]
-    for kernel in KERNELS:
-        digital = digital_zoom(rgb, MAGNIFICATION, kernel)
+    for kernel, method in KERNELS.items():
+        digital = _enlarged(rgb, method)
         error = np.mean((digital.astype(np.float64) - optical) ** 2)
         psnr_db = 10.0 * np.log10(255.0**2 / max(float(error), 1e-5))
         tiles.append(_tile(digital, PANEL_WIDTH_PX, f"digital {MAGNIFICATION:g}x, {kernel}: {psnr_db:.1f} dB"))
@@ -176,14 +163,12 @@ def draw_fidelity(wide: Track, longer: Track) -> bytes:
     return rgb_bytes(np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[2:])]))
 
 
-def digital_zoom(rgb: np.ndarray, magnification: float, kernel: str) -> np.ndarray:
-    """Enlarge the middle of a picture, (h, w, 3) uint8, to its full size."""
-    height, width = rgb.shape[:2]
+def _enlarged(rgb: np.ndarray, method: int) -> np.ndarray:
+    """Enlarge the middle of a picture, (h, w, 3) uint8, to its full size by MAGNIFICATION."""
     # Pixel (u, v) of the result samples the same ray in the wide picture; pixel centres are at + 0.5.
-    offsets = [(side - 1) / 2.0 * (1.0 - 1.0 / magnification) for side in (width, height)]
-    matrix = np.array([[1.0 / magnification, 0.0, offsets[0]], [0.0, 1.0 / magnification, offsets[1]]])
-    flags = KERNELS[kernel] | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(rgb, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    size, share = rgb.shape[1::-1], 1.0 / MAGNIFICATION
+    matrix = np.column_stack([share * np.eye(2), (np.array(size) - 1) / 2.0 * (1.0 - share)])
+    return cv2.warpAffine(rgb, matrix, size, flags=method | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _tile(rgb: np.ndarray, width_px: int, title: str) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 
@@ -17,3 +18,8 @@ class TextTable:
         """Return the table in Markdown, without its title."""
         lines = [self.columns, ["---", *["---:"] * (len(self.columns) - 1)], *self.rows]
         return "".join(f"| {' | '.join(line)} |\n" for line in lines).replace("*", "\\*")
+
+
+def cells(values: Iterable[float | None], digits: int = 3) -> list[str]:
+    """Return numbers as text, "-" for None."""
+    return ["-" if value is None else f"{value:.{digits}f}" for value in values]

@@ -20,8 +20,6 @@ from cosfly.planners.smoothing import repair_to_limits
 from cosfly.runtime.compiled import njit
 
 # --- start ------------------------------------------------------------------------------------------------------------
-# The start is the reference where that is free and sees the target, else the best trajectory of a coarse search.
-#
 # The reference positions (the paper: 20 m behind the target and as high) can be inside towers and behind corners.
 # Pushing each waypoint out of a tower on its own would put neighbours on opposite sides of it; the search chooses
 # places that can be reached from each other: dynamic programming over time, places on rings around the target, edges
@@ -51,28 +49,23 @@ def search_start(
     Args:
         climbing: Try places above the normal and the steep ring too.
     Returns:
-        (n, 3), straight between key frames, every point and segment `clearance_m` from all boxes; None if there is
-        none.
+        (n, 3), straight between key frames, all of it `clearance_m` from all boxes; None if there is none.
     """
     targets_m, reference = problem.targets, scenario.reference
     keys, _, preferred_m, greatest_m = scenario.key_frames(max(1, round(BETWEEN_KEYS_S / problem.dt_s)))
     rings = _rings(reference.ground_distance_m[keys], preferred_m, greatest_m, climbing)
     azimuths = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
     angles = problem.views_rad[keys, None, None] + np.pi + azimuths[None, None, :]
-    offsets = rings[:, :, 0, None]
-    x = targets_m[keys, 0, None, None] + offsets * np.cos(angles)
-    y = targets_m[keys, 1, None, None] + offsets * np.sin(angles)
-    z = np.broadcast_to(rings[:, :, 1, None], x.shape)
-    places = np.stack([x, y, z], axis=-1).reshape(len(keys), -1, 3)
+    offsets, middles = rings[:, :, 0, None], targets_m[keys, :2, None, None]
+    x, y = middles[:, 0] + offsets * np.cos(angles), middles[:, 1] + offsets * np.sin(angles)
+    places = np.stack([x, y, np.broadcast_to(rings[:, :, 1, None], x.shape)], axis=-1).reshape(len(keys), -1, 3)
     turns = np.minimum(azimuths, 2.0 * np.pi - azimuths) / np.pi
     climbs = np.maximum(rings[0, :, 1] - preferred_m[0], 0.0)[:, None] / 20.0
     turn_cost = TURN_COST if reference.any_bearing else TURN_COST_OF_STYLES
     extra = turn_cost * turns[None] ** 2 + CLIMB_COST * climbs + STEEP_COST * (np.arange(rings.shape[1]) > 0)[:, None]
     sight = reference.keeps_sight[keys]
     chosen = _search(places, targets_m[keys], keys * problem.dt_s, extra, sight, index, clearance_m, cfg.speed_max_mps)
-    if chosen[0] < 0:
-        return None
-    return scenario.between(keys, places[np.arange(len(keys)), chosen])
+    return None if chosen[0] < 0 else scenario.between(keys, places[np.arange(len(keys)), chosen])
 
 
 def _rings(distances_m: np.ndarray, preferred_m: np.ndarray, greatest_m: np.ndarray, climbing: bool) -> np.ndarray:
@@ -173,32 +166,23 @@ def make_problem(scenario: Scenario, cfg: PlanConfig) -> Problem:
     bounds = (reference.altitude_min_m, reference.altitude_m, reference.altitude_max_m)
     beneath = 0.0 if reference.any_bearing else muco.weight_beneath
     return Problem(
-        targets=np.ascontiguousarray(scenario.targets_m),
-        views_rad=reference.view_rad,
-        distances=reference.distance_m,
-        weights=weights,
-        altitudes=scenario.ground_m[:, None] + np.stack(bounds, axis=1),
-        keeps_sight=reference.keeps_sight,
+        targets=np.ascontiguousarray(scenario.targets_m), views_rad=reference.view_rad,
+        distances=reference.distance_m, weights=weights,
+        altitudes=scenario.ground_m[:, None] + np.stack(bounds, axis=1), keeps_sight=reference.keeps_sight,
         bearing_weight=muco.weight_view_angle if reference.any_bearing else muco.weight_bearing,
         altitude_weights=np.array([muco.weight_below, muco.weight_above, muco.weight_oscillation, beneath]),
-        pitches_rad=np.stack([low, reference.pitch_rad, high], axis=1),
-        influence_m=muco.influence_m,
-        difference_m=muco.difference_m,
-        pitch_weight=muco.weight_pitch,
-        safety_m=cfg.safety_distance_m,
-        floor_m=cfg.relaxed_safety_m,
-        step_max_m=cfg.speed_max_mps * scenario.dt_s,
-        pushes_max=muco.pushes_max,
+        pitches_rad=np.stack([low, reference.pitch_rad, high], axis=1), influence_m=muco.influence_m,
+        difference_m=muco.difference_m, pitch_weight=muco.weight_pitch, safety_m=cfg.safety_distance_m,
+        floor_m=cfg.relaxed_safety_m, step_max_m=cfg.speed_max_mps * scenario.dt_s, pushes_max=muco.pushes_max,
         dt_s=scenario.dt_s,
-    )
+    )  # fmt: skip
 
 
 def start_trajectory(
     scenario: Scenario, problem: Problem, obstacles: BoxIndex, cfg: PlanConfig
 ) -> tuple[np.ndarray, str]:
-    """Return a feasible trajectory to start from and its kind: `behind`, the reference, or `search` where it is blocked
-    or does not see the target.
-    """
+    """Return a feasible trajectory to start from and its kind: `behind`, the reference, or `search` where that is
+    blocked or does not see the target."""
     targets = problem.targets
     plain = scenario.reference.places_m(targets, scenario.ground_m)
     plain_is_free = bool(project(plain, problem, obstacles, 0, len(plain), nothing_nearby(len(plain))))

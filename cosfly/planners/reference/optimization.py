@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.optimize import minimize
 
-from cosfly.planners.reference.grid_search import along_voxels
+from cosfly.planners.reference.graph_search import along_voxels
 from cosfly.planners.reference.task import Task, planner
 from cosfly.planners.smoothing import PULL_FIXED, smoothness_band
 

@@ -23,7 +23,11 @@ EXACT_M = 1e-6
 
 def sampled(task: Task, method: str, *, is_spline: bool = False) -> np.ndarray | None:
     """Return the trajectory along the path that OMPL finds, (num, 3); None if it does not reach the goal."""
-    base, geometric, util = load_ompl()
+    try:
+        from ompl import base, geometric, util
+    except ImportError as error:
+        raise EnvironmentMissing("OMPL is not installed", got=str(error), fix='pip install "cosfly[ompl]"') from None
+    util.setLogLevel(util.LogLevel.LOG_NONE)
     util.RNG.setSeed(int(task.rng.integers(1, 2**31)))
     space, bounds = base.RealVectorStateSpace(3), base.RealVectorBounds(3)
     for axis in range(3):
@@ -33,7 +37,7 @@ def sampled(task: Task, method: str, *, is_spline: bool = False) -> np.ndarray |
     about = base.SpaceInformation(space)
 
     def are_joined(one: Any, other: Any) -> bool:
-        ends = np.array([[one[0], one[1], one[2]], [other[0], other[1], other[2]]])
+        ends = np.array([[state[axis] for axis in range(3)] for state in (one, other)])
         return not task.hits(ends[:1], ends[1:])[0]
 
     class Motions(base.MotionValidator):  # type: ignore[name-defined]  # imported as a value
@@ -63,20 +67,10 @@ def sampled(task: Task, method: str, *, is_spline: bool = False) -> np.ndarray |
         search.solve(base.plannerAlwaysTerminatingCondition())
     path = problem.getSolutionPath()
     states = [] if path is None else [path.getState(k) for k in range(path.getStateCount())]
-    route = np.array([[state[0], state[1], state[2]] for state in states]).reshape(-1, 3)
+    route = np.array([[state[axis] for axis in range(3)] for state in states]).reshape(-1, 3)
     if not len(route) or np.linalg.norm(route[-1] - task.goal) > EXACT_M:
         return None
     return task.along(splined(route) if is_spline else route)
-
-
-def load_ompl() -> tuple[Any, Any, Any]:
-    """Import OMPL's three modules, silenced; raises EnvironmentMissing where it is not installed."""
-    try:
-        from ompl import base, geometric, util
-    except ImportError as error:
-        raise EnvironmentMissing("OMPL is not installed", got=str(error), fix='pip install "cosfly[ompl]"') from None
-    util.setLogLevel(util.LogLevel.LOG_NONE)
-    return base, geometric, util
 
 
 def splined(route: np.ndarray) -> np.ndarray:

@@ -40,9 +40,8 @@ class Task:
         return segments_hit(self.obstacles, starts, ends, self.clearance_m)
 
     def near(self, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance of points (n, 3) to boxes, (n,) m, at most `reach_m`, and unit vectors away from the
-        nearest, (n, 3), zero where none is in reach.
-        """
+        """Return the distance of points (n, 3) to boxes, (n,) m, at most `reach_m`, and (n, 3) unit vectors away from
+        the nearest, zero where none is in reach."""
         gaps_m, boxes = signed_distances(self.obstacles, points, reach_m)
         away, found = np.zeros_like(points), boxes >= 0
         away[found] = normals(self.obstacles, points[found], boxes[found])
@@ -64,8 +63,7 @@ def make_task(
     scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator, clearance_m: float
 ) -> Task | None:
     """Return the task of a scenario; None where no free place is near its first or last reference position."""
-    reference, targets = scenario.reference, scenario.targets_m
-    margin_m = cfg.track_astar.corridor_m
+    reference, targets, margin_m = scenario.reference, scenario.targets_m, cfg.track_astar.corridor_m
     low_z = (scenario.ground_m + reference.altitude_min_m).max()
     high_z = (scenario.ground_m + reference.altitude_max_m).min()
     low = np.array([*(targets[:, :2].min(axis=0) - margin_m), low_z])
@@ -104,14 +102,12 @@ def planner(find: Callable[[Task], np.ndarray | None]) -> Planner:
     def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
         for clearance_m in (cfg.safety_distance_m, cfg.relaxed_safety_m):
             task = make_task(scenario, obstacles, cfg, rng, clearance_m)
-            found = find(task) if task else None
-            if task and found is not None:
+            if task is not None and (found := find(task)) is not None:
                 found = np.clip(found, task.low, task.high)
                 repaired = repair_to_limits(found, scenario, obstacles, cfg)
                 moved_m = float(np.linalg.norm(repaired - found, axis=1).max())
                 return Plan(repaired, {"clearance_m": clearance_m, "repaired_m": round(moved_m, 4)})
-        raise scenario.no_path_error(
-            "no free path leads from the first reference position to the last", cfg.relaxed_safety_m
-        )
+        what = "no free path leads from the first reference position to the last"
+        raise scenario.no_path_error(what, cfg.relaxed_safety_m)
 
     return plan
