@@ -184,7 +184,8 @@ class PromptedEngine:
         return EngineDecision("ok", parsed.coc.flight_decision, words, answer_s)
 
     def _question(self, observation: Observation) -> Question:
-        place, moments = observation.simulation.place, observation.moments
+        script, moments = observation.simulation.script, observation.moments
+        place = script.town, script.trajectory, script.variant
         targets = [moment.target for moment in moments]
         bystanders = [[moment.bystanders.get(BYSTANDER_COLUMNS[k]) for k in (0, 1, 4)] for moment in moments]
         poses = ("time_s", "position_m", "rotation_deg", "target_m")

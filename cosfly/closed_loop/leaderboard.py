@@ -69,7 +69,6 @@ def run(
 
     Args:
         folders: name and folder; "" names it after its student.
-
     Raises:
         InputError: Two folders of one name contain the same episode.
     """

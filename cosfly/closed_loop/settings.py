@@ -67,36 +67,23 @@ class RelabelConfig(Config):
 CONTROLLER_FILE = Path(__file__).with_name("controller.yaml")
 BASELINES, MODELS = ("track_straight", "random"), ("endpoint", "vllm", "transformers")
 ENGINES = ("rules", *MODELS, "policy", *BASELINES, "planner")
-KINDS = (
-    "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR or policy:MODULE:CLASS; the baselines track_straight and "
-    "random; the upper bound planner, which flies its plan"
-)
+KINDS = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR, policy:MODULE:CLASS, track_straight, random or planner"
 
 
 class FlyConfig(Config):
     """Settings of `cosfly fly`."""
 
     student: str = Field("rules", description=f"who decides: {KINDS}")
-    as_student: Path | None = Field(
-        None, description="output of `distill train` or `merge`: the format in which a model behind a URL is asked"
-    )
+    as_student: Path | None = Field(None, description="output of `distill train` or `merge`: the format for a URL")
     adapter: Path | None = Field(None, description="adapter of transformers:MODEL_DIR, as `distill train` wrote it")
     controller: Path | None = Field(None, description="table of commands per decision, instead of controller.yaml")
-    lead_frames: int = Field(
-        21, ge=5, le=1000, description="frames of the plan before the first decision, the present one included"
-    )
-    answer_limit_s: float = Field(
-        60.0, gt=0, description="a later decision counts as late and the drone hovers; simulated time does not run on"
-    )
+    lead_frames: int = Field(21, ge=5, le=1000, description="frames of the plan up to the first decision's")
+    answer_limit_s: float = Field(60.0, gt=0, description="a later decision counts as late, and the drone hovers")
     lost_s: float = Field(30.0, ge=0, description="an episode ends after so long without a visible target; 0: never")
     most_decisions: int = Field(0, ge=0, description="an episode ends after so many decisions; 0: with its trajectory")
-    side_by_side: int = Field(
-        16, ge=1, le=1024, description="episodes that a worker flies at once; their frames are one batch of a student"
-    )
+    side_by_side: int = Field(16, ge=1, le=1024, description="episodes that a worker flies at once, as one batch")
     tree: bool = Field(True, description="render the playback tree of what was flown")
-    trained_on: tuple[str, ...] | None = Field(
-        None, description="towns of the student's training: the score marks their episodes; null: unknown"
-    )
+    trained_on: tuple[str, ...] | None = Field(None, description="towns of the student's training; null: unknown")
     relabel: RelabelConfig = Field(RelabelConfig(), description="settings of `cosfly fly --relabel`")
 
     @property

@@ -121,11 +121,6 @@ class ClosedLoopTrajectory:
         )
         self._begin()
 
-    @property
-    def place(self) -> tuple[str, str, str]:
-        """Town, trajectory and track of the playback tree."""
-        return self.script.town, self.script.trajectory, self.script.variant
-
     def _begin(self) -> None:
         planned, last = self.planned, self.num_lead - 1
         flown = Poses(planned.positions_m, planned.rotations_deg, planned.targets_m, planned.clearances_m)

@@ -102,10 +102,9 @@ def run(
     """Read a simplified map and `path.json`; write `benchmark.json`, its tables and the figures.
 
     A pedestrian trajectory that no planner can follow, such as one through a house, is a failure and no scenario.
-    Planning times are written to `items.jsonl` and the manifest, the only files that differ between equal runs.
+    Planning times are written to `items.jsonl` and the manifest, the only files that differ between equal runs. Return
+    the path of `benchmark.json`.
 
-    Returns:
-        The path of `benchmark.json`.
     Raises:
         InputError: If an input file is invalid.
         NothingKept: If no planner finds any trajectory.

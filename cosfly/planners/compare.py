@@ -229,17 +229,12 @@ def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int, keeps_all: 
     return work
 
 
-Planned = tuple[BoxMap, list[PedestrianTrajectory], ItemOutcomes, dict[str, PlannedItem], dict[str, Any]]
-
-
 def plan_all(
     stage: StageFolder, cfg: CompareConfig, simplified_map: Path, paths: Path, seed: int, *, most: int | None = None,
     keeps_all: bool = False, **pool: Any,
-) -> Planned:  # fmt: skip
+) -> tuple[BoxMap, list[PedestrianTrajectory], ItemOutcomes, dict[str, PlannedItem], dict[str, Any]]:  # fmt: skip
     """Plan for each pedestrian trajectory, or the first `most`, with each planner.
 
-    Args:
-        pool: `workers` and `watch` of `run_items`.
     Returns:
         Map, pedestrian trajectories, work items, the kept ones by id, and the head of the product.
     """
@@ -260,10 +255,8 @@ def run(
     """Read a simplified map and `path.json`; write `compare.json`, each planner's traces and a picture.
 
     A pedestrian trajectory that a planner cannot follow is dropped with that planner's name; one that no planner can
-    follow is a failure.
+    follow is a failure. Return the path of `compare.json`.
 
-    Returns:
-        The path of `compare.json`.
     Raises:
         InputError: If an input file is invalid.
         NothingKept: If there is no pedestrian trajectory that all planners follow.

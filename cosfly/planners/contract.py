@@ -20,14 +20,8 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from cosfly.formats.segments import FOLLOW
+from cosfly.geometry import trajectory_metrics as limits
 from cosfly.geometry.axes import DT_S
-from cosfly.geometry.trajectory_metrics import (
-    ACCEL_RMS_MAX_MPS2,
-    FIVE_RAY_MEAN_MIN,
-    JERK_RMS_MAX_MPS3,
-    RELAXED_SAFETY_M,
-    SAFETY_DISTANCE_M,
-)
 from cosfly.planners.styles import ALTITUDE_LEAST_M, NAMES, OTHER_SIDE, ROWS, Range, Style, with_ranges
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import NoPathError, nearest
@@ -42,20 +36,13 @@ PLANNERS = {
     "muco": "cosfly.planners.muco.muco:plan",
 }
 # Generic planners without a visibility term, for `plan benchmark` (app:three_axis_eval).
-REFERENCES = {
-    "rrt_star": "cosfly.planners.reference.sampling:plan_rrt_star",
-    "prm": "cosfly.planners.reference.sampling:plan_prm",
-    "bspline_prm": "cosfly.planners.reference.sampling:plan_bspline_prm",
-    "elastic_band": "cosfly.planners.reference.optimization:plan_elastic_band",
-    "minimum_jerk": "cosfly.planners.reference.optimization:plan_minimum_jerk",
-    "astar": "cosfly.planners.reference.graph_search:plan_astar",
-    "weighted_astar": "cosfly.planners.reference.graph_search:plan_weighted",
-    "theta_star": "cosfly.planners.reference.graph_search:plan_theta",
-    "visibility_astar": "cosfly.planners.reference.graph_search:plan_visibility",
-    "potential_field": "cosfly.planners.reference.optimization:plan_potential_field",
-    "chomp": "cosfly.planners.reference.optimization:plan_chomp",
-    "trajopt": "cosfly.planners.reference.optimization:plan_trajopt",
-}
+_REFERENCE_MODULES = {
+    "rrt_star": "sampling", "prm": "sampling", "bspline_prm": "sampling", "elastic_band": "optimization",
+    "minimum_jerk": "optimization", "astar": "graph_search", "weighted_astar": "graph_search",
+    "theta_star": "graph_search", "visibility_astar": "graph_search", "potential_field": "optimization",
+    "chomp": "optimization", "trajopt": "optimization",
+}  # fmt: skip
+REFERENCES = {name: f"cosfly.planners.reference.{module}:plan_{name}" for name, module in _REFERENCE_MODULES.items()}
 ALL_PLANNERS = PLANNERS | REFERENCES
 # Titles for tables and pictures, where they are not the names.
 TITLES = {
@@ -63,8 +50,6 @@ TITLES = {
     "astar": "3D A*", "weighted_astar": "weighted A*", "theta_star": "Theta*", "visibility_astar": "visibility-A*",
     "chomp": "CHOMP-lite", "trajopt": "L-BFGS-B TrajOpt",
 }  # fmt: skip
-
-
 SMOOTHING_NOTE = "the paper's search, our least-squares smoothing instead of its shortcuts and elastic band"
 STEP_NOTE = "the paper's loss, our Newton step and a repair to plan.accel_max_mps2; muco.step=paper has neither"
 
@@ -147,12 +132,10 @@ class PlanConfig(Config):
     """Settings of step 4, for all planners (tab:drone_params); altitudes count from the ground under the target."""
 
     planner: str = Field(
-        "foresight",
-        description=f"foresight (ours), muco ({STEP_NOTE}) or track_astar ({SMOOTHING_NOTE}); "
-        "`cosfly plan benchmark` has generic ones",
+        "foresight", description=f"foresight (ours), muco ({STEP_NOTE}) or track_astar ({SMOOTHING_NOTE})"
     )
-    safety_distance_m: float = Field(SAFETY_DISTANCE_M, gt=0, description="nominal distance to obstacles, m")
-    relaxed_safety_m: float = Field(RELAXED_SAFETY_M, gt=0, description="distance where that is impossible, m")
+    safety_distance_m: float = Field(limits.SAFETY_DISTANCE_M, gt=0, description="nominal distance to obstacles, m")
+    relaxed_safety_m: float = Field(limits.RELAXED_SAFETY_M, gt=0, description="distance where that is impossible, m")
     altitude_min_m: float = Field(20.0, gt=0, description="least altitude of the style follow, m")
     altitude_preferred_m: float = Field(20.0, gt=0, description="preferred altitude of the style follow, m")
     altitude_max_m: float = Field(100.0, gt=0, description="greatest altitude, m")
@@ -165,10 +148,13 @@ class PlanConfig(Config):
     )
     heading_smoothing_s: ClassVar[float] = 4.0  # standard deviation of the target's heading filter, s; 0: none
     five_ray_mean_min: float = Field(
-        FIVE_RAY_MEAN_MIN, ge=0, le=1, description="drop a trajectory of lower mean five-ray visibility; 0: never"
+        limits.FIVE_RAY_MEAN_MIN,
+        ge=0,
+        le=1,
+        description="a trajectory of lower mean five-ray visibility is dropped",
     )
-    accel_rms_max_mps2: ClassVar[float] = ACCEL_RMS_MAX_MPS2  # a trajectory of greater RMS acceleration is dropped
-    jerk_rms_max_mps3: ClassVar[float] = JERK_RMS_MAX_MPS3  # a trajectory of greater RMS jerk is dropped
+    accel_rms_max_mps2: ClassVar[float] = limits.ACCEL_RMS_MAX_MPS2  # of greater RMS acceleration: dropped
+    jerk_rms_max_mps3: ClassVar[float] = limits.JERK_RMS_MAX_MPS3  # of greater RMS jerk: dropped
     styles: dict[str, float] = Field(
         {FOLLOW: 1.0}, description="share of each manoeuvre style; shares need not add up to one", examples=[*NAMES]
     )
@@ -264,8 +250,7 @@ class TrackingReference:
 
     heading_rad: smoothed direction of the target, continuous. bearing_rad: of the drone as seen from the target,
     counter-clockwise from the heading: 0 in front, pi behind. distance_m: slant distance to the hip point;
-    ground_distance_m: in the plane. pitch_rad: downward pitch of the view. Two of these three would suffice, but the
-    paper's values do not agree with each other.
+    ground_distance_m: in the plane. pitch_rad: downward pitch of the view; the paper's three values do not agree.
     altitude_m: above the ground under the target; altitude_min_m and altitude_max_m are hard bounds.
     keeps_sight: bool, whether the target must be visible; elsewhere a planner ignores visibility. any_bearing: the
     paper's reference, whose bearing is a start and a weak preference; otherwise bearing and altitude are the purpose.
@@ -322,9 +307,7 @@ class Scenario:
     def key_frames(self, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return every stride-th frame and the last, with the least, preferred and greatest z at each, all (m,).
 
-        Between key frames a trajectory is straight while the ground may rise and fall, so a key frame keeps the bounds
-        of all frames around it.
-        """
+        They keep the bounds of all frames around them: a trajectory is straight between them, the ground is not."""
         from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
         frames = np.unique(np.append(np.arange(self.start, len(self.targets_m), stride), len(self.targets_m) - 1))

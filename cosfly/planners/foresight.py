@@ -11,20 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.geometry.kernels import (
-    HIGH_X,
-    HIGH_Y,
-    HIGH_Z,
-    LOW_X,
-    LOW_Y,
-    LOW_Z,
-    BoxIndex,
-    collect_hits,
-    distance_to_box,
-    index_boxes,
-    squared_gap,
-    visibility,
-)
+from cosfly.geometry import kernels
+from cosfly.geometry.kernels import BoxIndex, collect_hits, distance_to_box, squared_gap
 from cosfly.planners.contract import Plan, PlanConfig, Scenario
 from cosfly.planners.line_of_sight import FOOT_LOW_M, look, make_horizon
 from cosfly.planners.smoothing import smooth_trajectory, unsafe
@@ -57,10 +45,9 @@ NEAR_COST, FAR_COST = 0.1, 0.03
 class Lattice:
     """Candidate places at m key frames; r rings, `NUM_AZIMUTHS` places on each.
 
-    frames: (m,) frame numbers. places_m: (m, r, azimuths, 3). costs: (m, r, azimuths) without visibility.
-    links: (r, r) rings that can be reached from each, itself first, then -1. radius_max_m: of the largest ring.
-    max_turn: azimuths between one key frame and the next.
-    """
+    frames: (m,). places_m: (m, r, azimuths, 3). costs: (m, r, azimuths) without visibility. links: (r, r) rings that
+    can be reached from each, itself first, then -1. radius_max_m: of the largest ring. max_turn: azimuths between one
+    key frame and the next."""
 
     frames: np.ndarray
     places_m: np.ndarray
@@ -71,11 +58,7 @@ class Lattice:
 
 
 def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
-    """Return the rings around the target.
-
-    Args:
-        climbing: Add places far above the reference, at fewer key frames.
-    """
+    """Return the rings around the target. climbing: add places far above the reference, at fewer key frames."""
     reference, targets = scenario.reference, scenario.targets_m
     stride = max(1, round((BETWEEN_KEYS_CLIMBING_S if climbing else BETWEEN_KEYS_S) / scenario.dt_s))
     frames, least_z, _, greatest_z = scenario.key_frames(stride)
@@ -114,8 +97,6 @@ def _links(rings: np.ndarray) -> np.ndarray:
 
 
 # --- search -----------------------------------------------------------------------------------------------------------
-# The cheapest sequence of places that sees the target: dynamic programming over the key frames of a lattice.
-#
 # Visibility is computed once per place and key frame, so the path is the optimum, and it leaves a place before the
 # target is hidden from there. A metre costs the same in one step as in several: smoothing turns a jump from ring to
 # ring into a gentle change.
@@ -129,13 +110,11 @@ REACH_M = 12.0  # boxes farther away are ignored: two places with this clearance
 def search_trajectory(
     scenario: Scenario, lattice: Lattice, obstacles: BoxIndex, cfg: PlanConfig, clearance_m: float
 ) -> np.ndarray | None:
-    """Search the raw trajectory.
+    """Return the raw trajectory, (n, 3), straight between key frames; None if no sequence of places is free.
 
     Args:
         obstacles: at least the boxes of the map that can be near the lattice or hide the target.
         clearance_m: least distance of points and of the lines between them to boxes.
-    Returns:
-        (n, 3), straight between key frames; None if no sequence of places is free.
     """
     frames, num_azimuths = lattice.frames, lattice.places_m.shape[2]
     places = lattice.places_m.reshape(len(frames), -1, 3)
@@ -156,11 +135,11 @@ def search_trajectory(
 def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) -> BoxIndex:
     """Index the boxes that may be within REACH_M of a place: most boxes end far below a drone."""
     rows, flat, aside_m = obstacles.rows, targets_m[:, :2], lattice.radius_max_m + REACH_M
-    keep = rows[:, HIGH_Z] >= lattice.places_m[:, :, 0, 2].min() - REACH_M
-    keep &= (rows[:, [HIGH_X, HIGH_Y]] >= flat.min(axis=0) - aside_m).all(axis=1)
-    keep &= (rows[:, [LOW_X, LOW_Y]] <= flat.max(axis=0) + aside_m).all(axis=1)
+    keep = rows[:, kernels.HIGH_Z] >= lattice.places_m[:, :, 0, 2].min() - REACH_M
+    keep &= (rows[:, [kernels.HIGH_X, kernels.HIGH_Y]] >= flat.min(axis=0) - aside_m).all(axis=1)
+    keep &= (rows[:, [kernels.LOW_X, kernels.LOW_Y]] <= flat.max(axis=0) + aside_m).all(axis=1)
     rows = rows[keep]
-    return index_boxes(rows[:, :3], rows[:, 3:6], rows[:, 6:15].reshape(-1, 3, 3), cell_m=2.0 * REACH_M)
+    return kernels.index_boxes(rows[:, :3], rows[:, 3:6], rows[:, 6:15].reshape(-1, 3, 3), cell_m=2.0 * REACH_M)
 
 
 @njit(cache=True)
@@ -180,7 +159,7 @@ def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps, hidden):
             least_slope = min(least_slope, (places[key, c, 2] - target[2] - FOOT_LOW_M) / max(away, 1.0))
         horizon, num_near = make_horizon(index, target, away_max, least_slope), 0
         for box in range(len(aloft)):
-            if squared_gap(aloft, box, target[0], target[1], aloft[box, LOW_Z]) <= (away_max + reach_m) ** 2:
+            if squared_gap(aloft, box, target[0], target[1], aloft[box, kernels.LOW_Z]) <= (away_max + reach_m) ** 2:
                 near[num_near] = box
                 num_near += 1
         for c in range(places.shape[1]):
@@ -265,7 +244,7 @@ def raw_trajectory(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> 
     requested = scenario.with_past(scenario.reference.places_m(scenario.targets_m, scenario.ground_m))
     ahead, step_m = slice(scenario.start, None), cfg.speed_max_mps * scenario.dt_s
     safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
-    seen = ~scenario.reference.keeps_sight | (visibility(obstacles, requested, scenario.targets_m) == 1.0)
+    seen = ~scenario.reference.keeps_sight | (kernels.visibility(obstacles, requested, scenario.targets_m) == 1.0)
     if seen[ahead].all() and not unsafe(requested[ahead], obstacles, safety_m, SPEED_SHARE * step_m).any():
         return requested, "wished", safety_m
     for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):

@@ -6,24 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.geometry.kernels import (
-    CELL,
-    HALF_X,
-    HALF_Y,
-    HALF_Z,
-    HIGH_X,
-    HIGH_Y,
-    HIGH_Z,
-    LOW_X,
-    LOW_Y,
-    ORIGIN_X,
-    ORIGIN_Y,
-    RAY_OFFSETS_M,
-    RAY_SPREAD_M,
-    in_box_frame,
-    touches,
-    turned,
-)
+from cosfly.geometry import kernels
+from cosfly.geometry.kernels import HALF_X, HALF_Y, HALF_Z, HIGH_X, HIGH_Y, HIGH_Z, LOW_X, LOW_Y, in_box_frame, touches
 from cosfly.runtime.compiled import int64, njit
 
 NUM_SECTORS = 128  # of the horizon round a target
@@ -60,10 +44,8 @@ def make_horizon(index, target, reach_m, least_slope):
     than t = (r - FOOT_SIDE_M) / d.
     """
     boxes, near, slopes, spans = _boxes_round(index, target, reach_m, least_slope)
-    counts = np.zeros(NUM_SECTORS, dtype=np.int64)
-    lists = np.empty((NUM_SECTORS, len(boxes)), dtype=np.int64)
-    steepest = np.empty(NUM_SECTORS)
-    steepest.fill(-np.inf)
+    counts, lists = np.zeros(NUM_SECTORS, dtype=np.int64), np.empty((NUM_SECTORS, len(boxes)), dtype=np.int64)
+    steepest = np.full(NUM_SECTORS, -np.inf)
     for k in range(len(boxes)):
         first = int(np.floor(spans[k, 0] / (2.0 * np.pi) * NUM_SECTORS))
         last = int(np.floor(spans[k, 1] / (2.0 * np.pi) * NUM_SECTORS))
@@ -77,17 +59,16 @@ def make_horizon(index, target, reach_m, least_slope):
 
 @njit(cache=True)
 def _boxes_round(index, target, reach_m, least_slope):
-    """Return the boxes in reach that are steep enough, their distance, slope, and span of azimuth (2,), first <=
-    last."""
+    """Return the boxes in reach that are steep enough: number, distance, slope, and first and last azimuth (2,)."""
     boxes = np.empty(len(index.rows), dtype=np.int64)
     near, slopes, spans, num = np.empty(len(boxes)), np.empty(len(boxes)), np.empty((len(boxes), 2)), 0
     if len(index.rows) == 0:
         return boxes, near, slopes, spans
-    cell, num_x, num_y = index.grid[CELL], index.shape[0], index.shape[1]
-    first_x = min(max(int(np.floor((target[0] - reach_m - index.grid[ORIGIN_X]) / cell)), 0), num_x)
-    last_x = min(int(np.floor((target[0] + reach_m - index.grid[ORIGIN_X]) / cell)), num_x - 1)
-    first_y = min(max(int(np.floor((target[1] - reach_m - index.grid[ORIGIN_Y]) / cell)), 0), num_y)
-    last_y = min(int(np.floor((target[1] + reach_m - index.grid[ORIGIN_Y]) / cell)), num_y - 1)
+    cell, num_x, num_y = index.grid[kernels.CELL], index.shape[0], index.shape[1]
+    first_x = min(max(int(np.floor((target[0] - reach_m - index.grid[kernels.ORIGIN_X]) / cell)), 0), num_x)
+    last_x = min(int(np.floor((target[0] + reach_m - index.grid[kernels.ORIGIN_X]) / cell)), num_x - 1)
+    first_y = min(max(int(np.floor((target[1] - reach_m - index.grid[kernels.ORIGIN_Y]) / cell)), 0), num_y)
+    last_y = min(int(np.floor((target[1] + reach_m - index.grid[kernels.ORIGIN_Y]) / cell)), num_y - 1)
     known, low = np.zeros(len(index.rows), dtype=np.bool_), target[2] + FOOT_LOW_M
     for ix in range(first_x, last_x + 1):
         for iy in range(first_y, last_y + 1):
@@ -152,7 +133,7 @@ def look(index, horizon, target, x, y, z):
 @njit(cache=True)
 def _blocked_rays(rows, box, x, y, z, target, blocked):
     """Add to the bits of `blocked` the rays to a target that touch a box."""
-    tx, ty, tz = target[0], target[1], target[2]
+    tx, ty, tz, feet = target[0], target[1], target[2], kernels.RAY_OFFSETS_M
     if min(x, tx - FOOT_SIDE_M) > rows[box, HIGH_X] or max(x, tx + FOOT_SIDE_M) < rows[box, LOW_X]:
         return blocked
     if min(y, ty) > rows[box, HIGH_Y] or max(y, ty) < rows[box, LOW_Y] or tz + FOOT_LOW_M > rows[box, HIGH_Z]:
@@ -165,17 +146,15 @@ def _blocked_rays(rows, box, x, y, z, target, blocked):
     for step in range(7):
         grown, a, b, c = 0.0, 0.0, 0.0, 0.0
         if step == 0:
-            grown = RAY_SPREAD_M
+            grown = kernels.RAY_SPREAD_M
         elif step == 1:
-            if least < RAY_SPREAD_M:
+            if least < kernels.RAY_SPREAD_M:
                 continue
-            grown = -RAY_SPREAD_M
+            grown = -kernels.RAY_SPREAD_M
         elif (blocked >> (step - 2)) & 1:
             continue
         else:
-            a, b, c = turned(
-                rows, box, RAY_OFFSETS_M[step - 2, 0], RAY_OFFSETS_M[step - 2, 1], RAY_OFFSETS_M[step - 2, 2]
-            )
+            a, b, c = kernels.turned(rows, box, feet[step - 2, 0], feet[step - 2, 1], feet[step - 2, 2])
         hits = touches(rows, box, hip_u + a, hip_v + b, hip_w + c, u, v, w, grown)
         if step == 0 and not hits:
             return blocked

@@ -25,7 +25,6 @@ from cosfly.runtime.seeding import draw_to_quota
 if TYPE_CHECKING:
     from cosfly.geometry.kernels import BoxIndex
 
-
 HELD_DEG, HELD_RATIO, HELD_SHARE = 25.0, 1.4, 0.7
 POINTS_LEAST = 4  # of a segment
 NOT_HELD = "style_not_held"
@@ -35,19 +34,14 @@ NOT_HELD = "style_not_held"
 class ManeuverPlan:
     """The styles of one trajectory. segments: empty for the paper's `follow` from end to end.
 
-    order: kind of the mission that ends the pursuit. impossible: why the map cannot hold the style; the reference is
-    the paper's then.
-    """
+    order: of the mission that ends the pursuit. impossible: why the map cannot hold the style; the reference is the
+    paper's then."""
 
     reference: TrackingReference
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
     order: MissionKind | None = None
     impossible: str | None = None
-
-    @property
-    def styles(self) -> str:
-        return ", ".join(part.style for part in self.segments)
 
     @property
     def searches(self) -> bool:
@@ -169,7 +163,7 @@ def describe_not_held(
 
     targets, reference = scenario.targets_m, maneuvers.reference
     is_held = _is_held(reference, scenario, positions_m)
-    judged = (one for one in maneuvers.segments if one.keeps_sight)
+    judged = [one for one in maneuvers.segments if one.keeps_sight]
     part = min(judged, key=lambda one: is_held[one.begin : one.end].mean())
     span, places = slice(part.begin, part.end), reference.places_m(targets, scenario.ground_m)
     lost = ~is_held[span]
@@ -181,11 +175,12 @@ def describe_not_held(
         apart_m = np.median(np.hypot(away[:, 0], away[:, 1])[lost])
         return f"{up_m:.0f} m up, {apart_m:.0f} m away, at {np.median(bearing[lost]):.0f} deg"
 
-    near = signed_distances(obstacles, places, cfg.safety_distance_m)[0] < cfg.safety_distance_m
-    unseen, fast = visibility(obstacles, places, targets) == 0, np.zeros(len(places), dtype=bool)
-    fast[1:] = np.linalg.norm(np.diff(places, axis=0), axis=1) > cfg.speed_max_mps * scenario.dt_s
-    causes = {f"nearer than {cfg.safety_distance_m:g} m to a box": near, "without line of sight": unseen}
-    causes["too fast to reach"] = fast
+    steps_m, safety_m = np.linalg.norm(np.diff(places, axis=0, prepend=places[:1]), axis=1), cfg.safety_distance_m
+    causes = {
+        f"nearer than {safety_m:g} m to a box": signed_distances(obstacles, places, safety_m)[0] < safety_m,
+        "without line of sight": visibility(obstacles, places, targets) == 0,
+        "too fast to reach": steps_m > cfg.speed_max_mps * scenario.dt_s,
+    }
     why = [f"{found[span][lost].mean():.0%} {cause}" for cause, found in causes.items() if found[span][lost].any()]
     return (
         f"{part.style}, {lost.mean():.0%} of frames {part.begin} to {part.end - 1}: requested {described(places)}; "
@@ -196,7 +191,6 @@ def describe_not_held(
 
 # --- mission ----------------------------------------------------------------------------------------------------------
 # `return_home`: an order ends the pursuit; the drone breaks off, turns away and returns to its start.
-
 
 LEAVES_MPS, HOME_MPS, HOME_MPS2 = 3.0, 6.0, 1.5  # greatest speeds, and the acceleration to and from them
 LEAVES_M, CLIMBS_M = 6.0, 8.0  # away from the target and up before it turns for home, where there is room
@@ -271,7 +265,6 @@ def _positions_along(corners_m: np.ndarray, most_mps: float, dt_s: float) -> np.
 # --- camera -----------------------------------------------------------------------------------------------------------
 # The camera looks at the target; on the way home, in the direction of motion; while the target is hidden, where it was
 # lost.
-
 
 TURNS_S = 0.8  # standard deviation of the smoothing of a turn during a search
 HOME_PITCH_DEG, HOME_TURN_DPS = -15.0, 45.0  # on the way home; the greatest turn rate of the view

@@ -20,7 +20,6 @@ from cosfly.planners.styles import REACQUIRE, Range, Style
 if TYPE_CHECKING:
     from cosfly.geometry.kernels import BoxIndex
 
-
 # Greatest speeds of the reference relative to the target between segments; within the drone's 10 m/s.
 APART_MPS, ROUND_MPS, CLIMB_MPS = 4.0, 6.5, 3.5
 OVERSHOOT_M = 3.0  # of a drone that climbs or sinks at full speed, until it has turned
@@ -68,15 +67,10 @@ def without_jumps(
     azimuth = followed(np.unwrap(course[:, 0]), ROUND_MPS / np.maximum(apart_m, 1.0))
     over_hips_m = altitude_m - (scenario.targets_m[:, 2] - scenario.ground_m)
     return replace(
-        paper,
-        bearing_rad=azimuth - paper.heading_rad,
-        distance_m=np.hypot(over_hips_m, apart_m),
-        ground_distance_m=apart_m,
-        pitch_rad=np.arctan2(over_hips_m, apart_m),
-        altitude_m=altitude_m,
-        altitude_min_m=np.full(num, cfg.styles_floor_m),
-        any_bearing=False,
-    )
+        paper, bearing_rad=azimuth - paper.heading_rad, distance_m=np.hypot(over_hips_m, apart_m),
+        ground_distance_m=apart_m, pitch_rad=np.arctan2(over_hips_m, apart_m), altitude_m=altitude_m,
+        altitude_min_m=np.full(num, cfg.styles_floor_m), any_bearing=False,
+    )  # fmt: skip
 
 
 def positions_of(course: np.ndarray, targets_m: np.ndarray, ground_m: np.ndarray) -> np.ndarray:
@@ -271,18 +265,13 @@ def follow(targets_m: np.ndarray, cfg: PlanConfig, dt_s: float = DT_S) -> Tracki
         targets_m: (n, 3), n >= 2. dt_s: between points.
     """
     num, muco = len(targets_m), cfg.muco
-    return TrackingReference(
-        heading_rad=smoothed_headings(targets_m, cfg.heading_smoothing_s, dt_s),
-        bearing_rad=np.full(num, np.pi),
-        distance_m=np.full(num, muco.track_distance_m),
-        ground_distance_m=np.full(num, cfg.behind_distance_m),
-        pitch_rad=np.full(num, np.radians(muco.pitch_deg)),
-        altitude_m=np.full(num, cfg.altitude_preferred_m),
-        altitude_min_m=np.full(num, cfg.altitude_min_m),
-        altitude_max_m=np.full(num, cfg.altitude_max_m),
-        keeps_sight=np.ones(num, dtype=bool),
-        any_bearing=True,
-    )
+    constants = {
+        "bearing_rad": np.pi, "distance_m": muco.track_distance_m, "ground_distance_m": cfg.behind_distance_m,
+        "pitch_rad": np.radians(muco.pitch_deg), "altitude_m": cfg.altitude_preferred_m,
+        "altitude_min_m": cfg.altitude_min_m, "altitude_max_m": cfg.altitude_max_m, "keeps_sight": True,
+    }  # fmt: skip
+    arrays = {name: np.full(num, value) for name, value in constants.items()}
+    return TrackingReference(smoothed_headings(targets_m, cfg.heading_smoothing_s, dt_s), **arrays, any_bearing=True)
 
 
 def smoothed_headings(targets_m: np.ndarray, smoothing_s: float, dt_s: float = DT_S) -> np.ndarray:

@@ -55,13 +55,9 @@ def make_scenario(pedestrian: PedestrianTrajectory, obstacles: BoxIndex, cfg: Pl
     dt_s, steps_s = step_s(pedestrian.time_s), np.diff(pedestrian.time_s)
     uneven = np.abs(steps_s - max(dt_s, 0.0)) > 1e-3
     if dt_s <= 0 or uneven.any():
-        place = int(np.argmax(uneven)) + 1
-        what, got = (
-            "time stamps do not increase in equal steps",
-            f"a step of {np.diff(pedestrian.time_s)[place - 1]:g} s",
-        )
-        expected = f"{abs(dt_s):g} s, the median"
-        raise NoPathError(what, where=f"{where}: t[{place}]", got=got, expected=expected)
+        what, first = "time stamps do not increase in equal steps", int(np.argmax(uneven))
+        where, got = f"{where}: t[{first + 1}]", f"a step of {steps_s[first]:g} s"
+        raise NoPathError(what, where=where, got=got, expected=f"{abs(dt_s):g} s, the median")
     if (farthest_m := np.abs(targets).max()) > COORDINATE_MAX_M:
         expected, fix = f"at most {COORDINATE_MAX_M:g} m", "move the map's origin near the pedestrian trajectories"
         raise NoPathError("a coordinate is too large", where=where, got=f"{farthest_m:g} m", expected=expected, fix=fix)
@@ -115,7 +111,8 @@ def plan_trajectory(
         raise problem
     reason, not_held = (found.drop_reason, found.not_held) if found else ("no_path", None)
     follow = _plan_once(pedestrian, scenario, ManeuverPlan(scenario.reference), obstacles, screens, cfg, seed)
-    return replace(follow, instead_of=f"{maneuvers.styles}: {reason}", not_held=not_held)
+    styles_flown = ", ".join(part.style for part in maneuvers.segments)
+    return replace(follow, instead_of=f"{styles_flown}: {reason}", not_held=not_held)
 
 
 def plan_on(
@@ -268,10 +265,8 @@ def run(
     """Read a simplified map and `path.json`; write `drone_trace.json` and `plan.png`.
 
     Trajectories that the filter drops are written too, with their reason; a pedestrian trajectory without a drone
-    trajectory is a counted failure.
+    trajectory is a counted failure. Return the path of `drone_trace.json`.
 
-    Returns:
-        The path of `drone_trace.json`.
     Raises:
         InputError: If an input file is invalid.
         NothingKept: If no trajectory is found, or the filter dropped all of them.

@@ -1,11 +1,10 @@
 """TA*+Smooth: a visibility search on a time-layered voxel grid, then smoothing (subsec:appendix_planner_tastar).
 
-The search is the paper's; the smoothing is ours (smoothing.py), not the paper's shortcuts and elastic band.
-
-A state is a voxel and a time. A layer lasts as many frames as the drone needs at its speed limit to reach all 26
-neighbours of a voxel (two, with the paper's settings), so that no direction is dearer than another; frames between
-layers are interpolated. All states of a layer have the same time left, so a best-first order by cost with a beam per
-layer needs no heuristic. The paper names the five weights but not the terms; the terms are these, per layer:
+The search is the paper's; the smoothing is ours (smoothing.py), not the paper's shortcuts and elastic band. A state is
+a voxel and a time. A layer lasts as many frames as the drone needs at its speed limit to reach all 26 neighbours of a
+voxel (two, with the paper's settings), so that no direction is dearer than another. All states of a layer have the same
+time left, so a best-first order by cost with a beam per layer needs no heuristic. The paper names the five weights but
+not the terms; the terms are these, per layer:
 
     tracking    distance to the ring around the target at the reference distance and altitude, in voxels; to the
                 reference position on it where the bearing counts
@@ -37,6 +36,7 @@ ALTITUDE_ROUNDING_M = 1e-6
 
 # The 26 neighbours of a voxel and itself.
 MOVES = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.int64)
+BENDS = ((MOVES[:, None] - MOVES) ** 2).sum(axis=2).astype(np.float64)  # squared change between each two, in voxels
 STAY = 13
 UNKNOWN, FREE, BLOCKED = range(3)  # edges between voxels
 
@@ -45,7 +45,7 @@ TRACKING, VISIBILITY, PATH, SAFETY, SMOOTHNESS = range(5)
 
 
 class Voxels(NamedTuple):
-    """The grid of one search. low: (3,) m, centre of voxel (0, 0, 0). shape: (3,). size: (3,) m.
+    """The grid of one search. low: (3,) m, centre of voxel (0, 0, 0). shape: (3,). size: (3,) m. lengths: of moves, m.
 
     columns: (nx, ny) bool, inside the corridor. Caches: clearances (cells,) m, NaN is unknown; edges (cells, 27):
     UNKNOWN, FREE or BLOCKED.
@@ -54,6 +54,7 @@ class Voxels(NamedTuple):
     low: np.ndarray
     shape: np.ndarray
     size: np.ndarray
+    lengths: np.ndarray
     columns: np.ndarray
     clearances: np.ndarray
     edges: np.ndarray
@@ -89,7 +90,6 @@ def search_layers(targets, reaches_m, voxels, costs, index, beam, corridor_m):
     best = np.full(num_cells, np.inf)
     came_from, came_by = np.empty(num_cells, dtype=np.int64), np.empty(num_cells, dtype=np.int64)
     touched, num_seen = np.empty(num_cells, dtype=np.int64), 0
-    lengths, bends = _move_tables(voxels.size)
     cost_before, move_before = np.empty(beam), np.empty(beam, dtype=np.int64)
     size = 0
     for layer in range(num_layers):
@@ -97,8 +97,8 @@ def search_layers(targets, reaches_m, voxels, costs, index, beam, corridor_m):
             num = _first_layer(targets[0], voxels, costs, index, corridor_m, best, came_from, came_by, touched)
         else:
             num = _expand(
-                cells[layer - 1, :size], cost_before, move_before, layer, reaches_m[layer], lengths, bends, voxels,
-                costs, index, best, came_from, came_by, touched,
+                cells[layer - 1, :size], cost_before, move_before, layer, reaches_m[layer], voxels, costs, index, best,
+                came_from, came_by, touched,
             )  # fmt: skip
         chosen, total, seen = _choose(touched[:num], best, targets[layer], layer, voxels, costs, index, beam)
         num_seen += seen
@@ -116,17 +116,6 @@ def search_layers(targets, reaches_m, voxels, costs, index, beam, corridor_m):
         way[layer] = cells[layer, b]
         b = parents[layer, b]
     return way, cost, num_seen
-
-
-@njit(cache=True)
-def _move_tables(size):
-    """Return the length of each move, m, and the squared change between each two, in voxels."""
-    lengths, bends = np.empty(len(MOVES)), np.empty((len(MOVES), len(MOVES)))
-    for m in range(len(MOVES)):
-        lengths[m] = np.sqrt(((MOVES[m] * size) ** 2).sum())
-        for k in range(len(MOVES)):
-            bends[m, k] = ((MOVES[m] - MOVES[k]) ** 2).sum()
-    return lengths, bends
 
 
 @njit(cache=True)
@@ -150,10 +139,9 @@ def _first_layer(target, voxels, costs, index, corridor_m, best, came_from, came
 
 
 @njit(cache=True)
-def _expand(
-    sources, cost_before, moved, layer, reach_m, lengths, bends, voxels, costs, index, best, came_from, came_by, touched
-):
+def _expand(sources, cost_before, moved, layer, reach_m, voxels, costs, index, best, came_from, came_by, touched):
     """Put the reachable cells into `touched`, the cheapest move there into `best`, `came_from` and `came_by`."""
+    lengths = voxels.lengths
     num_x, num_y, num_z, num = voxels.shape[0], voxels.shape[1], voxels.shape[2], 0
     for b in range(len(sources)):
         cell = sources[b]
@@ -164,7 +152,7 @@ def _expand(
                 continue
             there = (jx * num_y + jy) * num_z + jz
             cost = cost_before[b] + costs.weights[PATH] * lengths[move] / voxels.size[0]
-            cost += costs.weights[SMOOTHNESS] * bends[moved[b], move]
+            cost += costs.weights[SMOOTHNESS] * BENDS[moved[b], move]
             if cost >= best[there] or not voxels.columns[jx, jy]:
                 continue
             if not _is_in_bounds(voxels.low[2] + jz * voxels.size[2], costs, layer):
@@ -299,21 +287,20 @@ def search_trajectory(
         (n, 3) one position per target, and facts of the search; None if there is no path.
     """
     settings, targets, reference = cfg.track_astar, scenario.targets_m, scenario.reference
-    voxels = make_voxels(scenario, cfg)
-    stride = frames_per_layer(cfg, scenario.dt_s)
+    voxels, stride = make_voxels(scenario, cfg), frames_per_layer(cfg, scenario.dt_s)
     frames, least_z, preferred_z, greatest_z = scenario.key_frames(stride)
     places = reference.places_m(targets, scenario.ground_m)[frames, :2]
     costs = Costs(
         weights=np.array([getattr(settings, f"weight_{name}") for name in WEIGHTS]),
-        ring_m=reference.ground_distance_m[frames], requested=np.full_like(places, np.nan) if reference.any_bearing
-        else places, sight=settings.weight_visibility * reference.keeps_sight[frames],
+        ring_m=reference.ground_distance_m[frames],
+        requested=np.full_like(places, np.nan) if reference.any_bearing else places,
+        sight=settings.weight_visibility * reference.keeps_sight[frames],
         least_z=least_z, preferred_z=preferred_z, greatest_z=greatest_z,
         influence_m=settings.influence_m, safety_m=safety_m, start=np.array([*places[0], preferred_z[0]]),
     )  # fmt: skip
     reaches_m = np.diff(frames, prepend=frames[0]) * scenario.dt_s * cfg.speed_max_mps
-    cells, cost, num_seen = search_layers(
-        targets[frames], reaches_m, voxels, costs, obstacles, settings.beam, settings.corridor_m
-    )
+    beam, corridor_m = settings.beam, settings.corridor_m
+    cells, cost, num_seen = search_layers(targets[frames], reaches_m, voxels, costs, obstacles, beam, corridor_m)
     if cells[0] < 0:
         return None
     places = voxels.low + np.stack(np.unravel_index(cells, tuple(voxels.shape)), axis=1) * voxels.size
@@ -336,29 +323,16 @@ def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
     least_z, greatest_z = (scenario.ground_m + bound for bound in (reference.altitude_min_m, reference.altitude_max_m))
     num_z = np.floor((greatest_z.max() - least_z.min()) / settings.voxel_height_m + 1e-9) + 1
     if num_xy.prod() * num_z > MAX_CELLS:
-        raise NoPathError(
-            "the pedestrian trajectory is too long for the voxel grid", where=scenario.path_id,
-            got=f"{num_xy.prod() * num_z:.0f} voxels", expected=f"at most {MAX_CELLS}", fix="use another planner",
-        )  # fmt: skip
+        what, got = "the pedestrian trajectory is too long for the voxel grid", f"{num_xy.prod() * num_z:.0f} voxels"
+        expected, fix = f"at most {MAX_CELLS}", "use another planner"
+        raise NoPathError(what, where=scenario.path_id, got=got, expected=expected, fix=fix)
     shape = np.array([*num_xy, num_z], dtype=np.int64)
     size = np.array([settings.voxel_m, settings.voxel_m, settings.voxel_height_m])
-    low = np.array([*low_xy, least_z.min()])
-    num_cells = int(shape.prod())
-    return Voxels(
-        low, shape, size, _corridor(low, shape, size, np.ascontiguousarray(flat), settings.corridor_m),
-        np.full(num_cells, np.nan), np.zeros((num_cells, len(MOVES)), dtype=np.int8),
-    )  # fmt: skip
-
-
-@njit(cache=True)
-def _corridor(low, shape, size, flat, margin_m):
-    """Return which columns are within `margin_m` of a point of the pedestrian trajectory."""
-    inside = np.zeros((shape[0], shape[1]), dtype=np.bool_)
-    for ix in range(shape[0]):
-        for iy in range(shape[1]):
-            x, y = low[0] + ix * size[0], low[1] + iy * size[1]
-            for point in range(len(flat)):
-                if (flat[point, 0] - x) ** 2 + (flat[point, 1] - y) ** 2 <= margin_m * margin_m:
-                    inside[ix, iy] = True
-                    break
-    return inside
+    low, num_cells = np.array([*low_xy, least_z.min()]), int(shape.prod())
+    lengths_m = np.sqrt(((MOVES * size) ** 2).sum(axis=1))
+    x, y = (low[axis] + np.arange(shape[axis]) * size[axis] for axis in range(2))
+    columns = np.zeros(shape[:2], dtype=np.bool_)
+    for point in flat:
+        columns |= (point[0] - x[:, None]) ** 2 + (point[1] - y) ** 2 <= settings.corridor_m**2
+    edges = np.zeros((num_cells, len(MOVES)), dtype=np.int8)
+    return Voxels(low, shape, size, lengths_m, columns, np.full(num_cells, np.nan), edges)

@@ -12,16 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.geometry.kernels import (
-    HALF_X,
-    RAY_OFFSETS_M,
-    RAY_SPREAD_M,
-    clip,
-    collect_hits,
-    in_box_frame,
-    nearest_box,
-    normal_of_box,
-)
+from cosfly.geometry import kernels
+from cosfly.geometry.kernels import RAY_OFFSETS_M, RAY_SPREAD_M, collect_hits, in_box_frame, nearest_box, normal_of_box
 from cosfly.planners.muco.nearby import Nearby, hits_among, known, nearest_among, nothing_nearby, remember
 from cosfly.runtime.compiled import int64, njit
 
@@ -30,8 +22,7 @@ from cosfly.runtime.compiled import int64, njit
 
 @njit(cache=True)
 def window_rays(rows, boxes, num_boxes, x, y, z, step_m, tx, ty, tz, free):
-    """Put `free_rays` of a point and of its six neighbours at +-step_m into `free`, (7,): middle, -x, +x, -y, +y, -z,
-    +z.
+    """Put `free_rays` of a point and its six neighbours at +-step_m into `free`, (7,): middle, -x, +x, -y, +y, -z, +z.
 
     From (x, y, z) to (tx, ty, tz): the same tests as seven calls of `free_rays`, but each box sees each of the twelve
     ends of the rays once.
@@ -41,14 +32,9 @@ def window_rays(rows, boxes, num_boxes, x, y, z, step_m, tx, ty, tz, free):
     for k in range(num_boxes):
         box = boxes[k]
         for place in range(7):
-            shift, axis = step_m * (2 * (place % 2 == 0) - 1), (place - 1) // 2
-            ends[place, 0], ends[place, 1], ends[place, 2] = in_box_frame(
-                rows,
-                box,
-                x + (shift if place > 0 and axis == 0 else 0.0),
-                y + (shift if place > 0 and axis == 1 else 0.0),
-                z + (shift if place > 0 and axis == 2 else 0.0),
-            )
+            shift, axis = step_m * (2 * (place % 2 == 0) - 1), (place - 1) // 2  # -1: the middle
+            u, v, w = (x + shift if axis == 0 else x), (y + shift if axis == 1 else y), (z + shift if axis == 2 else z)
+            ends[place, 0], ends[place, 1], ends[place, 2] = in_box_frame(rows, box, u, v, w)
         for ray in range(5):
             feet[ray, 0], feet[ray, 1], feet[ray, 2] = in_box_frame(
                 rows, box, tx + RAY_OFFSETS_M[ray, 0], ty + RAY_OFFSETS_M[ray, 1], tz + RAY_OFFSETS_M[ray, 2]
@@ -60,7 +46,9 @@ def window_rays(rows, boxes, num_boxes, x, y, z, step_m, tx, ty, tz, free):
                 enter, leave = 0.0, 1.0
                 for axis in range(3):
                     foot = feet[ray, axis]
-                    enter, leave = clip(foot, ends[place, axis] - foot, rows[box, HALF_X + axis], enter, leave)
+                    enter, leave = kernels.clip(
+                        foot, ends[place, axis] - foot, rows[box, kernels.HALF_X + axis], enter, leave
+                    )
                     if enter > leave:
                         break
                 blocked[place, ray] = enter <= leave
@@ -248,12 +236,12 @@ def point_terms(points, begin, end, problem, index, masked, state):
 
 @njit(cache=True)
 def visibility_terms(points, problem, index, masked, state):
-    """Add (1 - V)^2 of every waypoint, V the five-ray fraction averaged over the waypoint and its six neighbours at
-    +-difference_m. The raw fraction is a staircase; the average has steps of 1/35, and the central difference over the
-    same window is its slope.
+    """Add (1 - V)^2 of every waypoint, V the five-ray fraction, averaged with that of six neighbours at +-difference_m.
+
+    The raw fraction is a staircase; the average has steps of 1/35, and the central difference over the window is its
+    slope.
     """
-    # Any ray of the window stays within this of the middle ray, at its foot and at its head.
-    spread = max(RAY_SPREAD_M, problem.difference_m)
+    spread = max(RAY_SPREAD_M, problem.difference_m)  # of any ray of the window from the middle one, at both ends
     weight, step, free = problem.weights[VISIBILITY], problem.difference_m, np.empty(7)
     visible, blockers, band, rough, rows = state.visibility, state.blockers, state.band, state.rough, index.rows
     anchors, on_view, num_on_view = state.nearby.anchors, state.nearby.on_view, state.nearby.num_on_view
@@ -315,8 +303,7 @@ def chain_terms(points, begin, end, problem, state):
     Adds to terms and gradient, and the path length's curvature to the band; the rest is `chain_curvature`.
     """
     num_points, weights, gradient = len(points), problem.weights, state.gradient
-    smoothness, jerk = weights[SMOOTHNESS], weights[JERK]
-    swing = problem.altitude_weights[SWING]
+    smoothness, jerk, swing = weights[SMOOTHNESS], weights[JERK], problem.altitude_weights[SWING]
     bends, jerks, swings = 0.0, 0.0, 0.0
     for i in range(max(begin, 0), min(end, num_points - 1)):
         for axis in range(3):
@@ -375,11 +362,10 @@ def _add_lengths(points, begin, end, weight, state):
 
 @njit(cache=True)
 def difference_gradient(points, problem, index, masked, state, gradient):
-    """Compute the paper's gradient: central differences of +-difference_m of the terms that a waypoint takes part in.
+    """Write the paper's gradient, (n, 3): central differences of +-difference_m of the terms of each waypoint.
 
     Altitudes stay within their bounds, or the penalty below the least altitude would lift every waypoint that is at it.
-    Writes `gradient` (n, 3), without the visibility term, whose own gradient is a difference already; `state` is
-    overwritten.
+    The visibility term, whose own gradient is a difference already, is left out; `state` is overwritten.
     """
     state.contacts.fill(0.0)
     for i in range(len(points)):

@@ -223,20 +223,14 @@ def optimize(start: np.ndarray, problem: Problem, obstacles: BoxIndex, cfg: Muco
     rules = Rules(*(getattr(cfg, name) for name in Rules._fields))
     state, spare = (make_state(len(points), len(obstacles.rows)) for _ in range(2))
     spare = spare._replace(nearby=state.nearby)
-    # A trajectory of two points has no interior waypoint; only its loss is computed.
-    history = history if len(points) > 2 else history[:1]
-    optimizer = descend_as_the_paper if cfg.step == "paper" else descend
-    points, state, masked, num_iterations, num_tried, reason = optimizer(
-        points, problem, obstacles, rules, (state, spare), history
-    )
-    facts = {
-        "iterations": num_iterations,
-        "evaluations": num_tried,
+    history = history if len(points) > 2 else history[:1]  # without an interior waypoint only the loss is computed
+    run = descend_as_the_paper if cfg.step == "paper" else descend
+    found = run(points, problem, obstacles, rules, (state, spare), history)
+    points, state, masked, num_iterations, num_tried, reason = found
+    return points, {
+        "iterations": num_iterations, "evaluations": num_tried,
         "stopped": STOP_REASONS[reason] if len(points) > 2 else "no_interior_waypoint",
-        "loss_start": round(float(history[0]), 6),
-        "loss_end": round(float(state.terms.sum()), 6),
+        "loss_start": round(float(history[0]), 6), "loss_end": round(float(state.terms.sum()), 6),
         "terms": {name: round(float(value), 6) for name, value in zip(TERM_NAMES, state.terms, strict=True)},
-        "num_masked": int(masked.sum()),
-        "loss_history": history[: num_iterations + 1],
-    }
-    return points, facts
+        "num_masked": int(masked.sum()), "loss_history": history[: num_iterations + 1],
+    }  # fmt: skip

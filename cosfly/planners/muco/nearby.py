@@ -38,12 +38,10 @@ class Nearby(NamedTuple):
 def nothing_nearby(num_points):
     """Return an empty cache: every query goes to the index."""
     return Nearby(
-        np.full((num_points, 3), np.inf),
-        np.zeros((num_points, ROOM), dtype=np.int64),
+        np.full((num_points, 3), np.inf), np.zeros((num_points, ROOM), dtype=np.int64),
+        np.zeros(num_points, dtype=np.int64), np.zeros((num_points, ROOM), dtype=np.int64),
         np.zeros(num_points, dtype=np.int64),
-        np.zeros((num_points, ROOM), dtype=np.int64),
-        np.zeros(num_points, dtype=np.int64),
-    )
+    )  # fmt: skip
 
 
 @njit(cache=True)

@@ -1,8 +1,7 @@
 """MuCO's step, compiled: the feasible region, the projection onto it, and the search for a step that lowers the loss.
 
-The curvature in `State.band` is solved as a band; the step is capped, projected and evaluated, all in one compiled
-call: a call from Python unpacks some forty arrays, which takes a third of the time of an evaluation. Loops replace
-NumPy's whole-array forms, because the compiler takes seconds for each form that checks shapes.
+All of it is one compiled call: a call from Python unpacks some forty arrays, which takes a third of the time of an
+evaluation. Loops replace NumPy's whole-array forms, because the compiler takes seconds for each one that checks shapes.
 """
 
 from __future__ import annotations
@@ -99,14 +98,12 @@ def solve_band(band, damping, gradient):
 
 @njit(cache=True)
 def try_step(points, steps, scale, cap_m, as_a_whole, problem, index, masked, state, trial):
-    """Compute one trial step of the interior waypoints: limit, project and evaluate it.
+    """Return the loss of one trial step of the interior waypoints, infinite if not feasible, and if it was capped.
 
     Args:
         points: (n, 3) m, kept. steps: (n - 2, 3) m. scale: share of it that is taken. cap_m: longest move of a
             waypoint; longer ones are shortened each on its own, or all by the same factor (as_a_whole).
         state, trial: written, what `evaluate` fills and the projected trajectory.
-    Returns:
-        the trial's loss, infinity if it is not feasible, and whether the step was capped.
     """
     longest = move(points, steps, scale, cap_m, as_a_whole, trial)
     loss = np.inf
@@ -183,12 +180,11 @@ def descend(points, problem, index, rules, states, history):
 
 @njit(cache=True)
 def descend_as_the_paper(points, problem, index, rules, states, history):
-    """Run the paper's optimizer: plain gradient steps by finite differences, capped per waypoint and projected, whether
-    or not the loss falls.
+    """Run the paper's optimizer: plain steps along finite differences, capped per waypoint and projected.
 
-    A projection that cannot make the trajectory feasible stops nothing; later steps may. Converged when |change of the
-    loss| is less than the tolerance, which is absolute here. Arguments and results as of `descend`; the trajectory is
-    the last feasible one.
+    The loss may rise. A projection that cannot make the trajectory feasible stops nothing; later steps may. Converged
+    when |change of the loss| is less than the tolerance, which is absolute here. Arguments and results as of `descend`;
+    the trajectory is the last feasible one.
     """
     now, spare = states
     best, trial, gradient = points.copy(), points.copy(), np.empty_like(points)
@@ -206,9 +202,7 @@ def descend_as_the_paper(points, problem, index, rules, states, history):
         remember_boxes(points, problem, index, now.nearby)
         history[iteration] = evaluate(points, problem, index, masked, now)
         if is_free:
-            for i in range(len(points)):
-                for axis in range(3):
-                    best[i, axis] = points[i, axis]
+            best = points.copy()
         if abs(history[iteration] - history[iteration - 1]) < rules.tolerance:
             reason = CONVERGED if is_free else INFEASIBLE
             break
@@ -220,8 +214,7 @@ def descend_as_the_paper(points, problem, index, rules, states, history):
 
 @njit(cache=True)
 def mask(points, problem, index, rules, masked, state):
-    """Return the waypoints in low-visibility runs, (n,); gradient and model in `state` change with them, not the
-    loss."""
+    """Return the waypoints in low-visibility runs, (n,); gradient and model in `state` change with them."""
     found = low_visibility_runs(state.visibility, rules.low_visibility, rules.low_visibility_frames)
     for i in range(len(found)):
         if found[i] != masked[i]:
@@ -262,16 +255,14 @@ def newton_step(points, loss, gradient, damping, num_tries, rules, problem, inde
 
     Args:
         points: (n, 3) m, kept. loss, now: its loss and state. gradient: (n, 3), changed. damping: (n,) of single
-            waypoints, Levenberg's way, changed if a step is found.
-        spare, trial: written, state and (n, 3) places of the last trial.
+            waypoints, Levenberg's way, changed if a step is found. spare, trial: written, of the last trial.
     Returns:
         the loss of the trial, infinity if none lowers it, and how many were tried.
     """
-    band = now.band.copy()
+    band, raised = now.band.copy(), damping.copy()
     for column in range(band.shape[1]):
         band[0, column] += DAMPING_LEAST
     hold_bounds(points, problem, now.contacts, band, gradient)
-    raised = damping.copy()
     steps, scale, as_a_whole = solve_band(band, raised, gradient), 1.0, boolean(False)
     for tried in range(1, num_tries + 1):
         found, is_capped = try_step(
@@ -331,9 +322,7 @@ def push_out(point, problem, index, nearby, i):
 def project(points, problem, index, begin, end, nearby):
     """Bring waypoints [begin, end) into the feasible region in place; return whether the whole trajectory is feasible.
 
-    Order as in the paper: altitude clamp, cap of the step from the waypoint before, push-out. Feasible means: no step
-    longer than the cap, every clearance at least the relaxed floor, and no segment between waypoints that touches a
-    box.
+    Order as in the paper: altitude clamp, cap of the step from the waypoint before, push-out.
     """
     step_max = problem.step_max_m
     anchors, around, num_around, rows = nearby.anchors, nearby.around, nearby.num_around, index.rows
@@ -358,10 +347,8 @@ def project(points, problem, index, begin, end, nearby):
 
 @njit(cache=True)
 def is_feasible(points, problem, index, nearby):
-    """Return whether a trajectory keeps altitude bounds, step cap, relaxed floor, and hits nothing between
-    waypoints."""
-    one, before = np.empty(1, dtype=np.int64), 0.0
-    step_max = problem.step_max_m
+    """Return whether a trajectory keeps altitude bounds, step cap and relaxed floor, and hits nothing on its way."""
+    one, before, step_max = np.empty(1, dtype=np.int64), 0.0, problem.step_max_m
     anchors, around, num_around, rows = nearby.anchors, nearby.around, nearby.num_around, index.rows
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]

@@ -139,6 +139,6 @@ def _corners(task: Task) -> np.ndarray:
 
 
 plan_astar = planner(along_voxels)
-plan_weighted = planner(partial(along_voxels, weight=WEIGHT))
-plan_theta = planner(partial(along_voxels, any_angle=True))
-plan_visibility = planner(_over_corners)
+plan_weighted_astar = planner(partial(along_voxels, weight=WEIGHT))
+plan_theta_star = planner(partial(along_voxels, any_angle=True))
+plan_visibility_astar = planner(_over_corners)
