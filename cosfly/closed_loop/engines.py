@@ -188,15 +188,14 @@ class PromptedEngine:
         place = script.town, script.trajectory, script.variant
         targets = [moment.target for moment in moments]
         bystanders = [[moment.bystanders.get(BYSTANDER_COLUMNS[k]) for k in (0, 1, 4)] for moment in moments]
-        poses = ("time_s", "position_m", "rotation_deg", "target_m")
+        poses, seen = ("time_s", "position_m", "rotation_deg", "target_m"), ("in_view", "visible", "visibility")
         frames = observed_frames(
             *(np.array([getattr(moment, name) for moment in moments]) for name in poses),
             np.array([target.image_uv or [math.nan] * 2 for target in targets]),
             np.array([target.mask_bbox_2d or [math.nan] * 4 for target in targets]),
-            *(np.array([getattr(target, name) for target in targets]) for name in ("in_view", "visible", "visibility")),
-            np.array([bool(target.legible) for target in targets]),
-            *np.array(bystanders, dtype=np.float64).T,
-        )
+            *(np.array([getattr(target, name) for target in targets]) for name in seen),
+            np.array([bool(target.legible) for target in targets]), *np.array(bystanders, dtype=np.float64).T,
+        )  # fmt: skip
         folders, indices = (
             tuple(one) for one in zip(*((self._folder(place, m), m.index) for m in moments), strict=True)
         )
@@ -237,10 +236,9 @@ class LocalEngine(PromptedEngine):
             return [EngineDecision("late", answer_s=answer_s)] * len(found)
         return [
             self._read(one.found.text, question, answer_s if one.is_new else None, one.found.finish_reason)
-            if isinstance(one.found, BookAnswer)
-            else EngineDecision("none", words=one.found.message[:MOST_WORDS])
+            if isinstance(one.found, BookAnswer) else EngineDecision("none", words=one.found.message[:MOST_WORDS])
             for one, question in zip(found, questions, strict=True)
-        ]
+        ]  # fmt: skip
 
     @staticmethod
     def _sample(question: Question) -> Sample:

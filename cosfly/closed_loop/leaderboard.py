@@ -127,10 +127,8 @@ def page_of(board: Leaderboard, students: Mapping[str, StudentFolders]) -> str:
     """Return the page; a student whose episodes were deleted has figures but no pictures."""
     tables = []
     for table in board.tables:
-        groups = {
-            words: {one.name: one.score.figures[measure] for one in table.standings}
-            for measure, words in (("success", "success"), ("in_view", "target visible"))
-        }
+        drawn = {"success": "success", "target visible": "in_view"}
+        groups = {w: {one.name: one.score.figures[name] for one in table.standings} for w, name in drawn.items()}
         strips = [strip for one in table.standings for strip in _strips(one, students[one.name])]
         tables.append({"table": table, "chart": bars(groups), "strips": strips})
     return page(

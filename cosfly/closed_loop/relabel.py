@@ -126,28 +126,19 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
         if simulation.ended != "finished":
             return Outcome(drop_reason="crashes")
         before, *after = moments[num.num_frames - 2 :][: num.future_frames + 2]
-        future = FutureMotion(
-            indices=tuple(moment.index for moment in after[1:]),
-            time_s=np.array([moment.time_s for moment in after]),
-            positions_m=np.array([moment.position_m for moment in after]),
-            yaw_deg=np.array([moment.rotation_deg[1] for moment in after]),
-            targets_m=np.array([moment.target_m for moment in after]),
-            visible=np.array([moment.target.visible for moment in after]),
-            speed_before_mps=float(np.linalg.norm(after[0].position_m - before.position_m)) / simulation.dt_s,
-        )
-        reasons = _reasons(record, i, future)
+        rows = [(m.time_s, m.position_m, m.rotation_deg[1], m.target_m, m.target.visible) for m in after]
+        speed_mps = float(np.linalg.norm(after[0].position_m - before.position_m)) / simulation.dt_s
+        columns = map(np.array, zip(*rows, strict=True))
+        reasons = _reasons(record, i, FutureMotion(tuple(m.index for m in after[1:]), *columns, speed_mps))
         if relabel.mistakes_only and not reasons:
             return Outcome(drop_reason="no_mistake")
-        poses = simulation.poses
+        poses, about = simulation.poses, {"student": record.student, "round": relabel.round}
         trace = flown_trace(
             space.surroundings.obstacles, np.array([moment.time_s for moment in moments]),
             np.hstack([poses.positions_m, poses.rotations_deg]), poses.targets_m, poses.clearances_m,
             np.array([moment.position_m[2] - moment.height_m for moment in moments]), path_id=item.item_id,
             planner=f"replanned from frame {i} of {record.student}, round {relabel.round}", pace=record.style.pace,
-            solver={
-                "source": episode, "frame": i, "student": record.student, "round": relabel.round,
-                "decision": record.frames[i].action, "reasons": reasons,
-            },
+            solver={"source": episode, "frame": i, **about, "decision": record.frames[i].action, "reasons": reasons},
             part_of=part_of,
         )  # fmt: skip
         return Outcome({"trace": trace.as_json(), "reasons": reasons})

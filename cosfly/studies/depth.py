@@ -7,16 +7,16 @@ float64 or float32; of the latter a 32-bit float loses nothing.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-from pydantic import BaseModel
 
 from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M, frame_path, read_depth, read_rgb
 from cosfly.runtime.arrays import parse_array, parse_array_header
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import read_bytes, write_bytes
-from cosfly.runtime.json_io import FileFormat, write_model
+from cosfly.runtime.json_io import FileFormat, write_json
 from cosfly.viz.frame_views import depth_colors
 from cosfly.viz.tables import TextTable
 from cosfly.viz.topview import Color, add_caption, draw_line, draw_text, png_bytes
@@ -28,7 +28,9 @@ CM = 100.0
 KB = 1024.0  # bytes, as in the paper's column
 PANEL_PX = (480, 270)  # width, height
 PROFILE_COLORS: dict[str, Color] = {"truth": (30, 30, 30), "10-bit": (240, 150, 40), "8-bit": (215, 60, 50)}
-# Field of CodingRow -> column of the table and form of its numbers.
+# Figures of a coding over the measured pixels -> column of the table and form of its numbers. Errors are against the
+# reference; psnr_db: relative to the frame's range, None without an error; edges: Pearson correlation of Sobel
+# gradients; kilobytes: of the frame in memory.
 COLUMNS = {
     "coding": ("coding", "{}"), "unique": ("unique values", "{:,}"), "max_cm": ("max error, cm", "{:.4g}"),
     "mean_cm": ("mean error, cm", "{:.4g}"), "rmse_cm": ("RMSE, cm", "{:.4g}"), "psnr_db": ("PSNR, dB", "{:.1f}"),
@@ -37,39 +39,8 @@ COLUMNS = {
 }  # fmt: skip
 
 
-class CodingRow(BaseModel):
-    """Figures of one coding over the measured pixels; errors against the reference, cm.
-
-    psnr_db: relative to the frame's range; None without an error. edges: Pearson correlation of Sobel gradients.
-    kilobytes: of the frame in memory.
-    """
-
-    coding: str
-    unique: int
-    max_cm: float
-    mean_cm: float
-    rmse_cm: float
-    psnr_db: float | None
-    entropy_bits: float
-    edges: float
-    kilobytes: float
-
-
-class Study(BaseModel):
-    """`depth_study.json`. share_measured: share of the pixels that are neither sky nor invalid."""
-
-    frame: str
-    width_px: int
-    height_px: int
-    truth: str
-    min_m: float
-    max_m: float
-    share_measured: float
-    rows: list[CodingRow]
-
-
-def run(frame: Path, out: Path) -> Study:
-    """Read a frame folder or a `.npy` file; write `depth_study.json`, `depth_study.md` and `depth_study.png`.
+def run(frame: Path, out: Path) -> dict[str, Any]:
+    """Read a frame folder or a `.npy` file; write `depth_study.json`, which is returned, `.md` and `.png`.
 
     Raises:
         InputError: There is no depth image, its unit is not metres, or it holds fewer than two different depths.
@@ -86,13 +57,13 @@ def run(frame: Path, out: Path) -> Study:
     decoded = {f"{bits}-bit": quantised(truth, measured, bits)[1] for bits in BITS}
     decoded["32-bit float"] = truth.astype(np.float32).astype(np.float64)
     sizes = zip(decoded.items(), (*BITS, 32), strict=True)
-    study = Study(
-        frame="/".join(file.absolute().parts[-2:]), width_px=truth.shape[1], height_px=truth.shape[0],
-        truth=str(truth.dtype), min_m=float(known.min()), max_m=float(known.max()),
-        share_measured=float(measured.mean()),
-        rows=[_row(coding, bits, values, truth, measured) for (coding, values), bits in sizes],
-    )  # fmt: skip
-    write_model(out / "depth_study.json", study, FORMAT)
+    study = {
+        "frame": "/".join(file.absolute().parts[-2:]), "width_px": truth.shape[1], "height_px": truth.shape[0],
+        "truth": str(truth.dtype), "min_m": float(known.min()), "max_m": float(known.max()),
+        "share_measured": float(measured.mean()),  # of the pixels: neither sky nor invalid
+        "rows": [_row(coding, bits, values, truth, measured) for (coding, values), bits in sizes],
+    }  # fmt: skip
+    write_json(out / "depth_study.json", {**FORMAT.header, **study})
     write_bytes(out / "depth_study.md", markdown(study).encode())
     rgb = read_rgb(frame) if is_folder and (frame / "rgb.png").exists() else np.full((*truth.shape, 3), 255, np.uint8)
     write_bytes(out / "depth_study.png", draw_study(rgb, truth, measured, decoded))
@@ -123,20 +94,21 @@ def quantised(truth: np.ndarray, measured: np.ndarray, bits: int) -> tuple[np.nd
     return codes, np.where(measured, low + codes * step_m, truth.astype(np.float64))
 
 
-def _row(coding: str, bits: int, values: np.ndarray, truth: np.ndarray, measured: np.ndarray) -> CodingRow:
+def _row(coding: str, bits: int, values: np.ndarray, truth: np.ndarray, measured: np.ndarray) -> dict[str, Any]:
     """Return the figures of one coding, which decodes to `values`, (h, w) m."""
     known, came_back = truth[measured].astype(np.float64), values[measured]
     errors = np.abs(came_back - known)
     rmse, low, high = float(np.sqrt(np.mean(errors**2))), float(known.min()), float(known.max())
     counts = np.histogram(came_back, bins=ENTROPY_BINS, range=(low, high))[0]
     shares = counts[counts > 0] / counts.sum()
-    return CodingRow(
-        coding=coding, unique=len(np.unique(came_back)), max_cm=float(errors.max()) * CM,
-        mean_cm=float(errors.mean()) * CM, rmse_cm=rmse * CM,
-        psnr_db=20.0 * float(np.log10((high - low) / rmse)) if rmse else None,
-        entropy_bits=float(-(shares * np.log2(shares)).sum()), kilobytes=truth.size * bits / 8.0 / KB,
-        edges=_edge_correlation(values, truth.astype(np.float64), measured),
-    )  # fmt: skip
+    return {
+        "coding": coding, "unique": len(np.unique(came_back)), "max_cm": float(errors.max()) * CM,
+        "mean_cm": float(errors.mean()) * CM, "rmse_cm": rmse * CM,
+        "psnr_db": 20.0 * float(np.log10((high - low) / rmse)) if rmse else None,
+        "entropy_bits": float(-(shares * np.log2(shares)).sum()),
+        "edges": _edge_correlation(values, truth.astype(np.float64), measured),
+        "kilobytes": truth.size * bits / 8.0 / KB,
+    }  # fmt: skip
 
 
 def _edge_correlation(values: np.ndarray, truth: np.ndarray, measured: np.ndarray) -> float:
@@ -150,16 +122,14 @@ def _edge_correlation(values: np.ndarray, truth: np.ndarray, measured: np.ndarra
     return float(np.corrcoef(lengths)[0, 1])
 
 
-def markdown(study: Study) -> str:
+def markdown(study: dict[str, Any]) -> str:
     """Return the table of the study in the paper's columns."""
-    rows = []
-    for row in study.rows:
-        values = [(getattr(row, name), form) for name, (_, form) in COLUMNS.items()]
-        rows.append(["no error" if value is None else form.format(value) for value, form in values])
-    source = f"`{study.frame}`, {study.width_px} x {study.height_px} px, {study.min_m:.2f} to {study.max_m:.2f} m"
-    measured = f"{study.share_measured:.1%} of the pixels measured; errors against {study.truth}."
-    table = TextTable("", [title for title, _ in COLUMNS.values()], rows)
-    return f"Depth of {source}, {measured}\n\n{table.markdown()}"
+    pairs = [[(row[name], form) for name, (_, form) in COLUMNS.items()] for row in study["rows"]]
+    texts = [["no error" if value is None else form.format(value) for value, form in row] for row in pairs]
+    size, ends = f"{study['width_px']} x {study['height_px']} px", f"{study['min_m']:.2f} to {study['max_m']:.2f} m"
+    measured = f"{study['share_measured']:.1%} of the pixels measured; errors against {study['truth']}."
+    table = TextTable("", [title for title, _ in COLUMNS.values()], texts)
+    return f"Depth of `{study['frame']}`, {size}, {ends}, {measured}\n\n{table.markdown()}"
 
 
 def draw_study(rgb: np.ndarray, truth: np.ndarray, measured: np.ndarray, decoded: dict[str, np.ndarray]) -> bytes:

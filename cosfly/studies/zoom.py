@@ -23,7 +23,7 @@ from cosfly.render.camera import ZoomConfig
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, write_json
-from cosfly.viz.tables import TextTable
+from cosfly.viz.tables import TextTable, cells
 from cosfly.viz.topview import add_caption
 
 FORMAT = FileFormat("cosfly.zoom_study", "3.0")
@@ -77,9 +77,9 @@ def run(
     write_bytes(out / "zoom_levels.png", _draw_levels(levels))
     write_bytes(out / "zoom_fidelity.png", _draw_fidelity(first, longer))
     rows = [_level_row(camera_of(cfg, fov), tracks) for fov, tracks in levels.items()]
-    settings = cfg.model_dump(mode="json") | {"every": every}
-    write_json(out / "zoom_study.json", {**FORMAT.header, "town": first.town, "settings": settings, "levels": rows})
-    return out / "zoom_study.json"
+    settings, product = cfg.model_dump(mode="json") | {"every": every}, out / "zoom_study.json"
+    write_json(product, {**FORMAT.header, "town": first.town, "settings": settings, "levels": rows})
+    return product
 
 
 def _track_figures(track: Track) -> dict[str, Any]:
@@ -104,21 +104,19 @@ def _level_row(camera: Camera, tracks: list[Track]) -> dict[str, Any]:
     for name in FIGURES:
         known = [one[name] for one in by_flight.values() if one[name] is not None]
         std = float(np.std(known, ddof=1)) if len(known) > 1 else 0.0
-        row[name] = {"mean": None, "std": None}
-        if known:
-            row[name] = {"mean": round(float(np.mean(known)), 4), "std": round(std, 4)}
+        mean_std = (round(float(np.mean(known)), 4), round(std, 4)) if known else (None, None)
+        row[name] = dict(zip(("mean", "std"), mean_std, strict=True))
     return row | {"by_flight": by_flight}
 
 
 def text_table(product: dict[str, Any]) -> TextTable:
     """Return tab:zoom_eval as text."""
 
-    def cell(figure: dict[str, float | None], digits: int) -> str:
-        return "-" if figure["mean"] is None else f"{figure['mean']:.{digits}f} ± {figure['std']:.{digits}f}"
-
     rows = []
     for level in product["levels"]:
-        width, height, seen, quality = (cell(level[name], 1 if name.endswith("_px") else 3) for name in FIGURES)
+        digits = [1 if name.endswith("_px") else 3 for name in FIGURES]
+        pairs = [cells([level[name]["mean"], level[name]["std"]], k) for name, k in zip(FIGURES, digits, strict=True)]
+        width, height, seen, quality = ("-" if mean == "-" else f"{mean} ± {std}" for mean, std in pairs)
         lens = [level["level"], f"{level['fov_deg']:g}", f"{level['focal_length_35mm_mm']:.1f}"]
         rows.append([*lens, f"{width} x {height}", seen, quality])
     columns = ["level", "deg", "35 mm", "target px", "visibility", "IoU"]

@@ -45,10 +45,8 @@ def window_rays(rows, boxes, num_boxes, x, y, z, step_m, tx, ty, tz, free):
                     continue
                 enter, leave = 0.0, 1.0
                 for axis in range(3):
-                    foot = feet[ray, axis]
-                    enter, leave = kernels.clip(
-                        foot, ends[place, axis] - foot, rows[box, kernels.HALF_X + axis], enter, leave
-                    )
+                    foot, half = feet[ray, axis], rows[box, kernels.HALF_X + axis]
+                    enter, leave = kernels.clip(foot, ends[place, axis] - foot, half, enter, leave)
                     if enter > leave:
                         break
                 blocked[place, ray] = enter <= leave
