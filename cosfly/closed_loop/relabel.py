@@ -128,7 +128,7 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
         before, *after = moments[num.num_frames - 2 :][: num.future_frames + 2]
         rows = [(m.time_s, m.position_m, m.rotation_deg[1], m.target_m, m.target.visible) for m in after]
         speed_mps = float(np.linalg.norm(after[0].position_m - before.position_m)) / simulation.dt_s
-        columns = map(np.array, zip(*rows, strict=True))
+        columns: list[Any] = [np.array(column) for column in zip(*rows, strict=True)]
         reasons = _reasons(record, i, FutureMotion(tuple(m.index for m in after[1:]), *columns, speed_mps))
         if relabel.mistakes_only and not reasons:
             return Outcome(drop_reason="no_mistake")
