@@ -128,8 +128,10 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
         before, *after = moments[num.num_frames - 2 :][: num.future_frames + 2]
         rows = [(m.time_s, m.position_m, m.rotation_deg[1], m.target_m, m.target.visible) for m in after]
         speed_mps = float(np.linalg.norm(after[0].position_m - before.position_m)) / simulation.dt_s
-        columns: list[Any] = [np.array(column) for column in zip(*rows, strict=True)]
-        reasons = _reasons(record, i, FutureMotion(tuple(m.index for m in after[1:]), *columns, speed_mps))
+        time_s, positions_m, yaw_deg, targets_m, visible = map(np.array, zip(*rows, strict=True))
+        indices = tuple(moment.index for moment in after[1:])
+        future = FutureMotion(indices, time_s, positions_m, yaw_deg, targets_m, visible, speed_mps)
+        reasons = _reasons(record, i, future)
         if relabel.mistakes_only and not reasons:
             return Outcome(drop_reason="no_mistake")
         poses, about = simulation.poses, {"student": record.student, "round": relabel.round}
