@@ -155,7 +155,7 @@ def summarize(planned: dict[str, PlannedItem], planners: tuple[str, ...], rng: n
     }
     means, (axes, *drawn) = compare.mean_figures(tables), compare.drawn_scores(tables, rng)
     both_found = all(p in means and np.isfinite(list(means[p].values())).all() for p in PAIR)
-    groups = {group: [means[p] for p in members if p in means] for group, members in GROUPS.items()}
+    groups = {group: [list(means[p].values()) for p in members if p in means] for group, members in GROUPS.items()}
     return {
         "scenarios": list(planned),
         "infeasible": {path_id: item.errors for path_id, item in planned.items() if item.errors},
@@ -169,10 +169,7 @@ def summarize(planned: dict[str, PlannedItem], planners: tuple[str, ...], rng: n
         "deltas": compare.deltas(*(means[p] for p in PAIR)) if both_found else {},
         "ranking": _ranking(means),
         "groups": {
-            group: {
-                "num_planners": len(rows),
-                "figures": _finite({name: float(np.mean([row[name] for row in rows])) for name in NAMES}),
-            }
+            group: {"num_planners": len(rows), "figures": _finite(dict(zip(NAMES, np.mean(rows, axis=0), strict=True)))}
             for group, rows in groups.items()
             if rows
         },
@@ -180,7 +177,7 @@ def summarize(planned: dict[str, PlannedItem], planners: tuple[str, ...], rng: n
 
 
 def _finite(figures: dict[str, float]) -> dict[str, float | None]:
-    return {name: round(value, 4) if np.isfinite(value) else None for name, value in figures.items()}
+    return {name: round(float(value), 4) if np.isfinite(value) else None for name, value in figures.items()}
 
 
 def _ranking(means: Means) -> dict[str, dict[str, Any]]:

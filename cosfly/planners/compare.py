@@ -112,14 +112,12 @@ def interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
 
 def deltas(first: dict[str, float], second: dict[str, float]) -> dict[str, dict[str, float | None]]:
     """Return difference and relative difference in percent for each figure; None where the second's is 0."""
-    changes = {name: first[name] - second[name] for name in NAMES}
-    return {
-        name: {
-            "delta": round(change, 4),
-            "relative_percent": round(100.0 * change / second[name], 3) if second[name] else None,
-        }
-        for name, change in changes.items()
-    }
+    table: dict[str, dict[str, float | None]] = {}
+    for name in NAMES:
+        change = first[name] - second[name]
+        relative = round(100.0 * change / second[name], 3) if second[name] else None
+        table[name] = {"delta": round(change, 4), "relative_percent": relative}
+    return table
 
 
 def win_rates(first: list[dict[str, float]], second: list[dict[str, float]]) -> dict[str, dict[str, float]]:

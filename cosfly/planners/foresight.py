@@ -181,9 +181,7 @@ def _cheapest(places, own, gaps, longest_m, index, clearance_m, links, num_azimu
     key frame. links: (rings, r) previous rings, the first -1 ends the list.
     """
     num_keys, num_places, one = len(places), places.shape[1], np.empty(1, dtype=np.int64)
-    cost, came_from = np.empty((num_keys, num_places)), np.empty((num_keys, num_places), dtype=np.int64)
-    cost.fill(np.inf)
-    came_from.fill(-1)
+    cost, came_from = np.full((num_keys, num_places), np.inf), np.full((num_keys, num_places), -1, dtype=np.int64)
     for key in range(num_keys):
         for c in range(num_places):
             if gaps[key, c] < clearance_m:
@@ -213,24 +211,25 @@ def _cheapest(places, own, gaps, longest_m, index, clearance_m, links, num_azimu
                         continue
                     best, came_from[key, c] = guess, b
             cost[key, c] = best + own[key, c]
-    chosen, last = np.empty(num_keys, dtype=np.int64), 0
-    chosen.fill(-1)
-    for c in range(num_places):
-        if cost[num_keys - 1, c] < cost[num_keys - 1, last]:
-            last = c
-    if cost[num_keys - 1, last] < np.inf:
-        chosen[num_keys - 1] = last
-        for key in range(num_keys - 1, 0, -1):
+    return cheapest_way(cost, came_from)
+
+
+@njit(cache=True)
+def cheapest_way(cost, came_from):
+    """Return the place of each of m key frames on the way of least cost, (m,), all -1 where none is finite.
+
+    cost, came_from: (m, c) of the cheapest way to each place, and its place at the key frame before.
+    """
+    last, chosen = int(np.argmin(cost[-1])), np.full(len(cost), -1, dtype=np.int64)
+    if cost[-1, last] < np.inf:
+        chosen[-1] = last
+        for key in range(len(cost) - 1, 0, -1):
             chosen[key - 1] = came_from[key, chosen[key]]
     return chosen
 
 
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan one trajectory (the signature of `planners.contract`); nothing here is random.
-
-    Raises:
-        NoPathError: If no free places connect start and end.
-    """
+    """Plan one trajectory (the signature of `planners.contract`); nothing here is random."""
     raw, start, clearance_m = raw_trajectory(scenario, obstacles, cfg)
     points, facts = smooth_trajectory(raw, scenario, obstacles, cfg, clearance_m)
     return Plan(points, {"start": start, "clearance_m": clearance_m, **facts})

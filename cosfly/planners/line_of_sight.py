@@ -21,9 +21,8 @@ ROUNDING = 1e-6
 class Horizon(NamedTuple):
     """The boxes that can hide one target, by direction; m boxes near it.
 
-    counts: (NUM_SECTORS,), lists: (NUM_SECTORS, m) boxes that reach into each sector. near: (m,) m, horizontal distance
-    less the rays' spread. slopes: (m,) a ray that rises more than this per horizontal metre passes above. steepest:
-    (NUM_SECTORS,).
+    counts: (NUM_SECTORS,), lists: (NUM_SECTORS, m) boxes that reach into each sector; steepest: (NUM_SECTORS,). near:
+    (m,) m in the plane, less the rays' spread. slopes: (m,) a ray that rises more per horizontal metre passes above.
     """
 
     boxes: np.ndarray

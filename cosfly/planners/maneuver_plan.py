@@ -132,11 +132,7 @@ def draw_maneuvers(
 
 
 def why_not_held(maneuvers: ManeuverPlan, scenario: Scenario, positions_m: np.ndarray, seen: np.ndarray) -> str | None:
-    """Return why a trajectory does not hold its styles, None where it does.
-
-    Args:
-        positions_m: (n, 3). seen: (n,) five-ray visibility past the screens.
-    """
+    """Return why a trajectory, (n, 3), does not hold its styles, None where it does. seen: (n,) past the screens."""
     if maneuvers.impossible is not None or not maneuvers.segments:
         return maneuvers.impossible
     if maneuvers.searches:

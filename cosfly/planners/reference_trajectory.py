@@ -7,6 +7,7 @@ row for each frame.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -107,11 +108,11 @@ def _best_course(
     from cosfly.geometry.kernels import signed_distances, visibility
 
     targets_m = scenario.targets_m[part]
-    best, best_score = np.empty(0), -np.inf
+    best, best_score, safety_m = np.empty(0), -np.inf, cfg.safety_distance_m
     for _ in range(DRAWS):
         course = _course(style, scenario, part, before, rng)
         places = positions_of(course, targets_m, scenario.ground_m[part])
-        is_near = signed_distances(obstacles, places, cfg.safety_distance_m)[0] < cfg.safety_distance_m
+        is_near = signed_distances(obstacles, places, safety_m)[0] < safety_m
         score = float(visibility(obstacles, places, targets_m).mean()) - float(is_near.mean())
         if before is not None:
             score -= WAY_ROUND * abs(np.angle(np.exp(1j * (course[0, 0] - before)))) / np.pi
@@ -161,19 +162,14 @@ def _even(start: Range, end: Range | None, rates: Range, seconds: np.ndarray, rn
 
 def _steady(heading_rad: np.ndarray) -> np.ndarray:
     """Keep a heading until the target's differs by more than STEADY_RAD, then take the target's."""
-    kept, now = [], float(heading_rad[0])
-    for heading in heading_rad.tolist():
-        now = heading if abs(heading - now) > STEADY_RAD else now
-        kept.append(now)
-    return np.array(kept)
+    return np.array([*accumulate(heading_rad.tolist(), lambda now, new: new if abs(new - now) > STEADY_RAD else now)])
 
 
 def _slew(values: np.ndarray, steps_max: np.ndarray) -> np.ndarray:
     """Follow values (n,) from the first on with steps of at most `steps_max` (n,)."""
-    followed, now = [], float(values[0])
-    for value, most in zip(values.tolist(), steps_max.tolist(), strict=True):
-        now += min(max(value - now, -most), most)
-        followed.append(now)
+    followed = [float(values[0])]
+    for value, most in zip(values[1:].tolist(), steps_max[1:].tolist(), strict=True):
+        followed.append(followed[-1] + min(max(value - followed[-1], -most), most))
     return np.array(followed)
 
 
@@ -277,10 +273,10 @@ def follow(targets_m: np.ndarray, cfg: PlanConfig, dt_s: float = DT_S) -> Tracki
 def smoothed_headings(targets_m: np.ndarray, smoothing_s: float, dt_s: float = DT_S) -> np.ndarray:
     """Return the target's heading at each point, (n,) radians, continuous, smoothed over time by a Gaussian.
 
+    A target that stops keeps its heading; one that never moves faces east.
+
     Args:
         targets_m: (n, 3), n >= 2. smoothing_s: standard deviation; 0: none. dt_s: between points.
-    Returns:
-        A target that stops keeps its heading; one that never moves faces east.
     """
     steps = np.diff(targets_m[:, :2], axis=0)
     moves = np.flatnonzero(np.hypot(steps[:, 0], steps[:, 1]) > 1e-6)

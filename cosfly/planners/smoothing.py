@@ -70,8 +70,7 @@ def smooth_trajectory(
 
 
 def repair_to_limits(points: np.ndarray, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> np.ndarray:
-    """Return a trajectory, (n, 3), that keeps the limits of speed, acceleration and clearance as it is written to
-    files; the same one where it keeps them already.
+    """Return a trajectory, (n, 3), whose rounded form keeps the limits of speed, acceleration and clearance.
 
     Raises:
         NoPathError: If no such trajectory is found.
@@ -109,8 +108,7 @@ def _pulled_to(goal: np.ndarray, pulls: np.ndarray, band: np.ndarray, scenario: 
 
 
 def exceeds_limits(points: np.ndarray, cfg: PlanConfig, dt_s: float, num_past: int = 0) -> np.ndarray:
-    """Return which waypoints, (n, 3), belong to a step of too great speed or acceleration, (n,) bool, after the first
-    `num_past`."""
+    """Return which waypoints, (n, 3), after the first `num_past` belong to a step that is too fast or abrupt."""
     found = np.zeros(len(points), dtype=bool)
     for order, most in ((1, cfg.speed_max_mps), (2, cfg.accel_max_mps2)):
         over = np.linalg.norm(np.diff(points, n=order, axis=0), axis=1) > most * dt_s**order + 1e-9

@@ -122,11 +122,9 @@ def plan_on(
 
     Args:
         targets_m: (n, 3) hip points of the whole pedestrian trajectory. past_m: (k, 3), 3 <= k < n, the drone's
-            positions at the first k of them.
-    Returns:
-        (n, 3), which begins with `past_m` and keeps all limits of the settings after it.
+            positions at the first k of them, with which the result, (n, 3), begins.
     Raises:
-        NoPathError: If no trajectory is found.
+        NoPathError: If no trajectory within the limits of the settings is found.
     """
     from cosfly.planners.foresight import plan
     from cosfly.planners.reference_trajectory import continued_reference, follow

@@ -262,11 +262,7 @@ MAX_CELLS = 4_000_000  # a pedestrian trajectory of 50-100 m needs about 50 000
 
 
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan one trajectory (the signature of `planners.contract`); nothing here is random.
-
-    Raises:
-        NoPathError: If the grid is too large, or no free voxels connect start and end.
-    """
+    """Plan one trajectory (the signature of `planners.contract`); nothing here is random."""
     for safety_m in (cfg.safety_distance_m, cfg.relaxed_safety_m):
         found = search_trajectory(scenario, obstacles, cfg, safety_m)
         if found is not None:

@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from cosfly.geometry.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box, visibility
 from cosfly.planners.contract import MucoConfig, Plan, PlanConfig, Scenario
+from cosfly.planners.foresight import cheapest_way
 from cosfly.planners.muco.loss import TERM_NAMES, Problem, make_state
 from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.planners.muco.step import STOP_REASONS, Rules, descend, descend_as_the_paper, is_feasible, project
@@ -71,8 +72,7 @@ def search_start(
 def _rings(distances_m: np.ndarray, preferred_m: np.ndarray, greatest_m: np.ndarray, climbing: bool) -> np.ndarray:
     """Return (m, r, 2): horizontal distance and z of the rings of each key frame, the normal one first."""
     all_rings = []
-    columns = (distances_m.tolist(), preferred_m.tolist(), greatest_m.tolist())
-    for distance_m, preferred, greatest in zip(*columns, strict=True):
+    for distance_m, preferred, greatest in np.stack([distances_m, preferred_m, greatest_m], axis=1).tolist():
         rings = [(distance_m, preferred), (STEEP_RADIUS * distance_m, min(preferred + STEEP_CLIMB_M, greatest))]
         climbs = np.geomspace(8.0, max(greatest - preferred, 8.0), NUM_CLIMBS if climbing else 0)
         all_rings.append(rings + [(distance_m + 0.2 * climb, min(preferred + climb, greatest)) for climb in climbs])
@@ -128,13 +128,7 @@ def _search(places, targets, times, extra, sight, index, clearance_m, speed_max_
                     cost[key, c], came_from[key, c] = guesses[b] + own[c], b
                     break
                 guesses[b] = np.inf
-    chosen = np.full(num_keys, -1, dtype=np.int64)
-    last = int(np.argmin(cost[num_keys - 1]))
-    if cost[num_keys - 1, last] < np.inf:
-        chosen[num_keys - 1] = last
-        for key in range(num_keys - 1, 0, -1):
-            chosen[key - 1] = came_from[key, chosen[key]]
-    return chosen
+    return cheapest_way(cost, came_from)
 
 
 # Where no step of any length lowers the loss, its change is 0, which is within the tolerance.
@@ -142,11 +136,7 @@ AT_REST = ("converged", "no_step", "no_interior_waypoint")
 
 
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan one trajectory (the signature of `planners.contract`); nothing here is random.
-
-    Raises:
-        NoPathError: If no free trajectory to start from is found.
-    """
+    """Plan one trajectory (the signature of `planners.contract`); nothing here is random."""
     problem = make_problem(scenario, cfg)
     start, kind = start_trajectory(scenario, problem, obstacles, cfg)
     points, solver = optimize(start, problem, obstacles, cfg.muco)

@@ -92,8 +92,7 @@ def _free_place(
 
 
 def planner(find: Callable[[Task], np.ndarray | None]) -> Planner:
-    """Return a planner (the signature of `planners.contract`) that finds a path at the nominal distance to boxes, else
-    at the relaxed one, and repairs it.
+    """Return a planner that finds a path at the nominal distance to boxes, else at the relaxed one, and repairs it.
 
     Args:
         find: Returns the trajectory, (num, 3), of a task, or None.
