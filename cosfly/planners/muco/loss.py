@@ -363,7 +363,7 @@ def difference_gradient(points, problem, index, masked, state, gradient):
     """Write the paper's gradient, (n, 3): central differences of +-difference_m of the terms of each waypoint.
 
     Altitudes stay within their bounds, or the penalty below the least altitude would lift every waypoint that is at it.
-    The visibility term, whose own gradient is a difference already, is left out; `state` is overwritten.
+    The visibility term, whose own gradient is a difference already, is excluded; `state` is overwritten.
     """
     state.contacts.fill(0.0)
     for i in range(len(points)):
