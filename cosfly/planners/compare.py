@@ -199,9 +199,7 @@ class PlannedItem(BaseModel):
 def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int, keeps_all: bool) -> Work:
     """Load the map once; return the function that plans for one pedestrian trajectory with each planner.
 
-    Args:
-        keeps_all: Keep an item although a planner failed.
-    """
+    keeps_all: Keep an item although a planner failed."""
     obstacles, screens = load_obstacles(simplified_map)
     settings = {name: cfg.model_copy(update={"planner": name}) for name in cfg.planners}
     for own in settings.values():
