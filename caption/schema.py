@@ -18,11 +18,11 @@ from pydantic import Field, model_validator
 from cosfly.formats.captions import KeyframeRecord, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
 from cosfly.formats.places import TrackChoice
 from cosfly.formats.predictions import PREDICTIONS
-from cosfly.llm.budget import BudgetConfig
+from cosfly.llm.answers import BudgetConfig
 from cosfly.llm.client import EndpointConfig
+from cosfly.llm.protocol import check_url
 from cosfly.llm.student_chat import MAX_ANSWER_TOKENS
 from cosfly.llm.vllm_engine import VllmConfig
-from cosfly.llm.wire import check_url
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.viz.frame_views import DEPTH_RANGE_M, Layout, View
 

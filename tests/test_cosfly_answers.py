@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from cosfly.formats.captions import Coc
 from cosfly.llm.answer_text import normalize_action, parse_answer
 from cosfly.llm.contract import Reply
-from cosfly.llm.protocol import error_words, read_body, read_completion, read_models
-from cosfly.llm.wire import Response
+from cosfly.llm.protocol import Response, error_words, read_body, read_completion, read_models
 from cosfly.runtime.model_json import find_object
 
 GOOD = {

@@ -12,7 +12,7 @@ import pytest
 from cosfly import cli
 from cosfly.cli.options import Job, resolve
 from cosfly.llm.client import ChatClient, EndpointConfig
-from cosfly.llm.wire import base_url
+from cosfly.llm.protocol import base_url
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.errors import InputError, TeacherError
 from cosfly.runtime.json_io import write_json

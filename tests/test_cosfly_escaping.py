@@ -22,7 +22,7 @@ from cosfly.formats.captions import Caption, read_captions
 from cosfly.formats.inspection import Inspection, read_inspection
 from cosfly.inspection.report import report_html
 from cosfly.inspection.stage import run as inspect
-from cosfly.llm.budget import BudgetConfig
+from cosfly.llm.answers import BudgetConfig
 from cosfly.runtime import console as shared
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import LONGEST, for_terminal

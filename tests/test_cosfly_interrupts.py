@@ -7,11 +7,11 @@ import sys
 
 import pytest
 
-from cosfly.llm.interrupts import run_until_interrupted
+from cosfly.llm.contract import run_until_interrupted
 
 CHILD = """
 import asyncio, sys
-from cosfly.llm.interrupts import run_until_interrupted
+from cosfly.llm.contract import run_until_interrupted
 
 async def ask():
     await asyncio.sleep(3600)

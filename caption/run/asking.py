@@ -26,8 +26,7 @@ from caption.teachers.teacher import Teacher, first_budget, open_teacher
 from caption.truth.vocabulary import Vocabulary
 from cosfly.formats.captions import Caption, Usage, read_captions, write_captions
 from cosfly.formats.places import flight_of
-from cosfly.llm.answers import AnswerBook
-from cosfly.llm.budget import BudgetSpent
+from cosfly.llm.answers import AnswerBook, BudgetSpent
 from cosfly.llm.client import STOP_AFTER_FAILURES
 from cosfly.llm.contract import NoAnswer, Troubles
 from cosfly.runtime.console import SECONDS_BETWEEN_LINES

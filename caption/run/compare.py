@@ -26,8 +26,7 @@ from caption.teachers.teacher import Teacher, first_budget, open_teacher
 from caption.truth.vocabulary import Vocabulary
 from cosfly.formats.captions import Coc
 from cosfly.llm.answers import AnswerBook
-from cosfly.llm.contract import NoAnswer
-from cosfly.llm.interrupts import run_until_interrupted
+from cosfly.llm.contract import NoAnswer, run_until_interrupted
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.io import refuse_links
 from cosfly.runtime.json_io import write_json

@@ -22,7 +22,7 @@ from caption.teachers.teacher import first_budget, open_teacher
 from cosfly.formats.captions import Caption, Usage
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook
-from cosfly.llm.interrupts import run_until_interrupted
+from cosfly.llm.contract import run_until_interrupted
 from cosfly.runtime.errors import ConfigError, InputError, TeacherError
 from cosfly.runtime.run_dir import Resume
 

@@ -18,7 +18,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 
 from cosfly.formats.captions import Caption
-from cosfly.llm.budget import Budget
+from cosfly.llm.answers import Budget
 from cosfly.llm.contract import Troubles
 from cosfly.runtime.console import SECONDS_BETWEEN_LINES, console
 

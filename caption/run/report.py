@@ -12,7 +12,7 @@ from cosfly.formats.captions import TOKENS, Caption, Language
 from cosfly.formats.frames import frame_name
 from cosfly.formats.places import flight_of
 from cosfly.llm.answer_text import sentences_of
-from cosfly.llm.budget import BudgetConfig
+from cosfly.llm.answers import BudgetConfig
 from cosfly.runtime.io import read_text, write_bytes
 from cosfly.viz.frame_views import thumbnail
 from cosfly.viz.page import page, run_name

@@ -28,7 +28,7 @@ from caption.truth.glossary import GLOSSARY_FILE
 from caption.truth.vocabulary import Vocabulary
 from cosfly.formats.captions import caption_lines, line_of, write_caption_lines
 from cosfly.formats.places import flight_of
-from cosfly.llm.interrupts import run_until_interrupted
+from cosfly.llm.contract import run_until_interrupted
 from cosfly.llm.student_chat import student_files
 from cosfly.runtime.errors import ConfigError, ResumeError, TeacherError
 from cosfly.runtime.json_io import write_json

@@ -30,7 +30,7 @@ from caption.writing.contract import more_fields, way_of
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Reply
-from cosfly.llm.protocol import read_body, request_body, response_format, thoughts_of
+from cosfly.llm.protocol import read_body, thoughts_of
 from cosfly.llm.refusals import MEANINGS, Refusal
 from cosfly.runtime.errors import TeacherError
 from cosfly.runtime.json_io import parse_json
@@ -106,14 +106,10 @@ class _Examination:
     async def _ask(self, messages: list[dict], max_tokens: int, schema: dict | None = None) -> _Probe:
         endpoint = self.cfg.endpoint.model_copy(update={"max_tokens": max_tokens})
         request = endpoint.request(messages, [], schema or {}, seed=0)  # sampled as a run samples
-        body = request_body(self.client.model, request)
-        if schema is not None:
-            body["response_format"] = response_format(schema)
         try:
-            response = await self.client.send(body)
+            response, found = await self.client.ask_once(request, schema)
         except (TimeoutError, httpx.RequestError) as error:
-            return _Probe(None, self.client.clean(f"{type(error).__name__} {error}"))
-        found = self.client.read(response, is_structured=schema is not None)
+            return _Probe(None, self.client.words_of(error))
         if isinstance(found, Refusal):
             fix = "" if found.kind == "unknown" else f"; {found.meaning.fix}"
             return _Probe(None, found.summary + fix, found)

@@ -7,25 +7,17 @@ import hashlib
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from caption.schema import ImageConfig, ObservedWindow
+from cosfly.llm.student_chat import EncodedImage
 from cosfly.viz.frame_views import VIEW_FILES, Pictures, encode_picture, scaled_size
 
 CACHE_FRAMES = 256  # encoded ones kept in memory for the windows that share them
 JPEG_QUALITY = 90
-
-
-@dataclass(frozen=True)
-class EncodedImage:
-    """One picture of a request."""
-
-    url: str  # base64 data URL
-    digest: str  # of the encoded bytes
 
 
 class FrameSource(Protocol):

@@ -21,8 +21,7 @@ from caption.truth.facts import Facts
 from caption.truth.vocabulary import Vocabulary
 from cosfly.formats.captions import Coc, JudgeRecord, Language
 from cosfly.formats.places import flight_of
-from cosfly.llm.answers import AnswerBook, KeptAnswers
-from cosfly.llm.budget import Budget
+from cosfly.llm.answers import AnswerBook, Budget, KeptAnswers
 from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.contract import NoAnswer, Request, Troubles, started
 from cosfly.runtime.errors import InputError

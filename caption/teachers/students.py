@@ -16,7 +16,6 @@ import numpy as np
 
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import Terms
-from caption.teachers.images import EncodedImage
 from caption.teachers.prompts import Question, decision_words, system_prompt
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft
@@ -27,7 +26,7 @@ from cosfly.llm.contract import Request
 from cosfly.llm.student_chat import (
     IMAGE_ENCODING,
     ChatFormat,
-    SentPicture,
+    EncodedImage,
     StudentEndpointConfig,
     picture_to_send,
     read_chat_format,
@@ -120,8 +119,7 @@ class TaughtStudent:
 
     def encode(self, rgb: np.ndarray) -> EncodedImage:
         """Encode a picture as it was taught."""
-        sent = picture_to_send(rgb, self.taught.max_pixels)
-        return EncodedImage(sent.part["image_url"]["url"], sent.digest)
+        return picture_to_send(rgb, self.taught.max_pixels)
 
     def check(self, question: Question) -> None:
         """Check that a window is shown as those were that the student learnt from.
@@ -167,7 +165,4 @@ class TaughtStudent:
         return prompt.model_copy(update={"system": "\n".join([prompt.system, *more])})
 
     def _request(self, prompt: Prompt, frames: Sequence[Sequence[EncodedImage]], schema: dict, seed: int) -> Request:
-        parts = [
-            [SentPicture({"type": "image_url", "image_url": {"url": p.url}}, p.digest) for p in each] for each in frames
-        ]
-        return student_request(prompt, parts, schema, self._sampling, seed)
+        return student_request(prompt, frames, schema, self._sampling, seed)

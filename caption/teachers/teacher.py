@@ -22,7 +22,7 @@ from pydantic_core import to_json
 
 from caption.schema import CaptionConfig, ImageConfig
 from caption.teachers.foreign import FileTeacher, StudentTeacher, Terms
-from caption.teachers.images import EncodedImage, FrameEncoder
+from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import Question, mirror_messages, question_messages
 from caption.teachers.rules import MODEL, write_templates
 from caption.teachers.students import TaughtStudent
@@ -31,10 +31,10 @@ from caption.writing.contract import Draft, more_fields, way_of
 from cosfly.formats.captions import TeacherRecord, TeacherSettings, Writing
 from cosfly.formats.places import flight_of
 from cosfly.llm.answer_text import answer_schema
-from cosfly.llm.answers import AnswerBook, KeptAnswers
-from cosfly.llm.budget import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, Budget
+from cosfly.llm.answers import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, AnswerBook, Budget, KeptAnswers
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Engine, Reply, Request, Troubles
+from cosfly.llm.student_chat import EncodedImage
 from cosfly.llm.vllm_engine import VllmEngine
 from cosfly.runtime.seeding import draws_for, rng_for
 from cosfly.viz.frame_views import Pictures

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 from cosfly.formats.captions import BY_LETTERS, FIELDS, TOKENS, Coc, Language
@@ -37,9 +38,7 @@ def normalize_action(text: str) -> str | None:
     return BY_LETTERS.get(re.sub(r"[\s_-]", "", found["action"])) if found else None
 
 
-def answer_schema(
-    decision: str | None = None, language: Language = "en", more: Mapping[str, dict] | None = None
-) -> dict:
+def answer_schema(decision: str | None = None, language: Language = "en", more: Mapping[str, dict] = {}) -> dict:
     """Return the JSON schema of an answer; a given decision is the enum's one value.
 
     Args:
@@ -49,7 +48,7 @@ def answer_schema(
         name: {"type": "string", "minLength": characters, "maxLength": MAX_CHARACTERS[name]}
         for name, characters in (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS).items()
     }
-    properties |= more or {}
+    properties |= more
     properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(TOKENS)}
     return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
 
@@ -89,9 +88,8 @@ def parse_answer(
 ) -> Parsed:
     """Check the structure of a raw answer (phase 3 of sec:appendix_e).
 
-    What stands round the answer's object, and what differs from JSON in punctuation alone, is taken off and named in
-    `recovered` (cosfly/runtime/model_json.py), as are raw control characters inside strings. Anything else is a failure
-    with a reason word.
+    Text around the answer's object is removed and named in `recovered` (cosfly/runtime/model_json.py), as are raw
+    control characters inside strings. Anything else is a failure with a reason word.
 
     Args:
         more: names of the further fields that were asked for.
@@ -100,54 +98,41 @@ def parse_answer(
     """
     names = (*FIELDS, *more)
     found = find_object(text, names, finish_reason)
-    recovered = list(found.recovered)
-    if found.value is None:
-        parsed = Parsed(None, found.reason)
-    else:
-        names = tuple(name for name in names if name in found.value or name not in optional)
-        parsed = _checked(found.value, language, names, recovered)
-    return replace(parsed, recovered=tuple(recovered)) if recovered else parsed
-
-
-def _checked(value: dict[str, Any], language: Language, names: Collection[str], recovered: list[str]) -> Parsed:
+    if (value := found.value) is None:
+        return Parsed(None, found.reason, found.recovered)
+    names = tuple(name for name in names if name in value or name not in optional)
     if len(value) != len(names) or not all(map(value.__contains__, names)):
-        return Parsed(None, "missing_field" if set(names) - value.keys() else "extra_field")
-    cleaned: dict[str, str] = {}
-    has_control = False
-    for name in FIELDS:
-        text = value[name]
-        if not isinstance(text, str):
-            return Parsed(None, "field_not_text")
-        if not text.isprintable() and _CONTROL.search(text):
-            text, has_control = _CONTROL.sub("", text), True
-        cleaned[name] = text.strip()
-    if has_control:
-        recovered.append("control_characters")
-    for name, characters in (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS).items():
-        problem = _problem_of(cleaned[name], language, characters)
-        if problem is not None:
-            return Parsed(None, f"{name}_{problem}")
-    action = normalize_action(cleaned["flight_decision"])
-    if action is None:
-        return Parsed(None, "decision_not_in_closed_set")
+        return Parsed(None, "missing_field" if set(names) - value.keys() else "extra_field", found.recovered)
+    texts = [value[name] for name in FIELDS]
+    if not all(isinstance(text, str) for text in texts):
+        return Parsed(None, "field_not_text", found.recovered)
+    plain = [_CONTROL.sub("", text) for text in texts]
+    recovered = found.recovered if plain == texts else (*found.recovered, "control_characters")
+    cleaned = {name: text.strip() for name, text in zip(FIELDS, plain, strict=True)}
+    if (reason := _problem_of(cleaned, language)) is not None:
+        return Parsed(None, reason, recovered)
+    if (action := normalize_action(cleaned["flight_decision"])) is None:
+        return Parsed(None, "decision_not_in_closed_set", recovered)
     stated = value.get("therefore")
     therefore = normalize_action(stated) if isinstance(stated, str) else None
     if therefore is None and "therefore" in names:
-        return Parsed(None, "therefore_not_in_closed_set")
+        return Parsed(None, "therefore_not_in_closed_set", recovered)
     others = {name: value[name] for name in names if name not in (*FIELDS, "therefore")}
-    cleaned["flight_decision"] = action
-    return Parsed(Coc(**cleaned), therefore=therefore, more=others)
+    return Parsed(Coc(**cleaned | {"flight_decision": action}), None, recovered, therefore, others)
 
 
-def _problem_of(text: str, language: Language, min_characters: int) -> str | None:
+def _problem_of(texts: Mapping[str, str], language: Language) -> str | None:
     """Return what makes a text none of a caption: it is short, stands for another one, or is in another language."""
-    if len(text) < min_characters:
-        return "too_short"
-    if (text[0], text[-1]) in (("<", ">"), ("[", "]")) or (
-        any(map(text.__contains__, _DOTS)) and _is_left_out(text, min_characters)
-    ):
-        return "placeholder"
-    return None if is_in_script(text, language) else "wrong_language"
+    for name, min_characters in (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS).items():
+        text = texts[name]
+        if len(text) < min_characters:
+            return f"{name}_too_short"
+        is_bracketed = (text[0], text[-1]) in (("<", ">"), ("[", "]"))
+        if is_bracketed or (any(map(text.__contains__, _DOTS)) and _is_left_out(text, min_characters)):
+            return f"{name}_placeholder"
+        if not is_in_script(text, language):
+            return f"{name}_wrong_language"
+    return None
 
 
 def _is_left_out(text: str, min_characters: int) -> bool:
@@ -190,12 +175,10 @@ def sentences_of(coc: Coc) -> Iterator[tuple[str, str]]:
 def cut_sentences(text: str) -> tuple[str, ...]:
     """Cut a text at the ends of its sentences; together the pieces are the text."""
     pieces: list[str] = []
-    start = 0
-    for end in [*[match.end() for match in END.finditer(text)], len(text)]:
-        piece = text[start:end]
+    ends = [0, *(match.end() for match in END.finditer(text)), len(text)]
+    for piece in (text[start:end] for start, end in pairwise(ends)):
         if piece and not piece.isspace():
             pieces.append(piece)
         elif pieces:
             pieces[-1] += piece
-        start = end
     return tuple(pieces)

@@ -1,9 +1,9 @@
-"""The journal of answers: each is written before anything is derived from it, and nothing is asked twice.
+"""The journal of answers: each is written before anything is derived from it, and nothing is asked twice; the budget.
 
-A folder has one journal per track, `answers/<track>.jsonl`, written by one process. An answer is handed to the
-system as
-it arrives, so a killed process loses none; a thread waits for the disk, once for all answers that arrived meanwhile.
-Only tracks in progress are in memory.
+A folder has one journal per track, `answers/<track>.jsonl`, written by one process. An answer is handed to the system
+as it arrives, so a killed process loses none; a thread waits for the disk, once for all answers that arrived meanwhile.
+Only tracks in progress are in memory. All runs into one folder count towards its budget of tokens and money, from the
+journal, so that repeating a command does not spend it twice.
 """
 
 from __future__ import annotations
@@ -14,19 +14,18 @@ import logging
 import re
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 from weakref import WeakValueDictionary
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cosfly.formats.captions import Usage
-from cosfly.llm.budget import Budget
 from cosfly.llm.contract import MOST_TOKENS, CountName, Engine, NoAnswer, Reply, Request
-from cosfly.runtime.errors import CosflyError
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import CosflyError, TeacherError
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import dump_json
@@ -35,6 +34,8 @@ from cosfly.runtime.model_json import CONTEXT_FULL
 log = logging.getLogger(__name__)
 
 MOST_OPEN_FILES = 64
+BYTES_PER_TOKEN = 3  # a low guess, so that the budget holds
+PIXELS_PER_TOKEN = 28 * 28  # of common vision encoders
 _PLAIN_NAME = re.compile(r"\w[\w.+-]*")
 
 
@@ -69,27 +70,13 @@ def answer_key(model: str, request: Request) -> str:
         else message | {"content": [part.get("text", "image") for part in message["content"]]}
         for message in request.messages
     ]
-    sampling = {"model": model, **request.sampling}
-    return sha256_bytes(dump_json([texts, request.digests, sampling, request.schema]).encode())
+    parts = [texts, request.digests, {"model": model, **request.sampling}, request.schema]
+    return sha256_bytes(dump_json(parts).encode())
 
 
 def read_answers(journal: Journal) -> Iterator[Answer]:
     """Yield the answers of a journal; raises InputError for an unusable line."""
     return journal.read_as(Answer.model_validate)
-
-
-def journal_name(track: str) -> str:
-    """Return the file name of a track's journal: the track's name if it is a plain file name, else its digest."""
-    is_plain = _PLAIN_NAME.fullmatch(track) is not None and len(track.encode()) <= 200
-    return f"{track if is_plain else f'flight-{sha256_bytes(track.encode())}'}.jsonl"
-
-
-@dataclass
-class _TrackAnswers:
-    """The journal of one track, and its answers by key."""
-
-    journal: Journal
-    answers: dict[str, Answer]
 
 
 class AnswerBook:
@@ -102,37 +89,41 @@ class AnswerBook:
         for path in sorted(folder.glob("*.jsonl")):
             for answer in read_answers(Journal(path)):
                 self._count(answer)
-        self._tracks: dict[str, _TrackAnswers] = {}
+        self._tracks: dict[str, tuple[Journal, dict[str, Answer]]] = {}  # a track's journal, and its answers by key
         self._disk, self._disk_lock = ThreadPoolExecutor(1, "journal"), asyncio.Lock()
         self._unsynced = set[Journal]()
         self._disk_error: CosflyError | OSError | None = None
 
     def get(self, track: str, key: str) -> Answer | None:
         """Return the recorded answer of a key."""
-        return self._open(track).answers.get(key)
+        return self._open(track)[1].get(key)
 
     def latency_s(self, track: str, sample_id: str) -> float:
         """Return the total time of the answers about one window."""
-        return sum(one.latency_s for one in self._open(track).answers.values() if one.sample_id == sample_id)
+        return sum(one.latency_s for one in self._open(track)[1].values() if one.sample_id == sample_id)
 
     async def put(self, track: str, answer: Answer) -> None:
-        """Write an answer, and wait until it is on the disk; raises StorageError if the disk is full or not
-        writable."""
-        opened = self._open(track)
-        opened.journal.append(answer.model_dump(mode="json"), sync=False)
-        opened.answers[answer.key] = answer
+        """Write an answer, and wait until it is on the disk; StorageError if the disk is full or not writable."""
+        journal, answers = self._open(track)
+        journal.append(answer.model_dump(mode="json"), sync=False)
+        answers[answer.key] = answer
         self._count(answer)
-        self._unsynced.add(opened.journal)
+        self._unsynced.add(journal)
         async with self._disk_lock:
             if self._disk_error is not None:  # a later sync may succeed without the lost lines
                 raise self._disk_error
-            if opened.journal in self._unsynced:  # else synced by another answer that waited
+            if journal in self._unsynced:  # else synced by another answer that waited
                 await self._sync()
 
     async def _sync(self) -> None:
         batch, self._unsynced = self._unsynced, set()
+
+        def sync_all() -> None:
+            for journal in batch:
+                journal.sync()
+
         try:
-            await asyncio.get_running_loop().run_in_executor(self._disk, _sync_all, batch)
+            await asyncio.get_running_loop().run_in_executor(self._disk, sync_all)
         except asyncio.CancelledError:
             self._unsynced |= batch
             raise
@@ -145,13 +136,15 @@ class AnswerBook:
 
     def forget(self, track: str) -> None:
         """Remove a finished track from memory; its journal stays on the disk."""
-        if (opened := self._tracks.pop(track, None)) is not None:
-            opened.journal.close()
+        if track in self._tracks:
+            self._tracks.pop(track)[0].close()
 
-    def _open(self, track: str) -> _TrackAnswers:
+    def _open(self, track: str) -> tuple[Journal, dict[str, Answer]]:
         if track not in self._tracks:
-            journal = Journal(self.folder / journal_name(track))
-            self._tracks[track] = _TrackAnswers(journal, {answer.key: answer for answer in read_answers(journal)})
+            is_plain = _PLAIN_NAME.fullmatch(track) is not None and len(track.encode()) <= 200
+            name = track if is_plain else f"flight-{sha256_bytes(track.encode())}"
+            journal = Journal(self.folder / f"{name}.jsonl")
+            self._tracks[track] = journal, {answer.key: answer for answer in read_answers(journal)}
             if journal.num_damaged:
                 log.warning("%s: %d damaged lines are skipped", journal.path, journal.num_damaged)
         return self._tracks[track]
@@ -169,9 +162,97 @@ class AnswerBook:
             self.forget(track)
 
 
-def _sync_all(journals: set[Journal]) -> None:
-    for journal in journals:
-        journal.sync()
+# --- the budget -------------------------------------------------------------------------------------------------------
+
+
+class BudgetConfig(Config):
+    """Limits over all runs into one folder, a judge's tokens included."""
+
+    price_prompt: float = Field(0.0, ge=0, description="price of a million prompt tokens, in your currency")
+    price_completion: float = Field(0.0, ge=0, description="price of a million answer tokens, in your currency")
+    max_cost: float | None = Field(None, gt=0, description="stop before this cost is exceeded; empty: no limit")
+    max_tokens: int | None = Field(None, ge=1, description="stop before this many tokens are exceeded; empty: no limit")
+
+    @model_validator(mode="after")
+    def _priced(self) -> Self:
+        if self.max_cost is not None and self.price_prompt == self.price_completion == 0:
+            raise ValueError("max_cost needs price_prompt or price_completion; without a price it is never reached")
+        return self
+
+    def cost(self, prompt_tokens: float, completion_tokens: float) -> float:
+        """Return the price of some tokens."""
+        return (prompt_tokens * self.price_prompt + completion_tokens * self.price_completion) / 1e6
+
+
+class BudgetSpent(TeacherError):
+    """The next request might exceed a limit; `what` says which."""
+
+
+class Budget:
+    """The shared budget of several journals of answers.
+
+    A request is sent only if it and all in flight, each taken at the largest size so far, fit; until then it waits. If
+    it does not fit alone, the budget is spent.
+    """
+
+    def __init__(self, cfg: BudgetConfig, *counts: Counter[str], first_prompt: int, first_completion: int) -> None:
+        """
+        Args:
+            counts: `AnswerBook.totals` of each journal.
+            first_prompt, first_completion: assumed tokens of a request until one is answered.
+        """
+        self.cfg, self._counts, self._first = cfg, counts, (first_prompt, first_completion)
+        self._largest: dict[int, tuple[int, int]] = {}  # prompt and completion tokens by number of pictures
+        self._in_flight = Counter[int]()  # requests by number of pictures
+        self._freed = asyncio.Event()
+
+    @property
+    def totals(self) -> Counter[str]:
+        """Answers, prompt_tokens and completion_tokens of all journals."""
+        return sum(self._counts, Counter())
+
+    @property
+    def spent(self) -> float:
+        """Cost so far."""
+        totals = self.totals
+        return self.cfg.cost(totals["prompt_tokens"], totals["completion_tokens"])
+
+    @contextlib.asynccontextmanager
+    async def request(self, num_pictures: int = 0) -> AsyncIterator[None]:
+        """Reserve the share of one request; raises BudgetSpent if it does not fit."""
+        while (spent := self._exceeded_by_another(num_pictures)) is not None:
+            if not self._in_flight.total():
+                raise spent
+            self._freed.clear()
+            await self._freed.wait()
+        self._in_flight[num_pictures] += 1
+        try:
+            yield
+        finally:
+            self._in_flight[num_pictures] -= 1
+            self._freed.set()
+
+    def _exceeded_by_another(self, num_pictures: int) -> BudgetSpent | None:
+        """Return which limit one more request might exceed."""
+        totals, prompt, completion = self.totals, 0, 0
+        for pictures, count in (self._in_flight + Counter([num_pictures])).items():
+            one_prompt, one_completion = self._largest.get(pictures, self._first)
+            prompt, completion = prompt + count * one_prompt, completion + count * one_completion
+        tokens, spent = totals["prompt_tokens"] + totals["completion_tokens"], None
+        if self.cfg.max_tokens is not None and tokens + prompt + completion > self.cfg.max_tokens:
+            spent, limit = f"{tokens:,} of at most {self.cfg.max_tokens:,} tokens are used", "max_tokens"
+        elif self.cfg.max_cost is not None and self.spent + self.cfg.cost(prompt, completion) > self.cfg.max_cost:
+            spent, limit = f"{self.spent:.4f} of at most {self.cfg.max_cost:g} are spent", "max_cost"
+        return None if spent is None else BudgetSpent(spent, where=f"budget.{limit}", fix="raise the limit")
+
+    def note(self, usage: Usage | None, where: str, num_pictures: int = 0) -> None:
+        """Record the size of an answered request; raises TeacherError if a limit is set and no usage is reported."""
+        if usage is not None:
+            prompt, completion = self._largest.get(num_pictures, (0, 0))
+            self._largest[num_pictures] = max(prompt, usage.prompt_tokens), max(completion, usage.completion_tokens)
+        elif self.cfg.max_cost is not None or self.cfg.max_tokens is not None:
+            what = "the endpoint reports no token usage, so a limit of tokens or cost cannot be kept"
+            raise TeacherError(what, where=where, fix="remove --max-cost and --max-tokens, and use --limit")
 
 
 class KeptAnswers:
@@ -196,27 +277,25 @@ class KeptAnswers:
             BudgetSpent: The request might exceed a limit.
             TeacherError: No request will be answered.
         """
-        key = answer_key(self.engine.model, request)
-        lock = self._asking.setdefault(key, asyncio.Lock())
-        async with lock:  # of two equal requests the second takes the answer of the first
+        key, engine, num_pictures = answer_key(self.engine.model, request), self.engine, len(request.digests)
+        async with self._asking.setdefault(key, asyncio.Lock()):  # of equal requests the second takes the first answer
             known = None if self.book is None else self.book.get(track, key)
             is_retried = self.only is not None and sample_id in self.only  # perhaps by a server with a larger context
             if known is not None and not (is_retried and known.finish_reason == CONTEXT_FULL):
                 return known.reply
             if self.only is not None and not is_retried:
                 raise NoAnswer("not_asked", "this run asks about other windows only")
-            num_pictures = len(request.digests)
             async with self.budget.request(num_pictures) if self.budget else contextlib.nullcontext():
                 start_s = time.monotonic()
-                reply = await self.engine.answer(request)
-                latency_s = round(time.monotonic() - start_s, 3)
+                reply = await engine.answer(request)
                 if self.book is not None:
                     answer = Answer(
-                        key=key, sample_id=sample_id, purpose=purpose, model=self.engine.model, text=reply.text,
+                        key=key, sample_id=sample_id, purpose=purpose, model=engine.model, text=reply.text,
                         usage=reply.usage.model_dump() if reply.usage else {}, structured=reply.structured,
-                        finish_reason=reply.finish_reason, latency_s=latency_s, time=round(time.time(), 3),
+                        finish_reason=reply.finish_reason, latency_s=round(time.monotonic() - start_s, 3),
+                        time=round(time.time(), 3),
                     )  # fmt: skip
                     await self.book.put(track, answer)  # on the disk before anything is derived from it
             if self.budget is not None:
-                self.budget.note(reply.usage, self.engine.where, num_pictures)
+                self.budget.note(reply.usage, engine.where, num_pictures)
             return reply

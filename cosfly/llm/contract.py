@@ -1,19 +1,25 @@
-"""The contract of every engine: requests to a language model, and its replies.
+"""The contract of every engine: requests to a language model, its replies, and Ctrl-C while requests are in flight.
 
 An engine knows no captions, journals or budgets: it is started, answers many requests at once, and is closed.
 """
 
 from __future__ import annotations
 
+import asyncio
+import os
+import signal
+import threading
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Coroutine
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, TypeVar
 
 from cosfly.formats.captions import Usage
 
+Result = TypeVar("Result")
 CountName = Literal["prompt_tokens", "completion_tokens"]
+AT_ONCE = b"error: interrupted at once; what was answered is kept: run the same command again to continue\n"
 MOST_TOKENS = 10_000_000  # of one answer: longer than the context of any model
 
 
@@ -46,13 +52,22 @@ class Reply:
     is_kept: bool = field(default=False, compare=False)
 
 
+@dataclass(eq=False)
 class NoAnswer(Exception):
-    """A request without an answer. cause: as tallies count it. detail: the server's message. is_final: the request was
-    refused, so repeating it does not help. fix: what helps."""
+    """A request without an answer.
 
-    def __init__(self, cause: str, detail: str, *, is_final: bool = False, fix: str = "") -> None:
-        super().__init__(f"{cause}: {detail}")
-        self.cause, self.detail, self.is_final, self.fix = cause, detail, is_final, fix
+    cause: as tallies count it. detail: the server's message. is_final: the request was refused, so repeating it does
+    not help. fix: what helps. wait_s: how long the server asks to wait, if it does.
+    """
+
+    cause: str
+    detail: str
+    is_final: bool = False
+    fix: str = ""
+    wait_s: float | None = None
+
+    def __str__(self) -> str:
+        return f"{self.cause}: {self.detail}"
 
 
 SECONDS_BETWEEN_WARNINGS = 10.0
@@ -61,28 +76,26 @@ SECONDS_BETWEEN_WARNINGS = 10.0
 class Troubles:
     """Failed tries, for the progress display. last: the last error; None after an answer."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self) -> None:
         self.num = 0
         self.last: str | None = None
-        self.answered_s = clock()  # time of the last answer
-        self._clock, self._warned_s = clock, float("-inf")
+        self._answered_s, self._warned_s = time.monotonic(), float("-inf")
 
     def answered(self) -> None:
         """Record an answer."""
-        self.last, self.answered_s = None, self._clock()
+        self.last, self._answered_s = None, time.monotonic()
 
     def failed(self, detail: str) -> bool:
         """Record a failed try; return whether it is time for a line in the log."""
-        self.num, self.last = self.num + 1, detail
-        if self._clock() - self._warned_s < SECONDS_BETWEEN_WARNINGS:
-            return False
-        self._warned_s = self._clock()
-        return True
+        self.num, self.last, now_s = self.num + 1, detail, time.monotonic()
+        if is_time := now_s - self._warned_s >= SECONDS_BETWEEN_WARNINGS:
+            self._warned_s = now_s
+        return is_time
 
     @property
     def silent_s(self) -> float:
         """Seconds since the last answer."""
-        return self._clock() - self.answered_s
+        return time.monotonic() - self._answered_s
 
 
 class Engine(Protocol):
@@ -111,3 +124,42 @@ async def started(engine: Engine) -> AsyncIterator[None]:
         yield
     finally:
         await engine.close()
+
+
+def run_until_interrupted(main: Coroutine[Any, Any, Result]) -> Result:
+    """Run a coroutine as `asyncio.run` does: the first Ctrl-C cancels its tasks in order, a second ends the process.
+
+    asyncio's second Ctrl-C interrupts the cancelled tasks and prints a traceback of each; journals survive an end at
+    any time.
+
+    Raises:
+        KeyboardInterrupt: After the first Ctrl-C, once all tasks have ended.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return asyncio.run(main)
+    is_interrupted = False
+
+    async def guarded() -> Result:
+        task, loop = asyncio.current_task(), asyncio.get_running_loop()
+
+        def interrupt() -> None:
+            nonlocal is_interrupted
+            if is_interrupted:
+                os.write(2, AT_ONCE)
+                os._exit(130)
+            assert task is not None
+            is_interrupted = task.cancel()
+
+        loop.add_signal_handler(signal.SIGINT, interrupt)
+        try:
+            return await main
+        finally:
+            if not is_interrupted:  # otherwise it stays until the last task has ended
+                loop.remove_signal_handler(signal.SIGINT)
+
+    try:
+        return asyncio.run(guarded())
+    except asyncio.CancelledError:
+        if is_interrupted:
+            raise KeyboardInterrupt from None
+        raise

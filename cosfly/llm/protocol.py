@@ -1,17 +1,19 @@
-"""The chat-completions protocol: writes request bodies and reads responses."""
+"""The chat-completions protocol: checks addresses, writes request bodies and reads responses."""
 
 from __future__ import annotations
 
 import json
 import re
+from dataclasses import dataclass
 from typing import Any
+
+import httpx
 
 from cosfly.formats.captions import Usage
 from cosfly.llm.contract import MOST_TOKENS, Reply, Request
-from cosfly.llm.wire import Response
 from cosfly.runtime.json_io import dump_json
 
-_PLACEHOLDER = re.compile(rb'"\\u0000(\d+)"')
+KEY_VARIABLE = "COSFLY_API_KEY"
 THOUGHT_FIELDS = ("reasoning_content", "reasoning", "thinking", "reasoning_details")  # of a message
 TEXT_PARTS = (None, "text", "output_text")
 ERROR_INSTEAD = "an error in place of an answer"  # with status 200
@@ -19,17 +21,47 @@ ENDED = ("error", "abort")  # finish reasons of an answer that a server gave up;
 MOST_NAME = 256  # characters of a name that is kept, such as a model or a finish reason
 
 
+# --- addresses --------------------------------------------------------------------------------------------------------
+
+
+def check_url(url: str) -> None:
+    """Check that a URL is usable and contains no secret, since it is written to `run.yaml` and shown in messages.
+
+    Raises:
+        ValueError: Says what is wrong, without parts of the URL that may be secret.
+    """
+    shown = "" if "@" in url else f", got {re.split('[?#]', url)[0][:200]!r}"
+    if re.search("[@?#]", url):
+        what = "a URL must not contain a user, password, query or fragment, since it is recorded"
+        raise ValueError(f"{what}; set the key in the environment variable {KEY_VARIABLE}{shown}")
+    try:
+        parts = httpx.URL(url)
+        parts.raw_host.decode("ascii").encode("idna")  # as the resolver does
+    except (httpx.InvalidURL, ValueError):
+        parts = httpx.URL("")
+    is_host = parts.scheme in ("http", "https") and parts.host and "%" not in parts.host
+    is_port = parts.port is None or 0 < parts.port < 65_536
+    if not (is_host and is_port) or re.search(r"[\s\x00-\x1f\x7f]", url):
+        what = "a URL must begin with http:// or https:// and a host name, with a port below 65536 and no blanks"
+        raise ValueError(f"{what}{shown}")
+
+
+def base_url(url: str) -> str:
+    """Return the API root of a URL given as host, host/v1 or the full chat-completions path."""
+    root = url.rstrip("/").removesuffix("/chat/completions").rstrip("/")
+    return root if re.search(r"/v\d+(beta)?(/openai)?$", root) else f"{root}/v1"
+
+
 # --- requests ---------------------------------------------------------------------------------------------------------
 
 
-def response_format(schema: dict) -> dict:
-    """Return the request field that asks for answers of a JSON schema."""
-    return {"type": "json_schema", "json_schema": {"name": "chain_of_cause", "strict": True, "schema": schema}}
-
-
-def request_body(model: str, request: Request) -> dict[str, Any]:
-    """Return a request's body without its response format."""
-    return {"model": model, "messages": request.messages, **request.sampling}
+def request_body(model: str, request: Request, schema: dict | None = None) -> dict[str, Any]:
+    """Return a request's body. schema: the JSON schema that the answer must have, if the server is asked for it."""
+    body = {"model": model, "messages": request.messages, **request.sampling}
+    if schema is None:
+        return body
+    wanted = {"name": "chain_of_cause", "strict": True, "schema": schema}
+    return body | {"response_format": {"type": "json_schema", "json_schema": wanted}}
 
 
 def encode_body(payload: dict) -> bytes:
@@ -48,13 +80,23 @@ def encode_body(payload: dict) -> bytes:
         else message | {"content": [with_placeholder(part) for part in message["content"]]}
         for message in payload["messages"]
     ]
-    pieces = _PLACEHOLDER.split(dump_json(payload | {"messages": messages}).encode())
+    pieces = re.split(rb'"\\u0000(\d+)"', dump_json(payload | {"messages": messages}).encode())
     for at in range(1, len(pieces), 2):
         pieces[at] = b'"' + urls[int(pieces[at])].encode("ascii") + b'"'
     return b"".join(pieces)
 
 
 # --- responses --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Response:
+    """A server's response. body: cut at the size limit (`is_cut`). retry_after_s: None if not given in seconds."""
+
+    status: int
+    body: bytes
+    is_cut: bool = False
+    retry_after_s: float | None = None
 
 
 def read_body(content: bytes) -> Any:
@@ -82,6 +124,15 @@ def _writable(value: Any) -> Any:
     return [_writable(member) for member in value] if isinstance(value, list) else value
 
 
+def _object(response: Response) -> dict[str, Any] | None:
+    """Return the object in a response; {} for other JSON, None if it is not JSON."""
+    try:
+        value = read_body(response.body)
+    except ValueError:
+        return None
+    return value if isinstance(value, dict) else {}
+
+
 def error_words(value: Any) -> str:
     """Return the text of an error in a server's JSON: its `error`, or all of it."""
     error = value.get("error", value) if isinstance(value, dict) else value
@@ -93,19 +144,16 @@ def read_completion(response: Response, structured: str) -> Reply | str:
 
     Types and sizes are checked: a server is not trusted.
     """
-    try:
-        value = read_body(response.body)
-    except ValueError:
+    value = _object(response)
+    if value is None:
         return "the body is not JSON"
-    choices = value.get("choices") if isinstance(value, dict) else None
+    choices = value.get("choices")
     if not isinstance(choices, list) or not choices or not isinstance(choices[0], dict):
-        has_error = isinstance(value, dict) and value.get("error")
-        return f"{ERROR_INSTEAD}: {error_words(value)}" if has_error else "no choices"
+        return f"{ERROR_INSTEAD}: {error_words(value)}" if value.get("error") else "no choices"
     choice, finish_reason = choices[0], choices[0].get("finish_reason")
-    message = choice["message"] if isinstance(choice.get("message"), dict) else {}
-    text = final_text(message)
     if choice.get("error") or finish_reason in ENDED:
         return f"{ERROR_INSTEAD}: {error_words(choice) if choice.get('error') else finish_reason}"
+    text = _final_text(choice["message"] if isinstance(choice.get("message"), dict) else {})
     if text is None:
         return "no text in the message"
     return Reply(text, _usage(value.get("usage")), structured, _name(finish_reason))
@@ -116,14 +164,17 @@ def _name(value: Any) -> str | None:
     return value if isinstance(value, str) and value.isprintable() and 0 < len(value) <= MOST_NAME else None
 
 
-def final_text(message: dict[str, Any]) -> str | None:
+def _final_text(message: dict[str, Any]) -> str | None:
     """Return a message's text or refusal; "" if it contains only thoughts, None if it contains nothing."""
-    text = _joined(message.get("content"))
-    if text:
+    text = message.get("content")
+    if isinstance(text, list):
+        parts = (part.get("text") for part in text if isinstance(part, dict) and part.get("type") in TEXT_PARTS)
+        text = "".join(part for part in parts if isinstance(part, str))
+    if isinstance(text, str) and text:
         return text
     if isinstance(message.get("refusal"), str):
         return message["refusal"]
-    return "" if any(message.get(name) for name in THOUGHT_FIELDS) else text
+    return "" if isinstance(text, str) or any(message.get(name) for name in THOUGHT_FIELDS) else None
 
 
 def thoughts_of(completion: Any) -> int:
@@ -133,31 +184,16 @@ def thoughts_of(completion: Any) -> int:
     return max((len(text) for text in thoughts if isinstance(text, str)), default=0)
 
 
-def _joined(content: Any) -> str | None:
-    """Return the text of a message's content, which is a text or a list of parts."""
-    if isinstance(content, list):
-        parts = (part.get("text") for part in content if isinstance(part, dict) and part.get("type") in TEXT_PARTS)
-        return "".join(part for part in parts if isinstance(part, str))
-    return content if isinstance(content, str) else None
-
-
 def _usage(value: Any) -> Usage | None:
     """Return the token counts, None if there are none or they are not plausible."""
-    counts = [value.get(name) if isinstance(value, dict) else None for name in Usage.model_fields]
-    if not all(type(count) is int and 0 <= count <= MOST_TOKENS for count in counts) or not counts[0]:
-        return None
-    return Usage(**dict(zip(Usage.model_fields, counts, strict=True)))
+    counts = {name: value.get(name) if isinstance(value, dict) else None for name in Usage.model_fields}
+    is_plausible = all(type(count) is int and 0 <= count <= MOST_TOKENS for count in counts.values())
+    return Usage.model_validate(counts) if is_plausible and counts["prompt_tokens"] else None
 
 
 def read_models(response: Response) -> list[dict[str, Any]] | None:
     """Return the entries of a list of models, each with a usable `id`; None if the response has no list."""
-    if response.status != 200:
-        return None
-    try:
-        value = read_body(response.body)
-    except ValueError:
-        return None
-    listed = value.get("data") if isinstance(value, dict) else None
+    listed = (_object(response) or {}).get("data") if response.status == 200 else None
     if not isinstance(listed, list):
         return None
     return [entry for entry in listed if isinstance(entry, dict) and _name(entry.get("id"))]

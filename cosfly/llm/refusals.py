@@ -1,29 +1,29 @@
 """The causes of refused requests, recognized by the server's text: one table for all servers.
 
 Servers share no status codes: what one reports as 400 another reports as 422 or 500. The patterns match the texts of
-vLLM, SGLang, llama.cpp, TGI, LM Studio, LiteLLM, OpenAI and similar hosts; tests/refusals.tsv lists them. The table
-names a cause, and whether it concerns every request.
+vLLM, SGLang, llama.cpp, TGI, LM Studio, LiteLLM, OpenAI and similar hosts; tests/refusals.tsv lists them.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
+
+from cosfly.llm.protocol import KEY_VARIABLE
 
 Kind = Literal["account", "too_long", "num_images", "no_vision", "schema", "parameter", "content", "unknown"]
 
 MOST_CHARACTERS = 4000  # of a text that are searched: some servers echo the request
 
 
-@dataclass(frozen=True)
-class Meaning:
-    """A cause of refusals. what, fix: of the error. ends_run: all requests are refused, so the run ends."""
+class Meaning(NamedTuple):
+    """A cause of refusals, matched by a pattern. what, fix: of the error. ends_run: all requests are refused."""
 
     what: str
     fix: str
     ends_run: bool
-    pattern: str = "$^"  # of the server's text; the default matches none
+    pattern: str = "$^"
 
 
 SMALLER = "send smaller pictures (image.max_side_px) or fewer (image.modalities, image.layout=tiled)"
@@ -87,6 +87,11 @@ MEANINGS: dict[Kind, Meaning] = {
     ),
     "unknown": Meaning("the server refuses the request", "check the server", False),
 }
+STATUSES = {  # what a status means for which no pattern matches
+    **dict.fromkeys((401, 403), Meaning("the teacher refuses the key", f"set {KEY_VARIABLE}", True)),
+    404: Meaning("no such model or not a chat endpoint", "check URL and model", True),
+    **dict.fromkeys((*range(300, 400), 405), Meaning("not a chat endpoint", "check the URL", True)),
+}
 # Statuses of a server that is busy or away (above 511: Cloudflare's, 424: TGI's of a failed generation); only an empty
 # account takes precedence.
 AWAY = frozenset({408, 409, 424, 425, 429, 502, 503, 504, *range(520, 531)})
@@ -94,17 +99,22 @@ AWAY = frozenset({408, 409, 424, 425, 429, 502, 503, 504, *range(520, 531)})
 
 def kind_of(status: int, text: str) -> Kind:
     """Return the cause of a refusal with this body; `unknown` if no pattern matches."""
-    text = text[:MOST_CHARACTERS]
-    found = (kind for kind, meaning in MEANINGS.items() if re.search(meaning.pattern, text, re.IGNORECASE | re.DOTALL))
+    text, flags = text[:MOST_CHARACTERS], re.IGNORECASE | re.DOTALL
+    found = (kind for kind, meaning in MEANINGS.items() if re.search(meaning.pattern, text, flags))
     kind: Kind = "account" if status == 402 else next(found, "unknown")
-    if status >= 500 and kind in ("content", "schema"):
-        return "unknown"  # in the text of a failed server these words are not about a window or a schema
-    return "unknown" if status in AWAY and kind != "account" else kind
+    # In the text of a failed server these words are not about a window or a schema.
+    is_other = status >= 500 and kind in ("content", "schema")
+    return "unknown" if is_other or (status in AWAY and kind != "account") else kind
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """A request that a server refused. message: the server's text, short, in one line, without the key."""
+    """A request that a server refused.
+
+    message: the server's text, short, in one line, without the key. code: the cause, as tallies count it. summary:
+    status and message. may_pass: whether the same request may be answered later, because the server is busy, away or
+    broken.
+    """
 
     status: int
     kind: Kind
@@ -112,19 +122,17 @@ class Refusal:
 
     @property
     def code(self) -> str:
-        """The cause, as tallies count it."""
         return f"refused_{self.status if self.kind == 'unknown' else self.kind}"
 
     @property
     def summary(self) -> str:
-        """Status and message."""
         return f"HTTP {self.status} {self.message}".rstrip()
 
     @property
     def meaning(self) -> Meaning:
-        return MEANINGS[self.kind]
+        by_text = MEANINGS[self.kind]
+        return by_text if by_text.ends_run or self.kind == "content" else STATUSES.get(self.status, by_text)
 
     @property
     def may_pass(self) -> bool:
-        """Whether the same request may be answered later, because the server is busy, away or broken."""
         return self.kind == "unknown" and (self.status in AWAY or self.status >= 500)

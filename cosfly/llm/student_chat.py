@@ -5,9 +5,8 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -52,15 +51,14 @@ def chat_messages(prompt: Prompt, frames: Sequence[Sequence[dict[str, Any]]]) ->
     return [{"role": "system", "content": prompt.system}, {"role": "user", "content": content}]
 
 
-@dataclass(frozen=True)
-class SentPicture:
-    """A picture as part of a request, and the sha256 of its bytes."""
+class EncodedImage(NamedTuple):
+    """One picture of a request: its base64 data URL, and the sha256 of its bytes."""
 
-    part: dict[str, Any]
+    url: str
     digest: str
 
 
-def picture_to_send(rgb: np.ndarray, max_pixels: int) -> SentPicture:
+def picture_to_send(rgb: np.ndarray, max_pixels: int) -> EncodedImage:
     """Encode a picture, (h, w, 3) uint8 RGB, without loss, scaled down to `max_pixels`; 0: not scaled."""
     height_px, width_px = rgb.shape[:2]
     scale = math.sqrt(max_pixels / (width_px * height_px))
@@ -69,15 +67,16 @@ def picture_to_send(rgb: np.ndarray, max_pixels: int) -> SentPicture:
         rgb = np.asarray(Image.fromarray(rgb).resize(size, Image.Resampling.BICUBIC))
     data = encode_picture(rgb, IMAGE_ENCODING, 0)
     url = f"data:image/{IMAGE_ENCODING};base64,{base64.b64encode(data).decode('ascii')}"
-    return SentPicture({"type": "image_url", "image_url": {"url": url}}, sha256_bytes(data))
+    return EncodedImage(url, sha256_bytes(data))
 
 
 def student_request(
-    prompt: Prompt, frames: Sequence[Sequence[SentPicture]], schema: dict, sampling: EndpointConfig, seed: int = 0
+    prompt: Prompt, frames: Sequence[Sequence[EncodedImage]], schema: dict, sampling: EndpointConfig, seed: int = 0
 ) -> Request:
     """Return a request to an engine. frames: the pictures of each frame, oldest first. schema: of the answer."""
-    messages = chat_messages(prompt, [[picture.part for picture in pictures] for pictures in frames])
-    return sampling.request(messages, [picture.digest for pictures in frames for picture in pictures], schema, seed)
+    parts = [[{"type": "image_url", "image_url": {"url": one.url}} for one in pictures] for pictures in frames]
+    digests = [picture.digest for pictures in frames for picture in pictures]
+    return sampling.request(chat_messages(prompt, parts), digests, schema, seed)
 
 
 # --- the chat format of training --------------------------------------------------------------------------------------
@@ -131,10 +130,7 @@ def _place_of(folder: Path) -> Path:
     places = [folder, folder / "adapter", folder / "model"]
     place = next((place for place in places if (place / CHAT_FORMAT_FILE).is_file()), None)
     if place is None:
-        raise InputError(
-            f"the folder contains no {CHAT_FORMAT_FILE}, which describes the student's training",
-            where=folder,
-            expected=f"{CHAT_FORMAT_FILE} in it, in adapter/ or in model/",
-            fix="pass the output of cosfly distill train or merge",
-        )
+        what = f"the folder contains no {CHAT_FORMAT_FILE}, which describes the student's training"
+        expected, fix = "it in the folder, in adapter/ or in model/", "pass the output of cosfly distill train or merge"
+        raise InputError(what, where=folder, expected=expected, fix=fix)
     return place

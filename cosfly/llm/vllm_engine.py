@@ -50,9 +50,8 @@ class VllmEngine:
             num_images: most pictures of one request. settings: section of `vllm` and `endpoint`, for messages.
         """
         if not (folder / "config.json").is_file():
-            raise InputError(
-                "this is not a model folder", where=folder, expected="a folder with config.json", fix="check --teacher"
-            )
+            what, expected = "this is not a model folder", "a folder with config.json"
+            raise InputError(what, where=folder, expected=expected, fix="check --teacher")
         self.folder, self.model, self.where = folder, folder.name, f"vllm:{folder}"
         self.cfg, self.sampling, self.num_images, self.settings = cfg, sampling, num_images, settings
         self._thread = ThreadPoolExecutor(1, "vllm")  # vLLM is called from one thread only
@@ -86,36 +85,34 @@ class VllmEngine:
         if importlib.util.find_spec("vllm") is None:
             raise EnvironmentMissing("the vLLM engine is not installed", where=self.where, fix=INSTALL)
         os.environ.setdefault("VLLM_NO_USAGE_STATS", "1")  # no telemetry
+        place = "vllm.engine"
         try:
             from vllm import LLM
 
-            try:
-                self.parameters(self.sampling.request([], [], {}, 0))
-            except (TypeError, ValueError) as error:
-                where = f"{self.settings}.endpoint"
-                raise ConfigError("vLLM refuses the sampling settings", where=where, got=_one_line(error)) from None
+            place = "endpoint"
+            self.parameters(self.sampling.request([], [], {}, 0))
+            place = "vllm.engine"
             return LLM(**self.arguments())
-        except TypeError as error:  # an unknown argument of LLM
-            where = f"{self.settings}.vllm.engine"
-            raise ConfigError("vLLM refuses an argument", where=where, got=_one_line(error)) from None
-        except (ImportError, RuntimeError, ValueError, OSError) as error:
-            reason = _one_line(error)
-            raise EnvironmentMissing("the vLLM engine does not start", where=self.where, got=reason) from None
+        except (ImportError, RuntimeError, TypeError, ValueError, OSError) as error:
+            if isinstance(error, TypeError) or (place == "endpoint" and isinstance(error, ValueError)):
+                what, where = f"vLLM refuses a setting of {place}", f"{self.settings}.{place}"
+                raise ConfigError(what, where=where, got=_one_line(error)) from None
+            what, got = "the vLLM engine does not start", _one_line(error)
+            raise EnvironmentMissing(what, where=self.where, got=got) from None
 
     def arguments(self) -> dict[str, Any]:
         """Return the keyword arguments of `vllm.LLM`."""
-        cfg = self.cfg
-        arguments: dict[str, Any] = {
+        length = {} if self.cfg.max_model_len is None else {"max_model_len": self.cfg.max_model_len}
+        return {
             "model": str(self.folder),
             "limit_mm_per_prompt": {"image": self.num_images, "video": 0},  # else memory is reserved for a video
             "gpu_memory_utilization": 0.9,
             # Free whitespace lets a model pad without end and slows decoding several times. vLLM forbids it only for a
             # named backend; "auto" is refused.
             "structured_outputs_config": {"backend": "xgrammar", "disable_any_whitespace": True},
+            **length,
+            **self.cfg.engine,
         }
-        if cfg.max_model_len is not None:
-            arguments["max_model_len"] = cfg.max_model_len
-        return arguments | cfg.engine
 
     def parameters(self, request: Request) -> Any:
         """Return a request's parameters for vLLM."""
@@ -129,37 +126,33 @@ class VllmEngine:
 
     def _serve(self, llm: Any) -> None:
         while not self._is_closing:
-            for request, answered in self._take():
-                if answered.set_running_or_notify_cancel():
-                    self._add(llm, request, answered)
             try:
+                self._add_new(llm)
                 if self._open and not self._is_closing:
                     self._step(llm)
             except Exception as error:  # else those who wait would wait forever
                 self._break(error)
 
-    def _take(self) -> list[tuple[Request, Future[Reply]]]:
-        """Return new requests; waits for one if there is nothing else to do."""
-        taken: list[tuple[Request, Future[Reply]]] = []
-        while len(taken) < min(ADDED_PER_STEP, self.cfg.batch - len(self._open)):
+    def _add_new(self, llm: Any) -> None:
+        """Add new requests to vLLM; wait for one if there is nothing else to do."""
+        for number in range(min(ADDED_PER_STEP, self.cfg.batch - len(self._open))):
             try:
-                found = self._new.get(block=not (self._open or taken))
+                found = self._new.get(block=not (self._open or number))
             except queue.Empty:
-                break
+                return
             if found is None:
-                break
-            taken.append(found)
-        return taken
+                return
+            request, answered = found
+            if answered.set_running_or_notify_cancel():
+                self._add(llm, request, answered)
 
     def _add(self, llm: Any, request: Request, answered: Future[Reply]) -> None:
         if self._broken is not None:
             answered.set_exception(self._broken)
             return
+        more = {"use_tqdm": False, "chat_template_kwargs": request.sampling.get("chat_template_kwargs")}
         try:
-            template = request.sampling.get("chat_template_kwargs")
-            [name] = llm.enqueue_chat(
-                [request.messages], [self.parameters(request)], use_tqdm=False, chat_template_kwargs=template
-            )
+            [name] = llm.enqueue_chat([request.messages], [self.parameters(request)], **more)
             self._open[str(name).partition("-")[0]] = answered  # vLLM adds a random suffix that outputs lack
         except (ValueError, RuntimeError) as error:  # of a prompt that vLLM cannot process
             answered.set_exception(NoAnswer("engine", _one_line(error), is_final=True))
@@ -169,29 +162,21 @@ class VllmEngine:
     def _step(self, llm: Any) -> None:
         structured = "json_schema" if self.sampling.json_schema else "plain"
         for output in [output for output in llm.llm_engine.step() if output.finished]:
-            answered, reply = self._open.pop(output.request_id), read_output(output, structured)
-            if reply.finish_reason in FINISHED:
-                answered.set_result(reply)
+            answered, completion = self._open.pop(output.request_id), output.outputs[0]
+            num_prompt, num_completion = len(output.prompt_token_ids or ()), len(completion.token_ids)
+            usage = Usage(prompt_tokens=num_prompt, completion_tokens=num_completion)
+            if completion.finish_reason in FINISHED:
+                answered.set_result(Reply(completion.text, usage, structured, completion.finish_reason))
             else:
-                answered.set_exception(NoAnswer("engine", f"it ended with {reply.finish_reason!r}"))
+                answered.set_exception(NoAnswer("engine", f"it ended with {completion.finish_reason!r}"))
 
     def _break(self, error: Exception, *more: Future[Reply]) -> None:
-        self._broken = TeacherError(
-            "the vLLM engine failed",
-            where=self.where,
-            got=f"{type(error).__name__}: {_one_line(error)}",
-            fix="read its messages above, then run the same command again: recorded answers are reused",
-        )
+        got = f"{type(error).__name__}: {_one_line(error)}"
+        fix = "read its messages above, then run the same command again: recorded answers are reused"
+        self._broken = TeacherError("the vLLM engine failed", where=self.where, got=got, fix=fix)
         for answered in (*more, *self._open.values()):
             answered.set_exception(self._broken)
         self._open.clear()
-
-
-def read_output(output: Any, structured: str) -> Reply:
-    """Return the reply of a `vllm.RequestOutput`."""
-    completion = output.outputs[0]
-    usage = Usage(prompt_tokens=len(output.prompt_token_ids or ()), completion_tokens=len(completion.token_ids))
-    return Reply(completion.text, usage, structured, completion.finish_reason)
 
 
 def _one_line(error: Exception) -> str:
