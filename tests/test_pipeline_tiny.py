@@ -15,7 +15,7 @@ from cosfly.formats.captions import read_captions
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.pipeline import run as pipeline
-from cosfly.pipeline.estimate import estimate
+from cosfly.pipeline.runs import estimate
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
 from cosfly.runtime.errors import ConfigError, ResumeError, VerifyError
@@ -83,6 +83,7 @@ def test_every_stage_is_complete_and_adds_up(base):
 def test_a_run_goes_on_by_its_folder_or_its_settings_whatever_is_begun(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(pipeline, "run", lambda cfg, out, **_: asked.append(out) or [])
+    monkeypatch.setattr("cosfly.cli.run.print_run", lambda out: None)
     for number, (config, begun) in enumerate(
         [("", ""), ("", "one/maps"), ("run.yaml", "one/maps"), ("run.yaml", "maps")]
     ):

@@ -5,65 +5,27 @@ Nothing heavy is imported before a command runs, so `cosfly --help` is instant.
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
 import signal
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from cosfly import __version__
-from cosfly.cli.caption import app as caption_app
-from cosfly.cli.distill import app as distill_app
-from cosfly.cli.fly import app as fly_app
-from cosfly.cli.release import app as release_app
-from cosfly.cli.run import app as run_app
-from cosfly.cli.stages import app as stages_app
-from cosfly.cli.studies import app as studies_app
-from cosfly.cli.view import app as view_app
-from cosfly.cli.world import app as world_app
-from cosfly.runtime.errors import CosflyError, plain
+from cosfly.cli.options import app
+from cosfly.runtime.errors import CosflyError
 
 # Exit codes of Ctrl-C, which Typer catches silently, and of SIGTERM.
 ENDED = {130: "interrupted", 143: "terminated"}
 
 log = logging.getLogger(__name__)
 
-
-class _Root(typer.core.TyperGroup):
-    """The root command: explains an invalid value of an option in plain words."""
-
-    def invoke(self, ctx: Any) -> Any:
-        try:
-            return super().invoke(ctx)
-        except typer.BadParameter as error:
-            from pydantic import ValidationError
-
-            if isinstance(error.__cause__, ValidationError):
-                detail = error.__cause__.errors()[0]
-                got = "" if detail["type"] == "value_error" else f", got {detail['input']!r}"
-                error.message = f"{plain(error.message)}{got}"
-            raise
-
-
-app = typer.Typer(
-    cls=_Root,
-    help="Make data sets from 3D maps that teach a vision-language model to follow a person from the air.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-for group in (run_app, stages_app, view_app, world_app, fly_app):
-    app.add_typer(group)  # without a name: its commands are at the top level
-for name, named_group in (
-    ("caption", caption_app),
-    ("distill", distill_app),
-    ("release", release_app),
-    ("study", studies_app),
-):
-    app.add_typer(named_group, name=name)
+for name in ("run", "stages", "caption", "distill", "release"):  # these add their commands, in the order of the help
+    importlib.import_module(f"cosfly.cli.{name}")
 
 
 @app.callback(invoke_without_command=True)

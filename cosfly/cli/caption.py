@@ -9,12 +9,12 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import STAGE, Job, Short, takes
+from cosfly.cli.options import STAGE, Job, Short, choice_of, command
 
 if TYPE_CHECKING:
     from caption.schema import CaptionConfig
 
-app = options.stage_group("Write Chain-of-Cause captions in English and Chinese (step 7).")
+options.add_group("caption")
 
 TEACHERS = "rules, URL of an OpenAI-compatible server, vllm:MODEL_DIR, file:PATH, or student:PATH of `distill infer`."
 TEACHER = Short("caption.teacher", TEACHERS, default="rules")
@@ -22,11 +22,11 @@ MODEL = Short("caption.endpoint.model", "Model name at the server; by default it
 STUDENT = "Folder of `distill train` or `merge`: ask the teacher's model as that student was trained."
 
 
-@app.callback(epilog="cosfly caption --data render --teacher http://localhost:8000")
-@takes(
+@command(
+    "cosfly caption --data render --teacher http://localhost:8000",
     "caption",
     STAGE,
-    **options.choice_of("caption"),
+    **choice_of("caption"),
     teacher=TEACHER,
     as_student=Short("caption.student.folder", STUDENT, Path),
     model=MODEL,
@@ -45,29 +45,19 @@ def caption(
     check: Annotated[bool, Option(help="Test the server before the first request of a directory.")] = True,
 ) -> None:
     """Ask a teacher for the reason of every manoeuvre, verify it against geometry, regenerate, translate (step 7)."""
-    from caption.run import stage
-
     cfg, tree = job.cfg.caption, job.tree(data)
     target = out or tree.resolve().parent / "caption"
     is_student = cfg.student.folder is not None  # it answers one kind of question only
     if check and cfg.teacher_kind == "endpoint" and not is_student and not (target / "answers").exists():
         _examine_endpoint(cfg.teacher, cfg)
-    if plan_only:
-        return _print_forecast(job, tree, target)
-    job.finish(stage.run(cfg, tree, target, seed=job.cfg.seed, retry_failed=retry_failed, **job.worker_options), target)
+    if not plan_only:
+        return job.run("caption.run.stage", cfg, tree, target, retry_failed=retry_failed)
+    forecast = job.call("caption.run.forecast:make_forecast", cfg, tree, target)
+    options.print_table((), forecast, "What this run will take")
 
 
-def _print_forecast(job: Job, tree: Path, target: Path) -> None:
-    from caption.run.forecast import make_forecast
-    from cosfly.runtime.console import console
-
-    forecast = make_forecast(job.cfg.caption, tree, target, seed=job.cfg.seed, resume=job.resume)
-    options.print_table(console, (), forecast, title="What this run will take")
-
-
-@app.command("doctor", epilog="cosfly caption doctor http://localhost:8000")
-@takes("caption", model=MODEL)
-def caption_doctor(job: Job, url: Annotated[str, Argument(help="URL of an OpenAI-compatible server.")]) -> None:
+@command("cosfly caption doctor http://localhost:8000", "caption", model=MODEL)
+def doctor(job: Job, url: Annotated[str, Argument(help="URL of an OpenAI-compatible server.")]) -> None:
     """Test what a server can do: text, images, schema, thinking, context. Exit with 1 if it cannot caption."""
     _examine_endpoint(url, job.cfg.caption)
 
@@ -75,14 +65,12 @@ def caption_doctor(job: Job, url: Annotated[str, Argument(help="URL of an OpenAI
 def _examine_endpoint(url: str, cfg: CaptionConfig) -> None:
     from caption.teachers.doctor import examine_endpoint
     from caption.teachers.prompt_files import vocabulary_of
-    from cosfly.runtime.console import console
 
-    options.print_checks(examine_endpoint(url, cfg, vocabulary_of(cfg)), console, "What the server can do")
+    options.print_checks(examine_endpoint(url, cfg, vocabulary_of(cfg)), "What the server can do")
 
 
-@app.command("prompts", epilog="cosfly caption prompts --export my-prompts")
-@takes("caption")
-def caption_prompts(
+@command("cosfly caption prompts --export my-prompts", "caption")
+def prompts(
     job: Job,
     export: Annotated[Path | None, Option(help="Folder to write the current prompts to.")] = None,
     check: Annotated[Path | None, Option(help="Folder with your own prompts, to be checked.")] = None,
@@ -98,9 +86,11 @@ def caption_prompts(
         raise typer.BadParameter("give either --export DIR or --check DIR")
 
 
-@app.command("judge-check", epilog="cosfly caption judge-check http://localhost:8000")
-@takes("caption", model=Short("caption.judge.model", "Model name at the server; by default its only model."))
-def caption_judge_check(job: Job, url: Annotated[str, Argument(help="URL of the judge's server.")]) -> None:
+JUDGE = Short("caption.judge.model", "Model name at the server; by default its only model.")
+
+
+@command("cosfly caption judge-check http://localhost:8000", "caption", model=JUDGE)
+def judge_check(job: Job, url: Annotated[str, Argument(help="URL of the judge's server.")]) -> None:
     """Measure a judge on a small gold set: agreement, position bias, unparsable answers."""
     import asyncio
 
@@ -115,20 +105,19 @@ def caption_judge_check(job: Job, url: Annotated[str, Argument(help="URL of the 
     console.print(judge_check_table(found))
 
 
-@app.command(
-    "compare-strategies",
-    epilog="cosfly caption compare-strategies --teacher URL --out compared",
-)
-@takes("caption", "seed", **options.choice_of("caption"), teacher=TEACHER, model=MODEL)
-def caption_compare_strategies(
+COMPARE = "cosfly caption compare-strategies --teacher URL --out compared"
+
+
+@command(COMPARE, "caption", "seed", **choice_of("caption"), teacher=TEACHER, model=MODEL)
+def compare_strategies(
     job: Job,
     out: Annotated[Path, Option(help="Folder for compare_strategies.json and the answers.")],
     data: options.Trees = None,
     conflicts: Annotated[int, Option(min=1, help="Stop after so many conflicts.")] = 50,
 ) -> None:
     """Compare hint, multi_sample, anchored and cascade on the same conflicts: consistency, text, requests, tokens."""
-    from caption.run import compare
+    from caption.run.compare import comparison_table
     from cosfly.runtime.console import console
 
-    found = compare.run(job.cfg.caption, job.tree(data), out, seed=job.cfg.seed, conflicts=conflicts)
-    console.print(compare.comparison_table(found))
+    found = job.call("caption.run.compare", job.cfg.caption, job.tree(data), out, conflicts=conflicts)
+    console.print(comparison_table(found))

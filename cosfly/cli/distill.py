@@ -1,4 +1,4 @@
-"""The commands `cosfly distill ...`."""
+"""The commands `cosfly distill ...` of students, and `cosfly fly` and `cosfly leaderboard`, which measure them."""
 
 from __future__ import annotations
 
@@ -9,23 +9,21 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import Job, Short, takes
+from cosfly.cli.options import STAGE, Job, Short, choice_of, command
 
-app = typer.Typer(no_args_is_help=True, help="Train a small student: training set, LoRA, inference, evaluation.")
+options.add_group("distill", "Train a small student: training set, LoRA, inference, evaluation.")
 
 Dataset = Annotated[Path, Option(help="Training set: the output of `distill prepare`.")]
 STUDENTS = "Model folder, repository such as Qwen/Qwen3.5-2B, or random weights: tiny, tiny:small, tiny:medium, random."
 JUDGED = "captions.jsonl of `caption --teacher student:PATH`, one per tree; repeat it."
+LIMIT = Short("distill.prepare.limit", "Windows in all splits, shared by the decisions; 0 for all.", int)
 
 
-@app.command("prepare", epilog="cosfly distill prepare runs/diverse --out dataset")
-@takes(
-    "distill",
-    "seed resume",
-    **options.choice_of("distill.prepare"),
-    limit=Short("distill.prepare.limit", "Windows in all splits, shared by the decisions; 0 for all.", int),
-)
-def distill_prepare(
+@command(
+    "cosfly distill prepare runs/diverse --out dataset", "distill", "seed resume",
+    **choice_of("distill.prepare"), limit=LIMIT,
+)  # fmt: skip
+def prepare(
     job: Job,
     out: options.Out,
     runs: options.Runs = None,
@@ -33,7 +31,6 @@ def distill_prepare(
     data: options.Trees = None,
 ) -> None:
     """Make a training set from the captions of one or more runs, with splits that share no pedestrian."""
-    from distill.prepare import stage as prepare
     from distill.prepare.sources import RunSource
 
     sources = [RunSource.of_run(folder) for folder in runs or []]
@@ -42,24 +39,20 @@ def distill_prepare(
         if len(trees) != len(captions or []):
             raise typer.BadParameter("give one --captions for each --data, or run directories")
         sources += [RunSource.of_files(*files) for files in zip(trees, captions or [], strict=True)]
-    typer.echo(prepare.run(job.cfg.distill.prepare, sources, out, seed=job.cfg.seed, resume=job.resume))
+    job.run("distill.prepare.stage", job.cfg.distill.prepare, sources, out)
 
 
-@app.command("dual-track", epilog="cosfly distill dual-track runs/diverse --out windows")
-@takes("distill", "seed resume")
-def distill_dual_track(job: Job, out: options.Out, runs: options.Runs = None, data: options.Trees = None) -> None:
+@command("cosfly distill dual-track runs/diverse --out windows", "distill", "seed resume")
+def dual_track(job: Job, out: options.Out, runs: options.Runs = None, data: options.Trees = None) -> None:
     """Make windows over clean and perturbed tracks, by split, to learn denoising and prediction from."""
-    from distill.prepare import dual_track
-
     trees = [folder / "render" for folder in runs or []]
     if data or not trees:
         trees += job.trees(data)
-    job.finish(dual_track.run(job.cfg.distill.dual_track, trees, out, seed=job.cfg.seed, resume=job.resume), out)
+    job.run("distill.prepare.dual_track", job.cfg.distill.dual_track, trees, out)
 
 
-@app.command("train", epilog="cosfly distill train --dataset dataset --student Qwen/Qwen3.5-2B --out student")
-@takes("distill", "seed resume")
-def distill_train(
+@command("cosfly distill train --dataset dataset --student Qwen/Qwen3.5-2B --out student", "distill", "seed resume")
+def train(
     job: Job,
     dataset: Dataset,
     student: Annotated[str, Option(help=STUDENTS)],
@@ -67,24 +60,19 @@ def distill_train(
     data: options.Trees = None,
 ) -> None:
     """Train a student, by LoRA or in full, in one process or many (torchrun); resume from its last checkpoint."""
-    from distill.training import stage as train
     from distill.training.ranks import is_first_process
 
-    cfg, trees = job.cfg, job.trees(data)
-    product = train.run(cfg.distill.train, dataset, trees, student, out, seed=cfg.seed, resume=job.resume)
+    product = job.call("distill.training.stage", job.cfg.distill.train, dataset, job.trees(data), student, out)
     if is_first_process():
         typer.echo(product)
 
 
 ENGINE = Short("distill.infer.engine", "transformers, endpoint (a server) or vllm.", default="transformers")
+INFER = "cosfly distill infer --dataset dataset --model Qwen/Qwen3.5-2B --out predictions"
 
 
-@app.command(
-    "infer",
-    epilog="cosfly distill infer --dataset dataset --model Qwen/Qwen3.5-2B --out predictions",
-)
-@takes("distill", "resume", engine=ENGINE)
-def distill_infer(
+@command(INFER, "distill", "resume", engine=ENGINE)
+def infer(
     job: Job,
     dataset: Dataset,
     model: Annotated[str, Option(help="Base model: folder or repository; with --engine endpoint a URL.")],
@@ -93,30 +81,23 @@ def distill_infer(
     data: options.Trees = None,
 ) -> None:
     """Run a student on the samples of a split; resume where it stopped."""
-    from distill.inference import stage as infer
-
-    trees = job.trees(data)
-    product = infer.run(job.cfg.distill.infer, dataset, trees, model, out, adapter=adapter, resume=job.resume)
-    job.finish(product, out)
+    cfg = job.cfg.distill.infer
+    job.run("distill.inference.stage", cfg, dataset, job.trees(data), model, out, adapter=adapter)
 
 
-@app.command("merge", epilog="cosfly distill merge --model models/Qwen3.5-2B --adapter student/adapter --out merged")
-@takes("", "resume")
-def distill_merge(
+@command("cosfly distill merge --model models/Qwen3.5-2B --adapter student/adapter --out merged", names="resume")
+def merge(
     job: Job,
     model: Annotated[Path, Option(help="Folder of the student's base model.")],
     adapter: Annotated[Path, Option(help="Adapter folder, the output of `distill train`.")],
     out: options.Out,
 ) -> None:
     """Merge an adapter into its base: a model folder for transformers, vLLM and servers."""
-    from distill.inference import merge
-
-    typer.echo(merge.run(model, adapter, out, resume=job.resume))
+    job.run("distill.inference.merge", model, adapter, out)
 
 
-@app.command("evaluate", epilog="cosfly distill evaluate --dataset dataset --predictions predictions --out evaluation")
-@takes("distill", "seed resume")
-def distill_evaluate(
+@command("cosfly distill evaluate --dataset dataset --predictions predictions --out scores", "distill", "seed resume")
+def evaluate(
     job: Job,
     dataset: Dataset,
     predictions: Annotated[Path, Option(help="Predictions: the output of `distill infer`.")],
@@ -127,31 +108,78 @@ def distill_evaluate(
     judged: Annotated[list[Path] | None, Option(help=JUDGED)] = None,
 ) -> None:
     """Score predictions: parse rate, decisions, verdicts, BERTScore and evidence, with baselines and intervals."""
-    from distill.evaluation import stage as evaluate
-
-    models = {"en": bertscore_en, "zh": bertscore_zh}
-    product = evaluate.run(
-        job.cfg.distill.evaluate,
-        predictions,
-        dataset,
-        out,
-        bertscore_models={language: folder for language, folder in models.items() if folder is not None},  # type: ignore[misc]
-        data=data or [],
-        judged=judged or [],
-        seed=job.cfg.seed,
-        resume=job.resume,
-    )
-    typer.echo(product)
+    folders = {"en": bertscore_en, "zh": bertscore_zh}
+    models = {language: folder for language, folder in folders.items() if folder is not None}
+    more = {"bertscore_models": models, "data": data or [], "judged": judged or []}
+    job.run("distill.evaluation.stage", job.cfg.distill.evaluate, predictions, dataset, out, **more)
 
 
-@app.command("report", epilog="cosfly distill report evaluation-2B evaluation-4B --out report")
-@takes("", "seed resume")
-def distill_report(
+@command("cosfly distill report evaluation-2B evaluation-4B --out report", names="seed resume")
+def report(
     job: Job,
     evaluations: Annotated[list[Path], Argument(help="Output directories of `distill evaluate`, one per student.")],
     out: options.Out,
 ) -> None:
     """Compare students: the trade-off table, and differences by paired bootstrap over pedestrians."""
-    from distill.evaluation import compare
+    job.run("distill.evaluation.compare", evaluations, out)
 
-    typer.echo(compare.run(evaluations, out, seed=job.cfg.seed, resume=job.resume))
+
+FLOWN = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR; baselines: track_straight, random; ceiling: planner."
+
+
+@command(
+    "cosfly fly --map maps/boxes_3d.json --paths pedestrians/path.json --student rules --out flown",
+    "fly plan render caption distill",
+    STAGE,
+    student=Short("fly.student", FLOWN, default="rules"),
+    as_student=Short("fly.as_student", "Folder of `distill train` or `merge`: the model behind a URL.", Path),
+    adapter=Short("fly.adapter", "Adapter of transformers:MODEL_DIR.", Path),
+)
+def fly(
+    job: Job,
+    out: options.Out,
+    map_: Annotated[Path | None, Option("--map", help="Boxes that are drawn: boxes_3d.json.")] = None,
+    paths: Annotated[Path | None, Option(help="Pedestrian trajectories: path.json.")] = None,
+    env: Annotated[str | None, Option(help="Benchmark instead of map and paths: cosfly/Follow-v0.")] = None,
+    policy: Annotated[str | None, Option(metavar="MODULE:CLASS", help="Policy to import and run.")] = None,
+    simplified: Annotated[Path | None, Option(help="Simplified map for collisions; by default --map.")] = None,
+    others: options.Bystanders = None,
+    relabel: Annotated[Path | None, Option(help="Output of `cosfly fly` to relabel by the planner.")] = None,
+) -> None:
+    """Fly a student in a closed loop: its decisions move the drone, and the new view is drawn."""
+    from cosfly.closed_loop.stage import ClosedLoopConfig
+
+    cfg = job.cfg
+    if policy and (cfg.fly.student != "rules" or "fly.student" in job.given):
+        raise typer.BadParameter("give either --policy or --student")
+    flown = cfg.fly.model_copy(update={"student": f"policy:{policy}"}) if policy else cfg.fly
+    run = ClosedLoopConfig(fly=flown, plan=cfg.plan, render=cfg.render, caption=cfg.caption, infer=cfg.distill.infer)
+    if relabel is not None:
+        if map_ is None or paths or env or policy:
+            raise typer.BadParameter("--relabel takes --map only; its folder holds the rest")
+        job.run("cosfly.closed_loop.relabel", run, relabel, map_, simplified or map_, out)
+    elif env is not None:
+        if map_ or paths or simplified or others:
+            raise typer.BadParameter("--env has its own maps and pedestrians")
+        from cosfly.envs.listed import ListConfig
+
+        job.run("cosfly.envs.listed", ListConfig(**dict(run), env=env), out)
+    elif map_ is None or paths is None:
+        raise typer.BadParameter("give --map and --paths, or --env")
+    else:
+        job.run("cosfly.closed_loop.stage", run, map_, simplified or map_, paths, out, others=others)
+
+
+@command("cosfly leaderboard rules=flown0 student=flown1 --out board", names="seed resume")
+def leaderboard(
+    job: Job,
+    folders: Annotated[list[str], Argument(metavar="[NAME=]DIR...", help="Outputs of `cosfly fly`, by student.")],
+    out: options.Out,
+    rounds: Annotated[bool, Option("--rounds", help="They are rounds of one student, in order.")] = False,
+) -> None:
+    """Compare students: figures with intervals, and frames of their best and worst trajectories."""
+    from cosfly.closed_loop.leaderboard import LeaderboardConfig
+
+    parts = [text.partition("=") if "=" in text else ("", "", text) for text in folders]
+    named = [(name, Path(folder)) for name, _, folder in parts]
+    job.run("cosfly.closed_loop.leaderboard", LeaderboardConfig(rounds=rounds), named, out)

@@ -1,9 +1,10 @@
-"""Shared parts of the commands: `takes`, which adds common options and resolves the settings; option types; tables."""
+"""Shared parts of the commands: `command`, which adds common options and resolves settings; option types; tables."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import logging
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,10 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, cast
 import typer
 from typer import Option
 
-from cosfly.runtime.errors import ConfigError, InputError, nearest
+from cosfly.runtime.errors import ConfigError, InputError, nearest, plain
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
+    from rich.console import RenderableType
 
     from cosfly.pipeline.settings import RunConfig
     from cosfly.runtime.run_dir import Resume, Tally
@@ -29,12 +30,14 @@ Map = Annotated[Path, Option("--map", help="Map of boxes: boxes_3d.json or step2
 MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="Map of boxes: step2_simplified.json.")]
 Simplified = Annotated[Path, Option(help="Simplified map: step2_simplified.json.")]
 Traces = Annotated[Path, Option(help="Drone trajectories: drone_trace.json.")]
-Trees = Annotated[
-    list[Path] | None,
-    Option("--data", show_default="render of this run directory", help="Playback tree; repeat it for several."),
-]
+_TREES_HELP = "Playback tree; repeat it for several."
+Trees = Annotated[list[Path] | None, Option("--data", show_default="render of this run directory", help=_TREES_HELP)]
 Runs = Annotated[list[Path] | None, typer.Argument(help="Run directories of `cosfly run`, all taken together.")]
 Bystanders = Annotated[Path | None, Option("--others", help="Bystanders: others.json, next to path.json.")]
+
+
+def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> Parameter:
+    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option])
 
 
 class Short(NamedTuple):
@@ -50,13 +53,13 @@ class Short(NamedTuple):
     def parameter(self, name: str) -> Parameter:
         names = [f"--{name}"] if self.kind is bool else []
         option = Option(*names, help=self.help, show_default=self.default, metavar=self.metavar)
-        return Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[self.kind | None, option])
+        return _parameter(name, self.kind | None, option)
 
 
-TRACKS = {"clean": ["clean"], "perturbed": ["perturbed"], "both": ["clean", "perturbed"]}
 GLOB_HELP = "Only tracks whose folder, or one above it, matches: 'Town01/trajectory_17*/ORI', 'Town0[12]'; repeat it."
 ENGINE_HELP = "Where workers run: in processes of this machine, or on the nodes of a Ray cluster."
 ADDRESS_HELP = "Head node for --engine ray, or auto; none: $RAY_ADDRESS, or a cluster on this machine."
+RESUME_HELP = "With existing work in the output directory: refuse, or resume if settings and inputs agree."
 SHARED = {
     "seed": Short("seed", "Seed; every random choice derives from it.", int),
     "workers": Short("workers", "Worker processes; 0 takes one per core.", int),
@@ -65,24 +68,21 @@ SHARED = {
 }
 WORKERS = "workers engine address"
 STAGE = f"town seed {WORKERS} resume"  # of a stage that processes items by workers
-PLAIN: dict[str, tuple[Any, Any, Any]] = {  # options that are no settings: type, option and default
-    "config": (Path | None, Option("--config", "-c", help="YAML file with the settings of a run."), None),
-    "overrides": (list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Set a setting; repeat it."), None),
-    "town": (str | None, Option(help="Town of the configuration whose settings and seed are used."), None),
-    "resume": (
-        Literal["never", "if-same"],
-        Option(help="With existing work in the output directory: refuse, or resume if settings and inputs agree."),
-        "if-same",
-    ),
-}
+PLAIN = [  # options that are no settings
+    _parameter("config", Path | None, Option("--config", "-c", help="YAML file with the settings of a run.")),
+    _parameter("overrides", list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Set a setting; repeat it.")),
+    _parameter("town", str | None, Option(help="Town of the configuration whose settings and seed are used.")),
+    _parameter("resume", Literal["never", "if-same"], Option(help=RESUME_HELP), "if-same"),
+]
 
 
-def choice_of(section: str) -> dict[str, Short]:
-    """Return the options --flights and --tracks of the setting `section.flights`."""
-    tracks = Literal["clean", "perturbed", "both"]
+def choice_of(section: str, match: str = "flights.match", tracks: str = "flights.tracks") -> dict[str, Short]:
+    """Return the options --flights and --tracks of two settings of a section."""
+    words = {"clean": ["clean"], "perturbed": ["perturbed"], "both": ["clean", "perturbed"]}
+    kind = Literal["clean", "perturbed", "both"]
     return {
-        "flights": Short(f"{section}.flights.match", GLOB_HELP, list[str], metavar="GLOB"),
-        "tracks": Short(f"{section}.flights.tracks", "Only this track.", tracks, TRACKS, "both"),
+        "flights": Short(f"{section}.{match}", GLOB_HELP, list[str], metavar="GLOB"),
+        "tracks": Short(f"{section}.{tracks}", "Only this track.", kind, words, "both"),
     }
 
 
@@ -98,21 +98,31 @@ class Job:
     resume: Resume = "if-same"
     given: Collection[str] = ()
 
-    @property
-    def worker_options(self) -> dict[str, Any]:
-        """The arguments that all stages with workers take."""
+    def call(self, place: str, *arguments: Any, **more: Any) -> Any:
+        """Call a function, `module` for its `run` or `module:function`, with those of the keyword arguments seed,
+        resume, workers and watch that it takes."""
         from cosfly.pipeline.command_settings import worker_options
 
-        return worker_options(self.cfg) | {"resume": self.resume}
+        module, _, name = place.partition(":")
+        function = getattr(importlib.import_module(module), name or "run")
+        taken = signature(function).parameters.values()
+        takes_all = any(one.kind is Parameter.VAR_KEYWORD for one in taken)
+        options = {"seed": self.cfg.seed, "resume": self.resume, **worker_options(self.cfg)}
+        names = options if takes_all else {one.name for one in taken} & options.keys()
+        return function(*arguments, **{name: options[name] for name in names} | more)
+
+    def run(self, module: str, *arguments: Any, **more: Any) -> None:
+        """Run a stage, whose last argument is its output directory, and finish."""
+        self.finish(self.call(module, *arguments, **more), arguments[-1])
 
     def tree(self, data: list[Path] | None) -> Path:
         """Return the one playback tree that is given, or that of the current run directory."""
-        trees = self.trees(data)
-        if len(trees) > 1:
-            what, got = "this command takes one playback tree", f"{len(trees)}: {', '.join(map(str, trees))}"
+        tree, *others = self.trees(data)
+        if others:
+            what, got = "this command takes one playback tree", f"{len(others) + 1}: {', '.join(map(str, data or ()))}"
             fix = "run it once for each tree; distill and release take the results of several together"
             raise InputError(what, where="--data", got=got, fix=fix)
-        return trees[0]
+        return tree
 
     def trees(self, data: list[Path] | None) -> list[Path]:
         """Return the playback trees that are given, or that of the current run directory."""
@@ -140,56 +150,20 @@ class Job:
             raise InputError(what, where=where, got=str(failed), expected=expected, fix=fix)
 
 
-def takes(sections: str = "", names: str = "", **short: Short) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Add options to a command and resolve its settings; the function takes a Job first.
+class _Root(typer.core.TyperGroup):
+    """The root command: explains an invalid value of an option in plain words."""
 
-    Nothing is done where a command below this one is called.
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            from pydantic import ValidationError
 
-    Args:
-        sections: The sections of the settings that the command uses, separated by blanks; `*` for all.
-        names: Common options, of PLAIN and SHARED, separated by blanks; `config` and `overrides` are always there.
-        short: Further options that set a setting; the function does not get them.
-    """
-    listed = ["config", "overrides", *names.split()]
-    shorts = short | {name: option for name, option in SHARED.items() if name in listed}
-
-    def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        _, *own = signature(function, eval_str=True).parameters.values()
-        own = [one.replace(kind=Parameter.KEYWORD_ONLY) for one in own]
-        taken = [one.name for one in own]
-        plain = [
-            Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option])
-            for name, (kind, option, default) in PLAIN.items()
-            if name in listed and name not in taken
-        ]
-
-        @functools.wraps(function)
-        def command(context: typer.Context, **given: Any) -> None:
-            if context.invoked_subcommand is not None:
-                return
-            extra = {}
-            for name, one in shorts.items():
-                if name not in taken and (value := given[name]) not in (None, []):
-                    extra[one.setting] = one.words.get(value, value) if isinstance(value, str) else value
-            cfg = resolve(given["config"], given["overrides"], extra, None if sections == "*" else sections.split())
-            cfg = _town_of(cfg, given["town"]) if "town" in listed else cfg
-            job = Job(cfg, given["overrides"] or (), given.get("resume", "if-same"), extra)
-            function(job, **{name: _opened(cfg, given[name]) for name in taken})
-
-        settings = [one.parameter(name) for name, one in shorts.items() if name not in taken]
-        context = Parameter("context", Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
-        command.__signature__ = Signature([context, *own, *settings, *plain])  # type: ignore[attr-defined]
-        command.__annotations__ = {}
-        return command
-
-    return decorate
-
-
-def _opened(cfg: RunConfig, given: Any) -> Any:
-    """Return a path, or a list of paths, whose links are followed if the settings say so."""
-    if isinstance(given, list):
-        return [_opened(cfg, one) for one in given]
-    return cfg.opened(given) if isinstance(given, Path) else given
+            if isinstance(error.__cause__, ValidationError):
+                detail = error.__cause__.errors()[0]
+                got = "" if detail["type"] == "value_error" else f", got {detail['input']!r}"
+                error.message = f"{plain(error.message)}{got}"
+            raise
 
 
 class StageGroup(typer.core.TyperGroup):
@@ -202,9 +176,77 @@ class StageGroup(typer.core.TyperGroup):
         return super().parse_args(ctx, args)
 
 
-def stage_group(text: str) -> typer.Typer:
-    """Make the group of a stage; its callback is the stage itself."""
-    return typer.Typer(cls=StageGroup, invoke_without_command=True, help=text)
+app = typer.Typer(
+    cls=_Root,
+    help="Make data sets from 3D maps that teach a vision-language model to follow a person from the air.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+groups: dict[str, typer.Typer] = {}
+
+
+def add_group(name: str, text: str = "") -> None:
+    """Add a group of commands; one without a text is a command itself, the first that is added."""
+    kind: dict[str, Any] = {"cls": StageGroup, "invoke_without_command": True}
+    groups[name] = typer.Typer(**({"help": text, "no_args_is_help": True} if text else kind))
+    app.add_typer(groups[name], name=name)
+
+
+Command = Callable[..., None]
+
+
+def command(example: str, sections: str = "", names: str = "", **short: Short) -> Callable[[Command], Command]:
+    """Add a function as the command of its name, and resolve its settings; the function takes a Job first.
+
+    The command of a group does nothing where a command below it is called.
+
+    Args:
+        example: A command line, with the group's name if the command is in one.
+        sections: The sections of the settings that the command uses, separated by blanks; `*` for all.
+        names: Common options, of PLAIN and SHARED, separated by blanks; `config` and `overrides` are always there.
+        short: Further options that set a setting; the function does not get them.
+    """
+    listed = {"config", "overrides", *names.split()}
+
+    def add(function: Command) -> Command:
+        _, *own = signature(function, eval_str=True).parameters.values()
+        taken = [one.name for one in own]
+        shorts = short | {name: one for name, one in SHARED.items() if name in listed and name not in taken}
+
+        @functools.wraps(function)
+        def called(context: typer.Context, **given: Any) -> None:
+            if context.invoked_subcommand is not None:
+                return
+            extra = {}
+            for name, one in shorts.items():
+                if (value := given[name]) not in (None, []):
+                    extra[one.setting] = one.words.get(value, value) if isinstance(value, str) else value
+            cfg = resolve(given["config"], given["overrides"], extra, None if sections == "*" else sections.split())
+            cfg = _town_of(cfg, given["town"]) if "town" in listed else cfg
+            job = Job(cfg, given["overrides"] or (), given.get("resume", "if-same"), extra)
+            function(job, **{name: _opened(cfg, given[name]) for name in taken})
+
+        called.__signature__ = Signature([  # type: ignore[attr-defined]
+            Parameter("context", Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context),
+            *(one.replace(kind=Parameter.KEYWORD_ONLY) for one in own),
+            *(one.parameter(name) for name, one in shorts.items()),
+            *(one for one in PLAIN if one.name in listed and one.name not in taken),
+        ])  # fmt: skip
+        called.__annotations__ = {}
+        group = groups.get(example.split()[1], app)
+        if group.info.invoke_without_command is True and group.registered_callback is None:
+            return group.callback(epilog=example)(called)
+        return group.command(function.__name__.replace("_", "-"), epilog=example)(called)
+
+    return add
+
+
+def _opened(cfg: RunConfig, given: Any) -> Any:
+    """Return a path, or a list of paths, whose links are followed if the settings say so."""
+    if isinstance(given, list):
+        return [_opened(cfg, one) for one in given]
+    return cfg.opened(given) if isinstance(given, Path) else given
 
 
 def resolve(
@@ -225,8 +267,7 @@ def resolve(
 
     # As YAML, which JSON is: a colon in a text is only a colon.
     extra = [f"{name}={dump_json(str(value) if isinstance(value, Path) else value)}" for name, value in given.items()]
-    assigned = [*(overrides or []), *extra]
-    file = config_file(config)
+    assigned, file = [*(overrides or []), *extra], config_file(config)
     source = " with ".join([*([str(file)] if file else []), *(["--set"] if assigned else [])])
     data = apply_overrides(read_yaml(file) if file else {}, assigned)
     known = {*CommandConfig.model_fields, *(sections or ())}
@@ -243,27 +284,42 @@ def resolve(
 def _town_of(cfg: RunConfig, name: str | None) -> RunConfig:
     """Return the settings of a town; without a name, the settings that all towns share."""
     names = ", ".join(cfg.towns)
-    if name is None:
-        if cfg.towns:
-            log.warning("%s has towns; choose one with --town, of %s: the shared settings are used", cfg.name, names)
-        return cfg
-    if name not in cfg.towns:
+    if name in cfg.towns:
+        return cfg.of_town(name)
+    if name is not None:
         what, expected = f"there is no such town{nearest(name, cfg.towns)}", names or "a configuration with towns"
         raise ConfigError(what, where="--town", got=name, expected=expected)
-    return cfg.of_town(name)
+    if cfg.towns:
+        log.warning("%s has towns; choose one with --town, of %s: the shared settings are used", cfg.name, names)
+    return cfg
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print lines of a command's answer, however long."""
+    from cosfly.runtime.console import answer_console
+
+    for line in lines:
+        answer_console.print(line, soft_wrap=True)
 
 
 def print_table(
-    console: Console,
     head: Sequence[str],
     rows: Iterable[Sequence[RenderableType]],
-    *,
     title: str | None = None,
     left: Sequence[str] = (),
+    *,
+    is_answer: bool = False,
     **style: Any,
 ) -> None:
-    """Print a table. head: names of the columns, or none; `left` and the first column are left-aligned."""
+    """Print a table.
+
+    Args:
+        head: Names of the columns, or none; `left` and the first column are left-aligned.
+        is_answer: It is the command's answer, on stdout; else it goes to stderr, as log lines do.
+    """
     from rich.table import Table
+
+    from cosfly.runtime.console import answer_console, console
 
     style = style if head else {"box": None}
     table = Table(title=title, title_justify="left", show_header=bool(head), **style)
@@ -271,15 +327,16 @@ def print_table(
         table.add_column(name, justify="right" if number and name not in left else "left", overflow="fold")
     for row in rows:
         table.add_row(*row)
-    console.print(table)
+    (answer_console if is_answer else console).print(table)
 
 
-def print_checks(checks: Sequence[Any], console: Console, title: str | None = None) -> None:
+def print_checks(checks: Iterable[Any], title: str | None = None, *, is_answer: bool = False) -> None:
     """Print checks with name, state and detail; exit with 1 where something required does not work."""
     from rich.text import Text
 
     colors = {"ok": "green", "optional": "yellow", "warning": "yellow", "missing": "red", "unusable": "red"}
+    checks = list(checks)
     rows = [(check.name, Text(check.state, colors[check.state]), check.detail) for check in checks]
-    print_table(console, (), rows, title=title)
+    print_table((), rows, title, is_answer=is_answer)
     if any(colors[check.state] == "red" for check in checks):
         raise typer.Exit(1)

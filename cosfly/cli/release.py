@@ -1,4 +1,4 @@
-"""The commands `cosfly release ...`."""
+"""The commands `cosfly release ...` and `cosfly view`."""
 
 from __future__ import annotations
 
@@ -9,22 +9,19 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import WORKERS, Job, Short, takes
+from cosfly.cli.options import WORKERS, Job, Short, choice_of, command
 
-app = typer.Typer(no_args_is_help=True, help="Package captions and frames as a data set that opens with one line.")
-
-Split = Literal["train", "validation", "test"]
+options.add_group("release", "Package captions and frames as a data set that opens with one line.")
 
 
-@app.command("build", epilog="cosfly release build runs/diverse --out release")
-@takes(
+@command(
+    "cosfly release build runs/diverse --out release",
     "release",
     f"{WORKERS} resume",
-    flights=Short("release.flights", options.GLOB_HELP, list[str], metavar="GLOB"),
-    tracks=options.choice_of("release")["tracks"]._replace(setting="release.tracks"),
+    **choice_of("release", "flights", "tracks"),
     frames=Short("release.num_frames", "Frames per track, or all.", words={"all": None}, metavar="N|all"),
 )
-def release_build(
+def build(
     job: Job,
     out: Annotated[Path, Option(help="Release directory.")],
     runs: options.Runs = None,
@@ -33,7 +30,6 @@ def release_build(
     data: options.Trees = None,
 ) -> None:
     """Select frames of one or more runs, join captions, write parquet, data-set card and checksums."""
-    from release.package import stage as package
     from release.package.sources import Source
 
     sources = [Source.of_run(folder) for folder in runs or []]
@@ -41,31 +37,27 @@ def release_build(
         trees = job.trees(data)
         inspections: list[Path | None] = list(inspected) if inspected else [None for _ in trees]
         if not len(trees) == len(captions or []) == len(inspections):
-            raise typer.BadParameter(
-                "give one --captions and at most one --inspect for each --data, or run directories"
-            )
+            what = "give one --captions and at most one --inspect for each --data, or run directories"
+            raise typer.BadParameter(what)
         sources += [Source.of_files(*files) for files in zip(trees, captions or [], inspections, strict=True)]
-    job.finish(package.run(job.cfg.release, sources, out, **job.worker_options), out)
+    job.run("release.package.stage", job.cfg.release, sources, out)
 
 
-@app.command("verify", epilog="cosfly release verify release")
-@takes("", WORKERS)
-def release_verify(
+LEVELS = "structure: names, sizes, records, card. rows: also every row. pixels: also all files."
+
+
+@command("cosfly release verify release", names=WORKERS)
+def verify(
     job: Job,
     folder: Annotated[Path, Argument(help="Release, run directory, playback tree, export, or the hub's cache.")],
-    level: Annotated[
-        Literal["structure", "rows", "pixels"],
-        Option(help="structure: names, sizes, records, card. rows: also every row. pixels: also all files."),
-    ] = "pixels",
+    level: Annotated[Literal["structure", "rows", "pixels"], Option(help=LEVELS)] = "pixels",
     json_file: Annotated[Path | None, Option("--json", help="File for the findings, as JSON.")] = None,
 ) -> None:
     """Check that a release agrees with its records and with geometry. Exit with 1 if anything is wrong."""
     from caption.run.released import read_released
-    from cosfly.pipeline.command_settings import worker_options
     from cosfly.runtime.json_io import write_json
-    from release.verify.verify import verify
 
-    report = verify(folder, level=level, reader=read_released, **worker_options(job.cfg))
+    report = job.call("release.verify.verify:verify", folder, level=level, reader=read_released)
     typer.echo(str(report))
     if json_file is not None:
         write_json(json_file, report.as_json())
@@ -73,52 +65,80 @@ def release_verify(
         raise typer.Exit(1)
 
 
-@app.command("stats", epilog="cosfly release stats release --out stats")
-@takes()
-def release_stats(
+@command("cosfly release stats release --out stats")
+def stats(
     job: Job,
     folder: Annotated[Path, Argument(help="Release directory, or a run directory.")],
     out: Annotated[Path, Option(help="Folder for stats.html, stats.md and stats.json.")],
     pixels: Annotated[int, Option(min=0, help="Frames whose depth and instance pictures are read; 0 for none.")] = 200,
 ) -> None:
     """Compute the paper's tables from the rows of a release, and draw what it covers."""
-    from release.stats import stats
-
-    typer.echo(stats.run(folder, out, pixels=pixels))
+    typer.echo(job.call("release.stats.stats", folder, out, pixels=pixels))
 
 
-@app.command("export", epilog="cosfly release export release --format webdataset --out shards")
-@takes("", f"{WORKERS} resume")
-def release_export(
+FORMATS = (
+    "Playback tree (CosFly-Track v7), WebDataset or LeRobot v3.0; captions alone as a table, JSON lines, or "
+    "conversations for LLaMA-Factory or LLaVA."
+)
+Format = Literal["tree", "webdataset", "lerobot", "csv", "jsonl", "sharegpt", "llava"]
+Split = Literal["train", "validation", "test"]
+
+
+@command("cosfly release export release --format webdataset --out shards", names=f"{WORKERS} resume")
+def export(
     job: Job,
     source: Annotated[Path, Argument(help="Release; for captions also a run directory or captions.jsonl.")],
     out: Annotated[Path, Option(help="Output directory; of captions the file.")],
-    format: Annotated[
-        Literal["tree", "webdataset", "lerobot", "csv", "jsonl", "sharegpt", "llava"],
-        Option(
-            help="Playback tree (CosFly-Track v7), WebDataset or LeRobot v3.0; captions alone as a table, JSON lines, "
-            "or conversations for LLaMA-Factory or LLaVA."
-        ),
-    ],
-    shard_mb: Annotated[int | None, Option(help="Approximate size of a file of many frames, MB.")] = None,
+    format: Annotated[Format, Option(help=FORMATS)],
     language: Annotated[Literal["en", "zh", "both"], Option(help="Captions: languages of the texts.")] = "both",
     frames: Annotated[Literal["all", "last"], Option(help="Conversations: pictures of these frames.")] = "all",
     split: Annotated[Split | None, Option(help="Captions: only this split.")] = None,
     overwrite: Annotated[bool, Option("--overwrite", help="Captions: replace an existing file.")] = False,
 ) -> None:
     """Write a release in another format, without loss, or its accepted captions to one file."""
-    from cosfly.runtime.config import build
-
     if format == "tree" or format == "webdataset" or format == "lerobot":
-        from release.export import stage as export
         from release.export.contract import ExportConfig
 
-        given = {"format": format} | ({} if shard_mb is None else {"shard_mb": shard_mb})
-        cfg = build(ExportConfig, given, "--format, --shard-mb")
-        return job.finish(export.run(cfg, source, out, **job.worker_options), out)
+        return job.run("release.export.stage", ExportConfig(format=format), source, out)
     from release.columns import LANGUAGES
-    from release.export import captions
 
-    languages = LANGUAGES if language == "both" else [language]
-    tally = captions.export(source, out, format, languages=languages, shown=frames, split=split, overwrite=overwrite)
+    choice = {"languages": LANGUAGES if language == "both" else [language], "shown": frames, "split": split}
+    tally = job.call("release.export.captions:export", source, out, format, overwrite=overwrite, **choice)
     typer.echo(f"{out}: {tally}")
+
+
+@command("cosfly view release --out release.html", "inspect", "", **choice_of("inspect"))
+def view(
+    job: Job,
+    source: Annotated[Path, Argument(help="Map (a file), playback tree, run directory or release.")],
+    out: Annotated[Path, Option(help="Page (.html), or of a playback tree a .png or .gif.")],
+    paths: Annotated[Path | None, Option(help="With a map: pedestrian trajectories, path.json.")] = None,
+    traces: Annotated[list[Path] | None, Option(help="With a map: drone_trace.json; repeat it.")] = None,
+    data: Annotated[Path | None, Option(help="With a map: playback tree with the frames of both tracks.")] = None,
+    captions: Annotated[Path | None, Option(help="With a playback tree: its captions.jsonl.")] = None,
+    frame: Annotated[str | None, Option(help="With a .png: the pictures of this frame, or `best`.")] = None,
+    map_: Annotated[Path | None, Option("--map", help="With --frame: boxes_3d.json that was drawn.")] = None,
+    picture_px: Annotated[int, Option(min=32, max=1280, help="Width of a frame on a page, px.")] = 320,
+    max_mb: Annotated[int, Option(min=1, help="Size of a page, MB; frames are omitted to stay below it.")] = 24,
+) -> None:
+    """Make a page or a picture of a map, a playback tree, a run or a release; pages work offline."""
+    size = {"picture_px": picture_px, "max_mb": max_mb}
+    if source.is_file():
+        job.call("cosfly.viz.scene_page", source, out, paths=paths, traces=traces or [], data=data, **size)
+    elif out.suffix in (".png", ".gif"):
+        from cosfly.formats.boxes import read_boxes
+        from cosfly.viz import gallery
+
+        choice = job.cfg.inspect.flights
+        if frame is not None:
+            box_map = None if map_ is None else read_boxes(map_)
+            typer.echo(gallery.four_panels(source, out, frame=None if frame == "best" else frame, box_map=box_map))
+        elif out.suffix == ".png":
+            gallery.contact_sheet(source, out, choice)
+        else:
+            gallery.preview_gif(source, out, choice)
+    else:
+        from release.viewer.page import ViewerConfig, run
+
+        run(source, out, ViewerConfig(**size), captions)
+    typer.echo(f"{out}: {out.stat().st_size / 1e6:,.1f} MB")

@@ -1,4 +1,4 @@
-"""The commands `cosfly run`, `show`, `list`, `bench`, `reproduce`, `doctor` and `config ...`."""
+"""The commands `cosfly run`, `show`, `list`, `bench`, `reproduce`, `doctor`, `config ...` and `study ...`."""
 
 from __future__ import annotations
 
@@ -10,20 +10,17 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import WORKERS, Job, takes
+from cosfly.cli.options import STAGE, WORKERS, Job, command
 
 if TYPE_CHECKING:
-    from cosfly.pipeline.run import StageResult
     from cosfly.pipeline.settings import RunConfig
 
-app = typer.Typer()
 CONFIG = "YAML file, a shipped one (quickstart, showcase, diverse, learning, simworld, delft), or a run directory."
 Until = Literal["maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release"]
 PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 
 
-@app.command(epilog="cosfly run quickstart --out runs/first")
-@takes("*", f"seed {WORKERS} resume")
+@command("cosfly run quickstart --out runs/first", "*", f"seed {WORKERS} resume")
 def run(
     job: Job,
     config: Annotated[Path, Argument(help=CONFIG)],
@@ -40,103 +37,82 @@ def run(
         pipeline.check_with_files(job.cfg)
         return _print_estimate(job.cfg, out)
     results = pipeline.run(job.cfg, out, resume=job.resume, until=until)
-    print_results(results, out)
+    print_run(out)
     job.check_failures({r.stage.name: r.manifest.counts for r in results}, out)
 
 
 def _print_estimate(cfg: RunConfig, out: Path) -> None:
     from caption.run.progress import duration
-    from cosfly.pipeline import estimate
-    from cosfly.runtime.console import answer_console
+    from cosfly.pipeline import runs
 
-    rows, cells = estimate.estimate(cfg, out), []
+    rows, cells = runs.estimate(cfg, out), []
     for row in rows:
         time = "done" if row.is_done else "unknown" if row.seconds is None else duration(row.seconds)
-        cells.append((row.name, row.amount, time, estimate.in_words(row.bytes)))
+        cells.append((row.name, row.amount, time, runs.in_words(row.bytes)))
     title = f"What {out} would take; nothing is written"
-    options.print_table(answer_console, ("stage", "to do", "time", "disk"), cells, title=title)
-    for line in estimate.remarks(cfg, out, rows):
-        answer_console.print(line, soft_wrap=True)
+    options.print_table(("stage", "to do", "time", "disk"), cells, title, is_answer=True)
+    options.print_lines(runs.remarks(cfg, out, rows))
 
 
-def print_results(results: list[StageResult], out: Path) -> None:
-    """Print the closing table of a run, and what to look at."""
-    from cosfly.runtime.console import console
-
-    rows = []
-    for result in results:
-        counts = result.manifest.counts
-        lost = [", ".join(f"{k} {v}" for k, v in reasons.items()) or "-" for reasons in (counts.dropped, counts.failed)]
-        seconds = "before" if result.was_complete else f"{result.manifest.seconds:.1f}"
-        rows.append((result.stage.name, f"{counts.kept} of {counts.input}", *lost, seconds))
-    head = ("stage", "kept", "dropped", "failed", "seconds")
-    options.print_table(console, head, rows, title=f"What was made in {out}", left=("dropped", "failed"))
-    made = (os.path.relpath(result.stage.product, out) for result in results)
-    console.print(f"  made     {', '.join(made)}", soft_wrap=True)  # a path that a table folds cannot be copied
-    pages = [out / name for name in ("viewer.html", "contact_sheet.png", "inspect/report.html")]
-    if is_there := [os.path.relpath(page) for page in pages if page.exists()]:  # several towns have their own
-        console.print(f"  open     {', '.join(is_there)}", soft_wrap=True)
-
-
-@app.command(epilog="cosfly show runs/first")
+@options.app.command(epilog="cosfly show runs/first")
 def show(run: Annotated[Path, Argument(metavar="RUN", help="A run directory.")]) -> None:
     """Show a run: its stages, what they kept, their disk space, and the settings that are not the defaults."""
+    print_run(run, with_settings=True)
+
+
+def print_run(run: Path, *, with_settings: bool = False) -> None:
+    """Print the stages of a run, what to do next, and what to open."""
     from cosfly.formats.inspection import how_to_decide
-    from cosfly.pipeline.estimate import in_words as size
-    from cosfly.pipeline.runs import summarize
-    from cosfly.runtime.console import answer_console
+    from cosfly.pipeline.runs import PAGES, summarize
+    from cosfly.pipeline.runs import in_words as size
+    from cosfly.pipeline.settings_guide import changed
     from cosfly.runtime.json_io import dump_json
 
-    seen = summarize(run)
-    at_work = ", running now" if seen.is_at_work else ""
-    complete = f"{seen.num_complete} of {len(seen.stages)} stages complete"
-    answer_console.print(f"{run}: {seen.cfg.name}, {complete}, {size(seen.size_bytes)}{at_work}")
-    rows = []
+    seen, rows, total = summarize(run), [], 0
     for one in seen.stages:
         seconds, disk = "" if one.seconds is None else f"{one.seconds:.1f}", one.size_bytes
-        tally = "" if one.tally is None else str(one.tally)
-        rows.append((one.name, one.state, tally, seconds, size(disk) if disk else ""))
+        rows.append((one.name, one.state, str(one.tally or ""), seconds, size(disk) if disk else ""))
+        total += disk
+    typer.echo(f"{run}: {seen.cfg.name}, {seen.progress} stages complete, {size(total)}{seen.held}")
     head = ("stage", "state", "items", "seconds", "on disk")
-    options.print_table(answer_console, head, rows, left=("state", "items"), **PLAIN)
-    lines = ["settings that are not the defaults:"] if seen.differing else []
-    lines += [f"  {setting.name} = {dump_json(setting.value)}" for setting in seen.differing]
-    lines += [f"look at  {os.path.relpath(path)}" for path in seen.to_look_at]
+    options.print_table(head, rows, left=("state", "items"), is_answer=True, **PLAIN)
+    differing = changed(seen.cfg) if with_settings else []
+    lines = ["settings that are not the defaults:"] if differing else []
+    lines += [f"  {setting.name} = {dump_json(setting.value)}" for setting in differing]
     for folder, count in seen.waiting().items():
         lines.append(f"review   {count} tracks wait for a decision: {how_to_decide(Path(os.path.relpath(folder)))}")
-    if seen.num_complete < len(seen.stages) and not seen.is_at_work:
+    if not (seen.is_complete or seen.held):
         lines.append(f"resume   cosfly run {os.path.relpath(run)}")
-    for line in lines:
-        answer_console.print(line, soft_wrap=True)
+    if pages := [os.path.relpath(run / name) for name in PAGES if (run / name).exists()]:  # towns have their own
+        lines.append(f"open     {', '.join(pages)}")
+    options.print_lines(lines)
 
 
-@app.command("list", epilog="cosfly list runs")
+@options.app.command("list", epilog="cosfly list runs")
 def list_runs(root: Annotated[Path, Argument(metavar="[DIR]", help="Folder with runs.")] = Path("runs")) -> None:
     """List the runs in a folder: their progress, tracks, captions and size."""
-    from cosfly.pipeline.estimate import in_words as size
-    from cosfly.pipeline.runs import summaries
-    from cosfly.runtime.console import answer_console
+    from cosfly.pipeline.runs import find_runs, summarize
+    from cosfly.pipeline.runs import in_words as size
     from cosfly.runtime.errors import CosflyError
 
     rows, errors = [], []
-    for seen in summaries(root):
-        if isinstance(seen, CosflyError):
-            errors.append(seen)
+    for run in find_runs(root):
+        try:
+            seen = summarize(run)
+        except CosflyError as error:
+            errors.append(f"not readable: {error}")
             continue
-        counts = (str(seen.tally(stage).kept or "") for stage in ("render", "caption"))
+        counts = (str(seen.kept(stage) or "") for stage in ("render", "caption"))
         source = f"{len(seen.cfg.towns)} towns" if seen.cfg.towns else seen.cfg.maps.source
-        stages, state = f"{seen.num_complete} of {len(seen.stages)}", "running" if seen.is_at_work else ""
-        rows.append((os.path.relpath(seen.path, root), source, stages, *counts, size(seen.size_bytes), state))
+        state = seen.held.lstrip(", ")
+        rows.append((os.path.relpath(run, root), source, seen.progress, *counts, size(seen.size_bytes), state))
     head = ("run", "map", "stages", "tracks", "captions", "on disk", "")
     if rows:
-        options.print_table(answer_console, head, rows, left=("map", "stages", ""), **PLAIN)
-    else:
-        answer_console.print(f"there are no runs in {root}")
-    for error in errors:
-        answer_console.print(f"not readable: {error}", soft_wrap=True)
+        options.print_table(head, rows, left=("map", "stages", ""), is_answer=True, **PLAIN)
+    options.print_lines(errors if rows else [f"there are no runs in {root}", *errors])
 
 
-@app.command(epilog="cosfly bench runs/first --stage render --workers 1,2 --out bench")
-@takes("*", "engine address")
+@command("cosfly bench runs/first --stage render --workers 1,2 --out bench", "*", "engine address")
 def bench(
     job: Job,
     config: Annotated[Path, Argument(metavar="RUN", help="Run directory that is finished up to the stage.")],
@@ -148,19 +124,17 @@ def bench(
     from rich.box import SIMPLE_HEAD
 
     from cosfly.pipeline import bench as benchmark
-    from cosfly.runtime.console import console
 
     counts = [int(word) if word.isdecimal() else 0 for word in workers.split(",")]
     if min(counts) < 1:
         raise typer.BadParameter("give whole numbers from 1 up, separated by commas", param_hint="'--workers'")
     measured = benchmark.run(job.cfg, config, out, stage, counts)
     for title, (head, *rows) in benchmark.tables(measured).items():  # the widest fits eighty columns
-        options.print_table(console, head, rows, title=title, box=SIMPLE_HEAD, padding=0, show_edge=False)
+        options.print_table(head, rows, title, box=SIMPLE_HEAD, padding=0, show_edge=False)
     typer.echo(out)
 
 
-@app.command(epilog="cosfly reproduce runs/first")
-@takes("*", f"{WORKERS} resume")
+@command("cosfly reproduce runs/first", "*", f"{WORKERS} resume")
 def reproduce(
     job: Job,
     config: Annotated[Path, Argument(metavar="[RUN]", help="Run directory; of several towns, that of one.")] = Path(),
@@ -168,30 +142,24 @@ def reproduce(
     pedestrians: Annotated[int, Option(min=1, help="Number that planners are measured on.")] = 20,
 ) -> None:
     """Compare the paper's tables and figures with those of one run, on one page. Repeat the command to resume."""
-    from cosfly.pipeline import reproduce as reproduction
-
     out = out or config / "reproduce"
-    typer.echo(reproduction.run(job.cfg, config, out, pedestrians=pedestrians, resume=job.resume))
+    typer.echo(job.call("cosfly.pipeline.reproduce", job.cfg, config, out, pedestrians=pedestrians))
 
 
-config_app = typer.Typer(no_args_is_help=True, help="Check and show configurations.")
-app.add_typer(config_app, name="config")
+options.add_group("config", "Check and show configurations.")
 
 
-@config_app.command("check", epilog="cosfly config check quickstart")
-@takes("*")
-def config_check(job: Job, config: Annotated[Path, Argument(help="YAML file, or the name of a shipped one.")]) -> None:
+@command("cosfly config check quickstart", "*")
+def check(job: Job, config: Annotated[Path, Argument(help="YAML file, or the name of a shipped one.")]) -> None:
     """Check a configuration without running it: report all problems, also missing files and licences."""
-    from cosfly.pipeline import estimate
-    from cosfly.pipeline import run as pipeline
+    from cosfly.pipeline.run import check_with_files
+    from cosfly.pipeline.runs import caveats
 
-    pipeline.check_with_files(job.cfg)
-    for line in estimate.caveats(job.cfg):
-        typer.echo(line)
-    typer.echo(f"{config}: ok")
+    check_with_files(job.cfg)
+    options.print_lines([*caveats(job.cfg), f"{config}: ok"])
 
 
-@config_app.command("show", epilog="cosfly config show --describe plan")
+@options.groups["config"].command("show", epilog="cosfly config show --describe plan")
 def config_show(
     config: Annotated[str | None, Argument(help="YAML file, a shipped name, or a section; none: defaults.")] = None,
     section: Annotated[str | None, Argument(help="Only this section or setting, such as plan.muco.")] = None,
@@ -204,7 +172,6 @@ def config_show(
 
     from cosfly.pipeline import settings_guide
     from cosfly.runtime.config import shipped
-    from cosfly.runtime.console import answer_console
 
     if section is None and config is not None:
         path = Path(config)
@@ -213,17 +180,77 @@ def config_show(
     cfg = options.resolve(None if config is None else Path(config), overrides)
     explained = (settings_guide.changed if changed else settings_guide.explain)(cfg, section)
     if describe:
-        for line in settings_guide.as_lines(explained):
-            answer_console.print(line)
+        options.print_lines(settings_guide.as_lines(explained))
     else:
         values = settings_guide.nested(explained)
         typer.echo(yaml.safe_dump(values, sort_keys=False, allow_unicode=True), nl=False)
 
 
-@app.command(epilog="cosfly doctor")
+@options.app.command(epilog="cosfly doctor")
 def doctor(out: Annotated[Path, Option(help="Folder that runs will be written to.")] = Path("runs")) -> None:
     """Check what works on this machine: GL, GPU, packages, disk. Exit with 1 if the main job cannot run."""
-    from cosfly.pipeline import doctor as examination
-    from cosfly.runtime.console import answer_console
+    from cosfly.pipeline.doctor import examine
 
-    options.print_checks(examination.examine(out), answer_console)
+    options.print_checks(examine(out), is_answer=True)
+
+
+options.add_group("study", "Compare depth formats, weathers and levels of zoom on the same frames and trajectories.")
+
+
+@command("cosfly study depth --data render --out depth")
+def depth(
+    job: Job,
+    out: Annotated[Path, Option(help="Folder for depth_study.json, depth_study.md and depth_study.png.")],
+    data: options.Trees = None,
+    frame: Annotated[Path | None, Option(help="Frame folder in the tree, or a .npy in metres.")] = None,
+) -> None:
+    """Compare ways to store the depth of one frame: errors, entropy, edges and size."""
+    from cosfly.viz.gallery import best_frame, frame_in
+
+    if frame is None:
+        frame = best_frame(job.tree(data), "depth.npy")
+    elif data and not frame.exists():
+        frame = frame_in(job.tree(data), frame)
+    job.call("cosfly.studies.depth", frame, out)
+    typer.echo(out / "depth_study.md")
+
+
+@command("cosfly study weather --map boxes_3d.json --traces drone_trace.json --out weather", "render", "seed")
+def weather(
+    job: Job,
+    map_: options.Map,
+    traces: options.Traces,
+    out: Annotated[Path, Option(help="Folder for weather_gallery.jpg and weather_sheet.jpg.")],
+    frame: Annotated[int | None, Option(show_default="looks down least", help="Index of a frame of the first.")] = None,
+    fov: Annotated[float, Option(min=1.0, max=169.0, help="Horizontal field of view, degrees.")] = 67.38,
+) -> None:
+    """Draw one view under every weather and time of day: nine pictures, and a sheet of all."""
+    from cosfly.formats.weather import TIMES, WEATHERS
+    from cosfly.runtime.console import progress_bar
+
+    view = {"frame": frame, "fov_deg": fov}
+    with progress_bar("study weather: pictures", len(WEATHERS) * len(TIMES)) as advance:
+        cfg, files = job.cfg.render, (map_, traces, out)
+        product = job.call("cosfly.studies.weather", cfg, *files, **view, advance=lambda: advance(1))
+    for path in product:
+        typer.echo(path)
+
+
+@command("cosfly study zoom --map boxes.json --simplified map.json --traces traces.json --out zoom", "render", STAGE)
+def zoom(
+    job: Job,
+    map_: options.Map,
+    simplified: options.Simplified,
+    traces: options.Traces,
+    out: options.Out,
+    every: Annotated[int, Option(min=1, max=100, help="Draw one of this many frames.")] = 2,
+) -> None:
+    """Compare levels of zoom on the same trajectories: target size, visibility, track quality; optical and digital."""
+    from cosfly.runtime.json_io import read_object
+    from cosfly.studies import zoom
+
+    cfg = job.cfg.render
+    product = job.call("cosfly.studies.zoom", cfg, map_, simplified, traces, out, every=every)
+    table = zoom.text_table(read_object(product, what="zoom study"))
+    options.print_table(table.columns, table.rows, table.title)
+    job.finish(product, zoom.tree_of(out, max(cfg.fovs_deg)))

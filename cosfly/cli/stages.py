@@ -1,43 +1,85 @@
-"""The commands of steps 1 to 6: `cosfly maps`, `simplify`, `pedestrians`, `roi`, `plan`, `render` and `inspect`."""
+"""The commands of steps 1 to 6: `cosfly world`, `maps`, `simplify`, `pedestrians`, `roi`, `plan`, `render` ..."""
 
 from __future__ import annotations
 
+import re
+import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import STAGE, WORKERS, Job, Short, takes
+from cosfly.cli.options import STAGE, WORKERS, Job, Short, choice_of, command, resolve
 
-app = typer.Typer()
+for stage in ("maps", "plan", "inspect"):
+    options.add_group(stage)
+options.add_group("roi", "Draw the region of interest for pedestrians.")
 
 Paths = Annotated[Path, Option(help="Pedestrian trajectories: path.json.")]
 PathsArgument = Annotated[Path, Argument(metavar="PATHS", help="Pedestrian trajectories: path.json.")]
 Planners = Annotated[list[str] | None, Option("--planner", show_default="all", help="Planner to compare; repeat it.")]
 SOURCE = Short("maps.source", "synthetic, simworld, cityjson, boxes, carla or unrealcv.")
+ROI = Short("roi", "Region of interest: roi_polygon.json.", Path)
 BACKEND = Short("render.backend", "Renderer: gl, pyrender, carla or unrealcv.")
 
-maps_app = options.stage_group("Make a map of boxes (step 1).")
-app.add_typer(maps_app, name="maps")
 
-
-@maps_app.callback(epilog="cosfly maps --source synthetic --out maps")
-@takes(
-    "maps", "town seed resume", source=Short("maps.source", "synthetic, simworld, cityjson, boxes, carla or unrealcv.")
+@command(
+    'cosfly world "a small village by a river" --out village',
+    "world",
+    f"seed {WORKERS} resume",
+    planner=Short("world.planner", "Language model that plans the world; none: embedded rules.", metavar="URL"),
+    model=Short("world.model", "Name of the language model."),
 )
+def world(
+    job: Job,
+    prompt: Annotated[str, Argument(help="The world, in plain English.")],
+    out: Annotated[Path | None, Option(show_default="worlds/<prompt>-<time>", help="New folder.")] = None,
+    count: Annotated[int, Option(min=1, max=1000, help="Number of worlds, each with its own seed.")] = 1,
+    run: Annotated[bool, Option("--run", help="Also make a data set in it, as `cosfly run` does.")] = False,
+) -> None:
+    """Make a world from text: SimWorld's combined_world.json of the town that a prompt describes."""
+    from cosfly.runtime.config import build
+
+    words = "-".join(re.findall(r"[a-z0-9]+", prompt.lower())[:5]) or "world"
+    out = out or Path("worlds") / f"{words[:40]}-{time.strftime('%Y%m%d-%H%M%S')}"
+    cfg = build(type(job.cfg.world), job.cfg.world.model_dump() | {"prompt": prompt}, "world")
+    folders = [out] if count == 1 else [out / f"world_{number:03}" for number in range(count)]
+    seeds = range(job.cfg.seed, job.cfg.seed + count)
+    for seed, folder in zip(seeds, folders, strict=True):
+        job.run("cosfly.worldgen.stage", cfg, folder, seed=seed)
+    if run:
+        for seed, folder in zip(seeds, folders, strict=True):
+            _make_data_set(job, folder, seed)
+
+
+def _make_data_set(job: Job, folder: Path, seed: int) -> None:
+    """Run all stages on a world, with a region of interest that is proposed from the simplified map."""
+    from cosfly.cli.run import print_run
+    from cosfly.pedestrians.roi_editor import run_propose
+    from cosfly.pipeline import run as pipeline
+    from cosfly.worldgen.stage import LOOP_FILE
+
+    out, roi, own = folder / "run", folder / "run/roi_polygon.json", job.cfg
+    given = {"workers": own.workers, "engine": own.engine, "ray.address": own.ray.address, "seed": seed, "roi": roi}
+    cfg = resolve(folder / LOOP_FILE, job.overrides, given)
+    for first in pipeline.stages(cfg, out)[:2]:
+        first.work()
+    if not roi.exists():
+        run_propose(out / "simplify/step2_simplified.json", cfg.pedestrians, roi)
+    pipeline.run(cfg, out)
+    print_run(out)
+
+
+@command("cosfly maps --source synthetic --out maps", "maps", "town seed resume", source=SOURCE)
 def maps(job: Job, out: options.Out) -> None:
-    """Make boxes_3d.json from a map source (step 1)."""
-    from cosfly.maps import stage
-
-    cfg = job.cfg
-    job.finish(stage.run(cfg.maps, out, seed=cfg.seed, resume=job.resume, follow_links=cfg.follow_links), out)
+    """Make boxes_3d.json, a map of boxes, from a map source (step 1)."""
+    job.run("cosfly.maps.stage", job.cfg.maps, out, follow_links=job.cfg.follow_links)
 
 
-@maps_app.command("roi-backdrop", epilog="cosfly maps roi-backdrop --map maps/boxes_3d.json --out above.png")
-@takes("render", "seed", backend=BACKEND)
-def maps_roi_backdrop(
+@command("cosfly maps roi-backdrop --map boxes_3d.json --out above.png", "render", "seed", backend=BACKEND)
+def roi_backdrop(
     job: Job,
     map_: options.Map,
     out: Annotated[Path, Option(help="PNG to write, with its world frame in a JSON file next to it.")],
@@ -48,38 +90,24 @@ def maps_roi_backdrop(
     pixels_per_m: Annotated[float, Option(min=0.01, max=100, help="Scale.")] = 4.0,
 ) -> None:
     """Draw the map from above with a renderer, for `roi edit --backdrop`."""
-    from cosfly.render import backdrop
-
-    cfg = job.cfg
-    typer.echo(backdrop.run(cfg.render, map_, out, bounds_m=bounds, pixels_per_m=pixels_per_m, seed=cfg.seed))
+    drawing = {"bounds_m": bounds, "pixels_per_m": pixels_per_m}
+    typer.echo(job.call("cosfly.render.backdrop", job.cfg.render, map_, out, **drawing))
 
 
-@app.command(epilog="cosfly simplify --map maps/boxes_3d.json --out simplify")
-@takes("simplify", "town resume")
+@command("cosfly simplify --map maps/boxes_3d.json --out simplify", "simplify", "town resume")
 def simplify(job: Job, map_: options.Map, out: options.Out) -> None:
     """Merge, crop and prune boxes_3d.json into step2_simplified.json (step 2)."""
-    from cosfly.simplify import stage
-
-    job.finish(stage.run(job.cfg.simplify, map_, out, resume=job.resume), out)
+    job.run("cosfly.simplify.stage", job.cfg.simplify, map_, out)
 
 
-@app.command(epilog="cosfly pedestrians --map simplify/step2_simplified.json --out pedestrians")
-@takes("pedestrians", STAGE, roi=Short("roi", "Region of interest: roi_polygon.json.", Path))
+@command("cosfly pedestrians --map step2_simplified.json --out pedestrians", "pedestrians", STAGE, roi=ROI)
 def pedestrians(job: Job, map_: options.Map, out: options.Out) -> None:
     """Plan pedestrian trajectories of 50 to 100 m on the simplified map, path.json (step 3)."""
-    from cosfly.pedestrians import stage
-
-    product = stage.run(job.cfg.pedestrians, map_, out, seed=job.cfg.seed, roi=job.cfg.roi, **job.worker_options)
-    job.finish(product, out)
+    job.run("cosfly.pedestrians.stage", job.cfg.pedestrians, map_, out, roi=job.cfg.roi)
 
 
-roi_app = typer.Typer(help="Draw the region of interest for pedestrians.", no_args_is_help=True)
-app.add_typer(roi_app, name="roi")
-
-
-@roi_app.command("edit", epilog="cosfly roi edit simplify/step2_simplified.json --roi roi_polygon.json")
-@takes("pedestrians", "town")
-def roi_edit(
+@command("cosfly roi edit simplify/step2_simplified.json --roi roi_polygon.json", "pedestrians", "town")
+def edit(
     job: Job,
     map_: options.MapArgument,
     roi: Annotated[Path, Option(help="Region to edit, if it exists, and to save.")] = Path("roi_polygon.json"),
@@ -87,94 +115,74 @@ def roi_edit(
     port: Annotated[int, Option(min=0, max=65535, help="Port on this machine; 0 takes a free one.")] = 0,
 ) -> None:
     """Edit the region of interest on a local page, over the planning grid; end with Ctrl-C."""
-    from cosfly.pedestrians.roi_editor import open_editor
-
-    server = open_editor(map_, job.cfg.pedestrians, roi, port, backdrop)
+    server = job.call("cosfly.pedestrians.roi_editor:open_editor", map_, job.cfg.pedestrians, roi, port, backdrop)
     typer.echo(f"open {server.address}")
     server.serve()
 
 
-@roi_app.command("propose", epilog="cosfly roi propose simplify/step2_simplified.json --out roi_polygon.json")
-@takes("pedestrians", "town")
-def roi_propose(
+@command("cosfly roi propose simplify/step2_simplified.json --out roi_polygon.json", "pedestrians", "town")
+def propose(
     job: Job, map_: options.MapArgument, out: Annotated[Path, Option(help="Region to write: roi_polygon.json.")]
 ) -> None:
     """Write the outline of the walkable ground as a first region, to edit with `cosfly roi edit`."""
-    from cosfly.pedestrians.roi_editor import run_propose
-
-    typer.echo(run_propose(map_, job.cfg.pedestrians, out))
+    typer.echo(job.call("cosfly.pedestrians.roi_editor:run_propose", map_, job.cfg.pedestrians, out))
     typer.echo(out)
 
 
-plan_app = options.stage_group("Plan drone trajectories (step 4).")
-app.add_typer(plan_app, name="plan")
-
-
-@plan_app.callback(epilog="cosfly plan --map simplify/step2_simplified.json --paths pedestrians/path.json --out plan")
-@takes("plan", STAGE)
+@command("cosfly plan --map simplified.json --paths pedestrians/path.json --out plan", "plan", STAGE)
 def plan(job: Job, map_: options.Map, paths: Paths, out: options.Out) -> None:
     """Plan a drone trajectory for each pedestrian, drone_trace.json (step 4)."""
-    from cosfly.planners import stage
-
-    job.finish(stage.run(job.cfg.plan, map_, paths, out, seed=job.cfg.seed, **job.worker_options), out)
+    job.run("cosfly.planners.stage", job.cfg.plan, map_, paths, out)
 
 
-@plan_app.command("compare", epilog="cosfly plan compare step2_simplified.json path.json --out compare")
-@takes("plan", STAGE)
-def plan_compare(
+@command("cosfly plan compare step2_simplified.json path.json --out compare", "plan", STAGE)
+def compare(
     job: Job, map_: options.MapArgument, paths: PathsArgument, out: options.Out, planner: Planners = None
 ) -> None:
     """Compare planners on the same pedestrians, against the first: tables, compare.json, trajectories, pictures.
 
     TA*+Smooth is the paper's search with our smoothing, MuCO the paper's objective with our step."""
     from cosfly.planners import compare
-    from cosfly.runtime.config import build
-    from cosfly.runtime.console import console
 
-    settings = job.cfg.plan.model_dump() | ({"planners": planner} if planner else {})
-    cfg = build(compare.CompareConfig, settings, "--planner")
-    product = compare.run(cfg, map_, paths, out, seed=job.cfg.seed, **job.worker_options)
+    product = job.call("cosfly.planners.compare", _comparison(job, compare.CompareConfig, planner), map_, paths, out)
     for table in compare.text_tables(product):
-        options.print_table(console, table.columns, table.rows, title=table.title)
+        options.print_table(table.columns, table.rows, table.title)
     typer.echo(product)
 
 
-@plan_app.command("benchmark", epilog="cosfly plan benchmark step2_simplified.json path.json --out benchmark")
-@takes("plan", STAGE)
-def plan_benchmark(
-    job: Job,
-    map_: options.MapArgument,
-    paths: PathsArgument,
-    out: options.Out,
-    scenarios: Annotated[int, Option(help="Number of pedestrians, the first of the file.")] = 20,
-    planner: Planners = None,
+def _comparison(job: Job, model: Any, planners: list[str] | None) -> Any:
+    """Return the settings of a comparison of planners."""
+    from cosfly.runtime.config import build
+
+    return build(model, job.cfg.plan.model_dump() | ({"planners": planners} if planners else {}), "--planner")
+
+
+@command("cosfly plan benchmark step2_simplified.json path.json --out benchmark", "plan", STAGE)
+def benchmark(
+    job: Job, map_: options.MapArgument, paths: PathsArgument, out: options.Out, planner: Planners = None
 ) -> None:
     """Compare the paper's 14 planners and ours: tables with intervals, benchmark.json, figures.
 
     TA*+Smooth is the paper's search with our smoothing, MuCO the paper's objective with our step."""
     from cosfly.planners import benchmark
     from cosfly.planners.contract import title_of
-    from cosfly.runtime.config import build
     from cosfly.runtime.console import console
     from cosfly.runtime.json_io import read_object
 
-    settings = job.cfg.plan.model_dump() | {"scenarios": scenarios} | ({"planners": planner} if planner else {})
-    cfg = build(benchmark.BenchmarkConfig, settings, "plan benchmark")
-    product = benchmark.run(cfg, map_, paths, out, seed=job.cfg.seed, **job.worker_options)
+    cfg = _comparison(job, benchmark.BenchmarkConfig, planner)
+    product = job.call("cosfly.planners.benchmark", cfg, map_, paths, out)
     found = read_object(product, what=benchmark.FORMAT.what)
     table = next(benchmark.text_tables(found))
-    narrow = [[row[k] for k in (0, 1, 5, 6, 7)] for row in (table.columns, *table.rows)]  # fits eighty columns
-    options.print_table(console, narrow[0], narrow[1:], title=table.title)
+    head, *rows = [[row[k] for k in (0, 1, 5, 6, 7)] for row in (table.columns, *table.rows)]  # fits eighty columns
+    options.print_table(head, rows, table.title)
     for name, note in found["notes"].items():
         console.print(f"{title_of(name)}: {note}")
     console.print(f"all tables: {out / 'benchmark.md'}")
     typer.echo(product)
 
 
-@app.command(
-    epilog="cosfly render --map boxes_3d.json --simplified step2_simplified.json --traces drone_trace.json --out render"
-)
-@takes(
+@command(
+    "cosfly render --map boxes_3d.json --simplified step2_simplified.json --traces drone_trace.json --out render",
     "render",
     STAGE,
     backend=BACKEND,
@@ -205,7 +213,6 @@ def render(
     gif_name: Annotated[str, Option(help="File name of the animation, in the output directory.")] = "preview.gif",
 ) -> None:
     """Render RGB, depth and instance frames of the clean and the perturbed track (step 5)."""
-    from cosfly.render import stage
     from cosfly.render.settings import RenderConfig
     from cosfly.runtime.config import build
     from cosfly.runtime.io import inside
@@ -215,18 +222,18 @@ def render(
     modalities: list[str] = [name for name in job.cfg.render.modalities if wanted.get(name) is not False]
     modalities += [name for name, is_wanted in wanted.items() if is_wanted and name not in modalities]
     cfg = build(RenderConfig, job.cfg.render.model_dump() | {"modalities": modalities}, "render")
-    product = stage.run(cfg, map_, simplified, traces, out, seed=job.cfg.seed, others=others, **job.worker_options)
+    product = job.call("cosfly.render.stage", cfg, map_, simplified, traces, out, others=others)
     if gif:
         preview_gif(product, inside(out, gif_name), frames_per_s=gif_fps)
     job.finish(product, out)
 
 
-inspect_app = options.stage_group("Accept, review or reject every track (step 6).")
-app.add_typer(inspect_app, name="inspect")
-
-
-@inspect_app.callback(epilog="cosfly inspect --map step2_simplified.json --traces drone_trace.json --out inspect")
-@takes("inspect", f"town {WORKERS} resume", **options.choice_of("inspect"))
+@command(
+    "cosfly inspect --map step2_simplified.json --traces drone_trace.json --out inspect",
+    "inspect",
+    f"town {WORKERS} resume",
+    **choice_of("inspect"),
+)
 def inspect(
     job: Job,
     out: options.Out,
@@ -235,19 +242,16 @@ def inspect(
     data: options.Trees = None,
 ) -> None:
     """Accept, route to review or reject every track; write inspect.json and an HTML report (step 6)."""
-    from cosfly.inspection import stage
-
-    job.finish(stage.run(job.cfg.inspect, map_, traces, job.tree(data), out, **job.worker_options), out)
+    job.run("cosfly.inspection.stage", job.cfg.inspect, map_, traces, job.tree(data), out)
 
 
 TRACK_HELP = "a track, or all tracks of a trajectory; repeat it."
 
 
-@inspect_app.command(
-    "review",
-    epilog="cosfly inspect review --inspect inspect --accept trajectory_1 --by me --reason clear",
+@options.groups["inspect"].command(
+    epilog="cosfly inspect review --inspect inspect --accept trajectory_1 --by me --reason clear"
 )
-def inspect_review(
+def review(
     folder: Annotated[Path, Option("--inspect", help="Output directory of the inspection, or its inspect.json.")],
     accept: Annotated[list[str] | None, Option(metavar="TRACK", help=f"Accept {TRACK_HELP}")] = None,
     reject: Annotated[list[str] | None, Option(metavar="TRACK", help=f"Reject {TRACK_HELP}")] = None,

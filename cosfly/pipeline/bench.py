@@ -51,16 +51,6 @@ class BenchRun(BaseModel):
         return self.successful / self.seconds
 
 
-class StageRow(BaseModel):
-    """The watchdog's figures of a stage. launches: worker processes; modes: how workers were lost."""
-
-    stage: str
-    launches: int
-    restarts: int
-    seconds: float
-    modes: dict[str, int]
-
-
 class Bench(BaseModel):
     """`bench.json`: one row for each number of workers."""
 
@@ -80,13 +70,9 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
     if out.exists() and any(out.iterdir()):
         raise ResumeError("the output directory is not empty", where=out, fix="choose another --out")
     if stage == "caption" and (cfg.caption.teacher_kind not in EMBEDDED or cfg.caption.judge.url):
-        raise ConfigError(
-            "captions that a server writes do not depend on the number of workers",
-            where="caption.teacher",
-            got=cfg.caption.teacher,
-            expected="an embedded teacher and no judge",
-            fix="--set caption.teacher=rules",
-        )
+        what, expected = "captions of a server do not depend on the number of workers", "an embedded teacher, no judge"
+        where, got, fix = "caption.teacher", cfg.caption.teacher, "--set caption.teacher=rules"
+        raise ConfigError(what, where=where, got=got, expected=expected, fix=fix)
     rows = [_measure(cfg, run_folder, out / f"workers_{count}", stage, count) for count in sorted(set(workers))]
     bench = Bench(stage=stage, cores=len(os.sched_getaffinity(0)), rows=rows)
     write_model(out / "bench.json", bench, FORMAT)
@@ -126,17 +112,12 @@ def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_fram
     )
 
 
-def stage_rows(run_folder: Path, names: Iterable[str]) -> list[StageRow]:
-    """Return the watchdog's figures of the finished stages of a run."""
-    rows = []
-    for name in names:
-        folder = run_folder / name
-        if (folder / "manifest.json").is_file():
-            counts = Counter(event.event for event in read_events(folder))
-            restarts, modes = counts["restarted"], {mode: n for mode, n in counts.items() if mode in LOSSES}
-            launches, seconds = counts["worker_started"] + restarts, read_manifest(folder).seconds
-            rows.append(StageRow(stage=name, launches=launches, restarts=restarts, seconds=seconds, modes=modes))
-    return rows
+def watched(folder: Path) -> tuple[int, int, float, dict[str, int]]:
+    """Return the watchdog's figures of a finished stage: worker processes, restarts, seconds, and losses by kind."""
+    counts = Counter(event.event for event in read_events(folder))
+    losses: dict[str, int] = {kind: count for kind, count in counts.items() if kind in LOSSES}
+    restarts = counts["restarted"]
+    return counts["worker_started"] + restarts, restarts, read_manifest(folder).seconds, losses
 
 
 def tables(bench: Bench) -> dict[str, list[tuple[str, ...]]]:
@@ -144,28 +125,14 @@ def tables(bench: Bench) -> dict[str, list[tuple[str, ...]]]:
 
     The first row of a table is its head, the first column is a name.
     """
-    unit, first = "frames" if bench.stage == "render" else "items", bench.rows[0].per_s
-    head = (
-        "workers",
-        "wall s",
-        "attempted",
-        "successful",
-        f"{unit}/s",
-        "speed-up",
-        "cores",
-        "MiB",
-        "restarts",
-        "failed",
-    )
-    rows = [
-        (
-            str(row.workers), f"{row.seconds:.1f}", str(row.attempted), str(row.successful), f"{row.per_s:.2f}",
-            f"{row.per_s / first:.2f}x", f"{row.cores_used:.2f}", f"{row.peak_memory_mib:.0f}", str(row.restarts),
-            str(row.failed),
-        )
-        for row in bench.rows
-    ]  # fmt: skip
-    found: dict[str, list[tuple[str, ...]]] = {f"{bench.stage} on {bench.cores} cores": [head, *rows]}
+    rate, first = "frames/s" if bench.stage == "render" else "items/s", bench.rows[0].per_s
+    columns = {
+        "workers": "{0.workers}", "wall s": "{0.seconds:.1f}", "attempted": "{0.attempted}",
+        "successful": "{0.successful}", rate: "{0.per_s:.2f}", "speed-up": "{1:.2f}x", "cores": "{0.cores_used:.2f}",
+        "MiB": "{0.peak_memory_mib:.0f}", "restarts": "{0.restarts}", "failed": "{0.failed}",
+    }  # fmt: skip
+    rows = [tuple(text.format(row, row.per_s / first) for text in columns.values()) for row in bench.rows]
+    found: dict[str, list[tuple[str, ...]]] = {f"{bench.stage} on {bench.cores} cores": [tuple(columns), *rows]}
     if any(row.gpu_percent is not None for row in bench.rows):
         used = [(str(row.workers), str(row.gpu_percent), str(row.gpu_gib)) for row in bench.rows]
         found["NVIDIA GPUs"] = [("workers", "GPU %", "GPU GiB"), *used]

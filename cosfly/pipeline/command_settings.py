@@ -36,18 +36,10 @@ SECTIONS = {  # section -> its model
 class CommandConfig(Config):
     """The settings that all commands share."""
 
-    name: str = Field(
-        "run", pattern=r"^[\w-][\w. -]*$", description="name of the run; `cosfly run` writes to runs/<name>"
-    )
+    name: str = Field("run", pattern=r"^[\w-][\w. -]*$", description="name; `cosfly run` writes to runs/<name>")
     seed: int = Field(0, description="seed; every random choice derives from it, the stage and the item")
-    workers: int = Field(
-        0,
-        ge=0,
-        description="worker processes; 0 takes one per core, or as many as a Ray cluster has room for",
-    )
-    engine: Literal["local", "ray"] = Field(
-        "local", description="where workers run: in processes of this machine, or on the nodes of `ray`"
-    )
+    workers: int = Field(0, ge=0, description="worker processes; 0: one per core, or as a Ray cluster has room for")
+    engine: Literal["local", "ray"] = Field("local", description="workers: on this machine, or on the nodes of `ray`")
     ray: RayConfig = Field(default_factory=RayConfig, description="the cluster of engine ray")
     item_limit_s: float | None = Field(
         None,
@@ -55,15 +47,9 @@ class CommandConfig(Config):
         description="seconds without progress (in rendering: without a new frame) after which a worker is ended and "
         "its item tried again, twice; null takes the larger of 600 and 20 times the usual time; 0 for no limit",
     )
-    max_failed: int = Field(
-        0, ge=0, description="failed items that are accepted; with more, the command exits with 1 at its end"
-    )
-    roi: Path | None = Field(
-        None, description="region of interest for the pedestrians (roi_polygon.json); none: the whole map"
-    )
-    follow_links: bool = Field(
-        False, description="follow symbolic links that lead out of the run, tree, release or folder of meshes"
-    )
+    max_failed: int = Field(0, ge=0, description="failed items that are accepted; with more, the command exits with 1")
+    roi: Path | None = Field(None, description="region for the pedestrians (roi_polygon.json); none: the whole map")
+    follow_links: bool = Field(False, description="follow symbolic links out of the run, tree, release or meshes")
     towns: dict[str, dict[str, Any]] = Field(
         {},
         description="towns of one data set: name -> the settings that differ there; each is a run in a folder of its "

@@ -8,9 +8,9 @@ import os
 import platform
 import shutil
 import subprocess
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from cosfly.runtime.errors import EnvironmentMissing
 
@@ -26,10 +26,10 @@ OPTIONAL_PACKAGES = {  # name -> what needs it, and what to install
     "carla": ("CARLA's maps and pictures", "cosfly[carla]"),
     "unrealcv": ("UnrealCV's maps and pictures", "cosfly[unrealcv]; then --no-deps unrealcv"),
 }
+GPU_QUERY = ("--query-gpu=name,memory.total,driver_version", "--format=csv,noheader")
 
 
-@dataclass(frozen=True)
-class Check:
+class Check(NamedTuple):
     """One line of the table. state: `missing` stops the main job; `optional` does not."""
 
     name: str
@@ -37,28 +37,24 @@ class Check:
     detail: str
 
 
-def examine(folder: Path) -> list[Check]:
-    """Return the checks of this machine; runs will be written to `folder`."""
+def examine(folder: Path) -> Iterator[Check]:
+    """Yield the checks of this machine; runs will be written to `folder`."""
     memory_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    return [
-        Check("python", "ok", f"{platform.python_version()} on {platform.platform()}"),
-        Check("machine", "ok", f"{len(os.sched_getaffinity(0))} cores, {memory_gib:.0f} GiB memory"),
-        _disk(folder),
-        _gl(),
-        _gpu(),
-        *map(_package, OPTIONAL_PACKAGES),
-    ]
-
-
-def _disk(folder: Path) -> Check:
-    while not folder.exists():
-        folder = folder.parent
-    free = shutil.disk_usage(folder).free / 2**30
+    yield Check("python", "ok", f"{platform.python_version()} on {platform.platform()}")
+    yield Check("machine", "ok", f"{len(os.sched_getaffinity(0))} cores, {memory_gib:.0f} GiB memory")
+    place = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    free = shutil.disk_usage(place).free / 2**30
     # A 1280x720 frame takes about 5 MB, nearly all of it float32 depth.
-    detail = f"{free:.1f} GiB free at {folder.resolve()}, room for about {int(free * 200):,} frames of 1280x720"
-    if free > 5:
-        return Check("disk", "ok", detail)
-    return Check("disk", "missing", f"{detail}; free some space, or name another disk with --out")
+    detail = f"{free:.1f} GiB free at {place.resolve()}, room for about {int(free * 200):,} frames of 1280x720"
+    fix = "" if free > 5 else "; free some space, or name another disk with --out"
+    yield Check("disk", "missing" if fix else "ok", detail + fix)
+    yield _gl()
+    yield _gpu()
+    for name, (purpose, install) in OPTIONAL_PACKAGES.items():
+        if importlib.util.find_spec(name) is None:
+            yield Check(name, "optional", f'not installed; for {purpose}: pip install "{install}"')
+        else:
+            yield Check(name, "ok", importlib.metadata.version(name.replace("_", "-")))
 
 
 def _gl() -> Check:
@@ -74,21 +70,12 @@ def _gl() -> Check:
 
 
 def _gpu() -> Check:
-    program = shutil.which("nvidia-smi")
-    if program is None:
-        return Check("GPU", "optional", "no nvidia-smi: frames are rendered and students trained on the CPU")
-    query = [program, "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
     try:
-        done = subprocess.run(query, capture_output=True, text=True, timeout=20, check=False)
+        done = subprocess.run(["nvidia-smi", *GPU_QUERY], capture_output=True, text=True, timeout=20, check=False)
+    except FileNotFoundError:
+        return Check("GPU", "optional", "no nvidia-smi: frames are rendered and students trained on the CPU")
     except subprocess.TimeoutExpired:
         return Check("GPU", "optional", "nvidia-smi does not answer")
     if done.returncode != 0:
         return Check("GPU", "optional", f"nvidia-smi failed: {done.stdout.strip() or done.stderr.strip()}"[:120])
     return Check("GPU", "ok", "; ".join(done.stdout.strip().splitlines()))
-
-
-def _package(name: str) -> Check:
-    if importlib.util.find_spec(name) is None:
-        purpose, install = OPTIONAL_PACKAGES[name]
-        return Check(name, "optional", f'not installed; for {purpose}: pip install "{install}"')
-    return Check(name, "ok", importlib.metadata.version(name.replace("_", "-")))

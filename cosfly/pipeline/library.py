@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_trajectory, screens_of
 from cosfly.render.contract import Frame
-from cosfly.render.person import choose_clothes, gait_of
+from cosfly.render.person import PosedPerson, choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of
 from cosfly.render.weather import WeatherConfig, random_seed, read_pools, weather_of
@@ -59,14 +60,13 @@ def load_map(path: str | Path | None = None, *, source: str | None = None, seed:
     source = source or ("synthetic" if path is None else "boxes")
     if source not in SOURCES:
         raise ConfigError("there is no such source of maps", got=source, expected=", ".join(SOURCES))
-    if path is not None and source not in FILE_SETTING:
-        fix = f"omit the path, or choose another source than {source}"
-        raise ConfigError("this source reads no file", where="load_map", got=str(path), fix=fix)
-    given = settings
     if path is not None:
+        if source not in FILE_SETTING:
+            fix = f"omit the path, or choose another source than {source}"
+            raise ConfigError("this source reads no file", where="load_map", got=str(path), fix=fix)
         _check_taken(settings, settings.keys() - {FILE_SETTING[source]}, "load_map")
-        given = {FILE_SETTING[source]: path, **settings}
-    return load_source(build(MapsConfig, {"source": source, source: given}, "load_map"), seed=seed)
+        settings[FILE_SETTING[source]] = path
+    return load_source(build(MapsConfig, {"source": source, source: settings}, "load_map"), seed=seed)
 
 
 def plan(
@@ -101,14 +101,15 @@ def plan(
 
 def _checked_route(given: Any) -> np.ndarray:
     """Return a route, (k, 2) m, checked."""
-    what, expected = "the route is invalid", "(k, 2) finite positions in m, at least two, successive ones different"
     try:
-        route_m = np.asarray(given, dtype=np.float64)
+        route_m, got = np.asarray(given, dtype=np.float64), ""
     except (TypeError, ValueError):
-        raise InputError(what, where="route_m", got=repr(given)[:60], expected=expected) from None
-    is_way = route_m.ndim == 2 and route_m.shape[1] == 2 and len(route_m) >= 2 and np.isfinite(route_m).all()
-    if not is_way or not np.diff(route_m, axis=0).any(axis=1).all():
-        raise InputError(what, where="route_m", got=f"an array of shape {route_m.shape}", expected=expected)
+        route_m, got = np.empty(0), repr(given)[:60]
+    is_route = route_m.ndim == 2 and route_m.shape[1] == 2 and len(route_m) >= 2 and np.isfinite(route_m).all()
+    if not is_route or not np.diff(route_m, axis=0).any(axis=1).all():
+        expected = "(k, 2) finite positions in m, at least two, successive ones different"
+        got = got or f"an array of shape {route_m.shape}"
+        raise InputError("the route is invalid", where="route_m", got=got, expected=expected)
     return route_m
 
 
@@ -153,19 +154,15 @@ def render_frames(
         cfg = cfg.model_copy(update={"weather_seed": random_seed()})
     weather = weather_of(cfg, read_pools(cfg), 0)
     intrinsic = intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg)
-    gait = None if targets is None else gait_of(targets, STEP_S * np.arange(len(targets)))
-    clothes = choose_clothes(rng_for(seed, "render", "library"))
-    renderer = renderer_of(cfg, box_map, seed)
-    try:
-        knobs = None if weather is None else weather.params
-        renderer.prepare(positions.min(axis=0), positions.max(axis=0), knobs)
-        frames = []
-        for i, pose in enumerate(zip(positions, rotations, strict=True)):
-            person = None if gait is None or targets is None else gait.posed(i, targets[i], clothes)
-            frames.append(renderer.render(world_from_camera(*pose), intrinsic, person))
-        return frames
-    finally:
-        renderer.close()
+    people: list[PosedPerson | None] = [None] * len(positions)
+    if targets is not None:
+        gait = gait_of(targets, STEP_S * np.arange(len(targets)))
+        clothes = choose_clothes(rng_for(seed, "render", "library"))
+        people = [gait.posed(i, target, clothes) for i, target in enumerate(targets)]
+    with contextlib.closing(renderer_of(cfg, box_map, seed)) as renderer:
+        renderer.prepare(positions.min(axis=0), positions.max(axis=0), None if weather is None else weather.params)
+        poses = zip(positions, rotations, people, strict=True)
+        return [renderer.render(world_from_camera(*pose), intrinsic, person) for *pose, person in poses]
 
 
 def _check_taken(settings: dict[str, Any], taken: Collection[str], where: str) -> None:

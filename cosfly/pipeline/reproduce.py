@@ -25,7 +25,6 @@ from cosfly.formats.boxes import read_boxes
 from cosfly.formats.captions import FIELDS, read_captions
 from cosfly.formats.segments import FOLLOW
 from cosfly.pipeline import bench as benchmark
-from cosfly.pipeline.command_settings import worker_options
 from cosfly.pipeline.runs import summarize
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners import compare
@@ -103,11 +102,14 @@ def read_paper() -> Paper:
     return build(Paper, read_yaml(path), path)
 
 
-def run(cfg: RunConfig, folder: Path, out: Path, *, pedestrians: int = 20, resume: Resume) -> Path:
+def run(
+    cfg: RunConfig, folder: Path, out: Path, *, pedestrians: int = 20, seed: int = 0, resume: Resume, **pool: Any
+) -> Path:
     """Read a run directory; write `reproduction.html` and `reproduction.json`, and return the page.
 
     Args:
         pedestrians: Number of pedestrians that planners are measured on.
+        pool: `workers` and `watch` of stages.
 
     Raises:
         InputError: It is not a run directory, has several towns, or no drone trajectories yet.
@@ -118,13 +120,14 @@ def run(cfg: RunConfig, folder: Path, out: Path, *, pedestrians: int = 20, resum
         what, got = "the run has no drone trajectories yet", f"no {', no '.join(missing)}"
         raise InputError(what, where=folder, got=got, fix=fix)
     printed = read_paper()
-    made = measure(cfg, folder, out, pedestrians, done, {**worker_options(cfg), "resume": resume})
-    places = Places([folder, out], made)
-    made |= work(cfg, folder, places, done)
+    places = Places(
+        [folder, out], measure(cfg, folder, out, pedestrians, done, pool | {"seed": seed, "resume": resume})
+    )
+    places.made |= work(cfg, folder, places, done)
     parts, left_out = [settings(cfg, printed)], dict(printed.left_out)
     for label, table in printed.tables.items():
         try:
-            parts.append(part(label, table, places, folder))
+            parts.append(part(label, table, places))
         except MissingFile as absent:
             left_out[f"{label}, {table.also}".strip(", ")] = f"needs {absent}, which this run has not made"
     if "release" in done:
@@ -152,7 +155,7 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
 
 @dataclass
 class Places:
-    """Reader of figures by their places. roots: folders that are searched for files, in order; made: `work`."""
+    """Reader of figures by their places. roots: the run, and further folders with files; made: `work`."""
 
     roots: Sequence[Path]
     made: dict[str, Any]
@@ -181,13 +184,12 @@ class Places:
         return found
 
     def _document(self, name: str) -> Any:
+        if name == "work":
+            return self.made
         if name not in self._read:
-            if name == "work":
-                self._read[name] = self.made
-            elif name.endswith(".jsonl"):
-                self._read[name] = list(Journal(self.file(name)).read())
-            else:
-                self._read[name] = read_object(self.file(name), what="report")
+            path = self.file(name)
+            is_journal = path.suffix == ".jsonl"
+            self._read[name] = list(Journal(path).read()) if is_journal else read_object(path, what="report")
         return self._read[name]
 
 
@@ -206,9 +208,9 @@ def _at(value: Any, way: list[str]) -> Any:
     return value
 
 
-def part(label: str, printed: Printed, places: Places, run: Path) -> Part:
+def part(label: str, printed: Printed, places: Places) -> Part:
     """Make a table of the paper: our figures, with the paper's next to or below them."""
-    files, ours = set[str](), dict[str, list[Any]]()
+    files, ours = {printed.picture} if printed.picture else set(), dict[str, list[Any]]()
     for name, row in printed.here.items():
         place = row if ":" in row else printed.place.format(row)
         files |= {one.partition(":")[0] for one in place.split(" + ")} - {"work"}
@@ -217,28 +219,22 @@ def part(label: str, printed: Printed, places: Places, run: Path) -> Part:
             raise InputError(UNEXPECTED, where=place, got=str(found[0])[:80], expected="names with figures")
         ours |= {key: _values(row) for key, row in (found[0] or {}).items()} if name == "*" else {name: found}
     names, rows, theirs = printed.head.split("|"), Rows(), {name: _values(row) for name, row in printed.paper.items()}
-    is_beside = names[1] == "here"  # ours is one column, next to the paper's; else the paper's rows follow ours
+    is_next, width = names[1] == "here", len(names) - 1  # ours is one column; else the paper's rows follow ours
     for name in dict.fromkeys([*ours, *theirs]):
-        here, paper = ([*map(_cell, found.get(name, [])), *[None] * len(names)] for found in (ours, theirs))
-        if is_beside:
-            rows.append([name, here[0], *paper[: len(names) - 2]])
+        here, paper = ([*map(_cell, found.get(name, [])), *[None] * width][:width] for found in (ours, theirs))
+        if is_next:
+            rows.append([name, here[0], *paper[: width - 1]])
             continue
-        width = len(names) - 1
-        rows += [[name, *(["here"] if theirs else []), *here[:width]]] if name in ours else []
-        rows += [["" if name in ours else name, "paper", *paper[:width]]] if name in theirs else []
-    if theirs and not is_beside:
+        rows += [[name, *(["here"] if theirs else []), *here]] if name in ours else []
+        rows += [["" if name in ours else name, "paper", *paper]] if name in theirs else []
+    if theirs and not is_next:
         names.insert(1, "")
-    if printed.picture:
-        files.add(printed.picture)
-    is_recorded = all((run / file).is_file() for file in files)
-    why = f"Differs: {printed.why}. " if theirs and printed.why else ""
-    if printed.why and not theirs:
-        why = f"{printed.why[:1].upper()}{printed.why[1:]}. "
-    labels = ", ".join(name for name in (label, printed.also) if ":" in name)
+    why = f"Differs: {printed.why}. " if theirs else f"{printed.why[:1].upper()}{printed.why[1:]}. "
     return Part(
-        key=label, title=printed.title, head=names, rows=rows, paper=labels,
-        note=why + (f"From {', '.join(sorted(files))}." if files else ""),
-        source="recorded" if is_recorded else "measured again",
+        key=label, title=printed.title, head=names, rows=rows,
+        paper=", ".join(name for name in (label, printed.also) if ":" in name),
+        note=why * bool(printed.why) + (f"From {', '.join(sorted(files))}." if files else ""),
+        source="recorded" if all((places.roots[0] / file).is_file() for file in files) else "measured again",
         picture=_jpeg(places.file(printed.picture)) if printed.picture else None,
     )  # fmt: skip
 
@@ -281,7 +277,7 @@ def settings(cfg: RunConfig, printed: Paper) -> Part:
 
 
 def measure(
-    cfg: RunConfig, run: Path, out: Path, num_pedestrians: int, done: Sequence[str], worker_options: dict[str, Any]
+    cfg: RunConfig, run: Path, out: Path, num_pedestrians: int, done: Sequence[str], how: dict[str, Any]
 ) -> dict[str, Any]:
     """Measure what the run has not recorded, in folders below `out`; return the facts that are in no file.
 
@@ -289,16 +285,14 @@ def measure(
     its map with its settings; its own pedestrians are the first of them.
     """
     boxes, simplified = run / "maps/boxes_3d.json", run / "simplify/step2_simplified.json"
-    traces, tree, how = run / "plan/drone_trace.json", run / "render", {"seed": cfg.seed, **worker_options}
-    walking = cfg.pedestrians.model_copy(
-        update={"num_paths": num_pedestrians, "others": 0, "traffic": 0, "look_alikes": 0}
-    )
+    traces, tree = run / "plan/drone_trace.json", run / "render"
+    alone = {"num_paths": num_pedestrians, "others": 0, "traffic": 0, "look_alikes": 0}
+    walking = cfg.pedestrians.model_copy(update=alone)
     paths = cosfly.pedestrians.stage.run(walking, simplified, out / "pedestrians", roi=cfg.roi, **how)
     plan = cfg.plan.model_copy(update={"styles": {FOLLOW: 1.0}})
     compared = build(compare.CompareConfig, plan.model_dump() | {"planners": PLANNERS}, "planners")
     compare.run(compared, simplified, paths, out / "compare", **how)
-    beams = build(beam.BeamConfig, plan.model_dump(), "beams")
-    beam.run(beams, simplified, paths, out / "beam", **how)
+    beam.run(build(beam.BeamConfig, plan.model_dump(), "beams"), simplified, paths, out / "beam", **how)
     if "release" in done:
         release_stats(run / "release/dataset", out / "release", pixels=0)
     if "render" not in done:
@@ -315,13 +309,12 @@ def measure(
 def work(cfg: RunConfig, run: Path, places: Places, done: Sequence[str]) -> dict[str, Any]:
     """Return `work`: the figures that come from several files, or from none."""
     manifests = {name: read_manifest(run / name) for name in benchmark.STAGES if name in done}
-    watched = benchmark.stage_rows(run, benchmark.STAGES)
     lens = RenderConfig(width_px=1280, height_px=720)
     lenses = {str(fov): zoom.camera_of(lens, fov) for fov in LENSES_DEG}
     points = places.figures("plan/drone_trace.json:traces.*.metrics.num_points")[0]
     found: dict[str, Any] = {
         "budget": {name: [m.seconds, m.counts.input, m.seconds / m.counts.input] for name, m in manifests.items()},
-        "watchdog": {row.stage: [row.launches, row.restarts, row.seconds, row.modes] for row in watched},
+        "watchdog": {name: [*benchmark.watched(run / name)] for name in manifests},
         "lenses": {fov: [one.focal_px, one.focal_35mm_mm] for fov, one in lenses.items()},
         "samples": [len(windows_of(count, cfg.distill.dual_track)) for count in points],
     }

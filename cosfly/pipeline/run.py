@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from pydantic import BaseModel
 
 import caption.run.stage
 import cosfly
@@ -26,10 +27,11 @@ import cosfly.simplify.stage
 import release.package.stage
 from cosfly.formats.bystanders import BYSTANDERS_FILE
 from cosfly.pipeline.command_settings import worker_options
-from cosfly.pipeline.settings import RunConfig
-from cosfly.runtime.errors import ConfigError, CosflyError, InputError, ResumeError
+from cosfly.pipeline.runs import STAGES
+from cosfly.pipeline.settings import RunConfig, run_checks
+from cosfly.runtime.errors import ConfigError, InputError, ResumeError
 from cosfly.runtime.io import refuse_link, write_bytes
-from cosfly.runtime.json_io import read_object, write_json
+from cosfly.runtime.json_io import read_object, validated, write_json
 from cosfly.runtime.run_dir import Manifest, Resume, hold_folder, read_manifest
 from cosfly.viz.gallery import contact_sheet
 from release.package.sources import Source, choose_licence
@@ -38,15 +40,24 @@ from release.viewer.page import run as write_viewer
 
 log = logging.getLogger(__name__)
 
-SUMMARY = "summary.json"
+
+class RunTotals(BaseModel):
+    """`summary.json` of a run: counts and seconds of its stages."""
+
+    stages: list[dict[str, Any]] = []
+    peak_memory_mb: float = 0.0
+
+    @classmethod
+    def of(cls, run: Path) -> RunTotals:
+        path = run / "summary.json"
+        return validated(cls, read_object(path, what="summary"), path) if path.exists() else cls()
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a run: `work` makes `product` in the stage's folder and may be called again."""
+    """One stage of a run: `work` makes its product in the folder of its name and may be called again."""
 
     name: str
-    product: Path
     work: Callable[[], Path]
 
 
@@ -67,27 +78,25 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
     others = paths.with_name(BYSTANDERS_FILE) if cfg.pedestrians.has_others else None
     inspected, captions = out / "inspect/inspect.json", out / "caption/captions.jsonl"
 
-    def stage(name: str, product: Path, run: Callable[..., Path], *inputs: Any, **options: Any) -> Stage:
-        work = partial(run, getattr(cfg, name), *inputs, (into or out) / name, resume=resume, **options)
-        return Stage(name, product, work)
+    def stage(name: str, run: Callable[..., Path], *inputs: Any, **options: Any) -> Stage:
+        return Stage(name, partial(run, getattr(cfg, name), *inputs, (into or out) / name, resume=resume, **options))
 
     return [
-        stage("maps", boxes, cosfly.maps.stage.run, seed=seed, follow_links=cfg.follow_links),
-        stage("simplify", simplified, cosfly.simplify.stage.run, boxes),
-        stage("pedestrians", paths, cosfly.pedestrians.stage.run, simplified, roi=cfg.roi, seed=seed, **pool),
-        stage("plan", traces, cosfly.planners.stage.run, simplified, paths, seed=seed, **pool),
-        stage("render", tree, cosfly.render.stage.run, boxes, simplified, traces, others=others, seed=seed, **pool),
-        stage("inspect", inspected, cosfly.inspection.stage.run, simplified, traces, tree, **pool),
-        stage("caption", captions, caption.run.stage.run, tree, seed=seed, **pool),
+        stage("maps", cosfly.maps.stage.run, seed=seed, follow_links=cfg.follow_links),
+        stage("simplify", cosfly.simplify.stage.run, boxes),
+        stage("pedestrians", cosfly.pedestrians.stage.run, simplified, roi=cfg.roi, seed=seed, **pool),
+        stage("plan", cosfly.planners.stage.run, simplified, paths, seed=seed, **pool),
+        stage("render", cosfly.render.stage.run, boxes, simplified, traces, others=others, seed=seed, **pool),
+        stage("inspect", cosfly.inspection.stage.run, simplified, traces, tree, **pool),
+        stage("caption", caption.run.stage.run, tree, seed=seed, **pool),
         joint_release(cfg, [Source.of_files(tree, captions, inspected)], into or out, resume),
     ]
 
 
 def joint_release(cfg: RunConfig, sources: list[Source], out: Path, resume: Resume) -> Stage:
     """Return the stage that releases one or more runs together."""
-    options: dict[str, Any] = {"resume": resume, **worker_options(cfg)}
-    work = partial(release.package.stage.run, cfg.release, sources, out / "release", **options)
-    return Stage("release", out / "release/dataset", work)
+    how: dict[str, Any] = {"resume": resume, **worker_options(cfg)}
+    return Stage("release", partial(release.package.stage.run, cfg.release, sources, out / "release", **how))
 
 
 def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "release") -> list[StageResult]:
@@ -99,29 +108,25 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "
     Args:
         until: The last stage to run.
     """
-    out = cfg.opened(out)
+    out, num = cfg.opened(out), STAGES.index(until) + 1
     check_out(out)
     towns = check(cfg)
     if not towns:
-        return _run_town(cfg, out, _up_to(until, stages(cfg, out, resume=resume)))
+        return _run_town(cfg, out, stages(cfg, out, resume=resume)[:num])
     for name in (*towns, "release"):
         refuse_link(out / name)
     with _run_directory(cfg, out):
         results = []
         for number, (name, town) in enumerate(towns.items(), 1):
             log.info("town %d of %d: %s", number, len(towns), name)
-            own = _up_to(until, stages(town, out / name, resume=resume)[:-1])  # the release is made of all
-            made = _run_town(town, out / name, own)
+            own = stages(town, out / name, resume=resume)[:-1]  # the release is made of all
+            made = _run_town(town, out / name, own[:num])
             results += [replace(one, stage=replace(one.stage, name=f"{name}/{one.stage.name}")) for one in made]
         if until == "release":
             joint = joint_release(cfg, [Source.of_run(out / name) for name in towns], out, resume)
             results.append(_do(joint, out, "all towns"))
         _save_summary(results, out)
     return results
-
-
-def _up_to(name: str, todo: list[Stage]) -> list[Stage]:
-    return todo[: next((k for k, stage in enumerate(todo, 1) if stage.name == name), len(todo))]
 
 
 @contextlib.contextmanager
@@ -176,24 +181,15 @@ def check_with_files(cfg: RunConfig) -> None:
     Raises:
         CosflyError: The text names each of several problems.
     """
-    problems = list[CosflyError]()
-    try:
-        check(cfg)
-    except CosflyError as error:
-        problems.append(error)
-    for one in [cfg.of_town(name) for name in cfg.towns] or [cfg]:
-        where = f"maps.{one.maps.source}"
-        try:
-            files = getattr(one.maps, one.maps.source).inputs()
-        except CosflyError as error:
-            problems.append(error)
-            continue
-        missing = [(f"{where}: {name}", path) for name, path in files.items() if not path.exists()]
-        problems += [InputError("there is no such file", where=place, got=str(path)) for place, path in missing]
-    if len(problems) > 1:
-        raise ConfigError.of_all([str(problem) for problem in problems], where=cfg.name)
-    if problems:
-        raise problems[0]
+    towns = [cfg.of_town(name) for name in cfg.towns] or [cfg]
+    run_checks([partial(check, cfg), *(partial(_check_files, town) for town in towns)], cfg.name)
+
+
+def _check_files(cfg: RunConfig) -> None:
+    files = getattr(cfg.maps, cfg.maps.source).inputs()
+    if missing := {name: str(path) for name, path in files.items() if not path.exists()}:
+        where = f"maps.{cfg.maps.source}: {', '.join(missing)}"
+        raise InputError("there is no such file", where=where, got=", ".join(missing.values()))
 
 
 def _run_town(cfg: RunConfig, out: Path, todo: list[Stage]) -> list[StageResult]:
@@ -203,7 +199,7 @@ def _run_town(cfg: RunConfig, out: Path, todo: list[Stage]) -> list[StageResult]
     with _run_directory(cfg, out):
         results = [_do(stage, out, f"{number}/{len(todo)}") for number, stage in enumerate(todo, 1)]
         # summary.json is written after the pictures: with these very stages in it, they are up to date.
-        is_shown = _summary(out).get("stages") == _rows(results) and (out / "viewer.html").exists()
+        is_shown = RunTotals.of(out).stages == _rows(results) and (out / "viewer.html").exists()
         if (out / "render/manifest.json").exists() and not is_shown:
             contact_sheet(out / "render", out / "contact_sheet.png")
             write_viewer(out, out / "viewer.html", ViewerConfig())
@@ -238,16 +234,9 @@ def _rows(results: list[StageResult]) -> list[dict[str, Any]]:
     ]
 
 
-def _summary(out: Path) -> dict[str, Any]:
-    return read_object(out / SUMMARY, what="summary") if (out / SUMMARY).exists() else {}
-
-
 def _save_summary(results: list[StageResult], out: Path) -> None:
-    """Write `summary.json`: counts, seconds and peak memory, of a resumed run the larger of both peaks."""
-    before = _summary(out).get("peak_memory_mb", 0)
-    if not isinstance(before, int | float):
-        where, got = f"{out / SUMMARY}: peak_memory_mb", repr(before)[:80]
-        raise InputError("the summary is damaged", where=where, got=got, expected="a number", fix="remove the file")
+    """Write `summary.json`; the peak memory is that of a resumed run if it was larger."""
     unit = 1024 * 1024 if sys.platform == "darwin" else 1024
     peak_mb = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / unit
-    write_json(out / SUMMARY, {"stages": _rows(results), "peak_memory_mb": round(max(before, peak_mb), 1)})
+    peak_mb = round(max(RunTotals.of(out).peak_memory_mb, peak_mb), 1)
+    write_json(out / "summary.json", {"stages": _rows(results), "peak_memory_mb": peak_mb})

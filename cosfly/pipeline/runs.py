@@ -1,29 +1,30 @@
-"""Read-only summaries of run directories: which stages are done, what they kept, how much disk they take."""
+"""What run directories hold: stages, items and disk; and the time and disk that a run will take, by stage."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
+import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from caption.run.progress import duration
 from cosfly.formats.inspection import undecided
+from cosfly.formats.pedestrian_paths import read_paths, walk_id
+from cosfly.formats.traces import read_traces
+from cosfly.maps.stage import load_map
 from cosfly.pipeline.settings import RunConfig
-from cosfly.pipeline.settings_guide import Setting, changed
+from cosfly.render.weather import dark_trajectories
 from cosfly.runtime.config import load
-from cosfly.runtime.errors import CosflyError, InputError
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.run_dir import StageFolder, Tally, is_held, read_manifest
 
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")  # of a run, in order
-TO_LOOK_AT = (
-    "contact_sheet.png",
-    "viewer.html",
-    "inspect/report.html",
-    "caption/report.html",
-    "release/dataset/README.md",
-)
+PAGES = ("viewer.html", "contact_sheet.png", "inspect/report.html", "caption/report.html", "release/dataset/README.md")
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,6 @@ class StageSummary:
     state: Literal["complete", "begun", "to do"]
     tally: Tally | None = None
     seconds: float | None = None
-
-    @property
-    def stage(self) -> str:
-        """Its name without the town."""
-        return self.name.rpartition("/")[2]
 
     @property
     def size_bytes(self) -> int:
@@ -54,32 +50,33 @@ class StageSummary:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """One run directory. is_at_work: a process holds it; differing: settings that are not the defaults."""
+    """One run directory. held: `, running now` while a process holds it, else nothing."""
 
-    path: Path
     cfg: RunConfig
-    is_at_work: bool
+    held: str
     stages: list[StageSummary]
-    differing: list[Setting]
-    to_look_at: list[Path]
 
     @property
-    def num_complete(self) -> int:
-        return sum(stage.state == "complete" for stage in self.stages)
+    def is_complete(self) -> bool:
+        return all(stage.state == "complete" for stage in self.stages)
+
+    @property
+    def progress(self) -> str:
+        """The number of complete stages: `3 of 8`."""
+        return f"{sum(stage.state == 'complete' for stage in self.stages)} of {len(self.stages)}"
 
     @property
     def size_bytes(self) -> int:
         return sum(stage.size_bytes for stage in self.stages)
 
-    def tally(self, stage: str) -> Tally:
-        """Return the outcomes of a stage in all towns."""
-        return sum((one.tally for one in self.stages if one.stage == stage and one.tally), Tally())
+    def kept(self, stage: str) -> int:
+        """Return how many items a stage has kept in all towns."""
+        return sum(one.tally.kept for one in self.stages if one.folder.name == stage and one.tally)
 
     def waiting(self) -> dict[Path, int]:
         """Return the inspections with trajectories that wait for a manual decision, and how many."""
-        done = [one.folder for one in self.stages if one.stage == "inspect" and one.state == "complete"]
-        counts = {folder: len(undecided(folder / "inspect.json")) for folder in done}
-        return {folder: count for folder, count in counts.items() if count}
+        done = [one.folder for one in self.stages if one.folder.name == "inspect" and one.state == "complete"]
+        return {folder: count for folder in done if (count := len(undecided(folder / "inspect.json")))}
 
 
 def summarize(run: Path) -> RunSummary:
@@ -89,43 +86,28 @@ def summarize(run: Path) -> RunSummary:
         InputError: It is not a run directory. ConfigError: Its `run.yaml` is not of this version.
     """
     if not (run / "run.yaml").is_file():
-        raise InputError(
-            "not a run directory",
-            where=run,
-            got="no run.yaml",
-            expected="a directory that `cosfly run` made",
-            fix="find runs with cosfly list DIR",
-        )
+        expected, fix = "a directory that `cosfly run` made", "find runs with cosfly list DIR"
+        raise InputError("not a run directory", where=run, got="no run.yaml", expected=expected, fix=fix)
     cfg = load(RunConfig, run / "run.yaml")
     names = [f"{town}/{name}" for town in cfg.towns for name in STAGES[:-1]]
     stages = [_stage(name, run / name) for name in ([*names, "release"] if cfg.towns else STAGES)]
-    found = [run / name for name in TO_LOOK_AT if (run / name).exists()]
-    return RunSummary(run, cfg, is_held(run), stages, changed(cfg), found)
+    return RunSummary(cfg, ", running now" if is_held(run) else "", stages)
 
 
-def summaries(root: Path) -> Iterator[RunSummary | CosflyError]:
-    """Yield the summary of each run below a folder, or the error of a run that cannot be read.
+def find_runs(root: Path, depth: int = 2) -> Iterator[Path]:
+    """Yield the run directories below a folder by name; the towns of a run are part of it.
 
     Raises:
         InputError: There is no such folder.
     """
     if not root.is_dir():
         raise InputError("no such folder", where=root, expected="a folder with runs")
-    for run in _find(root, depth=2):
-        try:
-            yield summarize(run)
-        except CosflyError as error:
-            yield error
-
-
-def _find(root: Path, depth: int) -> Iterator[Path]:
-    """Yield the run directories below a folder by name; the towns of a run are part of it."""
     if (root / "run.yaml").is_file():
         yield root
     elif depth:
         for path in sorted(root.iterdir()):
             if path.is_dir() and not path.is_symlink():
-                yield from _find(path, depth - 1)
+                yield from find_runs(path, depth - 1)
 
 
 def _stage(name: str, folder: Path) -> StageSummary:
@@ -139,3 +121,118 @@ def _stage(name: str, folder: Path) -> StageSummary:
     for record in outcomes.values():
         tally.count(record)
     return StageSummary(name, folder, "begun", tally)
+
+
+# --- estimates --------------------------------------------------------------------------------------------------------
+
+# Stage -> its unit, and seconds and MB per unit; those of frames are per million pixels. Of `cosfly run showcase`
+# (docs/first-runs.md; 2 cores, AMD EPYC, idle): 3 pedestrians, 858 frames of 0.9216 Mpx, 804 windows by `rules`.
+BASIS = "`cosfly run showcase` on a 2-core machine (docs/first-runs.md)"
+RATES = {
+    "maps": ("map", 0.2, 1.1),
+    "simplify": ("map", 5.6, 1.2),
+    "pedestrians": ("pedestrians", 4.6 / 3, 0.3 / 3),
+    "plan": ("pedestrians", 2.3 / 3, 0.4 / 3),
+    "render": ("frames", 51.2 / 790.7, 4383 / 790.7),
+    "inspect": ("frames", 8.3 / 790.7, 0.7 / 790.7),
+    "caption": ("windows", 4.0 / 804, 7.4 / 804),
+    "release": ("frames", 7.8 / 790.7, 1842 / 790.7),
+}
+# Frames of a trajectory over those of the straight line between its ends (50 to 100 m at 1.2 m/s, 2 frames/s: 143).
+DETOUR = 1.14
+
+
+@dataclass(frozen=True)
+class StageEstimate:
+    """One stage of a run, of a town `town/stage`. seconds: None where its teacher decides; 0 where it is done."""
+
+    name: str
+    count: int
+    seconds: float | None
+    bytes: float
+    is_done: bool
+
+    @property
+    def amount(self) -> str:
+        """The number of its units: `858 frames`."""
+        return f"{self.count:,} {RATES[self.name.rpartition('/')[2]][0]}"
+
+
+def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
+    """Estimate each stage of a run; of several towns, each stage of each town, then the release.
+
+    Raises:
+        CosflyError: A product of the run cannot be read.
+    """
+    if not cfg.towns:
+        return list(_estimates(cfg, out, STAGES))
+    rows: list[StageEstimate] = []
+    for name in cfg.towns:
+        own = _estimates(cfg.of_town(name), out / name, STAGES[:-1])
+        rows += [replace(row, name=f"{name}/{row.name}") for row in own]
+    return [*rows, _estimate("release", sum(row.count for row in rows if row.name.endswith("/render")), cfg, out)]
+
+
+def _estimates(cfg: RunConfig, out: Path, names: tuple[str, ...]) -> Iterator[StageEstimate]:
+    walk, window, stride = cfg.pedestrians, cfg.caption.window, cfg.render.frame_stride
+    straight = (walk.min_distance_m + walk.max_distance_m) / 2 / walk.cruise_speed_mps / walk.dt_s / stride
+    frames = [round(DETOUR * straight)] * walk.num_paths
+    paths, traces = out / "pedestrians/path.json", out / "plan/drone_trace.json"
+    if all(_is_complete(path.parent) for path in (paths, traces)) and len(read_paths(paths)) == walk.num_paths:
+        kept = (trace for trace in read_traces(traces) if trace.drop_reason is None)
+        frames = [math.ceil(len(trace.time_s) / stride) for trace in kept] or frames
+    whole = (max(0, count - window.num_frames + 1 - window.future_frames) for count in frames)
+    per_track = {"frames": sum(frames), "windows": sum(math.ceil(count / window.stride) for count in whole)}
+    counts = {unit: count * len(cfg.render.tracks) for unit, count in per_track.items()}
+    counts |= {"map": 1, "pedestrians": walk.num_paths}
+    for name in names:
+        yield _estimate(name, counts[RATES[name][0]], cfg, out)
+
+
+def _estimate(name: str, count: int, cfg: RunConfig, out: Path) -> StageEstimate:
+    if _is_complete(out / name):
+        return StageEstimate(name, count, 0.0, 0.0, True)
+    unit, *rates = RATES[name]
+    scale = count * (cfg.render.width_px * cfg.render.height_px / 1e6 if unit == "frames" else 1)
+    seconds, size_mb = (rate * scale for rate in rates)
+    is_known = name != "caption" or cfg.caption.teacher_kind == "rules"
+    return StageEstimate(name, count, seconds if is_known else None, size_mb * 1e6, False)
+
+
+def _is_complete(folder: Path) -> bool:
+    return (folder / "manifest.json").exists()
+
+
+def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
+    """Return the basis of the figures, their totals, and what prevents the run."""
+    needed, time = sum(row.bytes for row in rows), duration(sum(row.seconds or 0.0 for row in rows))
+    unknown = [row.name for row in rows if row.seconds is None]
+    if unknown:
+        time += f", and {', '.join(unknown)}, whose time depends on the teacher"
+    place = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    free = shutil.disk_usage(place).free
+    lines = [f"figures: {BASIS}", f"in all about {time}; {in_words(needed)} of disk, {in_words(free)} are free"]
+    lines += caveats(cfg)
+    lines += ["cosfly caption --plan estimates the teacher's part"] if unknown else []
+    too_small = "the disk is too small: choose another --out, or fewer pedestrians or pixels"
+    return [*lines, too_small] if needed > free else lines
+
+
+def caveats(cfg: RunConfig) -> list[str]:
+    """Return which settings apply to some trajectories only, and which trajectories will be too dark to see."""
+    lines = cfg.plan.remarks()
+    for name, town in ({name: cfg.of_town(name) for name in cfg.towns} or {cfg.name: cfg}).items():
+        num = town.pedestrians.num_paths
+        if dark := dark_trajectories(town.render, num, partial(load_map, town.maps, seed=town.seed)):
+            listed = ", ".join(map(walk_id, dark[:4])) + ", ..." * (len(dark) > 4)
+            lines.append(
+                f"{name}: {len(dark)} of {num} trajectories are dark ({listed}): they are at night, on a map without "
+                "street lamps, roads and pavements, so nobody will see the target. Choose another time of day "
+                "(render.tod_name, render.tod_pool), another render.weather_seed, or a map with streets"
+            )
+    return lines
+
+
+def in_words(num_bytes: float) -> str:
+    """Return a size in MB or GB."""
+    return f"{num_bytes / 1e9:.2f} GB" if num_bytes >= 1e9 else f"{num_bytes / 1e6:.1f} MB"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 from pydantic import Field, model_validator
@@ -16,7 +18,7 @@ from cosfly.pipeline.command_settings import CommandConfig
 from cosfly.planners.contract import PlanConfig
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.config import Config, build
-from cosfly.runtime.errors import ConfigError
+from cosfly.runtime.errors import ConfigError, CosflyError
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig
 from cosfly.worldgen.stage import WorldConfig
@@ -57,20 +59,14 @@ class RunConfig(CommandConfig):
 
     @model_validator(mode="after")
     def _towns_are_valid(self) -> RunConfig:
-        problems = list[ConfigError]()
-        for name in self.towns:
-            try:
-                if not TOWN_NAME.fullmatch(name) or name == "release":
-                    expected = "letters, digits, _ and -, and not 'release'"
-                    raise ConfigError(f"{name!r} is not a name for a town", where="towns", expected=expected)
-                self.of_town(name)
-            except ConfigError as error:
-                problems.append(error)
-        if len(problems) > 1:
-            raise ConfigError.of_all([str(problem) for problem in problems], where="towns")
-        if problems:
-            raise problems[0]
+        run_checks((partial(self._check_town, name) for name in self.towns), "towns")
         return self
+
+    def _check_town(self, name: str) -> None:
+        if not TOWN_NAME.fullmatch(name) or name == "release":
+            expected = "letters, digits, _ and -, and not 'release'"
+            raise ConfigError(f"{name!r} is not a name for a town", where="towns", expected=expected)
+        self.of_town(name)
 
     def of_town(self, name: str) -> RunConfig:
         """Return the settings of one town's run. Its seed derives from the run's seed and the town's name.
@@ -81,19 +77,15 @@ class RunConfig(CommandConfig):
         changes = self.towns[name]
         if "towns" in changes:
             raise ConfigError("a town cannot have towns", where=f"towns.{name}.towns", fix="list them one by one")
-        maps = {"source": "synthetic"} | _mapping(changes.get("maps", {}), f"towns.{name}.maps")
-        source = str(maps["source"])
-        maps[source] = {"name": name} | _mapping(maps.get(source, {}), f"towns.{name}.maps.{source}")
+        maps = changes.get("maps", {})
+        if isinstance(maps, dict):
+            source = maps.get("source", "synthetic")
+            own = maps.get(source, {}) if isinstance(source, str) else {}
+            maps = {**maps, "source": source} | ({source: {"name": name} | own} if isinstance(own, dict) else {})
         seed = int(rng_for(self.seed, "run", name).integers(2**31))
         shared = self.model_dump(mode="json", exclude={"towns", "maps"}) | {"name": name, "seed": seed}
         rest = {setting: value for setting, value in changes.items() if setting != "maps"}
         return build(RunConfig, _merged(self, shared, rest) | {"maps": maps}, f"towns.{name}")
-
-
-def _mapping(value: Any, where: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ConfigError("not a group of settings", where=where, got=repr(value)[:80])
-    return value
 
 
 def _merged(group: Config, settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -105,3 +97,17 @@ def _merged(group: Config, settings: dict[str, Any], changes: dict[str, Any]) ->
             value = _merged(within, settings[name], value)
         result[name] = value
     return result
+
+
+def run_checks(checks: Iterable[Callable[[], object]], where: str) -> None:
+    """Run all checks, and raise the error of the one that fails, or one error for several."""
+    problems = list[CosflyError]()
+    for check in checks:
+        try:
+            check()
+        except CosflyError as error:
+            problems.append(error)
+    if len(problems) > 1:
+        raise ConfigError.of_all([str(problem) for problem in problems], where=where)
+    if problems:
+        raise problems[0]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel
 
@@ -13,17 +12,14 @@ from cosfly.runtime.json_io import dump_json
 
 KINDS = {"integer": "whole number", "number": "number", "string": "text", "boolean": "true or false", "null": "null"}
 BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
+BOUNDS |= {"multipleOf": "a multiple of"}
 
 
-@dataclass(frozen=True)
-class Setting:
+class Setting(NamedTuple):
     """One setting, or a group of settings.
 
-    Attributes:
-        name: With its sections: `plan.altitude_max_m`.
-        value: JSON-able; None for a group.
-        kind: What it may be, in words; empty for a group.
-        meaning: Its description.
+    name: with its sections, such as `plan.altitude_max_m`. value: JSON-able, None for a group. kind: what it may be, in
+    words, empty for a group. meaning: its description.
     """
 
     name: str
@@ -31,31 +27,23 @@ class Setting:
     kind: str
     meaning: str
 
-    @property
-    def is_group(self) -> bool:
-        return not self.kind
-
 
 def explain(cfg: BaseModel, section: str | None = None) -> list[Setting]:
     """Return all settings in order, a group before its members; or those of one section, or one setting."""
     schema = type(cfg).model_json_schema()
     settings = list(_explain(schema, schema["$defs"], cfg.model_dump(mode="json"), ""))
-    if section is None:
-        return settings
-    found = [s for s in settings if s.name == section or s.name.startswith(f"{section}.")]
-    if not found:
-        raise ConfigError(
-            f"no such section or setting{nearest(section, [setting.name for setting in settings])}",
-            got=section,
-            expected="for instance plan or plan.muco, after the name of a file or of a shipped configuration",
-        )
+    found = [s for s in settings if section is None or s.name == section or s.name.startswith(f"{section}.")]
+    if section is not None and not found:
+        what = f"no such section or setting{nearest(section, [setting.name for setting in settings])}"
+        expected = "for instance plan or plan.muco, after the name of a file or of a shipped configuration"
+        raise ConfigError(what, got=section, expected=expected)
     return found
 
 
 def changed(cfg: BaseModel, section: str | None = None) -> list[Setting]:
     """Return the settings that are not the defaults; raises as `explain`."""
     defaults = {setting.name: setting.value for setting in explain(type(cfg)())}
-    return [one for one in explain(cfg, section) if not one.is_group and one.value != defaults.get(one.name)]
+    return [one for one in explain(cfg, section) if one.kind and one.value != defaults.get(one.name)]
 
 
 def _explain(
@@ -72,32 +60,25 @@ def _explain(
 
 def _kind_of(field: Mapping[str, Any], models: Mapping[str, Any]) -> str:
     """Return what a setting may be: `number > 0`, `one of a, b`, `list of texts`, `text, as a, b`."""
-    if "examples" in field:
-        rest = {name: value for name, value in field.items() if name != "examples"}
-        return f"{_kind_of(rest, models)}, as {', '.join(map(str, field['examples']))}"
-    if "$ref" in field:
-        return _kind_of(models[field["$ref"].rpartition("/")[2]], models)
+    field = {**models.get(field.get("$ref", "").rpartition("/")[2], {}), **field}
+    kind, rule = field.get("type", ""), field.get("additionalProperties")
     if "anyOf" in field:
-        return ", or ".join(_kind_of(part, models) for part in field["anyOf"])
-    if "enum" in field:
-        return f"one of {', '.join(map(str, field['enum']))}"
-    if "const" in field:
-        return str(field["const"])
-    kind = field.get("type")
-    if kind == "array":
+        words = ", or ".join(_kind_of(part, models) for part in field["anyOf"])
+    elif "enum" in field:
+        words = f"one of {', '.join(map(str, field['enum']))}"
+    elif "const" in field:
+        words = str(field["const"])
+    elif kind == "array":
         parts = field.get("prefixItems") or [field.get("items", {})]
-        return f"list of: {', '.join(_kind_of(part, models) for part in parts)}"
-    if kind == "object":
-        rule = field.get("additionalProperties")
-        return "mapping of names to: " + (_kind_of(rule, models) if isinstance(rule, dict) and rule else "values")
-    if kind == "string" and field.get("format") == "path":
-        return "path"
-    if kind not in KINDS:
-        return "value"
-    bounds = [f"{sign} {field[bound]}" for bound, sign in BOUNDS.items() if bound in field]
-    if "multipleOf" in field:
-        bounds.append(f"a multiple of {field['multipleOf']}")
-    return " ".join([KINDS[kind], " and ".join(bounds)]).strip()
+        words = f"list of: {', '.join(_kind_of(part, models) for part in parts)}"
+    elif kind == "object":
+        words = "mapping of names to: " + (_kind_of(rule, models) if isinstance(rule, dict) and rule else "values")
+    elif field.get("format") == "path":
+        words = "path"
+    else:
+        bounds = " and ".join(f"{sign} {field[bound]}" for bound, sign in BOUNDS.items() if bound in field)
+        words = f"{KINDS.get(kind, 'value')} {bounds}".strip()
+    return f"{words}, as {', '.join(map(str, field['examples']))}" if "examples" in field else words
 
 
 def nested(settings: list[Setting]) -> dict[str, Any]:
@@ -108,15 +89,14 @@ def nested(settings: list[Setting]) -> dict[str, Any]:
         group = values
         for name in above:
             group = group.setdefault(name, {})
-        group[last] = {} if setting.is_group else setting.value
+        group[last] = setting.value if setting.kind else {}
     return values
 
 
 def as_lines(settings: list[Setting]) -> Iterator[str]:
     """Yield lines for a terminal: `name = value`, then what it means and what it may be."""
     for setting in settings:
-        if setting.is_group:
-            yield f"\n{setting.name}: {setting.meaning}"
+        if setting.kind:
+            yield f"  {setting.name} = {dump_json(setting.value)}\n      {setting.meaning} [{setting.kind}]"
         else:
-            yield f"  {setting.name} = {dump_json(setting.value)}"
-            yield f"      {setting.meaning} [{setting.kind}]"
+            yield f"\n{setting.name}: {setting.meaning}"
