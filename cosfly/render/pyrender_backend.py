@@ -43,7 +43,6 @@ def _open_screen(width_px: int, height_px: int) -> Any:
     try:
         import pyrender
         import trimesh  # noqa: F401
-        from OpenGL.EGL import eglDestroyContext
         from pyrender.shader_program import ShaderProgramCache
 
         screen = pyrender.OffscreenRenderer(width_px, height_px)
@@ -55,6 +54,9 @@ def _open_screen(width_px: int, height_px: int) -> Any:
         fix = f"apt-get install {contract.DEBIAN_PACKAGES}"
         raise EnvironmentMissing("no OpenGL without a window (EGL)", got=str(error), fix=fix) from None
     screen._renderer._program_cache = ShaderProgramCache(str(Path(__file__).parent / "pyrender_shaders"))
+    # pyrender has loaded the EGL functions by now, also where someone imported OpenGL for another platform before.
+    from OpenGL.EGL import eglDestroyContext
+
     # Closing ends this context only: pyrender would end the display, which all contexts share.
     platform = screen._platform
     platform.delete_context = lambda: eglDestroyContext(platform._egl_display, platform._egl_context)

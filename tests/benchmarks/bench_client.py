@@ -33,8 +33,7 @@ from caption.schema import CaptionConfig
 from caption.teachers.images import FrameEncoder
 from caption.teachers.teacher import SharedFrames
 from cosfly.formats.frames import SKY_DEPTH_M
-from cosfly.llm import client
-from cosfly.llm.protocol import encode_body
+from cosfly.llm import protocol
 from cosfly.viz.frame_views import VIEW_FILES
 from specimens import make_playback_tree
 
@@ -92,7 +91,7 @@ def _client(
     allotted, _ = allot(named_flights(tree), cfg)
     bodies: list[bytes] = []
     frames: list[SharedFrames] = []
-    plain_init, plain_encode = SharedFrames.__init__, encode_body
+    plain_init, plain_encode = SharedFrames.__init__, protocol.encode_body
 
     def init(self: SharedFrames, *args) -> None:
         plain_init(self, *args)
@@ -105,13 +104,13 @@ def _client(
         return bodies[-1]
 
     SharedFrames.__init__ = init  # type: ignore[method-assign]
-    client.encode_body = recording if encoder is None else plain_encode
+    protocol.encode_body = recording if encoder is None else plain_encode
     try:
         start_s = time.monotonic()
         asked = asyncio.run(Asking(stage, cfg, VOCABULARY, 0).run(allotted))
         seconds = time.monotonic() - start_s
     finally:
-        SharedFrames.__init__, client.encode_body = plain_init, plain_encode  # type: ignore[method-assign, assignment]
+        SharedFrames.__init__, protocol.encode_body = plain_init, plain_encode  # type: ignore[method-assign, assignment]
     assert not asked.unanswered, asked.unanswered[:3]
     return seconds, bodies, frames[0].encoder
 
