@@ -53,7 +53,6 @@ bench.TURNS, bench.census_town = 1, lambda name, seed: cosfly.load_map(seed=seed
              r"noise-0=[01]\.\d+", "bench.NOISE = (0.0,)"),
     ("dagger_rounds", f"--train RUN --test RUN --out OUT {DRAWN_SMALL}", r"control1 success",
              "bench.STEPS = 5"),
-    ("simulate_cluster", "RUN --flights 2000", r"2,000 flights"),
 )  # fmt: skip
 
 

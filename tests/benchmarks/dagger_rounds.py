@@ -28,7 +28,6 @@ from teacher_server import TeacherServer
 
 from cosfly.formats.captions import TOKENS, read_captions
 
-TOKENS = TOKENS
 TUPLE, FRAMES = re.compile(r"\(([-\d.,; ]+)\)"), 5
 STEPS, RATE, WIDTH = 3000, 2e-3, 64
 
