@@ -11,7 +11,7 @@ from cosfly.runtime.errors import EnvironmentMissing, InputError, StorageError
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.pool import run_items
 from cosfly.runtime.run_dir import Failed, Kept, StageFolder
-from cosfly.runtime.seeding import draws_for, rng_for
+from cosfly.runtime.seeding import random_bytes, rng_for
 from cosfly.runtime.worker import Item, Outcome
 
 
@@ -127,4 +127,4 @@ def test_rng_depends_on_all_three_and_zero_is_a_seed():
     draws = {rng_for(*key).random() for key in ((0, "a", "x"), (1, "a", "x"), (0, "b", "x"), (0, "a", "y"))}
     assert len(draws) == 4
     assert rng_for(0, "a", "x").random() == rng_for(0, "a", "x").random()
-    assert len({draws_for(*key) for key in ((0, "a", "x"), (1, "a", "x"), (0, "b", "x"), (0, "a", "y"))}) == 4
+    assert len({random_bytes(*key) for key in ((0, "a", "x"), (1, "a", "x"), (0, "b", "x"), (0, "a", "y"))}) == 4

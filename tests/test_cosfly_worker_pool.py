@@ -50,7 +50,7 @@ def test_an_item_that_never_ends_has_failed_and_the_others_are_done(tmp_path, ca
     assert [record.id for record in finished.kept] == ["i1", "i2"]
     assert finished.tally.model_dump()["failed"] == {"timed_out": 1}
     failure = next(record for record in finished.records if isinstance(record, Failed))
-    assert "did not get on within its time limit, 3 times" in failure.message
+    assert "finished no step within its time limit, 3 times" in failure.message
     assert caplog.text.count("it is tried again") >= 2
     assert not list((tmp_path / "s").glob(".*.partial"))
 

@@ -223,7 +223,7 @@ def write_templates(facts: Facts, draws: bytes, decision: str | None = None) -> 
     """Write the English and the Chinese answer, with slots for the facts.
 
     Args:
-        draws: random, one for each sentence (draws_for).
+        draws: random, one for each sentence (random_bytes).
         decision: the decision to justify (anchored); None decides freely.
     """
     cues = find_cues(facts)

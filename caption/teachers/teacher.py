@@ -36,7 +36,7 @@ from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Engine, Reply, Request, Troubles
 from cosfly.llm.student_chat import EncodedImage
 from cosfly.llm.vllm_engine import VllmEngine
-from cosfly.runtime.seeding import draws_for, rng_for
+from cosfly.runtime.seeding import random_bytes, rng_for
 from cosfly.viz.frame_views import Pictures
 
 ENCODING_THREADS = 4
@@ -69,7 +69,7 @@ class RuleTeacher:
         # Corrections have the same answer: the Chinese of `mirror` is of the question alone.
         key = f"{question.window.sample_id}/{replace(question, correction=None).purpose}"
         if self._last is None or self._last[0] != key:
-            draws = draws_for(self.seed, "caption", key)
+            draws = random_bytes(self.seed, "caption", key)
             self._last = (
                 key,
                 write_templates(question.facts, draws, question.decision),

@@ -15,7 +15,7 @@ from cosfly.geometry.axes import focal_px
 from cosfly.render.contract import PERSON_ID, Frame, Others, PosedCar, PosedPerson, check_pose
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import EnvironmentMissing, RenderError
-from cosfly.runtime.worker import worker_place
+from cosfly.runtime.worker import worker_index
 from cosfly.simulators.guard import EngineGuard
 
 log = logging.getLogger(__name__)
@@ -53,7 +53,7 @@ class SimulatorRenderer(ABC):
         rim: BoxMap | None = None, *, settings: Any,
     ) -> None:  # fmt: skip
         self._map, self._size_px, self._num_others, self._cfg = box_map, (width_px, height_px), num_others, settings
-        self._port = settings.port + self.port_step * worker_place()
+        self._port = settings.port + self.port_step * worker_index()
         self._open()
 
     @abstractmethod

@@ -1,13 +1,12 @@
-"""PNG pictures and NumPy arrays: the header is checked before anything is allocated for what it claims.
+"""PNG pictures and NumPy arrays. The header is checked before memory is allocated for the sizes in it.
 
-PNG is the only picture format of a data set, so no other decoder is given a file. NumPy's own reader evaluates headers
-as Python literals, which a crafted one makes slow and two threads at once make fail (Python before 3.11.8, its issue
-106905); the three fields are found by their patterns here. Format: numpy.lib.format, versions 1 to 3.
+PNG is the only picture format of a data set, so no other decoder reads a file. NumPy's own reader evaluates headers as
+Python literals: a crafted header makes that slow, and it fails in two threads at once (Python before 3.11.8, its issue
+106905). This reader finds the three fields by regular expressions. Format: numpy.lib.format, versions 1 to 3.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import re
@@ -23,9 +22,12 @@ from cosfly.runtime.io import disk_errors, open_file, over_limit, read_bytes
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_HEADER_BYTES = 24  # signature, length and name of the first chunk, width, height
+CHUNK_HEADER_BYTES, CHECKSUM_BYTES = 8, 4  # length and name before the data of a chunk, checksum after it
 NPY_MAGIC = b"\x93NUMPY"
+VERSION_BYTE, LENGTH_BYTE = 6, 8  # the places of the major version and of the header's length in a `.npy` file
+PREFIX_BYTES, LONG_PREFIX_BYTES = 10, 12  # before the header: version 1 stores its length in 2 bytes, later ones in 4
 MOST_HEADER_BYTES = 10_000  # NumPy's own limit
-LONGEST_SIDE_PX = 8192  # of a picture that `render` draws; a square of it is the largest that is read, 8K has half
+LONGEST_SIDE_PX = 8192  # of a picture that `render` draws; pictures up to this square are read, twice an 8K picture
 _DESCR = re.compile(rb"'descr' *: *'([<>|=][a-z][0-9]{1,2})'")
 _ORDER = re.compile(rb"'fortran_order' *: *(True|False)")
 _SHAPE = re.compile(rb"'shape' *: *\(([0-9, ]{0,200})\)")
@@ -35,7 +37,7 @@ _SHAPE = re.compile(rb"'shape' *: *\(([0-9, ]{0,200})\)")
 
 
 class ArrayHeader(NamedTuple):
-    """The header of a `.npy` file; the numbers begin at byte `offset`."""
+    """The header of a `.npy` file; the data begin at byte `offset`."""
 
     dtype: np.dtype
     shape: tuple[int, ...]
@@ -47,22 +49,22 @@ class ArrayHeader(NamedTuple):
 
 
 def array_header(path: Path, *, tree: Path | None = None) -> ArrayHeader:
-    """Read the header of a `.npy` file, and check that the numbers are all there."""
+    """Read the header of a `.npy` file, and check that the file is complete."""
     with open_file(path, what="array", tree=tree) as file, disk_errors(path, "array"):
-        return _header(file.read(MOST_HEADER_BYTES + 12), os.fstat(file.fileno()).st_size, path, "array")
+        return _header(file.read(MOST_HEADER_BYTES + LONG_PREFIX_BYTES), os.fstat(file.fileno()).st_size, path, "array")
 
 
 def parse_array_header(data: memoryview, where: str | Path, *, what: str = "array") -> ArrayHeader:
-    """Return the header of the bytes of a `.npy` file, which are not copied."""
-    return _header(bytes(data[: MOST_HEADER_BYTES + 12]), len(data), where, what)
+    """Return the header of a `.npy` file from its bytes, without copying them."""
+    return _header(bytes(data[: MOST_HEADER_BYTES + LONG_PREFIX_BYTES]), len(data), where, what)
 
 
 def parse_array(
     data: bytes | memoryview, where: str | Path, *, dtype: type, ndim: int, what: str = "array", copy: bool = True
 ) -> np.ndarray:
-    """Return the array of the bytes of a `.npy` file of a known type and number of dimensions.
+    """Return the array in the bytes of a `.npy` file; dtype and ndim are the expected ones.
 
-    copy: False returns a view of the bytes, which cannot be written to.
+    copy: False returns a read-only view of the bytes.
     """
     header = parse_array_header(memoryview(data), where, what=what)
     if header.dtype != dtype or len(header.shape) != ndim:
@@ -74,38 +76,46 @@ def parse_array(
 
 
 def _header(start: bytes, size: int, where: str | Path, what: str) -> ArrayHeader:
-    """Return the header of a file of `size` bytes from its first ones."""
-    got, first = f"{size} bytes that do not begin as a NumPy array", 10 if start[6:7] == b"\1" else 12
-    if len(start) >= 12 and start.startswith(NPY_MAGIC) and 1 <= start[6] <= 3:
-        length = int.from_bytes(start[8:first], "little")
-        text = start[first : first + length] if length <= MOST_HEADER_BYTES else b""
-        found = [match.group(1).decode() for p in (_DESCR, _ORDER, _SHAPE) if (match := p.search(text))]
-        got = f"a header of {length} bytes, {text[:80].decode('latin-1')!r}"
-        if len(found) == 3:
-            descr, order, shape = found
-            got = f"{size} bytes that are not a complete NumPy array, {descr} ({shape})"
-            with contextlib.suppress(TypeError, ValueError):
-                lengths = tuple(int(part) for part in shape.split(",") if part.strip())
-                header = ArrayHeader(np.dtype(descr), lengths, order == "True", first + length)
-                is_whole = math.prod(lengths) * header.dtype.itemsize == size - header.offset
-                # With a length of 0 the product says nothing about the others, which may be beyond every machine.
-                if is_whole and max(lengths, default=0) <= size:
-                    return header
-    raise InputError(f"not a {what}", where=where, got=got, expected="a complete .npy file of numbers")
+    """Return the header of a `.npy` file of `size` bytes from its first bytes."""
+
+    def not_an_array(got: str) -> InputError:
+        return InputError(f"not a {what}", where=where, got=got, expected="a complete .npy file of numbers")
+
+    if len(start) < LONG_PREFIX_BYTES or not start.startswith(NPY_MAGIC) or start[VERSION_BYTE] not in (1, 2, 3):
+        raise not_an_array(f"{size} bytes that do not begin as a NumPy array")
+    text_start = PREFIX_BYTES if start[VERSION_BYTE] == 1 else LONG_PREFIX_BYTES
+    length = int.from_bytes(start[LENGTH_BYTE:text_start], "little")
+    text = start[text_start : text_start + length] if length <= MOST_HEADER_BYTES else b""
+    matches = [pattern.search(text) for pattern in (_DESCR, _ORDER, _SHAPE)]
+    fields = [match.group(1).decode() for match in matches if match]
+    if len(fields) < len(matches):
+        raise not_an_array(f"a header of {length} bytes, {text[:80].decode('latin-1')!r}")
+    descr, order, shape = fields
+    incomplete = not_an_array(f"{size} bytes that are not a complete NumPy array, {descr} ({shape})")
+    try:
+        lengths = tuple(int(part) for part in shape.split(",") if part.strip())
+        header = ArrayHeader(np.dtype(descr), lengths, order == "True", text_start + length)
+    except (TypeError, ValueError):
+        raise incomplete from None
+    # If one length is 0, the product does not bound the others, which may exceed the memory of any machine.
+    has_all_bytes = math.prod(lengths) * header.dtype.itemsize == size - header.offset
+    if not has_all_bytes or max(lengths, default=0) > size:
+        raise incomplete
+    return header
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
 def check_pixels(num_pixels: float, where: str | Path, got: str) -> None:
-    """Refuse more pixels than a picture may have."""
+    """Raise InputError if a picture or array has more pixels than are read."""
     if num_pixels > LONGEST_SIDE_PX**2:
-        fix = "scale the pictures down, or cut them"
-        raise over_limit(where, got, f"{LONGEST_SIDE_PX} x {LONGEST_SIDE_PX} px", fix)
+        limit = f"{LONGEST_SIDE_PX} x {LONGEST_SIDE_PX} px"
+        raise over_limit(where, got, limit, "scale the pictures down, or cut them")
 
 
 def png_size(data: bytes) -> tuple[int, int] | None:
-    """Return (width, height) px of a PNG from its first bytes, None if it is none."""
+    """Return (width, height) in px from the first bytes of a PNG; None for other bytes."""
     if len(data) < PNG_HEADER_BYTES or not data.startswith(PNG_SIGNATURE) or data[12:16] != b"IHDR":
         return None
     width, height = struct.unpack_from(">II", data, 16)
@@ -113,21 +123,24 @@ def png_size(data: bytes) -> tuple[int, int] | None:
 
 
 def picture_size(path: Path, *, tree: Path | None = None) -> tuple[int, int] | None:
-    """Return (width, height) px of a PNG file from its header, None if it is none."""
+    """Return (width, height) in px from the header of a PNG file; None for another file."""
     with open_file(path, what="image", tree=tree) as file, disk_errors(path, "image"):
         return png_size(file.read(PNG_HEADER_BYTES))
 
 
 def read_picture(path: Path, *, tree: Path | None = None) -> np.ndarray:
-    """Read a PNG file, (h, w, 3) uint8 in OpenCV's order of colours."""
+    """Read a PNG file, (h, w, 3) uint8 in OpenCV's channel order (B, G, R)."""
     return parse_picture(read_bytes(path, what="image", tree=tree), path)
 
 
 def parse_picture(data: bytes, where: str | Path, *, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
-    """Return the pixels of a PNG; InputError where it is none, damaged, or larger than pictures may be."""
-    size, image, got = png_size(data), None, f"{len(data)} bytes"
+    """Return the pixels of a PNG; raises InputError if it is not a PNG, damaged or too large."""
+    size = png_size(data)
+    image = None
+    got = f"{len(data)} bytes"
     if size is not None and _holds_its_chunks(data):
-        check_pixels(size[0] * size[1], where, "{} x {} px".format(*size))
+        width, height = size
+        check_pixels(width * height, where, f"{width} x {height} px")
         try:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         except cv2.error as error:
@@ -138,11 +151,11 @@ def parse_picture(data: bytes, where: str | Path, *, flags: int = cv2.IMREAD_COL
 
 
 def _holds_its_chunks(data: bytes) -> bool:
-    """Return whether no chunk claims to end beyond the file: OpenCV allocates what a chunk claims, up to gigabytes."""
-    place = len(PNG_SIGNATURE)
-    while place + 8 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, place)
-        place += length + 12
+    """Return whether all chunks end within the file: OpenCV allocates the length in a chunk, up to gigabytes."""
+    chunk_start = len(PNG_SIGNATURE)
+    while chunk_start + CHUNK_HEADER_BYTES <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, chunk_start)
+        chunk_start += CHUNK_HEADER_BYTES + length + CHECKSUM_BYTES
         if kind == b"IEND":
             break
-    return place <= len(data)
+    return chunk_start <= len(data)

@@ -1,4 +1,4 @@
-"""`events.jsonl`: a log of a stage's workers for people and `cosfly bench`; nothing is decided by it."""
+"""`events.jsonl`: a log of the workers of a stage, for people and `cosfly bench`; no stage reads it."""
 
 from __future__ import annotations
 
@@ -15,21 +15,26 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from cosfly.runtime.journal import Journal
 
 EVENTS = "events.jsonl"
-MOST_PROBES = 500  # of one e-fold of the time since the beginning: a week of work makes a few thousand lines
+# A probe is written once the time since the last one exceeds this fraction of the time since the beginning: 500 lines
+# whenever that time grows by the factor e, a few thousand lines in a week.
+PROBE_SPACING = 1 / 500
 MEBIBYTE = 2**20
+# Indices into `process_stat`: proc(5) numbers the fields from 1, and the state is number 3.
+STAT_UTIME, STAT_STIME, STAT_RSS = 14 - 3, 15 - 3, 24 - 3
 Loss = Literal["heartbeat_lost", "timed_out", "worker_died"]
-LOSSES: dict[str, str] = {  # events of a worker that is of no use any more
-    "heartbeat_lost": "its worker stood still",
-    "timed_out": "it did not get on within its time limit",
-    "worker_died": "its worker process died; it may need more memory than there is",
+# Events that end a worker, as a message says them.
+LOSSES: dict[str, str] = {
+    "heartbeat_lost": "its worker neither reported nor computed",
+    "timed_out": "it finished no step within its time limit",
+    "worker_died": "its worker process died; it may need more memory than is free",
 }
 Kind = Loss | Literal["began", "worker_started", "restarted", "item_done", "retried", "given_up", "probe", "ended"]
 
 
 class Event(BaseModel):
-    """A line of `events.jsonl`; what each kind holds, and the units, are in docs/files.md.
+    """A line of `events.jsonl`; docs/files.md lists the fields of each kind and their units.
 
-    worker: its place, 0 and up; a restarted one keeps it. rss_mib: by worker, the most since the last probe.
+    worker: Its index from 0; a replacement keeps it. rss_mib: By worker, the maximum since the last probe.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -53,56 +58,60 @@ class Event(BaseModel):
 
 
 class Vitals(NamedTuple):
-    """The processor time of a worker process with all its threads, and its resident memory."""
+    """The processor time of a process with all its threads, s, and its resident memory, MiB."""
 
     cpu_s: float
     rss_mib: float
 
     @classmethod
     def of(cls, pid: int) -> Vitals:
-        """Return the vitals of a process of this machine; zeros where it is gone or the system does not tell."""
+        """Return the vitals of a process of this machine; zeros if it is gone or has no `/proc/PID/stat`."""
         if not (fields := process_stat(pid)):
             return cls(0.0, 0.0)
-        cpu_s = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # utime, stime: proc(5)
-        return cls(cpu_s, round(int(fields[21]) * os.sysconf("SC_PAGE_SIZE") / MEBIBYTE, 1))
+        cpu_s = (int(fields[STAT_UTIME]) + int(fields[STAT_STIME])) / os.sysconf("SC_CLK_TCK")
+        return cls(cpu_s, round(int(fields[STAT_RSS]) * os.sysconf("SC_PAGE_SIZE") / MEBIBYTE, 1))
 
 
 class EventLog:
-    """Appends to a stage's `events.jsonl`. A kill costs the last line."""
+    """Appends to the `events.jsonl` of a stage without syncing: a kill may lose the last line."""
 
     def __init__(self, folder: Path) -> None:
-        self._journal, self._folder = Journal(folder / EVENTS), folder
+        self._journal = Journal(folder / EVENTS)
+        self._folder = folder
         self._begun_s = self._probed_s = time.monotonic()
-        self._peaks_mib: dict[int, float] = {}
-        self._cpu_s: dict[int, float] = {}  # by worker, at the last probe
-        self._used_s = 0.0  # by all workers since the last line
+        self._peaks_mib: dict[int, float] = {}  # by worker, since the last written probe
+        self._cpu_s: dict[int, float] = {}  # by worker, at the last measurement
+        self._used_s = 0.0  # processor time of all workers since the last written probe
 
     def write(self, event: Kind, **fields: object) -> None:
         line = {"at_s": round(time.time(), 3), "event": event, **fields}
         self._journal.append({name: value for name, value in line.items() if value is not None}, sync=False)
 
     def probe(self, workers: Mapping[int, Vitals]) -> None:
-        """Measure memory and time of the workers (by place) and the disk; not every measurement is written."""
+        """Add up the vitals of the workers, by index; write them with the free disk space if a probe is due."""
         for worker, (cpu_s, mib) in workers.items():
             self._peaks_mib[worker] = max(self._peaks_mib.get(worker, 0.0), mib)
-            before_s = self._cpu_s.get(worker, 0.0)
-            self._used_s += cpu_s - before_s if cpu_s >= before_s else cpu_s  # of one that replaces another
+            previous_s = self._cpu_s.get(worker, 0.0)
+            is_replaced = cpu_s < previous_s  # a new process counts from zero
+            self._used_s += cpu_s if is_replaced else cpu_s - previous_s
             self._cpu_s[worker] = cpu_s
         now_s = time.monotonic()
         elapsed_s = now_s - self._probed_s
-        if elapsed_s < (now_s - self._begun_s) / MOST_PROBES:
+        if elapsed_s < (now_s - self._begun_s) * PROBE_SPACING:
             return
         cores = round(self._used_s / elapsed_s, 2) if elapsed_s else 0.0
         free = shutil.disk_usage(self._folder).free / MEBIBYTE
         self.write("probe", rss_mib=self._peaks_mib, cores_used=cores, disk_free_mib=round(free, 1), **gpu_use())
-        self._peaks_mib, self._used_s, self._probed_s = {}, 0.0, now_s
+        self._peaks_mib = {}
+        self._used_s = 0.0
+        self._probed_s = now_s
 
     def close(self) -> None:
         self._journal.close()
 
 
 def read_events(folder: Path) -> list[Event]:
-    """Read the events of a stage folder in order; damaged lines and those of a later cosfly are skipped."""
+    """Read the events of a stage folder in order; skip damaged lines and those of a later version of cosfly."""
     events = list[Event]()
     for line in Journal(folder / EVENTS).read():
         with contextlib.suppress(ValidationError):
@@ -111,7 +120,7 @@ def read_events(folder: Path) -> list[Event]:
 
 
 def lost_steps(folder: Path) -> int:
-    """Return the number of steps, as frames, of items that then failed or were lost with their worker."""
+    """Return the number of steps, such as frames, that were done for items which then failed or lost their worker."""
     events = read_events(folder)
     return sum(event.steps or 0 for event in events if event.event in LOSSES or event.status == "failed")
 
@@ -120,7 +129,7 @@ def lost_steps(folder: Path) -> int:
 
 
 def process_stat(pid: int) -> list[bytes]:
-    """Read the fields of /proc/PID/stat from the state on; empty where there are none."""
+    """Read the fields of /proc/PID/stat from the process state on; an empty list if there is no such file."""
     try:
         return Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
     except OSError:
@@ -128,16 +137,18 @@ def process_stat(pid: int) -> list[bytes]:
 
 
 def gpu_use() -> dict[str, float]:
-    """Return `gpu_percent`, the mean load of the machine's NVIDIA devices, and `gpu_mib`, their memory in use; empty
-    where there is none."""
+    """Return the mean load of this machine's NVIDIA devices and their memory in use; an empty dict without devices."""
     import pynvml as nvml
 
-    loads, used_mib = list[float](), 0.0
+    loads = list[float]()
+    used_mib = 0.0
     with contextlib.suppress(nvml.NVMLError, nvml.NVMLLibraryMismatchError):
-        nvml.nvmlInit()  # only the first has something to do
+        nvml.nvmlInit()  # a repeated call does nothing
         for index in range(nvml.nvmlDeviceGetCount()):
-            with contextlib.suppress(nvml.NVMLError):  # a virtual device, or a missing right
+            with contextlib.suppress(nvml.NVMLError):  # a virtual device, or no permission
                 device = nvml.nvmlDeviceGetHandleByIndex(index)
                 used_mib += nvml.nvmlDeviceGetMemoryInfo(device).used / MEBIBYTE
                 loads.append(nvml.nvmlDeviceGetUtilizationRates(device).gpu)
-    return {"gpu_percent": round(sum(loads) / len(loads), 1), "gpu_mib": round(used_mib, 1)} if loads else {}
+    if not loads:
+        return {}
+    return {"gpu_percent": round(sum(loads) / len(loads), 1), "gpu_mib": round(used_mib, 1)}

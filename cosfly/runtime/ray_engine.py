@@ -1,8 +1,8 @@
-"""Stages on a Ray cluster: an actor starts a worker process on whichever node Ray has room for it, and relays messages.
+"""Stages on a Ray cluster: an actor on a node with free resources starts a worker process and relays its messages.
 
-Ray finds the node, carries bytes and reports lost nodes. When a worker counts as stalled, and what is tried again, is
-decided in `pool`, as for the processes of one machine. Files do not travel: the nodes share the folder of the stage and
-its inputs. Items are handed out one at a time, and no frame passes through Ray.
+Ray finds the node, carries bytes and reports lost nodes. `worker_pool` decides when a worker counts as stalled and what
+is tried again, as for the processes of one machine. Ray transfers no files: the nodes share the folder of the stage and
+its inputs. Workers receive one item at a time, and no frame passes through Ray.
 """
 
 from __future__ import annotations
@@ -29,14 +29,15 @@ from cosfly.runtime.worker import Item, Message, Start
 
 log = logging.getLogger(__name__)
 
-ALL_ROOM = 2**31  # as many workers as the cluster has room for when a stage begins
-STORE_BYTES = 80_000_000  # of a cluster of this machine: Ray's minimum; nothing of ours is kept in it
-ANSWER_S = 5.0  # within which a head node or an actor answers
+ALL_ROOM = 2**31  # this number of workers means: as many as fit on the cluster when a stage begins
+STORE_BYTES = 80_000_000  # object store of a cluster of this machine: Ray's minimum, since it stores nothing of ours
+ANSWER_S = 5.0  # time limit for an answer of a head node or an actor
+ROUNDING = 1e-6  # lets four shares of 0.25 fit in one device
 ENVIRONMENT = {
-    "RAY_USAGE_STATS_ENABLED": "0",  # no report to its makers
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # else it hides the GPUs from workers that ask for no share
+    "RAY_USAGE_STATS_ENABLED": "0",  # send no usage report
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # otherwise it hides the GPUs from workers that request none
 }
-WAITING_S = 30.0  # after so long the log says that there is no room
+WAITING_S = 30.0  # interval of warnings that no node has free resources
 
 
 class RayConfig(Config):
@@ -54,44 +55,62 @@ class RayConfig(Config):
 
 
 class Cluster:
-    """A cluster, and a stage's folder that its nodes share. room: how many workers fit on its nodes when they are idle;
-    needs: the resources of a worker in words."""
+    """A cluster whose nodes share the folder of a stage.
+
+    room: The number of workers that fit on its nodes when they are idle. needs: The resources of a worker, in words.
+    """
 
     def __init__(self, cfg: RayConfig, folder: Path) -> None:
-        self._folder, self._ray, self._record = folder, connected(cfg), sha256_file(folder / "stage.json")
+        self._folder = folder
+        self._ray = connected(cfg)
+        self._record_sha256 = sha256_file(folder / "stage.json")
         self._takes = {"num_cpus": cfg.worker_cpus, "num_gpus": cfg.worker_gpus, "max_restarts": 0}
-        shares = {"CPU": cfg.worker_cpus} | ({"GPU": cfg.worker_gpus} if cfg.worker_gpus else {})
+        shares = {"CPU": cfg.worker_cpus}
+        if cfg.worker_gpus:
+            shares["GPU"] = cfg.worker_gpus
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
-        self.room = sum(min(int(node.get(name, 0.0) / one + 1e-6) for name, one in shares.items()) for node in nodes)
+        self.room = 0
+        for node in nodes:
+            self.room += min(int(node.get(name, 0.0) / share + ROUNDING) for name, share in shares.items())
         self.needs = " and ".join(f"{share:g} {name}s" for name, share in shares.items())
         if not self.room:
             got = ", ".join(f"{node.get('CPU', 0):g} CPUs and {node.get('GPU', 0):g} GPUs" for node in nodes)
-            fix = "lower ray.worker_cpus or ray.worker_gpus, or add a node that has as many"
-            what = "no node has room for a worker"
-            raise EnvironmentMissing(what, got=f"nodes of {got}", expected=self.needs, fix=fix)
+            raise EnvironmentMissing(
+                "no node has room for a worker",
+                got=f"nodes of {got}",
+                expected=self.needs,
+                fix="lower ray.worker_cpus or ray.worker_gpus, or add a node that has as many",
+            )
         self._actor = self._ray.remote(_host())
 
     def start_transport(self, *options: Any) -> RayTransport:
-        """Request a worker on any node; options as for `pool.LocalTransport`."""
-        host, of_stage = self._actor.options(**self._takes).remote(), (str(self._folder), self._record, os.getcwd())
-        started = host.start.remote(options, *of_stage, sys.path, cosfly.__version__)
-        return RayTransport(self._ray, host, started, options[-1], self.needs)
+        """Request a worker on any node; the options are the arguments of `LocalTransport`."""
+        host = self._actor.options(**self._takes).remote()
+        started = host.start.remote(
+            options, str(self._folder), self._record_sha256, os.getcwd(), sys.path, cosfly.__version__
+        )
+        worker_index = options[-1]
+        return RayTransport(self._ray, host, started, worker_index, self.needs)
 
 
 class RayTransport:
-    """The connection to a worker process on a node; its methods are those of `pool.LocalTransport`."""
+    """The connection to a worker process on a node; its methods are those of `LocalTransport`."""
 
-    def __init__(self, ray: Any, host: Any, started: Any, place: int, needs: str) -> None:
+    def __init__(self, ray: Any, host: Any, started: Any, worker_index: int, needs: str) -> None:
         self.pid: int | None = None
         self.node: str | None = None
-        self._ray, self._host, self._started, self._place, self._needs = ray, host, started, place, needs
+        self._ray = ray
+        self._host = host
+        self._started = started
+        self._worker_index = worker_index
+        self._needs = needs
         self._call: Any = None
         self._received = deque[bytes]()
         self._vitals: Vitals | None = Vitals(0.0, 0.0)
 
-    def send(self, what: Start | Item | None) -> None:
-        """Send a message, the first once the worker has started; EnvironmentMissing where its node is not fit."""
-        data = pickle.dumps(what)
+    def send(self, message: Start | Item | None) -> None:
+        """Send a message once the worker has started; raises EnvironmentMissing if its node cannot run it."""
+        data = pickle.dumps(message)
         with self._gone_as_eof():
             while self.pid is None:
                 if self._ray.wait([self._started], timeout=WAITING_S)[0]:
@@ -99,7 +118,7 @@ class RayTransport:
                     if problem:
                         raise EnvironmentMissing(where=f"node {node}", **problem)
                     self.node, self.pid = node, pid
-                elif self._place == 0:
+                elif self._worker_index == 0:
                     log.warning("worker 0 waits for a node with %s free; `ray status` shows who has them", self._needs)
             self._call = self._host.exchange.remote(data)
 
@@ -115,12 +134,12 @@ class RayTransport:
         return pickle.loads(self._received.popleft())
 
     def look(self) -> Vitals | None:
-        return self._vitals  # the last that came: those of a lost node change no more
+        return self._vitals  # the last received ones: those of a lost node stay the same, so that it counts as stalled
 
     def kill(self, patience_s: float) -> None:
         unreachable = self._ray.exceptions.RayError
         if self.pid is not None:
-            # By its host, so that it is known to be gone. A node that is lost does not answer.
+            # The host confirms that the worker is gone. A lost node does not answer.
             with contextlib.suppress(unreachable):
                 self._ray.get(self._host.end.remote(patience_s), timeout=ANSWER_S + patience_s)
         with contextlib.suppress(unreachable):
@@ -132,19 +151,23 @@ class RayTransport:
         try:
             yield
         except (errors.RayActorError, errors.WorkerCrashedError, errors.ObjectLostError) as error:
-            log.debug("worker %d: %s", self._place, error)
+            log.debug("worker %d: %s", self._worker_index, error)
             raise EOFError from None
 
 
 def _host() -> type:
-    """Return the class of the actors, which Ray pickles by value because it is local: it also runs on a node that has
-    another cosfly, or none, and can report that."""
+    """Return the class of the actors.
+
+    Ray pickles a local class by value, so it also runs on a node with another version of cosfly or none, and reports it.
+    """
 
     class Host:
         """Starts a worker on its node and relays its messages. One call at a time."""
 
-        def start(self, options: tuple, folder: str, record: str, cwd: str, path: list[str], version: str) -> tuple:
-            """Return the node's name, the worker's process id, and the node's problem as an error's arguments."""
+        def start(
+            self, options: tuple, folder: str, record_sha256: str, cwd: str, path: list[str], version: str
+        ) -> tuple:
+            """Return the node's name, the worker's process id, and the arguments of an error, if there is one."""
             import os
             import queue
             import socket
@@ -154,22 +177,23 @@ def _host() -> type:
 
             import ray
 
-            node, python = socket.gethostname(), f"Python {sys.executable}"
+            node = socket.gethostname()
+            python = f"Python {sys.executable}"
             try:
                 import cosfly
             except ImportError as error:
                 fix = f"install cosfly {version} there, or start the node with the Python that has it"
                 return node, None, {"what": "cosfly is not there", "got": f"{error} ({python})", "fix": fix}
             if cosfly.__version__ != version:
-                fix = "install the same on every node, then start Ray there again"
+                fix = "install the same version on every node, then start Ray there again"
                 got = f"{cosfly.__version__} ({python})"
-                return node, None, {"what": "another cosfly", "got": got, "expected": version, "fix": fix}
+                return node, None, {"what": "another version of cosfly", "got": got, "expected": version, "fix": fix}
             from cosfly.runtime.io import sha256_file
-            from cosfly.runtime.pool import LocalTransport
+            from cosfly.runtime.local_transport import LocalTransport
 
             try:
                 os.chdir(cwd)
-                is_same = sha256_file(Path(folder) / "stage.json") == record
+                is_same = sha256_file(Path(folder) / "stage.json") == record_sha256
             except (OSError, cosfly.runtime.errors.InputError):
                 is_same = False
             if not is_same:
@@ -177,11 +201,11 @@ def _host() -> type:
                 fix = "have run folder and inputs on storage that all nodes share, at the same path"
                 return node, None, {"what": "the stage's folder is not there", "got": got, "fix": fix}
             if devices := ray.get_gpu_ids():
-                os.environ.setdefault("GLCONTEXT_DEVICE_INDEX", str(devices[0]))  # of EGL, which counts NVIDIA's first
-            sys.path.extend(place for place in path if place not in sys.path)  # a spawned process takes it over
-            vars(sys.modules["__main__"]).pop("__file__", None)  # Ray's own, which a spawned process would run again
+                os.environ.setdefault("GLCONTEXT_DEVICE_INDEX", str(devices[0]))  # EGL lists NVIDIA devices first
+            sys.path.extend(entry for entry in path if entry not in sys.path)  # a spawned process inherits it
+            vars(sys.modules["__main__"]).pop("__file__", None)  # a spawned process would run Ray's main module again
             self.heartbeat_s = options[0]
-            self.inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()  # a worker that still imports reads nothing
+            self.inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()  # a worker reads nothing while it imports
             self.worker = LocalTransport(*options)
             threading.Thread(target=self._send, daemon=True).start()
             return node, self.worker.pid, None
@@ -194,7 +218,7 @@ def _host() -> type:
                 pass  # the worker is gone; `exchange` reports it
 
         def exchange(self, data: bytes | None) -> tuple:
-            """Forward a message; return those of the worker since the last call and its vitals, None if it is gone."""
+            """Forward a message; return the worker's new messages, and its vitals or None if it is gone."""
             if data is not None:
                 self.inbox.put(data)
             received: list[bytes] = []
@@ -207,7 +231,7 @@ def _host() -> type:
             return received, None if vitals is None and not received else tuple(vitals or (0.0, 0.0))[:2]
 
         def end(self, patience_s: float) -> None:
-            """End the worker; it is gone then."""
+            """End the worker and wait until it is gone."""
             self.worker.kill(patience_s)
 
     return Host
@@ -229,24 +253,26 @@ def connected(cfg: RayConfig) -> Any:
     if ray.is_initialized():
         return ray
     address = cfg.address or os.environ.get("RAY_ADDRESS") or "local"
-    own: dict[str, Any] = {"object_store_memory": STORE_BYTES, "include_dashboard": False} if address == "local" else {}
+    local_options: dict[str, Any] = {}
+    if address == "local":
+        local_options = {"object_store_memory": STORE_BYTES, "include_dashboard": False}
     if ":" in address:
         _check_reachable(address)
     handler = signal.getsignal(signal.SIGTERM)
     try:
-        ray.init(address, **own, log_to_driver=False, logging_level=logging.ERROR, namespace="cosfly")
+        ray.init(address, **local_options, log_to_driver=False, logging_level=logging.ERROR, namespace="cosfly")
     except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
         raise _refused(address, error) from None
     finally:
-        # It would write messages about lost nodes on the standard output.
+        # Ray would write messages about lost nodes to the standard output.
         ray_worker.print_to_stdstream = lambda data, **_: log.debug("ray: %s", " ".join(data["lines"]))
-        with contextlib.suppress(ValueError, TypeError):  # not the main thread, where Ray leaves it alone
+        with contextlib.suppress(ValueError, TypeError):  # outside the main thread, where Ray sets no handler
             signal.signal(signal.SIGTERM, handler)
     return ray
 
 
 def _check_reachable(address: str) -> None:
-    """Check that a gRPC server is at a host and port: Ray itself would try for a quarter of an hour."""
+    """Check that a gRPC server answers at a host and port: Ray itself would try for a quarter of an hour."""
     import grpc
     from ray._private.gcs_utils import create_gcs_channel
 
@@ -254,7 +280,7 @@ def _check_reachable(address: str) -> None:
     try:
         grpc.channel_ready_future(channel).result(ANSWER_S)
     except grpc.FutureTimeoutError:
-        raise _refused(address, f"nobody who speaks gRPC within {ANSWER_S:g} s") from None
+        raise _refused(address, f"no gRPC server within {ANSWER_S:g} s") from None
     finally:
         channel.close()
 

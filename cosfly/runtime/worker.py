@@ -1,6 +1,6 @@
-"""A worker process: does the items that come through its pipe, reports progress, and ends when its parent does.
+"""A worker process: works on the items that it receives through a pipe, and ends with its parent.
 
-`pool` is the other end of the pipe.
+`worker_pool` is at the other end of the pipe.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from cosfly.runtime.run_dir import Dropped, Failed, ItemRecord, Kept
 
 log = logging.getLogger(__name__)
 
-LEFT_TO_THE_PARENT = frozenset({signal.SIGINT, signal.SIGTERM})  # it ends its workers, and alone reports it
-PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # prctl(2)
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # mallopt(3) of glibc
-GREATEST_KEPT_BYTES = 32 << 20  # an array, the most that glibc takes
-MOST_KEPT_BYTES = 64 << 20  # together
+LEFT_TO_THE_PARENT = frozenset({signal.SIGINT, signal.SIGTERM})  # the parent ends its workers and reports the signal
+PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # options of prctl(2)
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3) in glibc
+GREATEST_KEPT_BYTES = 32 << 20  # freed arrays up to this size are kept for reuse; glibc accepts no more
+MOST_KEPT_BYTES = 64 << 20  # of all freed arrays together
 
 
 # --- items ------------------------------------------------------------------------------------------------------------
@@ -40,7 +40,7 @@ MOST_KEPT_BYTES = 64 << 20  # together
 class Item:
     """One unit of work. `item_id` is unique within the stage and stable between runs.
 
-    num_steps: The number of steps, as frames, that the work reports with `advance`; None where it is not known before.
+    num_steps: The number of steps, such as frames, that the work reports with `advance`; None if it is unknown.
     """
 
     item_id: str
@@ -59,18 +59,18 @@ class Outcome:
 Work = Callable[[Item], Outcome]
 Start = Callable[[], Work]  # the first message to a worker: a partial of a module-level function
 
-_place = 0
+_worker_index = 0
 _on_steps: Callable[[int], None] | None = None
 _num_steps = 0
 
 
-def worker_place() -> int:
+def worker_index() -> int:
     """Return the index of this process among a stage's workers; one that replaces another takes over its index."""
-    return _place
+    return _worker_index
 
 
 def advance(num_steps: int = 1) -> None:
-    """Report that the current item is getting on: a heartbeat, and a step of the progress bar."""
+    """Report steps of the current item: they move the progress bar and show that the item makes progress."""
     global _num_steps
     _num_steps += num_steps
     if _on_steps is not None:
@@ -80,10 +80,11 @@ def advance(num_steps: int = 1) -> None:
 def attempt(work: Work, item: Item, on_steps: Callable[[int], None] | None = None) -> ItemRecord:
     """Run one item and return its record; only a fatal error is raised.
 
-    on_steps: It is called with the number of steps done whenever the item's work calls `advance`.
+    on_steps: Called with the number of finished steps whenever the work calls `advance`.
     """
     global _on_steps, _num_steps
-    _on_steps, _num_steps = on_steps, 0
+    _on_steps = on_steps
+    _num_steps = 0
     start_s = time.monotonic()
     try:
         outcome = work(item)
@@ -91,7 +92,7 @@ def attempt(work: Work, item: Item, on_steps: Callable[[int], None] | None = Non
         if error.fatal:
             raise
         return Failed(id=item.item_id, code=error.code, message=str(error))
-    except Exception as error:  # the item boundary: a bug in one item must not lose the others
+    except Exception as error:  # a bug in one item must not lose the others
         log.error("%s: a bug in cosfly\n%s", item.item_id, traceback.format_exc())
         return Failed(id=item.item_id, code="bug", message=f"{type(error).__name__}: {error}")
     finally:
@@ -106,23 +107,23 @@ def attempt(work: Work, item: Item, on_steps: Callable[[int], None] | None = Non
 
 
 @dataclass(frozen=True)
-class Sign:
-    """A heartbeat: the process lives and has done `num_steps` of its item; item_id None: it has none yet."""
+class Heartbeat:
+    """A sign that the process is alive. num_steps: finished steps of the item; item_id: None before the first item."""
 
     item_id: str | None
     num_steps: int
 
 
-# An exception: the stage cannot go on, because of a fatal error or because the worker cannot be made.
-Message = Sign | Exception | logging.LogRecord | ItemRecord
+# An Exception ends the stage: a fatal error, or the worker could not be made.
+Message = Heartbeat | Exception | logging.LogRecord | ItemRecord
 
 
 # --- the process ------------------------------------------------------------------------------------------------------
 
 
-def work_through(connection: Connection, parent_pid: int, heartbeat_s: float, log_level: int, place: int) -> None:
-    """Receive a Start, then do items until None comes; records, heartbeats and log lines go back through the pipe."""
-    global _place
+def work_through(connection: Connection, parent_pid: int, heartbeat_s: float, log_level: int, index: int) -> None:
+    """Receive a Start, then work on items until None comes; send records, heartbeats and log lines back."""
+    global _worker_index
     end_with_parent(parent_pid)
     for number in LEFT_TO_THE_PARENT:
         signal.signal(number, signal.SIG_IGN)
@@ -130,33 +131,33 @@ def work_through(connection: Connection, parent_pid: int, heartbeat_s: float, lo
     sender = _Sender(connection)
     logging.getLogger().handlers = [sender]
     set_levels(log_level)
-    _place = place
+    _worker_index = index
     with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
-        # A frame's arrays are megabytes each; pages that are freed and asked for again are cleared one by one.
+        # The arrays of a frame have megabytes each. Pages that glibc returned to the system are cleared on reuse.
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(MMAP_THRESHOLD, GREATEST_KEPT_BYTES)
         mallopt(TRIM_THRESHOLD, MOST_KEPT_BYTES)
     threading.Thread(target=sender.send_heartbeats, args=(heartbeat_s,), daemon=True).start()
     try:
-        make: Start | None = _received(connection)
-        work = make() if make else None
+        start: Start | None = _received(connection)
+        work = start() if start else None
         while work and (item := _received(connection)):
             sender.begin(item)
             record = attempt(work, item)
             sender.is_busy = False
-            sender.send(Sign(record.id, _num_steps))
+            sender.send(Heartbeat(record.id, _num_steps))
             sender.send(record)
-    # The boundary of the process: an error that ends the work is sent, or the pool would take it for a death.
+    # Errors that end the work are sent: otherwise the pool would report that the process died.
     except Exception as error:
         if not isinstance(error, CosflyError):
-            if type(error).__module__ != "builtins":  # many of those do not cross the pipe; their words do
+            if type(error).__module__ != "builtins":  # many errors of libraries cannot be pickled
                 error = RuntimeError(f"a bug in a worker: {type(error).__name__}: {error}")
-            error.add_note(traceback.format_exc())  # a bug keeps its traceback, which does not cross the pipe
+            error.add_note(traceback.format_exc())  # a traceback cannot be pickled
         sender.send(error)
 
 
 def _received(connection: Connection) -> Any:
-    """Return the next message of the parent; None: no more."""
+    """Return the next message of the parent; None if there are no more."""
     try:
         return connection.recv()
     except EOFError:
@@ -164,11 +165,12 @@ def _received(connection: Connection) -> Any:
 
 
 class _Sender(logging.handlers.QueueHandler):
-    """Sends a worker's messages, from whichever thread."""
+    """Sends the messages of a worker from any of its threads."""
 
     def __init__(self, connection: Connection) -> None:
         super().__init__(None)  # type: ignore[arg-type]  # there is no queue: `enqueue` sends
-        self._connection, self._sending = connection, threading.Lock()
+        self._connection = connection
+        self._sending = threading.Lock()
         self._item_id: str | None = None
         self.is_busy = True
 
@@ -185,14 +187,15 @@ class _Sender(logging.handlers.QueueHandler):
     def begin(self, item: Item) -> None:
         global _num_steps
         _num_steps = 0
-        self._item_id, self.is_busy = item.item_id, True
-        self.send(Sign(item.item_id, 0))
+        self._item_id = item.item_id
+        self.is_busy = True
+        self.send(Heartbeat(item.item_id, 0))
 
     def send_heartbeats(self, heartbeat_s: float) -> None:
         while True:
             time.sleep(heartbeat_s)
             if self.is_busy:
-                self.send(Sign(self._item_id, _num_steps))
+                self.send(Heartbeat(self._item_id, _num_steps))
 
 
 # --- the system -------------------------------------------------------------------------------------------------------
@@ -200,40 +203,45 @@ class _Sender(logging.handlers.QueueHandler):
 
 @contextlib.contextmanager
 def signals_held_back() -> Iterator[None]:
-    """Hold back Ctrl-C and SIGTERM while a process starts, which inherits that: the exceptions that they raise are lost
-    in the hooks of a fork, and would hit a worker's imports."""
-    came, is_main = list[int](), threading.current_thread() is threading.main_thread()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, LEFT_TO_THE_PARENT)
-    # Another thread may take the signal all the same; its handler runs in the main one, here.
-    handlers = {number: signal.getsignal(number) for number in LEFT_TO_THE_PARENT}
-    ours = [number for number, handler in handlers.items() if callable(handler)] if is_main else []
+    """Hold back Ctrl-C and SIGTERM while a process starts, and raise them afterwards.
+
+    The exceptions of their handlers would be lost in the hooks of a fork, or interrupt the imports of the new process,
+    which inherits the blocked signals.
+    """
+    received = list[int]()
+    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, LEFT_TO_THE_PARENT)
+    # Another thread may still receive the signal; Python then runs the handler in the main thread.
+    handlers = {}
+    if threading.current_thread() is threading.main_thread():
+        current = {number: signal.getsignal(number) for number in LEFT_TO_THE_PARENT}
+        handlers = {number: handler for number, handler in current.items() if callable(handler)}
     try:
-        for number in ours:
-            signal.signal(number, lambda one, _: came.append(one))
+        for number in handlers:
+            signal.signal(number, lambda number, _: received.append(number))
         yield
     finally:
-        for number in ours:
-            signal.signal(number, handlers[number])
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for one in came:
-            signal.raise_signal(one)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
+        for received_number in received:
+            signal.raise_signal(received_number)
 
 
 def return_freed_memory() -> None:
-    """Return all freed memory to the system: glibc keeps what lies between pieces that are still in use."""
+    """Return all freed memory to the system: glibc keeps the gaps between pieces that are still in use."""
     with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def end_with_parent(parent_pid: int) -> None:
-    """Make the system kill this process with its parent; on other systems than Linux the pipe reports its end."""
+    """Let Linux kill this process when its parent ends; on other systems the closed pipe ends a worker."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent_pid:  # it died before the call
+        if os.getppid() != parent_pid:  # the parent died before the call
             os._exit(1)
 
 
 def adopt_orphans() -> None:
-    """Make this process the parent of processes that its own workers leave behind, so that it can find them."""
+    """Make this process the parent of processes that its workers leave behind, so that it can find them."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)

@@ -13,7 +13,7 @@ import numpy as np
 from cosfly.formats.captions import ORDERS, TOKENS
 from cosfly.formats.segments import Segment
 from cosfly.inspection.blind_baseline import FITTED_ON, LEAST_WINDOWS, fit_deciders, is_drawn_ahead, past_of
-from cosfly.runtime.seeding import draws_for, rng_for
+from cosfly.runtime.seeding import random_bytes, rng_for
 from release.card.numbers import DIGITS, row_lists
 from release.columns import PLACE, SHORT_NAMES, WINDOW
 from release.flight_rows import FlightRows
@@ -51,7 +51,7 @@ def _windows(shard: Path, record: ReleaseRecord) -> Iterator[tuple[np.ndarray, i
         begins = [now for now in range(1, len(rows)) if styles[now] != styles[now - 1]]
         flight = replace(rows.flight, segments=tuple(Segment(styles[now], now, len(rows)) for now in begins))
         for now, row in enumerate(rows.rows):
-            if row["label"] is None or int.from_bytes(draws_for(0, STAGE, row["sample_id"])[:8]) > most_rank:
+            if row["label"] is None or int.from_bytes(random_bytes(0, STAGE, row["sample_id"])[:8]) > most_rank:
                 continue
             is_ordered, last = row["label"] in ORDERS, now + num_future
             is_known = not rows.is_foreign and place.get(row["frame_index"] + num_future) == last
