@@ -128,11 +128,11 @@ def test_all_that_is_wrong_with_a_table_is_told(tmp_path, subtests):
 def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
     for text, words in [
             (collection(feature("LineString", [[0, 0], [1, 1]], type="Walls")),
-             "feature 1: a geometry that has no place here, LineString; there are Point"),
+             "feature 1: unsupported geometry LineString; expected one of Point"),
             (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")),
-             "feature 1: its coordinates are not places: at least four finite"),
+             "feature 1: invalid coordinates of a Polygon; expected at least four finite"),
             (collection(feature("Polygon", [[[0, 0], [9, "x"], [9, 9], [0, 0]]], type="Walls")),
-             "not places: at least four"),
+             "of a Polygon; expected at least four"),
             (collection(feature("Polygon", [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]], type="Buildings", height_m=3)),
              r"feature 1: the outline crosses itself: Self-intersection\[4\.5 4\.5\]"),
             (collection(feature("Point", [5, 5], type="Vegetation", height_m=3)),
@@ -140,14 +140,14 @@ def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
             (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 0]]], type="Buildings")),
              "feature 1: no height_m"),
             (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 9]]], type="Buildings", height_m=3)),
-             "the last the first again"),
+             "the last equal to the first"),
             (
                 collection(
                     {**feature("LineString", [[0, 0], [1, 1]], type="Walls"), "id": "way/7"},
                     feature("Point", [5, 5], type="Vegetation", name="old oak", height_m="tall"),
                     feature("Point", [5, 5], type="house", levels=3, length_m=4, width_m=4, height_m=6),
                 ),
-                r"unknown column 'levels'.*feature 1 \(way/7\): a geometry.*feature 2 \(old oak\): "
+                r"unknown column 'levels'.*feature 1 \(way/7\): unsupported geometry.*feature 2 \(old oak\): "
                 r"no length_m, no width_m, height_m is not a finite number: 'tall'"
                 r".*feature 3: unknown type 'house'.*expected columns .*types .*4 to fix",
             ),

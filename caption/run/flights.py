@@ -15,7 +15,7 @@ from pathlib import Path
 from caption.run.windows import current_frames, cut_windows
 from caption.schema import CaptionConfig, Window, WindowConfig
 from cosfly.formats.captions import caption_lines, write_caption_lines
-from cosfly.formats.places import ALL_FLIGHTS, TrackChoice, flight_ids, flight_of, place_of
+from cosfly.formats.places import ALL_TRACKS, TrackChoice, flight_ids, flight_of, place_of
 from cosfly.formats.playback import Track, read_track
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.runtime.errors import InputError, VerifyError
@@ -77,7 +77,7 @@ def _twin_of(flight: Track) -> Track | None:
         return None
 
 
-def named_flights(data: Path, choice: TrackChoice = ALL_FLIGHTS) -> list[tuple[str, Path]]:
+def named_flights(data: Path, choice: TrackChoice = ALL_TRACKS) -> list[tuple[str, Path]]:
     """Return (flight id, folder) in the order of the product."""
     folders = find_tracks(data, choice)
     ids = flight_ids([place_of(folder) for folder in folders])

@@ -22,21 +22,24 @@ from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import MISSING, FileFormat, Record, check_schema, dump_json, read_json, validated
 
 BOXES_FORMAT = FileFormat("cosfly.boxes_3d", "1.0", "map")
-MAP_MB = 4_096  # 15 million boxes; ten million took 2.7 GB as they are written
+MAP_MB = 4_096  # 15 million boxes; a file of ten million has 2.7 GB
 AXES = "right-handed, metres, x east, y north, z up; degrees"
-# How far a given corner may be from the computed one: exporters round, and turn boxes in single precision.
-CORNER_M = 0.05
-# Written from the boxes, never carried.
+# Largest distance between a corner in a file and the computed one, per axis: an absolute part, because exporters round
+# and rotate in single precision, and a part relative to the coordinate.
+CORNER_M, CORNER_SHARE = 0.05, 1e-6
+# Fields of a file that are computed from the boxes; a header does not keep them.
 COMPUTED = {"schema", "schema_version", "axes", "bounds", "num_boxes", "counts"}
-ARRAYS = ("centers", "half_extents", "rotations_deg", "kinds", "ids")  # of a BoxMap, one row a box
+VECTORS = ("centers", "half_extents", "rotations_deg")  # fields of a BoxMap, (n, 3)
+ARRAYS = (*VECTORS, "kinds", "ids")  # fields of a BoxMap with one row per box
 
-UNKNOWN_LICENCE, OUR_LICENCE = "unknown", "apache-2.0"  # the latter: of maps that cosfly invents
+UNKNOWN_LICENCE = "unknown"
+OUR_LICENCE = "apache-2.0"  # of maps that cosfly generates
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
 def _licence_id(text: str) -> str:
     if not re.fullmatch(r"[a-z0-9][a-z0-9.+-]*", text):
-        raise ValueError("not a licence identifier as the hub spells it (cc-by-4.0, apache-2.0); words go into credits")
+        raise ValueError("not a licence identifier such as cc-by-4.0 or apache-2.0; put other text into credits")
     return text
 
 
@@ -44,13 +47,13 @@ LicenceId = Annotated[str, AfterValidator(_licence_id)]
 
 
 class _Kept(BaseModel):
-    """Base of records that keep foreign keys."""
+    """Base of records that keep unknown keys."""
 
     model_config = ConfigDict(extra="allow", frozen=True, populate_by_name=True)
 
 
 class MapSource(_Kept):
-    """The tool, and the file or seed, of a map."""
+    """The tool that made a map, and its input file or seed."""
 
     tool: str = ""
     version: str = ""
@@ -59,7 +62,7 @@ class MapSource(_Kept):
 
 
 class SimplifyPass(_Kept):
-    """Boxes after one pass of step 2; the first entry of a list is the input."""
+    """The number of boxes by kind after one pass of step 2; the first entry of a list is the input."""
 
     name: str = Field(alias="pass")
     counts: dict[str, int]
@@ -69,7 +72,7 @@ Height = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 
 
 class GroundGrid(Record):
-    """Sloping ground in the map header. heights_m: rows from south to north, each from west to east."""
+    """Sloping ground in the header of a map. heights_m: Rows from south to north, each from west to east."""
 
     west_m: Height
     south_m: Height
@@ -80,7 +83,7 @@ class GroundGrid(Record):
     def _rows_are_even(self) -> GroundGrid:
         lengths = {len(row) for row in self.heights_m}
         if len(lengths) != 1 or lengths.pop() < 2:
-            raise ValueError("the rows of heights_m are not of one length of at least two")
+            raise ValueError("the rows of heights_m must have the same length, at least two")
         return self
 
     def ground(self) -> Ground:
@@ -88,32 +91,32 @@ class GroundGrid(Record):
 
     @classmethod
     def of(cls, ground: Ground) -> GroundGrid:
-        """Return the record of a ground, heights to a millimetre."""
+        """Return the record of a ground, with heights rounded to a millimetre."""
         rows = np.round(ground.heights_m, 3).tolist()
         return cls(west_m=ground.west_m, south_m=ground.south_m, cell_m=ground.cell_m, heights_m=rows)
 
 
 class MapHeader(_Kept):
-    """The header of a map; fields that are not set are not written.
+    """The header of a map. A file holds only the fields that are set.
 
-    ground_z_m: height of flat ground; where it slopes, `ground` holds the heights. All stages use `BoxMap.ground`.
+    ground_z_m: Height of flat ground; `ground` holds the heights of sloping ground. Stages use `BoxMap.ground`.
     """
 
     name: str = "map"
     source: MapSource = MapSource()
     licence: LicenceId = UNKNOWN_LICENCE
-    credits: str = ""  # who must be named, one sentence or more
+    credits: str = ""  # the attribution that the licence requires, in sentences
     ground_z_m: float = Field(0.0, ge=-LARGEST, le=LARGEST)
     ground: GroundGrid | None = None
-    extent_sources: dict[str, int] = {}  # where a box's size comes from -> boxes
+    extent_sources: dict[str, int] = {}  # number of boxes by the source of their size
     roads: dict[str, float] = {}
-    added_boxes: int = 0  # boxes that the source does not hold
-    derived_ground: int = 0  # of these, ground that was derived from the buildings
-    offset_m: dict[str, float] = {}  # from this map's coordinates to the source's
+    added_boxes: int = 0  # number of boxes that the source does not hold
+    derived_ground: int = 0  # number of these that are ground, derived from the buildings
+    offset_m: dict[str, float] = {}  # added to coordinates of this map, gives those of the source
     building_footprint_m2: float | None = None
     building_area_ratio: float | None = None
     building_covered_share: float | None = None
-    num_objects: int | None = None  # of the source, those that were dropped included
+    num_objects: int | None = None  # of the source, including dropped ones
     dropped_objects: dict[str, int] = {}
     passes: list[SimplifyPass] = []
     simplify: dict[str, Any] = {}  # the settings of step 2
@@ -124,7 +127,7 @@ class BoxMap:
     """A map of boxes, the product of stages 1 and 2.
 
     centers, half_extents: (n, 3) float64, m. rotations_deg: (n, 3) float64: pitch, yaw, roll. kinds: (n,) uint8, KINDS.
-    ids: (n,) uint64, unique and stable. meshes: what some boxes are drawn as; none in simplified maps.
+    ids: (n,) uint64, unique and stable. meshes: Drawn instead of some boxes; none in simplified maps.
     """
 
     centers: np.ndarray
@@ -144,12 +147,12 @@ class BoxMap:
 
     @cached_property
     def ground(self) -> Ground:
-        """The height of the ground, everywhere."""
+        """The height of the ground at each position."""
         return self.header.ground.ground() if self.header.ground else Ground.flat(self.header.ground_z_m)
 
     @property
     def mins(self) -> np.ndarray:
-        """(n, 3) low corners of the axis-aligned boxes round the rotated ones."""
+        """(n, 3) low corners of the axis-aligned boxes around the rotated ones, m."""
         return self.centers - axis_aligned_half_extents(self.half_extents, self.rotations_deg)
 
     @property
@@ -157,7 +160,7 @@ class BoxMap:
         return self.centers + axis_aligned_half_extents(self.half_extents, self.rotations_deg)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the low and high corners of all boxes, (3,) each."""
+        """Return the low and high corner of all boxes together, (3,) m each."""
         return self.mins.min(axis=0), self.maxs.max(axis=0)
 
     def select(self, index: np.ndarray) -> BoxMap:
@@ -165,12 +168,12 @@ class BoxMap:
         return replace(self, **{name: getattr(self, name)[index] for name in ARRAYS})
 
     def joined(self, other: BoxMap) -> BoxMap:
-        """Return these boxes and then the other's, under this header."""
+        """Return these boxes followed by those of another map, under this header."""
         both: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in ARRAYS}
         return replace(self, **both)
 
     def is_any_of(self, kinds: Collection[int]) -> np.ndarray:
-        """Return which boxes are of one of some kinds, (n,) bool."""
+        """Return which boxes have one of the kinds, (n,) bool."""
         return np.isin(self.kinds, np.array(sorted(kinds), dtype=np.uint8))
 
     def counts(self) -> dict[str, int]:
@@ -183,7 +186,7 @@ class BoxMap:
 def make_box_map(
     centers: Any, half_extents: Any, rotations_deg: Any, kinds: Any, ids: Any = None, header: MapHeader | None = None
 ) -> BoxMap:
-    """Make a BoxMap from anything array-like; ids default to 1..n."""
+    """Make a BoxMap from array-like columns; ids default to 1..n."""
     vectors = [np.asarray(rows, dtype=np.float64).reshape(-1, 3) for rows in (centers, half_extents, rotations_deg)]
     ids = np.asarray(np.arange(1, len(vectors[0]) + 1) if ids is None else ids, dtype=np.uint64).reshape(-1)
     kinds = np.asarray(kinds, dtype=np.uint8).reshape(-1)
@@ -191,39 +194,54 @@ def make_box_map(
 
 
 def check_boxes(box_map: BoxMap, where: str | Path) -> None:
-    """Check finite numbers, extents, kinds and ids."""
-    columns = (box_map.centers, box_map.half_extents, box_map.rotations_deg)
-    checks = [
-        ("a box is not finite", name, rows, ~(np.abs(rows) <= LARGEST), "finite numbers")  # NaN is not
-        for name, rows in zip(("center", "extent", "rotation"), columns, strict=True)
-    ]
+    """Check that numbers are finite, extents not negative, kinds known and ids unique."""
+
+    def check(name: str, rows: np.ndarray, is_valid: np.ndarray, what: str, expected: str) -> None:
+        bad = _first_row(~is_valid)
+        if bad is not None:
+            got = str(rows[bad].tolist())
+            raise InputError(what, where=f"{where}: box {box_map.ids[bad]}: {name}", got=got, expected=expected)
+
+    for name, rows in (
+        ("center", box_map.centers),
+        ("extent", box_map.half_extents),
+        ("rotation", box_map.rotations_deg),
+    ):
+        check(name, rows, np.abs(rows) <= LARGEST, "a box is not finite", "finite numbers")  # NaN fails
     half = box_map.half_extents
-    checks.append(("a box has a negative extent", "extent", half, half < 0, "half sizes of at least 0 m"))
-    for what, name, rows, is_bad, expected in checks:
-        for row in np.flatnonzero(is_bad.any(axis=1)):
-            place, got = f"{where}: box {box_map.ids[row]}: {name}", str(rows[row].tolist())
-            raise InputError(what, where=place, got=got, expected=expected)
+    check("extent", half, half >= 0, "a box has a negative extent", "half sizes of at least 0 m")
     unknown = [int(kind) for kind in np.unique(box_map.kinds) if int(kind) not in KIND_NAMES]
     if unknown:
-        raise InputError("unknown semantic id", where=where, got=str(unknown[0]), expected="0 to 28")
+        expected = f"{min(KIND_NAMES)} to {max(KIND_NAMES)}"
+        raise InputError("unknown semantic id", where=where, got=str(unknown[0]), expected=expected)
     ids, counts = np.unique(box_map.ids, return_counts=True)
     if (counts > 1).any():
         raise InputError("a box id occurs more than once", where=where, got=str(ids[counts > 1][0]))
 
 
+def _first_row(mask: np.ndarray) -> int | None:
+    """Return the first row of a mask (n, 3) that holds True; None if there is none."""
+    rows = np.flatnonzero(mask.any(axis=1))
+    return int(rows[0]) if len(rows) else None
+
+
 def check_ground(box_map: BoxMap, path: Path) -> None:
-    """Check that a map has ground: a height, a grid of heights, or a box of it."""
-    given = box_map.header.model_fields_set & {"ground_z_m", "ground"}
-    if not given and not box_map.is_any_of(GROUND_KINDS).any():
-        what, got = "the map has no ground", "neither ground_z_m nor heights in the header, and no box of the ground"
-        fix = "put ground_z_m into the header, or boxes of Roads, Sidewalks, Terrain or Ground"
-        raise InputError(what, where=path, got=got, expected="where people stand", fix=fix)
+    """Check that a map has ground: a height or a grid of heights in its header, or a box of a ground kind."""
+    has_heights = box_map.header.model_fields_set & {"ground_z_m", "ground"}
+    if not has_heights and not box_map.is_any_of(GROUND_KINDS).any():
+        raise InputError(
+            "the map has no ground",
+            where=path,
+            got="neither ground_z_m nor heights in the header, and no box of the ground",
+            expected="the height at which people stand",
+            fix="put ground_z_m into the header, or add boxes of Roads, Sidewalks, Terrain or Ground",
+        )
 
 
 class _Box(BaseModel):
-    """A box of a file; fields with a default follow from the others and are compared with them."""
+    """A box of a file. Fields with a default, except `mesh`, are redundant and compared with the others."""
 
-    model_config = ConfigDict(strict=True, extra="forbid")  # no numbers in quotes
+    model_config = ConfigDict(strict=True, extra="forbid")  # strict: a quoted number is an error
 
     type: str
     id: int = Field(ge=0, lt=2**64)
@@ -249,40 +267,55 @@ class _Boxes(BaseModel):
 
 
 def write_boxes(path: Path, box_map: BoxMap) -> None:
-    """Write boxes in the paper's fields (tab:boxes_schema), one box a line; meshes in `meshes.glb` next to them."""
+    """Write boxes in the paper's fields (tab:boxes_schema), one per line; meshes are in `meshes.glb` next to it."""
     check_boxes(box_map, path)
     refs = box_map.meshes.relative_to(path.parent).refs
-    columns = {name: np.round(getattr(box_map, name), 6) for name in ("centers", "half_extents", "rotations_deg")}
-    box_map = replace(box_map, **columns)  # so that min and max agree with what is read back
+    # min and max follow from the rounded vectors, as they do for a reader.
+    box_map = replace(box_map, **{name: np.round(getattr(box_map, name), 6) for name in VECTORS})
     mins, maxs = box_map.mins, box_map.maxs
     low, high = box_map.bounds() if len(box_map) else (np.zeros(3), np.zeros(3))
     fields = box_map.header.model_dump(mode="json", by_alias=True, exclude_unset=True)
-    last: dict[str, Any] = {name: fields.pop(name) for name in ("passes", "simplify", "ground") if name in fields}
-    heights = last.pop("ground", None)
-    header = BOXES_FORMAT.header | fields | {
-        "axes": AXES, "bounds": {"min": rounded(low), "max": rounded(high)}, "num_boxes": len(box_map),
+    ground = fields.pop("ground", None)
+    last_fields = {name: fields.pop(name) for name in ("passes", "simplify") if name in fields}
+    header: dict[str, Any] = {
+        **BOXES_FORMAT.header,
+        **fields,
+        "axes": AXES,
+        "bounds": {"min": rounded(low), "max": rounded(high)},
+        "num_boxes": len(box_map),
         "counts": box_map.counts(),
-    } | last  # fmt: skip
+        **last_fields,
+    }
     lines = []
     for i, (number, box_id) in enumerate(zip(box_map.kinds.tolist(), box_map.ids.tolist(), strict=True)):
-        kind, mesh = KIND_NAMES[number], refs.get(box_id)
-        vectors = {
-            "center": box_map.centers[i], "extent": box_map.half_extents[i], "rotation": box_map.rotations_deg[i],
-            "min": mins[i], "max": maxs[i],
-        }  # fmt: skip
-        box = {"type": kind, "semantic_id": number, "color": KIND_COLORS[kind], "id": box_id}
-        box |= {name: rounded(vector) for name, vector in vectors.items()}
-        lines.append(dump_json(box if mesh is None else box | {"mesh": mesh.model_dump(exclude_none=True)}))
-    ground = f',\n "ground": {dump_json(heights)}' if heights else ""
-    text = dump_json(header, indent=1)[:-2] + ground + ',\n "boxes": [\n' + ",\n".join(lines) + "\n]}\n"
-    write_bytes(path, text.encode())
+        kind = KIND_NAMES[number]
+        box = {
+            "type": kind,
+            "semantic_id": number,
+            "color": KIND_COLORS[kind],
+            "id": box_id,
+            "center": rounded(box_map.centers[i]),
+            "extent": rounded(box_map.half_extents[i]),
+            "rotation": rounded(box_map.rotations_deg[i]),
+            "min": rounded(mins[i]),
+            "max": rounded(maxs[i]),
+        }
+        if mesh := refs.get(box_id):
+            box["mesh"] = mesh.model_dump(exclude_none=True)
+        lines.append(dump_json(box))
+    # The header is indented; the heights of the ground take one line, and so does each box.
+    members = [dump_json(header, indent=1).removesuffix("\n}")]
+    if ground:
+        members.append(f' "ground": {dump_json(ground)}')
+    members.append(' "boxes": [\n' + ",\n".join(lines) + "\n]")
+    write_bytes(path, (",\n".join(members) + "}\n").encode())
 
 
 def read_boxes(path: Path) -> BoxMap:
-    """Read `boxes_3d.json` or `step2_simplified.json`; also a bare list of boxes, as the paper's exporter writes."""
+    """Read `boxes_3d.json`, `step2_simplified.json` or a bare list of boxes, which the paper's exporter writes."""
     if path.suffix.lower() in (".csv", ".geojson"):
-        fix = f"cosfly maps --source boxes --set maps.boxes.path={path} --out DIR makes boxes_3d.json of it"
-        raise InputError("boxes of one's own, not a map yet", where=path, fix=fix)
+        fix = f"convert it to boxes_3d.json: cosfly maps --source boxes --set maps.boxes.path={path} --out DIR"
+        raise InputError("a table of boxes is not a map", where=path, fix=fix)
     value = read_json(path, what=BOXES_FORMAT.what, most_mb=MAP_MB)
     header = MapHeader(name=path.stem)
     records: Any = value
@@ -294,12 +327,17 @@ def read_boxes(path: Path) -> BoxMap:
         if not isinstance(records, list):
             raise InputError("no list of boxes", where=f"{path}: boxes", got=type(records).__name__, expected="a list")
     if not records:
-        raise InputError("the map holds no boxes", where=path, fix="check the source, or the stage that made it")
+        raise InputError("the map holds no boxes", where=path, fix="check its source, or the stage that wrote it")
     boxes = validated(_Boxes, {"boxes": records}, path).boxes
-    centers, extents, rotations = ([getattr(box, name) for box in boxes] for name in ("center", "extent", "rotation"))
-    kinds, ids = [KINDS[box.type] for box in boxes], [box.id for box in boxes]
+    box_map = make_box_map(
+        [box.center for box in boxes],
+        [box.extent for box in boxes],
+        [box.rotation for box in boxes],
+        [KINDS[box.type] for box in boxes],
+        [box.id for box in boxes],
+        header,
+    )
     refs = {box.id: box.mesh for box in boxes if box.mesh is not None}
-    box_map = make_box_map(centers, extents, rotations, kinds, ids, header)
     box_map = replace(box_map, meshes=Meshes(refs, path.parent))
     check_boxes(box_map, path)
     _check_computed(value if isinstance(value, dict) else {}, boxes, box_map, path)
@@ -307,19 +345,31 @@ def read_boxes(path: Path) -> BoxMap:
 
 
 def _check_computed(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, path: Path) -> None:
-    """Compare derived fields of a file with its boxes; other axes or units would not agree."""
-    for name, follows in (("axes", AXES), ("num_boxes", len(box_map)), ("counts", box_map.counts())):
-        if header.get(name, follows) != follows:
-            got, expected = str(header[name])[:200], str(follows)[:200]
-            raise InputError("not what its boxes are", where=f"{path}: {name}", got=got, expected=expected)
+    """Check the redundant fields of a file against its boxes, which finds a file with other axes or units."""
+    computed = {"axes": AXES, "num_boxes": len(box_map), "counts": box_map.counts()}
+    for name, value in computed.items():
+        if header.get(name, value) != value:
+            got, expected = str(header[name])[:200], str(value)[:200]
+            raise InputError("the field contradicts the boxes", where=f"{path}: {name}", got=got, expected=expected)
     for box in boxes:
-        if box.semantic_id not in (None, KINDS[box.type]):
-            where, expected = f"{path}: box {box.id}: semantic_id", f"{KINDS[box.type]}, {box.type}"
-            raise InputError("not the number of its type", where=where, got=box.semantic_id, expected=expected)
+        number = KINDS[box.type]
+        if box.semantic_id not in (None, number):
+            raise InputError(
+                "not the number of the box's type",
+                where=f"{path}: box {box.id}: semantic_id",
+                got=box.semantic_id,
+                expected=f"{number}, {box.type}",
+            )
     for name, corners in (("min", box_map.mins), ("max", box_map.maxs)):
-        given = np.array([getattr(box, name) or [np.nan] * 3 for box in boxes])  # NaN is not off
-        for row in np.flatnonzero((np.abs(given - corners) > CORNER_M + 1e-6 * np.abs(corners)).any(axis=1)):
-            what, where = "does not follow from center, extent and rotation", f"{path}: box {boxes[row].id}: {name}"
-            fix = "extent is half the size, in metres; rotation is pitch, yaw, roll in degrees"
-            got, expected = str(given[row].tolist()), str(rounded(corners[row]))
-            raise InputError(what, where=where, got=got, expected=expected, fix=fix)
+        # A corner that the file does not hold is NaN, which compares as equal here.
+        file_corners = np.array([getattr(box, name) or [np.nan] * 3 for box in boxes])
+        differs = np.abs(file_corners - corners) > CORNER_M + CORNER_SHARE * np.abs(corners)
+        bad = _first_row(differs)
+        if bad is not None:
+            raise InputError(
+                "does not follow from center, extent and rotation",
+                where=f"{path}: box {boxes[bad].id}: {name}",
+                got=str(file_corners[bad].tolist()),
+                expected=str(rounded(corners[bad])),
+                fix="extent is half the size, in metres; rotation is pitch, yaw, roll in degrees",
+            )

@@ -1,7 +1,7 @@
 """The files of one frame folder of the playback tree: rgb.png, depth, instance.png and meta.json.
 
-Depth is float32: `depth_float32.png`, packed without loss, or `depth.npy` as in the public layout. Ask `frame_path` for
-a file by its name in the public layout. `meta.json` holds CARLA's axes (left-handed), FrameMeta the project's.
+Depth is float32: `depth_float32.png`, packed without loss, or `depth.npy` as in the public layout. `frame_path` finds a
+file by its name in the public layout. `meta.json` uses CARLA's axes (left-handed), `FrameMeta` those of the project.
 """
 
 from __future__ import annotations
@@ -33,21 +33,24 @@ FRAMES_DIR = "frames_playback"
 FrameFile = Literal["rgb", "depth", "instance"]
 DepthFormat = Literal["png", "npy"]
 DEPTH_NPY, DEPTH_PNG = "depth.npy", "depth_float32.png"
-# In the public layout.
+# Names in the public layout.
 FILE_NAMES: dict[FrameFile, str] = {"rgb": "rgb.png", "depth": DEPTH_NPY, "instance": "instance.png"}
-DEBUG_FILE = "debug.png"  # for people, where the settings ask for it: no label, and nobody reads it but they
+DEBUG_FILE = "debug.png"  # an optional picture for people, no label: no stage reads it
 FRAME_FILES = (*FILE_NAMES.values(), "meta.json")
-FILM_WIDTH_MM = 36.0  # of a 35 mm film's picture
-# Fields of view, degrees: nearer to 0 and 180 a picture is one point, or one line is all of it.
+FILM_WIDTH_MM = 36.0  # width of a picture on 35 mm film
+# Limits of the horizontal field of view: towards 0 a picture shows a single point, towards 180 it degenerates.
 LEAST_FOV_DEG, MOST_FOV_DEG = 0.1, 179.0
 LEVEL_NAMES: dict[float, str] = {110: "wide-angle", 90: "standard", 60: "narrow", 30: "telephoto"}  # tab:zoom_config
-SKY_DEPTH_M, INVALID_DEPTH_M = 1000.0, 0.0
-PERSON_ID = 65535  # of the target in `instance.png`
+SKY_DEPTH_M = 1000.0  # depth of the sky and of everything beyond
+INVALID_DEPTH_M = 0.0
+PERSON_ID = 65535  # instance id of the target in `instance.png`
 META_FORMAT = FileFormat("cosfly.frame", "1.0", "frame annotation")
-# A person is legible who is visible, so high in the picture, of so much of the box unhidden, and of so much colour
-# difference (CIE76, where 2.3 is just noticeable) from what is around.
-LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE, LEGIBLE_CONTRAST = 16.0, 0.3, 5.0
-BYSTANDER_COLUMNS = ("in_view", "nearest_m", "nearest_id", "alike_id", "alike_differences")  # of a point's `others`
+# A visible target is legible if it reaches these minima.
+LEGIBLE_HEIGHT_PX = 16.0
+LEGIBLE_SHARE = 0.3  # of its box that is not hidden
+LEGIBLE_CONTRAST = 5.0  # colour difference from its surroundings, CIE76; 2.3 is just noticeable
+# Columns of `others` in a track: see `BystandersMeta.people_of`.
+BYSTANDER_COLUMNS = ("in_view", "nearest_m", "nearest_id", "alike_id", "alike_differences")
 
 COORDINATES = {
     "frame": "carla",
@@ -60,7 +63,7 @@ COORDINATES = {
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera of square pixels; `intrinsic` is (3, 3)."""
+    """A pinhole camera with square pixels; `intrinsic` is (3, 3), px."""
 
     width_px: int
     height_px: int
@@ -72,33 +75,33 @@ class Camera:
 
     @property
     def fov_deg(self) -> float:
-        """Horizontal field of view."""
+        """Horizontal field of view, degrees."""
         return float(np.degrees(2.0 * np.arctan(self.width_px / (2.0 * self.focal_px))))
 
     @property
     def focal_35mm_mm(self) -> float:
-        """Focal length of a lens that shows as much, from left to right, on film 36 mm wide."""
+        """Focal length of a lens with the same horizontal field of view on 35 mm film."""
         return FILM_WIDTH_MM * self.focal_px / self.width_px
 
     def focal_record(self) -> dict[str, Any]:
-        """Return what files hold of the lens."""
+        """Return the fields of the lens in files."""
         focal = {"focal_length_px": self.focal_px, "focal_length_35mm_mm": round(self.focal_35mm_mm, 6)}
         return {**focal, "intrinsic": self.intrinsic.tolist()}
 
 
 def level_name(fov_deg: float) -> str:
-    """Return the paper's name of a level of zoom, "" for one that is not among them."""
+    """Return the paper's name of a zoom level; "" for a field of view that has none."""
     return LEVEL_NAMES.get(round(fov_deg, 3), "")
 
 
 class Look(Config):
-    """Sun and air of a run without weather, the same for every frame."""
+    """Sunlight and haze of a run without weather, the same in every frame."""
 
     sun_azimuth_deg: float = Field(
         235.0, ge=0, le=360, description="direction towards the sun, counter-clockwise from east"
     )
     sun_elevation_deg: float = Field(42.0, ge=5, le=85, description="height of the sun above the horizon, degrees")
-    haze_m: float = Field(520.0, gt=1, description="distance at which haze hides two thirds of what stands there, m")
+    haze_m: float = Field(520.0, gt=1, description="distance at which haze hides two thirds of an object, m")
     exposure: float = Field(0.82, gt=0, le=10, description="brightness of the picture, a factor; 1 is neutral")
 
     def sun_direction(self) -> np.ndarray:
@@ -111,20 +114,23 @@ class Look(Config):
 
 
 def _read_axes(names: tuple[str, ...], value: Any) -> np.ndarray:
-    """Return what a file holds under these names in the tree's axes, in the project's."""
+    """Convert an object of a file, in the tree's axes, to an array in the project's axes; return an array as it is."""
     if isinstance(value, np.ndarray):
         return value
-    found = numbers([value.get(name) for name in names], len(names)) if isinstance(value, dict) else None
-    if found is None or len(value) != len(names):
-        raise ValueError(f"Value should be an object of finite numbers, {', '.join(names)}")
-    return mirror_poses(found)
+    if isinstance(value, dict) and len(value) == len(names):
+        row = numbers([value.get(name) for name in names], len(names))
+        if row is not None:
+            return mirror_poses(row)
+    raise ValueError(f"Value should be an object of finite numbers, {', '.join(names)}")
 
 
 def _write_axes(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
-    return dict(zip(names, (mirror_poses(values) + 0.0).tolist(), strict=True))  # + 0.0: no minus zero
+    """Convert an array in the project's axes to an object of a file, in the tree's axes."""
+    return dict(zip(names, (mirror_poses(values) + 0.0).tolist(), strict=True))  # + 0.0 turns -0.0 into 0.0
 
 
-# In a file in the tree's axes, by name; in memory in the project's: (3,) m, (3,) degrees, (6,) one after the other.
+# In memory arrays in the project's axes: Position (3,) m, Angles (3,) degrees, Pose (6,) both. In a file objects of
+# numbers by name, in the tree's axes.
 Position = Annotated[np.ndarray, PlainValidator(partial(_read_axes, XYZ)), PlainSerializer(partial(_write_axes, XYZ))]
 Angles = Annotated[
     np.ndarray, PlainValidator(partial(_read_axes, ANGLES)), PlainSerializer(partial(_write_axes, ANGLES))
@@ -133,12 +139,12 @@ Pose = Annotated[np.ndarray, PlainValidator(partial(_read_axes, POSE)), PlainSer
 
 
 def tree_yaw(yaw_deg: float) -> float:
-    """Return a yaw, degrees, in the tree's axes."""
-    return 0.0 - yaw_deg
+    """Convert a yaw between the project's and the tree's axes, degrees; the function is its own inverse."""
+    return 0.0 - yaw_deg  # not -yaw_deg: no minus zero
 
 
 class CameraMeta(Record):
-    """The camera that drew a frame; intrinsic 3x3 px, clip planes in m."""
+    """The camera of a frame. intrinsic: 3 x 3, px. near_m, far_m: Clip planes."""
 
     width: int
     height: int
@@ -152,33 +158,39 @@ class CameraMeta(Record):
 
 def camera_meta(camera: Camera, near_m: float, far_m: float) -> CameraMeta:
     """Return the record of a camera; clip planes in m."""
-    size = {"width": camera.width_px, "height": camera.height_px, "fov_deg": round(camera.fov_deg, 6)}
-    return CameraMeta(**size, **camera.focal_record(), near_m=near_m, far_m=far_m)
+    return CameraMeta(
+        width=camera.width_px,
+        height=camera.height_px,
+        fov_deg=round(camera.fov_deg, 6),
+        **camera.focal_record(),
+        near_m=near_m,
+        far_m=far_m,
+    )
 
 
 class TargetMeta(Record):
-    """The target in a frame: hip, (3,) m, box and visibility; px unless named otherwise, null where there is none."""
+    """The target in a frame: its hip, box and visibility. Picture coordinates are px, null if it is not in view."""
 
     world_location: Position
     half_extents_m: tuple[float, float, float]
     instance_id: int
     semantic_id: int
     image_uv: list[float] | None
-    bbox_2d: list[float] | None  # of the projected 3D box
-    mask_bbox_2d: list[float] | None = None  # of the target's pixels; absent in older trees
+    bbox_2d: list[float] | None  # of its projected 3D box
+    mask_bbox_2d: list[float] | None = None  # of its pixels; absent in older trees
     depth_m: float
     in_view: bool
     visible: bool
     visibility: float
     num_pixels: int
-    # Of the picture as written; absent in older trees, contrast null where no pixel of the target is seen.
+    # Measured in the picture; absent in older trees. The contrast is null if no pixel of the target is visible.
     height_px: float | None = None
     contrast: float | None = None
     legible: bool | None = None
 
 
 class PerturbationMeta(Record):
-    """The outcome of a frame's events (none, applied, fallback: reason) and the offsets."""
+    """The outcome of each perturbation event of a frame (none, applied, fallback: reason), and the offsets."""
 
     position: str
     rotation: str
@@ -188,7 +200,7 @@ class PerturbationMeta(Record):
 
 
 class BystanderMeta(Record):
-    """A bystander: middle of the box, heading in degrees clockwise from east, and pixels in the picture."""
+    """A bystander: centre of its box, heading in degrees clockwise from east, and number of its pixels."""
 
     instance_id: int
     semantic_id: int
@@ -199,26 +211,35 @@ class BystanderMeta(Record):
 
     @property
     def heading_rad(self) -> float:
-        """Heading, counter-clockwise from east."""
-        return float(-np.radians(self.yaw))
+        """Heading, rad counter-clockwise from east."""
+        return float(np.radians(tree_yaw(self.yaw)))
 
 
 class BystandersMeta(Record):
-    """The bystanders of a frame, and the shares of the target's box, 0 to 1, that they and the map hide."""
+    """The bystanders of a frame, and the shares of the target's box, 0 to 1, that they hide and that the map hides."""
 
     target_hidden_by_others: float
     target_hidden_by_map: float
     others: list[BystanderMeta]
 
     def people_of(self, target_m: np.ndarray, people: People | None) -> dict[str, float | None]:
-        """Return BYSTANDER_COLUMNS: how many people have a pixel, how far the nearest is from the target, m over the
-        ground, its id, and who looks most like the target; None without any, the last also without `people`."""
-        seen = [one for one in self.others if one.semantic_id == KINDS["Pedestrians"] and one.num_pixels]
-        away_m = {one.instance_id: float(np.hypot(*(one.world_location - target_m)[:2])) for one in seen}
-        nearest = min(away_m, key=away_m.__getitem__, default=None)
-        how_far_m = None if nearest is None else round(away_m[nearest], 3)
-        alike = (None, None) if people is None else people.most_alike(away_m)
-        return dict(zip(BYSTANDER_COLUMNS, (len(seen), how_far_m, nearest, *alike), strict=True))
+        """Return BYSTANDER_COLUMNS of the people with at least one pixel.
+
+        in_view: Their number. nearest_m, nearest_id: Horizontal distance from the target to the nearest one, and its
+        instance id. alike_id, alike_differences: The one that looks most like the target, and the number of
+        differences; None without `people`. All but the first are None if nobody is in view.
+        """
+        visible = [body for body in self.others if body.semantic_id == KINDS["Pedestrians"] and body.num_pixels]
+        distances_m = {body.instance_id: float(np.hypot(*(body.world_location - target_m)[:2])) for body in visible}
+        nearest_id = min(distances_m, key=distances_m.__getitem__, default=None)
+        alike_id, alike_differences = (None, None) if people is None else people.most_alike(distances_m)
+        return {
+            "in_view": len(visible),
+            "nearest_m": None if nearest_id is None else round(distances_m[nearest_id], 3),
+            "nearest_id": nearest_id,
+            "alike_id": alike_id,
+            "alike_differences": alike_differences,
+        }
 
 
 class FrameMeta(Record):
@@ -252,7 +273,7 @@ def read_meta(frame: Path) -> FrameMeta:
 
 
 def frame_name(index: int) -> str:
-    """Return a frame's folder below its track's: `frames_playback/frame_00000`."""
+    """Return the folder of a frame relative to its track: `frames_playback/frame_00000`."""
     return f"{FRAMES_DIR}/frame_{index:05d}"
 
 
@@ -262,13 +283,13 @@ def public_name(name: str) -> str:
 
 
 def frame_path(frame: Path, name: str) -> Path:
-    """Return the path of a frame's file by its name in the public layout; of depth the packed one if it exists."""
+    """Return the path of a frame's file from its name in the public layout; for depth the packed file if it exists."""
     packed = frame / DEPTH_PNG
     return packed if name == DEPTH_NPY and packed.exists() else frame / name
 
 
 def files_in(frame: Path) -> frozenset[str]:
-    """Return the names, in the public layout, of the files of a frame folder; none without a folder."""
+    """Return the names of the files of a frame folder in the public layout; an empty set if there is no folder."""
     try:
         return frozenset(map(public_name, os.listdir(frame)))
     except OSError:
@@ -293,23 +314,24 @@ def read_instance(frame: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_depth(frame: Path) -> np.ndarray:
-    """Read the depth of a frame folder, (h, w) float32 z-depth in m; 1000.0 is sky or as far, 0.0 invalid."""
+    """Read the depth of a frame folder, (h, w) float32 z-depth in m: at most SKY_DEPTH_M, or INVALID_DEPTH_M."""
     path = frame_path(frame, DEPTH_NPY)
     return depth_values(read_bytes(path, what="depth image", tree=tree_of(frame)), path)
 
 
 def depth_values(data: bytes | memoryview, where: Path) -> np.ndarray:
-    """Return the depth of an image's bytes in either form, as `read_depth`; a `.npy` is not copied."""
+    """Return the depth in the bytes of a file of either format, as `read_depth`; a `.npy` is not copied."""
     if data[: len(PNG_SIGNATURE)] == PNG_SIGNATURE:
         depth = floats_of(data, where)
     else:
         depth = parse_array(data, where, dtype=np.float32, ndim=2, what="depth image", copy=False)
-    is_beyond = SKY_DEPTH_M < depth.max(initial=0.0) < np.inf
-    return np.minimum(depth, np.float32(SKY_DEPTH_M)) if is_beyond else depth
+    if SKY_DEPTH_M < depth.max(initial=0.0) < np.inf:
+        return np.minimum(depth, np.float32(SKY_DEPTH_M))
+    return depth
 
 
 def rgb_bytes(rgb: np.ndarray) -> bytes:
-    """Return the content of `rgb.png`, of (h, w, 3) uint8."""
+    """Return the content of `rgb.png` for a picture, (h, w, 3) uint8."""
     return colours_png(rgb)
 
 
@@ -319,17 +341,19 @@ def instance_bytes(kinds: np.ndarray, ids: np.ndarray) -> bytes:
 
 
 def depth_file(depth: np.ndarray, form: DepthFormat) -> tuple[str, bytes]:
-    """Name and content of the file of a depth image, (h, w) float32."""
-    return (DEPTH_PNG, floats_png(depth)) if form == "png" else (DEPTH_NPY, depth_bytes(depth))
+    """Return the name and the content of the file of a depth image, (h, w) float32."""
+    if form == "png":
+        return DEPTH_PNG, floats_png(depth)
+    return DEPTH_NPY, depth_bytes(depth)
 
 
 def depth_bytes(depth: np.ndarray) -> bytes:
-    """Return the content of `depth.npy`, of (h, w) float32."""
+    """Return the content of `depth.npy` for a depth image, (h, w) float32."""
     buffer = io.BytesIO()
     np.lib.format.write_array(buffer, np.ascontiguousarray(depth), version=(1, 0), allow_pickle=False)
     return buffer.getvalue()
 
 
 def as_depth_npy(data: bytes, where: Path) -> bytes:
-    """Return the content of `depth.npy` of a depth image's bytes in either form."""
+    """Convert the bytes of a depth file of either format to the content of `depth.npy`."""
     return depth_bytes(depth_values(data, where)) if data.startswith(PNG_SIGNATURE) else data

@@ -1,4 +1,4 @@
-"""GeoJSON: features with their properties and the rings of their geometry. Coordinates stay as they stand there."""
+"""GeoJSON: features with their properties and the rings of their geometry. Coordinates are not converted."""
 
 from __future__ import annotations
 
@@ -11,32 +11,40 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import read_json
 
 GEOMETRIES = ("Point", "Polygon", "MultiPolygon")
-LARGEST = 1e9  # of a coordinate
+LARGEST = 1e9  # absolute value of a coordinate
+MOST_NAME = 40  # characters of a name in messages
 
 
 class Feature(NamedTuple):
-    """One feature. where: which one, for messages: counted from 1, with its id or name. parts: polygons of rings, the
-    outer one first, (n, 2); a point is a ring of one. wrong: what is wrong with its geometry; it has no parts then."""
+    """One feature.
+
+    where: Names it in messages: its number, counted from 1, with its id or name.
+    properties: Its properties; empty if there are none.
+    parts: Its polygons. Each is a list of rings (n, 2), the outer one first. A point is a ring of one position.
+    problem: What is wrong with its geometry; `parts` is empty then.
+    """
 
     where: str
     properties: dict[str, Any]
     parts: list[list[np.ndarray]]
-    wrong: str = ""
+    problem: str = ""
 
 
 def is_geojson(value: Any) -> bool:
-    """Return whether a JSON document says that it is GeoJSON."""
+    """Return whether the type of a JSON document is one of GeoJSON's that this module reads."""
     return isinstance(value, dict) and value.get("type") in ("FeatureCollection", "Feature", *GEOMETRIES)
 
 
 def read_features(path: Path, *, what: str = "GeoJSON") -> list[Feature]:
-    """Read a FeatureCollection, a Feature or a bare geometry. What is wrong with a feature is stored in it, so that all
-    is reported at once."""
+    """Read a FeatureCollection, a Feature or a bare geometry.
+
+    Each feature stores its own problem, so that the caller can report all of them at once.
+    """
     return features_of(read_json(path, what=what), path)
 
 
 def features_of(value: Any, path: Path) -> list[Feature]:
-    """Return the features of a document; `path` is for messages. Raises InputError where it is no GeoJSON."""
+    """Return the features of a document; `path` is for messages. Raises InputError if it is not GeoJSON."""
     if not is_geojson(value):
         expected = "FeatureCollection, Feature, Polygon or MultiPolygon"
         raise InputError("not GeoJSON", where=f"{path}: type", expected=expected)
@@ -47,28 +55,44 @@ def features_of(value: Any, path: Path) -> list[Feature]:
 
 
 def _feature(item: dict[str, Any], number: int) -> Feature:
-    geometry = item.get("geometry") if item.get("type") == "Feature" else item
-    given = item.get("properties")
-    properties: dict[str, Any] = given if isinstance(given, dict) else {}
+    """Return the feature of an object, which is a Feature or a bare geometry; `number` counts from 1."""
+    properties = item.get("properties")
+    if not isinstance(properties, dict):
+        properties = {}
+    where = f"feature {number}"
     names = (properties.get("name"), item.get("id"), properties.get("id"))
-    name = next((str(value)[:40] for value in names if value not in (None, "")), None)
-    where = f"feature {number}" + ("" if name is None else f" ({name})")
-    kind, places = (geometry.get("type"), geometry.get("coordinates")) if isinstance(geometry, dict) else (None, None)
+    if name := next((str(value)[:MOST_NAME] for value in names if value not in (None, "")), None):
+        where += f" ({name})"
+    geometry = item.get("geometry") if item.get("type") == "Feature" else item
+    if not isinstance(geometry, dict):
+        geometry = {}
+    kind = geometry.get("type")
     if kind not in GEOMETRIES:
-        wrong = f"a geometry that has no place here, {str(kind)[:40]}; there are {', '.join(GEOMETRIES)}"
-        return Feature(where, properties, [], wrong)
-    nested: Any = {"Point": [[[places]]], "Polygon": [places], "MultiPolygon": places}[kind]
-    try:
-        parts = [[np.array([place[:2] for place in ring], dtype=np.float64) for ring in part] for part in nested]
-        is_good = all(parts) and all(_is_ring(ring, kind == "Point") for part in parts for ring in part)
-    except (TypeError, ValueError, OverflowError):
-        is_good = False
-    if is_good:
+        problem = f"unsupported geometry {str(kind)[:MOST_NAME]}; expected one of {', '.join(GEOMETRIES)}"
+        return Feature(where, properties, [], problem)
+    parts = _parts(kind, geometry.get("coordinates"))
+    if parts is not None:
         return Feature(where, properties, parts)
-    needs = "one finite [x, y]" if kind == "Point" else "at least four finite [x, y], the last the first again"
-    return Feature(where, properties, [], f"its coordinates are not places: {needs}")
+    expected = "one finite [x, y]" if kind == "Point" else "at least four finite [x, y], the last equal to the first"
+    return Feature(where, properties, [], f"invalid coordinates of a {kind}; expected {expected}")
+
+
+def _parts(kind: str, coordinates: Any) -> list[list[np.ndarray]] | None:
+    """Return the polygons of a geometry as in `Feature.parts`; None if its coordinates are invalid."""
+    polygons: Any = {"Point": [[[coordinates]]], "Polygon": [coordinates], "MultiPolygon": coordinates}[kind]
+    is_point = kind == "Point"
+    try:
+        parts = [
+            [np.array([position[:2] for position in ring], dtype=np.float64) for ring in polygon]
+            for polygon in polygons
+        ]
+        is_valid = all(parts) and all(_is_ring(ring, is_point) for rings in parts for ring in rings)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return parts if is_valid else None
 
 
 def _is_ring(ring: np.ndarray, is_point: bool) -> bool:
+    """Return whether a ring has finite [x, y] and, unless it is a point, is closed."""
     is_closed = is_point or (len(ring) > 3 and (ring[0] == ring[-1]).all())
-    return bool(ring.shape == (len(ring), 2) and is_closed and (np.abs(ring) <= LARGEST).all())  # NaN is not
+    return bool(ring.shape == (len(ring), 2) and is_closed and (np.abs(ring) <= LARGEST).all())  # NaN fails

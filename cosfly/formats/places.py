@@ -39,7 +39,7 @@ class TrackChoice(Config):
         return not self.match or any(fnmatchcase(head, pattern.strip("/")) for pattern in self.match for head in heads)
 
 
-ALL_FLIGHTS = TrackChoice()
+ALL_TRACKS = TrackChoice()
 
 
 @dataclass(frozen=True, order=True)

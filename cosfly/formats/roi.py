@@ -100,12 +100,15 @@ def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Ro
 
 
 def _polygons_of(features: list[Feature], path: Path) -> list[dict[str, Any]]:
-    """Return polygons of GeoJSON, whose rings repeat their first point, in the form of this file; tells all that is
-    wrong."""
+    """Convert the polygons of GeoJSON, whose rings repeat their first point, to records of `RoiPolygon`.
+
+    Raises:
+        InputError: Lists the problems of all features.
+    """
     problems, polygons = [], []
     for feature in features:
-        if feature.wrong:
-            problems.append(f"{feature.where}: {feature.wrong}")
+        if feature.problem:
+            problems.append(f"{feature.where}: {feature.problem}")
         for rings in feature.parts:
             spread = np.ptp(rings[0], axis=0).max()
             if len(rings[0]) < 4 or spread < SMALLEST_M:

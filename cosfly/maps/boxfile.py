@@ -178,8 +178,8 @@ def _feature_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
     project = _to_metres(cfg, np.concatenate(rings), path) if rings else None
     for feature in features:
         row = {k: value for k, value in feature.properties.items() if value is not None and k in COLUMNS}
-        if feature.wrong or project is None:
-            yield _Row(feature.where, row, problem=feature.wrong)
+        if feature.problem or project is None:
+            yield _Row(feature.where, row, problem=feature.problem)
             continue
         for outer, *holes in ([project(ring) for ring in part] for part in feature.parts):
             if len(outer) == 1:

@@ -158,7 +158,7 @@ class RayTransport:
 def _host() -> type:
     """Return the class of the actors.
 
-    Ray pickles a local class by value, so it also runs on a node with another version of cosfly or none, and reports it.
+    Ray pickles a local class by value, so it also runs on a node without this version of cosfly, and can report that.
     """
 
     class Host:

@@ -234,7 +234,7 @@ def return_freed_memory() -> None:
 
 
 def end_with_parent(parent_pid: int) -> None:
-    """Let Linux kill this process when its parent ends; on other systems the closed pipe ends a worker."""
+    """Ensure that Linux kills this process when its parent ends; on other systems the closed pipe ends a worker."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent_pid:  # the parent died before the call

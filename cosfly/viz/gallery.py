@@ -11,7 +11,7 @@ from PIL import Image
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import DEBUG_FILE, FRAME_FILES, frame_path, read_instance, read_meta, read_rgb, rgb_bytes
-from cosfly.formats.places import ALL_FLIGHTS, TrackChoice
+from cosfly.formats.places import ALL_TRACKS, TrackChoice
 from cosfly.formats.playback import Track, read_track
 from cosfly.formats.town import read_instance_ids
 from cosfly.formats.tracks import find_tracks
@@ -30,7 +30,7 @@ GIF_WIDTH_PX, GIF_FRAME_MS = 480, 250  # at the paper's 0.5 s a frame twice as f
 BOX_COLOR = (255, 214, 10)
 
 
-def contact_sheet(tree: Path, out_png: Path, choice: TrackChoice = ALL_FLIGHTS) -> None:
+def contact_sheet(tree: Path, out_png: Path, choice: TrackChoice = ALL_TRACKS) -> None:
     """Read a playback tree and write a PNG below 2 MB: a few RGB frames, a depth image and a mask of each track."""
     folders = find_tracks(tree, choice)
     rows = [_row(read_track(folder, strict=False)) for folder in folders[:MOST_ROWS]]
@@ -41,7 +41,7 @@ def contact_sheet(tree: Path, out_png: Path, choice: TrackChoice = ALL_FLIGHTS) 
 
 
 def preview_gif(
-    tree: Path, out_gif: Path, choice: TrackChoice = ALL_FLIGHTS, frames_per_s: float = 1000 / GIF_FRAME_MS
+    tree: Path, out_gif: Path, choice: TrackChoice = ALL_TRACKS, frames_per_s: float = 1000 / GIF_FRAME_MS
 ) -> None:
     """Read a playback tree and write its first clean track as an animation below 4 MB, with the target's box."""
     track, frames = _first_clean(tree, choice, "rgb.png")
@@ -95,7 +95,7 @@ def frame_in(tree: Path, frame: str | Path) -> Path:
 
 def best_frame(tree: Path, *names: str) -> Path:
     """Return the frame folder of a tree's first clean track that shows most of the target and has these files."""
-    track, frames = _first_clean(tree, ALL_FLIGHTS, *names)
+    track, frames = _first_clean(tree, ALL_TRACKS, *names)
     return track.frame_folder(max(frames, key=lambda i: (np.nan_to_num(track.target.visibility[i]), i)))
 
 

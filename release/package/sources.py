@@ -9,7 +9,7 @@ from pathlib import Path
 from cosfly.formats.boxes import UNKNOWN_LICENCE
 from cosfly.formats.captions import OWN_PROMPTS, QUESTIONS
 from cosfly.formats.inspection import REVIEW, Inspection, TrackInspection, TrajectoryFunnel, read_settled
-from cosfly.formats.places import ALL_FLIGHTS, Place, TrackChoice, flight_ids, folder_name
+from cosfly.formats.places import ALL_TRACKS, Place, TrackChoice, flight_ids, folder_name
 from cosfly.formats.town import read_town_map
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import ConfigError, InputError
@@ -132,7 +132,7 @@ class Material:
 
 
 def gather(
-    sources: list[Source], *, include_review: bool, accept_unbound: bool, choice: TrackChoice = ALL_FLIGHTS
+    sources: list[Source], *, include_review: bool, accept_unbound: bool, choice: TrackChoice = ALL_TRACKS
 ) -> Material:
     """Read the inspections of the runs, and list their flights; of a tree without one all. Those that are not chosen
     are left out.
