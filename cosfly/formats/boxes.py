@@ -276,7 +276,7 @@ def write_boxes(path: Path, box_map: BoxMap) -> None:
     low, high = box_map.bounds() if len(box_map) else (np.zeros(3), np.zeros(3))
     fields = box_map.header.model_dump(mode="json", by_alias=True, exclude_unset=True)
     ground = fields.pop("ground", None)
-    last_fields = {name: fields.pop(name) for name in ("passes", "simplify") if name in fields}
+    last_fields: dict[str, Any] = {name: fields.pop(name) for name in ("passes", "simplify") if name in fields}
     header: dict[str, Any] = {
         **BOXES_FORMAT.header,
         **fields,
