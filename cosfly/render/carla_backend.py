@@ -27,9 +27,8 @@ from cosfly.runtime.errors import InputError, RenderError
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.simulators import conventions
-from cosfly.simulators.carla_client import CarlaConfig, CarlaConnection, connect
+from cosfly.simulators.carla_client import CarlaConfig, CarlaConnection, connect, read_attributes, set_attributes
 from cosfly.simulators.conventions import ACTOR_BITS, SIMULATED_STEP_S, unreal_pose
-from cosfly.simulators.guard import values_of, with_values
 
 log = logging.getLogger(__name__)
 
@@ -52,9 +51,10 @@ class CarlaRenderConfig(CarlaConfig, ServerCommand):
 
 
 class CarlaRenderer(SimulatorRenderer):
-    """A renderer by a CARLA server whose town is the map's."""
+    """A renderer that uses a CARLA server with the town of the map."""
 
-    engine, port_step = "carla", 10  # a server takes three ports from its own on
+    engine = "carla"
+    port_step = 10  # a server takes three ports, from its own on
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._weather: WeatherParams | None = None
@@ -73,9 +73,12 @@ class CarlaRenderer(SimulatorRenderer):
             self.device = f"CARLA {self._server.version} at {self._server.endpoint}, {self._server.town}"
             with self._server.asking("CARLA did not return its world"):
                 world = self._world = self._server.world
-                settings, self._found_weather = world.get_settings(), world.get_weather()
-                self._guard.note({"settings": values_of(settings), "weather": values_of(self._found_weather)})
-                settings.synchronous_mode, settings.fixed_delta_seconds = True, SIMULATED_STEP_S
+                settings = world.get_settings()
+                self._found_weather = world.get_weather()
+                weather = read_attributes(self._found_weather)
+                self._guard.note({"settings": read_attributes(settings), "weather": weather})
+                settings.synchronous_mode = True
+                settings.fixed_delta_seconds = SIMULATED_STEP_S
                 world.apply_settings(settings)
                 self._library = world.get_blueprint_library()
                 self._cameras: dict[str, tuple[Any, queue.SimpleQueue]] = {}
@@ -130,7 +133,7 @@ class CarlaRenderer(SimulatorRenderer):
         """Set the six knobs of the paper; CARLA's others are zero, so that no trajectory inherits them."""
         weather = self._found_weather
         if self._weather is not None:
-            weather = with_values(self._server.carla.WeatherParameters(), self._weather.model_dump())
+            weather = set_attributes(self._server.carla.WeatherParameters(), self._weather.model_dump())
         with self._server.asking("CARLA did not set the weather"):
             self._world.set_weather(weather)
 
@@ -187,10 +190,12 @@ class CarlaRenderer(SimulatorRenderer):
             camera = self._spawned(blueprint, pose)
             camera.listen(lambda image, inbox=inbox: inbox.put((image.frame, bytes(image.raw_data))))
             self._cameras[name] = camera, inbox
-        carla, walkers = self._server.carla, (one for one in self._movers.values() if one.type_id.startswith("walker."))
-        for walker in walkers:
-            walker.apply_control(carla.WalkerControl(carla.Vector3D(1.0, 0.0, 0.0), 0.0, False))
-        self._fov_deg, until_s = fov_deg, time.monotonic() + PICTURE_SHARE * self._cfg.timeout_s
+        carla = self._server.carla
+        for mover in self._movers.values():
+            if mover.type_id.startswith("walker."):
+                mover.apply_control(carla.WalkerControl(carla.Vector3D(1.0, 0.0, 0.0), 0.0, False))
+        self._fov_deg = fov_deg
+        until_s = time.monotonic() + PICTURE_SHARE * self._cfg.timeout_s
         while any(inbox.empty() for _, inbox in self._cameras.values()) and time.monotonic() < until_s:
             self._world.tick(self._cfg.timeout_s)
             time.sleep(SIMULATED_STEP_S)
@@ -205,7 +210,8 @@ class CarlaRenderer(SimulatorRenderer):
 
     def _place(self, number: int, body: Body) -> None:
         """Put somebody in their place; a walker starts where this tick's step leads there."""
-        carla, actor = self._server.carla, self._movers.get(number) or self._add(number, body)
+        carla = self._server.carla
+        actor = self._movers.get(number) or self._add(number, body)
         position_m, turn_deg, ahead, speed_mps = placement_of(body, SIMULATED_STEP_S)
         if isinstance(body, PosedPerson):
             x, y, z = unreal_pose(ahead, turn_deg)[:3]
@@ -215,7 +221,7 @@ class CarlaRenderer(SimulatorRenderer):
     def _add(self, number: int, body: Body) -> Any:
         """Spawn somebody, by clothes or size, and note the actor's number in pictures."""
         if isinstance(body, PosedPerson):
-            names = sorted(one.id for one in self._library.filter("walker.pedestrian.*"))
+            names = sorted(blueprint.id for blueprint in self._library.filter("walker.pedestrian.*"))
             worn = dump_json(asdict(body.clothes.looks))
             name = names[int(sha256_bytes(worn.encode())[:8], 16) % len(names)]
         else:
@@ -260,7 +266,8 @@ class CarlaRenderer(SimulatorRenderer):
         return self._transform(np.array([x + 10.0 * len(self._movers), y, z + SPAWN_M]), np.zeros(3))
 
     def _transform(self, position_m: np.ndarray, rotation_deg: np.ndarray) -> Any:
-        carla, (x, y, z, pitch, yaw, roll) = self._server.carla, unreal_pose(position_m, rotation_deg)
+        carla = self._server.carla
+        x, y, z, pitch, yaw, roll = unreal_pose(position_m, rotation_deg)
         return carla.Transform(carla.Location(x, y, z), carla.Rotation(pitch, yaw, roll))
 
 
@@ -272,7 +279,8 @@ def _ids_in_pictures(server: CarlaConnection, box_map: BoxMap, num_others: int) 
     """
     from scipy.spatial import cKDTree
 
-    ids, table = instance_ids(box_map, num_others), np.full(len(KINDS) << 16, NO_INSTANCE, dtype=np.uint16)
+    ids = instance_ids(box_map, num_others)
+    table = np.full(len(KINDS) << 16, NO_INSTANCE, dtype=np.uint16)
     num_found, num_doubtful = 0, 0
     for kind in np.unique(box_map.kinds).tolist():
         rows = np.flatnonzero(box_map.kinds == kind)
@@ -283,16 +291,21 @@ def _ids_in_pictures(server: CarlaConnection, box_map: BoxMap, num_others: int) 
         gaps_m, nearest = cKDTree(np.array(places)).query(box_map.centers[rows])
         actor_of_key: dict[int, int] = {}
         for row, place in zip(rows[gaps_m <= SAME_BOX_M].tolist(), nearest[gaps_m <= SAME_BOX_M].tolist(), strict=True):
-            actor, num_found = boxes[place].actor_id, num_found + 1
+            num_found += 1
+            actor = boxes[place].actor_id
             key = kind << 16 | actor & ACTOR_BITS
             if key not in actor_of_key:
-                actor_of_key[key], table[key] = actor, ids[row]
+                actor_of_key[key] = actor
+                table[key] = ids[row]
             num_doubtful += actor_of_key[key] != actor
     where = f"{server.endpoint} (CARLA {server.version}), {server.town}"
     if not num_found:
-        what = "no box of the map is in the town that the server has loaded"
-        fix = "export the map from this town (cosfly maps --source carla), or name its town in render.carla.town"
-        raise InputError(what, where=where, got=box_map.name, fix=fix)
+        raise InputError(
+            "no box of the map is in the town that the server has loaded",
+            where=where,
+            got=box_map.name,
+            fix="export the map from this town (cosfly maps --source carla), or name its town in render.carla.town",
+        )
     if num_found < len(box_map) or num_doubtful:
         what = "%s: %d of %d boxes have an id in pictures; %d of those share 16 bits with another"
         log.warning(what, where, num_found, len(box_map), num_doubtful)

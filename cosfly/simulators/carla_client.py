@@ -13,7 +13,7 @@ from pydantic import Field
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, nearest
 
-PROBE_S = 5.0  # for a server to accept a connection
+PROBE_S = 5.0  # time limit for a server to accept a connection
 
 
 class CarlaConfig(Config):
@@ -51,27 +51,53 @@ def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:
     try:
         import carla
     except ModuleNotFoundError as error:
-        fix = 'pip install "cosfly[carla]", on Linux or Windows with Python 3.11 or 3.12'
-        raise EnvironmentMissing("the package carla is not installed", got=str(error), fix=fix) from None
+        raise EnvironmentMissing(
+            "the package carla is not installed",
+            got=str(error),
+            fix='pip install "cosfly[carla]", on Linux or Windows with Python 3.11 or 3.12',
+        ) from None
     endpoint = f"{cfg.host}:{port}"
     with _server_errors("no CARLA server answers", endpoint, "unknown"):
         socket.create_connection((cfg.host, port), PROBE_S).close()
         client = carla.Client(cfg.host, port)
         client.set_timeout(cfg.timeout_s)
-        version, ours = client.get_server_version(), client.get_client_version()
-    if version != ours:
-        fix = f"run a server of {ours}: streams of other versions crash this client"
-        what = "the CARLA server has another version than the client"
-        raise EnvironmentMissing(what, where=endpoint, got=version, expected=ours, fix=fix)
+        version = client.get_server_version()
+        client_version = client.get_client_version()
+    if version != client_version:
+        raise EnvironmentMissing(
+            "the CARLA server has another version than the client",
+            where=endpoint,
+            got=version,
+            expected=client_version,
+            fix=f"run a server of {client_version}: streams of other versions crash this client",
+        )
     with _server_errors("CARLA did not return its world", endpoint, version):
         world = client.get_world()
-        loaded, towns = _short(world.get_map().name), sorted({_short(name) for name in client.get_available_maps()})
+        loaded = _short(world.get_map().name)
+        towns = sorted({_short(name) for name in client.get_available_maps()})
         if cfg.town is not None and cfg.town != loaded:
             if cfg.town not in towns:
-                what, expected = f"the server has no such town{nearest(cfg.town, towns)}", ", ".join(towns)
-                raise ConfigError(what, where=f"{endpoint} (CARLA {version})", got=cfg.town, expected=expected)
+                raise ConfigError(
+                    f"the server has no such town{nearest(cfg.town, towns)}",
+                    where=f"{endpoint} (CARLA {version})",
+                    got=cfg.town,
+                    expected=", ".join(towns),
+                )
             world = client.load_world(cfg.town)
     return CarlaConnection(carla, client, world, endpoint, version, cfg.town or loaded)
+
+
+def read_attributes(parameters: Any) -> dict[str, Any]:
+    """Return the plain attributes of an object of the client (numbers, flags, None), by name."""
+    values = {name: getattr(parameters, name) for name in dir(parameters) if not name.startswith("_")}
+    return {name: value for name, value in values.items() if isinstance(value, bool | int | float | None)}
+
+
+def set_attributes(parameters: Any, values: dict[str, Any]) -> Any:
+    """Set the attributes that `read_attributes` returned, and return the object."""
+    for name, value in values.items():
+        setattr(parameters, name, value)
+    return parameters
 
 
 def _short(name: str) -> str:
@@ -81,9 +107,13 @@ def _short(name: str) -> str:
 
 @contextlib.contextmanager
 def _server_errors(what: str, endpoint: str, version: str) -> Iterator[None]:
+    """Convert errors of the client to EnvironmentMissing; `what` describes the failure."""
     try:
         yield
     except (RuntimeError, OSError) as error:
-        fix = "check that a server runs there (one for each of --workers, ports 10 apart), or raise timeout_s"
-        where = f"{endpoint} (CARLA {version})"
-        raise EnvironmentMissing(what, where=where, got=str(error) or type(error).__name__, fix=fix) from None
+        raise EnvironmentMissing(
+            what,
+            where=f"{endpoint} (CARLA {version})",
+            got=str(error) or type(error).__name__,
+            fix="check that a server runs there (one for each of --workers, ports 10 apart), or raise timeout_s",
+        ) from None

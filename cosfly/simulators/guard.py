@@ -1,6 +1,15 @@
-"""A process that restores a simulator's server when its user ends: normally, killed, or by a crash. It starts and ends
-the server itself if a command is given. Its input is lines of JSON, up to the end of the process that writes it: for
-CARLA the state of the world, then the numbers of spawned actors; for UnrealCV the commands that restore the camera."""
+"""A guard process that restores a simulator's server after the process that uses it (the user) has ended.
+
+The user may end normally, be killed or crash. If a start command is given, the guard also starts the server, and kills
+it instead of restoring it.
+
+Protocol: the user writes lines of JSON to the standard input of the guard. The input ends when the user ends. The
+guard restores nothing if it received no line.
+
+    engine    first line                                          each further line
+    carla     {"settings": {...}, "weather": {...}}: attributes   the id of an actor that was spawned
+    unrealcv  a list of commands that restore the camera          (none)
+"""
 
 from __future__ import annotations
 
@@ -26,20 +35,27 @@ RESTORE_S = 20.0  # time limit of a server while it is restored
 
 
 class EngineGuard:
-    """The handle of a guard in the process that it watches; engine: carla or unrealcv."""
+    """The handle of a guard in the user's process.
+
+    Args:
+        engine: carla or unrealcv.
+        command: Starts the server; `{port}` is replaced. An empty command leaves the start to the user.
+        timeout_s: Time limit for the started server to listen. The connection that follows reports a server that does
+            not listen by then.
+    """
 
     def __init__(self, engine: str, host: str, port: int, command: str, timeout_s: float) -> None:
-        filled = command.replace("{port}", str(port))
-        words = [sys.executable, "-m", "cosfly.simulators.guard", engine, host, str(port), filled]
-        # In a session of its own, so that Ctrl-C does not end it.
+        server_command = command.replace("{port}", str(port))
+        words = [sys.executable, "-m", "cosfly.simulators.guard", engine, host, str(port), server_command]
+        # A session of its own protects the guard from Ctrl-C.
         self._process = subprocess.Popen(words, stdin=subprocess.PIPE, text=True, start_new_session=True)
         if command:
-            _wait_for(host, port, timeout_s)
+            _wait_until_listening(host, port, timeout_s)
 
-    def note(self, what: Any) -> None:
-        """Send the state of the world, or the number of an actor."""
+    def note(self, message: Any) -> None:
+        """Send one line of the protocol."""
         assert self._process.stdin is not None
-        print(json.dumps(what), file=self._process.stdin, flush=True)
+        print(json.dumps(message), file=self._process.stdin, flush=True)
 
     def close(self) -> None:
         """Restore the server, and wait until that is done."""
@@ -48,21 +64,8 @@ class EngineGuard:
         self._process.wait()
 
 
-def values_of(thing: Any) -> dict[str, Any]:
-    """Return the plain attributes of an object of the client, by name."""
-    names = [name for name in dir(thing) if not name.startswith("_")]
-    return {name: getattr(thing, name) for name in names if isinstance(getattr(thing, name), bool | int | float | None)}
-
-
-def with_values(thing: Any, values: dict[str, Any]) -> Any:
-    """Set attributes that `values_of` returned."""
-    for name, value in values.items():
-        setattr(thing, name, value)
-    return thing
-
-
-def _wait_for(host: str, port: int, timeout_s: float) -> None:
-    """Wait until a server listens at a port, or the time is over."""
+def _wait_until_listening(host: str, port: int, timeout_s: float) -> None:
+    """Wait until a server listens at a port. Return without an error after `timeout_s`."""
     until_s = time.monotonic() + timeout_s
     while time.monotonic() < until_s:
         try:
@@ -73,19 +76,23 @@ def _wait_for(host: str, port: int, timeout_s: float) -> None:
             return
 
 
-def _restore_carla(host: str, port: int, found: dict[str, Any], actors: list[int]) -> None:
+def _restore_carla(host: str, port: int, state: dict[str, Any], actor_ids: list[int]) -> None:
+    """Destroy the spawned actors, and reset weather and world settings to the recorded state."""
     import carla
+
+    from cosfly.simulators.carla_client import set_attributes
 
     client = carla.Client(host, port)
     client.set_timeout(RESTORE_S)
     world = client.get_world()
-    for actor in world.get_actors(actors):
+    for actor in world.get_actors(actor_ids):
         actor.destroy()
-    world.set_weather(with_values(carla.WeatherParameters(), found["weather"]))
-    world.apply_settings(with_values(carla.WorldSettings(), found["settings"]))
+    world.set_weather(set_attributes(carla.WeatherParameters(), state["weather"]))
+    world.apply_settings(set_attributes(carla.WorldSettings(), state["settings"]))
 
 
 def _restore_unrealcv(host: str, port: int, commands: list[str]) -> None:
+    """Resume the game, destroy the spawned objects and run the recorded commands."""
     from cosfly.simulators.unrealcv_client import UnrealCvConfig, connect, spawned_by_cosfly
 
     connection = connect(UnrealCvConfig(host=host, timeout_s=RESTORE_S), port)
@@ -96,7 +103,7 @@ def _restore_unrealcv(host: str, port: int, commands: list[str]) -> None:
 
 
 def _start_server(command: str) -> subprocess.Popen:
-    """Start a process that is killed with this one, in a session of its own, so that Ctrl-C does not end it."""
+    """Start a server that is killed when this process ends, in its own session, which protects it from Ctrl-C."""
     with signals_held_back():
         return subprocess.Popen(
             shlex.split(command),
@@ -107,6 +114,7 @@ def _start_server(command: str) -> subprocess.Popen:
 
 
 def _begin(parent_pid: int) -> None:
+    """Prepare the new process before it runs the server's program."""
     end_with_parent(parent_pid)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_THE_PARENT)
 
@@ -116,8 +124,8 @@ def _end_server(server: subprocess.Popen) -> None:
     if sys.platform != "linux":  # other systems do not list descendants
         with contextlib.suppress(ProcessLookupError):
             os.killpg(server.pid, signal.SIGKILL)
-    while left := _descendants():
-        for pid in left:
+    while pids := _descendants():
+        for pid in pids:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         server.poll()
@@ -125,18 +133,19 @@ def _end_server(server: subprocess.Popen) -> None:
 
 
 def _descendants() -> list[int]:
-    """Return the running descendants of this process."""
+    """Return the ids of the running descendants of this process."""
     children = defaultdict[int, list[int]](list)
     for path in Path("/proc").glob("[0-9]*"):
         if (stat := process_stat(int(path.name))) and stat[0] != b"Z":
             children[int(stat[1])].append(int(path.name))
-    found = [os.getpid()]
-    for pid in found:
-        found += children[pid]
-    return found[1:]
+    pids = [os.getpid()]
+    for pid in pids:  # the list grows while it is read
+        pids += children[pid]
+    return pids[1:]
 
 
 def main(engine: str, host: str, port: str, command: str) -> None:
+    """Read the protocol until the user ends, then kill the server that was started here, or restore the other."""
     adopt_orphans()
     server = _start_server(command) if command else None
     lines = [json.loads(line) for line in sys.stdin]
@@ -148,7 +157,8 @@ def main(engine: str, host: str, port: str, command: str) -> None:
                 _restore_carla(host, int(port), lines[0], lines[1:])
             else:
                 _restore_unrealcv(host, int(port), lines[0])
-        except (RuntimeError, EnvironmentMissing) as error:  # the server has ended, with all that was to be restored
+        except (RuntimeError, EnvironmentMissing) as error:
+            # No answer usually means that the server has ended, so there is nothing to restore.
             print(f"{engine} at {host}:{port} was not restored: {error}", file=sys.stderr)
 
 

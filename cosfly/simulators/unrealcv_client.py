@@ -47,7 +47,9 @@ class UnrealCvConnection:
     """A client of one server, unusable after an error: a late answer would be taken for the next one."""
 
     def __init__(self, cfg: UnrealCvConfig, port: int) -> None:
-        self.endpoint, self.version, self.level = f"{cfg.host}:{port}", "unknown", ""
+        self.endpoint = f"{cfg.host}:{port}"
+        self.version = "unknown"
+        self.level = ""
         self._client = _client(cfg, port)
         if self._client is None:
             raise NoAnswerError(_why_not(cfg.host, port))
@@ -118,7 +120,8 @@ def connect(cfg: UnrealCvConfig, port: int) -> UnrealCvConnection:
         expected = f"{'.'.join(map(str, LEAST_VERSION))} or newer"
         what, fix = "the UnrealCV server is too old", "run a newer build, as SimWorld ships"
         raise EnvironmentMissing(what, where=connection.endpoint, got=repr(version)[:80], expected=expected, fix=fix)
-    connection.version, connection.level = found[0], "" if is_refusal(level) else for_terminal(str(level).strip())
+    connection.version = found[0]
+    connection.level = "" if is_refusal(level) else for_terminal(str(level).strip())
     if cfg.level in (None, connection.level):
         return connection
     return _opened(cfg, port, connection)
@@ -126,7 +129,9 @@ def connect(cfg: UnrealCvConfig, port: int) -> UnrealCvConnection:
 
 def _opened(cfg: UnrealCvConfig, port: int, connection: UnrealCvConnection) -> UnrealCvConnection:
     """Open the level and wait for it; a server may drop its client meanwhile."""
-    before, until_s, answer = connection.where, time.monotonic() + cfg.timeout_s, None
+    before = connection.where
+    until_s = time.monotonic() + cfg.timeout_s
+    answer = None
     with contextlib.suppress(NoAnswerError):
         (answer,) = connection.ask(f"vset /action/game/level {cfg.level}")
     while answer is None or not is_refusal(answer):
@@ -172,7 +177,8 @@ def _client(cfg: UnrealCvConfig, port: int) -> Any:
                 self.ended = self.ended or str(error)
                 self.recv_data_q.put(ConnectionError(self.ended))
 
-    client, before_s = _Client((cfg.host, port)), socket.getdefaulttimeout()
+    client = _Client((cfg.host, port))
+    before_s = socket.getdefaulttimeout()
     socket.setdefaulttimeout(cfg.timeout_s)  # the package opens the socket itself, and sets none
     try:
         with contextlib.redirect_stdout(io.StringIO()):
