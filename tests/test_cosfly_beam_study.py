@@ -28,6 +28,11 @@ def test_differences_are_those_of_the_walks_that_both_fly():
     assert nobody[PAPER_BEAM] == {"walks": 1, "kept": 0, "figures": {}}
 
 
+def test_the_papers_beam_must_be_one_of_the_beams():
+    with pytest.raises(ValueError, match="2048"):
+        BeamConfig(beams=(64, 256))
+
+
 @pytest.mark.slow
 def test_the_study_of_beams_twice_gives_the_same_bytes(tmp_path):
     write_boxes(tmp_path / "map.json", town_of(*CANYON))

@@ -1,17 +1,19 @@
 """The sweep over the beam of TA*+Smooth (subsec:appendix_planner_tastar): the same pedestrians at each beam.
 
-Differences are taken over the pedestrians that both a beam and the paper's beam can follow, so that a failure does not
-make a beam look better.
+Each beam is compared with the paper's beam on the pedestrians that both can follow. Failures of one beam therefore do
+not improve its figures.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, field_validator
 
 from cosfly.planners.compare import NUM_RESAMPLES, interval
 from cosfly.planners.contract import PlanConfig
@@ -29,9 +31,16 @@ FIGURES = ("five_ray_mean", "length_m", "jerk_rms_mps3", "clearance_min_m")
 
 
 class BeamConfig(PlanConfig):
-    """Settings of the study: those of step 4 but for planner and beam, and the beams."""
+    """Settings of the study: the beams, and the settings of step 4, whose planner and beam are replaced."""
 
     beams: tuple[int, ...] = Field((64, 256, 512, 1024, PAPER_BEAM, 4096), description="beams of TA*'s search")
+
+    @field_validator("beams")
+    @classmethod
+    def _include_papers_beam(cls, beams: tuple[int, ...]) -> tuple[int, ...]:
+        if PAPER_BEAM not in beams:
+            raise ValueError(f"the paper's beam {PAPER_BEAM}, which the others are compared with, is missing")
+        return beams
 
     def at_beam(self, beam: int) -> PlanConfig:
         """Return the settings of the planner at a beam."""
@@ -40,9 +49,12 @@ class BeamConfig(PlanConfig):
 
 
 class Planned(BaseModel):
-    """One pedestrian at one beam. figures: None where no trajectory was found; reason: why it was dropped.
+    """The outcome for one pedestrian at one beam.
 
-    times_ms: `search` and `smooth`, each measured once more by itself.
+    Attributes:
+        figures: Values of FIGURES; None if no trajectory was found.
+        reason: The reason of a dropped trajectory; None if it was kept.
+        times_ms: Times of `search` and `smooth`, from a second run of each.
     """
 
     figures: dict[str, float] | None = None
@@ -51,6 +63,8 @@ class Planned(BaseModel):
 
 
 class _Result(BaseModel):
+    """The journal's record of one pedestrian, by beam."""
+
     flown: dict[str, Planned]
 
 
@@ -62,19 +76,18 @@ def make_worker(cfg: BeamConfig, simplified_map: Path, seed: int) -> Work:
     obstacles, screens = load_obstacles(simplified_map)
     warm_up(cfg.at_beam(PAPER_BEAM))
 
-    def plan(pedestrian: Any, styles: list[str], own: PlanConfig) -> Planned:
+    def plan(pedestrian: Any, styles: list[str], plan_cfg: PlanConfig) -> Planned:
         try:
-            trace = plan_trajectory(pedestrian, obstacles, own, seed, screens, styles)
+            trace = plan_trajectory(pedestrian, obstacles, plan_cfg, seed, screens, styles)
         except NoPathError:
             return Planned(reason="no_path")
-        scenario = make_scenario(pedestrian, obstacles, own)
-        times_s = [time.perf_counter()]
-        found = search_trajectory(scenario, obstacles, own, own.safety_distance_m)
-        times_s.append(time.perf_counter())
-        if found is not None:
-            smooth_trajectory(found[0], scenario, obstacles, own, own.safety_distance_m)
-            times_s.append(time.perf_counter())
-        times_ms = dict(zip(("search", "smooth"), np.round(1000.0 * np.diff(times_s), 2).tolist(), strict=False))
+        scenario = make_scenario(pedestrian, obstacles, plan_cfg)
+        times_ms: dict[str, float] = {}
+        with _timed(times_ms, "search"):
+            trajectory = search_trajectory(scenario, obstacles, plan_cfg, plan_cfg.safety_distance_m)
+        if trajectory is not None:
+            with _timed(times_ms, "smooth"):
+                smooth_trajectory(trajectory[0], scenario, obstacles, plan_cfg, plan_cfg.safety_distance_m)
         figures = {name: float(trace.metrics[name]) for name in FIGURES}
         return Planned(figures=figures, reason=trace.drop_reason, times_ms=times_ms)
 
@@ -86,20 +99,31 @@ def make_worker(cfg: BeamConfig, simplified_map: Path, seed: int) -> Work:
     return work
 
 
+@contextmanager
+def _timed(times_ms: dict[str, float], name: str) -> Iterator[None]:
+    """Store the wall time of a block under a name, in milliseconds."""
+    start_s = time.perf_counter()
+    yield
+    times_ms[name] = round(1000.0 * (time.perf_counter() - start_s), 2)
+
+
 def run(
     cfg: BeamConfig, simplified_map: Path, paths: Path, out: Path, *, seed: int = 0, resume: Resume = "if-same",
     **pool: Any,
 ) -> Path:  # fmt: skip
     """Read a simplified map and `path.json`; write `beam_study.json` and return its path.
 
-    Times differ from run to run and are in the journal only.
+    Only the journal holds the times, because they differ from run to run.
 
     Args:
         pool: `workers` and `watch` of `run_items`.
+
     Raises:
-        InputError: An input is malformed. NothingKept: There is no pedestrian trajectory.
+        InputError: If an input is malformed.
+        NothingKept: If there is no pedestrian trajectory.
     """
-    inputs, product = {"map": simplified_map, "paths": paths}, out / "beam_study.json"
+    inputs = {"map": simplified_map, "paths": paths}
+    product = out / "beam_study.json"
     stage = StageFolder.open(out, "beam_study", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return product
@@ -116,26 +140,34 @@ def run(
 
 
 def summarize(planned: dict[int, list[Planned]], rng: np.random.Generator) -> dict[int, dict[str, Any]]:
-    """Return how many pedestrians each beam can follow, and its figures against those of the paper's beam.
+    """Count the pedestrians that each beam can follow, and compare its figures with those of the paper's beam.
 
     Args:
-        planned: beam -> the same pedestrians in the same order; PAPER_BEAM is one of the beams.
+        planned: beam -> outcomes of the same pedestrians in the same order; PAPER_BEAM is one of the beams.
 
     Returns:
         beam -> `walks`, `kept`, and by figure `mean` and `difference` with `low` and `high` of its 95 % interval, over
         pedestrians drawn with replacement (Efron 1979).
     """
     rows = {}
-    for beam, many in planned.items():
-        pairs = zip(many, planned[PAPER_BEAM], strict=True)
-        both = [(a.figures, b.figures) for a, b in pairs if a.figures and b.figures]
-        draws = rng.integers(max(len(both), 1), size=(NUM_RESAMPLES, len(both)))
+    for beam, outcomes in planned.items():
+        pairs = [
+            (outcome.figures, paper.figures)
+            for outcome, paper in zip(outcomes, planned[PAPER_BEAM], strict=True)
+            if outcome.figures and paper.figures
+        ]
+        draws = rng.integers(max(len(pairs), 1), size=(NUM_RESAMPLES, len(pairs)))
         figures = {}
-        for figure in FIGURES if both else ():
-            own, base = (np.array([pair[k][figure] for pair in both]) for k in (0, 1))
-            low, high = interval((own - base)[draws].mean(axis=1))
-            mean, difference = (round(float(values.mean()), 4) for values in (own, own - base))
-            figures[figure] = {"mean": mean, "difference": difference, "low": low, "high": high}
-        kept = sum(one.reason is None for one in many)
-        rows[beam] = {"walks": len(many), "kept": kept, "figures": figures}
+        for figure in FIGURES if pairs else ():
+            values = np.array([beam_figures[figure] for beam_figures, _ in pairs])
+            differences = values - np.array([paper_figures[figure] for _, paper_figures in pairs])
+            low, high = interval(differences[draws].mean(axis=1))
+            figures[figure] = {
+                "mean": round(float(values.mean()), 4),
+                "difference": round(float(differences.mean()), 4),
+                "low": low,
+                "high": high,
+            }
+        kept = sum(outcome.reason is None for outcome in outcomes)
+        rows[beam] = {"walks": len(outcomes), "kept": kept, "figures": figures}
     return rows

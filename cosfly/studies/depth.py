@@ -96,9 +96,12 @@ def quantised(truth: np.ndarray, measured: np.ndarray, bits: int) -> tuple[np.nd
 
 def _row(coding: str, bits: int, values: np.ndarray, truth: np.ndarray, measured: np.ndarray) -> dict[str, Any]:
     """Return the figures of one coding, which decodes to `values`, (h, w) m."""
-    known, came_back = truth[measured].astype(np.float64), values[measured]
+    known = truth[measured].astype(np.float64)
+    came_back = values[measured]
     errors = np.abs(came_back - known)
-    rmse, low, high = float(np.sqrt(np.mean(errors**2))), float(known.min()), float(known.max())
+    rmse = float(np.sqrt(np.mean(errors**2)))
+    low = float(known.min())
+    high = float(known.max())
     counts = np.histogram(came_back, bins=ENTROPY_BINS, range=(low, high))[0]
     shares = counts[counts > 0] / counts.sum()
     return {
@@ -126,7 +129,8 @@ def markdown(study: dict[str, Any]) -> str:
     """Return the table of the study in the paper's columns."""
     pairs = [[(row[name], form) for name, (_, form) in COLUMNS.items()] for row in study["rows"]]
     texts = [["no error" if value is None else form.format(value) for value, form in row] for row in pairs]
-    size, ends = f"{study['width_px']} x {study['height_px']} px", f"{study['min_m']:.2f} to {study['max_m']:.2f} m"
+    size = f"{study['width_px']} x {study['height_px']} px"
+    ends = f"{study['min_m']:.2f} to {study['max_m']:.2f} m"
     measured = f"{study['share_measured']:.1%} of the pixels measured; errors against {study['truth']}."
     table = TextTable("", [title for title, _ in COLUMNS.values()], texts)
     return f"Depth of `{study['frame']}`, {size}, {ends}, {measured}\n\n{table.markdown()}"
@@ -140,8 +144,12 @@ def draw_study(rgb: np.ndarray, truth: np.ndarray, measured: np.ndarray, decoded
     """
     errors = np.where(measured, np.abs(decoded["8-bit"] - truth), 0.0)
     level = np.round(errors / (errors.max() or 1.0) * 255.0).astype(np.uint8)
-    low, high, y = float(truth[measured].min()), float(truth[measured].max()), truth.shape[0] // 2
-    columns, profile, left = np.flatnonzero(measured[y]), np.full((*PANEL_PX[::-1], 3), 255, np.uint8), 10
+    low = float(truth[measured].min())
+    high = float(truth[measured].max())
+    y = truth.shape[0] // 2
+    columns = np.flatnonzero(measured[y])
+    profile = np.full((*PANEL_PX[::-1], 3), 255, np.uint8)
+    left = 10
     for name, color in PROFILE_COLORS.items():
         depth = (truth if name == "truth" else decoded[name])[y, columns].astype(np.float64)
         rows = PANEL_PX[1] - 10.0 - (depth - low) / (high - low) * (PANEL_PX[1] - 40.0)

@@ -77,14 +77,16 @@ def run(
     write_bytes(out / "zoom_levels.png", _draw_levels(levels))
     write_bytes(out / "zoom_fidelity.png", _draw_fidelity(first, longer))
     rows = [_level_row(camera_of(cfg, fov), tracks) for fov, tracks in levels.items()]
-    settings, product = cfg.model_dump(mode="json") | {"every": every}, out / "zoom_study.json"
+    settings = cfg.model_dump(mode="json") | {"every": every}
+    product = out / "zoom_study.json"
     write_json(product, {**FORMAT.header, "town": first.town, "settings": settings, "levels": rows})
     return product
 
 
 def _track_figures(track: Track) -> dict[str, Any]:
     """Return the counts of frames of a track and its means by figure; None where no frame shows the target."""
-    seen, boxes = np.flatnonzero(track.target.visibility > 0), track.target.bbox
+    seen = np.flatnonzero(track.target.visibility > 0)
+    boxes = track.target.bbox
     masks = np.full_like(boxes, np.nan) if track.target.mask_bbox is None else track.target.mask_bbox
     quality = [0.0 if np.isnan(masks[i]).any() else box_iou(boxes[i], masks[i]) for i in seen]
     rows = np.column_stack([boxes[seen, 2:] - boxes[seen, :2], track.target.visibility[seen], quality])
@@ -133,9 +135,11 @@ def _draw_levels(levels: dict[float, list[Track]]) -> bytes:
     picked = np.unique(np.linspace(0, len(wide) - 1, min(len(wide), MOST_SHOWN)).round().astype(int))
     rows = []
     for k in picked.tolist():
-        i, tiles = _best_frame(wide[k]), []
+        i = _best_frame(wide[k])
+        tiles = []
         for fov, tracks in levels.items():
-            rgb, title = read_rgb(tracks[k].frame_folder(i)).copy(), f"{level_name(fov)} {fov:g} deg"
+            rgb = read_rgb(tracks[k].frame_folder(i)).copy()
+            title = f"{level_name(fov)} {fov:g} deg"
             if tracks[k].target.in_view[i]:
                 x0, y0, x1, y1 = tracks[k].target.bbox[i].round().astype(int).tolist()
                 cv2.rectangle(rgb, (x0, y0), (x1, y1), TARGET_COLOR, max(1, rgb.shape[1] // 640))
@@ -148,7 +152,8 @@ def _draw_levels(levels: dict[float, list[Track]]) -> bytes:
 def _draw_fidelity(wide: Track, longer: Track) -> bytes:
     """Draw a wide picture, digital enlargements of its middle, and the optical one (fig:zoom_fidelity)."""
     rgb, optical = (read_rgb(track.frame_folder(_best_frame(wide))) for track in (wide, longer))
-    size, half = np.array(rgb.shape[1::-1]), 0.5 / MAGNIFICATION
+    size = np.array(rgb.shape[1::-1])
+    half = 0.5 / MAGNIFICATION
     low, high = (np.round(size * share).astype(int).tolist() for share in (0.5 - half, 0.5 + half))
     marked = cv2.rectangle(rgb.copy(), low, high, CROP_COLOR, max(2, int(size[0]) // 400))
     tiles = [_tile(marked, PANEL_WIDTH_PX, f"{wide.camera.fov_deg:.3g} deg, 1.0x")]
