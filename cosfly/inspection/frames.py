@@ -1,7 +1,7 @@
-"""Checks of the files and pictures of one track: presence and digests, whether they decode, and agree with the poses
-and with each other.
+"""Checks of the files and pictures of one track: they exist, match their digests, decode, and agree with the poses and
+with each other.
 
-Findings go into a Report, numbers into FrameNumbers; the thresholds of acceptance are in track.py.
+Issues go into a Report, figures into FrameNumbers; the thresholds of acceptance are in track.py.
 """
 
 from __future__ import annotations
@@ -59,12 +59,14 @@ def check_files(track: Track, report: Report) -> dict[int, FrameMeta | None]:
     complete: dict[int, FrameMeta | None] = {}
     folders = [track.frame_folder(i) for i in range(len(track))]
     absent = [name for name in FRAME_FILES[1:] if not any(frame_path(folder, name).exists() for folder in folders)]
-    absent = [] if absent and _lists(track.folder, absent) else absent
+    if absent and _lists(track.folder, absent):
+        absent = []
     for name in absent:
         where = f"{FRAMES_DIR}/*/{name}"
         report.add("note", "not_in_this_tree", where, "no such file", "one per frame in cosfly's trees")
     for i, folder in enumerate(folders):
-        num_issues, meta = len(report.issues), None
+        num_issues = len(report.issues)
+        meta = None
         for name in (name for name in FRAME_FILES if name not in absent):
             path = frame_path(folder, name)
             where = f"{frame_name(i)}/{path.name}"
@@ -76,7 +78,8 @@ def check_files(track: Track, report: Report) -> dict[int, FrameMeta | None]:
                 _check_header(path, track, where, report)
         if len(report.issues) == num_issues:
             complete[i] = meta
-    frames, known = track.folder / FRAMES_DIR, {folder.name for folder in folders}
+    frames = track.folder / FRAMES_DIR
+    known = {folder.name for folder in folders}
     for stray in sorted(p.name for p in frames.iterdir() if p.name not in known) if frames.is_dir() else []:
         report.warn("stray_frame", f"{FRAMES_DIR}/{stray}", "no point of this index", f"{len(known)} frames")
     return complete
@@ -143,17 +146,18 @@ def check_recorded(folder: Path, root: Path, recorded: Mapping[str, str], report
         if digest is not None:
             compare_file(folder, name, digest, report, listed_in="the tree's manifest")
         elif name == "trajectory.json":
-            got, expected = "no such entry in the tree's manifest", "a track that was made with it"
-            report.error("not_of_this_tree", name, got, expected)
+            got = "no such entry in the tree's manifest"
+            report.error("not_of_this_tree", name, got, "a track that was made with it")
 
 
 # --- jumps ------------------------------------------------------------------------------------------------------------
-# Static surfaces are carried from each frame into the next (cosfly/geometry/reprojection.py), by depth and ids; colours
-# change with light, rain and zoom. What does not agree with the poses is a jump: something vanished, or the place
-# changed.
+# Static surfaces are projected from each frame into the next (cosfly/geometry/reprojection.py) and compared by depth and
+# ids, because colours change with light, rain and zoom. A disagreement is a jump: an object vanished, or the camera is
+# not at its recorded pose.
 
-NEAR_FRAMES = 2  # farther apart, more surface is hidden than seen twice
-USUAL_AGREE, ROUGH_ERROR = 0.8, 1e-3  # share of points; error of planes as a share of the depth
+NEAR_FRAMES = 2  # most frames between two compared ones; farther apart, they have too little surface in common
+USUAL_AGREE = 0.8  # share of points that agree in most pairs of a consistent track
+ROUGH_ERROR = 1e-3  # largest usual error of planes, as a share of the depth
 
 
 def _view(track: Track, i: int, picture: Picture) -> View:
@@ -164,7 +168,8 @@ def _view(track: Track, i: int, picture: Picture) -> View:
 def _report_jumps(track: Track, pairs: dict[int, Agreement], report: Report) -> int:
     """Report the jumps; return how many frames were compared, 0 for a foreign track with inaccurate depth.
 
-    pairs: by frame, its agreement with the one before.
+    Args:
+        pairs: By frame, its agreement with the previous frame.
     """
     if not track.is_ours and not _is_consistent(pairs):
         return 0
@@ -203,8 +208,9 @@ def check_bystanders(
             distance_m = float(distances_to_boxes_m(track.positions_m[i], bystander)[0])
             nearest_m = min(nearest_m, distance_m)
             if distance_m < clearance_min_m - CLEARANCE_TOLERANCE_M:
-                got, expected = f"{distance_m:.2f} m to {line.instance_id}", f"at least {clearance_min_m:g} m to others"
-                report.error("clearance", f"trajectory.json: points[{i}].drone_pose", got, expected)
+                where = f"trajectory.json: points[{i}].drone_pose"
+                got = f"{distance_m:.2f} m to {line.instance_id}"
+                report.error("clearance", where, got, f"at least {clearance_min_m:g} m to others")
             if bystander.gap_to_person_m(track.targets_m[i]) < -CLEARANCE_TOLERANCE_M:
                 where = f"trajectory.json: points[{i}].target.world_location"
                 report.error("collision", where, f"in {line.instance_id}", "no contact")
@@ -220,7 +226,8 @@ def check_bystanders(
 
 # --- pixels -----------------------------------------------------------------------------------------------------------
 
-SMALL_PX, SMALL_ROWS = (128, 72), 5  # size at which frames are compared, from every fifth row
+SMALL_PX = (128, 72)  # size at which frames are compared
+SMALL_ROWS = 5  # one row in five is used for it
 BLANK_STD = 2.0  # grey levels; a frame of one colour has 0, fog over a street more than 5
 # The centre of the target's box is at most half its height from its visible surface along the optical axis.
 SURFACE_TOLERANCE_M = PERSON_HALF_EXTENTS_M[2] + 0.3
@@ -242,9 +249,10 @@ def check_frames(
 ) -> FrameNumbers:
     """Decode frames; compare colour, depth and mask with each other, the poses and the previous frame.
 
-    Each file is read once, and compared with its digest, which leaves `digests` then.
+    Each file is read once and compared with its digest, which is removed from `digests`.
     """
-    numbers, jumps = FrameNumbers(), dict[int, Agreement]()
+    numbers = FrameNumbers()
+    jumps = dict[int, Agreement]()
     previous: tuple[int, np.ndarray] | None = None
     surfaces: tuple[int, View] | None = None  # of the previous frame with depth
     for i in indices:
@@ -284,20 +292,24 @@ def check_frames(
 def _read(track: Track, i: int, digests: dict[str, str], report: Report) -> dict[str, bytes]:
     """Read the existing pictures of a frame; `check_files` reports missing ones."""
     assert track.folder is not None
-    folder, tree, files = track.frame_folder(i), tree_of_track(track.folder), dict[str, bytes]()
+    folder = track.frame_folder(i)
+    tree = tree_of_track(track.folder)
+    files = dict[str, bytes]()
     for name in FILE_NAMES.values():
         if (path := frame_path(folder, name)).exists():
             data = files[path.name] = read_bytes(path, what="image", tree=tree)
-            digest = digests.pop(place := f"{frame_name(i)}/{path.name}", None)
+            where = f"{frame_name(i)}/{path.name}"
+            digest = digests.pop(where, None)
             if digest is not None and sha256_bytes(data) != digest:
-                report.error("checksum", place, "other bytes", f"the digest in {CHECKSUMS}")
+                report.error("checksum", where, "other bytes", f"the digest in {CHECKSUMS}")
     return files
 
 
 def _check_surfaces(figures: PixelFigures, where: str, report: Report) -> None:
     """Report missing textures and surfaces that fight for pixels."""
     if figures.flat > limits.FLAT_SURFACE_MAX:
-        kind, most = KIND_NAMES.get(figures.flat_kind, figures.flat_kind), f"at most {limits.FLAT_SURFACE_MAX:.1%}"
+        kind = KIND_NAMES.get(figures.flat_kind, figures.flat_kind)
+        most = f"at most {limits.FLAT_SURFACE_MAX:.1%}"
         got = f"{figures.flat:.1%} of the picture is a surface of one colour ({kind})"
         report.warn("missing_texture", f"{where}/rgb.png", got, most)
     if figures.magenta > limits.MAGENTA_MAX:
@@ -320,21 +332,21 @@ def _depth_place(track: Track, i: int) -> str:
     return f"{frame_name(i)}/{frame_path(track.frame_folder(i), DEPTH_NPY).name}"
 
 
-def _check_depth(depth: np.ndarray, place: str, numbers: FrameNumbers, report: Report) -> bool:
-    """Check that depths are metres between invalid (0) and sky (1000)."""
-    low, high = float(depth.min()), float(depth.max())  # NaN if any is
+def _check_depth(depth: np.ndarray, where: str, numbers: FrameNumbers, report: Report) -> bool:
+    """Check that depths are metres between invalid (0) and sky (1000); return whether they are."""
+    low, high = float(depth.min()), float(depth.max())  # NaN if any pixel is
+    num_issues = len(report.issues)
     if not np.isfinite([low, high]).all():
-        got, expected = f"{int((~np.isfinite(depth)).sum())} pixels not finite", "finite metres"
+        got = f"{int((~np.isfinite(depth)).sum())} pixels not finite"
+        report.error("depth_range", where, got, "finite metres")
     elif low < INVALID_DEPTH_M:
-        got, expected = f"{low:.3f} to {high:.3f} m", f"{INVALID_DEPTH_M} to {SKY_DEPTH_M} m"
+        report.error("depth_range", where, f"{low:.3f} to {high:.3f} m", f"{INVALID_DEPTH_M} to {SKY_DEPTH_M} m")
     elif low == high:
-        got, expected = f"{low:.3f} m everywhere", "a depth image"
+        report.error("depth_range", where, f"{low:.3f} m everywhere", "a depth image")
     else:
-        is_whole = low > INVALID_DEPTH_M
-        numbers.invalid_depth_shares.append(0.0 if is_whole else float((depth == INVALID_DEPTH_M).mean()))
-        return True
-    report.error("depth_range", place, got, expected)
-    return False
+        has_invalid = low <= INVALID_DEPTH_M
+        numbers.invalid_depth_shares.append(float((depth == INVALID_DEPTH_M).mean()) if has_invalid else 0.0)
+    return len(report.issues) == num_issues
 
 
 def _check_mask(
@@ -351,7 +363,8 @@ def _check_mask(
     visibility = track.target.visibility[i]
     if np.isnan(box).any() or not visibility > 0:
         return
-    where, region = f"{frame_name(i)}/instance.png", None
+    where = f"{frame_name(i)}/instance.png"
+    region = None
     x0, y0, x1, y1 = people = figures.person_box or (0, 0, 0, 0)
     corner = np.array([x0, y0, x0, y0], dtype=np.float64)
     if figures.person_box is not None:

@@ -1,8 +1,8 @@
-"""Figures of all pixels of one frame: surfaces without texture, Z-fighting, and the place of pedestrians.
+"""Figures of all pixels of one frame: missing textures, Z-fighting, and the box of pedestrians.
 
 A missing texture shows as the magenta of many engines, or as a large surface of one colour. Where two surfaces lie in
-one plane, rounding decides which is drawn at each pixel (Z-fighting): their ids alternate over the depth of one plane.
-It counts if colours or kinds differ.
+one plane, rounding decides which one is drawn at each pixel (Z-fighting): ids alternate while the depth is that of one
+plane. Z-fighting counts only where colours or kinds differ.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ NO_DEPTH.flags.writeable = False
 NO_IDS = np.empty((0, 0, 3), np.uint8)
 NUM_IDS = 1 << 16
 PERSON, NOTHING, SKY = KINDS["Pedestrians"], KINDS["NONE"], KINDS["Sky"]
-SHARED_ID = 65534  # of all boxes beyond the range of ids (docs/files.md)
-MAGENTA_LEAST, MAGENTA_MOST = 200, 60  # red and blue at least, green at most
-DARK = 16  # grey levels: below, surfaces have one colour at night
-SHORTEST_RUN_PX = 3  # of an id: longer runs are no stripes of rounding
+SHARED_ID = 65534  # the id of all boxes beyond the range of ids (docs/files.md)
+MAGENTA_LEAST = 200  # least red and blue
+MAGENTA_MOST = 60  # most green
+DARK = 16  # grey levels; darker surfaces have one colour at night
+SHORTEST_RUN_PX = 3  # longer runs of one id are not caused by rounding
 # 1 / depth of a plane is linear in the picture, so surfaces fight only on that line. The tolerance is 1 cm at 30 m.
 PLANE_SHARE = 3e-4
 GRAINLESS = 0.9  # share of equal neighbours on all other surfaces
-# Sum over red, green and blue: more than the grain of one surface.
-VISIBLE_STEP = 60
+VISIBLE_STEP = 60  # sum over red, green and blue; more than the grain of one surface
 LEAST_PAIRS = 400  # neighbouring pixels of a surface that is judged
 
 
@@ -48,9 +48,11 @@ class Picture:
 class PixelFigures:
     """Figures of a frame.
 
-    flat: share of the picture of the largest surface of one colour, 0 if there is none or all surfaces are so;
-    flat_kind: its kind. magenta, fighting: shares of the picture. person_box: box of pedestrian pixels that are no
-    bystander's, (4,) xmin, ymin, xmax, ymax px, or None.
+    Attributes:
+        flat: Share of the picture that the largest surface of one colour covers; 0 if no surface or all are like that.
+        flat_kind: The kind of that surface.
+        magenta, fighting: Shares of the picture.
+        person_box: Box of the pedestrian pixels that belong to no bystander, xmin, ymin, xmax, ymax px, or None.
     """
 
     flat: float
@@ -61,8 +63,11 @@ class PixelFigures:
 
 
 def unpack(files: dict[str, bytes], where: Path) -> Picture:
-    """Decode the files of a frame, by name; depth and `instance.png` are optional. Raises InputError for an
-    invalid one."""
+    """Decode the files of a frame, by name; depth and `instance.png` are optional.
+
+    Raises:
+        InputError: If a file is invalid.
+    """
     colours = colours_of(files["rgb.png"], where / "rgb.png")
     instance = colours_of(files["instance.png"], where / "instance.png") if "instance.png" in files else NO_IDS
     depth_name = next((name for name in files if public_name(name) == DEPTH_NPY), DEPTH_NPY)
@@ -94,8 +99,9 @@ def measure_pixels(picture: Picture, is_bystander: np.ndarray, flat_share: float
     candidates = (pairs >= LEAST_PAIRS) & (equal >= flat_share * pairs) & (bright >= DARK * pairs)
     largest = int(np.argmax(np.where(candidates, pairs, 0)))
     # A renderer without grain on any surface misses no texture.
-    others_equal, others = int(equal.sum() - equal[largest]), int(pairs.sum() - pairs[largest])
-    is_judged = bool(candidates[largest]) and others_equal < GRAINLESS * others
+    other_equal = int(equal.sum() - equal[largest])
+    other_pairs = int(pairs.sum() - pairs[largest])
+    is_judged = bool(candidates[largest]) and other_equal < GRAINLESS * other_pairs
     flat = float(pairs[largest]) / num_pixels if is_judged else 0.0
     person = None if box[2] < 0 else (int(box[0]), int(box[1]), int(box[2]), int(box[3]))
     return PixelFigures(flat, int(kinds[ids[largest]]), counts[0] / num_pixels, counts[1] / num_pixels, person)
@@ -103,9 +109,11 @@ def measure_pixels(picture: Picture, is_bystander: np.ndarray, flat_share: float
 
 @njit(cache=True, nogil=True)
 def _fights(colours, instance, depth, code, other, begins, line, down):  # type: ignore[no-untyped-def]
-    """Return whether two ids alternate over one plane and differ visibly, in a row, or in a column where `down`.
+    """Return whether two ids alternate over one plane and differ visibly.
 
-    begins: of their last three runs, of which the first two must be short.
+    Args:
+        code, other: Id and kind of both. line: Index of a row, or of a column if `down` is 1.
+        begins: First pixels of their last three runs, of which the first two must be short.
     """
     low, middle, end = begins
     if end - middle > SHORTEST_RUN_PX or middle - low > SHORTEST_RUN_PX:
@@ -146,8 +154,12 @@ def _pack(row, tones, codes, shades):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _measure(colours, instance, depth, is_bystander):  # type: ignore[no-untyped-def]
-    """Return by id the pairs of neighbours in a row, those of one colour, their sum of green, and the kind; the
-    counts of magenta and fighting pixels; the box of pedestrians that are no bystanders."""
+    """Measure a frame.
+
+    Returns:
+        By id: pairs of neighbours in a row, pairs of one colour, sum of green, kind. Then the counts of magenta and of
+        fighting pixels, and the box of the pedestrians that are no bystanders.
+    """
     height, width = instance.shape[:2]
     has_depth = depth.shape[0] > 0
     pairs, equal, bright = np.zeros(NUM_IDS, np.int64), np.zeros(NUM_IDS, np.int64), np.zeros(NUM_IDS, np.int64)

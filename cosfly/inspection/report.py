@@ -1,5 +1,7 @@
-"""`report.html` of the inspection, one self-contained page without scripts for the reviewer: of each track pictures,
-curves over time, and its path on the map."""
+"""`report.html` of the inspection: one self-contained page without scripts for the reviewer.
+
+It shows pictures of each track, curves over time, and the drone trajectory on the map.
+"""
 
 from __future__ import annotations
 
@@ -45,10 +47,13 @@ PLOTS: dict[str, tuple[str, str, tuple[float | None, float | None]]] = {
     "clearance_m": (f"clearance, up to {CLEARANCE_CAP_M:g} m", "m", (0.0, None)),
     "speed_mps": ("speed", "m/s", (0.0, None)),
 }
-OF_FRAME = re.compile(r"(?:frame_|points\[|frame )(\d+)")  # in `where` of a finding
+OF_FRAME = re.compile(r"(?:frame_|points\[|frame )(\d+)")  # the frame's index in `where` of an issue
 BETWEEN_FRAMES = ("temporal_jump", "frozen_frame", "teleport")
 PLAN_PX, MARGIN_M = 300, 12.0
-DRONE, TARGET, OTHER_TRACK = (35, 100, 220), (235, 120, 20), (150, 80, 190)  # RGB
+# RGB
+DRONE = (35, 100, 220)
+TARGET = (235, 120, 20)
+OTHER_TRACK = (150, 80, 190)
 JPEG = Annotated[str, Field(pattern=r"^[A-Za-z0-9+/=]*$")]
 
 
@@ -56,8 +61,14 @@ JPEG = Annotated[str, Field(pattern=r"^[A-Za-z0-9+/=]*$")]
 
 
 class TrackView(BaseModel):
-    """Curves by their names in PLOTS, with gaps; three frames and the map as JPEGs in base64, None if missing.
-    frames: the indices of the three: those of findings, then the first, the middle and the last."""
+    """The pictures and curves of one track; JPEGs are in base64.
+
+    Attributes:
+        curves: By their names in PLOTS; None is a gap.
+        pictures: Three frames; None if one cannot be read.
+        plan: The map from above.
+        frames: The indices of the three frames: those of issues first, then the first, the middle and the last.
+    """
 
     time_s: list[FiniteFloat] = []
     curves: dict[str, list[FiniteFloat | None]] = {}
@@ -74,7 +85,7 @@ def draw_track(
 
     Args:
         heights_m: (n,) of the drone over the target. clearance_m: (n,) to obstacles; None without a map.
-        width_px: of the pictures. issues: findings whose frames are shown.
+        width_px: Width of the pictures. issues: Their frames are shown first.
     """
     rows = np.unique(np.linspace(0, len(track) - 1, CURVE_POINTS).round().astype(int))
     speeds_mps = np.full(len(track), np.nan)
@@ -86,35 +97,36 @@ def draw_track(
         "clearance_m": clearance_m,
         "speed_mps": speeds_mps,
     }
-    usual = [0, len(track) // 2, len(track) - 1]
-    chosen = sorted((frames_of_issues(issues, len(track)) + usual)[: len(usual)])
+    default_frames = [0, len(track) // 2, len(track) - 1]
+    frames = sorted((frames_of_issues(issues, len(track)) + default_frames)[: len(default_frames)])
     return TrackView(
         time_s=[round(float(at_s), 2) for at_s in track.time_s[rows]],
         curves={name: _numbers(values[rows]) for name, values in curves.items() if values is not None},
-        pictures=[thumbnail(track.frame_folder(i), width_px) for i in chosen],
+        pictures=[thumbnail(track.frame_folder(i), width_px) for i in frames],
         plan=draw_plan(track, box_map, _other_tracks(track)),
-        frames=chosen,
+        frames=frames,
     )
 
 
 def _other_tracks(track: Track) -> list[Track]:
     """Read the other tracks of a trajectory, skipping unreadable ones."""
     assert track.folder is not None
-    found = list[Track]()
+    tracks = list[Track]()
     for folder in sorted(path.parent for path in track.folder.parent.glob("[!.]*/trajectory.json")):
-        with contextlib.suppress(InputError):
-            found += [read_track(folder, strict=False)] if folder != track.folder else []
-    return found
+        if folder != track.folder:
+            with contextlib.suppress(InputError):
+                tracks.append(read_track(folder, strict=False))
+    return tracks
 
 
 def frames_of_issues(issues: Sequence[Issue], num_frames: int) -> list[int]:
-    """Return the frames of findings, the worst first; of a jump also the previous frame."""
-    found: dict[int, None] = {}
+    """Return the frames of issues, the worst first. An issue between two frames has both."""
+    frames: dict[int, None] = {}
     for issue in sorted(issues, key=sort_key):
-        named = OF_FRAME.search(issue.where) if issue.severity != "note" else None
-        if named is not None and (i := int(named[1])) < num_frames:
-            found.update(dict.fromkeys([max(i - 1, 0), i] if issue.code in BETWEEN_FRAMES else [i]))
-    return list(found)
+        match = OF_FRAME.search(issue.where) if issue.severity != "note" else None
+        if match is not None and (i := int(match[1])) < num_frames:
+            frames.update(dict.fromkeys([max(i - 1, 0), i] if issue.code in BETWEEN_FRAMES else [i]))
+    return list(frames)
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:
@@ -122,15 +134,19 @@ def _numbers(values: np.ndarray) -> list[float | None]:
 
 
 def draw_plan(track: Track, box_map: BoxMap | None, others: Sequence[Track] = ()) -> str:
-    """Draw the paths of drone and target on the map from above; return a JPEG in base64. others: the other tracks
-    of the trajectory."""
+    """Draw the trajectories of drone and target on the map from above; return a JPEG in base64.
+
+    Args:
+        others: The other tracks of the trajectory, drawn as thin lines.
+    """
     person_m = track.targets_m[~np.isnan(track.targets_m).any(axis=1)]
     others_m = [other.positions_m for other in others]
     view = TopView.around(np.concatenate([track.positions_m, person_m, *others_m]), PLAN_PX, MARGIN_M)
     picture = np.full((*view.size_px[::-1], 3), PAPER, dtype=np.uint8)
     if box_map is not None:
         width_m, height_m = np.array(view.size_px) / view.pixels_per_m
-        low, high = np.array([view.west_m, view.north_m - height_m]), np.array([view.west_m + width_m, view.north_m])
+        low = np.array([view.west_m, view.north_m - height_m])
+        high = np.array([view.west_m + width_m, view.north_m])
         is_near = ((box_map.maxs[:, :2] >= low) & (box_map.mins[:, :2] <= high)).all(axis=1)
         picture = draw_map(box_map.select(np.flatnonzero(is_near)), view)
     for points_m, color in ((person_m, TARGET), (track.positions_m, DRONE)):
@@ -159,10 +175,11 @@ def _draw_scale(picture: np.ndarray, view: TopView) -> None:
 
 
 def report_html(name: str, inspection: Inspection, views: Mapping[str, TrackView], page_mb: float) -> str:
-    """Return the page. Tracks that need a decision come first, and keep their pictures longest.
+    """Return the page, with the tracks that need a decision first.
 
     Args:
-        name: of the run. views: pictures and curves by track folder, as many as `page_mb` allows.
+        name: Name of the run.
+        views: By track folder. Pages larger than `page_mb` leave out the pictures of the last tracks.
     """
     tracks, coverage = inspection.flights, inspection.coverage
     accepted = [track for track in tracks if track.result == "accepted"] or tracks
@@ -172,18 +189,21 @@ def report_html(name: str, inspection: Inspection, views: Mapping[str, TrackView
         for state in STATES
     }
     total = sum(counts.values())
-    cards, size, num_without_pictures = list[str](), 0, 0
+    cards = list[str]()
+    size = 0
+    num_without_pictures = 0
     for track in sorted(tracks, key=lambda track: (-RESULTS.index(track.result), track.folder)):
         card = _card(track, views.get(track.folder))
         if track.folder in views and size + len(card) > page_mb * MB:
-            card, num_without_pictures = _card(track, None), num_without_pictures + 1
+            card = _card(track, None)
+            num_without_pictures += 1
         size += len(card)
         cards.append(card)
     return page(
         "cosfly/inspection/report.html", title=name, style=STYLE, inspection=inspection, results=RESULTS,
         columns=COLUMNS, cards=cards, num_without_pictures=num_without_pictures, page_mb=page_mb,
-        pictures=[one for track in accepted if (one := views[track.folder].pictures[1])][:OPENING_PICTURES],
-        states=[(one, counts[one], f"{counts[one] / max(total, 1):.1%}", f"{STATES[one]:.0%}") for one in STATES],
+        pictures=[picture for track in accepted if (picture := views[track.folder].pictures[1])][:OPENING_PICTURES],
+        states=[(name, counts[name], f"{counts[name] / max(total, 1):.1%}", f"{STATES[name]:.0%}") for name in STATES],
         num_perturbable=total, coverage=coverage_html(coverage) if coverage is not None and coverage.frames else None,
     )  # fmt: skip
 
@@ -200,7 +220,8 @@ def _card(track: TrackInspection, view: TrackView | None) -> str:
 def _plot(name: str, view: TrackView) -> dict[str, Any] | None:
     """Return a curve over time and its range, with gaps for unknown values; None if all are unknown."""
     title, unit, span = PLOTS[name]
-    values, time_s = view.curves.get(name, []), view.time_s
+    values = view.curves.get(name, [])
+    time_s = view.time_s
     known = [value for value in values if value is not None]
     if not known:
         return None
@@ -215,6 +236,6 @@ def _plot(name: str, view: TrackView) -> dict[str, Any] | None:
     return {
         "title": title,
         "path": "".join(f"{'M' if before is None else 'L'}{point}" for before, point in points),
-        "found": f"{min(known):.2f} to {max(known):.2f}{' ' * bool(unit)}{unit}, mean {float(np.mean(known)):.2f}",
+        "found": f"{min(known):.2f} to {max(known):.2f}{unit and f' {unit}'}, mean {float(np.mean(known)):.2f}",
         "axes": f"{low:.4g} to {high:.4g}; {time_s[0]:g} s to {time_s[-1]:g} s",
     }

@@ -78,9 +78,9 @@ def run(
     Raises:
         NothingKept: Every track was rejected; both files are written and give the reasons.
     """
-    given = {"simplified": simplified, "traces": traces, "data": data}
-    inputs = {name: path for name, path in given.items() if path is not None}
-    # Tracks that were changed since are found one by one, and rejected.
+    optional_inputs = {"simplified": simplified, "traces": traces, "data": data}
+    inputs = {name: path for name, path in optional_inputs.items() if path is not None}
+    # A track that was changed after rendering does not stop the stage: it is rejected.
     stage = StageFolder.open(out, "inspect", config=cfg, inputs=inputs, seed=0, resume=resume, audited=("data",))
     product = out / "inspect.json"
     if stage.is_complete:
@@ -90,8 +90,8 @@ def run(
     # About as many steps as frames, for the progress bar.
     frames = [sum(1 for _ in (data / name / FRAMES_DIR).glob("frame_*")) for name in names]
     items = [Item(name, name, num_steps=max(1, count)) for name, count in zip(names, frames, strict=True)]
-    arguments, label = (cfg, simplified, traces, data), "inspect: frames"
-    finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label=label)
+    arguments = (cfg, simplified, traces, data)
+    finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="inspect: frames")
     inspection, views = assemble(finished, planned, cfg, data)
     write_inspection(product, inspection)
     write_bytes(out / "report.html", report_html(run_name(out), inspection, views, PAGE_MB).encode())
@@ -115,7 +115,9 @@ def assemble(
     finished: ItemOutcomes, planned: list[DroneTrace] | None, cfg: InspectConfig, data: Path
 ) -> tuple[Inspection, dict[str, TrackView]]:
     """Merge the outcomes of all tracks: the inspection, and the report's views by track folder."""
-    tracks, views, covered = list[TrackInspection](), dict[str, TrackView](), list[Coverage]()
+    tracks = list[TrackInspection]()
+    views = dict[str, TrackView]()
+    covered = list[Coverage]()
     for outcome in finished.records:
         if isinstance(outcome, Failed):
             tracks.append(_unreadable(outcome, planned or [], data))
@@ -125,13 +127,14 @@ def assemble(
         views[outcome.id] = inspected.view
         if inspected.record.result == "accepted":
             covered.append(inspected.coverage)
-    # The funnel counts an unreadable track at the plan of its twin.
+    # An unreadable track gets the plan of the other track of its trajectory.
     trace_ids = {Path(track.folder).parent: track.trace_id for track in tracks if track.trace_id is not None}
     planned_as = [track.trace_id or trace_ids.get(Path(track.folder).parent) for track in tracks]
     tracks = [track.model_copy(update={"trace_id": i}) for track, i in zip(tracks, planned_as, strict=True)]
     funnel = Funnel(trajectories=_trajectory_funnel(tracks, planned), flights=_track_funnel(tracks))
     funnel.trajectories.check()
-    settings, coverage = cfg.model_dump(mode="json"), Coverage.total(covered)
+    settings = cfg.model_dump(mode="json")
+    coverage = Coverage.total(covered)
     return Inspection(settings=settings, funnel=funnel, coverage=coverage, flights=tracks), views
 
 
@@ -141,18 +144,19 @@ def _unreadable(outcome: Failed, planned: list[DroneTrace], data: Path) -> Track
     report = Report()
     report.error("unreadable", outcome.id, outcome.message.replace(f"{data}/", ""), "a track that can be read")
     try:
-        found = trace_id(read_track(data / outcome.id, strict=False))
+        plan_id = trace_id(read_track(data / outcome.id, strict=False))
     except InputError:
-        found = ""
+        plan_id = ""
     return TrackInspection(
         town=town, trajectory=trajectory, variant=variant, folder=outcome.id, result="rejected", metrics={},
-        trace_id=found if any(trace.path_id == found for trace in planned) else None, issues=report.issues,
+        trace_id=plan_id if any(trace.path_id == plan_id for trace in planned) else None, issues=report.issues,
     )  # fmt: skip
 
 
 def _trajectory_funnel(tracks: list[TrackInspection], planned: list[DroneTrace] | None) -> TrajectoryFunnel:
     """Count planned trajectories by outcome; the worse track of a trajectory decides. Without plans all are planned."""
-    counts, rendered = count_trajectories(tracks, planned=planned is not None), {track.trace_id for track in tracks}
+    counts = count_trajectories(tracks, planned=planned is not None)
+    rendered = {track.trace_id for track in tracks}
     reasons = [trace.drop_reason for trace in planned or [] if trace.path_id not in rendered]
     dropped = dict(sorted(Counter(reason for reason in reasons if reason is not None).items()))
     num_planned = counts["rendered"] if planned is None else len(planned)

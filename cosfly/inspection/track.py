@@ -1,6 +1,6 @@
 """The inspection of one track: its plan, poses, motion and frames, and its record (sec:step6).
 
-The rendered poses are measured against the map: those of a perturbed track are not the plan's.
+The rendered poses are measured against the map, because the poses of a perturbed track differ from the plan.
 """
 
 from __future__ import annotations
@@ -51,8 +51,6 @@ if TYPE_CHECKING:
     from cosfly.geometry.kernels import BoxIndex
 
 TIME_TOLERANCE_S = 1e-3
-
-
 Metrics = dict[str, float | int | None]
 
 
@@ -76,8 +74,8 @@ def inspect_track(
     """Check one track folder.
 
     Args:
-        traces: plans by id; None if the tree has none.
-        box_map, obstacles: the map and its obstacles; None if there is no map.
+        traces: Plans by id; None if the tree has none.
+        box_map, obstacles: The map and its obstacles; None if there is no map.
         recorded: sha256 by path of the tree's manifest; empty if there is none.
     """
     report = Report()
@@ -100,7 +98,11 @@ def inspect_track(
     check_recorded(folder, root, recorded, report)
     _check_frames(track, cfg, report, metrics)
     issues = report.merged()
-    result: Result = "rejected" if report.num("error") else "review" if report.num("warning") else "accepted"
+    result: Result = "accepted"
+    if report.num("error"):
+        result = "rejected"
+    elif report.num("warning"):
+        result = "review"
     try:
         sha256 = digest_of(folder_digests(folder))
     except InputError:  # reported by `listed_digests`
@@ -118,10 +120,12 @@ def inspect_track(
 def coverage_of(track: Track) -> Coverage:
     """Count the frames of a track."""
     box = track.target.bbox if track.target.mask_bbox is None else track.target.mask_bbox
-    heights_px, headings_deg = box[:, 3] - box[:, 1], track.target_headings_deg
+    heights_px = box[:, 3] - box[:, 1]
+    headings_deg = track.target_headings_deg
     seen = [track.positions_m - track.targets_m, headings_deg, heights_px, track.target.visibility]
     weather, time = (name and preset_token(name) for name in track.weather.values())
-    paces, skies = [track.pace] * len(track), [(weather, time)] * len(track)
+    paces = [track.pace] * len(track)
+    skies = [(weather, time)] * len(track)
     return Coverage.of(np.column_stack(seen), TARGET_HEIGHT_M, track.styles, paces, skies=skies)
 
 
@@ -178,7 +182,8 @@ def check_surroundings(
         gaps_m = swept_m.reshape(len(track), -1).min(axis=1)
     metrics.update(clearance_min_m=float(gaps_m.min()))
     for i in np.flatnonzero((gaps_m < cfg.clearance_min_m - CLEARANCE_TOLERANCE_M) | (gaps_m <= 0)):
-        code, where = "collision" if gaps_m[i] <= 0 else "clearance", f"trajectory.json: points[{i}].drone_pose"
+        code = "collision" if gaps_m[i] <= 0 else "clearance"
+        where = f"trajectory.json: points[{i}].drone_pose"
         report.error(code, where, f"{gaps_m[i]:.2f} m", f"at least {cfg.clearance_min_m:g} m to every obstacle")
     known = np.flatnonzero(~np.isnan(track.targets_m).any(axis=1))
     if not len(known):
@@ -225,8 +230,8 @@ def check_poses(track: Track, trace: DroneTrace, report: Report) -> None:
     """
     num_planned = -(-len(trace.time_s) // track.motion.poses_a_frame)
     if len(track) < num_planned:
-        got, expected = f"{len(track)} frames", f"{num_planned} planned ones"
-        report.warn("shorter_than_planned", "trajectory.json: points", got, expected)
+        where = "trajectory.json: points"
+        report.warn("shorter_than_planned", where, f"{len(track)} frames", f"{num_planned} planned ones")
     row = np.searchsorted(trace.time_s, track.time_s - TIME_TOLERANCE_S).clip(max=len(trace.time_s) - 1)
     off_time = np.abs(trace.time_s[row] - track.time_s) > TIME_TOLERANCE_S
     for i in np.flatnonzero(off_time):
@@ -243,8 +248,9 @@ def check_poses(track: Track, trace: DroneTrace, report: Report) -> None:
     for name, difference, tolerance, unit in checks:
         distance = np.abs(np.asarray(difference)).max(axis=1)
         for i in np.flatnonzero((distance > tolerance) & ~off_time):
-            where, expected = f"trajectory.json: points[{i}].{name}", f"the plan within {tolerance:g} {unit}"
-            report.error("pose_differs", where, f"{distance[i]:.4f} {unit} from the plan", expected)
+            where = f"trajectory.json: points[{i}].{name}"
+            got = f"{distance[i]:.4f} {unit} from the plan"
+            report.error("pose_differs", where, got, f"the plan within {tolerance:g} {unit}")
 
 
 def check_motion(track: Track, report: Report) -> None:
