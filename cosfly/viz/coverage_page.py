@@ -40,7 +40,8 @@ def _skies(frames: dict[str, int]) -> dict[str, Any] | None:
 
 def ranges(coverage: Coverage) -> list[tuple[str, str, str]]:
     """Return a row for each axis: title, 5 % to 95 % of the frames, the same for the default run."""
-    plain, titles = default_coverage(), [f"{axis.title}, {axis.unit}".rstrip(", ") for axis in AXES.values()]
+    plain = default_coverage()
+    titles = [f"{axis.title}, {axis.unit}".rstrip(", ") for axis in AXES.values()]
     return [(title, _range(coverage, name), _range(plain, name)) for title, name in zip(titles, AXES, strict=True)]
 
 

@@ -68,7 +68,8 @@ class Pictures:
 
     def sentence(self, language: Language) -> str:
         """Return the sentence of a prompt that describes these pictures."""
-        count, is_tiled = len(self.views), self.layout == "tiled" and len(self.views) > 1
+        count = len(self.views)
+        is_tiled = self.layout == "tiled" and len(self.views) > 1
         form = _SENTENCES[language][3 if is_tiled else min(count, 2)]
         numbers = {"range": self.depth_range_m, "middle": MIDDLE}
         words = [_DESCRIPTIONS[language][view].format(**numbers) for view in self.views]
@@ -243,8 +244,13 @@ class PagePictures:
     """The encoder of the pictures of a page of limited size: if not all fit, every n-th frame has some."""
 
     def __init__(self, room_bytes: float, num_frames: int, width_px: int) -> None:
-        self._room, self._num_frames, self._width_px = room_bytes, max(1, num_frames), width_px
-        self._asked, self._every, self._skipped, self._unreadable = 0, 1, 0, 0
+        self._room = room_bytes
+        self._num_frames = max(1, num_frames)
+        self._width_px = width_px
+        self._asked = 0
+        self._every = 1
+        self._skipped = 0
+        self._unreadable = 0
 
     def of_frame(self, views: Mapping[View, Callable[[], np.ndarray]]) -> dict[View, str]:
         """Return a frame's pictures, JPEG in base64; an empty table if there is no room for them.
@@ -252,7 +258,8 @@ class PagePictures:
         Args:
             views: Readers of views as (h, w, 3) uint8 RGB; a damaged view is skipped.
         """
-        number, self._asked = self._asked, self._asked + 1
+        number = self._asked
+        self._asked = self._asked + 1
         pictures: dict[View, str] = {}
         if number % self._every == 0:
             for view, read in views.items():

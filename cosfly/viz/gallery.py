@@ -162,7 +162,8 @@ def _gif(frames: list[Image.Image], frame_ms: int) -> bytes:
     sample = np.vstack([np.asarray(frames[i]) for i in spread(len(frames), 6)])
     palette = Image.fromarray(sample).quantize(128)
     frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    buffer, options = io.BytesIO(), {"append_images": frames[1:], "duration": frame_ms, "loop": 0, "optimize": False}
+    buffer = io.BytesIO()
+    options = {"append_images": frames[1:], "duration": frame_ms, "loop": 0, "optimize": False}
     frames[0].save(buffer, format="GIF", save_all=True, **options)
     return buffer.getvalue()
 

@@ -72,7 +72,8 @@ class Overlay:
         turns = rotation_matrices(np.radians(self.box_map.rotations_deg[rows]))
         boxes = []
         for place, (row, turn) in enumerate(zip(rows.tolist(), turns, strict=True)):
-            kind, center_m = KIND_NAMES[int(self.box_map.kinds[row])], self.box_map.centers[row]
+            kind = KIND_NAMES[int(self.box_map.kinds[row])]
+            center_m = self.box_map.centers[row]
             corners_m = box_corners(np.zeros(3), self.box_map.half_extents[row]) @ turn.T + center_m
             label = f"{kind} {self.instance_ids[row]}" if place >= len(rows) - MOST_LABELS else ""
             color = [round(255 - 0.55 * (255 - value)) for value in COLORS.get(kind, OTHER_COLOR)]  # lighter
@@ -125,6 +126,7 @@ def _write_labels(picture: np.ndarray, labels: list[tuple[str, float, float, Col
         if any(own[0] < t[2] and t[0] < own[2] and own[1] < t[3] and t[1] < own[3] for t in taken):
             continue
         taken.append(own)
-        corner, other = (round(own[0]), round(own[1])), (round(own[2]), round(own[3]))
+        corner = (round(own[0]), round(own[1]))
+        other = (round(own[2]), round(own[3]))
         cv2.rectangle(picture, corner, other, (20, 20, 20), -1)
         draw_text(picture, text, left, base, size, color)

@@ -58,7 +58,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """Answer the page only: other pages in a browser have another origin and do not know the token."""
-        site, name, length = self.server_of_page.site, self._name(), self.headers.get("Content-Length", "")
+        site = self.server_of_page.site
+        name = self._name()
+        length = self.headers.get("Content-Length", "")
         if name is None or self.headers.get("Origin") != f"http://{self.server_of_page.host}":
             return self._send(404, b"", "text/plain")
         if not length.isdecimal() or int(length) > MOST_BYTES:

@@ -71,7 +71,8 @@ def run(
     Raises:
         InputError: If a file cannot be read, or the page is too large without any frame.
     """
-    box_map, notes = read_boxes(map_), list[str]()
+    box_map = read_boxes(map_)
+    notes = list[str]()
     pedestrians = [] if paths is None else read_paths(paths)
     tracks = [_of_trace(trace) for path in traces for trace in read_traces(path)]
     drawn_tracks = [] if data is None else [read_track(place, strict=False) for place in find_tracks(data)]
@@ -107,7 +108,8 @@ def run(
         }
         for track in tracks
     ]  # fmt: skip
-    script, style = scripts("tools.js", "canvas.js", "space.js", "scene.js"), scripts("scene.css")
+    script = scripts("tools.js", "canvas.js", "space.js", "scene.js")
+    style = scripts("scene.css")
     values: dict[str, Any] = {"title": box_map.name, "notes": notes, "data": content}
     write_bytes(out, page("cosfly/viz/templates/scene.html", style=style, script=script, **values).encode())
     return out
@@ -124,7 +126,8 @@ def _of_trace(trace: DroneTrace) -> PageTrack:
 
 
 def _of_drawn(drawn: Track) -> PageTrack:
-    path, kind = str(drawn.source.get("scenario_id") or drawn.trajectory), "clean" if drawn.is_original else "perturbed"
+    path = str(drawn.source.get("scenario_id") or drawn.trajectory)
+    kind = "clean" if drawn.is_original else "perturbed"
     return _page_track(path, f"{kind} frames", drawn, drawn.target.visibility, drawn=drawn)
 
 
