@@ -16,7 +16,8 @@ from cosfly.runtime.arrays import LONGEST_SIDE_PX
 from cosfly.runtime.errors import ConfigError
 from cosfly.viz.topview import TopView, png_bytes
 
-HEIGHT_M, TILE_M = 400.0, 50.0  # of the camera over the ground, and of a tile
+HEIGHT_M = 400.0  # of the camera over the ground
+TILE_M = 50.0  # side of a tile
 NORTH_UP_DEG = np.array([-90.0, 90.0, 0.0])
 NO_HAZE_M = 1e9
 Bounds = tuple[float, float, float, float]  # west, south, east, north, m

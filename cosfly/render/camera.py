@@ -103,7 +103,8 @@ def rendered_visibility(
     x0, y0, x1, y1 = view.box_px
     # A box that reaches far out of the image needs no ray for every pixel out there.
     stride = max(1.0, float(np.sqrt((x1 - x0) * (y1 - y0) / MOST_SAMPLES)))
-    columns, rows = np.arange(np.floor(x0), np.ceil(x1), stride), np.arange(np.floor(y0), np.ceil(y1), stride)
+    columns = np.arange(np.floor(x0), np.ceil(x1), stride)
+    rows = np.arange(np.floor(y0), np.ceil(y1), stride)
     pixels = np.stack(np.meshgrid(np.floor(columns), np.floor(rows)), axis=-1).reshape(-1, 2)
     half_m = np.array(PERSON_HALF_EXTENTS_M)
     near = box_depths(pixels + 0.5, np.asarray(target_m), half_m, camera_pose, camera.intrinsic)
@@ -113,7 +114,8 @@ def rendered_visibility(
     inside = ((pixels >= 0) & (pixels < [camera.width_px, camera.height_px])).all(axis=1)
     at = pixels[inside, 1], pixels[inside, 0]
     is_free = (frame.depth[at] >= near[inside] - DEPTH_TOLERANCE_M) | (frame.ids[at] == PERSON_ID)
-    num_free, num_others = np.count_nonzero(is_free), np.count_nonzero(np.isin(frame.ids[at][~is_free], other_ids))
+    num_free = np.count_nonzero(is_free)
+    num_others = np.count_nonzero(np.isin(frame.ids[at][~is_free], other_ids))
     num_map = len(is_free) - num_free - num_others
     return num_free / len(pixels), num_others / len(pixels), num_map / len(pixels)
 

@@ -28,7 +28,8 @@ from cosfly.runtime.errors import RenderError
 
 DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"  # OpenGL without a window, on a GPU or the CPU
 
-NEAR_M, FAR_M = 0.3, SKY_DEPTH_M  # clip planes (sec:step5)
+NEAR_M = 0.3  # near clip plane (sec:step5)
+FAR_M = SKY_DEPTH_M  # far clip plane
 
 # Instance ids, 16 bits in instance.png, in addition to PERSON_ID: 0 is no instance (sky, ground plane, rim).
 SHARED_ID, MAX_BOX_ID = 65534, 65533
@@ -159,7 +160,9 @@ def far_as_sky(frame: Frame) -> Frame:
     """Set pixels at FAR_M or beyond to sky: layers and rounding move the clip plane."""
     is_far = frame.depth >= FAR_M
     if np.count_nonzero(is_far) != np.count_nonzero(frame.kinds == KINDS["Sky"]):
-        frame.depth[is_far], frame.kinds[is_far], frame.ids[is_far] = SKY_DEPTH_M, KINDS["Sky"], NO_INSTANCE
+        frame.depth[is_far] = SKY_DEPTH_M
+    frame.kinds[is_far] = KINDS["Sky"]
+    frame.ids[is_far] = NO_INSTANCE
     return frame
 
 

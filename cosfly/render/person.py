@@ -155,7 +155,8 @@ def dress_bystanders(
     others: list[Bystander], time_s: np.ndarray, target: Appearance, rng: np.random.Generator
 ) -> DressedBystanders:
     """Dress the bystanders: hard distractors differ from the target in one garment, everybody in at least one."""
-    gaits, clothes = [gait_of(other.positions_m, time_s) for other in others], []
+    gaits = [gait_of(other.positions_m, time_s) for other in others]
+    clothes = []
     for other in others:
         looks = target
         while not target.differences(looks):
@@ -290,7 +291,8 @@ def _arm(figure: _Body, side: float, phase: float, swing: float, clothes: Clothe
 
 
 def _trunk(figure: _Body, breadth: float, swing: float, clothes: Clothes) -> None:
-    lean, top = 0.03 * swing, clothes.color("top")
+    lean = 0.03 * swing
+    top = clothes.color("top")
     covered = top if clothes.looks.top in HEMS else clothes.color("legs")
     figure.solid("rounded", [0.0, 0.0, 0.95], [0.115, 0.165, 0.12], covered)
     figure.solid("limb", [0.01, 0.0, 1.22], [0.125, 0.195 * breadth, 0.29], top, pitch_rad=lean)

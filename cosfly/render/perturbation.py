@@ -1,6 +1,9 @@
-"""The perturbed track (app:dual_track): small random shifts of person and drone (position) and turns of the view
-(rotation), frame by frame. What comes too near an obstacle, or loses or hides the person, falls back, and the frame's
-state records why."""
+"""The perturbed track (app:dual_track): random position and rotation events, frame by frame.
+
+A position event shifts person and drone; a rotation event turns the view. An event falls back if it brings the drone
+or the person too near an obstacle, or if the person leaves the image or is hidden. The frame's state records the
+reason.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +22,21 @@ from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT
 from cosfly.geometry.axes import look_at, project, rotation_matrices, world_from_camera, wrap_deg
 from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M
-from cosfly.render.contract import plane_z_m
+from cosfly.render.contract import NEAR_M, plane_z_m
 from cosfly.render.person import NO_BYSTANDERS, DressedBystanders
 from cosfly.runtime.config import Config
 
-HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # from the hip point: where branches and signs may be in the way
-NONE, APPLIED = "none", "applied"
-OUT_OF_VIEW, HIDDEN = "fallback: target out of view", "fallback: target hidden"
+HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # head from hip point: branches and signs may be in the way up there
 PERTURBED = "aug_001"  # the variant of the perturbed track
-STEP_UP_M = 0.5  # a shifted person may be this much higher or lower than before, not on a roof
+STEP_UP_M = 0.5  # most by which a shifted person may be higher or lower than before; keeps people off roofs
+
+# States of an event.
+NONE = "none"
+APPLIED = "applied"
+DRONE_CLEARANCE = "fallback: drone clearance"
+PERSON_IN_OBSTACLE = "fallback: person in an obstacle"
+OUT_OF_VIEW = "fallback: target out of view"
+HIDDEN = "fallback: target hidden"
 
 
 class PerturbationConfig(Config):
@@ -52,9 +61,13 @@ class PerturbationConfig(Config):
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of n frames: positions_m, rotations_deg (pitch, yaw, roll), targets_m (the person's hip point), (n, 3).
+    """Poses of n frames.
 
-    clearances_m: (n,) from the drone to the nearest obstacle, CLEARANCE_CAP_M at most.
+    Attributes:
+        positions_m: (n, 3), the drone.
+        rotations_deg: (n, 3), pitch, yaw, roll.
+        targets_m: (n, 3), the person's hip point.
+        clearances_m: (n,), from the drone to the nearest obstacle, CLEARANCE_CAP_M at most.
     """
 
     positions_m: np.ndarray
@@ -62,15 +75,24 @@ class Poses:
     targets_m: np.ndarray
     clearances_m: np.ndarray
 
+    def copy_frame(self, i: int, source: Poses) -> None:
+        """Copy frame i from other poses, in place."""
+        self.positions_m[i] = source.positions_m[i]
+        self.rotations_deg[i] = source.rotations_deg[i]
+        self.targets_m[i] = source.targets_m[i]
+        self.clearances_m[i] = source.clearances_m[i]
+
 
 @dataclass(frozen=True)
 class PerturbedTrack:
     """The perturbed poses and the events of each frame.
 
-    drone_offsets_m, target_offsets_m, rotation_offsets_deg: (n, 3), zero where nothing was applied; the rotation offset
-    is the turn away from the person, after the camera was aimed at it again. states: (n,) {"position", "rotation"},
-    each none | applied | or the reason for the fallback. unshifted: the same frames with their rotation events only,
-    which a dropped shift falls back to.
+    Attributes:
+        drone_offsets_m, target_offsets_m: (n, 3), zero without an applied position event.
+        rotation_offsets_deg: (n, 3), zero without an applied rotation event; the turn away from the person, after the
+            camera was aimed at the shifted person.
+        states: n times {"position", "rotation"}; each value is NONE, APPLIED or the reason for the fallback.
+        unshifted: The same frames with their rotation events only, for frames whose shift is dropped.
     """
 
     poses: Poses
@@ -82,7 +104,7 @@ class PerturbedTrack:
 
     @classmethod
     def unperturbed(cls, planned: Poses) -> PerturbedTrack:
-        """Return a track of the planned poses."""
+        """Return a track without events."""
         n = len(planned.positions_m)
         states = [{"position": NONE, "rotation": NONE} for _ in range(n)]
         return cls(copy.deepcopy(planned), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3)), states)
@@ -97,10 +119,10 @@ class PerturbedTrack:
     def drop_shift(self, i: int, position: str) -> None:
         """Undo the position event of frame i, in place; `position` is its new state."""
         assert self.unshifted is not None
-        for mine, without in ((self, self.unshifted), (self.poses, self.unshifted.poses)):
-            for name, values in vars(mine).items():
-                if isinstance(values, np.ndarray):
-                    values[i] = getattr(without, name)[i]
+        self.poses.copy_frame(i, self.unshifted.poses)
+        self.drone_offsets_m[i] = 0.0
+        self.target_offsets_m[i] = 0.0
+        self.rotation_offsets_deg[i] = self.unshifted.rotation_offsets_deg[i]
         self.states[i] = {**self.unshifted.states[i], "position": position}
 
 
@@ -108,34 +130,55 @@ class Surroundings:
     """Obstacles and ground heights of a map, for shifted people and drones."""
 
     def __init__(self, box_map: BoxMap) -> None:
-        self.obstacles, self._ground = obstacle_index(box_map), box_map.ground
+        self.obstacles = obstacle_index(box_map)
+        self._ground = box_map.ground
         slabs = box_map.select(np.isin(box_map.kinds, sorted(GROUND_KINDS)))
-        self._centers, self._half = slabs.centers, slabs.half_extents
+        self._centers = slabs.centers
+        self._half = slabs.half_extents
         self._turns = rotation_matrices(np.radians(slabs.rotations_deg))
-        self._tops, self._bottoms = slabs.maxs[:, 2], slabs.mins[:, 2]
+        self._tops = slabs.maxs[:, 2]
+        self._bottoms = slabs.mins[:, 2]
         self._plane_m = plane_z_m(box_map)
 
     def surface_z_m(self, x_m: float, y_m: float, near_z_m: float) -> float:
-        """Return the height of the highest surface within STEP_UP_M of `near_z_m`, or `near_z_m` where there is
-        none; on a slope, that of the ground."""
+        """Return the height of the surface at a place, m.
+
+        On sloped ground it is the height of the ground. On flat ground it is the highest slab within STEP_UP_M of
+        `near_z_m`, or `near_z_m` itself if there is none.
+        """
         if not self._ground.is_flat:
             return float(self._ground.height_at(np.array([[x_m, y_m]]))[0])
         over = self._slabs_at(x_m, y_m) & (np.abs(self._tops - near_z_m) <= STEP_UP_M)
         return float(self._tops[over].max()) if over.any() else near_z_m
 
-    def below_ground_m(self, place_m: np.ndarray) -> float:
-        """Return the depth of a place, (3,), in the ground: in or under its slabs, or under a slope; 0 above it."""
-        x_m, y_m, z_m = place_m.tolist()
+    def below_ground_m(self, position_m: np.ndarray) -> float:
+        """Return how far a position, (3,), is below the top of the ground's slabs or slope, m; 0 above it."""
+        x_m, y_m, z_m = position_m.tolist()
         if not self._ground.is_flat:
-            return max(0.0, float(self._ground.height_at(place_m[None])[0]) - z_m)
+            return max(0.0, float(self._ground.height_at(position_m[None])[0]) - z_m)
         inside = self._slabs_at(x_m, y_m) & (self._bottoms < z_m)
         return max(0.0, self._plane_m - z_m, float(self._tops[inside].max(initial=-np.inf)) - z_m)
 
     def _slabs_at(self, x_m: float, y_m: float) -> np.ndarray:
-        """Return which slabs of the ground are over or under a place, (n,) bool."""
+        """Return which slabs of the ground contain a place in the top view, (n,) bool."""
         offset = np.column_stack([x_m - self._centers[:, 0], y_m - self._centers[:, 1], np.zeros(len(self._centers))])
         local = np.einsum("nji,nj->ni", self._turns, offset)
         return (np.abs(local[:, :2]) <= self._half[:, :2]).all(axis=1)
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """The inputs of a perturbation that no event changes; `cameras` holds one per frame."""
+
+    planned: Poses
+    cameras: Sequence[Camera]
+    surroundings: Surroundings
+    cfg: PerturbationConfig
+    bystanders: DressedBystanders
+
+    def shows(self, i: int, target_m: np.ndarray, drone_m: np.ndarray, rotation_deg: np.ndarray) -> bool:
+        """Return whether the target is inside the image of frame i by the margin."""
+        return in_frame(target_m, drone_m, rotation_deg, self.cameras[i], self.cfg.frame_margin)
 
 
 def perturb(
@@ -146,79 +189,90 @@ def perturb(
     rng: np.random.Generator,
     others: DressedBystanders = NO_BYSTANDERS,
 ) -> PerturbedTrack:
-    """Perturb every frame of a trajectory; each takes the same number of random draws."""
+    """Perturb every frame of a trajectory. Each frame takes the same number of random draws."""
+    scene = _Scene(planned, cameras, surroundings, cfg, others)
     unshifted = PerturbedTrack.unperturbed(planned)
-    result = replace(PerturbedTrack.unperturbed(planned), unshifted=unshifted)
-    of_roll = rng.spawn(1)[0]  # the paper's track has none, and draws the same with and without
-    for i in range(len(result.states)):
+    track = replace(PerturbedTrack.unperturbed(planned), unshifted=unshifted)
+    roll_rng = rng.spawn(1)[0]  # its own generator: the other draws are those of the paper's track, which has no roll
+    for i in range(len(track.states)):
         is_shifted, is_turned = rng.random(2) < [cfg.position_probability, cfg.rotation_probability]
-        person_m = _offset(rng, cfg, cfg.pedestrian_radius_m, 2)
-        drone_m, view_m = _offset(rng, cfg, cfg.drone_radius_m, 3), _offset(rng, cfg, cfg.view_radius_m, 3)
-        roll = of_roll.uniform(-1.0, 1.0)
+        person_offset = _offset(rng, cfg, cfg.pedestrian_radius_m, 2)
+        drone_offset = _offset(rng, cfg, cfg.drone_radius_m, 3)
+        view_offset = _offset(rng, cfg, cfg.view_radius_m, 3)
+        roll = roll_rng.uniform(-1.0, 1.0)
         position = NONE
         if is_shifted:
-            position = _shift(result, planned, i, person_m, drone_m, cameras[i], surroundings, cfg, others)
+            position = _shift(track, i, person_offset, drone_offset, scene)
         if is_turned:
-            for each in (unshifted, result):
-                _turn(each, i, view_m, roll, cameras[i], cfg)
+            _turn(unshifted, i, view_offset, roll, scene)
+            _turn(track, i, view_offset, roll, scene)
         if position != APPLIED:
-            result.drop_shift(i, position)
-    return result
+            track.drop_shift(i, position)
+    return track
 
 
 def _offset(rng: np.random.Generator, cfg: PerturbationConfig, radius_m: float, num_axes: int) -> np.ndarray:
     """Return an offset evenly distributed in a cube or a ball, (3,); z is 0 for two axes."""
     in_cube = radius_m * rng.uniform(-1.0, 1.0, num_axes)
-    direction, share = rng.normal(size=num_axes), rng.random()
+    direction = rng.normal(size=num_axes)
+    share = rng.random()
     in_ball = radius_m * direction / np.linalg.norm(direction) * share ** (1.0 / num_axes)
     return np.append(in_cube if cfg.sampling == "cubic" else in_ball, np.zeros(3 - num_axes))
 
 
-def _shift(
-    result: PerturbedTrack, planned: Poses, i: int, person_offset: np.ndarray, drone_offset: np.ndarray, camera: Camera,
-    surroundings: Surroundings, cfg: PerturbationConfig, others: DressedBystanders,
-) -> str:  # fmt: skip
-    """Apply one frame's position event; return its state."""
+def _shift(track: PerturbedTrack, i: int, person_offset: np.ndarray, drone_offset: np.ndarray, scene: _Scene) -> str:
+    """Apply the position event of frame i if all checks pass. Return its state; offsets: (3,) m."""
+    planned = scene.planned
     target = planned.targets_m[i] + person_offset
     feet_z = planned.targets_m[i][2] - TARGET_HEIGHT_M
-    target[2] = surroundings.surface_z_m(target[0], target[1], feet_z) + TARGET_HEIGHT_M
+    target[2] = scene.surroundings.surface_z_m(target[0], target[1], feet_z) + TARGET_HEIGHT_M
     drone = planned.positions_m[i] + drone_offset
-    # The camera is aimed at the shifted person as it was aimed at the unshifted one.
-    aimed = planned.rotations_deg[i].copy()
-    aimed[:2] += _aim_deg(drone, target) - _aim_deg(planned.positions_m[i], planned.targets_m[i])
-    aimed[1] = wrap_deg(aimed[1])
-    ground_z = surroundings.surface_z_m(drone[0], drone[1], feet_z)
-    places = np.stack([drone, target, target + HEAD_OFFSET_M])
-    distances, _ = signed_distances(surroundings.obstacles, places, CLEARANCE_CAP_M)
-    kept_m = min(cfg.min_clearance_m, planned.clearances_m[i])  # a plan may be nearer, at its relaxed floor
-    if min(distances[0], others.distance_m(i, drone)) < kept_m or drone[2] < ground_z + cfg.min_clearance_m:
-        return "fallback: drone clearance"
-    if distances[1:].min() < PERSON_HALF_EXTENTS_M[0] or others.are_in_the_way(i, target):
-        return "fallback: person in an obstacle"
-    if not in_frame(target, drone, aimed, camera, cfg.frame_margin):
+    # Keep the angle between the camera's axis and the direction to the person.
+    rotation = planned.rotations_deg[i].copy()
+    rotation[:2] += _aim_deg(drone, target) - _aim_deg(planned.positions_m[i], planned.targets_m[i])
+    rotation[1] = wrap_deg(rotation[1])
+    points = np.stack([drone, target, target + HEAD_OFFSET_M])
+    (drone_distance, *person_distances), _ = signed_distances(scene.surroundings.obstacles, points, CLEARANCE_CAP_M)
+    min_clearance_m = scene.cfg.min_clearance_m
+    ground_z = scene.surroundings.surface_z_m(drone[0], drone[1], feet_z)
+    # Where the planner relaxed its safety distance, the plan itself may be nearer than min_clearance_m.
+    required_m = min(min_clearance_m, planned.clearances_m[i])
+    if min(drone_distance, scene.bystanders.distance_m(i, drone)) < required_m or drone[2] < ground_z + min_clearance_m:
+        return DRONE_CLEARANCE
+    if min(person_distances) < PERSON_HALF_EXTENTS_M[0] or scene.bystanders.are_in_the_way(i, target):
+        return PERSON_IN_OBSTACLE
+    if not scene.shows(i, target, drone, rotation):
         return OUT_OF_VIEW
-    poses = result.poses
-    poses.positions_m[i], poses.targets_m[i], poses.rotations_deg[i] = drone, target, aimed
-    poses.clearances_m[i] = distances[0]
-    result.drone_offsets_m[i], result.target_offsets_m[i] = drone_offset, target - planned.targets_m[i]
-    result.states[i]["position"] = APPLIED
+    track.poses.positions_m[i] = drone
+    track.poses.targets_m[i] = target
+    track.poses.rotations_deg[i] = rotation
+    track.poses.clearances_m[i] = drone_distance
+    track.drone_offsets_m[i] = drone_offset
+    track.target_offsets_m[i] = target - planned.targets_m[i]
+    track.states[i]["position"] = APPLIED
     return APPLIED
 
 
-def _turn(
-    result: PerturbedTrack, i: int, view_m: np.ndarray, roll: float, camera: Camera, cfg: PerturbationConfig
-) -> None:
-    """Apply one frame's rotation event to the pose that the frame has, or note the reason for the fallback."""
-    drone, target = result.poses.positions_m[i], result.poses.targets_m[i]
-    turn = wrap_deg(_aim_deg(drone, target + view_m) - _aim_deg(drone, target))
-    turn = np.array([*np.clip(turn, -cfg.max_view_deg, cfg.max_view_deg), cfg.max_roll_deg * roll])
-    rotation = result.poses.rotations_deg[i] + turn
+def _turn(track: PerturbedTrack, i: int, view_offset: np.ndarray, roll: float, scene: _Scene) -> None:
+    """Turn the view of frame i from its present pose, or record the fallback.
+
+    Args:
+        view_offset: (3,) m, from the person to the point to look at.
+        roll: From -1 to 1, the share of max_roll_deg.
+    """
+    cfg = scene.cfg
+    drone = track.poses.positions_m[i]
+    target = track.poses.targets_m[i]
+    pitch_yaw = wrap_deg(_aim_deg(drone, target + view_offset) - _aim_deg(drone, target))
+    turn = np.array([*np.clip(pitch_yaw, -cfg.max_view_deg, cfg.max_view_deg), cfg.max_roll_deg * roll])
+    rotation = track.poses.rotations_deg[i] + turn
     rotation[1] = wrap_deg(rotation[1])
-    if abs(rotation[0]) >= 90.0 or not in_frame(target, drone, rotation, camera, cfg.frame_margin):
-        result.states[i]["rotation"] = OUT_OF_VIEW
+    if abs(rotation[0]) >= 90.0 or not scene.shows(i, target, drone, rotation):
+        track.states[i]["rotation"] = OUT_OF_VIEW
         return
-    result.states[i]["rotation"] = APPLIED
-    result.poses.rotations_deg[i], result.rotation_offsets_deg[i] = rotation, turn
+    track.states[i]["rotation"] = APPLIED
+    track.poses.rotations_deg[i] = rotation
+    track.rotation_offsets_deg[i] = turn
 
 
 def _aim_deg(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -229,7 +283,10 @@ def _aim_deg(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 def in_frame(
     target_m: np.ndarray, drone_m: np.ndarray, rotation_deg: np.ndarray, camera: Camera, margin: float
 ) -> bool:
-    """Return whether the target's hip point is inside the image by a margin (a share of width and height)."""
+    """Return whether the target's hip point is inside the image by a margin (a share of width and height).
+
+    A point nearer than NEAR_M is not drawn.
+    """
     uv, z = project(np.asarray(target_m)[None], world_from_camera(drone_m, rotation_deg), camera.intrinsic)
     size = np.array([camera.width_px, camera.height_px])
-    return bool(z[0] > 0.3 and (uv[0] >= margin * size).all() and (uv[0] <= (1.0 - margin) * size).all())
+    return bool(z[0] > NEAR_M and (uv[0] >= margin * size).all() and (uv[0] <= (1.0 - margin) * size).all())

@@ -71,7 +71,8 @@ class PyrenderRenderer:
     def __init__(
         self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0, rim: BoxMap | None = None
     ) -> None:
-        self._screen, self._look = _open_screen(width_px, height_px), look
+        self._screen = _open_screen(width_px, height_px)
+        self._look = look
         import pyrender
         from OpenGL.GL import GL_RENDERER, glGetString
 
@@ -166,7 +167,8 @@ def _all_boxes(
     table[[KINDS[name] for name in COLORS]] = list(COLORS.values())
     ids = np.append(own_ids, np.uint16(NO_INSTANCE))
     tags = _tags(kinds, ids, np.append(layers_of(box_map), 0))
-    is_round, low = np.zeros(len(kinds), dtype=bool), np.full(len(kinds), -1.0)
+    is_round = np.zeros(len(kinds), dtype=bool)
+    low = np.full(len(kinds), -1.0)
     plants = np.flatnonzero(kinds == KINDS["Vegetation"])
     forms, low[plants] = contract.plants_of(centers[plants], halves[plants], contract.seeds_of(box_map.ids[plants]))
     is_round[plants] = forms >= contract.BUSH
@@ -174,7 +176,8 @@ def _all_boxes(
     crowns = halves * np.column_stack([np.ones((len(low), 2)), (1.0 - low) / 2.0])
     stems = np.column_stack([radius, radius, halves[:, 2] * (1.0 + middle) / 2.0])
     is_box = np.append(~are_solids(box_map), True)
-    box, ball = trimesh.creation.box(extents=(2.0, 2.0, 2.0)), trimesh.creation.icosphere(subdivisions=1)
+    box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
+    ball = trimesh.creation.icosphere(subdivisions=1)
     solids = [
         (box, is_box & ~is_round & ~np.append(is_draped(box_map), False), halves, 0.0 * low, table[kinds]),
         (ball, is_box & is_round, crowns, middle, table[kinds]),
@@ -204,7 +207,8 @@ def _mover(mover: PosedBystander, origin: np.ndarray) -> tuple[np.ndarray, np.nd
 
     body = mover.body
     if isinstance(body, PosedPerson):
-        ball, box = trimesh.creation.icosphere(subdivisions=2), trimesh.creation.box(extents=(2.0, 2.0, 2.0))
+        ball = trimesh.creation.icosphere(subdivisions=2)
+        box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
         rod = trimesh.creation.cylinder(1.0, 2.0, sections=12).triangles
         units = {"ball": ball.triangles, "rounded": box.triangles, "disc": rod, "limb": rod * LIMB_SHARE}
         figure = figure_of(body)

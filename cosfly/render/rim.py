@@ -110,7 +110,8 @@ def _roads(box_map: BoxMap, town: np.ndarray, rng: np.random.Generator) -> np.nd
         strips += [(across, town[0, across] - m, town[1, across] + m, town[side, axis] + sign * m) for m in LANES_M]
         for along, begin, end, place in strips:
             turn = 1 if along == 0 else -1
-            middle, size = ((begin + end) / 2.0, place)[::turn], (abs(end - begin) / 2.0 + ROAD_HALF_M, ROAD_HALF_M)
+            middle = ((begin + end) / 2.0, place)[::turn]
+            size = (abs(end - begin) / 2.0 + ROAD_HALF_M, ROAD_HALF_M)
             roads.append([*middle, *size[::turn], FLAT_HALF_M])
     return np.array(roads)
 
@@ -143,13 +144,16 @@ def _skyline(town: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def _plants(fields: np.ndarray, houses: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return hedges and trees along one side of fields, woods, and trees in gardens."""
-    hedges, around = fields.copy(), rng.uniform(-1.0, 1.0, (2, len(houses), 2))
+    hedges = fields.copy()
+    around = rng.uniform(-1.0, 1.0, (2, len(houses), 2))
     around *= 14.0 / np.abs(around).max(axis=2, keepdims=True)
-    every, across = np.arange(len(fields)), rng.integers(0, 2, len(fields))
+    every = np.arange(len(fields))
+    across = rng.integers(0, 2, len(fields))
     hedges[every, across] -= fields[every, 2 + across]
     hedges[every, 2 + across] = 0.6
     hedges[:, 4] = rng.uniform(1.1, 1.6, len(fields))
-    in_hedge, in_wood = rng.poisson(1.5, len(fields)), np.where(rng.random(len(fields)) < 0.06, 25, 0)
+    in_hedge = rng.poisson(1.5, len(fields))
+    in_wood = np.where(rng.random(len(fields)) < 0.06, 25, 0)
     ground = np.repeat(np.concatenate([hedges, fields]), np.concatenate([in_hedge, in_wood]), axis=0)
     places = ground[:, :2] + ground[:, 2:4] * rng.uniform(-0.9, 0.9, (len(ground), 2))
     places = np.concatenate([places, (houses[:, :2] + around).reshape(-1, 2)])

@@ -52,7 +52,10 @@ class SimulatorRenderer(ABC):
         self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0,
         rim: BoxMap | None = None, *, settings: Any,
     ) -> None:  # fmt: skip
-        self._map, self._size_px, self._num_others, self._cfg = box_map, (width_px, height_px), num_others, settings
+        self._map = box_map
+        self._size_px = (width_px, height_px)
+        self._num_others = num_others
+        self._cfg = settings
         self._port = settings.port + self.port_step * worker_index()
         self._open()
 
@@ -80,7 +83,8 @@ class SimulatorRenderer(ABC):
         fov_deg = round(Camera(width, height, intrinsic).fov_deg, 6)  # all that a simulator knows of a lens
         f = focal_px(width, fov_deg)
         if not np.allclose(intrinsic, [[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]], atol=1e-3):
-            what, expected = "the simulator has no such lens", "square pixels and the principal point in the middle"
+            what = "the simulator has no such lens"
+            expected = "square pixels and the principal point in the middle"
             raise RenderError(what, where=self.device, got=str(intrinsic.tolist()), expected=expected)
         bodies = ({} if person is None else {PERSON_ID: person}) | {one.instance_id: one.body for one in others}
         problem: Exception | None = None

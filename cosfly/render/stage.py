@@ -28,7 +28,7 @@ from cosfly.render.perturbation import PERTURBED, PerturbedTrack, Poses, Surroun
 from cosfly.render.rim import check_outside_rim, rim_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.track import VARIANTS, TrackScript, check_track, render_track
-from cosfly.render.weather import fog_hides, random_seed, read_pools, weather_of
+from cosfly.render.weather import fog_hides, random_seed, read_pools, weathers_of
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.io import CHECKSUMS, atomic_folder, inside, sha256_bytes
@@ -49,7 +49,9 @@ RENDERERS = {
 }
 TRAJECTORY = "trajectory_"
 Inputs = tuple[Path, Path, Path, Path | None]  # drawn and simplified map, trajectories, bystanders
-FIRST_S, SPAN_S = 1_000_000_000, 999_000_000  # seconds of ten digits, as those of the public release
+# Names of trajectories are times of ten digits, as those of the public release.
+FIRST_S = 1_000_000_000
+SPAN_S = 999_000_000
 FROM_ONE_RUN = "pass the others.json that was written together with path.json"
 
 
@@ -65,15 +67,16 @@ def open_renderer(
 ) -> Renderer:
     """Open a renderer for one map and at most `num_others` bystanders; settings: the renderer's own, if it has any."""
     module, _, attribute = RENDERERS[name].partition(":")
-    own = {} if settings is None else {"settings": settings}
-    make = getattr(importlib.import_module(module), attribute)
-    return make(box_map, width_px, height_px, look or Look(), num_others, rim, **own)
+    options = {} if settings is None else {"settings": settings}
+    renderer = getattr(importlib.import_module(module), attribute)
+    return renderer(box_map, width_px, height_px, look or Look(), num_others, rim, **options)
 
 
 def renderer_of(cfg: RenderConfig, box_map: BoxMap, seed: int, num_others: int = 0) -> Renderer:
     """Open the renderer that the settings ask for."""
-    rim, size_px = rim_of(box_map, seed) if cfg.rim else None, (cfg.width_px, cfg.height_px)
-    return open_renderer(cfg.backend, box_map, *size_px, cfg.look, num_others, rim, getattr(cfg, cfg.backend, None))
+    rim = rim_of(box_map, seed) if cfg.rim else None
+    settings = getattr(cfg, cfg.backend, None)
+    return open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look, num_others, rim, settings)
 
 
 # --- scripts of tracks ------------------------------------------------------------------------------------------------
@@ -98,7 +101,8 @@ def make_track_script(
     assert cfg.first_timestamp is not None, "`run` sets it"
     trace = planned.every(cfg.frame_stride)
     looks = planned.drawn_as(number)
-    before_m, step = looks.before_m[:-1], step_s(planned.time_s)
+    before_m = looks.before_m[:-1]
+    step = step_s(planned.time_s)
     before_s = trace.time_s[0] - step * np.arange(len(before_m), 0, -1)
     gait = gait_of(np.vstack([before_m, trace.targets_m]), np.concatenate([before_s, trace.time_s]))
     items = (f"{looks.path_id}{part}" for part in ("", "/others", "/zoom"))
@@ -168,8 +172,12 @@ def run(
     box_map = read_boxes(boxes)
     inputs |= {f"mesh {name}": path for name, path in box_map.meshes.files().items()}
     if cfg.path_index is not None and cfg.path_index >= (num := len(read_traces(traces))):
-        what, expected = "no trajectory has this index", f"an index below {num}"
-        raise ConfigError(what, where="render.path_index", got=cfg.path_index, expected=expected)
+        raise ConfigError(
+            "no trajectory has this index",
+            where="render.path_index",
+            got=cfg.path_index,
+            expected=f"an index below {num}",
+        )
     stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return out
@@ -187,9 +195,13 @@ def run(
         log.warning("render: %d boxes share the instance id %d: ids have 16 bits", num_shared, SHARED_ID)
     town, updates = _names(stage, cfg, box_map.name, traces, others, seed)
     cfg = cfg.model_copy(update=updates)
-    skies = {n: weather_of(cfg, pools, trace.drawn_as(n).number) for n, trace in passed.items()}
-    nearest_m = {n: np.linalg.norm(t.positions_m - t.targets_m, axis=1).min() for n, t in passed.items()}
-    if hidden := [trace.path_id for n, trace in passed.items() if fog_hides(skies[n], float(nearest_m[n]))]:
+    weathers = weathers_of(cfg, pools, (trace.drawn_as(number).number for number, trace in passed.items()))
+    hidden = []
+    for number, trace in passed.items():
+        nearest_m = float(np.linalg.norm(trace.positions_m - trace.targets_m, axis=1).min())
+        if fog_hides(weathers[trace.drawn_as(number).number], nearest_m):
+            hidden.append(trace.path_id)
+    if hidden:
         log.warning("render: fog hides the target in all frames of %s: plan nearer, or in other weather", hidden)
     items = [
         Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track), len(trace.time_s[:: cfg.frame_stride]))
@@ -198,7 +210,8 @@ def run(
     ]
     arguments = (cfg, (boxes, simplified, traces, others), out, town, seed, min(workers, len(items)))
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="render: frames")
-    ids_file, map_file = out / town / IDS_FILE, write_town_map(out / town, box_map.header)
+    ids_file = out / town / IDS_FILE
+    map_file = write_town_map(out / town, box_map.header)
     ids_record = {
         **IDS_FORMAT.header,
         "person": PERSON_ID,
@@ -209,18 +222,18 @@ def run(
         "boxes": [[a, b] for a, b in zip(ids.tolist(), box_map.ids.tolist(), strict=True) if a != SHARED_ID],
     }
     write_json(ids_file, ids_record, indent=None)
-    made = [result_of(record, _RenderedTrack) for record in finished.kept]
-    outputs = [inside(out, one.folder) / name for one in made for name in ("trajectory.json", CHECKSUMS)]
+    rendered = [result_of(record, _RenderedTrack) for record in finished.kept]
+    outputs = [inside(out, track.folder) / name for track in rendered for name in ("trajectory.json", CHECKSUMS)]
     stage.finish(
         [*outputs, ids_file, map_file],
         finished.tally,
         town=town,
         flights=[record.result for record in finished.kept],
-        num_frames=sum(one.num_frames for one in made),
+        num_frames=sum(track.num_frames for track in rendered),
         num_traces=len(all_traces),
         num_traces_not_rendered=len(all_traces) - len(passed),
         num_boxes_sharing_an_id=num_shared,
-        goals=dict(sorted(Counter(one.goal for one in made).items())),
+        goals=dict(sorted(Counter(track.goal for track in rendered).items())),
     )
     return out
 
@@ -236,36 +249,48 @@ class _RenderedTrack(BaseModel):
 
 def bystanders_of(others: Path | None, traces: list[DroneTrace]) -> tuple[dict[str, list[Bystander]], int]:
     """Read the bystanders of every trajectory, by path id, and how many ids they need: as many as one has at most."""
-    found = {} if others is None else {one.path_id: one.others for one in read_bystanders(others)}
-    for trace in traces if others is not None else ():
-        where, num_times = f"{others}: {trace.path_id}", len(trace.time_s)
-        if trace.path_id not in found:
+    if others is None:
+        return {}, 0
+    by_path = {path.path_id: path.others for path in read_bystanders(others)}
+    for trace in traces:
+        where = f"{others}: {trace.path_id}"
+        if trace.path_id not in by_path:
             raise InputError("the file has no bystanders of a path", where=where, fix=FROM_ONE_RUN)
-        if wrong := {len(other.positions_m) for other in found[trace.path_id]} - {num_times}:
-            what, got = "bystanders have other times than the trajectory", f"{wrong.pop()} positions"
-            raise InputError(what, where=where, got=got, expected=str(num_times), fix=FROM_ONE_RUN)
-    return found, max(map(len, found.values()), default=0)
+        if other_lengths := {len(other.positions_m) for other in by_path[trace.path_id]} - {len(trace.time_s)}:
+            raise InputError(
+                "bystanders have other times than the trajectory",
+                where=where,
+                got=f"{other_lengths.pop()} positions",
+                expected=str(len(trace.time_s)),
+                fix=FROM_ONE_RUN,
+            )
+    return by_path, max(map(len, by_path.values()), default=0)
 
 
 def _names(
     stage: StageFolder, cfg: RenderConfig, map_name: str, traces: Path, others: Path | None, seed: int
 ) -> tuple[str, dict[str, int]]:
-    """Return the town's folder, and the settings that name the first trajectory and seed the weather; a resumed tree
-    keeps its own."""
-    town, settings = town_folder(cfg.town or map_name), cfg.recorded()
+    """Return the town's folder, and the settings that name the first trajectory and seed the weather.
+
+    A resumed tree keeps its folder, names and seed.
+    """
+    town = town_folder(cfg.town or map_name)
+    settings = cfg.recorded()
     del settings["depth_format"]  # poses are the same in either
     named_by = [town, seed, fingerprint(traces), settings, *([] if others is None else [fingerprint(others)])]
-    first, weather_seed = cfg.first_timestamp, cfg.weather_seed
+    first = cfg.first_timestamp
+    weather_seed = cfg.weather_seed
     if first is None:
         first = FIRST_S + int(sha256_bytes(dump_json(named_by).encode()), 16) % SPAN_S
     numbers = {trace.path_id: number for number, trace in enumerate(read_traces(traces))}
-    begun = [(numbers.get(one.id.rpartition("/")[0]), one) for one in stage.items() if isinstance(one, Kept)]
-    kept = [(number, result_of(one, _RenderedTrack)) for number, one in begun if number is not None]
+    begun = [(numbers.get(item.id.rpartition("/")[0]), item) for item in stage.items() if isinstance(item, Kept)]
+    kept = [(number, result_of(item, _RenderedTrack)) for number, item in begun if number is not None]
     if kept:
         place = place_of(Path(kept[0][1].folder))
-        town, first = place.town, int(place.trajectory.removeprefix(TRAJECTORY)) - kept[0][0]
+        town = place.town
+        first = int(place.trajectory.removeprefix(TRAJECTORY)) - kept[0][0]
     if weather_seed < 0:
-        weather_seed = next((one.weather_seed for _, one in kept if one.weather_seed), None) or random_seed()
+        weather_seed = next((track.weather_seed for _, track in kept if track.weather_seed), None) or random_seed()
     return town, {"first_timestamp": first, "weather_seed": weather_seed}
 
 
@@ -275,9 +300,11 @@ def make_worker(cfg: RenderConfig, inputs: Inputs, out: Path, town: str, seed: i
     if num_processes > 1:
         # Processes share the cores: one rasteriser thread each. The driver reads it when it loads.
         os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num_processes)))
-    surroundings, all_traces = Surroundings(read_boxes(simplified)), read_traces(traces)
+    surroundings = Surroundings(read_boxes(simplified))
+    all_traces = read_traces(traces)
     bystanders, num_others = bystanders_of(others, all_traces)
-    box_map, pools = read_boxes(boxes), read_pools(cfg)
+    box_map = read_boxes(boxes)
+    weathers = weathers_of(cfg, read_pools(cfg), (trace.drawn_as(n).number for n, trace in enumerate(all_traces)))
     renderer = renderer_of(cfg, box_map, seed, num_others)
     overlay = Overlay(box_map, instance_ids(box_map, num_others)) if cfg.debug else None
 
@@ -287,9 +314,9 @@ def make_worker(cfg: RenderConfig, inputs: Inputs, out: Path, town: str, seed: i
         check_track(trace, surroundings)
         if cfg.rim:
             check_outside_rim(trace, box_map)
-        weather = weather_of(cfg, pools, trace.drawn_as(number).number)
-        cast = bystanders.get(trace.path_id, ())
-        script = make_track_script(trace, number, track, town, surroundings, cfg, seed, cast, weather)
+        weather = weathers[trace.drawn_as(number).number]
+        trace_bystanders = bystanders.get(trace.path_id, ())
+        script = make_track_script(trace, number, track, town, surroundings, cfg, seed, trace_bystanders, weather)
         folder = out / town / script.trajectory / script.variant
         with atomic_folder(folder) as unfinished:
             made = render_track(renderer, script, unfinished, cfg, overlay)

@@ -77,7 +77,9 @@ def _cut(triangles: np.ndarray, frame: np.ndarray, half: np.ndarray) -> np.ndarr
     Source: Sutherland and Hodgman 1974, for all triangles at once.
     """
     axes = np.array([[frame[2], frame[3]], [-frame[3], frame[2]]])
-    corners, sizes, every = triangles, np.full(len(triangles), 3), np.arange(len(triangles))
+    corners = triangles
+    sizes = np.full(len(triangles), 3)
+    every = np.arange(len(triangles))
     for axis, reach, sign in zip(axes[[0, 0, 1, 1]], half[[0, 0, 1, 1]], (-1.0, 1.0, -1.0, 1.0), strict=True):
         inside = reach - sign * ((corners[..., :2] - frame[:2]) @ axis)  # (n, m) m, negative outside
         kept, counts = np.zeros((len(corners), corners.shape[1] + 1, 3)), np.zeros(len(corners), dtype=int)

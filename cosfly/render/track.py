@@ -160,7 +160,8 @@ def draw_frame(
     renderer: Renderer, script: TrackScript, i: int, poses: Poses, threshold: float
 ) -> tuple[Frame, TargetMeta, BystandersMeta | None]:
     """Draw frame i from the given poses; annotate the target, without its legibility, and the bystanders."""
-    pose, target_m = world_from_camera(poses.positions_m[i], poses.rotations_deg[i]), poses.targets_m[i]
+    pose = world_from_camera(poses.positions_m[i], poses.rotations_deg[i])
+    target_m = poses.targets_m[i]
     camera = script.cameras[i]
     others = script.others.posed(i)
     frame = renderer.render(pose, camera.intrinsic, script.gait.posed(i, target_m, script.clothes), others)
@@ -224,7 +225,8 @@ def _write_frame(
     folder: Path, frame: Frame, meta: FrameMeta, cfg: RenderConfig, overlay: Overlay | None
 ) -> tuple[TargetMeta, dict[str, str]]:
     """Encode and write one frame, in a thread; return the target's annotation, and file name -> sha256."""
-    name, meta = frames.frame_name(meta.index), meta.model_copy(update={"target": written_target(meta.target, frame)})
+    name = frames.frame_name(meta.index)
+    meta = meta.model_copy(update={"target": written_target(meta.target, frame)})
     contents: dict[str, bytes] = {}
     if "rgb" in cfg.modalities:
         contents[frames.FILE_NAMES["rgb"]] = frames.rgb_bytes(frame.rgb)
@@ -298,7 +300,8 @@ def _with_goal(track: Track, renderer: Renderer, script: TrackScript, threshold:
     """Add the goal, from the first frame in which the target is legible and distinct, or the reason for its absence."""
     if not renderer.dresses:
         return replace(track, people=None, raw=track.raw | {"goal": {"absent": "clothes_unknown"}})
-    poses, people = script.perturbed.poses, script.others.people(script.clothes.looks)
+    poses = script.perturbed.poses
+    people = script.others.people(script.clothes.looks)
     legible = [i for i in range(len(track)) if track.legibility_at(i)["legible"]]
     for i in legible[:MOST_GOAL_FRAMES]:
 

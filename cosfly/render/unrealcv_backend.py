@@ -92,15 +92,18 @@ class UnrealCvRenderer(SimulatorRenderer):
 
     def _link(self, names: list[str]) -> None:
         """Make the tables from colours of the object mask to instance ids and kinds."""
-        ids, rows = instance_ids(self._map, self._num_others), {int(k): row for row, k in enumerate(self._map.ids)}
+        ids = instance_ids(self._map, self._num_others)
+        rows = {int(k): row for row, k in enumerate(self._map.ids)}
         self._ids = np.full(COLORS, NO_INSTANCE, dtype=np.uint16)
         self._kinds = np.full(COLORS, KINDS["NONE"], dtype=np.uint8)
         asked = (f"vget /object/{name}/{what}" for name in names for what in ("color", "uclass_name"))
-        answers, linked = iter(self._server.ask(*asked)), dict[str, int]()
+        answers = iter(self._server.ask(*asked))
+        linked = dict[str, int]()
         self._used = set[int]()
         num_doubtful = 0
         for name in names:
-            color, class_name = _color_of(next(answers)), str(next(answers))
+            color = _color_of(next(answers))
+            class_name = str(next(answers))
             row = rows.get(id_of(name))
             if row is not None:
                 linked[name] = row
@@ -226,15 +229,18 @@ class UnrealCvRenderer(SimulatorRenderer):
         colors = pictures[1].astype(np.int64) @ [1, 1 << 8, 1 << 16]  # blue, green, red
         kinds, ids, depth_m = self._kinds[colors], self._ids[colors], raw / np.float32(self._cfg.coord_scale)
         is_sky = ~(raw < FAR_CM)
-        depth_m[depth_m < NEAR_M], depth_m[is_sky] = INVALID_DEPTH_M, SKY_DEPTH_M
-        kinds[is_sky], ids[is_sky] = KINDS["Sky"], NO_INSTANCE
+        depth_m[depth_m < NEAR_M] = INVALID_DEPTH_M
+        depth_m[is_sky] = SKY_DEPTH_M
+        kinds[is_sky] = KINDS["Sky"]
+        ids[is_sky] = NO_INSTANCE
         return far_as_sky(Frame(np.ascontiguousarray(pictures[0][..., ::-1]), depth_m, kinds, ids))
 
     # --- people and cars ----------------------------------------------------------------------------------------------
 
     def _placing(self, number: int, body: Body) -> list[str]:
         """Return the commands that put somebody in their place; a walker starts where the settle delay leads there."""
-        name, animate = self._spawned.get(number) or self._spawn(number, body), self._cfg.animate
+        name = self._spawned.get(number) or self._spawn(number, body)
+        animate = self._cfg.animate
         position_m, turn_deg, _, speed_mps = placement_of(body, self._cfg.settle_delay_s if animate else 0.0)
         place, turn = self._there(position_m, turn_deg)
         commands = [f"vset /object/{name}/location {place}", f"vset /object/{name}/rotation {turn}"]
@@ -245,13 +251,15 @@ class UnrealCvRenderer(SimulatorRenderer):
 
     def _spawn(self, number: int, body: Body) -> str:
         """Spawn somebody in a colour that no object has; return their name."""
-        name, is_person = f"{OURS}{number}", isinstance(body, PosedPerson)
+        name = f"{OURS}{number}"
+        is_person = isinstance(body, PosedPerson)
         asset = self._cfg.person_asset if is_person else self._cfg.car_asset
         color = next(c for c in range(COLORS - 1, 0, -1) if c not in self._used)
         paint = f"{color >> 16} {color >> 8 & 0xFF} {color & 0xFF}"
         self._server.run(f"vset /objects/spawn_bp_asset {asset} {name}", f"vset /object/{name}/color {paint}")
         self._used.add(color)
-        self._ids[color], self._kinds[color] = number, KINDS["Pedestrians" if is_person else "Car"]
+        self._ids[color] = number
+        self._kinds[color] = KINDS["Pedestrians" if is_person else "Car"]
         self._spawned[number] = name
         return name
 

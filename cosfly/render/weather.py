@@ -1,13 +1,14 @@
-"""The weather and time of day of a trajectory: preset pools, modes, the seed formula (app:weather)."""
+"""The weather and time of day of a trajectory: preset pools, modes and the seed formula (app:weather)."""
 
 from __future__ import annotations
 
 import math
 import random
 import secrets
-from collections.abc import Callable, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
@@ -32,14 +33,14 @@ from cosfly.runtime.config import Config, MayDiffer, build, read_yaml
 from cosfly.runtime.errors import ConfigError, nearest
 from cosfly.runtime.seeding import draw_to_quota, rng_for
 
-# Extinction per m at 100 percent; dense fog (80) leaves 5 % of the colours 60 m away.
-FOG_AT_FULL, FOG_POWER = 0.10, 2.4
-RAIN_EXTINCTION = 0.0045  # per m of the heaviest rain: a visibility of some 700 m
-# Of clothes against the ground in clear air (CIE76), and how it goes with the light that is left: measured.
-STRONGEST_CONTRAST, CONTRAST_POWER = 75.0, 1.75
-LIT_KINDS = {KINDS[name] for name in ("Poles", "Roads", "Sidewalks")}  # where lamps are
+FOG_AT_FULL = 0.10  # extinction per m at a fog density of 100 percent
+FOG_POWER = 2.4  # of the fog density: dense fog (80 percent) leaves 5 % of the colours 60 m away
+RAIN_EXTINCTION = 0.0045  # extinction per m of the heaviest rain: a visibility of some 700 m
+STRONGEST_CONTRAST = 75.0  # measured colour difference (CIE76) between clothes and ground in clear air
+CONTRAST_POWER = 1.75  # contrast falls as this power of the transmitted share of light: measured
+LIT_KINDS = {KINDS[name] for name in ("Poles", "Roads", "Sidewalks")}  # kinds of boxes that carry lamps
 Preset = TypeVar("Preset", WeatherPreset, TimePreset)
-DEFAULT_SEED = 20260423  # of the paper's production runs (app:weather:coverage)
+DEFAULT_SEED = 20260423  # the seed of the paper's production runs (app:weather:coverage)
 
 
 class WeatherConfig(Config):
@@ -78,7 +79,8 @@ class WeatherConfig(Config):
     def _settings_agree(self) -> WeatherConfig:
         problems = []
         for field, pool_field, presets in (("weather_name", "weather_pool", WEATHERS), ("tod_name", "tod_pool", TIMES)):
-            name, pool = getattr(self, field), getattr(self, pool_field)
+            name = getattr(self, field)
+            pool = getattr(self, pool_field)
             if name is None and self.weather_mode == "fixed":
                 problems.append(f"{field} is needed in weather_mode fixed")
             if name is not None and self.weather_mode != "fixed":
@@ -120,36 +122,53 @@ class Pools:
     weathers: Mapping[str, WeatherPreset]
     times: Mapping[str, TimePreset]
 
-    def of_kind(self) -> dict[str, list[tuple[str, str]]]:
+    def pairs_by_kind(self) -> dict[str, list[tuple[str, str]]]:
         """Return the pairs of weather and time of each kind of sky."""
-        pairs = {(a, b): sky_kind(resolved(self.weathers[a], self.times[b])) for a in self.weathers for b in self.times}
-        return {kind: [pair for pair, own in pairs.items() if own == kind] for kind in dict.fromkeys(pairs.values())}
+        pairs = defaultdict[str, list[tuple[str, str]]](list)
+        for weather, time in product(self.weathers, self.times):
+            pairs[sky_kind(resolved(self.weathers[weather], self.times[time]))].append((weather, time))
+        return dict(pairs)
 
 
 def read_pools(cfg: WeatherConfig) -> Pools:
-    """Read the files of presets that the settings name, or return the paper's presets."""
-    pools: list[Any] = [WEATHERS, TIMES]
-    weathers: Any = (cfg.weather_pool, PresetPool[WeatherPreset], "weather_name")
-    times: Any = (cfg.tod_pool, PresetPool[TimePreset], "tod_name")
-    for i, (path, model, field) in enumerate((weathers, times)):
-        if path is None:
-            continue
-        given = build(model, read_yaml(path), path).presets
-        pools[i] = {preset_token(name): knobs for name, knobs in given.items()}
-        if len(pools[i]) < len(given):
-            raise ConfigError("two presets have the same name", where=path, got=", ".join(given))
-        if problems := _unknown(getattr(cfg, field), pools[i], field):
-            raise ConfigError("; ".join(problems), where=path)
-    found = Pools(*pools)
-    lacking = [kind for kind, share in cfg.sky_shares.items() if share and kind not in found.of_kind()]
-    if cfg.weather_mode == "by_weight" and lacking:
-        got, fix = f"a share of {', '.join(lacking)}", "remove the share, or add presets of this kind to the pools"
-        raise ConfigError("no preset belongs to a kind of sky", where="render.sky_shares", got=got, fix=fix)
-    return found
+    """Read the files of presets that the settings name, or return the paper's presets.
+
+    Raises:
+        ConfigError: If a file is malformed, lacks the named preset, or a kind with a share has no presets.
+    """
+    pools = Pools(
+        weathers=_read_pool(cfg.weather_pool, PresetPool[WeatherPreset], WEATHERS, cfg.weather_name, "weather_name"),
+        times=_read_pool(cfg.tod_pool, PresetPool[TimePreset], TIMES, cfg.tod_name, "tod_name"),
+    )
+    if cfg.weather_mode == "by_weight":
+        kinds = pools.pairs_by_kind()
+        if missing := [kind for kind, share in cfg.sky_shares.items() if share and kind not in kinds]:
+            raise ConfigError(
+                "no preset belongs to a kind of sky",
+                where="render.sky_shares",
+                got=f"a share of {', '.join(missing)}",
+                fix="remove the share, or add presets of this kind to the pools",
+            )
+    return pools
+
+
+def _read_pool(
+    path: Path | None, model: type[PresetPool[Preset]], default: Mapping[str, Preset], name: str | None, field: str
+) -> Mapping[str, Preset]:
+    """Read a file of presets, or return the default; `field` is the setting that holds `name`."""
+    if path is None:
+        return default
+    presets = build(model, read_yaml(path), path).presets
+    pool = {preset_token(key): preset for key, preset in presets.items()}
+    if len(pool) < len(presets):
+        raise ConfigError("two presets have the same name", where=path, got=", ".join(presets))
+    if problems := _unknown(name, pool, field):
+        raise ConfigError("; ".join(problems), where=path)
+    return pool
 
 
 def _unknown(name: str | None, presets: Mapping[str, Any], field: str) -> list[str]:
-    """Return what is wrong with the name of a preset; an empty list if it exists, or none is given."""
+    """Return the problem with a preset's name, in a list that is empty if the preset exists or no name is set."""
     if name is None or preset_token(name) in presets:
         return []
     return [f"{field}: unknown preset {name!r}{nearest(preset_token(name), presets)}; there are {', '.join(presets)}"]
@@ -161,44 +180,75 @@ def path_seed(weather_seed: int, path_index: int) -> int:
 
 
 def random_seed() -> int:
-    """Return a seed that no two runs share: what a negative `weather_seed` asks for."""
+    """Return a new random seed for a run with a negative `weather_seed`."""
     return secrets.randbelow(2**31)
 
 
 def weather_of(cfg: WeatherConfig, pools: Pools, path_index: int) -> WeatherRecord | None:
-    """Return the weather of a trajectory, None where the mode is off. `weather_seed` is not negative."""
+    """Return the weather of one trajectory. For many trajectories `weathers_of` is faster."""
+    return weathers_of(cfg, pools, [path_index])[path_index]
+
+
+def weathers_of(cfg: WeatherConfig, pools: Pools, path_indices: Iterable[int]) -> dict[int, WeatherRecord | None]:
+    """Return the weather of trajectories by path index, None where the mode is off. `weather_seed` is not negative."""
+    indices = sorted(set(path_indices))
     if cfg.weather_mode == "off":
-        return None
+        return dict.fromkeys(indices)
     if cfg.weather_mode == "fixed":
-        names = [preset_token(str(name)) for name in (cfg.weather_name, cfg.tod_name)]
+        names = dict.fromkeys(indices, (preset_token(str(cfg.weather_name)), preset_token(str(cfg.tod_name))))
     elif cfg.weather_mode == "by_weight":
-        # Pairs of one kind are adjacent, so that kinds meet their quota as pairs do. Tokens have no blanks.
-        of_kind = pools.of_kind()
-        shares = {kind: share / len(of_kind[kind]) for kind, share in cfg.sky_shares.items() if share}
-        weights = {f"{kind} {weather} {time}": shares[kind] for kind in shares for weather, time in of_kind[kind]}
-        drawn = draw_to_quota(weights, rng_for(cfg.weather_seed, "render", "skies"))  # none depends on their number
-        _, *names = next(islice(drawn, path_index, None)).split(" ")
+        # Each draw depends on the draws before it, but not on how many follow.
+        drawn = list(islice(_draw_by_weight(cfg, pools), max(indices, default=-1) + 1))
+        names = {index: drawn[index] for index in indices}
     else:
-        assert cfg.weather_seed >= 0, "`run` draws one"
-        # Python guarantees a stable sequence for a seed only of `random()`.
-        rng = random.Random(path_seed(cfg.weather_seed, path_index))
-        names = [list(presets)[int(rng.random() * len(presets))] for presets in (pools.weathers, pools.times)]
-    params = resolved(pools.weathers[names[0]], pools.times[names[1]])
-    return WeatherRecord(mode=cfg.weather_mode, weather_name=names[0], tod_name=names[1], params=params)
+        assert cfg.weather_seed >= 0, "`run` replaces a negative seed"
+        names = {index: _draw_evenly(pools, path_seed(cfg.weather_seed, index)) for index in indices}
+    records: dict[int, WeatherRecord | None] = {}
+    for index, (weather, time) in names.items():
+        params = resolved(pools.weathers[weather], pools.times[time])
+        records[index] = WeatherRecord(mode=cfg.weather_mode, weather_name=weather, tod_name=time, params=params)
+    return records
+
+
+def _draw_by_weight(cfg: WeatherConfig, pools: Pools) -> Iterator[tuple[str, str]]:
+    """Yield the names of weather and time for path index 0, 1, ... without end, in the shares of the settings."""
+    pairs_by_kind = pools.pairs_by_kind()
+    weights: dict[str, float] = {}
+    for kind, share in cfg.sky_shares.items():
+        pairs = pairs_by_kind[kind] if share else []
+        # The quota sorts its names. This prefix keeps the pairs of one kind adjacent, so that kinds meet their quota.
+        weights |= {f"{kind} {weather} {time}": share / len(pairs) for weather, time in pairs}
+    for name in draw_to_quota(weights, rng_for(cfg.weather_seed, "render", "skies")):
+        _, weather, time = name.split(" ")  # tokens have no blanks
+        yield weather, time
+
+
+def _draw_evenly(pools: Pools, seed: int) -> tuple[str, str]:
+    """Return the names of a weather and a time, each drawn with equal probability."""
+    rng = random.Random(seed)
+    # Of all its methods, Python guarantees the sequence for a seed only of `random()`.
+    weather = list(pools.weathers)[int(rng.random() * len(pools.weathers))]
+    time = list(pools.times)[int(rng.random() * len(pools.times))]
+    return weather, time
 
 
 def dark_trajectories(cfg: WeatherConfig, num: int, read_map: Callable[[], BoxMap]) -> list[int]:
-    """Return the numbers of the trajectories whose pictures are black: by night, on a map without lamps.
+    """Return the indices of trajectories with black pictures: those at night on a map without lamps.
 
     Args:
-        read_map: called only if a trajectory is by night. While `weather_seed` is still to be drawn, none is known.
+        num: The number of trajectories.
+        read_map: Called only if a trajectory is at night.
+
+    Returns:
+        An empty list if `weather_seed` is negative: the weather is then not drawn yet.
     """
     if cfg.weather_mode == "off" or cfg.weather_seed < 0:
         return []
-    pools = read_pools(cfg)
-    skies = [weather_of(cfg, pools, number) for number in range(num)]
-    by_night = [k for k, sky in enumerate(skies) if sky and sky_kind(sky.params).startswith("night")]
-    return by_night if by_night and not read_map().is_any_of(LIT_KINDS).any() else []
+    weathers = weathers_of(cfg, read_pools(cfg), range(num))
+    at_night = [
+        index for index, weather in weathers.items() if weather and sky_kind(weather.params).startswith("night")
+    ]
+    return at_night if at_night and not read_map().is_any_of(LIT_KINDS).any() else []
 
 
 def fog_extinction(params: WeatherParams) -> float:
@@ -207,7 +257,10 @@ def fog_extinction(params: WeatherParams) -> float:
     return float(FOG_AT_FULL * (params.fog_density / 100.0) ** FOG_POWER + RAIN_EXTINCTION * rain**1.5)
 
 
-def fog_hides(sky: WeatherRecord | None, distance_m: float) -> bool:
+def fog_hides(weather: WeatherRecord | None, distance_m: float) -> bool:
     """Return whether fog and rain make a person illegible at a distance."""
-    thick = 0.0 if sky is None else fog_extinction(sky.params) * max(0.0, distance_m - sky.params.fog_distance)
-    return math.exp(-CONTRAST_POWER * thick) * STRONGEST_CONTRAST < LEGIBLE_CONTRAST
+    optical_depth = 0.0
+    if weather is not None:
+        params = weather.params
+        optical_depth = fog_extinction(params) * max(0.0, distance_m - params.fog_distance)
+    return math.exp(-CONTRAST_POWER * optical_depth) * STRONGEST_CONTRAST < LEGIBLE_CONTRAST

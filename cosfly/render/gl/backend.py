@@ -51,7 +51,9 @@ class GlRenderer:
         driver = (str(self.context.info[f"GL_{name}"]) for name in ("VENDOR", "RENDERER", "VERSION"))
         self.device = ", ".join(("EGL", *driver))
         self._is_software = SOFTWARE in self.device
-        self.scene, self.look, self.num_others = build_scene(box_map, num_others, rim), look, num_others
+        self.scene = build_scene(box_map, num_others, rim)
+        self.look = look
+        self.num_others = num_others
         self.width_px, self.height_px = width_px, height_px
         context, size = self.context, (width_px, height_px)
         with context:
@@ -70,7 +72,8 @@ class GlRenderer:
             self._meshes = [
                 (context.buffer(one.vertices.tobytes()), context.buffer(one.triangles.tobytes())) for one in all_meshes
             ]
-            self._num_triangles, self._num_waiting = [len(mesh.triangles) for mesh in all_meshes], 0
+            self._num_triangles = [len(mesh.triangles) for mesh in all_meshes]
+            self._num_waiting = 0
             self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}  # made when needed
             self._loose = LooseTriangles(context, self.scene.loose)
             texts = programs.sources(("part.glsl", "depth.vert.glsl"), ("depth.frag.glsl",))
@@ -82,7 +85,8 @@ class GlRenderer:
     def _use_weather(self, define: str | None) -> None:
         """Switch to the programs of fair weather (None), or of a weather with these defines."""
         if define not in self._looks:
-            made, weather = programs.programs_of(self.context, define, snaps=not self._is_software), None
+            made = programs.programs_of(self.context, define, snaps=not self._is_software)
+            weather = None
             if define is not None:
                 weather = WeatherPass(self.context, self._color, self._depth, made.rain, self.num_others)
             self._looks[define] = made, self.context.vertex_array(made.sky, []), weather
@@ -166,7 +170,9 @@ class GlRenderer:
 
     def _prepare_openness(self, casting: np.ndarray, top: float, middle: np.ndarray, half: float) -> None:
         """Draw a blurred height map from above: higher objects nearby darken a point. top: no caster is higher."""
-        depth_m, low, pixel_m = top - self._ground_z + 10.0, middle[:2] - half, 2.0 * half / HEIGHT_SIZE_PX
+        depth_m = top - self._ground_z + 10.0
+        low = middle[:2] - half
+        pixel_m = 2.0 * half / HEIGHT_SIZE_PX
         clip_from_world = np.diag([1.0 / half, 1.0 / half, -2.0 / depth_m, 1.0])
         clip_from_world[:3, 3] = -middle[0] / half, -middle[1] / half, 2.0 * top / depth_m - 1.0
         texture = self.context.depth_texture((HEIGHT_SIZE_PX, HEIGHT_SIZE_PX))
@@ -204,17 +210,18 @@ class GlRenderer:
         """Draw one frame, as the contract says."""
         check_pose(camera_pose, intrinsic)
         figure = None if person is None else figure_of(person)
-        size_px, eye = (self.width_px, self.height_px), camera_pose[:3, 3] - self.origin_m
-        view = CameraView(camera_pose[:3, :3], eye, intrinsic, *size_px)
+        eye = camera_pose[:3, 3] - self.origin_m
+        view = CameraView(camera_pose[:3, :3], eye, intrinsic, self.width_px, self.height_px)
         moving = [] if figure is None else [movers.figure_parts(figure, PERSON_ID, self.origin_m)]
-        moving += movers.draw_bystanders(others, self.origin_m, view)
+        moving += movers.bystander_parts(others, self.origin_m, view)
         bones = np.zeros((0, 2, 4), np.float32)
         if figure is not None:
             bones = np.zeros((len(figure.bones_m), 2, 4), np.float32)
-            bones[..., :3], bones[:, 0, 3] = figure.bones_m - self.origin_m, figure.bone_radii_m
+            bones[..., :3] = figure.bones_m - self.origin_m
+            bones[:, 0, 3] = figure.bone_radii_m
         capsules = movers.capsules_of(others, self.origin_m, view)
         has_headlights = self._weather is not None and self._weather.has_lights
-        shades = movers.shades_of(bones, capsules, self._sun, view, has_headlights)
+        regions = movers.shadow_regions(bones, capsules, self._sun, view, has_headlights)
         uniforms = self._uniforms(view, camera_pose, person)
         with self.context:
             self._set_uniforms(self._programs.materials, uniforms)
@@ -230,11 +237,11 @@ class GlRenderer:
             if self._weather is not None:
                 self._weather.use()
             self._draw_scene(self._programs.materials, rows, moving)
-            if shades:
+            if regions:
                 center = np.zeros(3) if person is None else person.hip_m - self.origin_m
                 self._set_uniforms(self._programs.near_movers, uniforms | {"person_center": center})
-            for shade in shades:
-                self._draw_shaded(shade, bones, rows, moving)
+            for region in regions:
+                self._draw_region(region, bones, rows, moving)
             # Clearing targets of mixed types leaves garbage: the sky's triangle writes all three where nothing is.
             self.context.disable(self.context.CULL_FACE)
             self._sky.render(vertices=3)
@@ -271,31 +278,35 @@ class GlRenderer:
             for program in (*materials, self._programs.sky):
                 set_uniform(program, name, packed)
 
-    def _draw_shaded(
-        self, shade: movers.Shade, bones: np.ndarray, rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]
+    def _draw_region(
+        self,
+        region: movers.ShadowRegion,
+        bones: np.ndarray,
+        rows: np.ndarray,
+        moving: list[tuple[np.ndarray, np.ndarray]],
     ) -> None:
-        """Draw a rectangle again, with the shadows of movers."""
+        """Draw the rectangle of a shadow region again, with the shadows of its movers."""
         for name, count, most, capsules in (
-            ("person_bones", "person_num_bones", MAX_BONES, bones if shade.has_person else bones[:0]),
-            ("other_bones", "num_others", movers.MOST_CAPSULES, shade.capsules),
+            ("person_bones", "person_num_bones", MAX_BONES, bones if region.has_person else bones[:0]),
+            ("other_bones", "num_others", movers.MOST_CAPSULES, region.capsules),
         ):
             padded = np.zeros((most, 2, 4), np.float32)
             padded[: len(capsules)] = capsules
             for program in self._programs.near_movers:
                 set_uniform(program, name, padded.tobytes())
                 set_uniform(program, count, len(capsules))
-        # A sphere around all that is darkened.
-        center = (shade.points.min(axis=0) + shade.points.max(axis=0)) / 2.0
-        radius = float(np.linalg.norm(shade.points - center, axis=1).max())
+        # A sphere around the points. Objects outside it do not change.
+        center = (region.points.min(axis=0) + region.points.max(axis=0)) / 2.0
+        radius = float(np.linalg.norm(region.points - center, axis=1).max())
         away = np.linalg.norm(self._parts.object_centers[rows] - center, axis=1) - self._parts.object_radii[rows]
         near = [part for part in moving if np.linalg.norm(part[0]["center"][0] - center) < radius + MOVER_M]
-        x0, y0, x1, y1 = shade.rectangle_px
+        x0, y0, x1, y1 = region.rectangle_px
         self._image.scissor = x0, y0, x1 - x0, y1 - y0
         self._draw_scene(self._programs.near_movers, rows[away < radius], near)
         self._image.scissor = None
 
     def _draw_scene(self, materials: list[Any], rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]) -> None:
-        """Draw the ground last, and near before far. moving: records and meshes."""
+        """Draw parts by material in DRAW_ORDER. moving: records and meshes of the movers."""
         records = np.concatenate([*(part for part, _ in moving), self._parts.records[rows]])
         groups = np.concatenate([*(_groups(part, mesh) for part, mesh in moving), self._groups[rows]])
         order = np.argsort(groups, kind="stable")
@@ -308,6 +319,7 @@ class GlRenderer:
             self._loose.draw(materials[material], material)
 
     def _draw(self, program: Any, mesh: int, records: np.ndarray) -> None:
+        """Draw instances of one mesh."""
         if len(records) == 0:
             return
         array, instances = self._array(program, mesh)
@@ -320,8 +332,11 @@ class GlRenderer:
             self._num_waiting = 0
 
     def _read(self) -> Frame:
+        """Read the frame from the renderer's targets."""
         shape = (self.height_px, self.width_px)
-        color, depth, tag = np.empty((*shape, 4), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.uint32)
+        color = np.empty((*shape, 4), np.uint8)
+        depth = np.empty(shape, np.float32)
+        tag = np.empty(shape, np.uint32)
         self._image.read_into(color, components=4, attachment=0)
         self._image.read_into(depth, components=1, attachment=1, dtype="f4")
         self._image.read_into(tag, components=1, attachment=2, dtype="u4")

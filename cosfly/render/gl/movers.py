@@ -1,7 +1,8 @@
-"""People and cars as drawable parts of one frame, and the rectangles of pixels that their shadows may darken."""
+"""People and cars as drawable parts of one frame, and the rectangles of pixels that their shadows may change."""
 
 from __future__ import annotations
 
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -10,23 +11,24 @@ from scipy.spatial.transform import Rotation
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.geometry.axes import box_corners, rotation_matrix
-from cosfly.render.contract import LAYER_STEP, STANDING_LAYER, Others, PosedCar, PosedPerson
+from cosfly.render.contract import LAYER_STEP, STANDING_LAYER, Others, PosedBystander, PosedCar, PosedPerson
 from cosfly.render.gl import meshes
 from cosfly.render.gl.parts import CLOTH, PART, Boxes, CameraView, Parts, tags
 from cosfly.render.gl.shapes import parts_of
 from cosfly.render.person import PersonFigure, figure_of
 
 SHAPES = {"ball": meshes.SPHERE, "rounded": meshes.ROUNDED, "limb": meshes.LIMB, "disc": meshes.CYLINDER}
-MOST_CAPSULES = 32  # as many as the shader has room for: the nearest to the camera
-SHADOW_M = 5.0  # of a sphere round a person and its shadow, under a sun of usual height
-PERSON_RADIUS_M = 1.0  # of a sphere round a person
-PERSON_CAPSULE_M = (0.15, 1.62, 0.19)  # low and high end over the feet, radius
+MOST_CAPSULES = 32  # size of the shader's array; it holds the capsules nearest to the camera
+SHADOW_M = 5.0  # radius of a sphere that holds a bystander and its shadow, under a sun of usual height
+PERSON_RADIUS_M = 1.0  # radius of a sphere that holds a person
+PERSON_CAPSULE_M = (0.15, 1.62, 0.19)  # lower and upper end above the feet, radius
 
 
 def figure_parts(figure: PersonFigure, instance_id: int, origin_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the records (k,) PART and meshes (k,) of a figure, relative to the origin."""
     records = np.zeros(len(figure.shapes), PART)
-    records["center"], records["half"] = figure.centers_m - origin_m, figure.half_m
+    records["center"] = figure.centers_m - origin_m
+    records["half"] = figure.half_m
     records["color"][:, :3] = figure.colors
     records["quaternion"] = Rotation.from_matrix(figure.turns).as_quat()
     records["tag"] = tags(KINDS["Pedestrians"], CLOTH, np.full(len(records), instance_id))
@@ -34,39 +36,44 @@ def figure_parts(figure: PersonFigure, instance_id: int, origin_m: np.ndarray) -
     return records, np.array([SHAPES[shape] for shape in figure.shapes])
 
 
-def draw_bystanders(others: Others, origin_m: np.ndarray, view: CameraView) -> list[tuple[np.ndarray, np.ndarray]]:
+def bystander_parts(others: Others, origin_m: np.ndarray, view: CameraView) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return records and meshes of the bystanders that the camera may see."""
-    found = []
+    parts = []
     for other in others:
         center = other.center_m - origin_m
         if isinstance(other.body, PosedPerson):
             if view.can_show(center, PERSON_RADIUS_M):
-                found.append(figure_parts(figure_of(other.body), other.instance_id, origin_m))
+                parts.append(figure_parts(figure_of(other.body), other.instance_id, origin_m))
         elif view.can_show(center, float(np.linalg.norm(other.body.half_extents_m))):
-            found.append(_car(other.body, other.instance_id, center, view))
-    return found
+            parts.append(_car_parts(other.body, other.instance_id, center, view))
+    return parts
 
 
-def _car(car: PosedCar, instance_id: int, center: np.ndarray, view: CameraView) -> tuple[np.ndarray, np.ndarray]:
-    """Return a car of the same shape as the parked cars of a map."""
-    turn, half = rotation_matrix(0.0, car.heading_rad, 0.0), np.array(car.half_extents_m)
-    ids, seeds = np.array([instance_id], np.uint16), np.array([car.seed])
-    boxes = Boxes(center[None], half[None], turn[None], ids, seeds, KINDS["Car"], np.zeros(1))
+def _car_parts(car: PosedCar, instance_id: int, center: np.ndarray, view: CameraView) -> tuple[np.ndarray, np.ndarray]:
+    """Return records and meshes of a car, in the shape of a map's parked cars."""
+    turn = rotation_matrix(0.0, car.heading_rad, 0.0)
+    half = np.array(car.half_extents_m)
+    ids = np.array([instance_id], np.uint16)
+    boxes = Boxes(center[None], half[None], turn[None], ids, np.array([car.seed]), KINDS["Car"], np.zeros(1))
     parts = Parts.joined(parts_of(boxes))
     rows = view.rows(parts)
     return parts.records[rows], parts.mesh[rows]
 
 
 def capsules_of(others: Others, origin_m: np.ndarray, view: CameraView) -> np.ndarray:
-    """Return capsules of the bystanders that may cast a visible shadow, relative to the origin, (k, 2, 4): from and
-    radius, to and instance id.
+    """Return capsules of the bystanders that may cast a visible shadow.
 
-    Each pixel tests each capsule, which takes longer than all else that is drawn of bystanders.
+    The shader tests each pixel of a shadow region against each of its capsules, the largest cost of bystanders.
+
+    Returns:
+        (k, 2, 4) float32, metres, relative to the origin: [start, radius] and [end, instance id].
     """
-    seen = (other for other in others if view.can_show(other.center_m - origin_m, SHADOW_M))
-    nearest = sorted(seen, key=lambda other: float(np.linalg.norm(other.center_m - origin_m - view.eye)))[
-        :MOST_CAPSULES
-    ]
+
+    def distance_m(other: PosedBystander) -> float:
+        return float(np.linalg.norm(other.center_m - origin_m - view.eye))
+
+    visible = [other for other in others if view.can_show(other.center_m - origin_m, SHADOW_M)]
+    nearest = sorted(visible, key=distance_m)[:MOST_CAPSULES]
     capsules = np.zeros((len(nearest), 2, 4), np.float32)
     for capsule, other in zip(capsules, nearest, strict=True):
         center = other.center_m - origin_m
@@ -78,26 +85,37 @@ def capsules_of(others: Others, origin_m: np.ndarray, view: CameraView) -> np.nd
             ahead = (length - width) * np.array([np.cos(other.body.heading_rad), np.sin(other.body.heading_rad), 0.0])
             radius = max(width, height)
             ends = center + np.array([-ahead, ahead])
-        capsule[:, :3], capsule[0, 3], capsule[1, 3] = ends, radius, other.instance_id
+        capsule[:, :3] = ends
+        capsule[0, 3] = radius
+        capsule[1, 3] = other.instance_id
     return capsules
 
 
-# --- rectangles of shadows --------------------------------------------------------------------------------------------
+# --- shadow regions ---------------------------------------------------------------------------------------------------
 
-# In a program that draws shadows of movers every pixel runs its loops, a third of a frame on a CPU, though the shadows
-# cover a hundredth of it. So the scene is drawn without them, and these rectangles once more with them.
+# A program that draws shadows of movers runs their loops in every pixel. On a CPU this takes a third of a frame's time,
+# though the shadows cover a hundredth of its pixels. So the scene is drawn without these shadows, and then the shadow
+# regions are drawn again with them.
 PERSON_REACH_M = 30.0**0.5  # reach of the person's shadow in the shader, from the hip
-SHORTEST_CAR_M, HEADLIGHT_M, HEADLIGHT_ASIDE_M = 0.5, 26.0, 9.0  # as in the shader; shorter capsules are people
-EDGE = 1.25  # radii of a capsule where its shadow ends
-SKY_RADII, PERSON_SKY_M = 4.5, 1.0  # how far aside a capsule, in its radii, and the person darken the light of the sky
-BELOW_M, LONGEST_M = 1.5, 60.0  # a shadow ends this far below the feet, and is at most this long
+SHORTEST_CAR_M = 0.5  # as in the shader: a capsule with a shorter axis has no headlights
+HEADLIGHT_M = 26.0  # reach of headlights, as in the shader
+HEADLIGHT_ASIDE_M = 9.0  # half the width of their light, as in the shader
+HEADLIGHT_UP_M = 3.0  # half the height of their light
+EDGE = 1.25  # a shadow ends this many radii from a capsule's axis
+SKY_RADII = 4.5  # a capsule blocks light of the sky this many radii to each side
+PERSON_SKY_M = 1.0  # the person blocks light of the sky this far to each side
+BELOW_M = 1.5  # a shadow ends this far below the feet
+LONGEST_M = 60.0  # length of the longest shadow
 
 
-class Shade(NamedTuple):
-    """One rectangle of pixels and the movers that may darken it.
+class ShadowRegion(NamedTuple):
+    """One rectangle of pixels and the movers whose shadows or headlights may change it.
 
-    rectangle_px: x0, y0, x1, y1; points: (k, 3) relative to the scene's origin, whose hull holds all that is darkened;
-    capsules: (c, 2, 4) of `capsules_of`; has_person: whether the person is one of the movers.
+    Attributes:
+        rectangle_px: x0, y0, x1, y1.
+        points: (k, 3) m, relative to the scene's origin; their hull holds all shadows and lights of the movers.
+        capsules: (c, 2, 4) of `capsules_of`.
+        has_person: Whether the person is one of the movers.
     """
 
     rectangle_px: tuple[int, int, int, int]
@@ -105,62 +123,92 @@ class Shade(NamedTuple):
     capsules: np.ndarray
     has_person: bool
 
+    def overlaps(self, other: ShadowRegion) -> bool:
+        a, b = self.rectangle_px, other.rectangle_px
+        return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
-def shades_of(
+    def merged(self, other: ShadowRegion) -> ShadowRegion:
+        """Return one region in the rectangle around both."""
+        x0, y0, x1, y1 = zip(self.rectangle_px, other.rectangle_px, strict=True)
+        return ShadowRegion(
+            rectangle_px=(min(x0), min(y0), max(x1), max(y1)),
+            points=np.concatenate([self.points, other.points]),
+            capsules=np.concatenate([self.capsules, other.capsules]),
+            has_person=self.has_person or other.has_person,
+        )
+
+
+def shadow_regions(
     bones: np.ndarray, capsules: np.ndarray, sun: np.ndarray, view: CameraView, has_headlights: bool = False
-) -> list[Shade]:
-    """Return the rectangles of a frame, merged where they overlap.
+) -> list[ShadowRegion]:
+    """Return the shadow regions of a frame, merged where they overlap.
 
     Args:
-        bones: (b, 2, 4) capsules of the person, b is 0 without one: from and radius, to and 0. capsules: (c, 2, 4) of
-            bystanders. sun: (3,) unit vector towards it. has_headlights: Cars light the ground in front of them.
+        bones: (b, 2, 4) capsules of the person, [start, radius] and [end, 0]; b is 0 without a person.
+        capsules: (c, 2, 4) of bystanders.
+        sun: (3,) unit vector towards the sun.
+        has_headlights: Whether cars light the ground in front of them.
     """
-    found = []
-    for own in capsules[:, None]:
-        points = _darkened(own, sun, SKY_RADII * float(own[0, 0, 3]), LONGEST_M)
-        found.append((np.concatenate([points, _lit(own)]) if has_headlights else points, own, False))
+    movers = []  # points, capsules, whether it is the person
+    for capsule in capsules[:, None]:
+        points = _shadow_points(capsule, sun, SKY_RADII * float(capsule[0, 0, 3]), LONGEST_M)
+        if has_headlights:
+            points = np.concatenate([points, _headlight_points(capsule)])
+        movers.append((points, capsule, False))
     if len(bones):
-        found.append((_darkened(bones, sun, PERSON_SKY_M, PERSON_REACH_M), capsules[:0], True))
-    shades: list[Shade] = []
-    for points, own, is_person in found:
-        if (rectangle := view.rectangle_px(points)) is None:
-            continue
-        new = Shade(rectangle, points, own, is_person)
-        while touching := [shade for shade in shades if _overlap(shade.rectangle_px, new.rectangle_px)]:
-            shades = [shade for shade in shades if not _overlap(shade.rectangle_px, new.rectangle_px)]
-            for shade in touching:
-                x0, y0, x1, y1 = zip(shade.rectangle_px, new.rectangle_px, strict=True)
-                points, own = (np.concatenate([shade[k], new[k]]) for k in (1, 2))
-                rectangle = min(x0), min(y0), max(x1), max(y1)
-                new = Shade(rectangle, points, own, shade.has_person or new.has_person)
-        shades.append(new)
-    return shades
+        movers.append((_shadow_points(bones, sun, PERSON_SKY_M, PERSON_REACH_M), capsules[:0], True))
+    regions: list[ShadowRegion] = []
+    for points, mover_capsules, is_person in movers:
+        if (rectangle := view.rectangle_px(points)) is not None:
+            regions = _with_region(regions, ShadowRegion(rectangle, points, mover_capsules, is_person))
+    return regions
 
 
-def _darkened(capsules: np.ndarray, sun: np.ndarray, aside_m: float, longest_m: float) -> np.ndarray:
-    """Return corners around capsules and around their shadows down to BELOW_M under them, (24, 3)."""
-    ends, radii = capsules[..., :3], capsules[:, :1, 3:]
-    low, high = (ends - EDGE * radii).min(axis=(0, 1)), (ends + EDGE * radii).max(axis=(0, 1))
+def _with_region(regions: list[ShadowRegion], region: ShadowRegion) -> list[ShadowRegion]:
+    """Add a region to disjoint ones, merging until none overlap."""
+    overlaps = [other.overlaps(region) for other in regions]
+    if not any(overlaps):
+        return [*regions, region]
+    for other in compress(regions, overlaps):
+        region = other.merged(region)
+    return _with_region([other for other, is_merged in zip(regions, overlaps, strict=True) if not is_merged], region)
+
+
+def _shadow_points(capsules: np.ndarray, sun: np.ndarray, aside_m: float, longest_m: float) -> np.ndarray:
+    """Return corners around capsules, their shadows down to BELOW_M under them, and the sky light they block, (24, 3).
+
+    Args:
+        capsules: (c, 2, 4).
+        sun: (3,) unit vector towards the sun.
+        aside_m: How far to each side the capsules block light of the sky.
+        longest_m: Length of the longest shadow.
+    """
+    ends = capsules[..., :3]
+    radii = capsules[:, :1, 3:]
+    low = (ends - EDGE * radii).min(axis=(0, 1))
+    high = (ends + EDGE * radii).max(axis=(0, 1))
     length_m = min((high[2] - low[2] + BELOW_M) / max(float(sun[2]), 1e-3), longest_m)
     body = _corners(low, high)
-    wide_low, wide_high = low - np.array([aside_m, aside_m, BELOW_M]), high + np.array([aside_m, aside_m, 0.0])
-    return np.concatenate([body, body - length_m * sun, _corners(wide_low, wide_high)])
+    sky_low = low - np.array([aside_m, aside_m, BELOW_M])
+    sky_high = high + np.array([aside_m, aside_m, 0.0])
+    return np.concatenate([body, body - length_m * sun, _corners(sky_low, sky_high)])
 
 
-def _lit(car: np.ndarray) -> np.ndarray:
-    """Return corners of what a car's headlights may light, (8, 3), none for a person; car: (1, 2, 4), back, front."""
-    back, front = car[0, :, :3]
+def _headlight_points(capsule: np.ndarray) -> np.ndarray:
+    """Return corners around the light of a car's headlights, (8, 3), or (0, 3) below SHORTEST_CAR_M.
+
+    Args:
+        capsule: (1, 2, 4), from the back of the car to its front.
+    """
+    back, front = capsule[0, :, :3]
     along = front - back
     if np.linalg.norm(along) < SHORTEST_CAR_M:
         return np.zeros((0, 3))
     end = front + along / np.linalg.norm(along) * HEADLIGHT_M
-    aside = np.array([HEADLIGHT_ASIDE_M, HEADLIGHT_ASIDE_M, 3.0])
-    return _corners(np.minimum(front, end) - aside, np.maximum(front, end) + aside)
+    margin = np.array([HEADLIGHT_ASIDE_M, HEADLIGHT_ASIDE_M, HEADLIGHT_UP_M])
+    return _corners(np.minimum(front, end) - margin, np.maximum(front, end) + margin)
 
 
 def _corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the corners of the box from low to high, (8, 3)."""
     return box_corners((low + high) / 2.0, (high - low) / 2.0)
-
-
-def _overlap(a: tuple[int, int, int, int], b: tuple[int, int, int, int]) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

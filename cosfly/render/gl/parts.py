@@ -133,7 +133,8 @@ class Boxes:
         records["half"] = np.maximum(half, 1e-3)
         if n:
             records["quaternion"] = Rotation.from_matrix(self.turns if turn is None else self.turns @ turn).as_quat()
-        records["color"][:, :3], records["color"][:, 3] = color, self.seeds
+        records["color"][:, :3] = color
+        records["color"][:, 3] = self.seeds
         records["tag"] = tags(self.kind, material, self.ids)
         records["bias"] = LAYER_STEP * (STANDING_LAYER if layer is None else layer + self.tiers)
         radii = np.linalg.norm(self.half, axis=1).astype(np.float32)
@@ -197,7 +198,8 @@ class CameraView:
     ) -> tuple[np.ndarray, np.ndarray]:
         middle, size = self.intrinsic[:2, 2], np.array([self.width_px, self.height_px])
         tangents = np.maximum(middle, size - middle) / np.diag(self.intrinsic)[:2]
-        eye, turn = self.eye.astype(np.float32), np.ascontiguousarray(self.world_from_camera, np.float32)
+        eye = self.eye.astype(np.float32)
+        turn = np.ascontiguousarray(self.world_from_camera, np.float32)
         slants = np.sqrt(1.0 + tangents**2)
         return spheres_in_view(centers, radii, min_px, max_px, eye, turn, tangents, slants, float(self.intrinsic[0, 0]))
 
@@ -234,7 +236,9 @@ def spheres_in_view(  # type: ignore[no-untyped-def]
     Returns:
         rows (n,) int64, in their order; (n,) float32 m, how far along the axis each begins.
     """
-    rows, away, count = np.empty(len(centers), np.int64), np.empty(len(centers), np.float32), 0
+    rows = np.empty(len(centers), np.int64)
+    away = np.empty(len(centers), np.float32)
+    count = 0
     near, focal = np.float32(NEAR_M), np.float32(focal_px)
     for k in range(len(centers)):
         dx, dy, dz = centers[k, 0] - eye[0], centers[k, 1] - eye[1], centers[k, 2] - eye[2]

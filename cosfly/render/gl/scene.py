@@ -34,7 +34,8 @@ def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.
         return Loose({}, {}, np.zeros((0, 3)), np.zeros(0))
     normals, rows, kinds = solids.normals, solids.rows, box_map.kinds[solids.rows]
     is_house = (kinds == KINDS["Buildings"]) & np.isnan(solids.colors).any(axis=1)
-    is_wall, is_flat = is_house & (np.abs(normals[:, 2]) < STEEP), is_house & (np.abs(normals[:, 2]) > FLAT)
+    is_wall = is_house & (np.abs(normals[:, 2]) < STEEP)
+    is_flat = is_house & (np.abs(normals[:, 2]) > FLAT)
     materials = np.where(is_house, np.where(is_wall | is_flat, parts.FACADE, parts.TILES), parts.PLAIN)
     axes, planes = _planes(box_map, solids, is_wall, is_flat, is_house)
     firsts = np.searchsorted(solids.things, np.arange(solids.things[-1] + 2))[:-1]
@@ -46,7 +47,8 @@ def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.
     ends = -begins
     np.minimum.at(begins, planes, local.min(axis=1))
     np.maximum.at(ends, planes, local.max(axis=1))
-    center, half = ((begins + ends) / 2.0)[planes], np.maximum((ends - begins) / 2.0, THINNEST_M)[planes]
+    center = ((begins + ends) / 2.0)[planes]
+    half = np.maximum((ends - begins) / 2.0, THINNEST_M)[planes]
     seeds, paint = seeds_of(box_map.ids[rows]), solids.colors
     for material, palette in ((parts.FACADE, BUILDING_COLORS), (parts.TILES, TILE_COLORS), (parts.PLAIN, PLAIN_COLORS)):
         picked = palette[(contract.chance(seeds, 0) * len(palette)).astype(int)]
@@ -169,15 +171,18 @@ class Scene:
 
 def build_scene(town: BoxMap, num_others: int = 0, rim: BoxMap | None = None) -> Scene:
     """Convert a map and its rim to drawable parts, with a ground plane under everything."""
-    origin, (box_map, all_ids) = contract.scene_origin(town), contract.with_rim(town, num_others, rim)
+    origin = contract.scene_origin(town)
+    (box_map, all_ids) = contract.with_rim(town, num_others, rim)
     are_meshes = are_solids(box_map)
-    found, lies = list[Parts](), is_draped(box_map) & ~are_meshes
+    found = list[Parts]()
+    lies = is_draped(box_map) & ~are_meshes
     # Surfaces on a slope are built on a plane, so that they find their neighbours, and lifted afterwards.
     centers = box_map.centers - origin
     centers[lies, 2] -= box_map.ground.height_at(box_map.centers[lies])
     lying = np.zeros(len(box_map) + 1, PART)  # the last is the ground plane
     tiers, seeds = layers_of(box_map) % 1.0, seeds_of(box_map.ids)
-    turns, half = rotation_matrices(np.radians(box_map.rotations_deg)), np.maximum(box_map.half_extents, 1e-3)
+    turns = rotation_matrices(np.radians(box_map.rotations_deg))
+    half = np.maximum(box_map.half_extents, 1e-3)
     if (town.kinds == KINDS["RoadLines"]).any():
         seeds[(box_map.kinds == KINDS["Roads"]) & (all_ids != NO_INSTANCE)] = HAS_PAINT
     for kind in np.unique(box_map.kinds[~are_meshes]).tolist():

@@ -55,7 +55,8 @@ def _box(material: int, color: tuple[float, float, float], layer: int | None = N
 
 def _terrain(boxes: Boxes) -> list[Parts]:
     """Return lawns of the map, in one colour; meadows and fields of the rim."""
-    is_rim, is_tilled = boxes.ids[:, None] == contract.NO_INSTANCE, boxes.half[:, :1] > LARGEST_MEADOW_M
+    is_rim = boxes.ids[:, None] == contract.NO_INSTANCE
+    is_tilled = boxes.half[:, :1] > LARGEST_MEADOW_M
     crops = np.where(is_tilled, boxes.pick(FIELD_COLORS), boxes.pick(MEADOW_COLORS))
     colors = np.where(is_rim, crops, MEADOW_COLORS[0])
     rows = replace(boxes, seeds=boxes.seeds * 0.999 + (is_rim & is_tilled)[:, 0])  # the shader draws furrows from 1 on
@@ -77,7 +78,8 @@ def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray
     Returns:
         (n,) numbers of bits -x, +x, -y, +y; 0 for more than MOST_EDGED boxes.
     """
-    bits, reach = np.zeros(len(boxes)), boxes.half + np.array([0.0, 0.0, slack_m])
+    bits = np.zeros(len(boxes))
+    reach = boxes.half + np.array([0.0, 0.0, slack_m])
     if len(boxes) > MOST_EDGED:
         return bits
     for bit, (axis, side) in enumerate(((0, -1.0), (0, 1.0), (1, -1.0), (1, 1.0))):
@@ -128,7 +130,8 @@ def _bushes(boxes: Boxes, leaf: np.ndarray) -> list[Parts]:
         boxes.part(meshes.BLOB, h * [0.72, 0.72, 0.98], parts.LEAVES, leaf, min_px=FAR_PX),
     ]
     for side in (-1.0, 1.0):
-        offset, shade = h * [0.42 * side, 0.25 * side, -0.25], leaf * (1.0 + 0.12 * side)
+        offset = h * [0.42 * side, 0.25 * side, -0.25]
+        shade = leaf * (1.0 + 0.12 * side)
         size = h * [0.56, 0.6, 0.72]
         found.append(boxes.part(meshes.BLOB, size, parts.LEAVES, shade, offset=offset, min_px=FAR_PX))
     return found
@@ -179,7 +182,8 @@ def _wheels(boxes: Boxes, high: float, long: float, along: float) -> list[Parts]
     """Return four wheels; their largest radius is a share of the half height, and of the half length."""
     h = boxes.half
     radius, thick = np.minimum(high * h[:, 2], long * h[:, 0]), 0.16 * h[:, 1]
-    size, look = np.column_stack([radius, radius, thick]), (parts.RUBBER, (0.02, 0.02, 0.022))
+    size = np.column_stack([radius, radius, thick])
+    look = (parts.RUBBER, (0.02, 0.02, 0.022))
     found = []
     for front, side in ((-along, -1.0), (-along, 1.0), (along, -1.0), (along, 1.0)):
         offset = np.column_stack([front * h[:, 0], side * (0.97 * h[:, 1] - thick), radius - h[:, 2]])

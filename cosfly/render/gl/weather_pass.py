@@ -185,8 +185,12 @@ class WeatherPass:
     """The weather of a trajectory on one GL context."""
 
     def __init__(self, context: Any, color: Any, depth: Any, rain_program: Any, num_others: int) -> None:
-        self._context, self._depth, self._rain_program, self._num_others = context, depth, rain_program, num_others
-        self._rain, self._over_color = context.vertex_array(rain_program, []), context.framebuffer([color])
+        self._context = context
+        self._depth = depth
+        self._rain_program = rain_program
+        self._num_others = num_others
+        self._rain = context.vertex_array(rain_program, [])
+        self._over_color = context.framebuffer([color])
         self._lamp_map = context.texture((MAP_PX, MAP_PX), 2, dtype="f4")
         self._lamp_map.repeat_x = self._lamp_map.repeat_y = False
         self.values: dict[str, Any] = {}
@@ -198,7 +202,8 @@ class WeatherPass:
 
         Lamps of the parts are lit and mirrored in puddles. unseen_lamps: (n, 3), lamps that only give light.
         """
-        self._lamps, self.sun_direction = parts.lamps(), light_direction(params)
+        self._lamps = parts.lamps()
+        self.sun_direction = light_direction(params)
         lit = np.concatenate([self._lamps, unseen_lamps])
         near = lit[(np.abs(lit[:, :2] - middle[:2]) < half_m + REACH_M).all(axis=1)]
         light, area = lamp_map(near, middle, half_m)
@@ -224,7 +229,8 @@ class WeatherPass:
         rows = np.argsort(away, kind="stable")[:MOST_NEAR]
         rows = rows[away[rows] < 120.0]
         lamps = np.zeros((MOST_NEAR, 4), np.float32)  # places, and strength: far ones fade out
-        lamps[: len(rows), :3], lamps[: len(rows), 3] = self._lamps[rows], np.clip(1.6 - away[rows] / 75.0, 0.0, 1.0)
+        lamps[: len(rows), :3] = self._lamps[rows]
+        lamps[: len(rows), 3] = np.clip(1.6 - away[rows] / 75.0, 0.0, 1.0)
         # Drops differ from frame to frame, and are the same when a frame is drawn again.
         hip_m = np.zeros(3) if person is None else np.asarray(person.hip_m, dtype=np.float64)
         seen = np.ascontiguousarray(camera_pose, dtype=np.float64).tobytes() + hip_m.tobytes()
