@@ -161,8 +161,8 @@ def far_as_sky(frame: Frame) -> Frame:
     is_far = frame.depth >= FAR_M
     if np.count_nonzero(is_far) != np.count_nonzero(frame.kinds == KINDS["Sky"]):
         frame.depth[is_far] = SKY_DEPTH_M
-    frame.kinds[is_far] = KINDS["Sky"]
-    frame.ids[is_far] = NO_INSTANCE
+        frame.kinds[is_far] = KINDS["Sky"]
+        frame.ids[is_far] = NO_INSTANCE
     return frame
 
 
