@@ -33,7 +33,7 @@ Surface = list[np.ndarray]  # rings of (n, 3) m: the outline, then the holes
 
 
 class ObjectRule(NamedTuple):
-    """Kind and form of objects of a CityJSON type; with an attribute, only of those with a matching value."""
+    """The kind and form of objects of a CityJSON type; a rule with an attribute needs a matching value too."""
 
     type: str
     kind: str
@@ -42,9 +42,9 @@ class ObjectRule(NamedTuple):
     value: str = "*"
 
     def covers(self, item: _Object) -> bool:
-        """Return whether the rule is for an object. Extension types (a leading +) count as their base name."""
-        given = str((item.attributes or {}).get(self.attribute, ""))
-        return fnmatchcase(item.type.removeprefix("+"), self.type) and fnmatchcase(given, self.value)
+        """Return whether the rule applies to an object. Extension types (a leading +) count as their base name."""
+        value = str((item.attributes or {}).get(self.attribute, ""))
+        return fnmatchcase(item.type.removeprefix("+"), self.type) and fnmatchcase(value, self.value)
 
 
 # The first rule that matches decides. Attribute values are those of the Dutch register BGT, as 3dfier writes them.
@@ -74,8 +74,8 @@ RULES = (
 class CityObject(NamedTuple):
     """One object.
 
-    surfaces: of the plainest geometry with a height, which boxes are made of; detailed: of the most detailed one of a
-    solid, which is drawn.
+    surfaces: those of the coarsest geometry with a height; boxes are made of them. detailed: those of the most
+    detailed geometry of a solid; the renderer draws them.
     """
 
     object_id: str
@@ -89,12 +89,15 @@ class CityObject(NamedTuple):
 
     def moved(self, move: Callable[[np.ndarray], np.ndarray]) -> CityObject:
         """Return the object with each ring of vertices moved."""
-        surfaces, detailed = ([[move(r) for r in rings] for rings in each] for each in (self.surfaces, self.detailed))
-        return self._replace(surfaces=surfaces, detailed=detailed)
+
+        def moved_surfaces(surfaces: list[Surface]) -> list[Surface]:
+            return [[move(ring) for ring in surface] for surface in surfaces]
+
+        return self._replace(surfaces=moved_surfaces(self.surfaces), detailed=moved_surfaces(self.detailed))
 
 
 class CityModel(NamedTuple):
-    """The objects that a rule covers, and how many objects were dropped, by reason."""
+    """The objects that a rule covers, and the number of dropped objects by reason."""
 
     objects: list[CityObject]
     dropped: dict[str, int]
@@ -145,32 +148,44 @@ class _Document(_Part):
 class _Vertices(NamedTuple):
     """Vertices of a part, the templates of the document and their vertices, (n, 3) m."""
 
-    own: np.ndarray
+    part_vertices: np.ndarray
     templates: list[_Geometry]
-    of_templates: np.ndarray
+    template_vertices: np.ndarray
+
+
+class _Dropped(Exception):
+    """The object is not used; the text is the reason."""
 
 
 def read_model(path: Path) -> CityModel:
     """Read a CityJSON file or text sequence, plain or gzipped; coordinates stay the file's."""
     version, head, features = _read_parts(path)
-    of_templates = _vectors(head.templates.vertices, f"{path}: geometry-templates.vertices-templates")
-    objects, known, num_objects = dict[str, CityObject](), set[str](), 0
+    template_vertices = _vectors(head.templates.vertices, f"{path}: geometry-templates.vertices-templates")
+    objects = dict[str, CityObject]()
+    seen_ids = set[str]()
+    num_objects = 0
     dropped = dict.fromkeys(("unmapped_type", "group", "no_geometry", "outline_of_parts", "repeated_id"), 0)
     for where, part in [(str(path), head), *features] if head.objects else features:
-        own = _vectors(part.vertices, f"{where}: vertices") * head.scale + head.translate
-        vertices = _Vertices(own, head.templates.templates, of_templates)
+        part_vertices = _vectors(part.vertices, f"{where}: vertices") * head.scale + head.translate
+        vertices = _Vertices(part_vertices, head.templates.templates, template_vertices)
         num_objects += len(part.objects)
-        for object_id, value in part.objects.items():
-            found = _city_object(object_id, value, part, vertices, f"{where}: CityObjects.{object_id}")
-            if object_id in known or isinstance(found, str):
-                dropped["repeated_id" if object_id in known else str(found)] += 1
+        for object_id, item in part.objects.items():
+            reason = ""
+            try:
+                candidate = _city_object(object_id, item, part, vertices, f"{where}: CityObjects.{object_id}")
+            except _Dropped as error:
+                reason = str(error)
+            if object_id in seen_ids:
+                reason = "repeated_id"
+            seen_ids.add(object_id)
+            if reason:
+                dropped[reason] += 1
             else:
-                objects[object_id] = found
-            known.add(object_id)
+                objects[object_id] = candidate
     dropped = {reason: count for reason, count in dropped.items() if count}
     if not objects:
-        got = ", ".join(f"{count} {reason}" for reason, count in dropped.items()) or "no objects"
-        raise InputError("the model has no usable object", where=f"{path}: CityObjects", got=got)
+        counts = ", ".join(f"{count} {reason}" for reason, count in dropped.items()) or "no objects"
+        raise InputError("the model has no usable object", where=f"{path}: CityObjects", got=counts)
     return CityModel(list(objects.values()), dropped, num_objects, version)
 
 
@@ -181,27 +196,36 @@ def _read_parts(path: Path) -> tuple[str, _Document, list[tuple[str, _Part]]]:
     texts = [(str(path), data)]
     if len(lines) > 1 and b'"CityJSONFeature"' in data and _is_json(lines[0]):
         texts = [(f"{path}: line {k + 1}", line) for k, line in enumerate(lines) if line.strip()]
-    version, parts = "", list[tuple[str, Any]]()
+    version = ""
+    parts = list[tuple[str, Any]]()
     for where, text in texts:
         value = parse_document(text, where)
-        found = value.get("type") if isinstance(value, dict) else type(value).__name__
+        object_type = value.get("type") if isinstance(value, dict) else type(value).__name__
         expected = "CityJSONFeature" if parts else "CityJSON"
-        if found != expected:
-            fix = None if parts else "put the CityJSON object with version and transform on the first line"
-            what = "the object is not of the expected type"
-            raise InputError(what, where=f"{where}: type", got=repr(found)[:80], expected=repr(expected), fix=fix)
+        if object_type != expected:
+            raise InputError(
+                "the object is not of the expected type",
+                where=f"{where}: type",
+                got=repr(object_type)[:80],
+                expected=repr(expected),
+                fix=None if parts else "put the CityJSON object with version and transform on the first line",
+            )
         if not parts:
             version = ".".join(str(value.get("version")).split(".")[:2])  # 1.1.3 is 1.1
             if version not in VERSIONS:
-                what, got = "the version of CityJSON is not supported", repr(value.get("version"))[:80]
-                fix = "convert the file, for instance with `cjio OLD upgrade save NEW`"
-                raise InputError(what, where=f"{where}: version", got=got, expected=" or ".join(VERSIONS), fix=fix)
+                raise InputError(
+                    "the version of CityJSON is not supported",
+                    where=f"{where}: version",
+                    got=repr(value.get("version"))[:80],
+                    expected=" or ".join(VERSIONS),
+                    fix="convert the file, for instance with `cjio OLD upgrade save NEW`",
+                )
         parts.append((where, validated(_Part if parts else _Document, value, where)))
     return version, parts[0][1], parts[1:]
 
 
 def _is_json(line: bytes) -> bool:
-    """Return whether a line is JSON by itself: the first one of a document over several lines is not."""
+    """Return whether a line is JSON by itself; the first line of a document of several lines is not."""
     try:
         parse_json(line)
     except ValueError:
@@ -217,78 +241,106 @@ def _vectors(values: list[Any], where: str) -> np.ndarray:
     return vectors
 
 
-def _city_object(object_id: str, value: _Object, part: _Part, vertices: _Vertices, where: str) -> CityObject | str:
-    """Return an object, or the reason why it is dropped."""
-    if value.type == "CityObjectGroup":  # its members are objects themselves
-        return "group"
-    rule = next((rule for rule in RULES if rule.covers(value)), None)
+class _Candidate(NamedTuple):
+    """A geometry with its vertices, (n, 3) m, and its place in the file."""
+
+    geometry: _Geometry
+    vertices: np.ndarray
+    where: str
+
+    @property
+    def level(self) -> float:
+        return self.geometry.level
+
+    def surfaces(self) -> list[Surface]:
+        """Return the surfaces; for a solid those of its outer shell."""
+        where = f"{self.where}.boundaries"
+        boundaries = self.geometry.boundaries
+        if (nesting := NESTING[self.geometry.type]) > 0:
+            solids = boundaries if nesting == 2 else [boundaries]
+            outer_shells = [shell for solid in solids for shell in _require_list(solid, where)[:1]]
+            boundaries = [surface for shell in outer_shells for surface in _require_list(shell, where)]
+        return [_rings(surface, self.vertices, f"{where} surface {k}") for k, surface in enumerate(boundaries)]
+
+
+def _city_object(object_id: str, item: _Object, part: _Part, vertices: _Vertices, where: str) -> CityObject:
+    """Return an object; raise _Dropped if it is not used."""
+    if item.type == "CityObjectGroup":  # its members are objects themselves
+        raise _Dropped("group")
+    rule = next((rule for rule in RULES if rule.covers(item)), None)
     if rule is None:
-        log.warning("%s: no rule for the type %s; dropped", object_id, value.type)
-        return "unmapped_type"
-    placed = [_placed(g, vertices, f"{where}.geometry[{k}]") for k, g in enumerate(value.geometry)]
-    usable = [(geometry.level, number) for number, (geometry, _) in enumerate(placed) if geometry.type in NESTING]
+        log.warning("%s: no rule for the type %s; dropped", object_id, item.type)
+        raise _Dropped("unmapped_type")
+    candidates = [
+        _resolve_instance(geometry, vertices, f"{where}.geometry[{k}]") for k, geometry in enumerate(item.geometry)
+    ]
+    usable = [candidate for candidate in candidates if candidate.geometry.type in NESTING]
     if not usable:
-        return "no_geometry"
-    level, plainest = min(usable, key=lambda pair: (pair[0] < 1, pair[0]))
-    _, finest = max(usable, key=lambda pair: pair[0])
-    surfaces = _surfaces(*placed[plainest], f"{where}.geometry[{plainest}].boundaries")
+        raise _Dropped("no_geometry")
+    coarsest = min(usable, key=lambda candidate: (candidate.level < 1, candidate.level))  # level 0 has no height
+    finest = max(usable, key=lambda candidate: candidate.level)
+    surfaces = coarsest.surfaces()
     if not surfaces:
-        return "no_geometry"
-    is_solid = rule.form == "solid"
-    if level < 1 and is_solid and any(child in part.objects for child in value.children or []):
-        return "outline_of_parts"  # its parts have the walls; the outline would hide their courtyards
-    detailed = surfaces if is_solid else []
-    if is_solid and finest != plainest:
-        detailed = _surfaces(*placed[finest], f"{where}.geometry[{finest}].boundaries")
-    return CityObject(object_id, rule, surfaces, detailed)
+        raise _Dropped("no_geometry")
+    if rule.form != "solid":
+        return CityObject(object_id, rule, surfaces, [])
+    if coarsest.level < 1 and any(child in part.objects for child in item.children or []):
+        raise _Dropped("outline_of_parts")  # its parts have the walls; the outline would hide their courtyards
+    return CityObject(object_id, rule, surfaces, surfaces if finest is coarsest else finest.surfaces())
 
 
-def _placed(geometry: _Geometry, vertices: _Vertices, where: str) -> tuple[_Geometry, np.ndarray]:
-    """Return a geometry and its vertices; of an instance its template, moved to its place."""
+def _resolve_instance(geometry: _Geometry, vertices: _Vertices, where: str) -> _Candidate:
+    """Return a geometry with its vertices; an instance becomes its template with moved vertices."""
     if geometry.type != "GeometryInstance":
-        return geometry, vertices.own
+        return _Candidate(geometry, vertices.part_vertices, where)
     anchor = geometry.boundaries[0] if len(geometry.boundaries) == 1 else None
     if not 0 <= geometry.template < len(vertices.templates):
-        got, expected = str(geometry.template)[:40], f"below {len(vertices.templates)}"
-        raise InputError("the template does not exist", where=f"{where}.template", got=got, expected=expected)
-    if type(anchor) is not int or not 0 <= anchor < len(vertices.own):
-        got, expected = repr(geometry.boundaries)[:40], "one vertex index"
-        raise InputError("the instance has no place", where=f"{where}.boundaries", got=got, expected=expected)
+        raise InputError(
+            "the template does not exist",
+            where=f"{where}.template",
+            got=str(geometry.template)[:40],
+            expected=f"below {len(vertices.templates)}",
+        )
+    if type(anchor) is not int or not 0 <= anchor < len(vertices.part_vertices):
+        raise InputError(
+            "the instance has no place",
+            where=f"{where}.boundaries",
+            got=repr(geometry.boundaries)[:40],
+            expected="one vertex index",
+        )
     if len(geometry.transformationMatrix) != 16:
-        what, where = "the instance has no matrix", f"{where}.transformationMatrix"
-        raise InputError(what, where=where, expected="16 finite numbers, row by row")
+        expected = "16 finite numbers, row by row"
+        raise InputError("the instance has no matrix", where=f"{where}.transformationMatrix", expected=expected)
     matrix = np.array(geometry.transformationMatrix).reshape(4, 4)
-    corners = vertices.of_templates @ matrix[:3, :3].T + matrix[:3, 3] + vertices.own[anchor]
-    return vertices.templates[geometry.template], corners
+    corners = vertices.template_vertices @ matrix[:3, :3].T + matrix[:3, 3] + vertices.part_vertices[anchor]
+    return _Candidate(vertices.templates[geometry.template], corners, where)
 
 
-def _surfaces(geometry: _Geometry, corners: np.ndarray, where: str) -> list[Surface]:
-    """Return the surfaces of one geometry; of a solid those of its outer shell."""
-    lists, nesting = geometry.boundaries, NESTING[geometry.type]
-    solids = lists if nesting == 2 else [lists] if nesting == 1 else [[lists]]
-    found = [one for solid in solids for shell in _list(solid, where)[:1] for one in _list(shell, where)]
-    return [_rings(surface, corners, f"{where} surface {k}") for k, surface in enumerate(found)]
-
-
-def _list(value: Any, where: str) -> list:
+def _require_list(value: Any, where: str) -> list:
     if not isinstance(value, list):
-        what = "the boundaries are not nested as the geometry's type requires"
-        raise InputError(what, where=where, got=repr(value)[:40], expected="a list")
+        problem = "the boundaries are not nested as the geometry's type requires"
+        raise InputError(problem, where=where, got=repr(value)[:40], expected="a list")
     return value
 
 
 def _rings(surface: Any, vertices: np.ndarray, where: str) -> Surface:
+    """Return the rings of a surface, the outline first; raise InputError if they are malformed."""
     rings = Surface()
-    for ring in _list(surface, where):
+    for ring in _require_list(surface, where):
         if not isinstance(ring, list) or len(ring) < 3 or not all(type(index) is int for index in ring):
             expected = "at least three vertex indices"
             raise InputError("the ring is malformed", where=where, got=repr(ring)[:60], expected=expected)
-        if min(ring) < 0 or max(ring) >= len(vertices):
-            got, expected = str(min(ring) if min(ring) < 0 else max(ring)), f"0 to {len(vertices) - 1}"
-            raise InputError("the vertex does not exist", where=where, got=got[:60], expected=expected)
+        low, high = min(ring), max(ring)
+        if low < 0 or high >= len(vertices):
+            raise InputError(
+                "the vertex does not exist",
+                where=where,
+                got=str(low if low < 0 else high)[:60],
+                expected=f"0 to {len(vertices) - 1}",
+            )
         rings.append(vertices[ring])
     if not rings or not all(np.isfinite(ring).all() for ring in rings):
         raise InputError("the surface has no finite vertices", where=where, expected="a list of rings")
-    if (num := sum(map(len, rings))) > MOST_VERTICES:
-        raise over_limit(where, f"a surface of {num:,} vertices", f"{MOST_VERTICES:,}", "simplify it")
+    if (num_vertices := sum(map(len, rings))) > MOST_VERTICES:
+        raise over_limit(where, f"a surface of {num_vertices:,} vertices", f"{MOST_VERTICES:,}", "simplify it")
     return rings

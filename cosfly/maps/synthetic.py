@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -31,7 +31,12 @@ WIDE_M = 26.0  # wider streets have wide pavements and large trees
 VERGE_M = 10.0  # of lawn around the town
 DASH_M, DASH_GAP_M = 3.0, 6.0
 RAILING_M = 0.2
+WATER_BOTTOM_M = -1.2
 PAINT_TOP_M, BASE_TOP_M = -0.03, -0.12  # over and below ROAD_TOP_M
+# Lamps and parked cars: distances from the ends of a stretch, which have zebra crossings, to the next, and to the kerb.
+LAMPS_START_M, LAMPS_END_M, LAMP_SPACING_M, LAMP_FROM_KERB_M = 9.0, 8.0, 8.0, 1.0
+PARKING_START_M, PARKING_END_M, PARKING_SPACING_M, PARKED_FROM_KERB_M = 9.5, 11.0, 6.6, 1.15
+TRUCK_SHARE = 0.06  # of parked cars
 
 
 @dataclass(frozen=True)
@@ -62,21 +67,40 @@ class TownPlan:
 
 
 # Towns of different plan, density and height, so that results of one can be checked in another.
-PRESETS = {"small_town": TownPlan()} | {
-    name: TownPlan(size_m, along, street_m, boulevard_m, unevenness, kinds, river_m=river_m, parked_share=parked,
-                   tree_share=trees)
-    for name, size_m, along, street_m, boulevard_m, river_m, unevenness, parked, trees, kinds in (
-        ("grid", 330.0, 4, 18.0, 26.0, 0.0, 0.0, 0.6, 0.85,
-         {"courtyard": 0.6, "towers": 0.2, "square": 0.1, "park": 0.1}),
-        ("old_town", 270.0, 4, 12.0, 15.0, 0.0, 0.12, 0.1, 0.3, {"lanes": 0.75, "square": 0.15, "market": 0.1}),
-        ("towers", 340.0, 3, 26.0, 40.0, 0.0, 0.1, 0.4, 0.85, {"skyscrapers": 0.55, "towers": 0.25, "square": 0.2}),
-        ("park", 320.0, 3, 16.0, 26.0, 0.0, 0.2, 0.2, 0.85, {"park": 0.45, "meadow": 0.35, "houses": 0.2}),
-        ("campus", 310.0, 3, 15.0, 28.0, 0.0, 0.15, 0.15, 0.85, {"campus": 0.6, "meadow": 0.2, "square": 0.2}),
-        ("village", 300.0, 3, 13.0, 16.0, 0.0, 0.3, 0.1, 0.4, {"farm": 0.45, "houses": 0.35, "meadow": 0.2}),
-        ("river", 320.0, 4, 16.0, 26.0, 46.0, 0.1, 0.4, 0.85,
-         {"courtyard": 0.45, "houses": 0.2, "park": 0.2, "square": 0.15}),
-        ("market", 280.0, 3, 18.0, 30.0, 0.0, 0.1, 0.2, 0.85, {"market": 0.45, "courtyard": 0.35, "lanes": 0.2}),
-    )
+PRESETS = {
+    "small_town": TownPlan(),
+    "grid": TownPlan(
+        size_m=330.0, num_blocks=4, street_m=18.0, boulevard_m=26.0, parked_share=0.6,
+        blocks={"courtyard": 0.6, "towers": 0.2, "square": 0.1, "park": 0.1},
+    ),
+    "old_town": TownPlan(
+        size_m=270.0, num_blocks=4, street_m=12.0, boulevard_m=15.0, unevenness=0.12, parked_share=0.1, tree_share=0.3,
+        blocks={"lanes": 0.75, "square": 0.15, "market": 0.1},
+    ),
+    "towers": TownPlan(
+        size_m=340.0, num_blocks=3, street_m=26.0, boulevard_m=40.0, unevenness=0.1, parked_share=0.4,
+        blocks={"skyscrapers": 0.55, "towers": 0.25, "square": 0.2},
+    ),
+    "park": TownPlan(
+        size_m=320.0, num_blocks=3, street_m=16.0, boulevard_m=26.0, unevenness=0.2, parked_share=0.2,
+        blocks={"park": 0.45, "meadow": 0.35, "houses": 0.2},
+    ),
+    "campus": TownPlan(
+        size_m=310.0, num_blocks=3, street_m=15.0, boulevard_m=28.0, unevenness=0.15, parked_share=0.15,
+        blocks={"campus": 0.6, "meadow": 0.2, "square": 0.2},
+    ),
+    "village": TownPlan(
+        size_m=300.0, num_blocks=3, street_m=13.0, boulevard_m=16.0, unevenness=0.3, parked_share=0.1, tree_share=0.4,
+        blocks={"farm": 0.45, "houses": 0.35, "meadow": 0.2},
+    ),
+    "river": TownPlan(
+        size_m=320.0, num_blocks=4, street_m=16.0, boulevard_m=26.0, river_m=46.0, unevenness=0.1, parked_share=0.4,
+        blocks={"courtyard": 0.45, "houses": 0.2, "park": 0.2, "square": 0.15},
+    ),
+    "market": TownPlan(
+        size_m=280.0, num_blocks=3, street_m=18.0, boulevard_m=30.0, unevenness=0.1, parked_share=0.2,
+        blocks={"market": 0.45, "courtyard": 0.35, "lanes": 0.2},
+    ),
 }  # fmt: skip
 
 
@@ -96,15 +120,16 @@ class SyntheticConfig(Config):
             hint = nearest(self.preset, list(PRESETS))
             raise ValueError(f"there is no preset {self.preset!r}{hint}; there are {', '.join(PRESETS)}")
         if (side := self.plan.narrowest_block_m) < MIN_BLOCK_M:
-            what = f"a block would be {side:.1f} m wide, less than {MIN_BLOCK_M:.0f} m"
-            raise ValueError(f"{what}: raise size_m or lower num_blocks")
+            problem = f"a block would be {side:.1f} m wide, less than {MIN_BLOCK_M:.0f} m"
+            raise ValueError(f"{problem}: raise size_m or lower num_blocks")
         return self
 
     @property
     def plan(self) -> TownPlan:
-        """The preset with the given sizes."""
-        given = {name: value for name in ("size_m", "num_blocks") if (value := getattr(self, name)) is not None}
-        return dataclasses.replace(PRESETS[self.preset], **given)
+        """The preset, with the sizes of these settings where they are set."""
+        sizes = {"size_m": self.size_m, "num_blocks": self.num_blocks}
+        changes: dict[str, Any] = {name: value for name, value in sizes.items() if value is not None}
+        return dataclasses.replace(PRESETS[self.preset], **changes)
 
     @property
     def licence(self) -> str:
@@ -115,11 +140,11 @@ class SyntheticConfig(Config):
 
 
 class Strip(NamedTuple):
-    """One street's cross-section along its axis: from front to front, and the carriageway inside."""
+    """The cross-section of one street: from house front to house front, and the carriageway inside; m, world frame."""
 
     low_m: float
     high_m: float
-    road: Range
+    road: Range  # both kerbs
 
     @property
     def middle_m(self) -> float:
@@ -128,7 +153,10 @@ class Strip(NamedTuple):
 
 @dataclass(frozen=True)
 class Streets:
-    """All streets, low to high: rows along x, columns along y; river: the row that is water, if there is one."""
+    """All streets of a town, from low to high coordinates.
+
+    rows: the streets along x. columns: the streets along y. river: the row that is water, if there is one.
+    """
 
     rows: list[Strip]
     columns: list[Strip]
@@ -139,7 +167,7 @@ class Streets:
         return self.columns if axis else self.rows
 
     def stretches(self, axis: int) -> list[Range]:
-        """Return the stretches of a street along an axis between the carriageways that cross it."""
+        """Return the stretches of the streets along an axis: the intervals between the carriageways that cross them."""
         return [(a.road[1], b.road[0]) for a, b in pairwise(self.along(1 - axis))]
 
     def blocks(self) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -157,13 +185,19 @@ def load(cfg: SyntheticConfig, seed: int) -> BoxMap:
 
 
 def build_town(plan: TownPlan, name: str, seed: int) -> BoxMap:
-    """Build the town of a plan and a seed."""
-    streets, half = street_grid(plan, seed), plan.size_m / 2
+    """Build the town of a plan and a seed.
+
+    Builders add boxes in four ways: `add` takes the center and the size of a footprint, `span` two corners of it,
+    `lay` adds ground between two corners at the height of its kind, and `ring` fills the area between two rectangles.
+    """
+    streets = street_grid(plan, seed)
+    half = plan.size_m / 2
+    boxes = BoxList()
+    corners = ((-half, -half), (half, half))
 
     def plot_of(low: Pair, high: Pair, item: str) -> Plot:
         return Plot(boxes, low, high, rng_for(seed, "maps", item), plan.lots)
 
-    boxes, corners = BoxList(), ((-half, -half), (half, half))
     town = plot_of(*corners, "verge")
     town.span("Terrain", *corners, BASE_TOP_M - SLAB_M, BASE_TOP_M)
     _add_surfaces(town, streets)
@@ -171,13 +205,14 @@ def build_town(plan: TownPlan, name: str, seed: int) -> BoxMap:
     for axis in (0, 1):
         for number, strip in enumerate(streets.along(axis)):
             _furnish_street(plot_of(*corners, f"street {axis} {number}"), plan, axis, strip, streets)
-    _add_crossings(town, streets)
+    _add_traffic_lights(town, streets)
+    _add_sewers(town, streets)
     _add_verge(town, streets)
     if streets.river is not None:
         _add_river(town, plan, streets, streets.river)
     if plan.shore_m:
-        town.span("Water", (-half, -half - plan.shore_m), (half, -half - RAILING_M), -1.2, WATER_TOP_M)
-        town.span("Walls", (-half, -half - RAILING_M), (half, -half), -1.2, 0.4)  # of a quay
+        town.span("Water", (-half, -half - plan.shore_m), (half, -half - RAILING_M), WATER_BOTTOM_M, WATER_TOP_M)
+        town.span("Walls", (-half, -half - RAILING_M), (half, -half), WATER_BOTTOM_M, 0.4)  # the quay
     kinds = _block_kinds(plan, rng_for(seed, "maps", "plan"))
     for number, (kind, block) in enumerate(zip(kinds, streets.blocks(), strict=True)):
         row, column = divmod(number, plan.num_blocks)
@@ -188,50 +223,59 @@ def build_town(plan: TownPlan, name: str, seed: int) -> BoxMap:
 
 def street_grid(plan: TownPlan, seed: int) -> Streets:
     """Return the streets of a town, and its river."""
-    wide = 1 if plan.num_blocks > 1 else 0  # the boulevard's place
+    widest = 1 if plan.num_blocks > 1 else 0  # index of the boulevard or the river
+    rows = _strips(plan, widest, plan.river_m or plan.boulevard_m, rng_for(seed, "maps", "rows"))
+    columns = _strips(plan, widest, plan.boulevard_m, rng_for(seed, "maps", "columns"))
+    return Streets(rows, columns, rows[widest] if plan.river_m else None)
 
-    def strips(widest_m: float, axis: str) -> list[Strip]:
-        widths = [plan.street_m] * (plan.num_blocks + 1)
-        widths[wide] = widest_m
-        parts = 1.0 + plan.unevenness * rng_for(seed, "maps", axis).uniform(-1.0, 1.0, plan.num_blocks)
-        sides_m = (plan.size_m - 2 * VERGE_M - sum(widths)) * parts / parts.sum()
-        found, at = [], -plan.size_m / 2 + VERGE_M
-        for width, side_m in zip(widths, [*sides_m.tolist(), 0.0], strict=True):
-            sidewalk_m = 6.0 if width >= WIDE_M else max(2.5, 0.22 * width)
-            found.append(Strip(at, at + width, (at + sidewalk_m, at + width - sidewalk_m)))
-            at += width + side_m
-        return found
 
-    rows = strips(plan.river_m or plan.boulevard_m, "rows")
-    return Streets(rows, strips(plan.boulevard_m, "columns"), rows[wide] if plan.river_m else None)
+def _strips(plan: TownPlan, widest: int, widest_m: float, rng: np.random.Generator) -> list[Strip]:
+    """Return the parallel streets of one direction; the one with the index `widest` is `widest_m` wide."""
+    widths_m = [plan.street_m] * (plan.num_blocks + 1)
+    widths_m[widest] = widest_m
+    shares = 1.0 + plan.unevenness * rng.uniform(-1.0, 1.0, plan.num_blocks)
+    sides_m = (plan.size_m - 2 * VERGE_M - sum(widths_m)) * shares / shares.sum()  # of the blocks between the streets
+    strips = []
+    at_m = -plan.size_m / 2 + VERGE_M
+    for width_m, side_m in zip(widths_m, [*sides_m.tolist(), 0.0], strict=True):
+        sidewalk_m = 6.0 if width_m >= WIDE_M else max(2.5, 0.22 * width_m)
+        strips.append(Strip(at_m, at_m + width_m, (at_m + sidewalk_m, at_m + width_m - sidewalk_m)))
+        at_m += width_m + side_m
+    return strips
 
 
 def _add_surfaces(town: Plot, streets: Streets) -> None:
-    """Add carriageways, and a ring of pavement around each block and the town; the ground of a block is its own."""
+    """Add carriageways, and a ring of pavement around each block and the town; blocks add their own ground."""
     rows, columns = streets.rows, streets.columns
-    first, last = (columns[0].road[0], rows[0].road[0]), (columns[-1].road[1], rows[-1].road[1])
+    first = (columns[0].road[0], rows[0].road[0])  # outer corners of the carriageways
+    last = (columns[-1].road[1], rows[-1].road[1])
     for row, column in zip(rows, columns, strict=True):
         if row is not streets.river:
             town.lay("Roads", (first[0], row.road[0]), (last[0], row.road[1]))
         for low, high in streets.stretches(1):
             town.lay("Roads", (column.road[0], low), (column.road[1], high))
-    for a, b in pairwise(columns):
-        for c, d in pairwise(rows):
-            kerbs = (a.road[1], c.road[1]), (b.road[0], d.road[0])
-            town.ring("Sidewalks", kerbs, ((a.high_m, c.high_m), (b.low_m, d.low_m)))
-    town.ring("Sidewalks", ((columns[0].low_m, rows[0].low_m), (columns[-1].high_m, rows[-1].high_m)), (first, last))
+    for west, east in pairwise(columns):
+        for south, north in pairwise(rows):
+            kerbs = (west.road[1], south.road[1]), (east.road[0], north.road[0])
+            fronts = (west.high_m, south.high_m), (east.low_m, north.low_m)
+            town.ring("Sidewalks", kerbs, fronts)
+    outer_fronts = (columns[0].low_m, rows[0].low_m), (columns[-1].high_m, rows[-1].high_m)
+    town.ring("Sidewalks", outer_fronts, (first, last))
 
 
 def _add_river(town: Plot, plan: TownPlan, streets: Streets, river: Strip) -> None:
     """Add water from edge to edge between quays, and a bridge with railings where a street along y crosses it."""
-    (low, high), count, crossing = river.road, len(streets.columns), streets.columns
-    if 0 < plan.bridges < count:  # spread evenly
-        crossing = [crossing[int((k + 0.5) * count / plan.bridges)] for k in range(plan.bridges)]
-    edges = [-plan.size_m / 2, *(m for strip in crossing for m in (strip.low_m, strip.high_m)), plan.size_m / 2]
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
-        town.span("Water", (a, low), (b, high), -1.2, WATER_TOP_M)
+    low, high = river.road
+    crossing = streets.columns
+    if 0 < plan.bridges < len(crossing):
+        places = [int((k + 0.5) * len(crossing) / plan.bridges) for k in range(plan.bridges)]  # spread evenly
+        crossing = [crossing[place] for place in places]
+    bridge_edges = [m for strip in crossing for m in (strip.low_m, strip.high_m)]
+    edges = [-plan.size_m / 2, *bridge_edges, plan.size_m / 2]
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        town.span("Water", (start, low), (end, high), WATER_BOTTOM_M, WATER_TOP_M)
         for quay in (low, high):
-            town.span("Walls", (a, quay - RAILING_M), (b, quay + RAILING_M), -1.2, 0.5)
+            town.span("Walls", (start, quay - RAILING_M), (end, quay + RAILING_M), WATER_BOTTOM_M, 0.5)
     for strip in crossing:
         town.lay("Roads", (strip.road[0], low), (strip.road[1], high))
         for side, kerb, edge in ((-1, strip.road[0], strip.low_m), (1, strip.road[1], strip.high_m)):
@@ -243,7 +287,9 @@ def _add_road_paint(town: Plot, streets: Streets) -> None:
     """Add centre dashes, and a zebra crossing at both ends of every stretch."""
     for axis in (0, 1):
         for strip in streets.along(axis):
-            for low, high in streets.stretches(axis) if strip is not streets.river else []:
+            if strip is streets.river:
+                continue
+            for low, high in streets.stretches(axis):
                 dashes = np.arange(low + 7.0, high - 7.0 - DASH_M, DASH_M + DASH_GAP_M) + DASH_M / 2
                 stripes = np.arange(strip.road[0] + 0.7, strip.road[1] - 0.5, 1.2)
                 paint = [(at, strip.middle_m, DASH_M, 0.16) for at in dashes]
@@ -254,80 +300,121 @@ def _add_road_paint(town: Plot, streets: Streets) -> None:
 
 
 def _furnish_street(plot: Plot, plan: TownPlan, axis: int, strip: Strip, streets: Streets) -> None:
-    """Add lamps, trees, parked cars, benches, bins and signs along both kerbs of a street."""
-    rng, wide = plot.rng, strip.high_m - strip.low_m >= WIDE_M
+    """Add lamps, trees, benches, bins, parked cars and signs along both kerbs of a street.
+
+    `side` is -1 at the low kerb and 1 at the high one: kerb + side lies on the pavement, kerb - side on the road.
+    """
+    is_wide = strip.high_m - strip.low_m >= WIDE_M
     parked_share = plan.parked_share if strip is not streets.river else 0.0
-    for low, high in streets.stretches(axis):
+    for stretch in streets.stretches(axis):
         for side, kerb in ((-1, strip.road[0]), (1, strip.road[1])):
-            row = kerb + side * 1.0  # of lamps and trees, on the pavement
-            for number, along in enumerate(np.arange(low + 9.0, high - 8.0, 8.0)):
-                place = point(axis, along, row)
-                if number % 3 == 0:
-                    plot.add("Poles", place, (0.2, 0.2), 0.0, 7.6)
-                    plot.add("Poles", point(axis, along, row - side * 0.9), point(axis, 0.16, 2.0), 7.45, 7.6)
-                elif (wide or number % 3 == 1) and rng.random() < plan.tree_share:
-                    crowns = (3.4, 4.6) if wide else (2.6, 3.4)
-                    plot.tree(place, crowns, (5.5, 9.5), float(wide and plan.tree_parts))
-                elif rng.random() < 0.5:
-                    plot.bench(axis, along, row)
-            for along in np.arange(low + 9.5, high - 11.0, 6.6):
-                if rng.random() < parked_share:
-                    place = point(axis, along + rng.uniform(-0.4, 0.4), kerb - side * 1.15)
-                    is_truck = rng.random() < 0.06
-                    size = (6.2, 2.2) if is_truck else (rng.uniform(4.0, 4.7), 1.8)
-                    top = 2.7 if is_truck else rng.uniform(1.4, 1.65)
-                    plot.add("Truck" if is_truck else "Car", place, point(axis, *size), ROAD_TOP_M, top)
-            along, across = low + 6.0 if side < 0 else high - 6.0, kerb + side * 0.6
-            plot.add("Poles", point(axis, along, across), (0.08, 0.08), 0.0, 2.9)
-            plot.add("TrafficSigns", point(axis, along + 0.07, across), point(axis, 0.06, 0.65), 2.2, 2.85)
+            _add_lamps_and_trees(plot, plan, axis, stretch, side, kerb, is_wide=is_wide)
+            _add_parked_cars(plot, axis, stretch, side, kerb, parked_share)
+            _add_sign(plot, axis, stretch, side, kerb)
 
 
-def _add_crossings(town: Plot, streets: Streets) -> None:
+def _add_lamps_and_trees(
+    plot: Plot, plan: TownPlan, axis: int, stretch: Range, side: int, kerb: float, *, is_wide: bool
+) -> None:
+    """Add a row of lamps, and of trees or benches between them, on the pavement."""
+    rng = plot.rng
+    low, high = stretch
+    across = kerb + side * LAMP_FROM_KERB_M
+    for number, along in enumerate(np.arange(low + LAMPS_START_M, high - LAMPS_END_M, LAMP_SPACING_M)):
+        place = point(axis, along, across)
+        if number % 3 == 0:
+            plot.add("Poles", place, (0.2, 0.2), 0.0, 7.6)
+            arm = point(axis, along, across - side * 0.9)  # over the carriageway
+            plot.add("Poles", arm, point(axis, 0.16, 2.0), 7.45, 7.6)
+        elif (is_wide or number % 3 == 1) and rng.random() < plan.tree_share:
+            crowns_m = (3.4, 4.6) if is_wide else (2.6, 3.4)
+            plot.tree(place, crowns_m, (5.5, 9.5), 1.0 if is_wide and plan.tree_parts else 0.0)
+        elif rng.random() < 0.5:
+            plot.bench(axis, along, across)
+
+
+def _add_parked_cars(plot: Plot, axis: int, stretch: Range, side: int, kerb: float, parked_share: float) -> None:
+    """Add cars and a few trucks along a kerb of the carriageway."""
+    rng = plot.rng
+    low, high = stretch
+    for along in np.arange(low + PARKING_START_M, high - PARKING_END_M, PARKING_SPACING_M):
+        if rng.random() < parked_share:
+            place = point(axis, along + rng.uniform(-0.4, 0.4), kerb - side * PARKED_FROM_KERB_M)
+            if rng.random() < TRUCK_SHARE:
+                plot.add("Truck", place, point(axis, 6.2, 2.2), ROAD_TOP_M, 2.7)
+            else:
+                length_m = rng.uniform(4.0, 4.7)
+                plot.add("Car", place, point(axis, length_m, 1.8), ROAD_TOP_M, rng.uniform(1.4, 1.65))
+
+
+def _add_sign(plot: Plot, axis: int, stretch: Range, side: int, kerb: float) -> None:
+    """Add one traffic sign on the pavement: near the low end of a stretch at its low kerb, else near the high end."""
+    low, high = stretch
+    along = low + 6.0 if side < 0 else high - 6.0
+    across = kerb + side * 0.6
+    plot.add("Poles", point(axis, along, across), (0.08, 0.08), 0.0, 2.9)
+    plot.add("TrafficSigns", point(axis, along + 0.07, across), point(axis, 0.06, 0.65), 2.2, 2.85)
+
+
+def _add_traffic_lights(town: Plot, streets: Streets) -> None:
     """Add a signal on two opposite corners of every inner crossing; its lamps are boxes inside its housing."""
-    for a in streets.columns[1:-1]:
-        for b in (strip for strip in streets.rows[1:-1] if strip is not streets.river):
+    crossing_rows = [strip for strip in streets.rows[1:-1] if strip is not streets.river]
+    for column in streets.columns[1:-1]:
+        for row in crossing_rows:
             for side, end in ((-1, 0), (1, 1)):
-                x, y = a.road[end] + side * 0.7, b.road[end] + side * 0.7
+                x = column.road[end] + side * 0.7
+                y = row.road[end] + side * 0.7
                 town.add("Poles", (x, y), (0.16, 0.16), 0.0, 3.4)
                 town.add("TrafficLight", (x - side * 0.3, y), (0.36, 0.34), 2.5, 3.5)
                 for low in (2.54, 2.86, 3.18):
                     town.add("TrafficLight", (x - side * 0.3, y), (0.3, 0.3), low, low + 0.28)
+
+
+def _add_sewers(town: Plot, streets: Streets) -> None:
+    """Add a sewer under every street along x."""
     low_m, high_m = streets.columns[0].low_m, streets.columns[-1].high_m
-    for strip in streets.rows:  # a sewer under every street along x
+    for strip in streets.rows:
         town.span("Static", (low_m, strip.middle_m - 0.6), (high_m, strip.middle_m + 0.6), -4.2, -3.0)
 
 
 def _add_verge(town: Plot, streets: Streets) -> None:
     """Add lawn, trees and a fence with gates around the town, but not in a river."""
-    rng, half, edge, river = town.rng, town.high[0], streets.columns[-1].high_m, streets.river
+    rng, river = town.rng, streets.river
+    half = town.high[0]
+    edge = streets.columns[-1].high_m
     town.ring("Terrain", (town.low, town.high), ((-edge,) * 2, (edge,) * 2))
     for side in (-1, 1):
         for axis in (0, 1):
-            for at in np.arange(-half + 2.0, half - 12.0, 14.0):  # 12 m panels, 2 m gates
-                if river is None or axis == 0 or not river.low_m < at + 6.0 < river.high_m:
-                    place = point(axis, at + 6.0, side * (half - 0.4))
+            for start in np.arange(-half + 2.0, half - 12.0, 14.0):  # 12 m panels, 2 m gates
+                if river is None or axis == 0 or not river.low_m < start + 6.0 < river.high_m:
+                    place = point(axis, start + 6.0, side * (half - 0.4))
                     town.add("Fences", place, point(axis, 12.0, 0.1), -0.1, 1.3)
-            for at in np.arange(-half + 8.0, half - 6.0, 11.0):
-                in_river = river is not None and axis == 1 and river.low_m - 6.0 < at < river.high_m + 6.0
+            for start in np.arange(-half + 8.0, half - 6.0, 11.0):
+                in_river = river is not None and axis == 1 and river.low_m - 6.0 < start < river.high_m + 6.0
                 if rng.random() < 0.75 and not in_river:
-                    along = at + rng.uniform(-2, 2)
+                    along = start + rng.uniform(-2, 2)
                     place = point(axis, along, side * (half - 0.45 * VERGE_M + rng.uniform(-0.8, 0.8)))
                     town.tree(place, (3.5, 5.5), (6.0, 12.0))
 
 
 def _block_kinds(plan: TownPlan, rng: np.random.Generator) -> list[str]:
-    """Return one kind for each block, shuffled: of each its share, or a park, a square, and the built kinds in turn."""
+    """Return the kind of each block, shuffled.
+
+    A plan with shares of kinds gets those, the largest remainders rounded up. Another plan gets a park, a square, and
+    the built kinds in turn.
+    """
     count = plan.num_blocks * plan.num_blocks
-    if plan.blocks:  # of each kind so many, the largest remainders rounded up
+    if plan.blocks:
         exact = {name: share / sum(plan.blocks.values()) * count for name, share in plan.blocks.items()}
         kinds = [name for name, value in exact.items() for _ in range(int(value))]
         kinds += sorted(exact, key=lambda name: int(exact[name]) - exact[name])[: count - len(kinds)]
     else:
-        share = max(1, count // 9)
-        kinds = ["park"] * (share if count > 1 else 0) + ["square"] * (share if count > 3 else 0)
+        num_open = max(1, count // 9)
+        kinds = ["park"] * (num_open if count > 1 else 0) + ["square"] * (num_open if count > 3 else 0)
         kinds += [("courtyard", "houses", "towers")[i % 3] for i in range(count - len(kinds))]
     kinds = [kinds[i] for i in rng.permutation(count)]
     if plan.center in kinds:
-        middle, at = plan.num_blocks // 2 * (plan.num_blocks + 1), kinds.index(plan.center)
-        kinds[middle], kinds[at] = kinds[at], kinds[middle]
+        middle = plan.num_blocks // 2 * (plan.num_blocks + 1)
+        swapped = kinds.index(plan.center)
+        kinds[middle], kinds[swapped] = kinds[swapped], kinds[middle]
     return kinds
