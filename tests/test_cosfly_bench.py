@@ -5,7 +5,7 @@ from toy_workers import make_counting_worker, stage_in
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.pipeline.bench import Bench, row_of, run, tables, watched
+from cosfly.pipeline.bench import Bench, bench_run, run, tables, watchdog_figures
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.errors import ConfigError, ResumeError
 from cosfly.runtime.events import Event
@@ -38,14 +38,14 @@ MANIFEST = Manifest(stage="render", outputs=[], counts=Tally(input=3, kept=2, dr
 
 
 def test_figures_of_a_run():
-    row = row_of(EVENTS, MANIFEST, 2, counts_frames=True)
+    row = bench_run(EVENTS, MANIFEST, 2, counts_frames=True)
     assert (row.attempted, row.successful, row.per_s) == (120, 80, 4.0)
     assert (row.restarts, row.failed) == (1, 0)
     assert (row.peak_memory_mib, row.cores_used) == (220.0, 1.5)
     assert (row.gpu_percent, row.gpu_gib) == (45.0, 2.0)
     without = [one.model_copy(update={"gpu_percent": None, "gpu_mib": None}) for one in EVENTS]
-    assert row_of(without, MANIFEST, 2, counts_frames=True).gpu_percent is None
-    items = row_of(EVENTS, MANIFEST, 2, counts_frames=False)
+    assert bench_run(without, MANIFEST, 2, counts_frames=True).gpu_percent is None
+    items = bench_run(EVENTS, MANIFEST, 2, counts_frames=False)
     assert (items.attempted, items.successful) == (4, 2)
 
 
@@ -69,7 +69,7 @@ def test_what_lost_workers_had_done_is_counted_and_left_out(tmp_path):
     (tmp_path / "s/product").write_text("x")
     folder.finish([tmp_path / "s/product"], finished.tally)
     assert read_manifest(tmp_path / "s").facts["lost_steps"] == 3
-    launches, restarts, _, losses = watched(tmp_path / "s")
+    launches, restarts, _, losses = watchdog_figures(tmp_path / "s")
     assert (launches, restarts, losses) == (2, 1, {"worker_died": 1})
 
 

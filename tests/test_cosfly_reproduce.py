@@ -2,7 +2,8 @@
 
 import pytest
 
-from cosfly.pipeline.reproduce import OF_RELEASE, MissingFile, Places, read_paper
+from cosfly.pipeline.figure_places import FigureReader, MissingFile
+from cosfly.pipeline.reproduce import OF_RELEASE, read_paper
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import write_json
@@ -36,7 +37,7 @@ LABELS = [f"fig:{name}" for name in FIGURES.split()] + [f"tab:{name}" for name i
 
 def test_every_table_and_figure_of_the_paper_is_told_or_left_out_with_why():
     paper = read_paper()
-    told = [*paper.settings, *paper.tables, *(table.also for table in paper.tables.values())]
+    told = [*paper.settings, *paper.tables, *(table.more_labels for table in paper.tables.values())]
     told += [SHAPES[key][1] for key in OF_RELEASE]
     left = [label for labels in paper.left_out for label in labels.split(", ")]
     both = {label for labels in told for label in labels.split(", ")}
@@ -52,15 +53,15 @@ def test_figures_are_found_by_keys_numbers_ids_and_stars(tmp_path):
     write_json(tmp_path / "a.json", {"many": [{"id": "x", "ms": 1}, {"id": "y", "ms": 3}, {"id": "z"}], "none": {}})
     with Journal(tmp_path / "items.jsonl") as journal:
         journal.append({"id": "walk", "rss_mib": {"0": 2.0, "1": 3.0}})
-    places = Places([tmp_path / "absent", tmp_path], {"counts": {"a": 1, "b": 3}})
+    reader = FigureReader([tmp_path / "absent", tmp_path], {"counts": {"a": 1, "b": 3}})
     for place, expected in {
         "a.json:many.0.ms": [1], "a.json:many.-1.id": ["z"], "a.json:many.y.ms": [3], "a.json:many.9.ms": [None],
         "a.json:many.*.ms|mean,max": [2.0, 3], "a.json:many.x.ms,id + a.json:none": [1, "x", {}],
         "items.jsonl:walk.rss_mib.1": [3.0], "items.jsonl:*.rss_mib|peak": [5.0], "a.json:none.*.ms|mean": [None],
         "work:counts|shares": [{"a": 25.0, "b": 75.0}],
     }.items():  # fmt: skip
-        assert places.figures(place) == expected, place
+        assert reader.figures(place) == expected, place
     with pytest.raises(MissingFile):
-        places.figures("b.json:many")
+        reader.figures("b.json:many")
     with pytest.raises(InputError, match=r"a.json: many.\*.id"):
-        places.figures("a.json:many.*.id|mean")
+        reader.figures("a.json:many.*.id|mean")

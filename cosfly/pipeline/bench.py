@@ -31,8 +31,8 @@ STAGES = ("pedestrians", "plan", "render", "inspect", "caption", "release")  # t
 class BenchRun(BaseModel):
     """Figures of one run of the stage.
 
-    attempted: frames of render, or items of another stage, that were done or lost with a worker. gpu_percent, gpu_gib:
-    mean load and peak memory of the probes; None without a GPU.
+    attempted: the frames of render, or the items of another stage, that were done or lost with a worker. gpu_percent,
+    gpu_gib: mean load and peak memory of the probes; None without a GPU.
     """
 
     workers: int
@@ -70,9 +70,13 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
     if out.exists() and any(out.iterdir()):
         raise ResumeError("the output directory is not empty", where=out, fix="choose another --out")
     if stage == "caption" and (cfg.caption.teacher_kind not in EMBEDDED or cfg.caption.judge.url):
-        what, expected = "captions of a server do not depend on the number of workers", "an embedded teacher, no judge"
-        where, got, fix = "caption.teacher", cfg.caption.teacher, "--set caption.teacher=rules"
-        raise ConfigError(what, where=where, got=got, expected=expected, fix=fix)
+        raise ConfigError(
+            "captions of a server do not depend on the number of workers",
+            where="caption.teacher",
+            got=cfg.caption.teacher,
+            expected="an embedded teacher, no judge",
+            fix="--set caption.teacher=rules",
+        )
     rows = [_measure(cfg, run_folder, out / f"workers_{count}", stage, count) for count in sorted(set(workers))]
     bench = Bench(stage=stage, cores=len(os.sched_getaffinity(0)), rows=rows)
     write_model(out / "bench.json", bench, FORMAT)
@@ -85,13 +89,14 @@ def _measure(cfg: RunConfig, run_folder: Path, folder: Path, stage: str, workers
     log.info("bench: %s with %d worker%s", stage, workers, "s" if workers > 1 else "")
     cfg = cfg.model_copy(update={"workers": workers})
     next(s for s in stages(cfg, run_folder, into=folder) if s.name == stage).work()
-    row = row_of(read_events(folder / stage), read_manifest(folder / stage), workers, counts_frames=stage == "render")
+    events, manifest = read_events(folder / stage), read_manifest(folder / stage)
+    row = bench_run(events, manifest, workers, counts_frames=stage == "render")
     os.replace(folder / stage / EVENTS, folder.with_suffix(".events.jsonl"))
     shutil.rmtree(folder)
     return row
 
 
-def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_frames: bool) -> BenchRun:
+def bench_run(events: list[Event], manifest: Manifest, workers: int, *, counts_frames: bool) -> BenchRun:
     """Return the figures of one run from its events and its manifest."""
     done = [event for event in events if event.event == "item_done"]
     lost = [event for event in events if event.event in LOSSES]
@@ -112,7 +117,7 @@ def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_fram
     )
 
 
-def watched(folder: Path) -> tuple[int, int, float, dict[str, int]]:
+def watchdog_figures(folder: Path) -> tuple[int, int, float, dict[str, int]]:
     """Return the watchdog's figures of a finished stage: worker processes, restarts, seconds, and losses by kind."""
     counts = Counter(event.event for event in read_events(folder))
     losses: dict[str, int] = {kind: count for kind, count in counts.items() if kind in LOSSES}
@@ -125,15 +130,16 @@ def tables(bench: Bench) -> dict[str, list[tuple[str, ...]]]:
 
     The first row of a table is its head, the first column is a name.
     """
-    rate, first = "frames/s" if bench.stage == "render" else "items/s", bench.rows[0].per_s
+    rate = "frames/s" if bench.stage == "render" else "items/s"
+    first_per_s = bench.rows[0].per_s
     columns = {
         "workers": "{0.workers}", "wall s": "{0.seconds:.1f}", "attempted": "{0.attempted}",
         "successful": "{0.successful}", rate: "{0.per_s:.2f}", "speed-up": "{1:.2f}x", "cores": "{0.cores_used:.2f}",
         "MiB": "{0.peak_memory_mib:.0f}", "restarts": "{0.restarts}", "failed": "{0.failed}",
     }  # fmt: skip
-    rows = [tuple(text.format(row, row.per_s / first) for text in columns.values()) for row in bench.rows]
-    found: dict[str, list[tuple[str, ...]]] = {f"{bench.stage} on {bench.cores} cores": [tuple(columns), *rows]}
+    rows = [tuple(text.format(row, row.per_s / first_per_s) for text in columns.values()) for row in bench.rows]
+    titled: dict[str, list[tuple[str, ...]]] = {f"{bench.stage} on {bench.cores} cores": [tuple(columns), *rows]}
     if any(row.gpu_percent is not None for row in bench.rows):
         used = [(str(row.workers), str(row.gpu_percent), str(row.gpu_gib)) for row in bench.rows]
-        found["NVIDIA GPUs"] = [("workers", "GPU %", "GPU GiB"), *used]
-    return found
+        titled["NVIDIA GPUs"] = [("workers", "GPU %", "GPU GiB"), *used]
+    return titled

@@ -1,8 +1,9 @@
 """`cosfly reproduce`: the paper's tables and figures from one run, next to the paper's own, on one page.
 
-What the run recorded is read from its stages. The rest is measured again in folders below `out`: planners, TA*'s beam
-and zoom are stages that resume after a kill; depth, weather and single pictures are made again. `paper.yaml` lists
-where each figure is found, the paper's value, why they differ, and what is not reproduced.
+Figures that the run recorded are read from its stages. The others are measured again in folders below `out`: planners,
+TA*'s beam and zoom are stages that resume after a kill; depth, weather and single pictures are computed each time.
+`paper.yaml` lists the place of each figure (see `figure_places`), the paper's value, the reason for a difference, and
+what is not reproduced.
 """
 
 from __future__ import annotations
@@ -10,21 +11,20 @@ from __future__ import annotations
 import base64
 import logging
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import cv2
-import numpy as np
 from pydantic import BaseModel, Field
 
 import cosfly
 import cosfly.pedestrians.stage
 from cosfly.formats.boxes import read_boxes
-from cosfly.formats.captions import FIELDS, read_captions
+from cosfly.formats.captions import FIELDS, Caption, read_captions
 from cosfly.formats.segments import FOLLOW
 from cosfly.pipeline import bench as benchmark
+from cosfly.pipeline.figure_places import UNEXPECTED, FigureReader, MissingFile, files_of, follow
 from cosfly.pipeline.runs import summarize
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners import compare
@@ -34,9 +34,8 @@ from cosfly.runtime.config import build, read_yaml
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.events import read_events
 from cosfly.runtime.io import read_bytes, write_bytes
-from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import FileFormat, read_object, write_json
-from cosfly.runtime.run_dir import Resume, read_manifest
+from cosfly.runtime.run_dir import Manifest, Resume, read_manifest
 from cosfly.studies import beam, depth, weather, zoom
 from cosfly.viz.frame_views import small_jpeg
 from cosfly.viz.gallery import four_panels
@@ -49,18 +48,19 @@ from release.stats.tables import Cell, Rows, Table
 log = logging.getLogger(__name__)
 
 FORMAT = FileFormat("cosfly.reproduction", "1.0")
-STAGES = ("maps", "simplify", "pedestrians", "plan")  # of a run that can be compared
+STAGES = ("maps", "simplify", "pedestrians", "plan")  # complete in every run that can be compared
 PLANNERS = ("track_astar", "muco", "foresight")  # the first is compared with the others, as in the paper
 LENSES_DEG = (120, 110, 90, 70, 60, 45, 30)  # tab:zoom_conversion
-ZOOM_DEG, ZOOM_EVERY = (110.0, 90.0, 60.0, 30.0), 12
-UNEXPECTED = "the file is not as a stage writes it"
+ZOOM_DEG = (110.0, 90.0, 60.0, 30.0)
+ZOOM_EVERY = 12  # frames
+ALL_ROWS = "*"  # a row of `paper.yaml` for all rows that its place names
 WIDTH_PX = 1500  # of pictures on the page
 STYLE = """
 .pair { display: flex; flex-wrap: wrap; gap: 12px 34px; align-items: flex-start; }
 .pair img { flex: 1 1 420px; min-width: 0; max-width: min(100%, 860px); border-radius: 4px; }
 .panel h2 { margin-top: 2px; } [id="muco_visibility"] img { flex-basis: 100%; max-width: 100%; }
 """
-# Tables of `cosfly release stats` that are the paper's; the others come from plans here.
+# Tables of `cosfly release stats` that are shown; the paper's others come from the plans of the run.
 OF_RELEASE = ("release", "decisions", "confusion", "repairs", "text_lengths", "fovs", "weather")
 
 
@@ -71,29 +71,34 @@ class Part(Table):
     picture: str | None = Field(None, exclude=True)
 
 
-class Printed(BaseModel):
-    """A table of `paper.yaml`. here: row -> place of its figures, or the argument of `from`; "*": all rows of it."""
+class PaperTable(BaseModel):
+    """A table of `paper.yaml`.
+
+    head: names of the columns, separated by `|`. places: row -> place of our figures, or the text that replaces `{}`
+    in `template`. reason: why our figures differ. paper_rows: row -> the paper's figures. more_labels: further labels
+    of the paper that the table covers.
+    """
 
     title: str
     head: str
-    here: dict[str, str]
-    why: str = ""
-    paper: dict[str, Any] = {}
-    also: str = ""
+    places: dict[str, str] = Field(alias="here")
+    template: str = Field("{}", alias="from")
+    reason: str = Field("", alias="why")
+    paper_rows: dict[str, Any] = Field({}, alias="paper")
+    more_labels: str = Field("", alias="also")
     picture: str | None = None
-    place: str = Field("{}", alias="from")
+
+    def labels(self, label: str) -> str:
+        """Return all labels of the table, separated by commas."""
+        return f"{label}, {self.more_labels}" if self.more_labels else label
 
 
 class Paper(BaseModel):
     """`paper.yaml`. settings: label -> setting -> value; left_out: labels -> why."""
 
     settings: dict[str, dict[str, Any]]
-    tables: dict[str, Printed]
+    tables: dict[str, PaperTable]
     left_out: dict[str, str]
-
-
-class MissingFile(Exception):
-    """A file that a table needs does not exist."""
 
 
 def read_paper() -> Paper:
@@ -116,135 +121,132 @@ def run(
     """
     done = [stage.name for stage in summarize(folder).stages if stage.state == "complete"]
     if missing := [name for name in STAGES if name not in done]:
-        fix = f"one town at a time: {folder}/{next(iter(cfg.towns))}" if cfg.towns else f"cosfly run {folder}"
-        what, got = "the run has no drone trajectories yet", f"no {', no '.join(missing)}"
-        raise InputError(what, where=folder, got=got, fix=fix)
-    printed = read_paper()
-    places = Places(
-        [folder, out], measure(cfg, folder, out, pedestrians, done, pool | {"seed": seed, "resume": resume})
-    )
-    places.made |= work(cfg, folder, places, done)
-    parts, left_out = [settings(cfg, printed)], dict(printed.left_out)
-    for label, table in printed.tables.items():
+        raise InputError(
+            "the run has no drone trajectories yet",
+            where=folder,
+            got=f"no {', no '.join(missing)}",
+            fix=f"one town at a time: {folder}/{next(iter(cfg.towns))}" if cfg.towns else f"cosfly run {folder}",
+        )
+    sample = measure(cfg, folder, out, pedestrians, done, pool | {"seed": seed, "resume": resume})
+    reader = FigureReader([folder, out], {} if sample is None else {"sample": sample})
+    reader.derived |= derived_figures(cfg, folder, reader, done)
+    paper = read_paper()
+    parts = [compare_settings(cfg, paper)]
+    left_out = dict(paper.left_out)
+    for label, table in paper.tables.items():
         try:
-            parts.append(part(label, table, places))
-        except MissingFile as absent:
-            left_out[f"{label}, {table.also}".strip(", ")] = f"needs {absent}, which this run has not made"
+            parts.append(make_part(label, table, reader))
+        except MissingFile as missing_file:
+            left_out[table.labels(label)] = f"needs {missing_file}, which this run has not made"
     if "release" in done:
         tables = read_object(out / "release/stats.json", what="statistics")["tables"]
-        parts += [Part(**one) for one in tables if one["key"] in OF_RELEASE]
-    name, machine = run_name(folder / "plan"), f"cosfly {cosfly.__version__}, {len(os.sched_getaffinity(0))} cores"
-    facts = {"run": name, "made_by": machine, "pedestrians": pedestrians, "left_out": left_out}
-    listed = [one.model_dump(mode="json") for one in parts]
-    write_json(out / "reproduction.json", {**FORMAT.header, **facts, "parts": listed})
+        parts += [Part(**table) for table in tables if table["key"] in OF_RELEASE]
+    return _write_page(out, run_name(folder / "plan"), pedestrians, parts, left_out)
+
+
+def _write_page(out: Path, name: str, pedestrians: int, parts: list[Part], left_out: dict[str, str]) -> Path:
+    facts = {
+        "run": name,
+        "made_by": f"cosfly {cosfly.__version__}, {len(os.sched_getaffinity(0))} cores",
+        "pedestrians": pedestrians,
+        "left_out": left_out,
+    }
+    records = [part.model_dump(mode="json") for part in parts]
+    write_json(out / "reproduction.json", {**FORMAT.header, **facts, "parts": records})
     text = page("cosfly/pipeline/reproduce.html", title=name, style=STYLE, facts=facts, parts=parts, look=TABLE_LOOK)
     write_bytes(out / "reproduction.html", text.encode())
     return out / "reproduction.html"
 
 
-# --- places of figures ----------------------------------------------------------------------------------------------
-
-FUNCTIONS: dict[str, Callable[[Any], Any]] = {
-    "mean": lambda values: float(np.mean(values)), "std": lambda values: float(np.std(values)), "min": min, "max": max,
-    "p50": lambda values: float(np.percentile(values, 50)), "p95": lambda values: float(np.percentile(values, 95)),
-    "count": len,
-    "peak": lambda probes: max(sum(one.values()) for one in probes),  # memory of all workers
-    "shares": lambda counts: {name: 100.0 * count / sum(counts.values()) for name, count in counts.items()},
-}  # fmt: skip
+# --- tables -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Places:
-    """Reader of figures by their places. roots: the run, and further folders with files; made: `work`."""
-
-    roots: Sequence[Path]
-    made: dict[str, Any]
-    _read: dict[str, Any] = field(default_factory=dict)
-
-    def file(self, name: str) -> Path:
-        found = next((root / name for root in self.roots if (root / name).is_file()), None)
-        if found is None:
-            raise MissingFile(name)
-        return found
-
-    def figures(self, place: str) -> list[Any]:
-        """Return the figures of a place of `paper.yaml`; None where one does not exist."""
-        found = list[Any]()
-        for one in place.split(" + "):
-            path, _, functions = one.partition("|")
-            name, _, keys = path.partition(":")
-            *way, last = keys.split(".")
-            try:
-                values = [_at(self._document(name), [*way, key]) for key in last.split(",")]
-                if functions:
-                    values = [FUNCTIONS[f](v) if v else None for v in values for f in functions.split(",")]
-                found += values
-            except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
-                raise InputError(UNEXPECTED, where=f"{name}: {keys}", got=str(error)) from None
-        return found
-
-    def _document(self, name: str) -> Any:
-        if name == "work":
-            return self.made
-        if name not in self._read:
-            path = self.file(name)
-            is_journal = path.suffix == ".jsonl"
-            self._read[name] = list(Journal(path).read()) if is_journal else read_object(path, what="report")
-        return self._read[name]
-
-
-def _at(value: Any, way: list[str]) -> Any:
-    """Follow keys; of a list a number, or an element's id or key, or * for all that have the rest."""
-    for k, key in enumerate(way):
-        if key == "*":
-            found = [_at(one, way[k + 1 :]) for one in (value.values() if isinstance(value, dict) else value)]
-            return [one for one in found if one is not None]
-        if isinstance(value, list):
-            by_id = {str(one.get("id", one.get("key"))): one for one in value if isinstance(one, dict)}
-            index = int(key) if key.lstrip("-").isdecimal() else None
-            value = by_id.get(key) if index is None else value[index] if -len(value) <= index < len(value) else None
-        else:
-            value = value.get(key) if isinstance(value, dict) else None
-    return value
-
-
-def part(label: str, printed: Printed, places: Places) -> Part:
+def make_part(label: str, table: PaperTable, reader: FigureReader) -> Part:
     """Make a table of the paper: our figures, with the paper's next to or below them."""
-    files, ours = {printed.picture} if printed.picture else set(), dict[str, list[Any]]()
-    for name, row in printed.here.items():
-        place = row if ":" in row else printed.place.format(row)
-        files |= {one.partition(":")[0] for one in place.split(" + ")} - {"work"}
-        found = places.figures(place)
-        if name == "*" and not isinstance(found[0] or {}, dict):
-            raise InputError(UNEXPECTED, where=place, got=str(found[0])[:80], expected="names with figures")
-        ours |= {key: _values(row) for key, row in (found[0] or {}).items()} if name == "*" else {name: found}
-    names, rows, theirs = printed.head.split("|"), Rows(), {name: _values(row) for name, row in printed.paper.items()}
-    is_next, width = names[1] == "here", len(names) - 1  # ours is one column; else the paper's rows follow ours
-    for name in dict.fromkeys([*ours, *theirs]):
-        here, paper = ([*map(_cell, found.get(name, [])), *[None] * width][:width] for found in (ours, theirs))
-        if is_next:
-            rows.append([name, here[0], *paper[: width - 1]])
-            continue
-        rows += [[name, *(["here"] if theirs else []), *here]] if name in ours else []
-        rows += [["" if name in ours else name, "paper", *paper]] if name in theirs else []
-    if theirs and not is_next:
-        names.insert(1, "")
-    why = f"Differs: {printed.why}. " if theirs else f"{printed.why[:1].upper()}{printed.why[1:]}. "
+    our_rows, sources = our_figures(table, reader)
+    paper_rows = {name: _as_list(figures) for name, figures in table.paper_rows.items()}
+    head, rows = lay_out(table.head.split("|"), our_rows, paper_rows)
+    is_recorded = all((reader.roots[0] / file).is_file() for file in sources)
     return Part(
-        key=label, title=printed.title, head=names, rows=rows,
-        paper=", ".join(name for name in (label, printed.also) if ":" in name),
-        note=why * bool(printed.why) + (f"From {', '.join(sorted(files))}." if files else ""),
-        source="recorded" if all((places.roots[0] / file).is_file() for file in files) else "measured again",
-        picture=_jpeg(places.file(printed.picture)) if printed.picture else None,
-    )  # fmt: skip
+        key=label,
+        title=table.title,
+        head=head,
+        rows=rows,
+        paper=table.labels(label),
+        note=note_of(table.reason, sources, has_paper_rows=bool(paper_rows)),
+        source="recorded" if is_recorded else "measured again",
+        picture=_jpeg(reader.file(table.picture)) if table.picture else None,
+    )
 
 
-def _values(row: Any) -> list[Any]:
-    return list(row.values()) if isinstance(row, dict) else row if isinstance(row, list) else [row]
+def our_figures(table: PaperTable, reader: FigureReader) -> tuple[dict[str, list[Any]], set[str]]:
+    """Return our figures by row, and the files that they and the picture come from."""
+    rows = dict[str, list[Any]]()
+    sources = {table.picture} if table.picture else set()
+    for name, entry in table.places.items():
+        place = entry if ":" in entry else table.template.format(entry)
+        sources |= files_of(place)
+        figures = reader.figures(place)
+        if name != ALL_ROWS:
+            rows[name] = figures
+            continue
+        named_rows = figures[0] or {}
+        if not isinstance(named_rows, dict):
+            raise InputError(UNEXPECTED, where=place, got=str(named_rows)[:80], expected="names with figures")
+        rows |= {key: _as_list(row) for key, row in named_rows.items()}
+    return rows, sources
+
+
+def lay_out(
+    head: list[str], our_rows: Mapping[str, list[Any]], paper_rows: Mapping[str, list[Any]]
+) -> tuple[list[str], Rows]:
+    """Return the head and the rows of a table.
+
+    With `here` as the second column our figures are one column, and the paper's follow in the same row. Else a row of
+    the paper follows ours.
+    """
+    rows = Rows()
+    num_figures = len(head) - 1
+    names = dict.fromkeys([*our_rows, *paper_rows])
+    if head[1] == "here":
+        for name in names:
+            ours = _cells(our_rows.get(name, []), 1)
+            rows.append([name, *ours, *_cells(paper_rows.get(name, []), num_figures - 1)])
+        return head, rows
+    if not paper_rows:
+        return head, [[name, *_cells(figures, num_figures)] for name, figures in our_rows.items()]
+    for name in names:
+        if name in our_rows:
+            rows.append([name, "here", *_cells(our_rows[name], num_figures)])
+        if name in paper_rows:
+            rows.append(["" if name in our_rows else name, "paper", *_cells(paper_rows[name], num_figures)])
+    return [head[0], "", *head[1:]], rows
+
+
+def note_of(reason: str, sources: set[str], *, has_paper_rows: bool) -> str:
+    """Return the note below a table: the reason for differences, and the files of our figures."""
+    note = ""
+    if reason:
+        note = f"Differs: {reason}. " if has_paper_rows else f"{reason[0].upper()}{reason[1:]}. "
+    if sources:
+        note += f"From {', '.join(sorted(sources))}."
+    return note
+
+
+def _as_list(row: Any) -> list[Any]:
+    if isinstance(row, dict):
+        return list(row.values())
+    return row if isinstance(row, list) else [row]
+
+
+def _cells(figures: list[Any], width: int) -> list[Cell]:
+    """Return cells of `width` columns, the missing ones empty."""
+    cells: list[Cell] = [_cell(figure) for figure in figures[:width]]
+    return cells + [None] * (width - len(cells))
 
 
 def _cell(value: Any) -> Cell:
-    """Return the content of a cell: numbers and words as they are, counts by name and lists as words."""
+    """Return the content of a cell: numbers and texts as they are, counts by name and lists as text."""
     if isinstance(value, dict):
         return ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in value.items()) or "none"
     if isinstance(value, list | tuple):
@@ -261,77 +263,112 @@ def _jpeg(path: Path) -> str:
     return small_jpeg(picture, min(WIDTH_PX, picture.shape[1]))
 
 
-def settings(cfg: RunConfig, printed: Paper) -> Part:
+def compare_settings(cfg: RunConfig, paper: Paper) -> Part:
     """Compare the settings of the run with the paper's."""
-    data, rows = cfg.all_values(), Rows()
-    for label, wanted in printed.settings.items():
-        for name, theirs in wanted.items():
-            own = _at(data, name.split("."))
-            rows.append([name, str(_cell(own)), str(_cell(theirs)), "" if own == theirs else "other", label])
-    note = "The paper's planner, trunks and SimWorld runs are settings here, not defaults."
-    head, labels = ["setting", "here", "paper", "", "label"], ", ".join(printed.settings)
-    return Part(key="settings", title="Settings", head=head, rows=rows, paper=labels, note=note)
+    values = cfg.all_values()
+    rows = Rows()
+    for label, paper_values in paper.settings.items():
+        for name, paper_value in paper_values.items():
+            value = follow(values, name.split("."))
+            remark = "" if value == paper_value else "other"
+            rows.append([name, str(_cell(value)), str(_cell(paper_value)), remark, label])
+    return Part(
+        key="settings",
+        title="Settings",
+        head=["setting", "here", "paper", "", "label"],
+        rows=rows,
+        paper=", ".join(paper.settings),
+        note="The paper's planner, trunks and SimWorld runs are settings here, not defaults.",
+    )
 
 
-# --- what is measured again -------------------------------------------------------------------------------------------
+# --- figures that are measured again ----------------------------------------------------------------------------------
 
 
 def measure(
-    cfg: RunConfig, run: Path, out: Path, num_pedestrians: int, done: Sequence[str], how: dict[str, Any]
-) -> dict[str, Any]:
-    """Measure what the run has not recorded, in folders below `out`; return the facts that are in no file.
+    cfg: RunConfig, folder: Path, out: Path, num_pedestrians: int, done: Sequence[str], options: dict[str, Any]
+) -> str | None:
+    """Measure what the run has not recorded, in folders below `out`; return the frame that is shown, if it renders.
 
-    Planners track the paper's reference trajectory, whatever styles the run has, after pedestrians that are drawn on
-    its map with its settings; its own pedestrians are the first of them.
+    Planners track the paper's reference trajectory, whatever styles the run has. The pedestrians are sampled on the
+    run's map with its settings; the run's own pedestrians are the first of them.
+
+    Args:
+        done: Complete stages of the run.
+        options: `seed`, `resume`, `workers` and `watch` of stages.
     """
-    boxes, simplified = run / "maps/boxes_3d.json", run / "simplify/step2_simplified.json"
-    traces, tree = run / "plan/drone_trace.json", run / "render"
-    alone = {"num_paths": num_pedestrians, "others": 0, "traffic": 0, "look_alikes": 0}
-    walking = cfg.pedestrians.model_copy(update=alone)
-    paths = cosfly.pedestrians.stage.run(walking, simplified, out / "pedestrians", roi=cfg.roi, **how)
+    boxes = folder / "maps/boxes_3d.json"
+    simplified = folder / "simplify/step2_simplified.json"
+    traces = folder / "plan/drone_trace.json"
+    only_targets = {"num_paths": num_pedestrians, "others": 0, "traffic": 0, "look_alikes": 0}
+    walking = cfg.pedestrians.model_copy(update=only_targets)
+    paths = cosfly.pedestrians.stage.run(walking, simplified, out / "pedestrians", roi=cfg.roi, **options)
     plan = cfg.plan.model_copy(update={"styles": {FOLLOW: 1.0}})
     compared = build(compare.CompareConfig, plan.model_dump() | {"planners": PLANNERS}, "planners")
-    compare.run(compared, simplified, paths, out / "compare", **how)
-    beam.run(build(beam.BeamConfig, plan.model_dump(), "beams"), simplified, paths, out / "beam", **how)
+    compare.run(compared, simplified, paths, out / "compare", **options)
+    beam.run(build(beam.BeamConfig, plan.model_dump(), "beams"), simplified, paths, out / "beam", **options)
     if "release" in done:
-        release_stats(run / "release/dataset", out / "release", pixels=0)
+        release_stats(folder / "release/dataset", out / "release", pixels=0)
     if "render" not in done:
-        return {}
+        return None
     log.info("reproduce: pictures")
+    tree = folder / "render"
     frame = four_panels(tree, out / "sample.png", box_map=read_boxes(boxes))
     depth.run(tree / frame, out / "depth")
     weather.run(cfg.render, boxes, traces, out / "weather", seed=cfg.seed)
     lenses = cfg.render.model_copy(update={"fovs_deg": ZOOM_DEG})
-    zoom.run(lenses, boxes, simplified, traces, out / "zoom", every=ZOOM_EVERY, **how)
-    return {"sample": frame}
+    zoom.run(lenses, boxes, simplified, traces, out / "zoom", every=ZOOM_EVERY, **options)
+    return frame
 
 
-def work(cfg: RunConfig, run: Path, places: Places, done: Sequence[str]) -> dict[str, Any]:
-    """Return `work`: the figures that come from several files, or from none."""
-    manifests = {name: read_manifest(run / name) for name in benchmark.STAGES if name in done}
+def derived_figures(cfg: RunConfig, folder: Path, reader: FigureReader, done: Sequence[str]) -> dict[str, Any]:
+    """Return the figures that come from several files, or from none."""
+    manifests = {name: read_manifest(folder / name) for name in benchmark.STAGES if name in done}
     lens = RenderConfig(width_px=1280, height_px=720)
-    lenses = {str(fov): zoom.camera_of(lens, fov) for fov in LENSES_DEG}
-    points = places.figures("plan/drone_trace.json:traces.*.metrics.num_points")[0]
-    found: dict[str, Any] = {
+    cameras = {str(fov): zoom.camera_of(lens, fov) for fov in LENSES_DEG}
+    track_lengths = reader.figures("plan/drone_trace.json:traces.*.metrics.num_points")[0]
+    figures: dict[str, Any] = {
         "budget": {name: [m.seconds, m.counts.input, m.seconds / m.counts.input] for name, m in manifests.items()},
-        "watchdog": {name: [*benchmark.watched(run / name)] for name in manifests},
-        "lenses": {fov: [one.focal_px, one.focal_35mm_mm] for fov, one in lenses.items()},
-        "samples": [len(windows_of(count, cfg.distill.dual_track)) for count in points],
+        "watchdog": {name: [*benchmark.watchdog_figures(folder / name)] for name in manifests},
+        "lenses": {fov: [camera.focal_px, camera.focal_35mm_mm] for fov, camera in cameras.items()},
+        "samples": [len(windows_of(length, cfg.distill.dual_track)) for length in track_lengths],
     }
     if "render" in manifests:
-        events = read_events(run / "render")
-        workers = max((event.workers or 1 for event in events if event.event == "began"), default=1)
-        row = benchmark.row_of(events, manifests["render"], workers, counts_frames=True)
-        found["rendering"] = {
-            f"{row.workers} workers": [
-                row.seconds, row.attempted, row.successful, row.per_s, 1.0 if row.per_s else None, row.cores_used,
-                row.peak_memory_mib, row.restarts, row.failed, row.gpu_percent, row.gpu_gib,
-            ]
-        }  # fmt: skip
-    captions = read_captions(run / "caption/captions.jsonl") if {"caption", "render"} <= {*done} else iter(())
-    if kept := [one for one in captions if one.en and one.zh and one.status == "accepted"]:
-        *_, trajectory, _, _, name = places.made["sample"].split("/")
-        near = min(kept, key=lambda c: (c.trajectory != trajectory, abs(c.frame_index - int(name.rpartition("_")[2]))))
-        texts = {name: [getattr(near.en, name), getattr(near.zh, name)] for name in FIELDS}
-        found["caption"] = {"sample id": [near.sample_id], **texts}
-    return found
+        figures["rendering"] = _rendering(folder / "render", manifests["render"])
+    if "render" in manifests and "caption" in manifests:
+        caption = _caption_near(folder / "caption/captions.jsonl", reader.derived["sample"])
+        if caption is not None:
+            figures["caption"] = caption
+    return figures
+
+
+def _rendering(tree: Path, manifest: Manifest) -> dict[str, list[Any]]:
+    """Return the row of tab:render_scaling of the run's own rendering."""
+    events = read_events(tree)
+    workers = max((event.workers or 1 for event in events if event.event == "began"), default=1)
+    row = benchmark.bench_run(events, manifest, workers, counts_frames=True)
+    speed_up = 1.0 if row.per_s else None  # against itself
+    return {
+        f"{row.workers} workers": [
+            row.seconds, row.attempted, row.successful, row.per_s, speed_up, row.cores_used, row.peak_memory_mib,
+            row.restarts, row.failed, row.gpu_percent, row.gpu_gib,
+        ]
+    }  # fmt: skip
+
+
+def _caption_near(captions: Path, frame: str) -> dict[str, list[Any]] | None:
+    """Return the accepted caption in both languages that is nearest to a frame, by field; None if there is none."""
+    *_, trajectory, _, _, name = frame.split("/")
+    frame_index = int(name.rpartition("_")[2])
+    accepted = [
+        caption for caption in read_captions(captions) if caption.en and caption.zh and caption.status == "accepted"
+    ]
+    if not accepted:
+        return None
+
+    def distance(caption: Caption) -> tuple[bool, int]:
+        return caption.trajectory != trajectory, abs(caption.frame_index - frame_index)
+
+    nearest = min(accepted, key=distance)
+    texts = {field: [getattr(nearest.en, field), getattr(nearest.zh, field)] for field in FIELDS}
+    return {"sample id": [nearest.sample_id], **texts}
