@@ -1,15 +1,20 @@
 """The command line: what a person reads when something is wrong, and the exit codes."""
 
+import ast
+import importlib
 import logging
+import re
 import signal
 import subprocess
 import sys
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from cosfly import cli
+from cosfly.cli import options
 from cosfly.cli.options import Job, resolve
 from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.protocol import base_url
@@ -17,6 +22,8 @@ from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.errors import InputError, TeacherError
 from cosfly.runtime.json_io import write_json
 from cosfly.runtime.run_dir import StageFolder, Tally
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(autouse=True)
@@ -150,3 +157,28 @@ def test_every_form_of_an_address_leads_to_one_root():
         "https://h/api/v3/": "https://h/api/v3",
     }
     assert {url: base_url(url) for url in roots} == roots
+
+
+def test_every_common_option_of_a_command_is_taken_by_a_function_that_it_calls():
+    """An option that no function takes would be ignored without a word."""
+    texts = [
+        (ROOT / f"cosfly/cli/{name}.py").read_text() for name in ("stages", "run", "caption", "distill", "release")
+    ]
+    names = vars(options)
+    commands = 0
+    for function in (node for text in texts for node in ast.parse(text).body if isinstance(node, ast.FunctionDef)):
+        for decorator in (d for d in function.decorator_list if isinstance(d, ast.Call)):
+            common = [*decorator.args[2:3], *(k.value for k in decorator.keywords if k.arg == "common")]
+            listed = set(eval(ast.unparse(common[0]), names).split()) if common else set()  # a constant of `options`
+            body = ast.unparse(function.body)
+            taken = {name for name in ("seed", "resume", "workers") if f"job.{name}" in body or f"{name}=" in body}
+            if re.search(r"\(job, |\(job\.cfg, ", body):  # which holds seed and workers
+                taken |= {"seed", "workers"}
+            for target in re.findall(r"job\.(?:call|run)\('([\w.:]+)'", body):
+                module, _, name = target.partition(":")
+                parameters = signature(getattr(importlib.import_module(module), name or "run")).parameters
+                is_open = any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters.values())
+                taken |= {"seed", "resume", "workers"} if is_open else {*parameters}
+            assert listed & {"seed", "resume", "workers"} <= taken, function.name
+            commands += 1
+    assert commands > 30

@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import STAGE, Job, Short, choice_of, command
+from cosfly.cli.options import STAGE, Job, SettingOption, command, track_options
 
 if TYPE_CHECKING:
     from caption.schema import CaptionConfig
@@ -17,24 +17,28 @@ if TYPE_CHECKING:
 options.add_group("caption")
 
 TEACHERS = "rules, URL of an OpenAI-compatible server, vllm:MODEL_DIR, file:PATH, or student:PATH of `distill infer`."
-TEACHER = Short("caption.teacher", TEACHERS, default="rules")
-MODEL = Short("caption.endpoint.model", "Model name at the server; by default its only model.")
-STUDENT = "Folder of `distill train` or `merge`: ask the teacher's model as that student was trained."
+TEACHER = SettingOption("caption.teacher", TEACHERS, default="rules")
+MODEL_HELP = "Model name at the server; by default its only model."
+MODEL = SettingOption("caption.endpoint.model", MODEL_HELP)
+JUDGE_MODEL = SettingOption("caption.judge.model", MODEL_HELP)
+STUDENT = "Output of `distill train` or `merge`: ask the model in the form that this student was trained on."
 
 
 @command(
     "cosfly caption --data render --teacher http://localhost:8000",
     "caption",
     STAGE,
-    **choice_of("caption"),
+    **track_options("caption"),
     teacher=TEACHER,
-    as_student=Short("caption.student.folder", STUDENT, Path),
+    as_student=SettingOption("caption.student.folder", STUDENT, Path),
     model=MODEL,
-    judge=Short("caption.judge.url", "URL of a server that judges conflicts."),
-    keyframes=Short("caption.window.keyframes", "Only windows at which the label changes, and every tenth.", bool),
-    limit=Short("caption.limit", "Caption at most this many windows; a later run resumes.", int),
-    max_cost=Short("caption.budget.max_cost", "Stop before this cost; prices: caption.budget.price_*.", float),
-    max_tokens=Short("caption.budget.max_tokens", "Stop before this many tokens, over all runs.", int),
+    judge=SettingOption("caption.judge.url", "URL of a server that judges conflicts."),
+    keyframes=SettingOption(
+        "caption.window.keyframes", "Only windows at which the label changes, and every tenth.", bool
+    ),
+    limit=SettingOption("caption.limit", "Caption at most this many windows; a later run resumes.", int),
+    max_cost=SettingOption("caption.budget.max_cost", "Stop before this cost; prices: caption.budget.price_*.", float),
+    max_tokens=SettingOption("caption.budget.max_tokens", "Stop before this many tokens, over all runs.", int),
 )
 def caption(
     job: Job,
@@ -45,15 +49,17 @@ def caption(
     check: Annotated[bool, Option(help="Test the server before the first request of a directory.")] = True,
 ) -> None:
     """Ask a teacher for the reason of every manoeuvre, verify it against geometry, regenerate, translate (step 7)."""
-    cfg, tree = job.cfg.caption, job.tree(data)
+    cfg = job.cfg.caption
+    tree = job.tree(data)
     target = out or tree.resolve().parent / "caption"
-    is_student = cfg.student.folder is not None  # it answers one kind of question only
+    is_student = cfg.student.folder is not None  # it answers one kind of question, so the examination does not fit
     if check and cfg.teacher_kind == "endpoint" and not is_student and not (target / "answers").exists():
         _examine_endpoint(cfg.teacher, cfg)
-    if not plan_only:
-        return job.run("caption.run.stage", cfg, tree, target, retry_failed=retry_failed)
-    forecast = job.call("caption.run.forecast:make_forecast", cfg, tree, target)
-    options.print_table((), forecast, "What this run will take")
+    if plan_only:
+        forecast = job.call("caption.run.forecast:make_forecast", cfg, tree, target)
+        options.print_table((), forecast, "What this run will take")
+    else:
+        job.run("caption.run.stage", cfg, tree, target, retry_failed=retry_failed)
 
 
 @command("cosfly caption doctor http://localhost:8000", "caption", model=MODEL)
@@ -86,10 +92,7 @@ def prompts(
         raise typer.BadParameter("give either --export DIR or --check DIR")
 
 
-JUDGE = Short("caption.judge.model", "Model name at the server; by default its only model.")
-
-
-@command("cosfly caption judge-check http://localhost:8000", "caption", model=JUDGE)
+@command("cosfly caption judge-check http://localhost:8000", "caption", model=JUDGE_MODEL)
 def judge_check(job: Job, url: Annotated[str, Argument(help="URL of the judge's server.")]) -> None:
     """Measure a judge on a small gold set: agreement, position bias, unparsable answers."""
     import asyncio
@@ -101,14 +104,18 @@ def judge_check(job: Job, url: Annotated[str, Argument(help="URL of the judge's 
 
     cfg = job.cfg.caption
     judge = build(type(cfg.judge), cfg.judge.model_dump() | {"url": url}, "caption.judge")
-    found = asyncio.run(check_judge(judge, vocabulary_of(cfg), gold_conflicts(), job.cfg.seed))
-    console.print(judge_check_table(found))
+    report = asyncio.run(check_judge(judge, vocabulary_of(cfg), gold_conflicts(), job.cfg.seed))
+    console.print(judge_check_table(report))
 
 
-COMPARE = "cosfly caption compare-strategies --teacher URL --out compared"
-
-
-@command(COMPARE, "caption", "seed", **choice_of("caption"), teacher=TEACHER, model=MODEL)
+@command(
+    "cosfly caption compare-strategies --teacher URL --out compared",
+    "caption",
+    "seed",
+    **track_options("caption"),
+    teacher=TEACHER,
+    model=MODEL,
+)
 def compare_strategies(
     job: Job,
     out: Annotated[Path, Option(help="Folder for compare_strategies.json and the answers.")],
@@ -119,5 +126,5 @@ def compare_strategies(
     from caption.run.compare import comparison_table
     from cosfly.runtime.console import console
 
-    found = job.call("caption.run.compare", job.cfg.caption, job.tree(data), out, conflicts=conflicts)
-    console.print(comparison_table(found))
+    comparison = job.call("caption.run.compare", job.cfg.caption, job.tree(data), out, conflicts=conflicts)
+    console.print(comparison_table(comparison))

@@ -9,19 +9,19 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import STAGE, Job, Short, choice_of, command
+from cosfly.cli.options import STAGE, Job, SettingOption, command, track_options
 
 options.add_group("distill", "Train a small student: training set, LoRA, inference, evaluation.")
 
 Dataset = Annotated[Path, Option(help="Training set: the output of `distill prepare`.")]
 STUDENTS = "Model folder, repository such as Qwen/Qwen3.5-2B, or random weights: tiny, tiny:small, tiny:medium, random."
 JUDGED = "captions.jsonl of `caption --teacher student:PATH`, one per tree; repeat it."
-LIMIT = Short("distill.prepare.limit", "Windows in all splits, shared by the decisions; 0 for all.", int)
+LIMIT = SettingOption("distill.prepare.limit", "Windows in all splits, shared by the decisions; 0 for all.", int)
 
 
 @command(
     "cosfly distill prepare runs/diverse --out dataset", "distill", "seed resume",
-    **choice_of("distill.prepare"), limit=LIMIT,
+    **track_options("distill.prepare"), limit=LIMIT,
 )  # fmt: skip
 def prepare(
     job: Job,
@@ -67,7 +67,7 @@ def train(
         typer.echo(product)
 
 
-ENGINE = Short("distill.infer.engine", "transformers, endpoint (a server) or vllm.", default="transformers")
+ENGINE = SettingOption("distill.infer.engine", "transformers, endpoint (a server) or vllm.", default="transformers")
 INFER = "cosfly distill infer --dataset dataset --model Qwen/Qwen3.5-2B --out predictions"
 
 
@@ -85,7 +85,7 @@ def infer(
     job.run("distill.inference.stage", cfg, dataset, job.trees(data), model, out, adapter=adapter)
 
 
-@command("cosfly distill merge --model models/Qwen3.5-2B --adapter student/adapter --out merged", names="resume")
+@command("cosfly distill merge --model models/Qwen3.5-2B --adapter student/adapter --out merged", common="resume")
 def merge(
     job: Job,
     model: Annotated[Path, Option(help="Folder of the student's base model.")],
@@ -114,7 +114,7 @@ def evaluate(
     job.run("distill.evaluation.stage", job.cfg.distill.evaluate, predictions, dataset, out, **more)
 
 
-@command("cosfly distill report evaluation-2B evaluation-4B --out report", names="seed resume")
+@command("cosfly distill report evaluation-2B evaluation-4B --out report", common="seed resume")
 def report(
     job: Job,
     evaluations: Annotated[list[Path], Argument(help="Output directories of `distill evaluate`, one per student.")],
@@ -131,9 +131,9 @@ FLOWN = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR; baselines: track_
     "cosfly fly --map maps/boxes_3d.json --paths pedestrians/path.json --student rules --out flown",
     "fly plan render caption distill",
     STAGE,
-    student=Short("fly.student", FLOWN, default="rules"),
-    as_student=Short("fly.as_student", "Folder of `distill train` or `merge`: the model behind a URL.", Path),
-    adapter=Short("fly.adapter", "Adapter of transformers:MODEL_DIR.", Path),
+    student=SettingOption("fly.student", FLOWN, default="rules"),
+    as_student=SettingOption("fly.as_student", "Folder of `distill train` or `merge`: the model behind a URL.", Path),
+    adapter=SettingOption("fly.adapter", "Adapter of transformers:MODEL_DIR.", Path),
 )
 def fly(
     job: Job,
@@ -150,7 +150,7 @@ def fly(
     from cosfly.closed_loop.stage import ClosedLoopConfig
 
     cfg = job.cfg
-    if policy and (cfg.fly.student != "rules" or "fly.student" in job.given):
+    if policy and (cfg.fly.student != "rules" or "fly.student" in job.set_by_options):
         raise typer.BadParameter("give either --policy or --student")
     flown = cfg.fly.model_copy(update={"student": f"policy:{policy}"}) if policy else cfg.fly
     run = ClosedLoopConfig(fly=flown, plan=cfg.plan, render=cfg.render, caption=cfg.caption, infer=cfg.distill.infer)
@@ -170,7 +170,7 @@ def fly(
         job.run("cosfly.closed_loop.stage", run, map_, simplified or map_, paths, out, others=others)
 
 
-@command("cosfly leaderboard rules=flown0 student=flown1 --out board", names="seed resume")
+@command("cosfly leaderboard rules=flown0 student=flown1 --out board", common="seed resume")
 def leaderboard(
     job: Job,
     folders: Annotated[list[str], Argument(metavar="[NAME=]DIR...", help="Outputs of `cosfly fly`, by student.")],

@@ -1,4 +1,4 @@
-"""Shared parts of the commands: `command`, which adds common options and resolves settings; option types; tables."""
+"""What the commands share: `command` adds a command with its common options and resolves its settings; tables."""
 
 from __future__ import annotations
 
@@ -40,18 +40,22 @@ def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> Parame
     return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option])
 
 
-class Short(NamedTuple):
-    """An option that sets a setting. words: word of the option -> value of the setting; None: the value itself."""
+class SettingOption(NamedTuple):
+    """An option that sets a setting.
+
+    values: text of the option -> value of the setting; other texts are the value themselves. default: shown in the
+    help.
+    """
 
     setting: str
     help: str
     kind: Any = str
-    words: Mapping[str, Any] = {}
-    default: str | bool = False  # in the help
+    values: Mapping[str, Any] = {}
+    default: str | bool = False
     metavar: str | None = None
 
     def parameter(self, name: str) -> Parameter:
-        names = [f"--{name}"] if self.kind is bool else []
+        names = [f"--{name}"] if self.kind is bool else []  # without --no-NAME
         option = Option(*names, help=self.help, show_default=self.default, metavar=self.metavar)
         return _parameter(name, self.kind | None, option)
 
@@ -60,29 +64,31 @@ GLOB_HELP = "Only tracks whose folder, or one above it, matches: 'Town01/traject
 ENGINE_HELP = "Where workers run: in processes of this machine, or on the nodes of a Ray cluster."
 ADDRESS_HELP = "Head node for --engine ray, or auto; none: $RAY_ADDRESS, or a cluster on this machine."
 RESUME_HELP = "With existing work in the output directory: refuse, or resume if settings and inputs agree."
-SHARED = {
-    "seed": Short("seed", "Seed; every random choice derives from it.", int),
-    "workers": Short("workers", "Worker processes; 0 takes one per core.", int),
-    "engine": Short("engine", ENGINE_HELP, Literal["local", "ray"], default="local"),
-    "address": Short("ray.address", ADDRESS_HELP, metavar="HOST:PORT"),
+COMMON_SETTINGS = {
+    "seed": SettingOption("seed", "Seed; every random choice derives from it.", int),
+    "workers": SettingOption("workers", "Worker processes; 0 takes one per core.", int),
+    "engine": SettingOption("engine", ENGINE_HELP, Literal["local", "ray"], default="local"),
+    "address": SettingOption("ray.address", ADDRESS_HELP, metavar="HOST:PORT"),
 }
-WORKERS = "workers engine address"
-STAGE = f"town seed {WORKERS} resume"  # of a stage that processes items by workers
-PLAIN = [  # options that are no settings
+COMMON_OPTIONS = [  # these set no setting
     _parameter("config", Path | None, Option("--config", "-c", help="YAML file with the settings of a run.")),
     _parameter("overrides", list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Set a setting; repeat it.")),
     _parameter("town", str | None, Option(help="Town of the configuration whose settings and seed are used.")),
     _parameter("resume", Literal["never", "if-same"], Option(help=RESUME_HELP), "if-same"),
 ]
+WORKERS = "workers engine address"
+STAGE = f"town seed {WORKERS} resume"  # common options of a stage whose items workers process
 
 
-def choice_of(section: str, match: str = "flights.match", tracks: str = "flights.tracks") -> dict[str, Short]:
-    """Return the options --flights and --tracks of two settings of a section."""
-    words = {"clean": ["clean"], "perturbed": ["perturbed"], "both": ["clean", "perturbed"]}
+def track_options(
+    section: str, match: str = "flights.match", tracks: str = "flights.tracks"
+) -> dict[str, SettingOption]:
+    """Return the options --flights and --tracks, which set two settings of a section."""
+    values = {"clean": ["clean"], "perturbed": ["perturbed"], "both": ["clean", "perturbed"]}
     kind = Literal["clean", "perturbed", "both"]
     return {
-        "flights": Short(f"{section}.{match}", GLOB_HELP, list[str], metavar="GLOB"),
-        "tracks": Short(f"{section}.{tracks}", "Only this track.", kind, words, "both"),
+        "flights": SettingOption(f"{section}.{match}", GLOB_HELP, list[str], metavar="GLOB"),
+        "tracks": SettingOption(f"{section}.{tracks}", "Only this track.", kind, values, "both"),
     }
 
 
@@ -90,68 +96,87 @@ def choice_of(section: str, match: str = "flights.match", tracks: str = "flights
 class Job:
     """The resolved settings of a command, and how to work.
 
-    overrides: the values of --set. given: settings that an option of the command set.
+    overrides: the values of --set. set_by_options: names of the settings that an option of the command set.
     """
 
     cfg: RunConfig
     overrides: Sequence[str] = ()
     resume: Resume = "if-same"
-    given: Collection[str] = ()
+    set_by_options: Collection[str] = ()
 
-    def call(self, place: str, *arguments: Any, **more: Any) -> Any:
-        """Call a function, `module` for its `run` or `module:function`, with those of the keyword arguments seed,
-        resume, workers and watch that it takes."""
+    def call(self, target: str, *arguments: Any, **keywords: Any) -> Any:
+        """Import a function and call it with the arguments, and with the common arguments that it takes.
+
+        The common arguments are `seed`, `resume`, `workers` and `watch`. The function gets each of them that is in its
+        signature, or all if it takes any keyword; `keywords` replace them. A command imports its stage by this call,
+        so that the help of the command line loads no stage.
+
+        Args:
+            target: `module:function`, or `module` for its `run`.
+        """
         from cosfly.pipeline.command_settings import worker_options
 
-        module, _, name = place.partition(":")
+        module, _, name = target.partition(":")
         function = getattr(importlib.import_module(module), name or "run")
-        taken = signature(function).parameters.values()
-        takes_all = any(one.kind is Parameter.VAR_KEYWORD for one in taken)
-        options = {"seed": self.cfg.seed, "resume": self.resume, **worker_options(self.cfg)}
-        names = options if takes_all else {one.name for one in taken} & options.keys()
-        return function(*arguments, **{name: options[name] for name in names} | more)
+        common = {"seed": self.cfg.seed, "resume": self.resume, **worker_options(self.cfg)}
+        parameters = signature(function).parameters
+        if not any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters.values()):
+            common = {key: value for key, value in common.items() if key in parameters}
+        return function(*arguments, **common | keywords)
 
-    def run(self, module: str, *arguments: Any, **more: Any) -> None:
+    def run(self, target: str, *arguments: Any, **keywords: Any) -> None:
         """Run a stage, whose last argument is its output directory, and finish."""
-        self.finish(self.call(module, *arguments, **more), arguments[-1])
+        self.finish(self.call(target, *arguments, **keywords), arguments[-1])
 
     def tree(self, data: list[Path] | None) -> Path:
-        """Return the one playback tree that is given, or that of the current run directory."""
-        tree, *others = self.trees(data)
-        if others:
-            what, got = "this command takes one playback tree", f"{len(others) + 1}: {', '.join(map(str, data or ()))}"
-            fix = "run it once for each tree; distill and release take the results of several together"
-            raise InputError(what, where="--data", got=got, fix=fix)
-        return tree
+        """Return the one playback tree of --data, or that of the current run directory."""
+        trees = self.trees(data)
+        if len(trees) > 1:
+            raise InputError(
+                "this command takes one playback tree",
+                where="--data",
+                got=f"{len(trees)}: {', '.join(map(str, trees))}",
+                fix="run it once for each tree; distill and release take the results of several together",
+            )
+        return trees[0]
 
     def trees(self, data: list[Path] | None) -> list[Path]:
-        """Return the playback trees that are given, or that of the current run directory."""
+        """Return the playback trees of --data, or that of the current run directory."""
         if data:
             return data
         for candidate in (Path("render"), Path()):
             if (candidate / "manifest.json").exists() and candidate.resolve().name == "render":
                 return [self.cfg.opened(candidate)]
-        got = "no --data, and the current directory is not a run directory"
-        raise InputError("there is no playback tree", where=Path.cwd(), got=got, fix="add --data DIR")
+        raise InputError(
+            "there is no playback tree",
+            where=Path.cwd(),
+            got="no --data, and the current directory is not a run directory",
+            fix="add --data DIR",
+        )
 
     def finish(self, product: Path, out: Path) -> None:
-        """Print a stage's product; raise InputError where too many items failed."""
+        """Print a stage's product; raise InputError if too many items failed."""
         from cosfly.runtime.run_dir import read_manifest
 
         typer.echo(product)
         self.check_failures({out.name: read_manifest(out).counts}, out / "failures.jsonl")
 
     def check_failures(self, counts_by_stage: Mapping[str, Tally], where: Path) -> None:
-        """Raise InputError, after all work is done, where more items failed than the settings accept."""
+        """Raise InputError if more items failed than the settings accept; all work is done before."""
         failed = {stage: dict(counts.failed) for stage, counts in counts_by_stage.items() if counts.failed}
-        if sum(sum(reasons.values()) for reasons in failed.values()) > self.cfg.max_failed:
-            what, expected = "some items failed; the others are done", f"at most {self.cfg.max_failed} (max_failed)"
-            fix = "fix what the records name and run the same command again: only the failed ones are done again"
-            raise InputError(what, where=where, got=str(failed), expected=expected, fix=fix)
+        num_failed = sum(sum(reasons.values()) for reasons in failed.values())
+        if num_failed > self.cfg.max_failed:
+            raise InputError(
+                "some items failed; the others are done",
+                where=where,
+                got=str(failed),
+                expected=f"at most {self.cfg.max_failed} (max_failed)",
+                fix="fix what the records name and run the same command again: only the failed ones are done again",
+            )
 
 
 class _Root(typer.core.TyperGroup):
-    """The root command: explains an invalid value of an option in plain words."""
+    """The root command; it explains an invalid value of an option in plain words."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -167,7 +192,7 @@ class _Root(typer.core.TyperGroup):
 
 
 class StageGroup(typer.core.TyperGroup):
-    """A stage's command with further commands below it, which do not need the stage's own options."""
+    """The command of a stage, with subcommands that do not need the stage's own options."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if args and args[0] in self.commands:
@@ -187,51 +212,57 @@ groups: dict[str, typer.Typer] = {}
 
 
 def add_group(name: str, text: str = "") -> None:
-    """Add a group of commands; one without a text is a command itself, the first that is added."""
-    kind: dict[str, Any] = {"cls": StageGroup, "invoke_without_command": True}
-    groups[name] = typer.Typer(**({"help": text, "no_args_is_help": True} if text else kind))
-    app.add_typer(groups[name], name=name)
+    """Add a group of commands. A group without a help text is a command itself: the first that is added to it."""
+    if text:
+        group = typer.Typer(help=text, no_args_is_help=True)
+    else:
+        group = typer.Typer(cls=StageGroup, invoke_without_command=True)
+    groups[name] = group
+    app.add_typer(group, name=name)
 
 
 Command = Callable[..., None]
 
 
-def command(example: str, sections: str = "", names: str = "", **short: Short) -> Callable[[Command], Command]:
+def command(
+    example: str, sections: str = "", common: str = "", **options: SettingOption
+) -> Callable[[Command], Command]:
     """Add a function as the command of its name, and resolve its settings; the function takes a Job first.
 
-    The command of a group does nothing where a command below it is called.
+    The command of a group does nothing if one of its subcommands is called.
 
     Args:
         example: A command line, with the group's name if the command is in one.
         sections: The sections of the settings that the command uses, separated by blanks; `*` for all.
-        names: Common options, of PLAIN and SHARED, separated by blanks; `config` and `overrides` are always there.
-        short: Further options that set a setting; the function does not get them.
+        common: Names in COMMON_SETTINGS and COMMON_OPTIONS, separated by blanks. Every command has `config` and
+            `overrides`.
+        options: Further options that set a setting; the function does not get them.
     """
-    listed = {"config", "overrides", *names.split()}
+    listed = {"config", "overrides", *common.split()}
 
     def add(function: Command) -> Command:
-        _, *own = signature(function, eval_str=True).parameters.values()
-        taken = [one.name for one in own]
-        shorts = short | {name: one for name, one in SHARED.items() if name in listed and name not in taken}
+        _, *own_parameters = signature(function, eval_str=True).parameters.values()
+        own_names = [parameter.name for parameter in own_parameters]
+        added = listed - {*own_names}  # `config` is an argument of some commands
+        setting_options = options | {name: option for name, option in COMMON_SETTINGS.items() if name in added}
 
         @functools.wraps(function)
-        def called(context: typer.Context, **given: Any) -> None:
+        def called(context: typer.Context, **values: Any) -> None:
             if context.invoked_subcommand is not None:
                 return
-            extra = {}
-            for name, one in shorts.items():
-                if (value := given[name]) not in (None, []):
-                    extra[one.setting] = one.words.get(value, value) if isinstance(value, str) else value
-            cfg = resolve(given["config"], given["overrides"], extra, None if sections == "*" else sections.split())
-            cfg = _town_of(cfg, given["town"]) if "town" in listed else cfg
-            job = Job(cfg, given["overrides"] or (), given.get("resume", "if-same"), extra)
-            function(job, **{name: _opened(cfg, given[name]) for name in taken})
+            settings = _set_by_options(setting_options, values)
+            used = None if sections == "*" else sections.split()
+            cfg = resolve(values["config"], values["overrides"], settings, used)
+            if "town" in listed:
+                cfg = _town_of(cfg, values["town"])
+            job = Job(cfg, values["overrides"] or (), values.get("resume", "if-same"), settings)
+            function(job, **{name: _opened(cfg, values[name]) for name in own_names})
 
         called.__signature__ = Signature([  # type: ignore[attr-defined]
             Parameter("context", Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context),
-            *(one.replace(kind=Parameter.KEYWORD_ONLY) for one in own),
-            *(one.parameter(name) for name, one in shorts.items()),
-            *(one for one in PLAIN if one.name in listed and one.name not in taken),
+            *(parameter.replace(kind=Parameter.KEYWORD_ONLY) for parameter in own_parameters),
+            *(option.parameter(name) for name, option in setting_options.items()),
+            *(parameter for parameter in COMMON_OPTIONS if parameter.name in added),
         ])  # fmt: skip
         called.__annotations__ = {}
         group = groups.get(example.split()[1], app)
@@ -242,39 +273,55 @@ def command(example: str, sections: str = "", names: str = "", **short: Short) -
     return add
 
 
-def _opened(cfg: RunConfig, given: Any) -> Any:
+def _set_by_options(options: Mapping[str, SettingOption], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return setting -> value for the options that the user gave."""
+    settings = {}
+    for name, option in options.items():
+        value = values[name]
+        if value is None or value == []:
+            continue
+        settings[option.setting] = option.values.get(value, value) if isinstance(value, str) else value
+    return settings
+
+
+def _opened(cfg: RunConfig, value: Any) -> Any:
     """Return a path, or a list of paths, whose links are followed if the settings say so."""
-    if isinstance(given, list):
-        return [_opened(cfg, one) for one in given]
-    return cfg.opened(given) if isinstance(given, Path) else given
+    if isinstance(value, list):
+        return [_opened(cfg, item) for item in value]
+    return cfg.opened(value) if isinstance(value, Path) else value
 
 
 def resolve(
     config: Path | None,
     overrides: Sequence[str] | None,
-    given: Mapping[str, Any] = {},
+    settings: Mapping[str, Any] = {},
     sections: Sequence[str] | None = None,
 ) -> RunConfig:
     """Resolve settings: defaults, then the file, then --set, then options.
 
     Args:
-        given: Setting -> value of its option.
+        settings: Setting -> value of its option.
         sections: The sections that the command uses; None for all. The others are neither loaded nor checked.
     """
     from cosfly.pipeline.command_settings import SECTIONS, CommandConfig, config_with
     from cosfly.runtime.config import apply_overrides, build, config_file, read_yaml
     from cosfly.runtime.json_io import dump_json
 
-    # As YAML, which JSON is: a colon in a text is only a colon.
-    extra = [f"{name}={dump_json(str(value) if isinstance(value, Path) else value)}" for name, value in given.items()]
-    assigned, file = [*(overrides or []), *extra], config_file(config)
-    source = " with ".join([*([str(file)] if file else []), *(["--set"] if assigned else [])])
+    assigned = list(overrides or [])
+    for name, value in settings.items():
+        # Values are read as YAML, and JSON is YAML: quoted, a colon in a text is only a colon.
+        assigned.append(f"{name}={dump_json(str(value) if isinstance(value, Path) else value)}")
+    file = config_file(config)
+    sources = [str(file)] if file else []
+    if assigned:
+        sources.append("--set")
+    source = " with ".join(sources)
     data = apply_overrides(read_yaml(file) if file else {}, assigned)
-    known = {*CommandConfig.model_fields, *(sections or ())}
-    names = {word.partition("=")[0].partition(".")[0] for word in assigned}
-    if sections is not None and not data.get("towns") and names <= known:
-        used = {name: value for name, value in data.items() if name in known or name not in SECTIONS}
-        with contextlib.suppress(ConfigError):  # the model of all settings names the nearest one
+    allowed = {*CommandConfig.model_fields, *(sections or ())}
+    assigned_names = {text.partition("=")[0].partition(".")[0] for text in assigned}
+    if sections is not None and not data.get("towns") and assigned_names <= allowed:
+        used = {name: value for name, value in data.items() if name in allowed or name not in SECTIONS}
+        with contextlib.suppress(ConfigError):  # the model of all settings reports it, with the nearest name
             return cast("RunConfig", build(config_with(sections), used, source))
     from cosfly.pipeline.settings import RunConfig
 
@@ -287,8 +334,12 @@ def _town_of(cfg: RunConfig, name: str | None) -> RunConfig:
     if name in cfg.towns:
         return cfg.of_town(name)
     if name is not None:
-        what, expected = f"there is no such town{nearest(name, cfg.towns)}", names or "a configuration with towns"
-        raise ConfigError(what, where="--town", got=name, expected=expected)
+        raise ConfigError(
+            f"there is no such town{nearest(name, cfg.towns)}",
+            where="--town",
+            got=name,
+            expected=names or "a configuration with towns",
+        )
     if cfg.towns:
         log.warning("%s has towns; choose one with --town, of %s: the shared settings are used", cfg.name, names)
     return cfg
@@ -315,7 +366,7 @@ def print_table(
 
     Args:
         head: Names of the columns, or none; `left` and the first column are left-aligned.
-        is_answer: It is the command's answer, on stdout; else it goes to stderr, as log lines do.
+        is_answer: The table is the command's answer, on stdout; else it goes to stderr, as log lines do.
     """
     from rich.table import Table
 
@@ -331,7 +382,7 @@ def print_table(
 
 
 def print_checks(checks: Iterable[Any], title: str | None = None, *, is_answer: bool = False) -> None:
-    """Print checks with name, state and detail; exit with 1 where something required does not work."""
+    """Print checks with name, state and detail; exit with 1 if something required does not work."""
     from rich.text import Text
 
     colors = {"ok": "green", "optional": "yellow", "warning": "yellow", "missing": "red", "unusable": "red"}

@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import WORKERS, Job, Short, choice_of, command
+from cosfly.cli.options import WORKERS, Job, SettingOption, command, track_options
 
 options.add_group("release", "Package captions and frames as a data set that opens with one line.")
 
@@ -18,8 +18,8 @@ options.add_group("release", "Package captions and frames as a data set that ope
     "cosfly release build runs/diverse --out release",
     "release",
     f"{WORKERS} resume",
-    **choice_of("release", "flights", "tracks"),
-    frames=Short("release.num_frames", "Frames per track, or all.", words={"all": None}, metavar="N|all"),
+    **track_options("release", "flights", "tracks"),
+    frames=SettingOption("release.num_frames", "Frames per track, or all.", values={"all": None}, metavar="N|all"),
 )
 def build(
     job: Job,
@@ -37,8 +37,8 @@ def build(
         trees = job.trees(data)
         inspections: list[Path | None] = list(inspected) if inspected else [None for _ in trees]
         if not len(trees) == len(captions or []) == len(inspections):
-            what = "give one --captions and at most one --inspect for each --data, or run directories"
-            raise typer.BadParameter(what)
+            problem = "give one --captions and at most one --inspect for each --data, or run directories"
+            raise typer.BadParameter(problem)
         sources += [Source.of_files(*files) for files in zip(trees, captions or [], inspections, strict=True)]
     job.run("release.package.stage", job.cfg.release, sources, out)
 
@@ -46,7 +46,7 @@ def build(
 LEVELS = "structure: names, sizes, records, card. rows: also every row. pixels: also all files."
 
 
-@command("cosfly release verify release", names=WORKERS)
+@command("cosfly release verify release", common=WORKERS)
 def verify(
     job: Job,
     folder: Annotated[Path, Argument(help="Release, run directory, playback tree, export, or the hub's cache.")],
@@ -84,7 +84,7 @@ Format = Literal["tree", "webdataset", "lerobot", "csv", "jsonl", "sharegpt", "l
 Split = Literal["train", "validation", "test"]
 
 
-@command("cosfly release export release --format webdataset --out shards", names=f"{WORKERS} resume")
+@command("cosfly release export release --format webdataset --out shards", common=f"{WORKERS} resume")
 def export(
     job: Job,
     source: Annotated[Path, Argument(help="Release; for captions also a run directory or captions.jsonl.")],
@@ -99,15 +99,16 @@ def export(
     if format == "tree" or format == "webdataset" or format == "lerobot":
         from release.export.contract import ExportConfig
 
-        return job.run("release.export.stage", ExportConfig(format=format), source, out)
-    from release.columns import LANGUAGES
+        job.run("release.export.stage", ExportConfig(format=format), source, out)
+    else:
+        from release.columns import LANGUAGES
 
-    choice = {"languages": LANGUAGES if language == "both" else [language], "shown": frames, "split": split}
-    tally = job.call("release.export.captions:export", source, out, format, overwrite=overwrite, **choice)
-    typer.echo(f"{out}: {tally}")
+        choice = {"languages": LANGUAGES if language == "both" else [language], "shown": frames, "split": split}
+        tally = job.call("release.export.captions:export", source, out, format, overwrite=overwrite, **choice)
+        typer.echo(f"{out}: {tally}")
 
 
-@command("cosfly view release --out release.html", "inspect", "", **choice_of("inspect"))
+@command("cosfly view release --out release.html", "inspect", "", **track_options("inspect"))
 def view(
     job: Job,
     source: Annotated[Path, Argument(help="Map (a file), playback tree, run directory or release.")],

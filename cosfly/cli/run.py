@@ -35,19 +35,26 @@ def run(
     if dry_run:
         pipeline.check_out(out)
         pipeline.check_with_files(job.cfg)
-        return _print_estimate(job.cfg, out)
-    results = pipeline.run(job.cfg, out, resume=job.resume, until=until)
-    print_run(out)
-    job.check_failures({r.stage.name: r.manifest.counts for r in results}, out)
+        _print_estimate(job.cfg, out)
+    else:
+        results = pipeline.run(job.cfg, out, resume=job.resume, until=until)
+        print_run(out)
+        job.check_failures({result.stage.name: result.manifest.counts for result in results}, out)
 
 
 def _print_estimate(cfg: RunConfig, out: Path) -> None:
     from caption.run.progress import duration
     from cosfly.pipeline import runs
 
-    rows, cells = runs.estimate(cfg, out), []
+    rows = runs.estimate(cfg, out)
+    cells = []
     for row in rows:
-        time = "done" if row.is_done else "unknown" if row.seconds is None else duration(row.seconds)
+        if row.is_done:
+            time = "done"
+        elif row.seconds is None:
+            time = "unknown"
+        else:
+            time = duration(row.seconds)
         cells.append((row.name, row.amount, time, runs.in_words(row.bytes)))
     title = f"What {out} would take; nothing is written"
     options.print_table(("stage", "to do", "time", "disk"), cells, title, is_answer=True)
@@ -68,20 +75,22 @@ def print_run(run: Path, *, with_settings: bool = False) -> None:
     from cosfly.pipeline.settings_guide import changed
     from cosfly.runtime.json_io import dump_json
 
-    seen, rows, total = summarize(run), [], 0
-    for one in seen.stages:
-        seconds, disk = "" if one.seconds is None else f"{one.seconds:.1f}", one.size_bytes
-        rows.append((one.name, one.state, str(one.tally or ""), seconds, size(disk) if disk else ""))
-        total += disk
-    typer.echo(f"{run}: {seen.cfg.name}, {seen.progress} stages complete, {size(total)}{seen.held}")
+    summary = summarize(run)
+    rows = []
+    for stage in summary.stages:
+        seconds = "" if stage.seconds is None else f"{stage.seconds:.1f}"
+        disk = size(stage.size_bytes) if stage.size_bytes else ""
+        rows.append((stage.name, stage.state, str(stage.tally or ""), seconds, disk))
+    total = sum(stage.size_bytes for stage in summary.stages)
+    typer.echo(f"{run}: {summary.cfg.name}, {summary.progress} stages complete, {size(total)}{summary.held}")
     head = ("stage", "state", "items", "seconds", "on disk")
     options.print_table(head, rows, left=("state", "items"), is_answer=True, **PLAIN)
-    differing = changed(seen.cfg) if with_settings else []
+    differing = changed(summary.cfg) if with_settings else []
     lines = ["settings that are not the defaults:"] if differing else []
     lines += [f"  {setting.name} = {dump_json(setting.value)}" for setting in differing]
-    for folder, count in seen.waiting().items():
+    for folder, count in summary.waiting().items():
         lines.append(f"review   {count} tracks wait for a decision: {how_to_decide(Path(os.path.relpath(folder)))}")
-    if not (seen.is_complete or seen.held):
+    if not (summary.is_complete or summary.held):
         lines.append(f"resume   cosfly run {os.path.relpath(run)}")
     if pages := [os.path.relpath(run / name) for name in PAGES if (run / name).exists()]:  # towns have their own
         lines.append(f"open     {', '.join(pages)}")
@@ -95,17 +104,19 @@ def list_runs(root: Annotated[Path, Argument(metavar="[DIR]", help="Folder with 
     from cosfly.pipeline.runs import in_words as size
     from cosfly.runtime.errors import CosflyError
 
-    rows, errors = [], []
+    rows = []
+    errors = []
     for run in find_runs(root):
         try:
-            seen = summarize(run)
+            summary = summarize(run)
         except CosflyError as error:
             errors.append(f"not readable: {error}")
             continue
-        counts = (str(seen.kept(stage) or "") for stage in ("render", "caption"))
-        source = f"{len(seen.cfg.towns)} towns" if seen.cfg.towns else seen.cfg.maps.source
-        state = seen.held.lstrip(", ")
-        rows.append((os.path.relpath(run, root), source, seen.progress, *counts, size(seen.size_bytes), state))
+        counts = (str(summary.kept(stage) or "") for stage in ("render", "caption"))
+        source = f"{len(summary.cfg.towns)} towns" if summary.cfg.towns else summary.cfg.maps.source
+        state = summary.held.lstrip(", ")
+        name = os.path.relpath(run, root)
+        rows.append((name, source, summary.progress, *counts, size(summary.size_bytes), state))
     head = ("run", "map", "stages", "tracks", "captions", "on disk", "")
     if rows:
         options.print_table(head, rows, left=("map", "stages", ""), is_answer=True, **PLAIN)
@@ -230,9 +241,9 @@ def weather(
 
     view = {"frame": frame, "fov_deg": fov}
     with progress_bar("study weather: pictures", len(WEATHERS) * len(TIMES)) as advance:
-        cfg, files = job.cfg.render, (map_, traces, out)
-        product = job.call("cosfly.studies.weather", cfg, *files, **view, advance=lambda: advance(1))
-    for path in product:
+        cfg = job.cfg.render
+        paths = job.call("cosfly.studies.weather", cfg, map_, traces, out, **view, advance=lambda: advance(1))
+    for path in paths:
         typer.echo(path)
 
 

@@ -11,7 +11,7 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import STAGE, WORKERS, Job, Short, choice_of, command, resolve
+from cosfly.cli.options import STAGE, WORKERS, Job, SettingOption, command, resolve, track_options
 
 for stage in ("maps", "plan", "inspect"):
     options.add_group(stage)
@@ -20,17 +20,17 @@ options.add_group("roi", "Draw the region of interest for pedestrians.")
 Paths = Annotated[Path, Option(help="Pedestrian trajectories: path.json.")]
 PathsArgument = Annotated[Path, Argument(metavar="PATHS", help="Pedestrian trajectories: path.json.")]
 Planners = Annotated[list[str] | None, Option("--planner", show_default="all", help="Planner to compare; repeat it.")]
-SOURCE = Short("maps.source", "synthetic, simworld, cityjson, boxes, carla or unrealcv.")
-ROI = Short("roi", "Region of interest: roi_polygon.json.", Path)
-BACKEND = Short("render.backend", "Renderer: gl, pyrender, carla or unrealcv.")
+SOURCE = SettingOption("maps.source", "synthetic, simworld, cityjson, boxes, carla or unrealcv.")
+ROI = SettingOption("roi", "Region of interest: roi_polygon.json.", Path)
+BACKEND = SettingOption("render.backend", "Renderer: gl, pyrender, carla or unrealcv.")
 
 
 @command(
     'cosfly world "a small village by a river" --out village',
     "world",
     f"seed {WORKERS} resume",
-    planner=Short("world.planner", "Language model that plans the world; none: embedded rules.", metavar="URL"),
-    model=Short("world.model", "Name of the language model."),
+    planner=SettingOption("world.planner", "Language model that plans the world; none: embedded rules.", metavar="URL"),
+    model=SettingOption("world.model", "Name of the language model."),
 )
 def world(
     job: Job,
@@ -42,8 +42,8 @@ def world(
     """Make a world from text: SimWorld's combined_world.json of the town that a prompt describes."""
     from cosfly.runtime.config import build
 
-    words = "-".join(re.findall(r"[a-z0-9]+", prompt.lower())[:5]) or "world"
-    out = out or Path("worlds") / f"{words[:40]}-{time.strftime('%Y%m%d-%H%M%S')}"
+    name = "-".join(re.findall(r"[a-z0-9]+", prompt.lower())[:5]) or "world"
+    out = out or Path("worlds") / f"{name[:40]}-{time.strftime('%Y%m%d-%H%M%S')}"
     cfg = build(type(job.cfg.world), job.cfg.world.model_dump() | {"prompt": prompt}, "world")
     folders = [out] if count == 1 else [out / f"world_{number:03}" for number in range(count)]
     seeds = range(job.cfg.seed, job.cfg.seed + count)
@@ -61,11 +61,18 @@ def _make_data_set(job: Job, folder: Path, seed: int) -> None:
     from cosfly.pipeline import run as pipeline
     from cosfly.worldgen.stage import LOOP_FILE
 
-    out, roi, own = folder / "run", folder / "run/roi_polygon.json", job.cfg
-    given = {"workers": own.workers, "engine": own.engine, "ray.address": own.ray.address, "seed": seed, "roi": roi}
-    cfg = resolve(folder / LOOP_FILE, job.overrides, given)
-    for first in pipeline.stages(cfg, out)[:2]:
-        first.work()
+    out = folder / "run"
+    roi = out / "roi_polygon.json"
+    settings = {
+        "workers": job.cfg.workers,
+        "engine": job.cfg.engine,
+        "ray.address": job.cfg.ray.address,
+        "seed": seed,
+        "roi": roi,
+    }
+    cfg = resolve(folder / LOOP_FILE, job.overrides, settings)
+    for stage in pipeline.stages(cfg, out)[:2]:  # maps and simplify, which the region needs
+        stage.work()
     if not roi.exists():
         run_propose(out / "simplify/step2_simplified.json", cfg.pedestrians, roi)
     pipeline.run(cfg, out)
@@ -171,11 +178,11 @@ def benchmark(
 
     cfg = _comparison(job, benchmark.BenchmarkConfig, planner)
     product = job.call("cosfly.planners.benchmark", cfg, map_, paths, out)
-    found = read_object(product, what=benchmark.FORMAT.what)
-    table = next(benchmark.text_tables(found))
+    report = read_object(product, what=benchmark.FORMAT.what)
+    table = next(benchmark.text_tables(report))
     head, *rows = [[row[k] for k in (0, 1, 5, 6, 7)] for row in (table.columns, *table.rows)]  # fits eighty columns
     options.print_table(head, rows, table.title)
-    for name, note in found["notes"].items():
+    for name, note in report["notes"].items():
         console.print(f"{title_of(name)}: {note}")
     console.print(f"all tables: {out / 'benchmark.md'}")
     typer.echo(product)
@@ -186,18 +193,24 @@ def benchmark(
     "render",
     STAGE,
     backend=BACKEND,
-    weather_mode=Short("render.weather_mode", "How weather is chosen."),
-    weather_name=Short("render.weather_name", "Weather of mode fixed, such as heavy_rain."),
-    tod_name=Short("render.tod_name", "Time of day of mode fixed, such as night."),
-    weather_pool=Short("render.weather_pool", "YAML file with your own weather presets.", Path),
-    tod_pool=Short("render.tod_pool", "YAML file with your own times of day.", Path),
-    weather_seed=Short("render.weather_seed", "Seed of the weather; a negative one is replaced by a new seed.", int),
-    path_index=Short("render.path_index", "Index of one trajectory of the traces, or all.", words={"all": None}),
-    cvip=Short("render.unrealcv.host", "UnrealCV: host."),
-    cvport=Short("render.unrealcv.port", "UnrealCV: port.", int),
-    settle_delay=Short("render.unrealcv.settle_delay_s", "UnrealCV: seconds from a pose to its pictures.", float),
-    coord_scale=Short("render.unrealcv.coord_scale", "UnrealCV: its units per metre.", float),
-    coord_z_offset=Short("render.unrealcv.coord_z_offset", "UnrealCV: metres added to heights.", float),
+    weather_mode=SettingOption("render.weather_mode", "How weather is chosen."),
+    weather_name=SettingOption("render.weather_name", "Weather of mode fixed, such as heavy_rain."),
+    tod_name=SettingOption("render.tod_name", "Time of day of mode fixed, such as night."),
+    weather_pool=SettingOption("render.weather_pool", "YAML file with your own weather presets.", Path),
+    tod_pool=SettingOption("render.tod_pool", "YAML file with your own times of day.", Path),
+    weather_seed=SettingOption(
+        "render.weather_seed", "Seed of the weather; a negative one is replaced by a new seed.", int
+    ),
+    path_index=SettingOption(
+        "render.path_index", "Index of one trajectory of the traces, or all.", values={"all": None}
+    ),
+    cvip=SettingOption("render.unrealcv.host", "UnrealCV: host."),
+    cvport=SettingOption("render.unrealcv.port", "UnrealCV: port.", int),
+    settle_delay=SettingOption(
+        "render.unrealcv.settle_delay_s", "UnrealCV: seconds from a pose to its pictures.", float
+    ),
+    coord_scale=SettingOption("render.unrealcv.coord_scale", "UnrealCV: its units per metre.", float),
+    coord_z_offset=SettingOption("render.unrealcv.coord_z_offset", "UnrealCV: metres added to heights.", float),
 )
 def render(
     job: Job,
@@ -232,7 +245,7 @@ def render(
     "cosfly inspect --map step2_simplified.json --traces drone_trace.json --out inspect",
     "inspect",
     f"town {WORKERS} resume",
-    **choice_of("inspect"),
+    **track_options("inspect"),
 )
 def inspect(
     job: Job,
