@@ -300,12 +300,9 @@ def _ids_in_pictures(server: CarlaConnection, box_map: BoxMap, num_others: int) 
             num_doubtful += actor_of_key[key] != actor
     where = f"{server.endpoint} (CARLA {server.version}), {server.town}"
     if not num_found:
-        raise InputError(
-            "no box of the map is in the town that the server has loaded",
-            where=where,
-            got=box_map.name,
-            fix="export the map from this town (cosfly maps --source carla), or name its town in render.carla.town",
-        )
+        what = "no box of the map is in the town that the server has loaded"
+        fix = "export the map from this town (cosfly maps --source carla), or name its town in render.carla.town"
+        raise InputError(what, where=where, got=box_map.name, fix=fix)
     if num_found < len(box_map) or num_doubtful:
         what = "%s: %d of %d boxes have an id in pictures; %d of those share 16 bits with another"
         log.warning(what, where, num_found, len(box_map), num_doubtful)

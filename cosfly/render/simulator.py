@@ -20,7 +20,7 @@ from cosfly.simulators.guard import EngineGuard
 
 log = logging.getLogger(__name__)
 
-TRIES = 3  # of a frame
+TRIES = 3  # to draw a frame
 WALK_MPS = 1.4  # walking speed at full swing
 FIX = "read the server's log, then run the same command again: finished trajectories are kept"
 Body = PosedPerson | PosedCar
@@ -86,7 +86,8 @@ class SimulatorRenderer(ABC):
             what = "the simulator has no such lens"
             expected = "square pixels and the principal point in the middle"
             raise RenderError(what, where=self.device, got=str(intrinsic.tolist()), expected=expected)
-        bodies = ({} if person is None else {PERSON_ID: person}) | {one.instance_id: one.body for one in others}
+        bodies: dict[int, Body] = {} if person is None else {PERSON_ID: person}
+        bodies |= {other.instance_id: other.body for other in others}
         problem: Exception | None = None
         for attempt in range(1, TRIES + 1):
             try:
@@ -105,11 +106,11 @@ class SimulatorRenderer(ABC):
 
 
 def placement_of(body: Body, lead_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return where to put a body that is in its place `lead_s` seconds later.
+    """Return where to put a body so that it reaches its place `lead_s` seconds later.
 
     Returns:
-        position, (3,) m, a person's hip or a car's bottom; rotation, (3,) degrees; (3,) unit vector ahead; walking
-        speed, m/s, 0 of a car.
+        Position, (3,) m, of a person's hip or a car's bottom; rotation, (3,) degrees; unit vector ahead, (3,); walking
+        speed, m/s, 0 for a car.
     """
     turn_deg = np.array([0.0, np.degrees(body.heading_rad), 0.0])
     ahead = np.array([np.cos(body.heading_rad), np.sin(body.heading_rad), 0.0])

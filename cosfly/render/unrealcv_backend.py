@@ -1,6 +1,9 @@
-"""Rendering by a running UnrealCV server, as SimWorld's: it draws its own level and people, and this module decodes
-(app:simworld, step 6). The colour of a pixel in the object mask identifies its object, and the object's name its box.
-If lengths were not converted, the camera would be at ground level: so the level is compared with the map."""
+"""Rendering by a running UnrealCV server, such as SimWorld's (app:simworld, step 6).
+
+The server draws its own level and people; this module decodes its pictures. The colour of a pixel in the object mask
+identifies an object, and the object's name identifies its box. The level is compared with the map, because with another
+scale the camera would be at a wrong place.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,8 @@ from cosfly.simulators.unrealcv_client import OURS, NoAnswerError, UnrealCvConfi
 log = logging.getLogger(__name__)
 
 MOST_CHECKED = 200  # objects that are compared with the map
-SAME_BOX_M, SAME_PLACE_M = 1.0, 0.1
+SAME_BOX_M = 1.0  # largest median distance of objects from their boxes
+SAME_PLACE_M = 0.1  # largest distance of the camera from where it was put
 COLORS = 1 << 24
 
 
@@ -46,7 +50,7 @@ class UnrealCvRenderConfig(UnrealCvConfig, ServerCommand):
 
 
 class UnrealCvRenderer(SimulatorRenderer):
-    """A renderer by an UnrealCV server whose level is the map's."""
+    """A renderer that uses an UnrealCV server with the level of the map."""
 
     engine = "unrealcv"
     _guard: EngineGuard | None = None
@@ -72,18 +76,18 @@ class UnrealCvRenderer(SimulatorRenderer):
             raise
 
     def _begin(self, is_first: bool) -> None:
-        """Read what the level holds; note at first for the guard how the camera was found."""
+        """Read the objects of the level; at the first connection, send the camera's state to the guard."""
         self.device = f"UnrealCV {self._server.version} at {self._server.endpoint}, {self._server.level}"
         self._spawned: dict[int, str] = {}
         self._fov_deg = 0.0
         if is_first and self._guard is not None:
             asked = [f"{self._camera}/{what}" for what in ("size", "fov", "pose")]
-            found = zip(asked, self._server.ask(*(f"vget {name}" for name in asked)), strict=True)
-            self._guard.note([f"vset {name} {text!s}" for name, text in found if not is_refusal(text)])
+            state = zip(asked, self._server.ask(*(f"vget {name}" for name in asked)), strict=True)
+            self._guard.note([f"vset {name} {text!s}" for name, text in state if not is_refusal(text)])
         names = str(*self._server.ask("vget /objects"))
-        left = spawned_by_cosfly(names)  # by a connection that broke
-        self._server.run(*(f"vset /object/{name}/destroy" for name in left))
-        self._link([name for name in names.split() if name not in left])
+        leftover = spawned_by_cosfly(names)  # by a connection that broke
+        self._server.run(*(f"vset /object/{name}/destroy" for name in leftover))
+        self._link([name for name in names.split() if name not in leftover])
         self._server.run(f"vset {self._camera}/size {self._size_px[0]} {self._size_px[1]}")
 
     @property
@@ -114,7 +118,8 @@ class UnrealCvRenderer(SimulatorRenderer):
             self._ids[color] = NO_INSTANCE if row is None else ids[row]
             self._kinds[color] = KINDS[kind_of(class_name) or "Other"] if row is None else self._map.kinds[row]
         if not linked:
-            what, fix = "no box of the map is in the level", "export the level: cosfly maps --source unrealcv"
+            what = "no box of the map is in the level"
+            fix = "export the level: cosfly maps --source unrealcv"
             raise InputError(what, where=self._server.where, got=self._map.name, fix=fix)
         if len(linked) < len(self._map) or num_doubtful:
             what = "%s: %d of %d boxes are objects of the level; %d objects have no colour of their own"
@@ -122,11 +127,11 @@ class UnrealCvRenderer(SimulatorRenderer):
         self._check_scale(linked)
 
     def _check_scale(self, linked: dict[str, int]) -> None:
-        """Compare places of objects with the map's boxes: with another scale the camera would be elsewhere."""
+        """Compare the positions of objects with the map's boxes, to find another scale."""
         names = list(linked)[:: max(1, len(linked) // MOST_CHECKED)]
         answers = self._server.ask(*(f"vget /object/{name}/bounds" for name in names))
-        found = {linked[name]: self._server.numbers(answer, 6) for name, answer in zip(names, answers, strict=True)}
-        middles = {row: np.reshape(bounds, (2, 3)).mean(axis=0) for row, bounds in found.items() if bounds}
+        bounds = {linked[name]: self._server.numbers(answer, 6) for name, answer in zip(names, answers, strict=True)}
+        middles = {row: np.reshape(ends, (2, 3)).mean(axis=0) for row, ends in bounds.items() if ends}
         if not middles:
             return
         raw = np.array([world_pose([*middle, 0.0, 0.0, 0.0])[0] for middle in middles.values()])
@@ -170,8 +175,8 @@ class UnrealCvRenderer(SimulatorRenderer):
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
         """Remove everybody; the level's own weather stays."""
         if weather is not None:
-            what, fix = "the renderer unrealcv draws no weather", "use backend gl or carla"
-            raise RenderError(what, where=self.device, fix=fix)
+            fix = "use backend gl or carla"
+            raise RenderError("the renderer unrealcv draws no weather", where=self.device, fix=fix)
         with self._server.asking("UnrealCV did not remove people"):
             for number in list(self._spawned):
                 self._server.run(self._removal(number))
@@ -211,23 +216,27 @@ class UnrealCvRenderer(SimulatorRenderer):
             both = np.stack([place_m, position_m])
             over_m = both[:, 2] - self._map.ground.height_at(both)
             places = zip(both.round(2).tolist(), over_m, strict=True)
-            got, wanted = (f"{place}, {over:.1f} m over the ground" for place, over in places)
-            fix = "find what moves it, as a pawn's gravity, or use another camera (render.unrealcv.camera)"
+            got, expected = (f"{place}, {over:.1f} m over the ground" for place, over in places)
             what = "the camera is not where it was put"
-            raise RenderError(what, where=self.device, got=got, expected=wanted, fix=fix)
+            fix = "find what moves it, as a pawn's gravity, or use another camera (render.unrealcv.camera)"
+            raise RenderError(what, where=self.device, got=got, expected=expected, fix=fix)
 
     def _decoded(self, lit: str | bytes, mask: str | bytes, depth: str | bytes) -> Frame:
         """Convert a server's pictures to a frame; raise InputError where one is damaged."""
-        shape, pictures = self._size_px[::-1], []
+        shape = self._size_px[::-1]
+        pictures = []
         for name, data in (("lit", lit), ("object_mask", mask)):
             if isinstance(data, str):
                 raise InputError("the server sent no picture", where=name, got=repr(data)[:80])
             pictures.append(parse_picture(data, name, flags=cv2.IMREAD_COLOR))
         raw = parse_array(depth if isinstance(depth, bytes) else depth.encode(), "depth", dtype=np.float32, ndim=2)
-        if sizes := [one.shape[:2] for one in (*pictures, raw) if one.shape[:2] != shape]:
-            raise InputError("a picture has another size", where=self.device, got=str(sizes[0]), expected=str(shape))
+        for picture in (*pictures, raw):
+            if (got := picture.shape[:2]) != shape:
+                raise InputError("a picture has another size", where=self.device, got=str(got), expected=str(shape))
         colors = pictures[1].astype(np.int64) @ [1, 1 << 8, 1 << 16]  # blue, green, red
-        kinds, ids, depth_m = self._kinds[colors], self._ids[colors], raw / np.float32(self._cfg.coord_scale)
+        kinds = self._kinds[colors]
+        ids = self._ids[colors]
+        depth_m = raw / np.float32(self._cfg.coord_scale)
         is_sky = ~(raw < FAR_CM)
         depth_m[depth_m < NEAR_M] = INVALID_DEPTH_M
         depth_m[is_sky] = SKY_DEPTH_M
@@ -238,7 +247,7 @@ class UnrealCvRenderer(SimulatorRenderer):
     # --- people and cars ----------------------------------------------------------------------------------------------
 
     def _placing(self, number: int, body: Body) -> list[str]:
-        """Return the commands that put somebody in their place; a walker starts where the settle delay leads there."""
+        """Return the commands that place a body; a person who walks starts earlier on the way, by the settle delay."""
         name = self._spawned.get(number) or self._spawn(number, body)
         animate = self._cfg.animate
         position_m, turn_deg, _, speed_mps = placement_of(body, self._cfg.settle_delay_s if animate else 0.0)
@@ -250,7 +259,7 @@ class UnrealCvRenderer(SimulatorRenderer):
         return commands
 
     def _spawn(self, number: int, body: Body) -> str:
-        """Spawn somebody in a colour that no object has; return their name."""
+        """Spawn an object for a body, in a colour that no other object has; return its name."""
         name = f"{OURS}{number}"
         is_person = isinstance(body, PosedPerson)
         asset = self._cfg.person_asset if is_person else self._cfg.car_asset
@@ -268,7 +277,9 @@ class UnrealCvRenderer(SimulatorRenderer):
 
 
 def _color_of(answer: str | bytes) -> int | None:
-    """Read `(R=1,G=2,B=3,A=255)`; None is black or no colour."""
-    found = re.match(r"\(R=(\d{1,3}),G=(\d{1,3}),B=(\d{1,3})", answer) if isinstance(answer, str) else None
-    red, green, blue = map(int, found.groups()) if found else (0, 0, 0)
-    return (red << 16 | green << 8 | blue) or None if max(red, green, blue) < 256 else None
+    """Return the colour of an answer `(R=1,G=2,B=3,A=255)`; None if it is black or no colour."""
+    match = re.match(r"\(R=(\d{1,3}),G=(\d{1,3}),B=(\d{1,3})", answer) if isinstance(answer, str) else None
+    red, green, blue = map(int, match.groups()) if match else (0, 0, 0)
+    if max(red, green, blue) > 255:
+        return None
+    return (red << 16 | green << 8 | blue) or None

@@ -1,4 +1,4 @@
-"""Kinds of the assets of a SimWorld city, by name, and of the objects of a level, by class."""
+"""The kinds of a SimWorld city's assets, by name, and of a level's objects, by class."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ from cosfly.runtime.io import sha256_bytes
 
 
 class Asset(NamedTuple):
-    """A family of assets: its kind, and its full size (3,) m if the size table has a placeholder."""
+    """A family of assets.
+
+    Attributes:
+        pattern: Matches the names of the assets.
+        default_size_m: Full size (3,), m, of assets for which the size table holds only a placeholder.
+    """
 
     pattern: str
     kind: str
@@ -40,7 +45,7 @@ ASSETS = (
 )
 
 PEOPLE = ("*User_Agent*", "*Pedestrian*", "*Humanoid*")
-# Classes with bounds that are no part of a town: movers, and objects of the engine itself.
+# Classes of objects that have bounds but do not belong to a town: movers, and objects of the engine.
 NOT_TOWN = (
     *PEOPLE, "*Vehicle*", "*Robot*", "*Volume*", "*Sky*", "*Camera*", "*Pawn*", "*Character*", "*Controller*",
     "*Light", "*Manager*", "*Reflection*", "*Fog*", "*NavMesh*", "*LevelBounds*", "*WorldSettings*", "*Brush*",
@@ -48,19 +53,21 @@ NOT_TOWN = (
 
 
 def asset_of(name: str) -> Asset | None:
-    """Find an asset's entry by its name."""
+    """Return the entry of an asset's name; None if there is none."""
     return next((asset for asset in ASSETS if fnmatchcase(name, asset.pattern)), None)
 
 
 def kind_of(class_name: str) -> str | None:
-    """Return the kind of an object by its class: that of an asset, or the one in its name, as in Buildings_C.
+    """Return the kind of an object by its class: the kind of an asset, or a kind in the name, as in Buildings_C.
 
-    None is no part of a town, or unknown.
+    None means that the object is unknown or does not belong to a town.
     """
     if asset := asset_of(class_name):
         return asset.kind
-    found = re.match(r"(?:BP_)?([A-Za-z]+)", class_name)
-    return found[1] if found and found[1] in KINDS and not is_no_part_of_town(class_name) else None
+    match = re.match(r"(?:BP_)?([A-Za-z]+)", class_name)
+    if match is None or match[1] not in KINDS or is_no_part_of_town(class_name):
+        return None
+    return match[1]
 
 
 def is_no_part_of_town(class_name: str) -> bool:
@@ -69,10 +76,10 @@ def is_no_part_of_town(class_name: str) -> bool:
 
 
 def is_person(path: str) -> bool:
-    """Return whether an asset is a person, by its path."""
+    """Return whether the path of an asset is one of PEOPLE."""
     return any(fnmatchcase(path, pattern) for pattern in PEOPLE)
 
 
 def id_of(name: str) -> int:
-    """Return the id of an object's box: 48 bits of its name's hash, the same for every client of a level."""
+    """Return the id of an object's box: 48 bits of the hash of its name, the same for every client of a level."""
     return int(sha256_bytes(name.encode())[:12], 16)

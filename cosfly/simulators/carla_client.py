@@ -51,11 +51,8 @@ def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:
     try:
         import carla
     except ModuleNotFoundError as error:
-        raise EnvironmentMissing(
-            "the package carla is not installed",
-            got=str(error),
-            fix='pip install "cosfly[carla]", on Linux or Windows with Python 3.11 or 3.12',
-        ) from None
+        fix = 'pip install "cosfly[carla]", on Linux or Windows with Python 3.11 or 3.12'
+        raise EnvironmentMissing("the package carla is not installed", got=str(error), fix=fix) from None
     endpoint = f"{cfg.host}:{port}"
     with _server_errors("no CARLA server answers", endpoint, "unknown"):
         socket.create_connection((cfg.host, port), PROBE_S).close()
@@ -77,12 +74,9 @@ def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:
         towns = sorted({_short(name) for name in client.get_available_maps()})
         if cfg.town is not None and cfg.town != loaded:
             if cfg.town not in towns:
-                raise ConfigError(
-                    f"the server has no such town{nearest(cfg.town, towns)}",
-                    where=f"{endpoint} (CARLA {version})",
-                    got=cfg.town,
-                    expected=", ".join(towns),
-                )
+                what = f"the server has no such town{nearest(cfg.town, towns)}"
+                where = f"{endpoint} (CARLA {version})"
+                raise ConfigError(what, where=where, got=cfg.town, expected=", ".join(towns))
             world = client.load_world(cfg.town)
     return CarlaConnection(carla, client, world, endpoint, version, cfg.town or loaded)
 
@@ -111,9 +105,6 @@ def _server_errors(what: str, endpoint: str, version: str) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, OSError) as error:
-        raise EnvironmentMissing(
-            what,
-            where=f"{endpoint} (CARLA {version})",
-            got=str(error) or type(error).__name__,
-            fix="check that a server runs there (one for each of --workers, ports 10 apart), or raise timeout_s",
-        ) from None
+        fix = "check that a server runs there (one for each of --workers, ports 10 apart), or raise timeout_s"
+        where = f"{endpoint} (CARLA {version})"
+        raise EnvironmentMissing(what, where=where, got=str(error) or type(error).__name__, fix=fix) from None

@@ -44,7 +44,7 @@ class NoAnswerError(Exception):
 
 
 class UnrealCvConnection:
-    """A client of one server, unusable after an error: a late answer would be taken for the next one."""
+    """A client of one server. It is unusable after an error, because a late answer would be read as the next one."""
 
     def __init__(self, cfg: UnrealCvConfig, port: int) -> None:
         self.endpoint = f"{cfg.host}:{port}"
@@ -75,16 +75,17 @@ class UnrealCvConnection:
         """Run commands; raise EnvironmentMissing if the server refuses one."""
         for command, answer in zip(commands, self.ask(*commands), strict=True):
             if is_refusal(answer):
-                what, fix = "the server refuses a command", "use a build of UnrealCV that has it"
-                raise EnvironmentMissing(what, where=self.where, got=f"{command}: {answer!r}", fix=fix)
+                got = f"{command}: {answer!r}"
+                fix = "use a build of UnrealCV that has it"
+                raise EnvironmentMissing("the server refuses a command", where=self.where, got=got, fix=fix)
 
     def numbers(self, answer: str | bytes, num: int) -> tuple[float, ...] | None:
-        """Read finite numbers; None is anything else."""
+        """Return the numbers of an answer; None if it does not hold `num` finite numbers."""
         words = answer.split() if isinstance(answer, str) else []
         with contextlib.suppress(ValueError):
-            found = tuple(map(float, words))
-            if len(found) == num and all(abs(number) < 1e12 for number in found):
-                return found
+            numbers = tuple(map(float, words))
+            if len(numbers) == num and all(abs(number) < 1e12 for number in numbers):
+                return numbers
         return None
 
     def close(self) -> None:
@@ -115,12 +116,16 @@ def connect(cfg: UnrealCvConfig, port: int) -> UnrealCvConnection:
     with _server_errors("no UnrealCV server answers", f"{cfg.host}:{port} (UnrealCV unknown)"):
         connection = UnrealCvConnection(cfg, port)
         version, level = connection.ask("vget /unrealcv/version", "vget /level/name")
-    found = re.match(r"v?(\d+)\.(\d+)(?:\.(\d+))?", str(version))
-    if found is None or tuple(int(part or 0) for part in found.groups()) < LEAST_VERSION:
-        expected = f"{'.'.join(map(str, LEAST_VERSION))} or newer"
-        what, fix = "the UnrealCV server is too old", "run a newer build, as SimWorld ships"
-        raise EnvironmentMissing(what, where=connection.endpoint, got=repr(version)[:80], expected=expected, fix=fix)
-    connection.version = found[0]
+    match = re.match(r"v?(\d+)\.(\d+)(?:\.(\d+))?", str(version))
+    if match is None or tuple(int(part or 0) for part in match.groups()) < LEAST_VERSION:
+        raise EnvironmentMissing(
+            "the UnrealCV server is too old",
+            where=connection.endpoint,
+            got=repr(version)[:80],
+            expected=f"{'.'.join(map(str, LEAST_VERSION))} or newer",
+            fix="run a newer build, as SimWorld ships",
+        )
+    connection.version = match[0]
     connection.level = "" if is_refusal(level) else for_terminal(str(level).strip())
     if cfg.level in (None, connection.level):
         return connection
@@ -159,7 +164,7 @@ def _client(cfg: UnrealCvConfig, port: int) -> Any:
     warnings.filterwarnings("ignore", message="The connected UnrealCV server")
 
     class _Client(unrealcv.Client):
-        ended = ""  # why nothing comes any more
+        ended = ""  # the reason why no more answers come
 
         def receive(self) -> bytes:
             since_s = time.monotonic()
