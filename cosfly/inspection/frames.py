@@ -101,11 +101,11 @@ def _check_header(path: Path, track: Track, where: str, report: Report) -> None:
     is_depth = path.suffix == ".npy"
     expected = f"float32 ({height}, {width})" if is_depth else f"a PNG of {width} x {height} px"
     try:
-        found = str(array_header(path, tree=tree) if is_depth else picture_size(path, tree=tree) or "no PNG header")
+        got = str(array_header(path, tree=tree) if is_depth else picture_size(path, tree=tree) or "no PNG header")
     except InputError as error:
-        found = str(error.got or error.what)
-    if found != (expected if is_depth else str((width, height))):
-        report.error("wrong_format", where, found, expected)
+        got = str(error.got or error.what)
+    if got != (expected if is_depth else str((width, height))):
+        report.error("wrong_format", where, got, expected)
 
 
 def _check_meta(frame: Path, i: int, where: str, report: Report) -> FrameMeta | None:
@@ -151,9 +151,9 @@ def check_recorded(folder: Path, root: Path, recorded: Mapping[str, str], report
 
 
 # --- jumps ------------------------------------------------------------------------------------------------------------
-# Static surfaces are projected from each frame into the next (cosfly/geometry/reprojection.py) and compared by depth and
-# ids, because colours change with light, rain and zoom. A disagreement is a jump: an object vanished, or the camera is
-# not at its recorded pose.
+# Static surfaces are projected from each frame into the next (cosfly/geometry/reprojection.py) and compared by depth
+# and ids, because colours change with light, rain and zoom. A disagreement is a jump: an object vanished, or the camera
+# is not at its recorded pose.
 
 NEAR_FRAMES = 2  # most frames between two compared ones; farther apart, they have too little surface in common
 USUAL_AGREE = 0.8  # share of points that agree in most pairs of a consistent track
@@ -378,15 +378,15 @@ def _check_mask(
             report.error("mask_disagrees", where, got, "pedestrian pixels at the projected target")
         numbers.track_ious.append(0.0)
         return
-    found = mask_box(region) + corner
+    mask_px = mask_box(region) + corner
     # A tolerance of half a pixel at each edge.
-    numbers.track_ious.append(box_iou(np.clip(found, box - 0.5, box + 0.5), found))
+    numbers.track_ious.append(box_iou(np.clip(mask_px, box - 0.5, box + 0.5), mask_px))
     if track.target.mask_bbox is not None:
         recorded = track.target.mask_bbox[i]
         # A pole may cut the target into parts: its box lies between this part and all pedestrian pixels. NaN fails.
-        if not (_encloses(recorded, found) and _encloses(np.array(people), recorded)):
+        if not (_encloses(recorded, mask_px) and _encloses(np.array(people), recorded)):
             place = f"trajectory.json: points[{i}].target.mask_bbox_2d"
-            report.error("mask_disagrees", place, str(recorded.tolist()), f"the box of the pixels, {found.tolist()}")
+            report.error("mask_disagrees", place, str(recorded.tolist()), f"the box of the pixels, {mask_px.tolist()}")
     expected_m = float(track.target.depth_m[i])
     found_m = float(np.median(picture.depth[y0:y1, x0:x1][region]))
     if np.isfinite(expected_m) and abs(found_m - expected_m) > SURFACE_TOLERANCE_M:

@@ -222,10 +222,10 @@ def _plot(name: str, view: TrackView) -> dict[str, Any] | None:
     title, unit, span = PLOTS[name]
     values = view.curves.get(name, [])
     time_s = view.time_s
-    known = [value for value in values if value is not None]
-    if not known:
+    finite = [value for value in values if value is not None]
+    if not finite:
         return None
-    edges = [*known, *(edge for edge in span if edge is not None)]
+    edges = [*finite, *(edge for edge in span if edge is not None)]
     low, high = min(edges), max(edges)
     scale = (PLOT_HEIGHT - 4.0) / ((high - low) or 1.0)
     step = PLOT_WIDTH / ((time_s[-1] - time_s[0]) or 1.0)
@@ -236,6 +236,6 @@ def _plot(name: str, view: TrackView) -> dict[str, Any] | None:
     return {
         "title": title,
         "path": "".join(f"{'M' if before is None else 'L'}{point}" for before, point in points),
-        "found": f"{min(known):.2f} to {max(known):.2f}{unit and f' {unit}'}, mean {float(np.mean(known)):.2f}",
+        "found": f"{min(finite):.2f} to {max(finite):.2f}{unit and f' {unit}'}, mean {float(np.mean(finite)):.2f}",
         "axes": f"{low:.4g} to {high:.4g}; {time_s[0]:g} s to {time_s[-1]:g} s",
     }

@@ -185,15 +185,15 @@ def check_surroundings(
         code = "collision" if gaps_m[i] <= 0 else "clearance"
         where = f"trajectory.json: points[{i}].drone_pose"
         report.error(code, where, f"{gaps_m[i]:.2f} m", f"at least {cfg.clearance_min_m:g} m to every obstacle")
-    known = np.flatnonzero(~np.isnan(track.targets_m).any(axis=1))
-    if not len(known):
+    with_target = np.flatnonzero(~np.isnan(track.targets_m).any(axis=1))
+    if not len(with_target):
         return gaps_m
-    inside, _ = signed_distances(obstacles, track.targets_m[known], 0.0)
-    for i in known[inside < 0]:
+    inside, _ = signed_distances(obstacles, track.targets_m[with_target], 0.0)
+    for i in with_target[inside < 0]:
         where = f"trajectory.json: points[{i}].target.world_location"
         report.error("collision", where, "in an obstacle", "free ground")
-    judged = known[track.keeps_sight[known]]
-    rows = judged if len(judged) else known
+    judged = with_target[track.keeps_sight[with_target]]
+    rows = judged if len(judged) else with_target
     five_ray = float(visibility(obstacles, track.positions_m[rows], track.targets_m[rows]).mean())
     metrics.update(five_ray_mean=five_ray)
     if len(judged) and five_ray < cfg.five_ray_mean_min:
@@ -307,7 +307,7 @@ def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Met
     for name, digest in digests.items():
         advance()
         compare_file(track.folder, name, digest, report)
-    known = target.visibility[~np.isnan(target.visibility)]
+    visibility = target.visibility[~np.isnan(target.visibility)]
     quality = float(np.mean(frames.track_ious)) if frames.track_ious else None
     invalid = max(frames.invalid_depth_shares, default=None)
     heights_px = (target.bbox[:, 3] - target.bbox[:, 1])[target.in_view]
@@ -317,7 +317,7 @@ def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Met
         num_frames_compared=frames.num_compared,
         length_m=length_m(track.positions_m),
         height_mean_m=float(np.nanmean(_heights_m(track))) if not np.isnan(track.targets_m).all() else None,
-        rendered_visibility_mean=float(known.mean()) if len(known) else None,
+        rendered_visibility_mean=float(visibility.mean()) if len(visibility) else None,
         visible_share=float(target.visible.mean()),
         legible_share=None if target.legible is None else float(target.legible.mean()),
         small_share=float((heights_px < LEGIBLE_HEIGHT_PX).mean()) if is_judged else None,

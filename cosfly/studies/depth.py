@@ -1,7 +1,7 @@
 """`cosfly study depth`: ways to store the depth of one frame (tab:depth_format_comparison, fig:depth_comparison).
 
-Integers of 8 to 16 bits share the frame's own range evenly, as in the paper. The reference is what the file holds,
-float64 or float32; of the latter a 32-bit float loses nothing.
+Integers of 8 to 16 bits divide the frame's own range evenly, as in the paper. The reference is the file's float64 or
+float32; a 32-bit float stores the latter without loss.
 """
 
 from __future__ import annotations
@@ -46,20 +46,21 @@ def run(frame: Path, out: Path) -> dict[str, Any]:
         InputError: There is no depth image, its unit is not metres, or it holds fewer than two different depths.
     """
     is_folder = frame.is_dir()
-    file, truth = (frame_path(frame, "depth.npy"), read_depth(frame)) if is_folder else (frame, _read_npy(frame))
+    file = frame_path(frame, "depth.npy") if is_folder else frame
+    truth = read_depth(frame) if is_folder else _read_npy(frame)
     truth = np.where(np.isfinite(truth), truth, truth.dtype.type(INVALID_DEPTH_M))
     measured = (truth != INVALID_DEPTH_M) & (truth != SKY_DEPTH_M)
-    known = truth[measured]
-    if not known.size or known.min() == known.max() or known.min() < 0:
-        got = f"{known.min():g} to {known.max():g} m" if known.size else "no measured pixel"
-        what, expected = "the depth image has too few depths for a study", "at least two, above 0 m"
-        raise InputError(what, where=file, got=got, expected=expected)
+    depths = truth[measured]
+    if not depths.size or depths.min() == depths.max() or depths.min() < 0:
+        got = f"{depths.min():g} to {depths.max():g} m" if depths.size else "no measured pixel"
+        expected = "at least two, above 0 m"
+        raise InputError("the depth image has too few depths for a study", where=file, got=got, expected=expected)
     decoded = {f"{bits}-bit": quantised(truth, measured, bits)[1] for bits in BITS}
     decoded["32-bit float"] = truth.astype(np.float32).astype(np.float64)
     sizes = zip(decoded.items(), (*BITS, 32), strict=True)
     study = {
         "frame": "/".join(file.absolute().parts[-2:]), "width_px": truth.shape[1], "height_px": truth.shape[0],
-        "truth": str(truth.dtype), "min_m": float(known.min()), "max_m": float(known.max()),
+        "truth": str(truth.dtype), "min_m": float(depths.min()), "max_m": float(depths.max()),
         "share_measured": float(measured.mean()),  # of the pixels: neither sky nor invalid
         "rows": [_row(coding, bits, values, truth, measured) for (coding, values), bits in sizes],
     }  # fmt: skip
@@ -75,9 +76,13 @@ def _read_npy(file: Path) -> np.ndarray:
     data = read_bytes(file, what="depth image")
     kind = parse_array_header(memoryview(data), file, what="depth image").dtype
     if kind.kind in "iu":
-        what, expected = "the unit of the depth image is not known", "float32 or float64"
-        fix = 'save metres, for instance np.save("depth.npy", image / 1000.0) for millimetres'
-        raise InputError(what, where=file, got=str(kind), expected=expected, fix=fix)
+        raise InputError(
+            "the unit of the depth image is not known",
+            where=file,
+            got=str(kind),
+            expected="float32 or float64",
+            fix='save metres, for instance np.save("depth.npy", image / 1000.0) for millimetres',
+        )
     dtype = np.float64 if kind == np.float64 else np.float32
     return parse_array(data, file, dtype=dtype, ndim=2, what="depth image")
 
@@ -96,16 +101,15 @@ def quantised(truth: np.ndarray, measured: np.ndarray, bits: int) -> tuple[np.nd
 
 def _row(coding: str, bits: int, values: np.ndarray, truth: np.ndarray, measured: np.ndarray) -> dict[str, Any]:
     """Return the figures of one coding, which decodes to `values`, (h, w) m."""
-    known = truth[measured].astype(np.float64)
-    came_back = values[measured]
-    errors = np.abs(came_back - known)
+    expected = truth[measured].astype(np.float64)
+    decoded = values[measured]
+    errors = np.abs(decoded - expected)
     rmse = float(np.sqrt(np.mean(errors**2)))
-    low = float(known.min())
-    high = float(known.max())
-    counts = np.histogram(came_back, bins=ENTROPY_BINS, range=(low, high))[0]
+    low, high = float(expected.min()), float(expected.max())
+    counts = np.histogram(decoded, bins=ENTROPY_BINS, range=(low, high))[0]
     shares = counts[counts > 0] / counts.sum()
     return {
-        "coding": coding, "unique": len(np.unique(came_back)), "max_cm": float(errors.max()) * CM,
+        "coding": coding, "unique": len(np.unique(decoded)), "max_cm": float(errors.max()) * CM,
         "mean_cm": float(errors.mean()) * CM, "rmse_cm": rmse * CM,
         "psnr_db": 20.0 * float(np.log10((high - low) / rmse)) if rmse else None,
         "entropy_bits": float(-(shares * np.log2(shares)).sum()),
@@ -144,18 +148,17 @@ def draw_study(rgb: np.ndarray, truth: np.ndarray, measured: np.ndarray, decoded
     """
     errors = np.where(measured, np.abs(decoded["8-bit"] - truth), 0.0)
     level = np.round(errors / (errors.max() or 1.0) * 255.0).astype(np.uint8)
-    low = float(truth[measured].min())
-    high = float(truth[measured].max())
+    low, high = float(truth[measured].min()), float(truth[measured].max())
     y = truth.shape[0] // 2
     columns = np.flatnonzero(measured[y])
     profile = np.full((*PANEL_PX[::-1], 3), 255, np.uint8)
-    left = 10
+    name_x = 10
     for name, color in PROFILE_COLORS.items():
         depth = (truth if name == "truth" else decoded[name])[y, columns].astype(np.float64)
         rows = PANEL_PX[1] - 10.0 - (depth - low) / (high - low) * (PANEL_PX[1] - 40.0)
         if len(columns) > 1:
             draw_line(profile, np.stack([columns * PANEL_PX[0] / truth.shape[1], rows], axis=1), color)
-        left = draw_text(profile, name, left, 18, 0.45, color) + 16
+        name_x = draw_text(profile, name, name_x, 18, 0.45, color) + 16
     panels = {
         "(a) colours": rgb,
         f"(b) float32, inferno reversed, to {high:.0f} m": depth_colors(truth.astype(np.float32), high),

@@ -28,8 +28,10 @@ FIGURE = (  # fig:weather_gallery
     ("heavy_rain", "noon"), ("dense_fog", "morning"), ("smog", "dusk"),
     ("overcast", "night"), ("snow_haze", "noon"), ("dust_haze", "morning"),
 )  # fmt: skip
-FIGURE_COLUMNS, FIGURE_TILE_PX, SHEET_TILE_PX = 3, (640, 360), (320, 180)
-STRIP_PX, JPEG_QUALITY = 26, 88
+FIGURE_COLUMNS = 3
+FIGURE_TILE_PX, SHEET_TILE_PX = (640, 360), (320, 180)  # width, height
+STRIP_PX = 26  # height of the names below a picture
+JPEG_QUALITY = 88
 FIGURE_NAME, SHEET_NAME = "weather_gallery.jpg", "weather_sheet.jpg"
 FOV_DEG = 67.38  # 90 degrees at a zoom of 1.5
 
@@ -55,7 +57,8 @@ def run(
     trace = all_traces[trajectory]
     index = int(np.argmax(trace.rotations_deg[:, 0])) if frame is None else frame
     if not 0 <= index < len(trace.time_s):
-        where, expected = f"{traces}: {trace.path_id}", f"0 to {len(trace.time_s) - 1}"
+        expected = f"0 to {len(trace.time_s) - 1}"
+        where = f"{traces}: {trace.path_id}"
         raise InputError("the trajectory has no such frame", where=where, got=index, expected=expected)
     box_map = read_boxes(boxes)
     check_ground(box_map, boxes)

@@ -32,7 +32,7 @@ KERNELS = {"bilinear": cv2.INTER_LINEAR, "bicubic": cv2.INTER_CUBIC}
 MAGNIFICATION = 5.0  # of digital zoom, as in fig:zoom_fidelity
 MOST_SHOWN = 4  # tracks in zoom_levels.png
 TILE_WIDTH_PX, PANEL_WIDTH_PX = 480, 960
-TARGET_COLOR, CROP_COLOR = (255, 214, 10), (255, 40, 40)
+TARGET_COLOR, CROP_COLOR = (255, 214, 10), (255, 40, 40)  # RGB
 
 
 def camera_of(cfg: RenderConfig, fov_deg: float) -> Camera:
@@ -101,19 +101,18 @@ def _level_row(camera: Camera, tracks: list[Track]) -> dict[str, Any]:
         "level": level_name(camera.fov_deg), "fov_deg": round(camera.fov_deg, 6),
         "focal_length_px": round(camera.focal_px, 2), "focal_length_35mm_mm": round(camera.focal_35mm_mm, 2),
         "flights": len(tracks),
-        **{name: sum(one[name] for one in by_flight.values()) for name in ("frames", "frames_visible")},
+        **{name: sum(figures[name] for figures in by_flight.values()) for name in ("frames", "frames_visible")},
     }  # fmt: skip
     for name in FIGURES:
-        known = [one[name] for one in by_flight.values() if one[name] is not None]
-        std = float(np.std(known, ddof=1)) if len(known) > 1 else 0.0
-        mean_std = (round(float(np.mean(known)), 4), round(std, 4)) if known else (None, None)
-        row[name] = dict(zip(("mean", "std"), mean_std, strict=True))
+        row[name] = {"mean": None, "std": None}
+        if means := [figures[name] for figures in by_flight.values() if figures[name] is not None]:
+            std = float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
+            row[name] = {"mean": round(float(np.mean(means)), 4), "std": round(std, 4)}
     return row | {"by_flight": by_flight}
 
 
 def text_table(product: dict[str, Any]) -> TextTable:
     """Return tab:zoom_eval as text."""
-
     rows = []
     for level in product["levels"]:
         digits = [1 if name.endswith("_px") else 3 for name in FIGURES]
@@ -126,7 +125,8 @@ def text_table(product: dict[str, Any]) -> TextTable:
 
 
 def _best_frame(track: Track) -> int:
-    return int(np.argmax(np.nan_to_num(track.target.visibility)))  # which shows most of the target
+    """Return the frame that shows most of the target."""
+    return int(np.argmax(np.nan_to_num(track.target.visibility)))
 
 
 def _draw_levels(levels: dict[float, list[Track]]) -> bytes:
