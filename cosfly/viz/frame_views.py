@@ -25,7 +25,7 @@ VIEW_FILES: dict[View, str] = {
     "segmentation": FILE_NAMES["instance"],
     "middle": FILE_NAMES["rgb"],
 }
-MIDDLE = 3  # one part in so many of the width and of the height of a frame: what `middle` enlarges
+MIDDLE = 3  # `middle` enlarges 1 / MIDDLE of the width and height of a frame
 DEPTH_RANGE_M = 100.0  # dark end of the pseudo-colour; targets are within a third of it
 PEDESTRIAN_RGB = (255, 40, 40)
 NUM_SHADES = 24
@@ -36,9 +36,10 @@ PAGE_JPEG_QUALITY = 72
 class Pictures:
     """The pictures of each frame in a prompt.
 
-    views: in this order; none where no picture is sent. layout: separate is one picture per view, tiled one per frame,
-    the views side by side from left to right. size_px: (width, height) of one view's picture, which pixel values of the
-    prompt and of the answer refer to.
+    Attributes:
+        views: In this order; empty if no picture is sent.
+        size_px: (width, height) of one view's picture. Pixel values of the prompt and of the answer refer to it.
+        layout: separate: one picture per view; tiled: one per frame, with the views from left to right.
     """
 
     views: tuple[View, ...]
@@ -62,20 +63,24 @@ class Pictures:
     def check_size(self, file: Path, found_px: tuple[int, int]) -> None:
         """Check that a file of (width, height) gives pictures of `size_px`."""
         if scaled_size(*found_px, max(self.size_px)) != self.size_px:
-            what, fix = "the picture has another size than the prompt says", "pass the playback tree that was captioned"
-            expected = "{} x {} px, or larger and of this shape".format(*self.size_px)
-            raise InputError(what, where=file, got="{} x {} px".format(*found_px), expected=expected, fix=fix)
+            raise InputError(
+                "the picture has another size than the prompt says",
+                where=file,
+                got="{} x {} px".format(*found_px),
+                expected="{} x {} px, or larger and of this shape".format(*self.size_px),
+                fix="pass the playback tree that was captioned",
+            )
 
     def sentence(self, language: Language) -> str:
         """Return the sentence of a prompt that describes these pictures."""
         count = len(self.views)
         is_tiled = self.layout == "tiled" and len(self.views) > 1
-        form = _SENTENCES[language][3 if is_tiled else min(count, 2)]
+        sentence = _SENTENCES[language][3 if is_tiled else min(count, 2)]
         numbers = {"range": self.depth_range_m, "middle": MIDDLE}
         words = [_DESCRIPTIONS[language][view].format(**numbers) for view in self.views]
         listed = {"en": ", ", "zh": "、"}[language].join(words)
         scale = 2 if "middle" in self.views else int(is_tiled)
-        return form.format(count=count, views=listed) + _SCALE[language][scale].format(*self.size_px)
+        return sentence.format(count=count, views=listed) + _SCALE[language][scale].format(*self.size_px)
 
 
 _DESCRIPTIONS: dict[Language, dict[View, str]] = {
@@ -92,7 +97,7 @@ _DESCRIPTIONS: dict[Language, dict[View, str]] = {
         "middle": "画面中央（宽、高各 1/{middle:d}）的彩色放大图",
     },
 }
-# none; one picture of a frame; several; several in one
+# By number of pictures of a frame: none; one; several; several tiled into one.
 _SENTENCES: dict[Language, tuple[str, str, str, str]] = {
     "en": (
         "No pictures are given.",
@@ -155,9 +160,10 @@ def read_view(
         return depth_colors(_bounded(read_depth(frame), max_side_px, nearest=True), depth_range_m)
     kinds, ids = read_instance(frame)
     with contextlib.suppress(InputError):  # a tree of other software has no annotation
-        others = read_meta(frame).others
-        of_others = [] if others is None else [other.instance_id for other in others.others]  # only the target is red
-        kinds = np.where(np.isin(ids, of_others) & (kinds == KINDS["Pedestrians"]), KINDS["Rider"], kinds)
+        bystanders = read_meta(frame).others
+        bystander_ids = [] if bystanders is None else [other.instance_id for other in bystanders.others]
+        is_other_pedestrian = np.isin(ids, bystander_ids) & (kinds == KINDS["Pedestrians"])
+        kinds = np.where(is_other_pedestrian, KINDS["Rider"], kinds)  # only the target is red
     return segmentation_colors(_bounded(kinds, max_side_px, nearest=True), _bounded(ids, max_side_px, nearest=True))
 
 
@@ -259,7 +265,7 @@ class PagePictures:
             views: Readers of views as (h, w, 3) uint8 RGB; a damaged view is skipped.
         """
         number = self._asked
-        self._asked = self._asked + 1
+        self._asked += 1
         pictures: dict[View, str] = {}
         if number % self._every == 0:
             for view, read in views.items():
@@ -278,6 +284,11 @@ class PagePictures:
 
     def notes(self) -> list[str]:
         """Return notes on frames without pictures."""
-        skipped = f"{self._skipped:,} of {self._asked:,} shown frames have no pictures, to limit the page's size"
-        unreadable = f"of {self._unreadable:,} frames a picture cannot be read"
-        return [skipped] * bool(self._skipped) + [unreadable] * bool(self._unreadable)
+        notes = []
+        if self._skipped:
+            notes.append(
+                f"{self._skipped:,} of {self._asked:,} shown frames have no pictures, to limit the page's size"
+            )
+        if self._unreadable:
+            notes.append(f"of {self._unreadable:,} frames a picture cannot be read")
+        return notes

@@ -25,8 +25,11 @@ from cosfly.viz.topview import add_caption, draw_text
 TILE_PX = (320, 180)
 NUM_RGB_TILES = 4
 MOST_ROWS = 12  # tracks on one sheet
-SHEET_BYTES, GIF_BYTES = 2_000_000, 4_000_000
-GIF_WIDTH_PX, GIF_FRAME_MS = 480, 250  # at the paper's 0.5 s a frame twice as fast as life
+SHEET_BYTES = 2_000_000
+GIF_BYTES = 4_000_000
+GIF_WIDTH_PX = 480
+GIF_FRAME_MS = 250  # twice as fast as the paper's 0.5 s
+MOST_GIF_FRAMES, FEWEST_GIF_FRAMES = 60, 4
 BOX_COLOR = (255, 214, 10)
 
 
@@ -45,15 +48,17 @@ def preview_gif(
 ) -> None:
     """Read a playback tree and write its first clean track as an animation below 4 MB, with the target's box."""
     track, frames = _first_clean(tree, choice, "rgb.png")
-    num, data = 60, b""
-    while not data or (len(data) >= GIF_BYTES and num > 4):
-        num = max(4, int(num * 0.9 * GIF_BYTES / len(data))) if data else num
+    num = MOST_GIF_FRAMES
+    while True:
         data = _gif([_preview(track, frames[i]) for i in spread(len(frames), num)], round(1000 / frames_per_s))
+        if len(data) < GIF_BYTES or num <= FEWEST_GIF_FRAMES:
+            break
+        num = max(FEWEST_GIF_FRAMES, int(num * 0.9 * GIF_BYTES / len(data)))
     write_bytes(out_gif, data)
 
 
 def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map: BoxMap | None = None) -> str:
-    """Read a frame of a playback tree, writes a PNG: colours, depth, instances, and boxes with ids and distances.
+    """Read a frame of a playback tree; write a PNG: colours, depth, instances, and boxes with ids and distances.
 
     Args:
         frame: Its folder, as for `frame_in`; None is the frame of the first clean track that shows most of the target.
@@ -63,15 +68,16 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
         The frame's folder in the tree.
     """
     folder = best_frame(tree, *FRAME_FILES) if frame is None else frame_in(tree, frame)
-    meta, rgb = read_meta(folder), read_rgb(folder)
+    meta = read_meta(folder)
+    rgb = read_rgb(folder)
     if (folder / DEBUG_FILE).exists():
         debug = cv2.cvtColor(read_picture(folder / DEBUG_FILE, tree=tree), cv2.COLOR_BGR2RGB)
     elif box_map is not None:
         ids = read_instance_ids(folder.parents[3]).of_boxes(box_map)
         debug = Overlay(box_map, ids).draw(rgb, read_instance(folder)[1], meta)
     else:
-        expected, fix = "it, or the map", "pass --map boxes_3d.json, or render with --set render.debug=true"
-        raise InputError("the frame has no debug.png", where=folder, expected=expected, fix=fix)
+        fix = "pass --map boxes_3d.json, or render with --set render.debug=true"
+        raise InputError("the frame has no debug.png", where=folder, expected="it, or the map", fix=fix)
     panels = [rgb, read_view(folder, "depth"), read_view(folder, "segmentation"), debug]
     titles = (
         f"RGB, {meta.camera.fov_deg:.0f} deg",
@@ -103,7 +109,7 @@ def best_frame(tree: Path, *names: str) -> Path:
 
 
 def _first_clean(tree: Path, choice: TrackChoice, *names: str) -> tuple[Track, list[int]]:
-    """Return the first clean track of a tree, or else the first, and its frames that have these files."""
+    """Return the first clean track of a tree, or without clean ones the first, and its frames that have these files."""
     folders = find_tracks(tree, choice)
     track = read_track(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
     return track, _frames_with(track, *names)

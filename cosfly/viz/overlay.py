@@ -1,5 +1,8 @@
-"""A frame's labels drawn over its colours: the 3D boxes of map, target and bystanders, with ids and distances
-(`debug.png`), projected again from `meta.json` and the map: a line that does not fit shows an error in one of them."""
+"""A frame's labels drawn over its colours (`debug.png`): the 3D boxes of map, target and bystanders, with ids and
+distances.
+
+The boxes are projected again from `meta.json` and the map, so a line that does not fit reveals an error in either.
+"""
 
 from __future__ import annotations
 
@@ -64,18 +67,18 @@ class Overlay:
 
     def _seen(self, ids: np.ndarray) -> list[_Box]:
         """Return the boxes that cover enough of the picture, without ground, the largest last."""
-        found, counts = np.unique(ids, return_counts=True)
-        pixels = dict(zip(found.tolist(), counts.tolist(), strict=True))
-        seen = np.array([pixels.get(int(one), 0) for one in self.instance_ids.tolist()])
+        drawn_ids, counts = np.unique(ids, return_counts=True)
+        pixels = dict(zip(drawn_ids.tolist(), counts.tolist(), strict=True))
+        seen = np.array([pixels.get(int(number), 0) for number in self.instance_ids.tolist()])
         rows = np.flatnonzero((seen >= LEAST_SHARE * ids.size) & ~self.box_map.is_any_of(GROUND_KINDS))
         rows = rows[np.argsort(seen[rows], kind="stable")]
         turns = rotation_matrices(np.radians(self.box_map.rotations_deg[rows]))
         boxes = []
-        for place, (row, turn) in enumerate(zip(rows.tolist(), turns, strict=True)):
+        for rank, (row, turn) in enumerate(zip(rows.tolist(), turns, strict=True)):
             kind = KIND_NAMES[int(self.box_map.kinds[row])]
             center_m = self.box_map.centers[row]
             corners_m = box_corners(np.zeros(3), self.box_map.half_extents[row]) @ turn.T + center_m
-            label = f"{kind} {self.instance_ids[row]}" if place >= len(rows) - MOST_LABELS else ""
+            label = f"{kind} {self.instance_ids[row]}" if rank >= len(rows) - MOST_LABELS else ""
             color = [round(255 - 0.55 * (255 - value)) for value in COLORS.get(kind, OTHER_COLOR)]  # lighter
             boxes.append(_Box(corners_m, center_m, color, label))
         return boxes
@@ -113,20 +116,18 @@ def _lines(
 
 
 def _write_labels(picture: np.ndarray, labels: list[tuple[str, float, float, Color]], size: float) -> None:
-    """Write texts over places, px, in the picture; later ones have priority, and overlapping ones are skipped."""
+    """Write labels (text, x px, y px, colour). A label that overlaps a later one of the list is skipped."""
     height, width = picture.shape[:2]
     taken: list[tuple[float, float, float, float]] = []
     for text, x, y, color in reversed(labels):
         if not (0 <= x < width and -height / 2 <= y < height):
             continue
         (long, high), _ = cv2.getTextSize(text, FONT, size, 1)
-        left = float(np.clip(x - long / 2, 2, max(2, width - long - 2)))
-        base = float(np.clip(y - 4, high + 2, height - 4))
-        own = left - 2, base - high - 2, left + long + 2, base + 3
-        if any(own[0] < t[2] and t[0] < own[2] and own[1] < t[3] and t[1] < own[3] for t in taken):
+        begin = float(np.clip(x - long / 2, 2, max(2, width - long - 2)))
+        baseline = float(np.clip(y - 4, high + 2, height - 4))
+        x0, y0, x1, y1 = label = begin - 2, baseline - high - 2, begin + long + 2, baseline + 3
+        if any(x0 < t[2] and t[0] < x1 and y0 < t[3] and t[1] < y1 for t in taken):
             continue
-        taken.append(own)
-        corner = (round(own[0]), round(own[1]))
-        other = (round(own[2]), round(own[3]))
-        cv2.rectangle(picture, corner, other, (20, 20, 20), -1)
-        draw_text(picture, text, left, base, size, color)
+        taken.append(label)
+        cv2.rectangle(picture, (round(x0), round(y0)), (round(x1), round(y1)), (20, 20, 20), -1)
+        draw_text(picture, text, begin, baseline, size, color)

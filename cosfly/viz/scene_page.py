@@ -1,5 +1,7 @@
-"""`cosfly view MAP`: a self-contained page of a map in 3D with pedestrian and drone trajectories and frames. Arrays are
-embedded as base64; the page's script draws them (`space.js`, WebGL 2) and plays them back."""
+"""`cosfly view MAP`: a self-contained page of a map in 3D with pedestrian and drone trajectories and frames.
+
+Arrays are embedded as base64; the page's script draws them (`space.js`, WebGL 2) and plays them back.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ MB = 1024 * 1024
 # 1 is opaque.
 OPACITIES = {"Buildings": 0.5, "Vegetation": 0.35, "Walls": 0.6, "Bridge": 0.6}
 LAYER_M = 0.02  # between coplanar surfaces
-MOST_MATRIX_CELLS, MOST_PATHS = 64_000_000, 100
+MOST_MATRIX_CELLS = 64_000_000
+MOST_PATHS = 100
 
 
 @dataclass
@@ -62,8 +65,7 @@ def run(
     picture_px: int = 320,
     max_mb: float = 24.0,
 ) -> Path:
-    """Read a map, pedestrian trajectories, drone trajectories of planners and a playback tree; writes one page and
-    returns its path.
+    """Read a map, pedestrian trajectories, drone trajectories of planners and a playback tree; write one page.
 
     Args:
         picture_px: Width of frames. max_mb: Size of the page; frames are skipped evenly to stay below it.
@@ -75,35 +77,35 @@ def run(
     notes = list[str]()
     pedestrians = [] if paths is None else read_paths(paths)
     tracks = [_of_trace(trace) for path in traces for trace in read_traces(path)]
-    drawn_tracks = [] if data is None else [read_track(place, strict=False) for place in find_tracks(data)]
-    own = [drawn for drawn in drawn_tracks if town_folder(drawn.town) == town_folder(box_map.name)] or drawn_tracks
-    if len(own) < len(drawn_tracks):
-        notes.append(f"{len(drawn_tracks) - len(own):,} tracks are of other towns")
-    tracks += [_of_drawn(drawn) for drawn in own]
+    all_drawn = [] if data is None else [read_track(folder, strict=False) for folder in find_tracks(data)]
+    town_drawn = [drawn for drawn in all_drawn if town_folder(drawn.town) == town_folder(box_map.name)] or all_drawn
+    if len(town_drawn) < len(all_drawn):
+        notes.append(f"{len(all_drawn) - len(town_drawn):,} tracks are of other towns")
+    tracks += [_of_drawn(drawn) for drawn in town_drawn]
     names = list(dict.fromkeys([path.path_id for path in pedestrians] + [track.path for track in tracks]))
-    known = names[:MOST_PATHS]
+    shown = names[:MOST_PATHS]
     if len(names) > MOST_PATHS:
         notes.append(f"{MOST_PATHS:,} of {len(names):,} paths are shown")
-    tracks = [track for track in tracks if track.path in known]
+    tracks = [track for track in tracks if track.path in shown]
     content: dict[str, Any] = {
         **_boxes(box_map),
         "matrix": _matrix(box_map),
-        "paths": [{"name": for_terminal(name)} for name in known],
+        "paths": [{"name": for_terminal(name)} for name in shown],
         "walks": [
-            {"path": known.index(path.path_id), "rows": _packed(np.column_stack([path.time_s, path.positions_m]))}
+            {"path": shown.index(path.path_id), "rows": _packed(np.column_stack([path.time_s, path.positions_m]))}
             for path in pedestrians
-            if path.path_id in known
+            if path.path_id in shown
         ],
     }
-    left = max_mb * MB - sum(len(str(part)) for part in content.values())
-    left -= sum(60 * track.rows.size for track in tracks)
-    if left < 0:
+    room_bytes = max_mb * MB - sum(len(str(part)) for part in content.values())
+    room_bytes -= sum(60 * track.rows.size for track in tracks)
+    if room_bytes < 0:
         fix = "raise --max-mb, or use a simplified map and fewer paths"
         raise InputError("the page is too large", where=map_, expected=f"at most {max_mb:g} MB", fix=fix)
-    notes += _add_pictures(tracks, left, picture_px)
+    notes += _add_pictures(tracks, room_bytes, picture_px)
     content["tracks"] = [
         {
-            "path": known.index(track.path), "kind": for_terminal(track.kind), "rows": _packed(track.rows),
+            "path": shown.index(track.path), "kind": for_terminal(track.kind), "rows": _packed(track.rows),
             "figures": track.figures, "pictures": track.pictures,
         }
         for track in tracks
@@ -168,7 +170,8 @@ def _matrix(box_map: BoxMap) -> dict[str, Any] | None:
     cells = np.where(grid.occupied[::-1], np.uint8(128), np.uint8(255))
     done, png = cv2.imencode(".png", cells)
     assert done, "OpenCV encodes any 8-bit picture"
-    east, north = grid.x_min_m + grid.size[0] * grid.resolution_m, grid.y_min_m + grid.size[1] * grid.resolution_m
+    east = grid.x_min_m + grid.size[0] * grid.resolution_m
+    north = grid.y_min_m + grid.size[1] * grid.resolution_m
     return {"png": base64.b64encode(png.tobytes()).decode(), "bounds": [grid.x_min_m, grid.y_min_m, east, north]}
 
 
@@ -178,6 +181,6 @@ def _add_pictures(tracks: Sequence[PageTrack], room_bytes: float, picture_px: in
     pictures = PagePictures(room_bytes, sum(len(drawn) for _, drawn in shown), picture_px)
     for track, drawn in shown:
         for index in range(len(drawn)):
-            found = pictures.of_frame({"rgb": partial(read_rgb, drawn.frame_folder(index))})
-            track.pictures |= {index: found["rgb"]} if found else {}
+            if picture := pictures.of_frame({"rgb": partial(read_rgb, drawn.frame_folder(index))}):
+                track.pictures[index] = picture["rgb"]
     return pictures.notes()
