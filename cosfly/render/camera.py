@@ -18,7 +18,7 @@ from cosfly.render.contract import NEAR_M, PERSON_ID, Frame
 from cosfly.runtime.config import Config
 from cosfly.viz.overlay import EDGES
 
-DEPTH_TOLERANCE_M = 0.05  # something this little in front of the target's box does not hide it
+DEPTH_TOLERANCE_M = 0.05  # a surface this little in front of the target's box does not hide it
 NO_IDS = np.empty(0, np.int64)
 RING_LEAST_PX = 4  # around a person, for the contrast of colours
 MOST_SAMPLES = 40_000  # rays through the target's box; more are thinned evenly
@@ -49,7 +49,7 @@ def view_target(target_m: np.ndarray, camera_pose: np.ndarray, camera: Camera) -
     uv, z = project(np.asarray(target_m)[None], camera_pose, camera.intrinsic)
     corners = box_corners(target_m, np.array(PERSON_HALF_EXTENTS_M))
     corners = (corners - camera_pose[:3, 3]) @ camera_pose[:3, :3]
-    seen = [corner for corner in corners if corner[2] >= NEAR_M]  # of the part beyond the near plane
+    seen = [corner for corner in corners if corner[2] >= NEAR_M]  # corners of the part beyond the near plane
     for a, b in EDGES:
         za, zb = corners[a, 2], corners[b, 2]
         if (za < NEAR_M) != (zb < NEAR_M):
@@ -101,7 +101,7 @@ def rendered_visibility(
     if not view.in_view:
         return 0.0, 0.0, 0.0
     x0, y0, x1, y1 = view.box_px
-    # A box that reaches far out of the image needs no ray for every pixel out there.
+    # A box that reaches far beyond the image does not need a ray for each of its pixels.
     stride = max(1.0, float(np.sqrt((x1 - x0) * (y1 - y0) / MOST_SAMPLES)))
     columns = np.arange(np.floor(x0), np.ceil(x1), stride)
     rows = np.arange(np.floor(y0), np.ceil(y1), stride)

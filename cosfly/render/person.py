@@ -40,7 +40,7 @@ def draw_appearance(rng: np.random.Generator) -> Appearance:
 
 
 def look_alike(person: Appearance, rng: np.random.Generator) -> Appearance:
-    """Draw somebody who looks like a person but for one garment or its colour."""
+    """Draw an appearance that differs from a given one in one garment or its colour."""
     slot = _one(rng, tuple(GARMENTS))
     while True:
         other = replace(person, **_worn(rng, slot))
@@ -106,19 +106,20 @@ class DressedBystanders:
 
     def people(self, target: Appearance) -> People:
         """Return the appearance of the target and of every pedestrian."""
-        walking = (number for number, other in enumerate(self.others) if other.kind == "Pedestrians")
-        return People(target, {other_id(number): self.clothes[number].looks for number in walking})
+        pedestrians = (number for number, other in enumerate(self.others) if other.kind == "Pedestrians")
+        return People(target, {other_id(number): self.clothes[number].looks for number in pedestrians})
 
     def posed(self, i: int) -> list[PosedBystander]:
         """Return all bystanders in frame i."""
-        found = []
+        bystanders = []
         for number, other in enumerate(self.others):
-            center_m, half_m = other.centers_m[i], other.build.half_extents_m
+            center_m = other.centers_m[i]
             body: PosedPerson | PosedCar = self.gaits[number].posed(i, center_m, self.clothes[number])
             if other.kind != "Pedestrians":
-                body = PosedCar(center_m, float(other.headings_rad[i]), half_m, float(self.seeds[number]))
-            found.append(PosedBystander(other_id(number), body))
-        return found
+                heading_rad = float(other.headings_rad[i])
+                body = PosedCar(center_m, heading_rad, other.build.half_extents_m, float(self.seeds[number]))
+            bystanders.append(PosedBystander(other_id(number), body))
+        return bystanders
 
     def meta(self, i: int, frame: Frame, hidden_by_others: float, hidden_by_map: float) -> BystandersMeta:
         """Return the annotation of the bystanders in frame i."""
@@ -154,7 +155,7 @@ NO_BYSTANDERS = DressedBystanders([], [], [], np.empty(0))
 def dress_bystanders(
     others: list[Bystander], time_s: np.ndarray, target: Appearance, rng: np.random.Generator
 ) -> DressedBystanders:
-    """Dress the bystanders: hard distractors differ from the target in one garment, everybody in at least one."""
+    """Dress the bystanders: hard distractors differ from the target in one garment, the others in at least one."""
     gaits = [gait_of(other.positions_m, time_s) for other in others]
     clothes = []
     for other in others:
@@ -168,9 +169,10 @@ def dress_bystanders(
 # --- figures ----------------------------------------------------------------------------------------------------------
 
 # A figure of 1.8 m stays within the circle around the target's box (PERSON_HALF_EXTENTS_M), to 3 mm.
-HIP_SWING_RAD, ARM_SWING_RAD, KNEE_BEND_RAD = 0.25, 0.38, 0.65
-HIP_M, KNEE_M, ANKLE_M, SHOULDER_M = 0.93, 0.50, 0.085, 1.45
-SIZES, BREADTHS = {"woman": 0.96, "man": 1.0}, {"woman": 0.84, "man": 1.05}
+HIP_SWING_RAD, ARM_SWING_RAD, KNEE_BEND_RAD = 0.25, 0.38, 0.65  # largest angles of a stride
+HIP_M, KNEE_M, ANKLE_M, SHOULDER_M = 0.93, 0.50, 0.085, 1.45  # heights of joints
+SIZES = {"woman": 0.96, "man": 1.0}
+BREADTHS = {"woman": 0.84, "man": 1.05}
 # Garments that hang open below the waist: low end, high end, radii ahead and aside, m.
 HEMS = {"jacket": (0.82, 1.12, 0.15, 0.19), "coat": (0.46, 1.14, 0.22, 0.235), "skirt": (0.47, 1.04, 0.24, 0.26)}
 

@@ -24,7 +24,8 @@ from cosfly.runtime.errors import EnvironmentMissing, RenderError
 
 SKY_COLOR = np.array([0.52, 0.64, 0.78])  # also the haze's, linear RGB like all colours here
 AMBIENT = 0.45  # share of a surface's colour that the sky lights; the sun adds the rest to what faces it
-PLAIN_COLOR, STEM_COLOR = (0.42, 0.40, 0.37), (0.16, 0.11, 0.075)
+PLAIN_COLOR = (0.42, 0.40, 0.37)  # of kinds without an entry in COLORS
+STEM_COLOR = (0.16, 0.11, 0.075)
 COLORS = {
     "Roads": (0.11, 0.11, 0.115), "Sidewalks": (0.36, 0.345, 0.32), "Buildings": (0.50, 0.38, 0.29),
     "Vegetation": (0.09, 0.165, 0.04), "Terrain": (0.105, 0.14, 0.045), "Ground": (0.24, 0.21, 0.16),
@@ -47,9 +48,9 @@ def _open_screen(width_px: int, height_px: int) -> Any:
 
         screen = pyrender.OffscreenRenderer(width_px, height_px)
     except ModuleNotFoundError as error:
-        what, fix = "the renderer pyrender is not installed", 'pip install "cosfly[pyrender]"'
-        raise EnvironmentMissing(what, got=str(error), fix=fix) from None
-    # PyOpenGL raises its own, an ImportError without libEGL; pyrender's platforms bare assertions.
+        fix = 'pip install "cosfly[pyrender]"'
+        raise EnvironmentMissing("the renderer pyrender is not installed", got=str(error), fix=fix) from None
+    # Without libEGL, PyOpenGL raises errors of its own or an ImportError, and pyrender's platforms bare assertions.
     except Exception as error:
         fix = f"apt-get install {contract.DEBIAN_PACKAGES}"
         raise EnvironmentMissing("no OpenGL without a window (EGL)", got=str(error), fix=fix) from None
@@ -172,7 +173,8 @@ def _all_boxes(
     plants = np.flatnonzero(kinds == KINDS["Vegetation"])
     forms, low[plants] = contract.plants_of(centers[plants], halves[plants], contract.seeds_of(box_map.ids[plants]))
     is_round[plants] = forms >= contract.BUSH
-    middle, radius = (1.0 + low) / 2.0, contract.stem_radius_m(halves)
+    middle = (1.0 + low) / 2.0
+    radius = contract.stem_radius_m(halves)
     crowns = halves * np.column_stack([np.ones((len(low), 2)), (1.0 - low) / 2.0])
     stems = np.column_stack([radius, radius, halves[:, 2] * (1.0 + middle) / 2.0])
     is_box = np.append(~are_solids(box_map), True)
@@ -183,26 +185,28 @@ def _all_boxes(
         (ball, is_box & is_round, crowns, middle, table[kinds]),
         (box, is_box & (low > -1.0), stems, (middle - 1.0) / 2.0, np.tile(STEM_COLOR, (len(low), 1))),
     ]
-    found = []
+    pieces = []
     for mesh, rows, size, lift, paint in solids:  # lift: of the middle over the box's, in half heights
         middles = centers[rows] + turns[rows, :, 2] * (lift * halves[:, 2])[rows, None]
         corners = np.einsum("nij,nvj->nvi", turns[rows], size[rows, None] * mesh.vertices) + middles[:, None]
         repeated = (np.repeat(values[rows], len(mesh.faces), axis=0) for values in (paint, tags))
-        found.append((corners[:, mesh.faces].reshape(-1, 3, 3), *repeated))
+        pieces.append((corners[:, mesh.faces].reshape(-1, 3, 3), *repeated))
     placed = solids_of(box_map)
     paint = np.where(np.isnan(placed.colors), table[kinds][placed.rows], placed.colors)
     for sides in (placed.corners_m, placed.corners_m[:, ::-1]):  # seen from both
-        found.append((sides - origin, paint, tags[placed.rows]))
+        pieces.append((sides - origin, paint, tags[placed.rows]))
     if not box_map.ground.is_flat:
         draped = drape(box_map)  # the last row, BARE_GROUND, is the plane's
-        found.append((draped.corners_m - origin, table[kinds][draped.rows], tags[draped.rows]))
-    triangles, colors, tagged = map(np.concatenate, zip(*found, strict=True))
+        pieces.append((draped.corners_m - origin, table[kinds][draped.rows], tags[draped.rows]))
+    triangles, colors, tagged = map(np.concatenate, zip(*pieces, strict=True))
     return triangles, colors, tagged
 
 
 def _mover(mover: PosedBystander, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return triangles, colours and tags of a person, made of balls, boxes and cylinders, or of a car of two boxes: the
-    body, and a shorter, narrower cabin."""
+    """Return triangles, colours and tags of a bystander.
+
+    A person consists of balls, boxes and cylinders, a car of two boxes: the body, and a shorter, narrower cabin.
+    """
     import trimesh
 
     body = mover.body
@@ -214,14 +218,16 @@ def _mover(mover: PosedBystander, origin: np.ndarray) -> tuple[np.ndarray, np.nd
         figure = figure_of(body)
         solids = zip(figure.shapes, figure.centers_m, figure.turns, figure.half_m, strict=True)
         parts = [(units[shape] * half) @ turn.T + center - origin for shape, center, turn, half in solids]
-        triangles, kind = np.concatenate(parts), KINDS["Pedestrians"]
+        kind = KINDS["Pedestrians"]
+        triangles = np.concatenate(parts)
         paint = np.repeat(figure.colors, [len(part) for part in parts], axis=0)
     else:
         length, width, height = body.half_extents_m
         lower = trimesh.creation.box(extents=(2 * length, 2 * width, height)).apply_translation((0, 0, -height / 2))
         cabin = trimesh.creation.box(extents=(length, 1.6 * width, height))
         cabin.apply_translation((-0.1 * length, 0, height / 2))
-        triangles, kind = np.concatenate([lower.triangles, cabin.triangles]), KINDS["Car"]
+        kind = KINDS["Car"]
+        triangles = np.concatenate([lower.triangles, cabin.triangles])
         triangles = triangles @ rotation_matrix(0.0, body.heading_rad, 0.0).T + body.center_m - origin
         paint = np.tile(CAR_PAINTS[int(body.seed * len(CAR_PAINTS))], (len(triangles), 1))
     tag = _tags(np.array([kind]), np.array([mover.instance_id]), np.array([contract.STANDING_LAYER]))

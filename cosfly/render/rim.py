@@ -1,4 +1,4 @@
-"""The rim: scenery beyond a map instead of an endless lawn: fields, roads, houses and trees that thin out, a skyline.
+"""The rim: scenery around a map in place of an endless lawn. Fields, roads, houses and trees thin out to a skyline.
 
 Rectangles are rows of middle and half sizes along x and y, then the half height; `town`: (2, 2) low and high corner.
 """
@@ -19,19 +19,31 @@ from cosfly.runtime.seeding import rng_for
 
 # Distances from the map's bounds, m.
 REACH_M = FAR_M + 60.0
-SOLIDS_FROM_M, FLIGHTS_TO_M = 80.0, 70.0  # the rest is for the shifts of the perturbed track
-LANES_M, SKYLINE_M = (8.0, 125.0, 330.0), (420.0, 820.0)  # lanes go round the town
-# Longest sides of fields, m: nearer than YARD_M to houses, next to these, and growth per metre of distance.
-YARD_M, PLOT_M, FIELD_M, FIELD_GROWS = 20.0, 30.0, 60.0, 0.25
-ROAD_HALF_M, FLAT_HALF_M, OVERLAP_M = 3.0, 0.25, 0.004  # of fields, so that nothing shows between them
-SUNK_M = 1.0  # solid things begin under the ground, which may slope
-STREETS, APART_M, OUTERMOST_M = 2, 90.0, 40.0  # roads of a side; streets that end so near the outermost end lead out
-HOUSE_EVERY_M, THINS_M = 21.0, 150.0  # along roads; houses are e times fewer so far on
-CLUSTERS, BLOCKS = 6, 12  # of the skyline
+SOLIDS_FROM_M = 80.0  # houses and trees begin here
+FLIGHTS_TO_M = 70.0  # planned trajectories end here; the gap is for the shifts of the perturbed track
+LANES_M = (8.0, 125.0, 330.0)  # lanes around the town
+SKYLINE_M = (420.0, 820.0)  # nearest and farthest groups of the skyline
+
+# Sizes, m.
+YARD_M = 20.0  # within this distance of a house, fields are plots
+PLOT_M = 30.0  # longest side of a plot
+FIELD_M = 60.0  # longest side of the nearest fields
+FIELD_GROWS = 0.25  # growth of that side per metre of distance
+ROAD_HALF_M = 3.0  # half width of a road
+FLAT_HALF_M = 0.25  # half height of roads and fields
+OVERLAP_M = 0.004  # fields overlap by this, so that nothing shows between them
+SUNK_M = 1.0  # solid things begin this far under the ground, which may slope
+STREETS = 2  # most roads that leave the town on one side
+APART_M = 90.0  # least distance between these
+OUTERMOST_M = 40.0  # a street that ends this near the outermost end of all streets continues outwards
+HOUSE_EVERY_M = 21.0  # distance of houses along a road
+THINS_M = 150.0  # each time this far on, houses are e times fewer
+CLUSTERS = 6  # groups of the skyline
+BLOCKS = 12  # blocks in a group
 
 
 def rim_of(box_map: BoxMap, seed: int) -> BoxMap:
-    """Return the boxes beyond a map, with ids that no box of it has: the same for the same map and seed."""
+    """Return the boxes of the rim, with ids that no box of the map has. They depend on map and seed only."""
     from scipy.spatial import cKDTree  # takes half a second to import, as in contract.py
 
     rng = rng_for(seed, "render", f"rim/{box_map.name}")
@@ -42,7 +54,8 @@ def rim_of(box_map: BoxMap, seed: int) -> BoxMap:
     roads = _roads(box_map, town, rng)
     houses = np.concatenate([_houses(roads, town, rng), _skyline(town, rng)])
     rows = np.concatenate([fields, roads, houses, _plants(fields, houses, rng)])
-    num_flat, num_hard = len(fields) + len(roads), len(roads) + len(houses)
+    num_flat = len(fields) + len(roads)
+    num_hard = len(roads) + len(houses)
     kinds = np.full(len(rows), KINDS["Vegetation"])
     kinds[: num_flat + len(houses)] = KINDS["Buildings"]
     kinds[:num_flat] = KINDS["Roads"]
@@ -67,18 +80,22 @@ def check_outside_rim(trace: DroneTrace, box_map: BoxMap) -> None:
     """Raise RenderError if a trajectory comes near the solid things of the rim."""
     town = np.stack([corner[:2] for corner in box_map.bounds()])
     if (away_m := float(_away_m(trace.positions_m[:, :2], town).max())) > FLIGHTS_TO_M:
-        got, fix = f"{away_m:.0f} m beyond the map's bounds", "--set render.rim=false"
-        expected = f"at most {FLIGHTS_TO_M:g} m: houses and trees begin at {SOLIDS_FROM_M:g} m"
-        raise RenderError("the trajectory enters the rim", where=trace.path_id, got=got, expected=expected, fix=fix)
+        raise RenderError(
+            "the trajectory enters the rim",
+            where=trace.path_id,
+            got=f"{away_m:.0f} m beyond the map's bounds",
+            expected=f"at most {FLIGHTS_TO_M:g} m: houses and trees begin at {SOLIDS_FROM_M:g} m",
+            fix="--set render.rim=false",
+        )
 
 
 def _away_m(points: np.ndarray, town: np.ndarray) -> np.ndarray:
-    """Return the distances of places, (n, 2), beyond the bounds, (n,)."""
+    """Return how far places, (n, 2), are beyond the bounds, (n,) m; 0 within them."""
     return np.linalg.norm(np.maximum(np.maximum(town[0] - points, points - town[1]), 0.0), axis=1)
 
 
 def _fields(low: np.ndarray, high: np.ndarray, built: Callable, rng: np.random.Generator) -> np.ndarray:
-    """Cut a rectangle into fields, small ones near houses; `built` finds the nearest house."""
+    """Cut a rectangle into fields, which are small near houses; `built` returns the distance to the nearest house."""
     middle, size = (low + high) / 2.0, high - low
     away = float(built(middle)[0]) - size.max() / 2.0 - YARD_M
     if size.max() < (FIELD_M + FIELD_GROWS * away if away > 0.0 else PLOT_M) * rng.uniform(0.8, 1.6):
@@ -90,7 +107,7 @@ def _fields(low: np.ndarray, high: np.ndarray, built: Callable, rng: np.random.G
 
 
 def _roads(box_map: BoxMap, town: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return lanes around the town, and roads that continue its widest streets outwards, or begin anywhere."""
+    """Return lanes around the town, and roads that continue its widest streets outwards (without streets, any)."""
     streets = box_map.select(box_map.kinds == KINDS["Roads"])
     half = axis_aligned_half_extents(streets.half_extents, streets.rotations_deg)
     roads = []
@@ -118,17 +135,18 @@ def _roads(box_map: BoxMap, town: np.ndarray, rng: np.random.Generator) -> np.nd
 
 def _houses(roads: np.ndarray, town: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return low houses on both sides of roads, fewer far from the town."""
-    found: list[np.ndarray] = []
+    houses: list[np.ndarray] = []
     for road in np.repeat(roads, 2, axis=0):
-        axis, side = int(road[3] > road[2]), (-1.0) ** len(found)
+        axis = int(road[3] > road[2])
+        side = (-1.0) ** len(houses)
         along = np.arange(-road[2 + axis], road[2 + axis], HOUSE_EVERY_M)
         middle = np.tile(road[:2], (len(along), 1))
         middle[:, axis] += along + rng.uniform(0.0, 5.0, len(along))
         middle[:, 1 - axis] += side * rng.uniform(13.0, 17.0, len(along))
         half = rng.uniform([4.0, 4.0, 2.9], [7.0, 6.0, 4.7], (len(along), 3))
         is_built = rng.random(len(along)) < np.exp((SOLIDS_FROM_M - _away_m(middle, town)) / THINS_M)
-        found.append(np.column_stack([middle, half])[is_built])
-    return np.concatenate(found)
+        houses.append(np.column_stack([middle, half])[is_built])
+    return np.concatenate(houses)
 
 
 def _skyline(town: np.ndarray, rng: np.random.Generator) -> np.ndarray:

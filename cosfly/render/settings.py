@@ -91,9 +91,10 @@ class RenderConfig(WeatherConfig):
     @field_validator("fovs_deg")
     @classmethod
     def _fovs_are_possible(cls, fovs: tuple[float, ...]) -> tuple[float, ...]:
-        if wrong := [fov for fov in fovs if not LEAST_FOV_DEG <= fov <= MOST_FOV_DEG]:
-            span = f"(0, 180) degrees, {LEAST_FOV_DEG} to {MOST_FOV_DEG}"
-            raise ValueError(f"every field of view must lie in {span}; got {wrong[0]:g}")
+        for fov in fovs:
+            if not LEAST_FOV_DEG <= fov <= MOST_FOV_DEG:
+                span = f"(0, 180) degrees, {LEAST_FOV_DEG} to {MOST_FOV_DEG}"
+                raise ValueError(f"every field of view must lie in {span}; got {fov:g}")
         return fovs
 
     @model_validator(mode="after")

@@ -172,12 +172,9 @@ def run(
     box_map = read_boxes(boxes)
     inputs |= {f"mesh {name}": path for name, path in box_map.meshes.files().items()}
     if cfg.path_index is not None and cfg.path_index >= (num := len(read_traces(traces))):
-        raise ConfigError(
-            "no trajectory has this index",
-            where="render.path_index",
-            got=cfg.path_index,
-            expected=f"an index below {num}",
-        )
+        expected = f"an index below {num}"
+        where = "render.path_index"
+        raise ConfigError("no trajectory has this index", where=where, got=cfg.path_index, expected=expected)
     stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return out
@@ -319,16 +316,16 @@ def make_worker(cfg: RenderConfig, inputs: Inputs, out: Path, town: str, seed: i
         script = make_track_script(trace, number, track, town, surroundings, cfg, seed, trace_bystanders, weather)
         folder = out / town / script.trajectory / script.variant
         with atomic_folder(folder) as unfinished:
-            made = render_track(renderer, script, unfinished, cfg, overlay)
+            rendered = render_track(renderer, script, unfinished, cfg, overlay)
         result: dict[str, Any] = {
             "folder": str(folder.relative_to(out)),
-            "num_frames": len(made),
-            "fov_deg": round(made.camera.fov_deg, 6),
-            "fovs_deg": None if made.intrinsics is None else [round(fov, 6) for fov in made.fovs_deg],
-            "num_visible": int(made.target.visible.sum()),
-            "mean_visibility": round(float(made.target.visibility.mean()), 6),
-            "num_perturbed": int(made.perturbation.is_perturbed.sum()),
-            "goal": made.raw["goal"]["absent"] if made.goal is None else "told",
+            "num_frames": len(rendered),
+            "fov_deg": round(rendered.camera.fov_deg, 6),
+            "fovs_deg": None if rendered.intrinsics is None else [round(fov, 6) for fov in rendered.fovs_deg],
+            "num_visible": int(rendered.target.visible.sum()),
+            "mean_visibility": round(float(rendered.target.visibility.mean()), 6),
+            "num_perturbed": int(rendered.perturbation.is_perturbed.sum()),
+            "goal": rendered.raw["goal"]["absent"] if rendered.goal is None else "told",
         }
         if weather is not None:
             result |= {"weather": weather.weather_name, "time_of_day": weather.tod_name}

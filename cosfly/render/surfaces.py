@@ -1,5 +1,8 @@
-"""Triangles that all renderers draw instead of boxes, on sloping ground and for meshes; layers, which decide which of
-several surfaces in one place is visible. A surface is its box's outline cut out of the ground's triangles."""
+"""Triangles that all renderers draw instead of boxes, on sloping ground and for meshes.
+
+On sloping ground, a surface is the outline of its box cut out of the ground's triangles. Layers decide which of several
+surfaces at one place is visible.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ class Triangles:
 
     @property
     def normals(self) -> np.ndarray:
-        """Return (k, 3) unit vectors that point up or out; 0 of a triangle without an area."""
+        """Return unit vectors that point up or out, (k, 3); 0 for a triangle without area."""
         normals = np.cross(self.corners_m[:, 1] - self.corners_m[:, 0], self.corners_m[:, 2] - self.corners_m[:, 0])
         return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
@@ -82,7 +85,8 @@ def _cut(triangles: np.ndarray, frame: np.ndarray, half: np.ndarray) -> np.ndarr
     every = np.arange(len(triangles))
     for axis, reach, sign in zip(axes[[0, 0, 1, 1]], half[[0, 0, 1, 1]], (-1.0, 1.0, -1.0, 1.0), strict=True):
         inside = reach - sign * ((corners[..., :2] - frame[:2]) @ axis)  # (n, m) m, negative outside
-        kept, counts = np.zeros((len(corners), corners.shape[1] + 1, 3)), np.zeros(len(corners), dtype=int)
+        kept = np.zeros((len(corners), corners.shape[1] + 1, 3))
+        counts = np.zeros(len(corners), dtype=int)
         for i in range(corners.shape[1]):
             after = np.where(i + 1 < sizes, i + 1, 0)
             here, there = inside[:, i], inside[every, after]
@@ -100,13 +104,12 @@ def _cut(triangles: np.ndarray, frame: np.ndarray, half: np.ndarray) -> np.ndarr
 
 
 # --- layers -----------------------------------------------------------------------------------------------------------
-# Two roads that cross at one height are one plane for a depth buffer: rounding would decide pixel by pixel which of
-# them is visible (Z-fighting). So surfaces that overlap in one layer get tiers in it, as few as suffice.
+# Two roads that cross at one height are one plane for a depth buffer: rounding would decide at each pixel which one is
+# visible (Z-fighting). So surfaces that overlap in one layer get different tiers, as few as possible.
 
 SAME_HEIGHT_M = 0.005  # a layer moves the depth test by 3 mm at 30 m
-EDGE_M = 0.01  # surfaces that share no more than an edge do not fight
-# in a layer, as many as meet at a junction of SimWorld; float32 depth resolves an eighth of a layer at 50 m
-MOST_TIERS = 8
+EDGE_M = 0.01  # surfaces that share only an edge do not fight
+MOST_TIERS = 8  # as at a junction of SimWorld; float32 depth resolves an eighth of a layer at 50 m
 CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
@@ -120,8 +123,10 @@ def layers_of(box_map: BoxMap) -> np.ndarray:
 
 
 def _tiers(box_map: BoxMap, layers: np.ndarray) -> np.ndarray:
-    """Return the tier of each surface, (n,) in [0, 1): the lowest that no earlier one has which overlaps it in the same
-    layer and plane, or the highest."""
+    """Return the tier of each surface, (n,) in [0, 1).
+
+    It is the lowest tier that no earlier surface has which overlaps in the same layer and plane, or else the highest.
+    """
     rows = np.flatnonzero((layers < STANDING_LAYER) & ~box_map.rotations_deg[:, [0, 2]].any(axis=1))
     yaws = np.radians(box_map.rotations_deg[rows, 1])[:, None]
     x, y = np.moveaxis(np.maximum(box_map.half_extents[rows, None, :2] - EDGE_M, 0.0) * CORNERS, 2, 0)
@@ -160,7 +165,10 @@ def are_solids(box_map: BoxMap) -> np.ndarray:
 
 def solids_of(box_map: BoxMap) -> Solids:
     """Place the meshes of a map: each in its box, or once in the world for all boxes that name it."""
-    corners, rows, colors, counts = [np.zeros((0, 3, 3))], [], [np.zeros((0, 3))], []
+    corners = [np.zeros((0, 3, 3))]
+    colors = [np.zeros((0, 3))]
+    rows = []
+    counts = []
     meshes = box_map.meshes.resolved()
     placed = set()
     turns = rotation_matrices(np.radians(box_map.rotations_deg)) if meshes else np.zeros((0, 3, 3))

@@ -42,16 +42,21 @@ ENCODER_THREADS = 2  # of each worker, next to the drawing
 FRAMES_AHEAD = 6  # drawn but not written yet: bounds the memory (about 10 MB each)
 TOUCH_M = 0.01  # a camera this deep in a box still touches it only
 MOST_GOAL_FRAMES = 8  # the first in which the target is legible
-# Two appearances differ to the eye by so many pixels, such a share of a person's, of such a colour difference (CIE76).
-DIFFERENT_PX, DIFFERENT_SHARE, DIFFERENT_CONTRAST = 8, 0.04, 10.0
+# Two appearances differ to the eye if enough pixels of the person differ in colour.
+DIFFERENT_PX = 8  # least number of these pixels
+DIFFERENT_SHARE = 0.04  # least share of the person's pixels
+DIFFERENT_CONTRAST = 10.0  # least difference of a pixel (CIE76)
 
 
 @dataclass(frozen=True)
 class TrackScript:
     """All that one track shows.
 
-    trace: The drawn poses of trajectory `number` of a file. between: Planned poses that are not drawn
-    (`Track.between`). cameras: Of each frame. weather: Instead of `look`.
+    Attributes:
+        trace: The drawn poses of trajectory `number` of a file.
+        between: Planned poses that are not drawn (`Track.between`).
+        cameras: One per frame.
+        weather: Replaces `look`, which is then None.
     """
 
     town: str
@@ -73,24 +78,24 @@ def check_track(trace: DroneTrace, surroundings: Surroundings) -> None:
     """Check that in all frames the camera is outside every obstacle and the person not below the ground."""
     depths_m = -signed_distances(surroundings.obstacles, trace.positions_m, 0.0)[0]
     below_m = np.array([surroundings.below_ground_m(place) for place in trace.targets_m - [0.0, 0.0, TARGET_HEIGHT_M]])
-    plan, walk = "plan again on this map", "generate the pedestrian trajectory again on this map"
+    fix_path = "generate the pedestrian trajectory again on this map"
     for what, deep_m, most_m, expected, fix in (
-        ("a camera is inside a box", depths_m, TOUCH_M, "a camera in the open", plan),
-        ("the target is under the ground", below_m, STEP_UP_M, "feet on the ground", walk),
+        ("a camera is inside a box", depths_m, TOUCH_M, "a camera in the open", "plan again on this map"),
+        ("the target is under the ground", below_m, STEP_UP_M, "feet on the ground", fix_path),
     ):
-        if (wrong := deep_m > most_m).any():
-            i = int(np.argmax(wrong))
-            got = f"{deep_m[i]:.2f} m deep; {np.count_nonzero(wrong)} of {len(wrong)} frames"
+        is_too_deep = deep_m > most_m
+        if is_too_deep.any():
+            i = int(np.argmax(is_too_deep))
+            got = f"{deep_m[i]:.2f} m deep; {np.count_nonzero(is_too_deep)} of {len(is_too_deep)} frames"
             raise RenderError(what, where=f"{trace.path_id}: frame {i}", got=got, expected=expected, fix=fix)
 
 
 def render_track(
     renderer: Renderer, script: TrackScript, folder: Path, cfg: RenderConfig, overlay: Overlay | None = None
 ) -> Track:
-    """Draw a track into an (unfinished) folder: frames, `trajectory.json`, `perturbation_report.json`,
-    `checksums.sha256`.
+    """Draw a track into a folder: frames, `trajectory.json`, `perturbation_report.json`, `checksums.sha256`.
 
-    A shift that hides a target which is visible without it is dropped: only the drawn frame shows that.
+    A shift is dropped if it hides a target that is visible without it, which only the drawn frame shows.
 
     Args:
         overlay: Draws `debug.png`; None writes none.
@@ -98,19 +103,23 @@ def render_track(
     Returns:
         The track as it was written.
     """
-    script = replace(script, perturbed=copy.deepcopy(script.perturbed))  # dropped shifts are noted there
-    perturbed, poses = script.perturbed, script.perturbed.poses
+    script = replace(script, perturbed=copy.deepcopy(script.perturbed))  # dropped shifts change it
+    perturbed = script.perturbed
+    poses = perturbed.poses
     places = np.concatenate([poses.positions_m, poses.targets_m])
     weather = None if script.weather is None else script.weather.params
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M, weather)
     people = script.others.people(script.clothes.looks) if renderer.dresses else None
-    targets, visibility, bystanders = list[TargetMeta](), list[float](), list[dict]()
-    pending, digests = deque[Future](), dict[str, str]()
+    targets = list[TargetMeta]()
+    visibility = list[float]()
+    bystanders = list[dict]()
+    pending = deque[Future]()
+    digests = dict[str, str]()
 
-    def take() -> None:
-        target, made = pending.popleft().result()
+    def collect_oldest() -> None:
+        target, file_digests = pending.popleft().result()
         targets.append(target)
-        digests.update(made)
+        digests.update(file_digests)
 
     with ThreadPoolExecutor(ENCODER_THREADS) as pool:
         for i in range(len(script.trace.time_s)):
@@ -128,9 +137,9 @@ def render_track(
             )
             advance()
             while len(pending) >= FRAMES_AHEAD:
-                take()
+                collect_oldest()
         while pending:
-            take()
+            collect_oldest()
     track = _track(script, targets, np.array(visibility), bystanders)
     track = _with_goal(track, renderer, script, cfg.visible_threshold)
     write_track(folder, track)
@@ -143,13 +152,14 @@ def render_track(
         **{event: dict(sorted(counts.items())) for event, counts in outcomes.items()},
     }
     write_json(folder / "perturbation_report.json", report)
-    made = ["trajectory.json", "perturbation_report.json"]
+    file_names = ["trajectory.json", "perturbation_report.json"]
     if track.goal is not None and "rgb" in cfg.modalities:
-        box, rgb = targets[track.goal.frame].mask_bbox_2d, frames.read_rgb(folder / frames.frame_name(track.goal.frame))
+        box = targets[track.goal.frame].mask_bbox_2d
+        rgb = frames.read_rgb(folder / frames.frame_name(track.goal.frame))
         assert box is not None, "the target is legible there"
         (folder / TARGET_FILE).write_bytes(frames.rgb_bytes(target_picture(rgb, box)))
-        made.append(TARGET_FILE)
-    write_checksums(folder, digests | {name: sha256_file(folder / name) for name in made})
+        file_names.append(TARGET_FILE)
+    write_checksums(folder, digests | {name: sha256_file(folder / name) for name in file_names})
     return track
 
 
@@ -250,7 +260,8 @@ def _track(script: TrackScript, targets: list[TargetMeta], visibility: np.ndarra
     zooms = any(camera is not cameras[0] for camera in cameras)
 
     def column(name: str, num: int = 1) -> np.ndarray:
-        return np.array([[np.nan] * num if (value := getattr(one, name)) is None else value for one in targets])
+        values = [getattr(target, name) for target in targets]
+        return np.array([[np.nan] * num if value is None else value for value in values])
 
     offsets = perturbed.drone_offsets_m, perturbed.rotation_offsets_deg, perturbed.target_offsets_m
     weather = {} if script.weather is None else {"weather": script.weather.model_dump()}
@@ -325,7 +336,8 @@ def find_goal(
         draw: Draws the frame with a target of that appearance. intrinsic: (3, 3) px. rotation: (3, 3), world from
             camera.
     """
-    looks, frame = people.target, draw(people.target)
+    looks = people.target
+    frame = draw(looks)
 
     @cache
     def differs(other: Appearance) -> bool:
@@ -334,8 +346,8 @@ def find_goal(
     def distinguishes(slot: str, other: Appearance) -> bool:
         if slot == "figure":
             return differs(replace(looks, figure=other.figure))
-        kept, worn = ((getattr(one, slot), getattr(one, f"{slot}_color")) for one in (looks, other))
-        if kept[1] and worn[1] and kept[1] != worn[1]:  # the wardrobe's colours differ wherever they are visible
+        color, other_color = (getattr(person, f"{slot}_color") for person in (looks, other))
+        if color and other_color and color != other_color:  # the wardrobe's colours differ wherever they are visible
             other = otherwise(looks, slot)
         return differs(replace(looks, **{name: getattr(other, name) for name in (slot, f"{slot}_color")}))
 
@@ -347,6 +359,6 @@ def find_goal(
 def targets_differ(frame: Frame, other: Frame) -> bool:
     """Return whether the target of two frames that differ in its appearance only looks different to the eye."""
     is_person = (frame.ids == PERSON_ID) | (other.ids == PERSON_ID)
-    colors = [cv2.cvtColor(one.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[is_person] for one in (frame, other)]
-    num_px = np.count_nonzero(np.linalg.norm(colors[0] - colors[1], axis=-1) >= DIFFERENT_CONTRAST)
+    a, b = (cv2.cvtColor(f.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[is_person] for f in (frame, other))
+    num_px = np.count_nonzero(np.linalg.norm(a - b, axis=-1) >= DIFFERENT_CONTRAST)
     return bool(num_px >= max(DIFFERENT_PX, DIFFERENT_SHARE * np.count_nonzero(is_person)))

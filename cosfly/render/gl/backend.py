@@ -1,5 +1,7 @@
-"""The default renderer: OpenGL without a window (EGL), on a GPU or the CPU (llvmpipe), one pass into colour, z-depth in
-metres as float32, and kind + instance id."""
+"""The default renderer: OpenGL without a window (EGL), on a GPU or the CPU (llvmpipe).
+
+One pass draws colour, z-depth (float32, metres) and kind with instance id.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +24,16 @@ from cosfly.render.gl.weather_pass import WeatherPass, defines
 from cosfly.render.person import figure_of
 from cosfly.runtime.worker import return_freed_memory
 
-SHADOW_SIZE_PX, HEIGHT_SIZE_PX = 2560, 768
-AMBIENT_BLUR_M, TALLEST_AMBIENT_M = 5.0, 14.0  # a tower takes no more sky from its foot than a house
-LARGEST_SHADOW_AREA_M = 420.0
+SHADOW_SIZE_PX = 2560  # side of the sun's shadow map
+HEIGHT_SIZE_PX = 768  # side of the height map
+AMBIENT_BLUR_M = 5.0
+TALLEST_AMBIENT_M = 14.0  # a tower hides no more sky from the street than a house of this height
+LARGEST_SHADOW_AREA_M = 420.0  # side
 MAX_BONES = 6
-EDGE_LEVELS, EDGE_BLUR_PX = 5, 0.62
-MESH_STRIDE = 64
-MOVER_M = 4.5  # no part of a person or a car is farther from another one
+EDGE_LEVELS = 5  # larger steps of brightness are smoothed
+EDGE_BLUR_PX = 0.62
+MESH_STRIDE = 64  # more than there are meshes
+MOVER_M = 4.5  # largest distance between two parts of one person or car
 SOFTWARE = "llvmpipe"  # draws on the processor, and interpolates where hardware snaps to a grid (scene.frag.glsl)
 # Triangles that llvmpipe may hold back. It allocates another list of them (36 MB) whenever one is full while the last
 # is still being drawn, and never frees one: without this limit a process grows by a seventh over thousands of frames.
@@ -70,7 +75,8 @@ class GlRenderer:
                 texture.repeat_x = texture.repeat_y = False
             all_meshes = meshes.all_meshes()
             self._meshes = [
-                (context.buffer(one.vertices.tobytes()), context.buffer(one.triangles.tobytes())) for one in all_meshes
+                (context.buffer(mesh.vertices.tobytes()), context.buffer(mesh.triangles.tobytes()))
+                for mesh in all_meshes
             ]
             self._num_triangles = [len(mesh.triangles) for mesh in all_meshes]
             self._num_waiting = 0
@@ -85,11 +91,11 @@ class GlRenderer:
     def _use_weather(self, define: str | None) -> None:
         """Switch to the programs of fair weather (None), or of a weather with these defines."""
         if define not in self._looks:
-            made = programs.programs_of(self.context, define, snaps=not self._is_software)
+            compiled = programs.programs_of(self.context, define, snaps=not self._is_software)
             weather = None
             if define is not None:
-                weather = WeatherPass(self.context, self._color, self._depth, made.rain, self.num_others)
-            self._looks[define] = made, self.context.vertex_array(made.sky, []), weather
+                weather = WeatherPass(self.context, self._color, self._depth, compiled.rain, self.num_others)
+            self._looks[define] = compiled, self.context.vertex_array(compiled.sky, []), weather
         self._programs, self._sky, self._weather = self._looks[define]
 
     def _array(self, program: Any, mesh: int) -> tuple[Any, Any]:
@@ -111,8 +117,8 @@ class GlRenderer:
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
         """Compute sun shadows and sky openness for an area of the world, (3,) corners, and set the weather.
 
-        Each frame tests all parts that a camera within the corners can see, and kilometres from the origin float32
-        resolves a millimetre only: so these parts are selected, and the origin is moved near them.
+        Each frame tests all selected parts, and kilometres from the origin float32 resolves only a millimetre. So the
+        parts that a camera within the corners can see are selected, and the origin is moved near them.
         """
         low_m, high_m = np.asarray(low_m), np.asarray(high_m)
         parts, zero = self.scene.parts, self.scene.origin_m

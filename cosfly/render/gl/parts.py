@@ -1,5 +1,6 @@
-"""Drawable parts, and which of them a camera sees: a part is a unit mesh (meshes.py) with half sizes, a
-rotation, a colour and a material number of the shader. Independent of OpenGL and of the shapes of things (shapes.py).
+"""Drawable parts, and the choice of those that a camera sees, without OpenGL.
+
+A part is a unit mesh (meshes.py) with half sizes, a rotation, a colour and a material number of the shader.
 """
 
 from __future__ import annotations
@@ -24,12 +25,14 @@ DRAW_ORDER = (*(m for m in range(NUM_MATERIALS) if m not in GROUND_MATERIALS), *
 PART = np.dtype(
     [("center", "3f4"), ("half", "3f4"), ("quaternion", "4f4"), ("color", "4f4"), ("tag", "u4"), ("bias", "f4")]
 )
-# A vertex of a triangle that is no instance of a mesh: place and normal as in a mesh, then its part.
+# A vertex of a loose triangle, which belongs to no mesh: position and normal as in a mesh, then the fields of its part.
 LOOSE_VERTEX = np.dtype([("position", "3f4"), ("normal", "3f4"), *((name, PART[name]) for name in PART.names or ())])
 
-BRIGHT = 0.5  # red of a lamp's glass; its housing is darker
-SMALLEST_PX = 0.4  # an object whose radius on the image is below this is not drawn
-FAR_PX, NEVER_PX = 14.0, 1e9  # an object of a smaller radius on the image is drawn in its simple form
+BRIGHT = 0.5  # least red of a lamp's glass; its housing is darker
+# Radii of an object on the image.
+SMALLEST_PX = 0.4  # a smaller object is not drawn
+FAR_PX = 14.0  # a smaller object is drawn in its simple form
+NEVER_PX = 1e9  # no object is as large
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class Parts:
 
     @staticmethod
     def joined(parts: list[Parts]) -> Parts:
-        return Parts(*map(np.concatenate, zip(*(vars(one).values() for one in parts), strict=True)))
+        return Parts(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
     def select(self, keep: np.ndarray) -> Parts:
         return Parts(*(column[keep] for column in vars(self).values()))
@@ -97,9 +100,10 @@ class Boxes:
         return replace(self, **{name: getattr(self, name)[keep] for name in columns})
 
     def lengthwise(self) -> Boxes:
-        """Return the same boxes with x as their longer horizontal axis: turned by 90 degrees where it is not."""
+        """Return the same boxes with x as their longer horizontal axis, turned by 90 degrees if needed."""
         across = self.half[:, 1] > self.half[:, 0]
-        half, turns = self.half.copy(), self.turns.copy()
+        half = self.half.copy()
+        turns = self.turns.copy()
         half[across] = half[across][:, [1, 0, 2]]
         turns[across] = turns[across] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         return replace(self, half=half, turns=turns)
@@ -187,8 +191,11 @@ class CameraView:
         return rows[np.lexsort((away, -parts.records["bias"][rows]))]
 
     def shown(self, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
-        """Return which spheres may be seen, the nearest first; centers (n, 3), radii (n,) float32, from the scene's
-        origin."""
+        """Return the rows of the spheres that may be seen, the nearest first.
+
+        Args:
+            centers: (n, 3), relative to the scene's origin. radii: (n,) float32.
+        """
         least_px, most_px = (np.full(len(radii), size, np.float32) for size in (SMALLEST_PX, np.inf))
         rows, away = self._spheres(centers.astype(np.float32), radii, least_px, most_px)
         return rows[np.argsort(away, kind="stable")]
@@ -196,7 +203,8 @@ class CameraView:
     def _spheres(
         self, centers: np.ndarray, radii: np.ndarray, min_px: np.ndarray, max_px: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        middle, size = self.intrinsic[:2, 2], np.array([self.width_px, self.height_px])
+        middle = self.intrinsic[:2, 2]
+        size = np.array([self.width_px, self.height_px])
         tangents = np.maximum(middle, size - middle) / np.diag(self.intrinsic)[:2]
         eye = self.eye.astype(np.float32)
         turn = np.ascontiguousarray(self.world_from_camera, np.float32)

@@ -23,8 +23,11 @@ from cosfly.render.surfaces import Solids, Triangles, are_solids, drape, is_drap
 # Meshes have walls with storeys and windows, flat roofs, tiles on sloping roofs; plain paint if a file has colours. The
 # shader draws patterns in the axes of a part, so every plane of a building is a part of its own.
 
-STEEP, FLAT = 0.35, 0.94  # how far up the normal of a wall points at most, and of a flat roof at least
-SAME_ANGLE_RAD, SAME_PLACE_M = np.radians(1.0), 0.1  # surfaces as near to one plane as this are one wall
+STEEP = 0.35  # largest z of a wall's normal
+FLAT = 0.94  # least z of a flat roof's normal
+# Surfaces that are this near to one plane are one wall.
+SAME_ANGLE_RAD = np.radians(1.0)
+SAME_PLACE_M = 0.1
 THINNEST_M = 0.01
 
 
@@ -106,7 +109,8 @@ def _planes(
     away = np.round(np.einsum("kj,kj->k", out, solids.corners_m.mean(axis=1)) / SAME_PLACE_M).astype(np.int64)
     level_z = np.round(solids.corners_m[..., 2].mean(axis=1) / SAME_PLACE_M).astype(np.int64)
     key = np.stack([things, 1 + is_wall + 2 * is_flat, around, tilt, away], axis=1)
-    key[is_flat, 2:4], key[is_flat, 4] = 0, level_z[is_flat]
+    key[is_flat, 2:4] = 0
+    key[is_flat, 4] = level_z[is_flat]
     key[~is_house, 1:] = 0
     return axes, np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
 
@@ -115,24 +119,26 @@ def _planes(
 
 # Lamps along the streets of a map without any give light and are not drawn, since no box represents them.
 STREETS = ("Roads", "Sidewalks")
-ALONG_M, APART_M, HIGH_M = 16.0, 12.0, 6.5  # from one to the next; least distance of any two; over the street
+ALONG_M = 16.0  # distance from one to the next along a street
+APART_M = 12.0  # least distance of any two
+HIGH_M = 6.5  # height over the street
 FROM_EDGE_M = 0.5
 
 
 def lamps_along_streets(box_map: BoxMap) -> np.ndarray:
-    """Return places of lamps along the streets of a map without any, (n, 3) m, world: the largest street's first."""
+    """Return positions of lamps along the streets of a map without lamps, (n, 3) m, world; the largest street first."""
     streets = box_map.select(box_map.is_any_of({KINDS[name] for name in STREETS}))
     half = streets.half_extents
     turns = rotation_matrices(np.radians(streets.rotations_deg))
-    found = [np.zeros((0, 3))]
+    lamps = [np.zeros((0, 3))]
     for row in np.lexsort((streets.ids, -half[:, 0] * half[:, 1])):
         along, across = (0, 1) if half[row, 0] >= half[row, 1] else (1, 0)
         steps = np.arange(max(1, round(2.0 * half[row, along] / ALONG_M)))
-        own = np.zeros((len(steps), 3))
-        own[:, along] = half[row, along] * ((2.0 * steps + 1.0) / len(steps) - 1.0)
-        own[:, across] = np.where(steps % 2, 1.0, -1.0) * max(half[row, across] - FROM_EDGE_M, 0.0)
-        found.append(streets.centers[row] + own @ turns[row].T)
-    places = np.concatenate(found)
+        local = np.zeros((len(steps), 3))
+        local[:, along] = half[row, along] * ((2.0 * steps + 1.0) / len(steps) - 1.0)
+        local[:, across] = np.where(steps % 2, 1.0, -1.0) * max(half[row, across] - FROM_EDGE_M, 0.0)
+        lamps.append(streets.centers[row] + local @ turns[row].T)
+    places = np.concatenate(lamps)
     stays = np.ones(len(places), bool)
     pairs = cKDTree(places[:, :2]).query_pairs(APART_M, output_type="ndarray") if len(places) else []
     for first, second in sorted(map(tuple, pairs)):
@@ -172,9 +178,9 @@ class Scene:
 def build_scene(town: BoxMap, num_others: int = 0, rim: BoxMap | None = None) -> Scene:
     """Convert a map and its rim to drawable parts, with a ground plane under everything."""
     origin = contract.scene_origin(town)
-    (box_map, all_ids) = contract.with_rim(town, num_others, rim)
+    box_map, all_ids = contract.with_rim(town, num_others, rim)
     are_meshes = are_solids(box_map)
-    found = list[Parts]()
+    all_parts = list[Parts]()
     lies = is_draped(box_map) & ~are_meshes
     # Surfaces on a slope are built on a plane, so that they find their neighbours, and lifted afterwards.
     centers = box_map.centers - origin
@@ -188,20 +194,21 @@ def build_scene(town: BoxMap, num_others: int = 0, rim: BoxMap | None = None) ->
     for kind in np.unique(box_map.kinds[~are_meshes]).tolist():
         rows = np.flatnonzero((box_map.kinds == kind) & ~are_meshes)
         boxes = Boxes(centers[rows], half[rows], turns[rows], all_ids[rows], seeds[rows], kind, tiers[rows])
-        made = parts_of(boxes)
+        kind_parts = parts_of(boxes)
         if lies[rows].any():  # surfaces have one part each
-            lying[rows] = made[0].records
-            made = [made[0].select(~lies[rows])]
-        found += made
+            lying[rows] = kind_parts[0].records
+            kind_parts = [kind_parts[0].select(~lies[rows])]
+        all_parts += kind_parts
     center, half_m = contract.ground_plane(town, rim)
-    ids, none = np.full(1, NO_INSTANCE, np.uint16), np.zeros(1)
-    plane = Boxes((center - origin)[None], half_m[None], np.eye(3)[None], ids, none, KINDS["Terrain"], none)
-    found.append(plane.part(meshes.BOX, half_m[None], parts.GRASS, (0.105, 0.14, 0.045), layer=0))
-    lying[-1] = found[-1].records
+    ids = np.full(1, NO_INSTANCE, np.uint16)
+    zero = np.zeros(1)  # seed and tier
+    plane = Boxes((center - origin)[None], half_m[None], np.eye(3)[None], ids, zero, KINDS["Terrain"], zero)
+    all_parts.append(plane.part(meshes.BOX, half_m[None], parts.GRASS, (0.105, 0.14, 0.045), layer=0))
+    lying[-1] = all_parts[-1].records
     loose = loose_solids(box_map, solids_of(box_map), origin, all_ids)
     if not box_map.ground.is_flat:
         loose.vertices.update(_draped(drape(box_map), origin, lying))
-    joined = Parts.joined(found)
+    joined = Parts.joined(all_parts)
     lamps = np.zeros((0, 3)) if len(joined.lamps()) else lamps_along_streets(town) - origin
     return Scene(joined, origin, contract.plane_z_m(town), town.ground, loose, lamps)
 
@@ -212,14 +219,14 @@ def _draped(draped: Triangles, origin: np.ndarray, records: np.ndarray) -> dict[
     Args:
         records: (n + 1,) PART of the map's boxes; the last is the bare ground's.
     """
-    own = records[draped.rows]  # BARE_GROUND is -1, the last
-    axes = Rotation.from_quat(own["quaternion"].astype(np.float64)).inv().as_matrix()
-    half = own["half"].astype(np.float64)
-    local = np.einsum("kij,kcj->kci", axes, draped.corners_m - origin - own["center"][:, None])
-    vertices = np.zeros((len(own), 3), LOOSE_VERTEX)
+    triangle_records = records[draped.rows]  # BARE_GROUND is -1, the last
+    axes = Rotation.from_quat(triangle_records["quaternion"].astype(np.float64)).inv().as_matrix()
+    half = triangle_records["half"].astype(np.float64)
+    local = np.einsum("kij,kcj->kci", axes, draped.corners_m - origin - triangle_records["center"][:, None])
+    vertices = np.zeros((len(triangle_records), 3), LOOSE_VERTEX)
     vertices["position"] = local / half[:, None]
     vertices["normal"] = (np.einsum("kij,kj->ki", axes, draped.normals) * half)[:, None]
     for name in PART.names or ():
-        vertices[name] = own[name][:, None]
-    materials = materials_of(own)
+        vertices[name] = triangle_records[name][:, None]
+    materials = materials_of(triangle_records)
     return {int(material): vertices[materials == material].reshape(-1) for material in np.unique(materials)}

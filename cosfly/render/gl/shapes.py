@@ -1,5 +1,7 @@
-"""The shapes of houses, trees, cars and lamps: the parts of each kind of box, all inside the box, so that the planners'
-collision and visibility checks hold."""
+"""The shapes of houses, trees, cars and lamps: the parts of each kind of box.
+
+All parts stay inside their box, so that the planners' collision and visibility checks hold.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from cosfly.render import contract
 from cosfly.render.gl import meshes, parts
 from cosfly.render.gl.parts import FAR_PX, Boxes, Parts
 
-EDGE_GAP_M, MOST_EDGED = 0.05, 4000
+EDGE_GAP_M = 0.05  # an edge is open if no box is this near
+MOST_EDGED = 4000  # boxes; edges of more are not searched
 
 BUILDING_COLORS = np.array([
     [0.46, 0.23, 0.16], [0.55, 0.31, 0.21], [0.66, 0.59, 0.47], [0.60, 0.57, 0.52], [0.73, 0.68, 0.58],
@@ -108,24 +111,27 @@ def _vegetation(boxes: Boxes) -> list[Parts]:
     """Return trees, bushes, hedges and lawns, by the shape of the box."""
     forms, crown_low = contract.plants_of(boxes.centers, boxes.half, boxes.seeds)
     leaf = boxes.pick(LEAF_COLORS) * (0.85 + 0.35 * boxes.chance(3))[:, None]
-    of = {form: (boxes.select(forms == form), leaf[forms == form]) for form in range(contract.BROADLEAF + 1)}
-    (lawns, grass), (hedges, green), (trunks, _) = of[contract.LAWN], of[contract.HEDGE], of[contract.TRUNK]
-    trees, low = of[contract.BROADLEAF][0], crown_low[forms == contract.BROADLEAF]
+    by_form = {form: (boxes.select(forms == form), leaf[forms == form]) for form in range(contract.BROADLEAF + 1)}
+    lawns, grass = by_form[contract.LAWN]
+    hedges, green = by_form[contract.HEDGE]
+    trunks, _ = by_form[contract.TRUNK]
+    trees, tree_leaf = by_form[contract.BROADLEAF]
+    low = crown_low[forms == contract.BROADLEAF]
     return [
         lawns.part(meshes.BOX, lawns.half, parts.GRASS, grass, layer=LAYERS["RoadLines"]),
         hedges.part(meshes.BOX, hedges.half, parts.LEAVES, green),
-        *_bushes(*of[contract.BUSH]),
+        *_bushes(*by_form[contract.BUSH]),
         trunks.part(meshes.CYLINDER, trunks.half, parts.BARK, BARK_COLOR),
-        *_crowns(*of[contract.CROWN], crown_low[forms == contract.CROWN]),
-        *_conifers(*of[contract.CONIFER]),
+        *_crowns(*by_form[contract.CROWN], crown_low[forms == contract.CROWN]),
+        *_conifers(*by_form[contract.CONIFER]),
         _stems(trees, low + 0.75),
-        *_crowns(*of[contract.BROADLEAF], low),
+        *_crowns(trees, tree_leaf, low),
     ]
 
 
 def _bushes(boxes: Boxes, leaf: np.ndarray) -> list[Parts]:
     h = boxes.half
-    found = [
+    blobs = [
         boxes.part(meshes.BLOB_COARSE, h, parts.LEAVES, leaf, max_px=FAR_PX),
         boxes.part(meshes.BLOB, h * [0.72, 0.72, 0.98], parts.LEAVES, leaf, min_px=FAR_PX),
     ]
@@ -133,16 +139,17 @@ def _bushes(boxes: Boxes, leaf: np.ndarray) -> list[Parts]:
         offset = h * [0.42 * side, 0.25 * side, -0.25]
         shade = leaf * (1.0 + 0.12 * side)
         size = h * [0.56, 0.6, 0.72]
-        found.append(boxes.part(meshes.BLOB, size, parts.LEAVES, shade, offset=offset, min_px=FAR_PX))
-    return found
+        blobs.append(boxes.part(meshes.BLOB, size, parts.LEAVES, shade, offset=offset, min_px=FAR_PX))
+    return blobs
 
 
 def _crowns(boxes: Boxes, leaf: np.ndarray, crown_low: np.ndarray) -> list[Parts]:
     """Return foliage from `crown_low` (n,), in half heights, to the top: blobs inside the inscribed ellipsoid."""
-    h, one = boxes.half, np.ones(len(boxes))
-    half = h * np.column_stack([one, one, (1.0 - crown_low) / 2.0])
-    center = h * np.column_stack([0.0 * one, 0.0 * one, (1.0 + crown_low) / 2.0])
-    found = [
+    h = boxes.half
+    ones = np.ones(len(boxes))
+    half = h * np.column_stack([ones, ones, (1.0 - crown_low) / 2.0])
+    center = h * np.column_stack([0.0 * ones, 0.0 * ones, (1.0 + crown_low) / 2.0])
+    blobs = [
         boxes.part(meshes.BLOB_COARSE, half, parts.LEAVES, leaf, offset=center, max_px=FAR_PX),
         boxes.part(meshes.BLOB_FINE, half * 0.74, parts.LEAVES, leaf, offset=center, min_px=FAR_PX),
     ]
@@ -153,23 +160,25 @@ def _crowns(boxes: Boxes, leaf: np.ndarray, crown_low: np.ndarray) -> list[Parts
         flat = np.sqrt(np.maximum(0.0, 1.0 - lift**2))
         offset = center + half * np.column_stack([flat * np.cos(angle), flat * np.sin(angle), lift]) * (1.0 - radius)
         shade = leaf * (0.86 + 0.3 * boxes.chance(40 + number))[:, None]
-        found.append(boxes.part(meshes.BLOB, half * radius, parts.LEAVES, shade, offset=offset, min_px=FAR_PX))
-    return found
+        blobs.append(boxes.part(meshes.BLOB, half * radius, parts.LEAVES, shade, offset=offset, min_px=FAR_PX))
+    return blobs
 
 
 def _conifers(boxes: Boxes, leaf: np.ndarray) -> list[Parts]:
     h, dark = boxes.half, leaf * [0.6, 0.75, 0.85]
     far = boxes.part(meshes.CONE, h * [1, 1, 0.92], parts.LEAVES, dark, offset=h * [0, 0, 0.08], max_px=FAR_PX)
-    found = [far, _stems(boxes, np.full(len(h), -0.5))]
+    tree = [far, _stems(boxes, np.full(len(h), -0.5))]
     for low, top, radius in ((contract.CONIFER_LOW, 0.1, 1.0), (-0.35, 0.55, 0.78), (0.1, 1.0, 0.55)):
-        size, offset = h * [radius, radius, (top - low) / 2.0], h * [0, 0, (low + top) / 2.0]
-        found.append(boxes.part(meshes.CONE, size, parts.LEAVES, dark, offset=offset, min_px=FAR_PX))
-    return found
+        size = h * [radius, radius, (top - low) / 2.0]
+        offset = h * [0, 0, (low + top) / 2.0]
+        tree.append(boxes.part(meshes.CONE, size, parts.LEAVES, dark, offset=offset, min_px=FAR_PX))
+    return tree
 
 
 def _stems(boxes: Boxes, top: np.ndarray) -> Parts:
     """Return a stem from each box's bottom to `top` (n,), in units of the half height."""
-    h, radius = boxes.half, contract.stem_radius_m(boxes.half)
+    h = boxes.half
+    radius = contract.stem_radius_m(h)
     size = np.column_stack([radius, radius, h[:, 2] * (top + 1.0) / 2.0])
     offset = np.column_stack([0 * radius, 0 * radius, h[:, 2] * (top - 1.0) / 2.0])
     return boxes.part(meshes.CYLINDER, size, parts.BARK, BARK_COLOR, offset=offset, min_px=FAR_PX)
@@ -181,14 +190,15 @@ _WHEEL_TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # 
 def _wheels(boxes: Boxes, high: float, long: float, along: float) -> list[Parts]:
     """Return four wheels; their largest radius is a share of the half height, and of the half length."""
     h = boxes.half
-    radius, thick = np.minimum(high * h[:, 2], long * h[:, 0]), 0.16 * h[:, 1]
+    radius = np.minimum(high * h[:, 2], long * h[:, 0])
+    thick = 0.16 * h[:, 1]
     size = np.column_stack([radius, radius, thick])
     look = (parts.RUBBER, (0.02, 0.02, 0.022))
-    found = []
+    wheels = []
     for front, side in ((-along, -1.0), (-along, 1.0), (along, -1.0), (along, 1.0)):
         offset = np.column_stack([front * h[:, 0], side * (0.97 * h[:, 1] - thick), radius - h[:, 2]])
-        found.append(boxes.part(meshes.CYLINDER, size, *look, offset=offset, turn=_WHEEL_TURN, min_px=FAR_PX))
-    return found
+        wheels.append(boxes.part(meshes.CYLINDER, size, *look, offset=offset, turn=_WHEEL_TURN, min_px=FAR_PX))
+    return wheels
 
 
 def _cars(boxes: Boxes) -> list[Parts]:
@@ -243,7 +253,8 @@ def _poles(boxes: Boxes) -> list[Parts]:
     lamps = boxes.select(boxes.half[:, 2] > 1.2)
     h = lamps.half
     arm = np.column_stack([h[:, 0], np.minimum(h[:, 1], 0.06), np.minimum(0.03 * h[:, 2], 0.05)])
-    head, glass = np.minimum(h * [0.9, 1.0, 0.04], [0.35, 0.16, 0.1]), (0.75, 0.74, 0.68)
+    head = np.minimum(h * [0.9, 1.0, 0.04], [0.35, 0.16, 0.1])
+    glass = (0.75, 0.74, 0.68)
     ends = (np.column_stack([side * (h[:, 0] - head[:, 0]), 0 * h[:, 1], 0.93 * h[:, 2]]) for side in (-1.0, 1.0))
     return [
         heads.part(meshes.ROUNDED, heads.half, parts.LAMP, (0.17, 0.17, 0.17)),

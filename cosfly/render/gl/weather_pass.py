@@ -44,8 +44,11 @@ SKIES = np.array([
     (0.48, 0.56, 0.68, 0.27, 0.25, 0.22, 0.66, 0.75, 0.84, 0.16, 0.34, 0.66, 0.5, 0.42, 0.3, 0.94, 0.78),
     (0.5, 0.58, 0.7, 0.29, 0.27, 0.24, 0.64, 0.75, 0.86, 0.15, 0.33, 0.67, 0.5, 0.43, 0.32, 1, 0.6),
 ])  # fmt: skip
-COVERED_SKY, COVERED_GROUND = np.array([0.82, 0.86, 0.92]), np.array([0.37, 0.37, 0.36])  # hues of an overcast sky
-COVERED_HORIZON, COVERED_ZENITH = np.array([0.66, 0.69, 0.72]), np.array([0.50, 0.53, 0.57])
+# Hues of an overcast sky.
+COVERED_SKY = np.array([0.82, 0.86, 0.92])
+COVERED_GROUND = np.array([0.37, 0.37, 0.36])
+COVERED_HORIZON = np.array([0.66, 0.69, 0.72])
+COVERED_ZENITH = np.array([0.50, 0.53, 0.57])
 CITY_GLOW = np.array([0.030, 0.021, 0.013])  # light of street lamps from low clouds and fog
 COVERED_EXPOSURE = 1.4  # factor of an overcast sky by day
 LAMP_LIGHT = np.array([0.42, 0.29, 0.16])
@@ -62,7 +65,9 @@ def light_direction(params: WeatherParams) -> np.ndarray:
 
 def uniforms(params: WeatherParams) -> dict[str, Any]:
     """Return the uniforms of a trajectory: name -> number or array. lights_on: of street lamps and windows, 0 to 1."""
-    altitude, cloud, rain = params.sun_altitude_angle, params.cloudiness / 100.0, params.precipitation / 100.0
+    altitude = params.sun_altitude_angle
+    cloud = params.cloudiness / 100.0
+    rain = params.precipitation / 100.0
     extinction = fog_extinction(params)
     fogged = 1.0 - float(np.exp(-60.0 * extinction))  # of the sun's light and of the sky
     overcast = float(_step(0.55, 0.92, cloud))
@@ -139,7 +144,8 @@ def lamp_map(lamps: np.ndarray, middle: np.ndarray, half_m: float) -> tuple[np.n
         (MAP_PX, MAP_PX, 2) float32: light on the ground, about 1 under a lamp, and the height of the lamps that give
         it; (4,) low x, low y, 1 / side, 1 / side. The outermost pixels are dark, so that nothing beyond is lit.
     """
-    low, pixel_m = middle[:2] - half_m, 2.0 * half_m / MAP_PX
+    low = middle[:2] - half_m
+    pixel_m = 2.0 * half_m / MAP_PX
     light = np.zeros((MAP_PX, MAP_PX))
     height = np.zeros((MAP_PX, MAP_PX))
     reach_px = int(np.ceil(REACH_M / pixel_m))
@@ -152,26 +158,29 @@ def lamp_map(lamps: np.ndarray, middle: np.ndarray, half_m: float) -> tuple[np.n
         share = np.maximum((FALL_M**2 / (FALL_M**2 + away)) ** 1.5 - (FALL_M / REACH_M) ** 3, 0.0)
         light[rows, columns] += share
         height[rows, columns] += share * z
-    known = np.where(light > 0.0, height / np.maximum(light, 1e-12), 0.0)
+    lamp_height = np.where(light > 0.0, height / np.maximum(light, 1e-12), 0.0)
     light /= 1.0 + CROWDED * light
     light[[0, -1]] = light[:, [0, -1]] = 0.0
     side = 0.5 / half_m
-    return np.stack([light, known], axis=-1).astype(np.float32), np.array([*low, side, side])
+    return np.stack([light, lamp_height], axis=-1).astype(np.float32), np.array([*low, side, side])
 
 
 # --- one trajectory ---------------------------------------------------------------------------------------------------
 
-SOFT_M, FAINT = 0.25, 0.02  # wider borders of shadows are drawn soft; a fainter sun casts none
-LAMP_UNIT, DEPTH_UNIT = 2, 3
+SOFT_M = 0.25  # wider borders of shadows are drawn soft
+FAINT = 0.02  # a fainter sun casts no shadow
+LAMP_UNIT, DEPTH_UNIT = 2, 3  # texture units
 WIND = (0.07, 0.03)  # m to the side for each m that a drop falls
-# Levels from which lights glow; the glow is computed in a picture so many times smaller.
-GLOW_FROM, GLOW_SHRINK = 208, 4
-GLOW_WIDTHS_PX = ((5.0, 0.22), (19.0, 0.16))  # of a picture of 1280 px: width, share
+GLOW_FROM = 208  # brighter levels glow
+GLOW_SHRINK = 4  # the glow is computed in a picture this many times smaller
+GLOW_WIDTHS_PX = ((5.0, 0.22), (19.0, 0.16))  # width in a picture of 1280 px, share
 
 
 def defines(params: WeatherParams) -> str:
-    """Return the preprocessor lines of a weather's programs: a CPU runs both sides of a branch, so unneeded code is
-    not compiled."""
+    """Return the preprocessor lines of a weather's programs.
+
+    A CPU runs both sides of a branch, so code that is not needed is not compiled.
+    """
     values = uniforms(params)
     casts = float(values["sun_light"].max()) > FAINT
     needs = {
