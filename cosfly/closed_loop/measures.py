@@ -26,8 +26,9 @@ from cosfly.runtime.seeding import rng_for
 LOSS_S = 2.0  # the target is lost if not visible for so long; a tree or a lamp hides it for less
 BAND_M = (5.0, 40.0)  # over ground: a quarter and twice of what plans keep (plan.behind_distance_m)
 NEAR_MISS_M = RELAXED_SAFETY_M  # least clearance of any plan
-TURNS_DEGPS = {"straight": 3.0, "bends": 6.0, "turns": np.inf}  # mean turn of the target, up to
-# Share of frames that hide the target from a drone right behind, up to.
+# Groups by their upper ends: the mean turn of the target, and the share of frames that hide the target from a drone
+# right behind it.
+TURNS_DEGPS = {"straight": 3.0, "bends": 6.0, "turns": np.inf}
 HIDDEN = {"open": 0.02, "partly hidden": 0.2, "hidden": 1.0}
 GROUPS = ("map", "pace", "turn", "occlusion", "training")
 RESAMPLES, CONFIDENCE = 2000, 0.95
@@ -62,46 +63,48 @@ def measure(record: Episode, trained_on: Collection[str] | None = None) -> Episo
 
     Frames after an early end count as frames without a visible target.
     """
-    flown, decisions, dt_s = record.flown, record.decisions, record.dt_s
-    num, minutes = len(flown), len(flown) * dt_s / 60.0
-    loss_frames = max(1, round(LOSS_S / dt_s))
-    runs = [(is_seen, len(list(run))) for is_seen, run in groupby(frame.visible for frame in flown)]
-    begins = np.cumsum([0, *(count for _, count in runs)])[:-1].tolist()
-    hidden = [(begin, count) for (seen, count), begin in zip(runs, begins, strict=True) if not seen]
-    losses = [(begin, count) for begin, count in hidden if count >= loss_frames]
-    found = [count for begin, count in losses if begin + count < num]
-    is_lost = not runs[-1][0] and runs[-1][1] >= loss_frames
+    flown = record.flown
+    decisions = record.decisions
+    dt_s = record.dt_s
+    num_frames = len(flown)
+    minutes = num_frames * dt_s / 60.0
+    losses = _losses([frame.visible for frame in flown], max(1, round(LOSS_S / dt_s)))
+    reacquired = [count for begin, count in losses if begin + count < num_frames]
+    is_lost = len(reacquired) < len(losses)  # at the end
     in_band = [BAND_M[0] <= frame.distance_m <= BAND_M[1] for frame in flown]
     success = record.ended == "finished" and not is_lost and in_band[-1]
-    close = [frame.clearance_m < NEAR_MISS_M for frame in decisions]
-    near = sum(is_close for is_close, _ in groupby(close)) - (record.ended == "crashed" and close[-1])
+    is_close = [frame.clearance_m < NEAR_MISS_M for frame in decisions]
+    num_near_misses = sum(value for value, _ in groupby(is_close))
+    if record.ended == "crashed" and is_close[-1]:
+        num_near_misses -= 1  # the last one is the crash
     poses = np.array([frame.pose for frame in record.frames[record.num_lead :]])
     yaw_deg = np.degrees(np.unwrap(np.radians(poses[:, 4])))
     actions = [frame.action for frame in decisions if frame.action is not None]
-    times = [frame.answer_s for frame in decisions if frame.answer_s is not None]
+    answer_times_s = [frame.answer_s for frame in decisions if frame.answer_s is not None]
     answers = Counter(frame.answer for frame in decisions)
     sums = {
         "success": (success, 1),
         "in_view": (sum(frame.visible for frame in flown), record.num_walk_frames),
         "in_picture": (sum(frame.in_view for frame in flown), record.num_walk_frames),
         "tracked_frames": (sum(frame.visible for frame in flown), 1),
-        "kept_s": ((losses[0][0] if losses else num) * dt_s, 1),
+        "kept_s": ((losses[0][0] if losses else num_frames) * dt_s, 1),
         "lost": (bool(losses), 1),
-        "reacquired": (len(found), len(losses)),
-        "reacquire_s": (sum(found) * dt_s, len(found)),
-        "distance_m": (sum(frame.distance_m for frame in flown), num),
-        "in_band": (sum(in_band), num),
-        "height_m": (sum(frame.height_m for frame in flown), num),
+        "reacquired": (len(reacquired), len(losses)),
+        "reacquire_s": (sum(reacquired) * dt_s, len(reacquired)),
+        "distance_m": (sum(frame.distance_m for frame in flown), num_frames),
+        "in_band": (sum(in_band), num_frames),
+        "height_m": (sum(frame.height_m for frame in flown), num_frames),
         "crashed": (record.ended == "crashed", 1),
         "left": (record.ended == "left", 1),
-        "near_misses_pmin": (near, minutes),
+        "near_misses_pmin": (num_near_misses, minutes),
         "jerk_rms_mps3": (derivative_rms(poses[:, :3], 3, dt_s), 1),
         "yaw_jerk_rms_degps3": (derivative_rms(np.column_stack([yaw_deg, np.zeros((len(poses), 2))]), 3, dt_s), 1),
         "changes_pmin": (sum(a != b for a, b in pairwise(actions)), minutes if actions else 0),
         "no_decision": (len(decisions) - answers["ok"], len(decisions)),
-        "decision_s": (sum(times), len(times)),
+        "decision_s": (sum(answer_times_s), len(answer_times_s)),
     }
-    style, training = record.style, "unknown"
+    style = record.style
+    training = "unknown"
     if trained_on is not None:
         training = "trained on" if record.town in trained_on else "never trained on"
     return EpisodeScore(
@@ -115,54 +118,79 @@ def measure(record: Episode, trained_on: Collection[str] | None = None) -> Episo
     )  # fmt: skip
 
 
+def _losses(visible: Sequence[bool], least_frames: int) -> list[tuple[int, int]]:
+    """Return first frame and number of frames of each interval in which the target is lost."""
+    losses = []
+    begin = 0
+    for is_visible, interval in groupby(visible):
+        count = len(list(interval))
+        if not is_visible and count >= least_frames:
+            losses.append((begin, count))
+        begin += count
+    return losses
+
+
 def _group(value: float, ends: dict[str, float]) -> str:
     return next(name for name, end in ends.items() if value <= end)
 
 
-def episode_digest(one: Episode) -> str:
+def episode_digest(episode: Episode) -> str:
     """Return the digest of an episode's task: map, camera and lead frames, which no student decides."""
-    lead = [[frame.pose, frame.target_m] for frame in one.frames[: one.num_lead + 1]]
-    task = [one.map_sha256, one.walk, one.episode, one.list_sha256, one.num_walk_frames, one.dt_s, one.camera_px]
-    return sha256_bytes(dump_json([*task, one.fov_deg, lead]).encode())
+    lead = [[frame.pose, frame.target_m] for frame in episode.frames[: episode.num_lead + 1]]
+    task = [
+        episode.map_sha256, episode.walk, episode.episode, episode.list_sha256, episode.num_walk_frames, episode.dt_s,
+        episode.camera_px, episode.fov_deg, lead,
+    ]  # fmt: skip
+    return sha256_bytes(dump_json(task).encode())
 
 
 def score_episodes(records: Iterable[Episode], *, trained_on: Sequence[str] | None = None, seed: int = 0) -> Score:
     """Score the episodes of one student, in any order."""
-    measured, digests, students = [], [], set()
-    for one in records:
-        measured.append(measure(one, trained_on))
-        digests.append(episode_digest(one))
-        students.add((one.student, one.engine, one.list_sha256 or ""))
+    measured = []
+    digests = []
+    students = set()
+    for episode in records:
+        measured.append(measure(episode, trained_on))
+        digests.append(episode_digest(episode))
+        students.add((episode.student, episode.engine, episode.list_sha256 or ""))
     if len(students) != 1:
         got = "; ".join(" ".join(filter(None, words)) for words in sorted(students)[:3]) or "no episode"
         raise InputError("these are not episodes of one student on one list", where="episodes", got=got)
-    measured.sort(key=lambda one: (one.town, one.episode))
-    about = dict(zip(("student", "engine", "list_sha256"), (word or None for word in students.pop()), strict=True))
-    digest = sha256_bytes(dump_json(sorted(digests)).encode())
-    return score_measured(measured, seed, episodes_sha256=digest, trained_on=trained_on, **about)
+    measured.sort(key=lambda score: (score.town, score.episode))
+    student, engine, list_sha256 = students.pop()
+    return score_measured(
+        measured,
+        seed,
+        episodes_sha256=sha256_bytes(dump_json(sorted(digests)).encode()),
+        trained_on=trained_on,
+        student=student or None,
+        engine=engine or None,
+        list_sha256=list_sha256 or None,
+    )
 
 
-def score_measured(measured: Sequence[EpisodeScore], seed: int, **about: Any) -> Score:
-    """Score measured episodes, of one map or several. about: the fields of Score that are not computed here."""
+def score_measured(measured: Sequence[EpisodeScore], seed: int, **fields: Any) -> Score:
+    """Score measured episodes, of one map or several. fields: those of Score that are not computed here."""
     by: dict[str, dict[str, dict[str, Figure]]] = {kind: {} for kind in GROUPS}
     for kind, groups in by.items():
-        for name in sorted({one.groups[kind] for one in measured}):
-            group = [one for one in measured if one.groups[kind] == name]
+        for name in sorted({score.groups[kind] for score in measured}):
+            group = [score for score in measured if score.groups[kind] == name]
             groups[name] = figures_of(group, rng_for(seed, "score", "draws"))
     figures = figures_of(measured, rng_for(seed, "score", "draws"))
-    return Score(**about, confidence=CONFIDENCE, resamples=RESAMPLES, figures=figures, by=by, flights=tuple(measured))
+    return Score(**fields, confidence=CONFIDENCE, resamples=RESAMPLES, figures=figures, by=by, flights=tuple(measured))
 
 
 def figures_of(
     measured: Sequence[EpisodeScore], rng: np.random.Generator, before: Sequence[EpisodeScore] | None = None
 ) -> dict[str, Figure]:
     """Return all figures with intervals by bootstrap over pedestrian trajectories; with `before`, their changes."""
-    walks = sorted({one.walk for one in measured})
+    walks = sorted({score.walk for score in measured})
     draws = np.vstack([np.ones(len(walks)), draw_pedestrians(len(walks), RESAMPLES, rng)])  # the first: each once
     drawn = _ratios(draws, measured, walks)
-    counts = [sum(one.sums[name][1] > 0 for one in measured) for name in MEASURES]
+    counts = [sum(score.sums[name][1] > 0 for score in measured) for name in MEASURES]
     if before is not None:
-        drawn, counts = drawn - _ratios(draws, before, walks), [len(walks)] * len(MEASURES)
+        drawn = drawn - _ratios(draws, before, walks)
+        counts = [len(walks)] * len(MEASURES)
     return {
         name: figure_of_draws(float(drawn[0, k]), drawn[1:, k], counts[k], len(walks), CONFIDENCE)
         for k, name in enumerate(MEASURES)
@@ -172,8 +200,8 @@ def figures_of(
 def _ratios(draws: np.ndarray, measured: Sequence[EpisodeScore], walks: list[str]) -> np.ndarray:
     """Return the figures of each draw, (draws, figures), NaN if undefined. draws: (draws, walks), how often each."""
     sums = np.zeros((len(walks), len(MEASURES), 2))
-    for one in measured:
-        sums[walks.index(one.walk)] += [one.sums[name] for name in MEASURES]
+    for score in measured:
+        sums[walks.index(score.walk)] += [score.sums[name] for name in MEASURES]
     totals = np.tensordot(draws, sums, axes=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(totals[..., 1] > 0, totals[..., 0] / totals[..., 1], np.nan)

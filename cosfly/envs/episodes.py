@@ -81,13 +81,14 @@ class EpisodeLists(Record):
 
 def read_list(name: str) -> tuple[str, tuple[tuple[str, int], ...], str]:
     """Return environment, episodes and digest of a list such as `cosfly/Follow-v0/test`; `test` is the default."""
-    env, _, listed = name.partition("-v0")
-    env, listed = f"{env}-v0", listed.strip("/") or "test"
-    known = read_model(EPISODES_FILE, EpisodeLists, EPISODES_FORMAT).lists
-    episodes = known.get(env, {}).get(listed)
+    prefix, _, suffix = name.partition("-v0")
+    env = f"{prefix}-v0"
+    list_name = suffix.strip("/") or "test"
+    lists = read_model(EPISODES_FILE, EpisodeLists, EPISODES_FORMAT).lists
+    episodes = lists.get(env, {}).get(list_name)
     if episodes is None:
-        what = "unknown list" if env in known else f"unknown environment{nearest(name, known)}"
-        raise InputError(what, where="--env", got=name, expected=", ".join(known.get(env, known)))
+        problem = "unknown list" if env in lists else f"unknown environment{nearest(name, lists)}"
+        raise InputError(problem, where="--env", got=name, expected=", ".join(lists.get(env, lists)))
     task = [env, [[HELD_OUT[town]._asdict(), number] for town, number in episodes], SIZE_PX, FOV_DEG, NUM_DECISIONS]
     return env, episodes, sha256_bytes(dump_json(task).encode())
 
@@ -118,22 +119,29 @@ class BenchmarkWorld:
     def airspace(self, task: str, size_px: tuple[int, int] = SIZE_PX) -> Airspace:
         """Open a renderer for a task."""
         num_others = TASKS[task].others + TASKS[task].traffic
-        drawn = RenderConfig(width_px=size_px[0], height_px=size_px[1], fovs_deg=(FOV_DEG,))
-        return Airspace(drawn, self.boxes, self.simplified, seed=self.town.seed, num_others=num_others)
+        cfg = RenderConfig(width_px=size_px[0], height_px=size_px[1], fovs_deg=(FOV_DEG,))
+        return Airspace(cfg, self.boxes, self.simplified, seed=self.town.seed, num_others=num_others)
 
 
 @lru_cache(maxsize=16)
 def world_of(town: BenchmarkTown) -> BenchmarkWorld:
     """Build a town; the last ones are cached."""
     boxes = load(SyntheticConfig(name=town.name, preset=town.preset), town.seed)
-    flown = simplify(boxes, SimplifyConfig()).box_map
-    ground = walkable_ground(flown, _ALONE, where=town.name)
-    return BenchmarkWorld(town, boxes, flown, ground, lanes_of(flown), obstacle_index(flown), screens_of(flown))
+    simplified = simplify(boxes, SimplifyConfig()).box_map
+    return BenchmarkWorld(
+        town=town,
+        boxes=boxes,
+        simplified=simplified,
+        ground=walkable_ground(simplified, _ALONE, where=town.name),
+        lanes=lanes_of(simplified),
+        obstacles=obstacle_index(simplified),
+        screens=screens_of(simplified),
+    )
 
 
 @dataclass(frozen=True)
 class BenchmarkEpisode:
-    """A plan, of which num_lead frames are flown before a policy takes over, and the bystanders."""
+    """A plan and the bystanders. num_lead: frames that follow the plan before a policy takes over."""
 
     task: str
     world: BenchmarkWorld
@@ -149,14 +157,17 @@ class BenchmarkEpisode:
 
 def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisode | None:
     """Return the episode of a town's trajectory; None if the trajectory or its plan is unsuitable."""
-    cfg, town, name = TASKS[task], world.town, walk_id(number)
+    cfg = TASKS[task]
+    town = world.town
+    name = walk_id(number)
     planning = PlanConfig(styles={REACQUIRE: 1.0}) if task == REACQUIRES else PlanConfig()
     try:
-        walk = make_pedestrian(name, world.ground, cfg, rng_for(town.seed, "pedestrians", name)).trajectory
-        plan = plan_trajectory(walk, world.obstacles, planning, town.seed, world.screens)
+        target = make_pedestrian(name, world.ground, cfg, rng_for(town.seed, "pedestrians", name)).trajectory
+        plan = plan_trajectory(target, world.obstacles, planning, town.seed, world.screens)
     except NoPathError:
         return None
-    num_lead, rotations_deg, others = LEAD_FRAMES, plan.rotations_deg.copy(), tuple[Bystander, ...]()
+    num_lead = LEAD_FRAMES
+    rotations_deg = plan.rotations_deg.copy()
     if task == REACQUIRES:
         dt_s = float(plan.time_s[1])
         lost = None if plan.instead_of else first_loss(plan.visibility, dt_s, AFTER_LOSS * dt_s)
@@ -168,8 +179,11 @@ def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisod
         return None
     end = num_lead + NUM_DECISIONS
     plan = replace(plan, rotations_deg=rotations_deg).until(end)
+    bystanders = tuple[Bystander, ...]()
     if cfg.has_others:
         rng = rng_for(town.seed, "pedestrians", f"{name}/others")
-        there = bystanders_of(walk, world.ground, world.lanes, cfg, rng).others
-        others = tuple(replace(o, positions_m=o.positions_m[:end], headings_rad=o.headings_rad[:end]) for o in there)
-    return BenchmarkEpisode(task, world, number, plan, num_lead, others)
+        bystanders = tuple(
+            replace(other, positions_m=other.positions_m[:end], headings_rad=other.headings_rad[:end])
+            for other in bystanders_of(target, world.ground, world.lanes, cfg, rng).others
+        )
+    return BenchmarkEpisode(task, world, number, plan, num_lead, bystanders)

@@ -65,8 +65,9 @@ class BoxesConfig(Config):
     @field_validator("types")
     @classmethod
     def _types_are_known(cls, types: dict[str, str]) -> dict[str, str]:
-        if wrong := [f"{name}: unknown type {kind!r}" for name, kind in types.items() if kind not in TYPES]:
-            raise ValueError(f"{'; '.join(wrong)}; expected one of {', '.join(TYPES)}")
+        problems = [f"{name}: unknown type {kind!r}" for name, kind in types.items() if kind not in TYPES]
+        if problems:
+            raise ValueError(f"{'; '.join(problems)}; expected one of {', '.join(TYPES)}")
         return types
 
     def inputs(self) -> dict[str, Path]:
@@ -89,12 +90,15 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     if suffix not in (".json", ".csv", ".geojson"):
         raise InputError("the kind of map is unknown", where=path, got=path.suffix, expected=".json, .csv, .geojson")
     if suffix == ".json" and (cfg.types or cfg.ignore or cfg.ground_z_m):
-        what, fix = "boxes_3d.json has its own types and ground", "remove the settings types, ignore and ground_z_m"
-        raise ConfigError(what, where="maps.boxes", fix=fix)
+        raise ConfigError(
+            "boxes_3d.json has its own types and ground",
+            where="maps.boxes",
+            fix="remove the settings types, ignore and ground_z_m",
+        )
     box_map = read_boxes(path) if suffix == ".json" else _read_rows(cfg, path, suffix)
-    given = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})
+    settings = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})
     source = MapSource(tool=box_map.header.source.tool or "boxes", file=path.name)
-    header = box_map.header.model_copy(update={**given, "source": source})
+    header = box_map.header.model_copy(update={**settings, "source": source})
     low, high = box_map.bounds()
     if np.abs((low + high)[:2] / 2).max() > FAR_M and header.ground is None:
         origin = origin_m(low, high, path)
@@ -113,12 +117,13 @@ def plausibility(box_map: BoxMap) -> str:
     text = f"{len(box_map)} boxes, {' x '.join(f'{size:.6g}' for size in high - low)} m"
     if not len(solid):
         return text
-    ground_m, yaws_deg = solid.ground.height_at(solid.centers), solid.rotations_deg[:, 1]
-    feet_m, heights_m = solid.mins[:, 2] - ground_m, 2 * solid.half_extents[:, 2]
-    flat = shapely.box(*(solid.mins[:, :2] + OVERLAP_M / 2).T, *(solid.maxs[:, :2] - OVERLAP_M / 2).T)
-    one, other = shapely.STRtree(flat).query(flat, predicate="intersects")
-    shared_m = np.minimum(*solid.maxs[[one, other], 2]) - np.maximum(*solid.mins[[one, other], 2])
-    overlapping = np.unique(one[(one != other) & (shared_m > OVERLAP_M)])
+    yaws_deg = solid.rotations_deg[:, 1]
+    feet_m = solid.mins[:, 2] - solid.ground.height_at(solid.centers)
+    heights_m = 2 * solid.half_extents[:, 2]
+    outlines = shapely.box(*(solid.mins[:, :2] + OVERLAP_M / 2).T, *(solid.maxs[:, :2] - OVERLAP_M / 2).T)
+    first, second = shapely.STRtree(outlines).query(outlines, predicate="intersects")
+    shared_m = np.minimum(*solid.maxs[[first, second], 2]) - np.maximum(*solid.mins[[first, second], 2])
+    overlapping = np.unique(first[(first != second) & (shared_m > OVERLAP_M)])
     return (
         f"{text}; obstacles {heights_m.min():.4g} to {heights_m.max():.4g} m high, feet {feet_m.min():.4g} to "
         f"{feet_m.max():.4g} m above the ground, yaw {yaws_deg.min():.4g} to {yaws_deg.max():.4g} degrees, "
@@ -127,24 +132,36 @@ def plausibility(box_map: BoxMap) -> str:
 
 
 def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
-    rows = list((_table_rows if suffix == ".csv" else _feature_rows)(cfg, path))
+    rows = list(_table_rows(cfg, path) if suffix == ".csv" else _feature_rows(cfg, path))
     if not rows:
         raise InputError("the map holds no boxes", where=path, expected="a box in each row or feature")
-    boxes, places = BoxList(), dict[str, list[str]]()  # problem -> its rows, so that it is listed once
+    boxes = BoxList()
+    rows_by_problem = dict[str, list[str]]()  # so that each problem is listed once
     for row in rows:
         if problem := row.problem or _add(boxes, row, cfg):
-            places.setdefault(problem, []).append(row.where)
-    ids = [str(row.values["id"]) for row in rows if row.values.get("id")]
-    numbers = [int(text) if text.isascii() and text.isdecimal() else -1 for text in ids if len(ids) == len(rows)]
-    if len(set(numbers)) < len(numbers) or not all(0 <= number < 2**63 for number in numbers):
-        places["id is not a whole number, each once"] = [""]
-    if places:
-        more = {problem: f" (and {len(where) - 1} more)" * (len(where) > 1) for problem, where in places.items()}
-        problems = [f"{where[0]}: {problem}{more[problem]}".removeprefix(": ") for problem, where in places.items()]
+            rows_by_problem.setdefault(problem, []).append(row.where)
+    ids = _ids_of(rows)
+    if len(set(ids)) < len(ids) or not all(0 <= number < 2**63 for number in ids):
+        rows_by_problem["id is not a whole number, each once"] = [""]
+    if rows_by_problem:
+        problems = []
+        for problem, places in rows_by_problem.items():
+            more = f" (and {len(places) - 1} more)" if len(places) > 1 else ""
+            problems.append(f"{places[0]}: {problem}{more}".removeprefix(": "))
         expected = f"columns {', '.join(COLUMNS)}; types {', '.join(TYPES)}, or translated by maps.boxes.types"
         raise InputError.of_all(problems, where=path, expected=expected)
     box_map = boxes.box_map(MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows)))
-    return replace(box_map, ids=np.array(numbers, dtype=np.uint64)) if len(box_map) == len(numbers) else box_map
+    if len(box_map) == len(ids):  # no outline became several boxes
+        return replace(box_map, ids=np.array(ids, dtype=np.uint64))
+    return box_map
+
+
+def _ids_of(rows: Sequence[_Row]) -> list[int]:
+    """Return the ids of the rows, -1 for a text that is no whole number; none if a row has no id."""
+    texts = [str(row.values["id"]) for row in rows if row.values.get("id")]
+    if len(texts) < len(rows):
+        return []
+    return [int(text) if text.isascii() and text.isdecimal() else -1 for text in texts]
 
 
 def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
@@ -189,51 +206,67 @@ def _feature_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
 
 
 def _to_metres(cfg: BoxesConfig, places: np.ndarray, path: Path) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the function that turns coordinates, like all of the file, (n, 2), into metres east and north.
+    """Return the function that converts coordinates of the file, (n, 2), to metres east and north.
 
-    Degrees are projected on the plane that touches the Earth in the middle.
+    Degrees are projected on the plane that touches the Earth in the middle of the map.
+
+    Args:
+        places: All coordinates of the file, (n, 2).
     """
     low, high = places.min(axis=0), places.max(axis=0)
     size = float((high - low).max())
     may_be_degrees = size <= WIDEST_DEG and (np.abs(places) <= [180.0, 90.0]).all()
     if (cfg.units == "degrees" and not may_be_degrees) or (cfg.units == "m" and may_be_degrees and size > 0):
-        other, expected = "m", "longitude and latitude of one town"
-        if cfg.units == "m":
-            other, expected = "degrees", "wider than 2 m"
-        got, fix = f"{low.tolist()} to {high.tolist()}", f"--set maps.boxes.units={other}, if that is their unit"
-        raise InputError(f"the coordinates are not in {cfg.units}", where=path, got=got, expected=expected, fix=fix)
+        other_unit = "degrees" if cfg.units == "m" else "m"
+        raise InputError(
+            f"the coordinates are not in {cfg.units}",
+            where=path,
+            got=f"{low.tolist()} to {high.tolist()}",
+            expected="wider than 2 m" if cfg.units == "m" else "longitude and latitude of one town",
+            fix=f"--set maps.boxes.units={other_unit}, if that is their unit",
+        )
     if cfg.units == "m":
         return lambda ring: ring
     middle = (low + high) / 2
     log.info("longitude and latitude: metres east and north of %.6f, %.6f", *middle)
     latitude = math.radians(middle[1])
-    bent = 1 - EARTH_E2 * math.sin(latitude) ** 2
-    east_m, north_m = EARTH_M / math.sqrt(bent) * math.cos(latitude), EARTH_M * (1 - EARTH_E2) / bent**1.5  # a radian
+    curvature = 1 - EARTH_E2 * math.sin(latitude) ** 2
+    east_m = EARTH_M / math.sqrt(curvature) * math.cos(latitude)  # metres in a radian of longitude
+    north_m = EARTH_M * (1 - EARTH_E2) / curvature**1.5  # metres in a radian of latitude
     return lambda ring: np.radians(ring - middle) * [east_m, north_m]
 
 
 def _unknown(names: Sequence[str], cfg: BoxesConfig) -> list[str]:
-    known = {*COLUMNS, *(names if "*" in cfg.ignore else cfg.ignore)}
-    return [f"unknown column {name!r}{nearest(name, COLUMNS)}" for name in names if name not in known]
+    if "*" in cfg.ignore:
+        return []
+    accepted = {*COLUMNS, *cfg.ignore}
+    return [f"unknown column {name!r}{nearest(name, COLUMNS)}" for name in names if name not in accepted]
 
 
 def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> str:
     """Add the boxes of a row; return its problems, an empty text if there are none."""
-    name = str(row.values.get("type", ""))
-    kind, numbers = cfg.types.get(name, name), {k: _number(row.values[k]) for k in NUMBERS if k in row.values}
+    type_name = str(row.values.get("type", ""))
+    kind = cfg.types.get(type_name, type_name)
+    numbers = {name: _number(row.values[name]) for name in NUMBERS if name in row.values}
     is_slab = "height_m" not in numbers and kind in TYPES and KINDS[kind] in GROUND_KINDS
-    needed = PLACE * (row.outline is None) + ("height_m",) * (not is_slab)
-    problems = [] if kind in TYPES else [f"unknown type {name[:40]!r}{nearest(name, [*TYPES, *cfg.types])}"]
-    problems += [f"no {size}" for size in needed if size not in numbers]
-    wrong = [name for name, number in numbers.items() if math.isnan(number)]
-    problems += [f"{name} is not a finite number: {str(row.values[name])[:40]!r}" for name in wrong]
-    problems += [f"{size} is not more than 0" for size in needed if size[0] in "lwh" and numbers.get(size, 1.0) <= 0]
+    needed = list(PLACE) if row.outline is None else []
+    if not is_slab:
+        needed.append("height_m")
+    sizes = [name for name in needed if name not in ("x_m", "y_m")]
+    problems = [] if kind in TYPES else [f"unknown type {type_name[:40]!r}{nearest(type_name, [*TYPES, *cfg.types])}"]
+    problems += [f"no {name}" for name in needed if name not in numbers]
+    not_finite = [name for name, number in numbers.items() if math.isnan(number)]
+    problems += [f"{name} is not a finite number: {str(row.values[name])[:40]!r}" for name in not_finite]
+    problems += [f"{name} is not more than 0" for name in sizes if numbers.get(name, 1.0) <= 0]
     if row.outline is not None and not row.outline.is_valid:
         problems.append(f"the outline crosses itself: {shapely.is_valid_reason(row.outline)}")
     if problems:
         return ", ".join(problems)
     height_m = SLAB_M if is_slab else numbers["height_m"]
-    low_m = numbers["z_m"] - height_m / 2 if "z_m" in numbers else cfg.ground_z_m - SLAB_M * is_slab
+    if "z_m" in numbers:
+        low_m = numbers["z_m"] - height_m / 2
+    else:
+        low_m = cfg.ground_z_m - SLAB_M if is_slab else cfg.ground_z_m
     if row.outline is None:
         x_m, y_m, length_m, width_m = (numbers[name] for name in PLACE)
         rectangles = [Rectangle((x_m, y_m), (length_m, width_m), numbers.get("yaw_deg", 0.0))]

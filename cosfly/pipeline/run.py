@@ -72,11 +72,15 @@ class StageResult:
 
 def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path | None = None) -> list[Stage]:
     """Return the stages of a run in order; each works in the folder of its name in the run directory or in `into`."""
-    seed, pool = cfg.seed, worker_options(cfg)
-    boxes, simplified = out / "maps/boxes_3d.json", out / "simplify/step2_simplified.json"
-    paths, traces, tree = out / "pedestrians/path.json", out / "plan/drone_trace.json", out / "render"
+    seed = cfg.seed
+    pool = worker_options(cfg)
+    boxes = out / "maps/boxes_3d.json"
+    simplified = out / "simplify/step2_simplified.json"
+    paths = out / "pedestrians/path.json"
     others = paths.with_name(BYSTANDERS_FILE) if cfg.pedestrians.has_others else None
-    inspected, captions = out / "inspect/inspect.json", out / "caption/captions.jsonl"
+    traces = out / "plan/drone_trace.json"
+    tree = out / "render"
+    sources = [Source.of_files(tree, out / "caption/captions.jsonl", out / "inspect/inspect.json")]
 
     def stage(name: str, run: Callable[..., Path], *inputs: Any, **options: Any) -> Stage:
         return Stage(name, partial(run, getattr(cfg, name), *inputs, (into or out) / name, resume=resume, **options))
@@ -89,50 +93,53 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
         stage("render", cosfly.render.stage.run, boxes, simplified, traces, others=others, seed=seed, **pool),
         stage("inspect", cosfly.inspection.stage.run, simplified, traces, tree, **pool),
         stage("caption", caption.run.stage.run, tree, seed=seed, **pool),
-        joint_release(cfg, [Source.of_files(tree, captions, inspected)], into or out, resume),
+        joint_release(cfg, sources, into or out, resume),
     ]
 
 
 def joint_release(cfg: RunConfig, sources: list[Source], out: Path, resume: Resume) -> Stage:
     """Return the stage that releases one or more runs together."""
-    how: dict[str, Any] = {"resume": resume, **worker_options(cfg)}
-    return Stage("release", partial(release.package.stage.run, cfg.release, sources, out / "release", **how))
+    options: dict[str, Any] = {"resume": resume, **worker_options(cfg)}
+    return Stage("release", partial(release.package.stage.run, cfg.release, sources, out / "release", **options))
 
 
 def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "release") -> list[StageResult]:
     """Make a data set: read what the configuration names, write one folder per stage below `out`.
 
-    Of several towns each is a run directory of its own, and `release` is made of all. Every stage is complete or
-    resumable at any moment. The run ends with `contact_sheet.png`, `viewer.html` and `summary.json`.
+    With several towns each town has its own run directory below `out`, and one `release` is made of all. Every stage is
+    complete or resumable at any moment. The run ends with `contact_sheet.png`, `viewer.html` and `summary.json`.
 
     Args:
         until: The last stage to run.
     """
-    out, num = cfg.opened(out), STAGES.index(until) + 1
+    out = cfg.opened(out)
+    num_stages = STAGES.index(until) + 1
     check_out(out)
     towns = check(cfg)
     if not towns:
-        return _run_town(cfg, out, stages(cfg, out, resume=resume)[:num])
+        return _run_town(cfg, out, stages(cfg, out, resume=resume)[:num_stages])
     for name in (*towns, "release"):
         refuse_link(out / name)
     with _run_directory(cfg, out):
         results = []
         for number, (name, town) in enumerate(towns.items(), 1):
             log.info("town %d of %d: %s", number, len(towns), name)
-            own = stages(town, out / name, resume=resume)[:-1]  # the release is made of all
-            made = _run_town(town, out / name, own[:num])
-            results += [replace(one, stage=replace(one.stage, name=f"{name}/{one.stage.name}")) for one in made]
+            town_stages = stages(town, out / name, resume=resume)[:-1]  # the release is made of all towns
+            for result in _run_town(town, out / name, town_stages[:num_stages]):
+                results.append(replace(result, stage=replace(result.stage, name=f"{name}/{result.stage.name}")))
         if until == "release":
             joint = joint_release(cfg, [Source.of_run(out / name) for name in towns], out, resume)
-            results.append(_do(joint, out, "all towns"))
+            results.append(_run_stage(joint, out, "all towns"))
         _save_summary(results, out)
     return results
 
 
 @contextlib.contextmanager
 def _run_directory(cfg: RunConfig, out: Path) -> Iterator[None]:
-    """Lock a run directory and write its `run.yaml`: at once where no map is finished yet, else when all stages have
-    accepted the settings."""
+    """Lock a run directory and write its `run.yaml`.
+
+    A run without a finished map writes it at once; any other when all stages have accepted the settings.
+    """
     with hold_folder(out):
         is_new = not any(any(out.glob(maps)) for maps in ("maps/manifest.json", "*/maps/manifest.json"))
         if is_new or not (out / "run.yaml").exists():
@@ -143,7 +150,7 @@ def _run_directory(cfg: RunConfig, out: Path) -> Iterator[None]:
 
 
 def check(cfg: RunConfig) -> dict[str, RunConfig]:
-    """Check before the first stage what the last one requires; return the settings of each town.
+    """Check, before the first stage, the requirements of the last one; return the settings of each town.
 
     Raises:
         ConfigError: The licence of the release is not known, or it needs pictures that are not rendered.
@@ -151,35 +158,46 @@ def check(cfg: RunConfig) -> dict[str, RunConfig]:
     towns = {name: cfg.of_town(name) for name in cfg.towns}
     maps = [(name, town.maps.licence) for name, town in towns.items()] or [(cfg.maps.source, cfg.maps.licence)]
     choose_licence(cfg.release.licence, maps)
-    for one in towns.values() or [cfg]:
-        if missing := sorted(set(cfg.release.modalities) - set(one.render.modalities)):
-            what, got = "the release needs pictures that are not rendered", f"no {', no '.join(missing)}"
-            fix = f"render them, or --set 'release.modalities=[{', '.join(one.render.modalities)}]'"
-            raise ConfigError(what, where="render.modalities", got=got, fix=fix)
+    for town in towns.values() or [cfg]:
+        if missing := sorted(set(cfg.release.modalities) - set(town.render.modalities)):
+            raise ConfigError(
+                "the release needs pictures that are not rendered",
+                where="render.modalities",
+                got=f"no {', no '.join(missing)}",
+                fix=f"render them, or --set 'release.modalities=[{', '.join(town.render.modalities)}]'",
+            )
     return towns
 
 
 def begun_run(config: Path, cfg: RunConfig) -> Path | None:
-    """Return the run directory that a configuration belongs to: the run, or the run.yaml of one that has begun."""
+    """Return the run directory that a configuration belongs to; None if it is the configuration of a new run.
+
+    Args:
+        config: A run directory, or a YAML file, which may be the `run.yaml` of a run that has begun.
+    """
     if (config / "run.yaml").is_file():
         return config
-    places = [config.parent, *(config.parent / town for town in cfg.towns)]
-    has_begun = config.name == "run.yaml" and any(any(place.glob("*/stage.json")) for place in places)
+    folders = [config.parent, *(config.parent / town for town in cfg.towns)]
+    has_begun = config.name == "run.yaml" and any(any(folder.glob("*/stage.json")) for folder in folders)
     return config.parent if has_begun else None
 
 
 def check_out(out: Path) -> None:
     """Refuse to make a run in the folder of a stage: its tree would hold a second one."""
     if (out / "stage.json").exists() and not (out / "run.yaml").exists():
-        what, fix = "the folder of a stage, not of a run", "choose another --out, or the run directory above it"
-        raise ResumeError(what, where=out, got="stage.json in it", fix=fix)
+        raise ResumeError(
+            "the folder of a stage, not of a run",
+            where=out,
+            got="stage.json in it",
+            fix="choose another --out, or the run directory above it",
+        )
 
 
 def check_with_files(cfg: RunConfig) -> None:
-    """Check what the last stage requires, and that the files of all maps exist.
+    """Check the requirements of the last stage, and that the files of all maps exist.
 
     Raises:
-        CosflyError: The text names each of several problems.
+        CosflyError: Something is missing; several problems are reported in one error.
     """
     towns = [cfg.of_town(name) for name in cfg.towns] or [cfg]
     run_checks([partial(check, cfg), *(partial(_check_files, town) for town in towns)], cfg.name)
@@ -192,13 +210,13 @@ def _check_files(cfg: RunConfig) -> None:
         raise InputError("there is no such file", where=where, got=", ".join(missing.values()))
 
 
-def _run_town(cfg: RunConfig, out: Path, todo: list[Stage]) -> list[StageResult]:
+def _run_town(cfg: RunConfig, out: Path, town_stages: list[Stage]) -> list[StageResult]:
     """Run the stages of one town."""
-    for stage in todo:
+    for stage in town_stages:
         refuse_link(out / stage.name)
     with _run_directory(cfg, out):
-        results = [_do(stage, out, f"{number}/{len(todo)}") for number, stage in enumerate(todo, 1)]
-        # summary.json is written after the pictures: with these very stages in it, they are up to date.
+        results = [_run_stage(stage, out, f"{k}/{len(town_stages)}") for k, stage in enumerate(town_stages, 1)]
+        # summary.json is written after the pictures, so they are up to date if it has these very stages.
         is_shown = RunTotals.of(out).stages == _rows(results) and (out / "viewer.html").exists()
         if (out / "render/manifest.json").exists() and not is_shown:
             contact_sheet(out / "render", out / "contact_sheet.png")
@@ -207,16 +225,16 @@ def _run_town(cfg: RunConfig, out: Path, todo: list[Stage]) -> list[StageResult]
     return results
 
 
-def _do(stage: Stage, out: Path, place: str) -> StageResult:
-    """Run a stage; one that is complete refuses other settings, and continues where there is more to do."""
+def _run_stage(stage: Stage, out: Path, progress: str) -> StageResult:
+    """Run a stage; a complete stage refuses other settings, and continues if there is more to do."""
     folder = out / stage.name
     before = read_manifest(folder) if (folder / "manifest.json").exists() else None
     if before is None:
-        log.info("[%s] %s", place, stage.name)
+        log.info("[%s] %s", progress, stage.name)
     stage.work()
     after = read_manifest(folder)
     if before == after:
-        log.info("[%s] %s: already complete", place, stage.name)
+        log.info("[%s] %s: already complete", progress, stage.name)
     return StageResult(stage, after, before == after)
 
 
@@ -229,8 +247,12 @@ def _save_run(cfg: RunConfig, out: Path) -> None:
 
 def _rows(results: list[StageResult]) -> list[dict[str, Any]]:
     return [
-        {"stage": r.stage.name, "counts": r.manifest.counts.model_dump(mode="json"), "seconds": r.manifest.seconds}
-        for r in results
+        {
+            "stage": result.stage.name,
+            "counts": result.manifest.counts.model_dump(mode="json"),
+            "seconds": result.manifest.seconds,
+        }
+        for result in results
     ]
 
 

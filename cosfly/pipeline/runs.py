@@ -1,4 +1,4 @@
-"""What run directories hold: stages, items and disk; and the time and disk that a run will take, by stage."""
+"""Summaries of run directories (stages, items, disk), and estimates of the time and disk of a run, by stage."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ PAGES = ("viewer.html", "contact_sheet.png", "inspect/report.html", "caption/rep
 
 @dataclass(frozen=True)
 class StageSummary:
-    """One stage of a run, of a town `town/stage`. tally: outcomes of its items so far; None before it began."""
+    """One stage of a run.
+
+    name: `stage`, or `town/stage` in a run with towns. tally: outcomes of its items so far; None before it began.
+    """
 
     name: str
     folder: Path
@@ -41,16 +44,16 @@ class StageSummary:
     def size_bytes(self) -> int:
         """The disk space of its files, links not followed."""
         total = 0
-        for place, _, names in os.walk(self.folder):
+        for folder, _, names in os.walk(self.folder):
             for name in names:
                 with contextlib.suppress(OSError):  # a file that a running stage removes meanwhile
-                    total += os.lstat(os.path.join(place, name)).st_size
+                    total += os.lstat(os.path.join(folder, name)).st_size
         return total
 
 
 @dataclass(frozen=True)
 class RunSummary:
-    """One run directory. held: `, running now` while a process holds it, else nothing."""
+    """One run directory. held: `, running now` while a process holds it, else an empty text."""
 
     cfg: RunConfig
     held: str
@@ -70,27 +73,36 @@ class RunSummary:
         return sum(stage.size_bytes for stage in self.stages)
 
     def kept(self, stage: str) -> int:
-        """Return how many items a stage has kept in all towns."""
-        return sum(one.tally.kept for one in self.stages if one.folder.name == stage and one.tally)
+        """Return the number of items that a stage has accepted in all towns."""
+        return sum(summary.tally.kept for summary in self.stages if summary.folder.name == stage and summary.tally)
 
     def waiting(self) -> dict[Path, int]:
-        """Return the inspections with trajectories that wait for a manual decision, and how many."""
-        done = [one.folder for one in self.stages if one.folder.name == "inspect" and one.state == "complete"]
-        return {folder: count for folder in done if (count := len(undecided(folder / "inspect.json")))}
+        """Return folder of an inspection -> number of its tracks that wait for a manual decision, if there are any."""
+        waiting = {}
+        for stage in self.stages:
+            if stage.folder.name == "inspect" and stage.state == "complete":
+                waiting[stage.folder] = len(undecided(stage.folder / "inspect.json"))
+        return {folder: count for folder, count in waiting.items() if count}
 
 
 def summarize(run: Path) -> RunSummary:
-    """Return what is in a run directory.
+    """Return the summary of a run directory.
 
     Raises:
         InputError: It is not a run directory. ConfigError: Its `run.yaml` is not of this version.
     """
     if not (run / "run.yaml").is_file():
-        expected, fix = "a directory that `cosfly run` made", "find runs with cosfly list DIR"
-        raise InputError("not a run directory", where=run, got="no run.yaml", expected=expected, fix=fix)
+        raise InputError(
+            "not a run directory",
+            where=run,
+            got="no run.yaml",
+            expected="a directory that `cosfly run` made",
+            fix="find runs with cosfly list DIR",
+        )
     cfg = load(RunConfig, run / "run.yaml")
     names = [f"{town}/{name}" for town in cfg.towns for name in STAGES[:-1]]
-    stages = [_stage(name, run / name) for name in ([*names, "release"] if cfg.towns else STAGES)]
+    names = [*names, "release"] if cfg.towns else list(STAGES)
+    stages = [_stage(name, run / name) for name in names]
     return RunSummary(cfg, ", running now" if is_held(run) else "", stages)
 
 
@@ -125,8 +137,9 @@ def _stage(name: str, folder: Path) -> StageSummary:
 
 # --- estimates --------------------------------------------------------------------------------------------------------
 
-# Stage -> its unit, and seconds and MB per unit; those of frames are per million pixels. Of `cosfly run showcase`
-# (docs/first-runs.md; 2 cores, AMD EPYC, idle): 3 pedestrians, 858 frames of 0.9216 Mpx, 804 windows by `rules`.
+# Stage -> its unit, seconds per unit, MB per unit; rates of frames are per million pixels. Measured in
+# `cosfly run showcase` (docs/first-runs.md; 2 cores, AMD EPYC, idle): 3 pedestrians, 858 frames of 0.9216 Mpx, 804
+# windows by `rules`.
 BASIS = "`cosfly run showcase` on a 2-core machine (docs/first-runs.md)"
 RATES = {
     "maps": ("map", 0.2, 1.1),
@@ -138,13 +151,14 @@ RATES = {
     "caption": ("windows", 4.0 / 804, 7.4 / 804),
     "release": ("frames", 7.8 / 790.7, 1842 / 790.7),
 }
-# Frames of a trajectory over those of the straight line between its ends (50 to 100 m at 1.2 m/s, 2 frames/s: 143).
+# Frames of a trajectory over the frames of the straight line between its ends (50 to 100 m at 1.2 m/s, 2 frames/s:
+# 143).
 DETOUR = 1.14
 
 
 @dataclass(frozen=True)
 class StageEstimate:
-    """One stage of a run, of a town `town/stage`. seconds: None where its teacher decides; 0 where it is done."""
+    """The estimate of one stage. seconds: None if they depend on the teacher; 0 if the stage is complete."""
 
     name: str
     count: int
@@ -168,25 +182,43 @@ def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
         return list(_estimates(cfg, out, STAGES))
     rows: list[StageEstimate] = []
     for name in cfg.towns:
-        own = _estimates(cfg.of_town(name), out / name, STAGES[:-1])
-        rows += [replace(row, name=f"{name}/{row.name}") for row in own]
-    return [*rows, _estimate("release", sum(row.count for row in rows if row.name.endswith("/render")), cfg, out)]
+        town_rows = _estimates(cfg.of_town(name), out / name, STAGES[:-1])
+        rows += [replace(row, name=f"{name}/{row.name}") for row in town_rows]
+    num_frames = sum(row.count for row in rows if row.name.endswith("/render"))
+    return [*rows, _estimate("release", num_frames, cfg, out)]
 
 
 def _estimates(cfg: RunConfig, out: Path, names: tuple[str, ...]) -> Iterator[StageEstimate]:
-    walk, window, stride = cfg.pedestrians, cfg.caption.window, cfg.render.frame_stride
-    straight = (walk.min_distance_m + walk.max_distance_m) / 2 / walk.cruise_speed_mps / walk.dt_s / stride
-    frames = [round(DETOUR * straight)] * walk.num_paths
-    paths, traces = out / "pedestrians/path.json", out / "plan/drone_trace.json"
-    if all(_is_complete(path.parent) for path in (paths, traces)) and len(read_paths(paths)) == walk.num_paths:
-        kept = (trace for trace in read_traces(traces) if trace.drop_reason is None)
-        frames = [math.ceil(len(trace.time_s) / stride) for trace in kept] or frames
-    whole = (max(0, count - window.num_frames + 1 - window.future_frames) for count in frames)
-    per_track = {"frames": sum(frames), "windows": sum(math.ceil(count / window.stride) for count in whole)}
-    counts = {unit: count * len(cfg.render.tracks) for unit, count in per_track.items()}
-    counts |= {"map": 1, "pedestrians": walk.num_paths}
+    pedestrians = cfg.pedestrians
+    window = cfg.caption.window
+    frames = _frames_by_trajectory(cfg, out)
+    starts = [max(0, count - window.num_frames + 1 - window.future_frames) for count in frames]  # of whole windows
+    num_windows = sum(math.ceil(count / window.stride) for count in starts)
+    num_tracks = len(cfg.render.tracks)
+    counts = {
+        "map": 1,
+        "pedestrians": pedestrians.num_paths,
+        "frames": sum(frames) * num_tracks,
+        "windows": num_windows * num_tracks,
+    }
     for name in names:
         yield _estimate(name, counts[RATES[name][0]], cfg, out)
+
+
+def _frames_by_trajectory(cfg: RunConfig, out: Path) -> list[int]:
+    """Return the number of frames of each trajectory: of the plans if they are complete, else as expected."""
+    pedestrians = cfg.pedestrians
+    stride = cfg.render.frame_stride
+    paths = out / "pedestrians/path.json"
+    traces = out / "plan/drone_trace.json"
+    is_planned = _is_complete(paths.parent) and _is_complete(traces.parent)
+    if is_planned and len(read_paths(paths)) == pedestrians.num_paths:
+        accepted = [trace for trace in read_traces(traces) if trace.drop_reason is None]
+        if accepted:
+            return [math.ceil(len(trace.time_s) / stride) for trace in accepted]
+    distance_m = (pedestrians.min_distance_m + pedestrians.max_distance_m) / 2
+    straight = distance_m / pedestrians.cruise_speed_mps / pedestrians.dt_s / stride
+    return [round(DETOUR * straight)] * pedestrians.num_paths
 
 
 def _estimate(name: str, count: int, cfg: RunConfig, out: Path) -> StageEstimate:
@@ -205,29 +237,35 @@ def _is_complete(folder: Path) -> bool:
 
 def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
     """Return the basis of the figures, their totals, and what prevents the run."""
-    needed, time = sum(row.bytes for row in rows), duration(sum(row.seconds or 0.0 for row in rows))
+    needed = sum(row.bytes for row in rows)
+    time = duration(sum(row.seconds or 0.0 for row in rows))
     unknown = [row.name for row in rows if row.seconds is None]
     if unknown:
         time += f", and {', '.join(unknown)}, whose time depends on the teacher"
-    place = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
-    free = shutil.disk_usage(place).free
+    existing = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    free = shutil.disk_usage(existing).free
     lines = [f"figures: {BASIS}", f"in all about {time}; {in_words(needed)} of disk, {in_words(free)} are free"]
     lines += caveats(cfg)
-    lines += ["cosfly caption --plan estimates the teacher's part"] if unknown else []
-    too_small = "the disk is too small: choose another --out, or fewer pedestrians or pixels"
-    return [*lines, too_small] if needed > free else lines
+    if unknown:
+        lines.append("cosfly caption --plan estimates the teacher's part")
+    if needed > free:
+        lines.append("the disk is too small: choose another --out, or fewer pedestrians or pixels")
+    return lines
 
 
 def caveats(cfg: RunConfig) -> list[str]:
-    """Return which settings apply to some trajectories only, and which trajectories will be too dark to see."""
+    """Return the settings that apply to some trajectories only, and the trajectories that are too dark to see."""
     lines = cfg.plan.remarks()
-    for name, town in ({name: cfg.of_town(name) for name in cfg.towns} or {cfg.name: cfg}).items():
-        num = town.pedestrians.num_paths
-        if dark := dark_trajectories(town.render, num, partial(load_map, town.maps, seed=town.seed)):
-            listed = ", ".join(map(walk_id, dark[:4])) + ", ..." * (len(dark) > 4)
+    towns = {name: cfg.of_town(name) for name in cfg.towns} or {cfg.name: cfg}
+    for name, town in towns.items():
+        num_paths = town.pedestrians.num_paths
+        if dark := dark_trajectories(town.render, num_paths, partial(load_map, town.maps, seed=town.seed)):
+            listed = ", ".join(map(walk_id, dark[:4]))
+            if len(dark) > 4:
+                listed += ", ..."
             lines.append(
-                f"{name}: {len(dark)} of {num} trajectories are dark ({listed}): they are at night, on a map without "
-                "street lamps, roads and pavements, so nobody will see the target. Choose another time of day "
+                f"{name}: {len(dark)} of {num_paths} trajectories are dark ({listed}): they are at night, on a map "
+                "without street lamps, roads and pavements, so nobody will see the target. Choose another time of day "
                 "(render.tod_name, render.tod_pool), another render.weather_seed, or a map with streets"
             )
     return lines

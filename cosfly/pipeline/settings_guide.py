@@ -1,4 +1,4 @@
-"""The settings explained: each with its value, what it may be and what it means."""
+"""Explanations of settings: value, allowed values and meaning of each."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ BOUNDS |= {"multipleOf": "a multiple of"}
 class Setting(NamedTuple):
     """One setting, or a group of settings.
 
-    name: with its sections, such as `plan.altitude_max_m`. value: JSON-able, None for a group. kind: what it may be, in
-    words, empty for a group. meaning: its description.
+    name: with its sections, such as `plan.altitude_max_m`. value: JSON-able, None for a group. kind: a text about the
+    values that it takes, empty for a group. meaning: its description.
     """
 
     name: str
@@ -32,25 +32,31 @@ def explain(cfg: BaseModel, section: str | None = None) -> list[Setting]:
     """Return all settings in order, a group before its members; or those of one section, or one setting."""
     schema = type(cfg).model_json_schema()
     settings = list(_explain(schema, schema["$defs"], cfg.model_dump(mode="json"), ""))
-    found = [s for s in settings if section is None or s.name == section or s.name.startswith(f"{section}.")]
-    if section is not None and not found:
-        what = f"no such section or setting{nearest(section, [setting.name for setting in settings])}"
-        expected = "for instance plan or plan.muco, after the name of a file or of a shipped configuration"
-        raise ConfigError(what, got=section, expected=expected)
-    return found
+    if section is None:
+        return settings
+    selected = [s for s in settings if s.name == section or s.name.startswith(f"{section}.")]
+    if not selected:
+        raise ConfigError(
+            f"no such section or setting{nearest(section, [setting.name for setting in settings])}",
+            got=section,
+            expected="for instance plan or plan.muco, after the name of a file or of a shipped configuration",
+        )
+    return selected
 
 
 def changed(cfg: BaseModel, section: str | None = None) -> list[Setting]:
-    """Return the settings that are not the defaults; raises as `explain`."""
+    """Return the settings that differ from their defaults; raises the errors of `explain`."""
     defaults = {setting.name: setting.value for setting in explain(type(cfg)())}
-    return [one for one in explain(cfg, section) if one.kind and one.value != defaults.get(one.name)]
+    settings = explain(cfg, section)
+    return [setting for setting in settings if setting.kind and setting.value != defaults.get(setting.name)]
 
 
 def _explain(
     group: Mapping[str, Any], models: Mapping[str, Any], values: Mapping[str, Any], above: str
 ) -> Iterator[Setting]:
     for name, field in group["properties"].items():
-        meaning, model = field.get("description", ""), models.get(field.get("$ref", "").rpartition("/")[2], {})
+        meaning = field.get("description", "")
+        model = models.get(field.get("$ref", "").rpartition("/")[2], {})
         if "properties" in model:
             yield Setting(above + name, None, "", meaning)
             yield from _explain(model, models, values[name], f"{above}{name}.")
@@ -59,9 +65,10 @@ def _explain(
 
 
 def _kind_of(field: Mapping[str, Any], models: Mapping[str, Any]) -> str:
-    """Return what a setting may be: `number > 0`, `one of a, b`, `list of texts`, `text, as a, b`."""
+    """Return the allowed values in words: `number > 0`, `one of a, b`, `list of: text`, `text, as a, b`."""
     field = {**models.get(field.get("$ref", "").rpartition("/")[2], {}), **field}
-    kind, rule = field.get("type", ""), field.get("additionalProperties")
+    kind = field.get("type", "")
+    values = field.get("additionalProperties")  # of a mapping
     if "anyOf" in field:
         words = ", or ".join(_kind_of(part, models) for part in field["anyOf"])
     elif "enum" in field:
@@ -72,7 +79,9 @@ def _kind_of(field: Mapping[str, Any], models: Mapping[str, Any]) -> str:
         parts = field.get("prefixItems") or [field.get("items", {})]
         words = f"list of: {', '.join(_kind_of(part, models) for part in parts)}"
     elif kind == "object":
-        words = "mapping of names to: " + (_kind_of(rule, models) if isinstance(rule, dict) and rule else "values")
+        words = "mapping of names to: " + (
+            _kind_of(values, models) if isinstance(values, dict) and values else "values"
+        )
     elif field.get("format") == "path":
         words = "path"
     else:
@@ -82,7 +91,7 @@ def _kind_of(field: Mapping[str, Any], models: Mapping[str, Any]) -> str:
 
 
 def nested(settings: list[Setting]) -> dict[str, Any]:
-    """Return the values group within group, as a configuration file holds them."""
+    """Return the values as nested groups, as in a configuration file."""
     values: dict[str, Any] = {}
     for setting in settings:
         *above, last = setting.name.split(".")
@@ -94,7 +103,7 @@ def nested(settings: list[Setting]) -> dict[str, Any]:
 
 
 def as_lines(settings: list[Setting]) -> Iterator[str]:
-    """Yield lines for a terminal: `name = value`, then what it means and what it may be."""
+    """Yield lines for a terminal: `name = value`, then the meaning and the allowed values."""
     for setting in settings:
         if setting.kind:
             yield f"  {setting.name} = {dump_json(setting.value)}\n      {setting.meaning} [{setting.kind}]"
