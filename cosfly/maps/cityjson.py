@@ -1,6 +1,8 @@
-"""A CityJSON city model (1.1 or 2.0, one document or a text sequence, plain or gzipped): polygons become oriented
-boxes, cut up, because one box around an object can be hundreds of metres wide. Surfaces become thin slabs that never
-obstruct a pedestrian; green with the heights of its canopy becomes a lawn, and trees where it rises over the ground.
+"""A CityJSON city model (1.1 or 2.0, one document or a text sequence, plain or gzipped) as a map of oriented boxes.
+
+Polygons are cut into several boxes, because one box around an object can be hundreds of metres wide. Surfaces become
+thin slabs that never obstruct a pedestrian. Green areas with the heights of their canopy become a lawn, and trees where
+they rise over the ground.
 """
 
 from __future__ import annotations
@@ -92,9 +94,11 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
         objects = [item if item.rule.form == "solid" else item.moved(lowered) for item in objects]
     facets = {item.object_id: _facets(item) for item in objects}
     footprints = {key: united([polygon for polygon, _ in value]) for key, value in facets.items()}
-    boxes, solid_rows = BoxList(), list[int]()
-    refs, made = dict[int, MeshRef](), dict[str, Mesh]()
-    footprint_m2 = boxes_m2 = covered_m2 = 0.0
+    boxes = BoxList()
+    solid_rows = list[int]()
+    mesh_refs = dict[int, MeshRef]()
+    meshes = dict[str, Mesh]()
+    footprint_m2 = boxes_m2 = covered_m2 = 0.0  # of buildings
     for item in objects:
         footprint = footprints[item.object_id]
         if item.rule.form == "solid":
@@ -103,28 +107,22 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
             rows = range(first, len(boxes))
             solid_rows += rows
             if mesh is not None and rows:
-                made[item.object_id] = mesh
+                meshes[item.object_id] = mesh
                 ref = MeshRef(file=MESHES_FILE, node=item.object_id, fit="world")
-                refs |= {row + 1: ref for row in rows}  # ids are rows counted from 1
+                mesh_refs |= {row + 1: ref for row in rows}  # ids are rows counted from 1
             if item.rule.kind == "Buildings":
-                footprint_m2, boxes_m2 = footprint_m2 + footprint.area, boxes_m2 + outline.area
+                footprint_m2 += footprint.area
+                boxes_m2 += outline.area
                 covered_m2 += shapely.intersection(footprint, outline).area
-        elif item.rule.form == "wall":  # as high as the upper quartile of its vertices
-            high = float(np.clip(np.percentile(item.corners()[:, 2], 75), 0.3, WALL_MAX_M))
-            longest_m, low = (np.inf, -SLAB_M) if ground.is_flat else (SLOPED_WALL_M, -SLOPED_WALL_DEPTH_M)
-            for piece in _pieces(footprint, 0.02, min_fill=WALL_FILL, min_size_m=WALL_PIECE_M, max_size_m=longest_m):
-                boxes.add(item.rule.kind, piece.center, piece.size, low, high, piece.yaw_deg)
+        elif item.rule.form == "wall":
+            _add_wall(boxes, item, footprint, is_flat=ground.is_flat)
         elif item.rule.kind != "Water":
             _add_surface(boxes, item.rule.kind, footprint)
         if item.rule.kind == "Bridge":
             _add_surface(boxes, "Sidewalks", footprint)  # for pedestrians
         if item.rule.form == "green" and facets[item.object_id]:
             _add_trees(boxes, item, facets[item.object_id])
-    # Water without the bridges and streets that cross it: pedestrians cannot walk on water.
-    water = united([footprints[item.object_id] for item in objects if item.rule.kind == "Water"])
-    crossing = [footprints[i.object_id] for i in objects if i.rule.kind in ("Bridge", "Roads", "Sidewalks", "Ground")]
-    water = shapely.difference(water, shapely.buffer(united(crossing), 0.05)) if crossing else water
-    _add_surface(boxes, "Water", water)
+    _add_surface(boxes, "Water", _open_water(objects, footprints))
     header = MapHeader(
         name=cfg.name, source=MapSource(tool=cfg.tool, version=f"CityJSON {model.version}", file=path.name),
         licence=cfg.licence, credits=cfg.credits, ground_z_m=0.0,
@@ -135,11 +133,21 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     )  # fmt: skip
     if not ground.is_flat:
         header = header.model_copy(update={"ground": GroundGrid.of(ground)})
-    box_map = replace(boxes.box_map(header), meshes=Meshes(refs, made=made))
+    box_map = replace(boxes.box_map(header), meshes=Meshes(mesh_refs, made=meshes))
     if not ground.is_flat:
         follows = ~np.isin(np.arange(len(box_map)), solid_rows)
         box_map.centers[follows, 2] += ground.height_at(box_map.centers[follows])
     return with_derived_ground(box_map) if cfg.derive_ground else box_map
+
+
+def _open_water(objects: list[CityObject], footprints: dict[str, Any]) -> Any:
+    """Return the water without the bridges and streets that cross it: pedestrians cannot walk on water."""
+    water = united([footprints[item.object_id] for item in objects if item.rule.kind == "Water"])
+    crossing_kinds = ("Bridge", "Roads", "Sidewalks", "Ground")
+    crossing = [footprints[item.object_id] for item in objects if item.rule.kind in crossing_kinds]
+    if crossing:
+        water = shapely.difference(water, shapely.buffer(united(crossing), 0.05))
+    return water
 
 
 def _centred(objects: list[CityObject], path: Path) -> tuple[list[CityObject], np.ndarray]:
@@ -176,10 +184,15 @@ def _pieces(footprint: Any, tolerance_m: float, **rules: Any) -> Iterator[Rectan
 
 
 def _add_solid(
-    boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint, ground: Ground
+    boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint: Any, ground: Ground
 ) -> tuple[Any, Mesh | None]:
-    """Add a building as upright boxes from its lowest ground (or below it) to its top; return the union of their
-    outlines, and the mesh to draw. A box is as high as the mesh in it, so that planners know its spires."""
+    """Add a building as upright boxes from its lowest ground (or below it) to its top.
+
+    A box is as high as the mesh in it, so that planners know its spires.
+
+    Returns:
+        The union of the outlines of the boxes; the mesh to draw, if it has one.
+    """
     z = item.corners()[:, 2]
     low = min(float(z.min()), float(ground.height_at(item.corners()).min()))
     high = max(float(z.max()), float(z.min()) + 0.1)
@@ -198,7 +211,6 @@ def solid_mesh(surfaces: list[Surface], foot_m: float) -> Mesh | None:
     The foot is lowered to `foot_m`, so that no house floats over ground that a map made flat.
     """
     lowest = min(float(ring[:, 2].min()) for surface in surfaces for ring in surface)
-
     parts = []
     for surface in surfaces:
         rings = [ring.copy() for ring in surface]
@@ -211,19 +223,28 @@ def solid_mesh(surfaces: list[Surface], foot_m: float) -> Mesh | None:
     return Mesh(corners, np.full((len(corners), 3), np.nan))
 
 
-def _top_within(mesh: Mesh, rectangle: Rectangle, otherwise: float) -> float:
-    """Return the height of the highest triangle over a rectangle; `otherwise` if there is none."""
+def _add_wall(boxes: BoxList, item: CityObject, footprint: Any, *, is_flat: bool) -> None:
+    """Add a wall as boxes that are as high as the upper quartile of its vertices."""
+    high = float(np.clip(np.percentile(item.corners()[:, 2], 75), 0.3, WALL_MAX_M))
+    longest_m, low = (np.inf, -SLAB_M) if is_flat else (SLOPED_WALL_M, -SLOPED_WALL_DEPTH_M)
+    for piece in _pieces(footprint, 0.02, min_fill=WALL_FILL, min_size_m=WALL_PIECE_M, max_size_m=longest_m):
+        boxes.add(item.rule.kind, piece.center, piece.size, low, high, piece.yaw_deg)
+
+
+def _top_within(mesh: Mesh, rectangle: Rectangle, default: float) -> float:
+    """Return the height of the highest triangle over a rectangle; `default` if there is none."""
     yaw = np.radians(rectangle.yaw_deg)
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-    flat, half = (mesh.corners_m[..., :2] - rectangle.center) @ axes.T, np.array(rectangle.size) / 2.0 - EDGE_M
+    flat = (mesh.corners_m[..., :2] - rectangle.center) @ axes.T
+    half = np.array(rectangle.size) / 2.0 - EDGE_M
     over = ((flat.min(axis=1) < half) & (flat.max(axis=1) > -half)).all(axis=1)
-    return float(mesh.corners_m[over, :, 2].max()) if over.any() else otherwise
+    return float(mesh.corners_m[over, :, 2].max()) if over.any() else default
 
 
 def _triangles_of(rings: Surface) -> np.ndarray:
-    """Return triangles of a surface that turn as its outline does, (k, 3, 3), with the surface's own corners.
+    """Return the triangles of a surface, (k, 3, 3) m, with its own corners and the winding of its outline.
 
-    Of an outline that crosses itself the valid parts are used; their new corners lie in the surface's plane.
+    If the outline crosses itself, its valid parts are used; their new corners lie in the surface's plane.
     """
     outline = rings[0]
     after = np.roll(outline, -1, axis=0)
@@ -245,16 +266,18 @@ def _triangles_of(rings: Surface) -> np.ndarray:
             return outline[[(0, 1, 2), (0, 2, 3)]]
     polygon = Polygon(flat[0], flat[1:])
     pieces = polygons_of(polygon if polygon.is_valid else shapely.make_valid(polygon))
-    own = {(x, y): corner for places, ring in zip(flat, rings, strict=True)
-           for (x, y), corner in zip(places.tolist(), ring, strict=True)}  # fmt: skip
-    found = []
+    corner_at = {}  # position in the plane -> corner of the surface
+    for flat_ring, ring in zip(flat, rings, strict=True):
+        for (x, y), corner in zip(flat_ring.tolist(), ring, strict=True):
+            corner_at[x, y] = corner
+    triangles = []
     for triangle in shapely.get_parts([shapely.constrained_delaunay_triangles(piece) for piece in pieces]):
-        places = shapely.get_coordinates(shapely.orient_polygons(triangle))[:3]
-        found.append([own.get((x, y), middle + (x, y) @ axes) for x, y in places.tolist()])
-    return np.array(found).reshape(-1, 3, 3)
+        positions = shapely.get_coordinates(shapely.orient_polygons(triangle))[:3]
+        triangles.append([corner_at.get((x, y), middle + (x, y) @ axes) for x, y in positions.tolist()])
+    return np.array(triangles).reshape(-1, 3, 3)
 
 
-def _add_surface(boxes: BoxList, kind: str, footprint) -> None:
+def _add_surface(boxes: BoxList, kind: str, footprint: Any) -> None:
     """Add a surface as slabs at the height of its kind, so that it never obstructs a pedestrian."""
     top = SURFACE_TOPS_M.get(kind, -0.1)
     fill, piece_m = (WATER_FILL, WATER_PIECE_M) if kind == "Water" else (SURFACE_FILL, SURFACE_PIECE_M)
@@ -298,8 +321,14 @@ def _canopy_heights(item: CityObject, facets: list[Facet]) -> tuple[np.ndarray, 
 
 
 def _crowns(heights: np.ndarray) -> list[tuple[int, int, int, int, float]]:
-    """Gather the cells of a canopy, (nx, ny) m, into trees, the highest first: (x0, y0, x1, y1, height) in cells, ends
-    excluded. Every cell over CANOPY_M lies in exactly one."""
+    """Gather the cells of a canopy into trees, the highest first; every cell over CANOPY_M lies in exactly one.
+
+    Args:
+        heights: (nx, ny) m.
+
+    Returns:
+        (x0, y0, x1, y1, height) of each tree: indices of cells with the ends excluded, and m.
+    """
     free = heights > CANOPY_M
     trees = []
     for flat in np.argsort(-heights, axis=None, kind="stable"):
@@ -325,10 +354,12 @@ def _crowns(heights: np.ndarray) -> list[tuple[int, int, int, int, float]]:
 def ground_of(objects: list[CityObject]) -> Ground:
     """Return the ground of a city model with its usual height at 0: flat, or a grid of heights."""
     terrain = [item.corners() for item in objects if item.rule.form == "surface" and item.rule.kind in TERRAIN_KINDS]
-    samples, origin = (np.concatenate(terrain) if terrain else np.empty((0, 3))), "its terrain and streets"
-    if not terrain:
-        feet = [item.corners() for item in objects if item.rule.form == "solid"] or [i.corners() for i in objects]
-        samples = np.array([[*(c[:, :2].min(axis=0) + c[:, :2].max(axis=0)) / 2, c[:, 2].min()] for c in feet])
+    if terrain:
+        samples = np.concatenate(terrain)
+        origin = "its terrain and streets"
+    else:
+        solids = [item for item in objects if item.rule.form == "solid"] or objects
+        samples = np.array([_foot(item.corners()) for item in solids])
         origin = "the feet of its buildings"
     low, high = np.percentile(samples[:, 2], RISE_SHARES)
     if high - low <= FLAT_WITHIN_M:
@@ -341,8 +372,14 @@ def ground_of(objects: list[CityObject]) -> Ground:
     return GroundGrid.of(ground).ground()
 
 
+def _foot(corners: np.ndarray) -> list[float]:
+    """Return the middle of an object's bounds at the height of its lowest corner, (3,) m."""
+    middle = (corners[:, :2].min(axis=0) + corners[:, :2].max(axis=0)) / 2
+    return [*middle, corners[:, 2].min()]
+
+
 def _gridded(samples: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ground:
-    """Return a grid over a rectangle: linear between samples, beyond them as high as the nearest."""
+    """Return a grid of heights over a rectangle: linear between samples, and that of the nearest sample beyond them."""
     # Imported here: half a second that every command would spend for the settings of the maps.
     from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
     from scipy.spatial import QhullError
@@ -357,10 +394,10 @@ def _gridded(samples: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ground:
     num_x, num_y = (np.ceil((high - west_south) / cell_m).astype(int) + 1).clip(2).tolist()
     x, y = np.meshgrid(west_south[0] + cell_m * np.arange(num_x), west_south[1] + cell_m * np.arange(num_y))
     nodes = np.column_stack([x.ravel(), y.ravel()])
-    found = NearestNDInterpolator(places, heights)(nodes)
+    node_heights = NearestNDInterpolator(places, heights)(nodes)
     try:
         linear = LinearNDInterpolator(places, heights)(nodes)
-        found = np.where(np.isnan(linear), found, linear)
+        node_heights = np.where(np.isnan(linear), node_heights, linear)
     except QhullError:  # too few samples, or all on one line
         log.warning("the ground has %d samples, that span no area: heights are those of the nearest", len(places))
-    return Ground(found.reshape(num_y, num_x), float(west_south[0]), float(west_south[1]), cell_m)
+    return Ground(node_heights.reshape(num_y, num_x), float(west_south[0]), float(west_south[1]), cell_m)
