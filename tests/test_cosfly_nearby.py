@@ -31,7 +31,7 @@ def test_memory_answers_as_the_index_does(seed, count, far):
     index = random_boxes(rng, count)  # 400 boxes: more round a waypoint than there is room for
     places, targets = rng.uniform(-40, 40, (2, 6, 3)) * [1, 1, 0.3] + [0, 0, 10]
     memory = nearby.nothing_nearby(len(places))
-    assert nearby.known(memory.anchors, memory.num_around, 0, *places[0]) == -1, "it knows nothing yet"
+    assert nearby.num_cached(memory.anchors, memory.num_around, 0, *places[0]) == -1, "it knows nothing yet"
     nearby.remember(memory, index, places, targets, 8.0, 0.8)
     moves = rng.normal(size=places.shape)
     moves *= (4.0 if far else rng.uniform(0, nearby.MARGIN_M)) / np.linalg.norm(moves, axis=1, keepdims=True)
@@ -40,7 +40,7 @@ def test_memory_answers_as_the_index_does(seed, count, far):
         gap, box = nearby.nearest_of(memory, i, index, *p, 8.0)
         expected, nearest = kernels.nearest_box(index, *p, 8.0)
         assert (gap, box < 0) == (expected, nearest < 0)
-        number = nearby.known(memory.anchors, memory.num_on_view, i, *p)
+        number = nearby.num_cached(memory.anchors, memory.num_on_view, i, *p)
         wanted = set(room[: kernels.collect_hits(index, *x, *p, 0.8, room)].tolist())
         if number >= 0:
             assert not far

@@ -5,8 +5,7 @@ from hypothesis import strategies as st
 
 from cosfly.pedestrians.speed_model import (
     PACES,
-    arrival_times,
-    resample,
+    TimedRoute,
     standing_time_s,
     take_pace,
 )
@@ -15,11 +14,11 @@ from cosfly.pedestrians.speed_model import (
 def test_even_speed_gives_even_steps_and_ends_at_the_goal():
     polyline = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.3]])
     speeds = np.full(3, 1.0)
-    time_s, positions, sampled = resample(polyline, speeds, arrival_times(polyline, speeds), 0.5, np.zeros(3))
+    time_s, positions, sampled = TimedRoute(polyline, speeds, np.zeros(3)).resample(0.5)
     np.testing.assert_allclose(time_s, [0, 0.5, 1.0, 1.5, 2.0, 2.5])
     np.testing.assert_allclose(positions, [[0, 0], [0.5, 0], [1, 0], [1, 0.5], [1, 1.0], [1, 1.3]], atol=1e-12)
     np.testing.assert_allclose(sampled, 1.0)
-    time_s, positions, _ = resample(polyline[:2], np.ones(2), np.array([0.0, 1.0]), 0.5, np.zeros(2))
+    time_s, positions, _ = TimedRoute(polyline[:2], np.ones(2), np.zeros(2)).resample(0.5)
     np.testing.assert_allclose(time_s, [0.0, 0.5, 1.0])  # one that ends on a step has no second last point
     np.testing.assert_allclose(positions[-1], [1.0, 0.0])
 
@@ -30,8 +29,9 @@ def test_samples_agree_with_a_walk_in_tiny_steps(seed, count):
     rng = np.random.default_rng(seed)
     polyline = np.cumsum(rng.uniform(0.2, 1.0, (count, 2)), axis=0)
     speeds = rng.uniform(0.1, 1.6, count)
-    times = arrival_times(polyline, speeds)
-    time_s, positions, sampled = resample(polyline, speeds, times, 0.5, np.zeros(count))
+    route = TimedRoute(polyline, speeds, np.zeros(count))
+    times = route.times_s
+    time_s, positions, sampled = route.resample(0.5)
     # The slow way: speed is linear in time between waypoints, the way walked is its integral.
     fine_s = np.linspace(0.0, times[-1], 200_001)
     fine_mps = np.interp(fine_s, times, speeds)
@@ -68,5 +68,5 @@ def test_every_way_arrives(seed, count, name, cell_m):
     route = np.column_stack([cell_m * np.arange(count + 1), np.zeros(count + 1)])
     way = take_pace(route, PACES[name], np.random.default_rng(seed))
     speeds = np.where(way.stops_s > 0, 0.0, 1.2)
-    assert np.isfinite(arrival_times(way.polyline_m, speeds)).all()
+    assert np.isfinite(TimedRoute(way.polyline_m, speeds, way.stops_s).times_s).all()
     np.testing.assert_array_equal(way.polyline_m[0], route[0])

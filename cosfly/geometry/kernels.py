@@ -147,6 +147,16 @@ def squared_gap(rows, box, x, y, z):
     return dx * dx + dy * dy + dz * dz
 
 
+@njit(cache=True, inline="always")
+def distance_if_nearer(rows, box, x, y, z, best):
+    """Return the signed distance of a point to a box, m, or `best` if the bounds of the box are no nearer than that."""
+    gap = squared_gap(rows, box, x, y, z)
+    distance = best
+    if gap <= 0.0 or (best > 0.0 and gap < best * best):
+        distance = distance_to_box(rows, box, x, y, z)
+    return distance
+
+
 @njit(cache=True)
 def normal_of_box(rows, box, x, y, z):
     """Return the unit vector away from a box at a point: from the nearest surface point or, inside, face.
@@ -273,10 +283,7 @@ def nearest_box(index, x, y, z, reach_m):
                 cell = ix * num_y + iy
                 for place in range(index.starts[cell], index.starts[cell + 1]):
                     box = index.members[place]
-                    gap = squared_gap(index.rows, box, x, y, z)
-                    if gap > 0.0 and (best <= 0.0 or gap >= best * best):
-                        continue
-                    distance = distance_to_box(index.rows, box, x, y, z)
+                    distance = distance_if_nearer(index.rows, box, x, y, z, best)
                     if distance < best:
                         best, best_box = distance, box
     return best, best_box

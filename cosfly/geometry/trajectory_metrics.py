@@ -42,6 +42,11 @@ def length_m(positions_m: np.ndarray) -> float:
     return float(np.linalg.norm(_differences(positions_m, 1), axis=1).sum())
 
 
+def distances_along_m(points_m: np.ndarray) -> np.ndarray:
+    """Return the distance along a polyline to each of its points, (n, 2 or 3) m, as (n,) m from 0."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))])
+
+
 def speed_max_mps(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
     """Return the largest speed between neighbouring waypoints, (n, 3) m, in m/s; 0 for one point."""
     return float(np.linalg.norm(_differences(positions_m, 1), axis=1).max(initial=0.0)) / dt_s

@@ -15,9 +15,16 @@ from cosfly.formats.bystanders import Bystander, Bystanders
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.geometry.axes import headings_of
 from cosfly.geometry.ground import Ground
-from cosfly.pedestrians import speed_model
 from cosfly.pedestrians.lanes import Lane
-from cosfly.pedestrians.speed_model import PACES, STOP_GAP_MIN, PacedRoute, speeds_at, take_pace
+from cosfly.pedestrians.speed_model import (
+    PACES,
+    STOP_GAP_MIN,
+    PacedRoute,
+    TimedRoute,
+    menger_curvature,
+    speeds_at,
+    take_pace,
+)
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround
 from cosfly.runtime.seeding import draw_by_share
 
@@ -60,8 +67,8 @@ class Trip:
         if self.kind == "Car":
             speeds_mps = braked(speeds_mps, self.route.along_m)
         line = np.column_stack([self.route.along_m, np.zeros(len(speeds_mps))])
-        times_s, now_s = speed_model.arrival_times(line, speeds_mps), time_s + self.head_start_s
-        return speed_model.sample(line, speeds_mps, times_s, self.route.stops_s, now_s)[0][:, 0]
+        positions_m, _ = TimedRoute(line, speeds_mps, self.route.stops_s).sample(time_s + self.head_start_s)
+        return positions_m[:, 0]
 
     def waiting(self, before_m: float) -> Trip:
         """Return the trip with a stop of WAIT_S, or a longer one, at least KEEP_BACK_M before a place of the route."""
@@ -181,7 +188,7 @@ def _draw_car(
     route = PacedRoute.without_stops(np.concatenate(pieces))
     if route.along_m[-1] < SHORTEST_DRIVE_M:
         return None
-    curvatures = np.maximum(speed_model.menger_curvature(route.polyline_m), 1e-6)
+    curvatures = np.maximum(menger_curvature(route.polyline_m), 1e-6)
     limits_mps = np.minimum(CAR_SPEED_MPS * rng.uniform(*OWN_SPEED), np.sqrt(CAR_SIDEWAYS_MPS2 / curvatures))
     limits_mps[-1] = 0.0
     return Trip("Car", route, limits_mps)

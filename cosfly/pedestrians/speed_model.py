@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cosfly.formats.pedestrian_paths import PLAIN_PACE
+from cosfly.geometry.trajectory_metrics import distances_along_m
 
 if TYPE_CHECKING:
     from cosfly.pedestrians.walkable import PedestriansConfig
@@ -16,11 +17,14 @@ if TYPE_CHECKING:
 
 CURVATURE_EPSILON_M3 = 1e-6  # eq:menger: below this product of lengths three points have no curvature
 SLOWEST_SPEED_MPS = 0.05  # eq:speed alone allows 0, with which a pedestrian would never arrive
+STOP_GAP_MIN = 2  # waypoints from one stop to the next: a piece between two stops would have no speed
 
 
 def menger_curvature(polyline_m: np.ndarray) -> np.ndarray:
-    """Return the curvature at the waypoints of a polyline, (k, 2) m, in 1/m (eq:menger): 0 at both ends and where the
-    product of the three distances is below CURVATURE_EPSILON_M3."""
+    """Return the curvature at the waypoints of a polyline, (k, 2) m, in 1/m (eq:menger).
+
+    It is 0 at both ends and where the product of the three distances is below CURVATURE_EPSILON_M3.
+    """
     curvatures = np.zeros(len(polyline_m))
     if len(polyline_m) < 3:
         return curvatures
@@ -33,65 +37,74 @@ def menger_curvature(polyline_m: np.ndarray) -> np.ndarray:
     return curvatures
 
 
-def arrival_times(polyline_m: np.ndarray, speeds_mps: np.ndarray) -> np.ndarray:
-    """Return the times at waypoints, (k,) s from 0: a piece takes its length over the mean of its two speeds."""
-    lengths_m = np.linalg.norm(np.diff(polyline_m, axis=0), axis=1)
-    means_mps = 0.5 * (speeds_mps[1:] + speeds_mps[:-1])
-    if not (means_mps > 0).all():
-        raise ValueError("a piece has speed 0 at both ends, so its end is never reached")
-    return np.concatenate([[0.0], np.cumsum(lengths_m / means_mps)])
+@dataclass(frozen=True)
+class TimedRoute:
+    """A polyline with a speed and a stop at each waypoint.
 
-
-def resample(
-    polyline_m: np.ndarray, speeds_mps: np.ndarray, times_s: np.ndarray, step_s: float, stops_s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sample a timed polyline at equal steps; the last sample is the goal, reached within the last step.
-
-    Args:
-        polyline_m: (k, 2) m, k at least 2, no two neighbours equal. speeds_mps: (k,), 0 at stops. times_s: (k,) from
-            `arrival_times`, without stops. stops_s: (k,) duration of the stop at each waypoint.
-    Returns:
-        time_s (n,) = 0, step, 2 step ...; positions_m (n, 2); speeds_mps (n,).
+    polyline_m: (k, 2) m, k at least 2, no two neighbours equal. speeds_mps: (k,), 0 at stops. stops_s: (k,) duration of
+    the stop, 0 for none.
     """
-    num_samples = int(np.ceil((times_s[-1] + stops_s.sum()) / step_s - 1e-9)) + 1
-    time_s = np.arange(num_samples) * step_s
-    return time_s, *sample(polyline_m, speeds_mps, times_s, stops_s, time_s)
 
+    polyline_m: np.ndarray
+    speeds_mps: np.ndarray
+    stops_s: np.ndarray
 
-def sample(
-    polyline_m: np.ndarray, speeds_mps: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray, time_s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (n, 2) and speeds (n,) at any times, (n,) s, of a timed polyline; after its end, the end.
+    @cached_property
+    def times_s(self) -> np.ndarray:
+        """Return the times at waypoints without stops, (k,) s from 0.
 
-    Within a piece the speed changes evenly from one waypoint to the next.
-    """
-    now_s = np.minimum(time_s - standing_time_s(time_s, times_s, stops_s), times_s[-1])
-    piece = np.clip(np.searchsorted(times_s, now_s, side="right") - 1, 0, len(times_s) - 2)
-    duration_s = times_s[piece + 1] - times_s[piece]
-    elapsed_s = now_s - times_s[piece]
-    from_mps, to_mps = speeds_mps[piece], speeds_mps[piece + 1]
-    moved_m = from_mps * elapsed_s + 0.5 * (to_mps - from_mps) / duration_s * elapsed_s**2
-    along_m = polyline_m[piece + 1] - polyline_m[piece]
-    share = np.clip(moved_m / np.linalg.norm(along_m, axis=1), 0.0, 1.0)
-    return polyline_m[piece] + share[:, None] * along_m, from_mps + (to_mps - from_mps) * elapsed_s / duration_s
+        A piece takes its length over the mean of its two speeds.
+        """
+        lengths_m = np.linalg.norm(np.diff(self.polyline_m, axis=0), axis=1)
+        means_mps = 0.5 * (self.speeds_mps[1:] + self.speeds_mps[:-1])
+        if not (means_mps > 0).all():
+            raise ValueError("a piece has speed 0 at both ends, so its end is never reached")
+        return np.concatenate([[0.0], np.cumsum(lengths_m / means_mps)])
+
+    def resample(self, step_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Sample the route at equal steps; the last sample is the goal, reached within the last step.
+
+        Returns:
+            time_s (n,) = 0, step, 2 step ...; positions_m (n, 2); speeds_mps (n,).
+        """
+        num_samples = int(np.ceil((self.times_s[-1] + self.stops_s.sum()) / step_s - 1e-9)) + 1
+        time_s = np.arange(num_samples) * step_s
+        return time_s, *self.sample(time_s)
+
+    def sample(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions (n, 2) m and speeds (n,) m/s at times (n,) s; the last waypoint after the end.
+
+        Within a piece the speed changes evenly from one waypoint to the next.
+        """
+        times_s = self.times_s
+        moving_s = np.minimum(time_s - standing_time_s(time_s, times_s, self.stops_s), times_s[-1])
+        piece = np.clip(np.searchsorted(times_s, moving_s, side="right") - 1, 0, len(times_s) - 2)
+        duration_s = times_s[piece + 1] - times_s[piece]
+        elapsed_s = moving_s - times_s[piece]
+        from_mps, to_mps = self.speeds_mps[piece], self.speeds_mps[piece + 1]
+        moved_m = from_mps * elapsed_s + 0.5 * (to_mps - from_mps) / duration_s * elapsed_s**2
+        chord_m = self.polyline_m[piece + 1] - self.polyline_m[piece]
+        share = np.clip(moved_m / np.linalg.norm(chord_m, axis=1), 0.0, 1.0)
+        positions_m = self.polyline_m[piece] + share[:, None] * chord_m
+        return positions_m, from_mps + (to_mps - from_mps) * elapsed_s / duration_s
 
 
 def standing_time_s(time_s: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray) -> np.ndarray:
-    """Return the total duration of stops until each time, (n,) s; times_s, stops_s: (k,) as for `resample`."""
-    at = np.flatnonzero(stops_s)
-    begins_s = times_s[at] + np.cumsum(stops_s[at]) - stops_s[at]
-    return np.clip(time_s[:, None] - begins_s, 0.0, stops_s[at]).sum(axis=1)
+    """Return the total duration of stops until each time, (n,) s; times_s, stops_s: (k,) as in `TimedRoute`."""
+    stops = np.flatnonzero(stops_s)
+    begins_s = times_s[stops] + np.cumsum(stops_s[stops]) - stops_s[stops]
+    return np.clip(time_s[:, None] - begins_s, 0.0, stops_s[stops]).sum(axis=1)
 
 
-STOP_GAP_MIN = 2  # waypoints from one stop to the next: a piece between two stops would have no speed
+# --- paces ------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Pace:
-    """One row of the table of paces; values are drawn uniformly from ranges. Shares are of the route.
+    """One row of the table of paces; values are drawn uniformly from ranges.
 
     hurries: cruises at `hurry_speed_mps`. stop_every_m: distance between stops. stop_s: duration of a stop. turn_at:
-    where the pedestrian turns back. back: how much of the route so far is walked back.
+    where the pedestrian turns back, as a share of the route. back: share of the route so far that is walked back.
     """
 
     hurries: bool = False
@@ -126,14 +139,15 @@ class PacedRoute:
     @cached_property
     def along_m(self) -> np.ndarray:
         """Return the distance along the route to each waypoint, (k,) m."""
-        return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.polyline_m, axis=0), axis=1))])
+        return distances_along_m(self.polyline_m)
 
 
 def take_pace(route_m: np.ndarray, pace: Pace, rng: np.random.Generator) -> PacedRoute:
     """Apply a pace to a route, (k, 2) m. There are no stops at its ends; a route of two points is unchanged."""
     if len(route_m) < 3:
         return PacedRoute.without_stops(route_m)
-    polyline_m, turn = route_m, len(route_m) - 1
+    polyline_m = route_m
+    turn = len(route_m) - 1
     if pace.turn_at is not None:
         turn = int(np.clip(round(rng.uniform(*pace.turn_at) * turn), 1, turn))
         num_back = max(1, round(rng.uniform(*pace.back) * turn))
@@ -142,27 +156,31 @@ def take_pace(route_m: np.ndarray, pace: Pace, rng: np.random.Generator) -> Pace
     if pace.turn_at is not None:
         route.stops_s[turn] = rng.uniform(*pace.stop_s)
     if pace.stop_every_m is not None:
-        next_m, first = rng.uniform(*pace.stop_every_m), 1
+        next_m = rng.uniform(*pace.stop_every_m)
+        first_allowed = 1
         while next_m < route.along_m[-1]:
-            waypoint = max(int(np.searchsorted(route.along_m, next_m)), first)
+            waypoint = max(int(np.searchsorted(route.along_m, next_m)), first_allowed)
             if waypoint >= len(polyline_m) - 1:
                 break
             route.stops_s[waypoint] = rng.uniform(*pace.stop_s)
-            next_m, first = route.along_m[waypoint] + rng.uniform(*pace.stop_every_m), waypoint + STOP_GAP_MIN
+            next_m = route.along_m[waypoint] + rng.uniform(*pace.stop_every_m)
+            first_allowed = waypoint + STOP_GAP_MIN
     return route
 
 
 def speeds_at(route: PacedRoute, pace: Pace, cfg: PedestriansConfig, rng: np.random.Generator) -> np.ndarray:
     """Return the speeds at the waypoints of a paced route, (k,) m/s, 0 at stops (eq:speed).
 
-    The least speed is SLOWEST_SPEED_MPS. With the defaults eq:speed gives at least 0.067 m/s (a right angle of two
-    0.5 m steps), so that this bound has no effect.
+    No other speed is below SLOWEST_SPEED_MPS. With the default settings eq:speed gives at least 0.067 m/s (a right
+    angle of two 0.5 m steps), so that this bound has no effect.
     """
-    cruise_mps, most_mps = cfg.cruise_speed_mps, cfg.max_speed_mps
+    cruise_mps = cfg.cruise_speed_mps
+    fastest_mps = cfg.max_speed_mps
     if pace.hurries:
-        cruise_mps, most_mps = cfg.hurry_speed_mps, max(cfg.max_speed_mps, cfg.hurry_speed_mps)
-    unrest = 1.0 + cfg.speed_jitter * rng.uniform(-1.0, 1.0, size=len(route.polyline_m))
-    speeds_mps = cruise_mps / (1.0 + cfg.curvature_gain_m * menger_curvature(route.polyline_m)) * unrest
-    speeds_mps = np.clip(speeds_mps, max(cfg.min_speed_mps, SLOWEST_SPEED_MPS), most_mps)
+        cruise_mps = cfg.hurry_speed_mps
+        fastest_mps = max(cfg.max_speed_mps, cfg.hurry_speed_mps)
+    jitter = 1.0 + cfg.speed_jitter * rng.uniform(-1.0, 1.0, size=len(route.polyline_m))
+    speeds_mps = cruise_mps / (1.0 + cfg.curvature_gain_m * menger_curvature(route.polyline_m)) * jitter
+    speeds_mps = np.clip(speeds_mps, max(cfg.min_speed_mps, SLOWEST_SPEED_MPS), fastest_mps)
     speeds_mps[route.stops_s > 0] = 0.0
     return speeds_mps

@@ -27,7 +27,7 @@ from cosfly.pedestrians.astar import route_cost
 from cosfly.pedestrians.bystanders import bystanders_of
 from cosfly.pedestrians.crossings import CROSSING, ROAD, count_on_road
 from cosfly.pedestrians.lanes import Lane, lanes_of
-from cosfly.pedestrians.speed_model import PACES, arrival_times, resample, speeds_at, take_pace
+from cosfly.pedestrians.speed_model import PACES, TimedRoute, speeds_at, take_pace
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, timed, walkable_ground
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.io import write_bytes
@@ -76,9 +76,8 @@ def follow_route(
     """Return the trajectory along a route, (k, 2) m, at a pace; None: one that is drawn by its share."""
     name = pace or draw_by_share(cfg.pace, pace_rng)
     route = take_pace(route_m, PACES[name], pace_rng)
-    waypoint_mps = speeds_at(route, PACES[name], cfg, rng)
-    times_s = arrival_times(route.polyline_m, waypoint_mps)
-    time_s, positions_m, speeds_mps = resample(route.polyline_m, waypoint_mps, times_s, cfg.dt_s, route.stops_s)
+    timed_route = TimedRoute(route.polyline_m, speeds_at(route, PACES[name], cfg, rng), route.stops_s)
+    time_s, positions_m, speeds_mps = timed_route.resample(cfg.dt_s)
     on_ground = np.column_stack([positions_m, heights.height_at(positions_m)])
     return PedestrianTrajectory(path_id, route.polyline_m, time_s, on_ground, speeds_mps, name)
 

@@ -187,26 +187,26 @@ class PlanConfig(Config):
     @field_validator("style_ranges")
     @classmethod
     def _are_ranges(cls, ranges: dict[str, dict[str, Range]]) -> dict[str, dict[str, Range]]:
-        for name, own in ranges.items():
+        for name, style_ranges in ranges.items():
             if name not in ROWS:
                 raise ValueError(f"style {name!r} does not exist or has no ranges{nearest(name, ROWS)}")
-            with_ranges(ROWS[name], own)
+            with_ranges(ROWS[name], style_ranges)
         return ranges
 
     @model_validator(mode="after")
     def _check(self) -> PlanConfig:
-        wrong = []
+        problems = []
         if self.relaxed_safety_m > self.safety_distance_m:
-            wrong.append("relaxed_safety_m may not exceed safety_distance_m")
+            problems.append("relaxed_safety_m may not exceed safety_distance_m")
         if not self.altitude_min_m <= self.altitude_preferred_m <= self.altitude_max_m:
-            wrong.append("altitude_min_m, altitude_preferred_m and altitude_max_m must be in ascending order")
+            problems.append("altitude_min_m, altitude_preferred_m and altitude_max_m must be in ascending order")
         for name, row in self._rows().items():
             if (highest_m := row.altitude_range_m[1]) > self.altitude_max_m:
-                wrong.append(f"style_ranges.{name} goes up to {highest_m:g} m, above altitude_max_m")
+                problems.append(f"style_ranges.{name} goes up to {highest_m:g} m, above altitude_max_m")
             if (fastest_mps := max(map(abs, row.round_mps))) >= self.speed_max_mps:
-                wrong.append(f"style_ranges.{name}.round_mps is up to {fastest_mps:g}, no less than speed_max_mps")
-        if wrong:
-            raise ValueError("; ".join(wrong))
+                problems.append(f"style_ranges.{name}.round_mps is up to {fastest_mps:g}, no less than speed_max_mps")
+        if problems:
+            raise ValueError("; ".join(problems))
         return self
 
     def style(self, name: str) -> Style:

@@ -1,4 +1,4 @@
-"""The top-down pictures of trajectories: `plan.png` and `compare_overlay.png`."""
+"""Top-down pictures of trajectories: `plan.png` and `compare_overlay.png`."""
 
 from __future__ import annotations
 
@@ -11,16 +11,21 @@ from cosfly.formats.traces import DroneTrace
 from cosfly.planners.contract import ALL_PLANNERS, title_of
 from cosfly.viz.topview import HALO, TopView, add_caption, draw_dot, draw_line, draw_map, draw_text, png_bytes
 
-MARGIN_M, SIZE_PX = 27.0, 1400
-PEDESTRIAN_COLOR, SIGHT_COLOR = (20, 20, 30), (70, 90, 110)
-SEEN_COLOR, HIDDEN_COLOR = np.array([20.0, 110.0, 230.0]), np.array([225.0, 30.0, 40.0])  # of drone trajectories
-FRAMES_BETWEEN_SIGHTS = 20  # a line of sight every 10 s
-# Of planners: the paper's blue and orange, then others that differ in brightness too.
+MARGIN_M = 27.0
+LONGER_SIDE_PX = 1400
+MAP_SHARE, WHITE_SHARE = 0.55, 0.45  # the map is pale, so that trajectories stand out
+PEDESTRIAN_COLOR = (20, 20, 30)
+SIGHT_COLOR = (70, 90, 110)
+# A drone trajectory where the target is visible and where it is hidden; partial visibility mixes both.
+SEEN_COLOR = np.array([20.0, 110.0, 230.0])
+HIDDEN_COLOR = np.array([225.0, 30.0, 40.0])
+FRAMES_BETWEEN_SIGHTS = 20  # one line of sight every 10 s
+# Colors of planners: the paper's blue and orange, then others that also differ in brightness.
 PALETTE = (
     (30, 100, 210), (235, 120, 20), (20, 150, 90), (150, 60, 170), (120, 90, 60), (20, 170, 190), (200, 40, 60),
     (110, 110, 110),
 )  # fmt: skip
-LEGEND_PX = 160  # of one planner
+LEGEND_PX = 160  # width of one planner's entry
 
 
 def color_of(planner: str) -> tuple[int, int, int]:
@@ -28,13 +33,13 @@ def color_of(planner: str) -> tuple[int, int, int]:
     return PALETTE[list(ALL_PLANNERS).index(planner) % len(PALETTE)]
 
 
-def _draw_pedestrians(
+def _base_picture(
     box_map: BoxMap, pedestrians: list[PedestrianTrajectory], traces: list[DroneTrace]
 ) -> tuple[np.ndarray, TopView]:
-    """Draw the pale map around trajectories and the pedestrian trajectories on it; return the picture and its view."""
-    places_m = [pedestrian.positions_m for pedestrian in pedestrians] + [trace.positions_m for trace in traces]
-    view = TopView.around(np.vstack(places_m), SIZE_PX, MARGIN_M)
-    picture = (0.55 * draw_map(box_map, view) + 0.45 * 255).astype(np.uint8)
+    """Return a picture of the map around all trajectories, with the pedestrian trajectories on it, and its view."""
+    points_m = np.vstack([trajectory.positions_m for trajectory in (*pedestrians, *traces)])
+    view = TopView.around(points_m, LONGER_SIDE_PX, MARGIN_M)
+    picture = (MAP_SHARE * draw_map(box_map, view) + WHITE_SHARE * 255).astype(np.uint8)
     for pedestrian in pedestrians:
         draw_line(picture, view.pixels(pedestrian.positions_m), PEDESTRIAN_COLOR, 2, halo=5)
     return picture, view
@@ -46,42 +51,55 @@ def draw_trajectories(box_map: BoxMap, pedestrians: list[PedestrianTrajectory], 
     Returns:
         PNG bytes. Dropped trajectories are thin; a pedestrian trajectory without a drone trajectory ends in a cross.
     """
-    picture, view = _draw_pedestrians(box_map, pedestrians, traces)
-    planned = {trace.path_id for trace in traces}
+    picture, view = _base_picture(box_map, pedestrians, traces)
+    planned_ids = {trace.path_id for trace in traces}
     for pedestrian in pedestrians:
-        if pedestrian.path_id not in planned:
+        if pedestrian.path_id not in planned_ids:
             end = view.pixels(pedestrian.positions_m[-1:])[0].astype(int).tolist()
             cv2.drawMarker(picture, end, HIDDEN_COLOR.tolist(), cv2.MARKER_TILTED_CROSS, 16, 3, cv2.LINE_AA)
     for trace in traces:
-        drone, target = view.pixels(trace.positions_m), view.pixels(trace.targets_m)
-        for i in range(0, len(drone), FRAMES_BETWEEN_SIGHTS):
-            draw_line(picture, np.stack([drone[i], target[i]]), SIGHT_COLOR)
-        if not trace.drop_reason:
-            draw_line(picture, drone, HALO, 6)
-        for i, seen in enumerate(trace.visibility[:-1]):
-            color = SEEN_COLOR * seen + HIDDEN_COLOR * (1.0 - seen)
-            draw_line(picture, drone[i : i + 2], color.tolist(), 1 if trace.drop_reason else 3)
-        begin = drone[0].astype(int)
-        draw_dot(picture, begin, 5, SEEN_COLOR.tolist())
-        draw_text(picture, trace.path_id, begin[0] + 8, begin[1] - 6, 0.5, PEDESTRIAN_COLOR, halo=HALO)
+        _draw_trace(picture, view, trace)
     num_dropped = sum(trace.drop_reason is not None for trace in traces)
     drones = f"{len(traces)} drones (blue: target visible, red: hidden), {num_dropped} dropped"
     return png_bytes(add_caption(picture, f"{box_map.name}: {len(pedestrians)} pedestrians (dark), {drones}"))
+
+
+def _draw_trace(picture: np.ndarray, view: TopView, trace: DroneTrace) -> None:
+    """Draw one drone trajectory with its lines of sight, its start and its name."""
+    drone = view.pixels(trace.positions_m)
+    target = view.pixels(trace.targets_m)
+    for i in range(0, len(drone), FRAMES_BETWEEN_SIGHTS):
+        draw_line(picture, np.stack([drone[i], target[i]]), SIGHT_COLOR)
+    if not trace.drop_reason:
+        draw_line(picture, drone, HALO, 6)
+    for i, visibility in enumerate(trace.visibility[:-1]):
+        color = SEEN_COLOR * visibility + HIDDEN_COLOR * (1.0 - visibility)
+        draw_line(picture, drone[i : i + 2], color.tolist(), 1 if trace.drop_reason else 3)
+    start = drone[0].astype(int)
+    draw_dot(picture, start, 5, SEEN_COLOR.tolist())
+    draw_text(picture, trace.path_id, start[0] + 8, start[1] - 6, 0.5, PEDESTRIAN_COLOR, halo=HALO)
 
 
 def draw_compared(
     box_map: BoxMap, pedestrians: list[PedestrianTrajectory], traces: dict[str, list[DroneTrace]]
 ) -> bytes:
     """Draw pedestrian trajectories (dark) and the trajectories of each planner over the map; return PNG bytes."""
-    picture, view = _draw_pedestrians(box_map, pedestrians, [trace for own in traces.values() for trace in own])
-    for planner, own in traces.items():
-        for trace in own:
+    all_traces = [trace for planner_traces in traces.values() for trace in planner_traces]
+    picture, view = _base_picture(box_map, pedestrians, all_traces)
+    for planner, planner_traces in traces.items():
+        for trace in planner_traces:
             line = view.pixels(trace.positions_m)
             draw_line(picture, line, color_of(planner), 2, halo=5)
             draw_dot(picture, line[0], 5, color_of(planner))
     picture = add_caption(picture, f"{box_map.name}: {len(pedestrians)} pedestrians (dark); dots are starts")
-    x, y = float(picture.shape[1] - LEGEND_PX * len(traces)), 25.0
-    for planner in traces:
+    _draw_legend(picture, list(traces))
+    return png_bytes(picture)
+
+
+def _draw_legend(picture: np.ndarray, planners: list[str]) -> None:
+    """Draw a line and the title of each planner at the right end of the caption."""
+    x = float(picture.shape[1] - LEGEND_PX * len(planners))
+    y = 25.0
+    for planner in planners:
         draw_line(picture, np.array([[x, y - 5], [x + 34, y - 5]]), color_of(planner), 3)
         x = draw_text(picture, title_of(planner), x + 42, y) + 18
-    return png_bytes(picture)

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-TRIES = 6  # of a trajectory that does not hold its styles; each draws new values from their ranges
-CROWN_SHARE = 1 / np.sqrt(3.0)  # of the half extents: the box within the ellipsoid within the box
+TRIES = 6  # if a trajectory does not hold its styles; each try draws new values from their ranges
+CROWN_SHARE = 1 / np.sqrt(3.0)  # of a box's half extents: the largest box inside the ellipsoid that the box encloses
 COORDINATE_MAX_M = 1e6  # beyond, float32 depth and four decimals of a metre in the files lose their meaning
 
 
@@ -49,29 +49,43 @@ def make_scenario(pedestrian: PedestrianTrajectory, obstacles: BoxIndex, cfg: Pl
     from cosfly.geometry.kernels import segments_hit
     from cosfly.planners.reference_trajectory import follow
 
-    targets, where = pedestrian.positions_m + np.array([0.0, 0.0, TARGET_HEIGHT_M]), pedestrian.path_id
+    path_id = pedestrian.path_id
+    targets = pedestrian.positions_m + np.array([0.0, 0.0, TARGET_HEIGHT_M])
     if len(targets) < 2:
-        raise NoPathError("the pedestrian trajectory has one point only", where=where, expected="two points or more")
-    dt_s, steps_s = step_s(pedestrian.time_s), np.diff(pedestrian.time_s)
-    uneven = np.abs(steps_s - max(dt_s, 0.0)) > 1e-3
-    if dt_s <= 0 or uneven.any():
-        what, first = "time stamps do not increase in equal steps", int(np.argmax(uneven))
-        where, got = f"{where}: t[{first + 1}]", f"a step of {steps_s[first]:g} s"
-        raise NoPathError(what, where=where, got=got, expected=f"{abs(dt_s):g} s, the median")
+        raise NoPathError("the pedestrian trajectory has one point only", where=path_id, expected="two points or more")
+    dt_s = step_s(pedestrian.time_s)
+    steps_s = np.diff(pedestrian.time_s)
+    is_uneven = np.abs(steps_s - max(dt_s, 0.0)) > 1e-3
+    if dt_s <= 0 or is_uneven.any():
+        first = int(np.argmax(is_uneven))
+        raise NoPathError(
+            "time stamps do not increase in equal steps",
+            where=f"{path_id}: t[{first + 1}]",
+            got=f"a step of {steps_s[first]:g} s",
+            expected=f"{abs(dt_s):g} s, the median",
+        )
     if (farthest_m := np.abs(targets).max()) > COORDINATE_MAX_M:
-        expected, fix = f"at most {COORDINATE_MAX_M:g} m", "move the map's origin near the pedestrian trajectories"
-        raise NoPathError("a coordinate is too large", where=where, got=f"{farthest_m:g} m", expected=expected, fix=fix)
+        raise NoPathError(
+            "a coordinate is too large",
+            where=path_id,
+            got=f"{farthest_m:g} m",
+            expected=f"at most {COORDINATE_MAX_M:g} m",
+            fix="move the map's origin near the pedestrian trajectories",
+        )
     hits = segments_hit(obstacles, targets[:-1], targets[1:])
     if hits.any():
         x, y, _ = targets[int(np.argmax(hits))]
-        what, got = "the pedestrian trajectory passes through an obstacle", f"{int(hits.sum())} steps inside a box"
-        fix = "plan on the map that the pedestrian trajectories were made for"
-        raise NoPathError(what, where=where, got=f"{got}, the first at ({x:.1f}, {y:.1f})", fix=fix)
-    return Scenario(where, targets, np.array(pedestrian.positions_m[:, 2]), follow(targets, cfg, dt_s), dt_s)
+        raise NoPathError(
+            "the pedestrian trajectory passes through an obstacle",
+            where=path_id,
+            got=f"{int(hits.sum())} steps inside a box, the first at ({x:.1f}, {y:.1f})",
+            fix="plan on the map that the pedestrian trajectories were made for",
+        )
+    return Scenario(path_id, targets, np.array(pedestrian.positions_m[:, 2]), follow(targets, cfg, dt_s), dt_s)
 
 
 def draw_styles_of(pedestrians: Sequence[PedestrianTrajectory], cfg: PlanConfig, seed: int) -> list[list[str]]:
-    """Draw the styles of the trajectories of a run, for each pedestrian trajectory in order."""
+    """Draw the styles of the segments of each drone trajectory of a run, in the order of the pedestrians."""
     from cosfly.planners.maneuver_plan import draw_styles
 
     return draw_styles(pedestrians, cfg, style_rng(pedestrians[0], seed))
@@ -84,8 +98,8 @@ def plan_trajectory(
     """Plan, measure and check one drone trajectory in given styles, or in `follow` where the settings allow that.
 
     Args:
-        screens: Obstacles that certainly hide a person, for `reacquire`; None: all do. styles: of the segments; empty:
-            drawn as those of the first trajectory of a run.
+        screens: Obstacles that certainly hide a person, for `reacquire`; None: all do. styles: one per segment; empty:
+            drawn as for the first trajectory of a run.
     Raises:
         NoPathError: If the pedestrian trajectory cannot be followed, or the planner's trajectory collides.
     """
@@ -96,40 +110,44 @@ def plan_trajectory(
     styles = styles or draw_styles_of([pedestrian], cfg, seed)[0]
     for attempt in range(TRIES):
         maneuvers = draw_maneuvers(styles, scenario, obstacles, screens, cfg, style_rng(pedestrian, seed, attempt))
-        found, problem = None, None
+        trace = None
+        no_path = None
         try:
-            found = _plan_once(pedestrian, scenario, maneuvers, obstacles, screens, cfg, seed)
+            trace = _plan_once(pedestrian, scenario, maneuvers, obstacles, screens, cfg, seed)
         except NoPathError as error:
-            problem = error
-        if not maneuvers.segments or (found and found.drop_reason is None):
+            no_path = error
+        if not maneuvers.segments or (trace and trace.drop_reason is None):
             break
         styles = mirrored(styles)  # a wall may block one side only
-    is_last = not maneuvers.segments or cfg.styles_fallback == "drop"
-    if found and (is_last or found.drop_reason is None):
-        return found
-    if problem and is_last:
-        raise problem
-    reason, not_held = (found.drop_reason, found.not_held) if found else ("no_path", None)
+    has_no_fallback = not maneuvers.segments or cfg.styles_fallback == "drop"
+    if trace and (has_no_fallback or trace.drop_reason is None):
+        return trace
+    if no_path and has_no_fallback:
+        raise no_path
     follow = _plan_once(pedestrian, scenario, ManeuverPlan(scenario.reference), obstacles, screens, cfg, seed)
-    styles_flown = ", ".join(part.style for part in maneuvers.segments)
-    return replace(follow, instead_of=f"{styles_flown}: {reason}", not_held=not_held)
+    failed_styles = ", ".join(segment.style for segment in maneuvers.segments)
+    reason = trace.drop_reason if trace else "no_path"
+    return replace(follow, instead_of=f"{failed_styles}: {reason}", not_held=trace.not_held if trace else None)
 
 
 def plan_on(
     path_id: str, targets_m: np.ndarray, dt_s: float, past_m: np.ndarray, obstacles: BoxIndex, cfg: PlanConfig
 ) -> np.ndarray:
-    """Continue a drone trajectory in the style `follow` from where the drone is, with foresight.
+    """Continue a drone trajectory in the style `follow` from the drone's position, with the planner foresight.
 
     Args:
         targets_m: (n, 3) hip points of the whole pedestrian trajectory. past_m: (k, 3), 3 <= k < n, the drone's
-            positions at the first k of them, with which the result, (n, 3), begins.
+            positions at the first k of them.
+    Returns:
+        (n, 3) m; the first k are `past_m`.
     Raises:
         NoPathError: If no trajectory within the limits of the settings is found.
     """
     from cosfly.planners.foresight import plan
     from cosfly.planners.reference_trajectory import continued_reference, follow
 
-    ground_m, rng = targets_m[:, 2] - TARGET_HEIGHT_M, rng_for(0, "plan", path_id)  # from which nothing is drawn
+    ground_m = targets_m[:, 2] - TARGET_HEIGHT_M
+    rng = rng_for(0, "plan", path_id)  # foresight draws nothing from it
     scenario = Scenario(path_id, targets_m, ground_m, follow(targets_m, cfg, dt_s), dt_s, past_m)
     scenario = replace(scenario, reference=continued_reference(scenario, cfg))
     try:
@@ -153,28 +171,32 @@ def _plan_once(
     from cosfly.planners.maneuver_plan import NOT_HELD, describe_not_held, end_with_order, view_of, why_not_held
 
     scenario = replace(scenario, reference=maneuvers.reference)
-    made = load_planner(cfg.planner)(scenario, obstacles, cfg, rng_for(seed, "plan", pedestrian.path_id))
-    positions = made.positions_m
+    plan = load_planner(cfg.planner)(scenario, obstacles, cfg, rng_for(seed, "plan", pedestrian.path_id))
+    positions = plan.positions_m
     if maneuvers.order is not None:
         maneuvers, positions = end_with_order(maneuvers, positions, scenario, obstacles, cfg)
-    positions = np.round(positions, 4)  # measured as it is written
+    positions = np.round(positions, 4)  # as in the file, so that the metrics are those of the file
     targets = np.round(scenario.targets_m, 4)
     clearances, _, _ = swept_distances(obstacles, positions, CLEARANCE_CAP_M)
     if clearances.min() < cfg.relaxed_safety_m - CLEARANCE_TOLERANCE_M:
-        what, got = "no trajectory that is free of collisions", f"a least clearance of {clearances.min():.2f} m"
-        where, expected = pedestrian.path_id, f"at least {cfg.relaxed_safety_m:g} m everywhere"
-        raise NoPathError(f"planner {cfg.planner} found {what}", where=where, got=got, expected=expected)
-    seen, is_judged = visibility(obstacles, positions, targets), maneuvers.reference.keeps_sight
+        raise NoPathError(
+            f"planner {cfg.planner} found no trajectory that is free of collisions",
+            where=pedestrian.path_id,
+            got=f"a least clearance of {clearances.min():.2f} m",
+            expected=f"at least {cfg.relaxed_safety_m:g} m everywhere",
+        )
+    seen = visibility(obstacles, positions, targets)
+    is_judged = maneuvers.reference.keeps_sight
     seen_past_screens = visibility(screens, positions, targets) if maneuvers.searches else seen
     pitch, yaw = view_of(maneuvers, positions, targets, seen_past_screens, scenario.dt_s)
     counted = seen[is_judged] if is_judged.any() else seen
     metrics = trajectory_metrics(positions, targets, counted, clearances, scenario.ground_m, scenario.dt_s)
-    reason = drop_reason(metrics, cfg, made.is_converged, checks_visibility=bool(is_judged.any()))
+    reason = drop_reason(metrics, cfg, plan.is_converged, checks_visibility=bool(is_judged.any()))
     reason = reason or why_not_held(maneuvers, scenario, positions, seen_past_screens)
     return DroneTrace(
         path_id=pedestrian.path_id, planner=cfg.planner, time_s=pedestrian.time_s, positions_m=positions,
         rotations_deg=np.degrees(np.stack([pitch, yaw, np.zeros_like(yaw)], axis=1)), targets_m=targets,
-        visibility=seen, clearances_m=clearances, metrics=metrics, solver=made.solver, drop_reason=reason,
+        visibility=seen, clearances_m=clearances, metrics=metrics, solver=plan.solver, drop_reason=reason,
         not_held=describe_not_held(maneuvers, scenario, positions, obstacles, cfg) if reason == NOT_HELD else None,
         segments=maneuvers.segments, mission=maneuvers.mission, pace=pedestrian.pace,
     )  # fmt: skip
@@ -197,7 +219,7 @@ def drop_reason(
 
 
 def screens_of(box_map: BoxMap) -> BoxIndex:
-    """Index what certainly hides a person: obstacles, but only the box within the ellipsoid of a tree crown's box."""
+    """Index the boxes that certainly hide a person: obstacles, with tree crowns shrunk by CROWN_SHARE."""
     from cosfly.geometry.kernels import obstacle_index
 
     is_crown = box_map.is_any_of({KINDS["Vegetation"]})
@@ -251,9 +273,10 @@ def read_inputs(simplified_map: Path, paths: Path) -> tuple[BoxMap, list[Pedestr
 
 
 def make_items(pedestrians: Sequence[PedestrianTrajectory], cfg: PlanConfig, seed: int) -> list[Item]:
-    """Return the work items of a run: a pedestrian trajectory and the styles drawn for it each."""
+    """Return the work items of a run: each has a pedestrian trajectory and the styles drawn for it."""
     styles = draw_styles_of(pedestrians, cfg, seed)
-    return [Item(own.path_id, (own, names)) for own, names in zip(pedestrians, styles, strict=True)]
+    pairs = zip(pedestrians, styles, strict=True)
+    return [Item(pedestrian.path_id, (pedestrian, names)) for pedestrian, names in pairs]
 
 
 def run(
@@ -273,7 +296,8 @@ def run(
 
     inputs = {"map": simplified_map, "paths": paths}
     stage = StageFolder.open(out, "plan", config=cfg, inputs=inputs, seed=seed, resume=resume)
-    product, picture = out / "drone_trace.json", out / "plan.png"
+    product = out / "drone_trace.json"
+    picture = out / "plan.png"
     if stage.is_complete:
         return product
     box_map, pedestrians = read_inputs(simplified_map, paths)

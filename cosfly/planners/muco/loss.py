@@ -14,7 +14,7 @@ import numpy as np
 
 from cosfly.geometry import kernels
 from cosfly.geometry.kernels import RAY_OFFSETS_M, RAY_SPREAD_M, collect_hits, in_box_frame, nearest_box, normal_of_box
-from cosfly.planners.muco.nearby import Nearby, hits_among, known, nearest_among, nothing_nearby, remember
+from cosfly.planners.muco.nearby import Nearby, hits_among, nearest_among, nothing_nearby, num_cached, remember
 from cosfly.runtime.compiled import int64, njit
 
 # --- difference window: visibility from a waypoint and its neighbours half a metre away -------------------------------
@@ -195,7 +195,7 @@ def point_terms(points, begin, end, problem, index, masked, state):
         excess = distance - distances[i]
         _add_square(terms, gradient, band, TRACKING, i, weights[TRACKING], excess, ax, ay, az, True)
 
-        count = known(anchors, num_around, i, x, y, z)
+        count = num_cached(anchors, num_around, i, x, y, z)
         if count != 0:
             if count > 0:
                 gap, box = nearest_among(rows, around, i, count, x, y, z, influence)
@@ -250,7 +250,7 @@ def visibility_terms(points, problem, index, masked, state):
         if not problem.keeps_sight[i]:
             continue
         tx, ty, tz = targets[i, 0], targets[i, 1], targets[i, 2]
-        count = known(anchors, num_on_view, i, x, y, z)
+        count = num_cached(anchors, num_on_view, i, x, y, z)
         if count > 0:
             count = hits_among(rows, on_view, i, count, tx, ty, tz, x, y, z, spread, blockers)
         elif count < 0:

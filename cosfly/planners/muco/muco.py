@@ -16,7 +16,7 @@ from cosfly.planners.contract import MucoConfig, Plan, PlanConfig, Scenario
 from cosfly.planners.foresight import cheapest_way
 from cosfly.planners.muco.loss import TERM_NAMES, Problem, make_state
 from cosfly.planners.muco.nearby import nothing_nearby
-from cosfly.planners.muco.step import STOP_REASONS, Rules, descend, descend_as_the_paper, is_feasible, project
+from cosfly.planners.muco.step import STOP_REASONS, Rules, descend, descend_paper, is_feasible, project
 from cosfly.planners.smoothing import repair_to_limits
 from cosfly.runtime.compiled import njit
 
@@ -214,7 +214,7 @@ def optimize(start: np.ndarray, problem: Problem, obstacles: BoxIndex, cfg: Muco
     state, spare = (make_state(len(points), len(obstacles.rows)) for _ in range(2))
     spare = spare._replace(nearby=state.nearby)
     history = history if len(points) > 2 else history[:1]  # without an interior waypoint only the loss is computed
-    run = descend_as_the_paper if cfg.step == "paper" else descend
+    run = descend_paper if cfg.step == "paper" else descend
     found = run(points, problem, obstacles, rules, (state, spare), history)
     points, state, masked, num_iterations, num_tried, reason = found
     return points, {

@@ -1,8 +1,8 @@
-"""A cache of MuCO between iterations: for each waypoint, the few boxes that can matter while it stays near a place.
+"""The cache of MuCO between iterations: for each waypoint, the few boxes that can matter while it stays nearby.
 
-A waypoint moves half a metre an iteration, so the boxes around it and between it and its target are the same for
-several. Results do not depend on the cache: a waypoint that has left its place, or has too many boxes around it, is
-looked up in the index.
+A waypoint moves half a metre in an iteration, so the boxes around it and on the view of its target are the same for
+several iterations. Results do not depend on the cache: for a waypoint that has moved away, or has too many boxes around
+it, the index is queried.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.geometry.kernels import collect_hits, distance_to_box, nearest_box, segment_hits_box, squared_gap
+from cosfly.geometry.kernels import collect_hits, distance_if_nearer, nearest_box, segment_hits_box
 from cosfly.runtime.compiled import njit
 
-MARGIN_M = 1.5  # three steps of the default cap; more would remember more boxes, less would look up more often
-MOVED_M = 0.9  # looked up again beyond this, so that the trial steps of the next iteration stay within MARGIN_M
-ROOM = 32  # boxes cached for a waypoint; a longer list is not cached
+MARGIN_M = 1.5  # validity of an entry, three steps of the default cap; more caches more boxes, less queries more often
+MOVED_M = 0.9  # an entry is renewed beyond this, so that the trial steps of the next iteration stay within MARGIN_M
+ROOM = 32  # boxes in one entry; a longer list is not cached
 
 
 class Nearby(NamedTuple):
     """Cached boxes of n waypoints.
 
-    anchors: (n, 3) m, where the boxes were looked up; infinite where nothing is cached. around, on_view: (n, ROOM)
-    boxes within reach of the waypoint, and across the view of its target. num_around, num_on_view: (n,) how many, -1
-    for more than ROOM.
+    anchors: (n, 3) m, waypoints when their boxes were queried; infinite where nothing is cached. around: (n, ROOM)
+    boxes within reach of the waypoint. on_view: (n, ROOM) boxes on the view of its target. num_around, num_on_view:
+    (n,) their numbers, -1 for more than ROOM.
     """
 
     anchors: np.ndarray
@@ -46,39 +46,41 @@ def nothing_nearby(num_points):
 
 @njit(cache=True)
 def remember(nearby, index, points, targets, reach_m, spread_m):
-    """Look up the boxes of waypoints that have moved since they were looked up, in place.
+    """Renew the entries of waypoints that have moved more than MOVED_M, in place.
 
     Args:
-        points, targets: (n, 3) m. reach_m, spread_m: greatest distance and growth of boxes in queries.
+        points, targets: (n, 3) m. reach_m: greatest distance of boxes around a waypoint in later queries. spread_m:
+            greatest growth of boxes on the view in later queries.
     """
-    found = np.empty(ROOM + 1, dtype=np.int64)
+    hits = np.empty(ROOM + 1, dtype=np.int64)
     for i in range(len(points)):
-        p, x = points[i], targets[i]
+        p, target = points[i], targets[i]
         dx, dy, dz = p[0] - nearby.anchors[i, 0], p[1] - nearby.anchors[i, 1], p[2] - nearby.anchors[i, 2]
         if dx * dx + dy * dy + dz * dz <= MOVED_M * MOVED_M:
             continue
         nearby.anchors[i, 0], nearby.anchors[i, 1], nearby.anchors[i, 2] = p[0], p[1], p[2]
-        # A segment without length, grown: every box nearer than that on each axis of its own frame.
-        grown = reach_m + MARGIN_M
-        count = collect_hits(index, p[0], p[1], p[2], p[0], p[1], p[2], grown, found)
+        # A segment of length 0 touches a grown box if it is nearer than the growth on each axis of the box's frame.
+        reach_grown_m = reach_m + MARGIN_M
+        count = collect_hits(index, p[0], p[1], p[2], p[0], p[1], p[2], reach_grown_m, hits)
         nearby.num_around[i] = count if count <= ROOM else -1
-        _keep(found, min(count, ROOM), nearby.around, i)
-        count = collect_hits(index, x[0], x[1], x[2], p[0], p[1], p[2], spread_m + MARGIN_M, found)
+        _copy_row(hits, min(count, ROOM), nearby.around, i)
+        spread_grown_m = spread_m + MARGIN_M
+        count = collect_hits(index, target[0], target[1], target[2], p[0], p[1], p[2], spread_grown_m, hits)
         nearby.num_on_view[i] = count if count <= ROOM else -1
-        _keep(found, min(count, ROOM), nearby.on_view, i)
+        _copy_row(hits, min(count, ROOM), nearby.on_view, i)
 
 
 @njit(cache=True)
-def _keep(found, count, boxes, i):
+def _copy_row(hits, count, boxes, i):
     for k in range(count):  # the shape check of a slice assignment takes the compiler seconds
-        boxes[i, k] = found[k]
+        boxes[i, k] = hits[k]
 
 
 @njit(cache=True, inline="always")
-def known(anchors, numbers, i, x, y, z):
-    """Return the number of cached boxes for a place of waypoint i, -1 where the index must be queried.
+def num_cached(anchors, numbers, i, x, y, z):
+    """Return the number of cached boxes for waypoint i at (x, y, z), -1 where the index must be queried.
 
-    numbers: num_around or num_on_view. Arrays are passed one by one: see loss.py on the cost of tuples.
+    numbers: num_around or num_on_view. Arrays are passed one by one: loss.py explains the cost of tuples.
     """
     dx, dy, dz = x - anchors[i, 0], y - anchors[i, 1], z - anchors[i, 2]
     return numbers[i] if dx * dx + dy * dy + dz * dz <= MARGIN_M * MARGIN_M else -1
@@ -86,14 +88,11 @@ def known(anchors, numbers, i, x, y, z):
 
 @njit(cache=True)
 def nearest_among(rows, boxes, i, count, x, y, z, reach_m):
-    """Return what `nearest_box` does, of boxes[i, :count] only."""
+    """Return the result of `nearest_box` among boxes[i, :count] only."""
     best, best_box = reach_m, -1
     for k in range(count):
         box = boxes[i, k]
-        gap = squared_gap(rows, box, x, y, z)
-        if gap > 0.0 and (best <= 0.0 or gap >= best * best):
-            continue
-        distance = distance_to_box(rows, box, x, y, z)
+        distance = distance_if_nearer(rows, box, x, y, z, best)
         if distance < best:
             best, best_box = distance, box
     return best, best_box
@@ -101,8 +100,8 @@ def nearest_among(rows, boxes, i, count, x, y, z, reach_m):
 
 @njit(cache=True)
 def nearest_of(nearby, i, index, x, y, z, reach_m):
-    """Return what `nearest_box` does for a place of waypoint i, from the cache where possible."""
-    count = known(nearby.anchors, nearby.num_around, i, x, y, z)
+    """Return the result of `nearest_box` for waypoint i at (x, y, z), from the cache where possible."""
+    count = num_cached(nearby.anchors, nearby.num_around, i, x, y, z)
     if count < 0:
         return nearest_box(index, x, y, z, reach_m)
     return nearest_among(index.rows, nearby.around, i, count, x, y, z, reach_m)
@@ -110,10 +109,10 @@ def nearest_of(nearby, i, index, x, y, z, reach_m):
 
 @njit(cache=True)
 def hits_among(rows, boxes, i, count, ax, ay, az, bx, by, bz, inflate_m, out):
-    """Return what `collect_hits` does, of boxes[i, :count] only."""
-    found = 0
+    """Return the result of `collect_hits` among boxes[i, :count] only."""
+    num_hits = 0
     for k in range(count):
         if segment_hits_box(rows, boxes[i, k], ax, ay, az, bx, by, bz, inflate_m):
-            out[found] = boxes[i, k]
-            found += 1
-    return found
+            out[num_hits] = boxes[i, k]
+            num_hits += 1
+    return num_hits

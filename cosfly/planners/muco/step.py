@@ -1,7 +1,7 @@
 """MuCO's step, compiled: the feasible region, the projection onto it, and the search for a step that lowers the loss.
 
-All of it is one compiled call: a call from Python unpacks some forty arrays, which takes a third of the time of an
-evaluation. Loops replace NumPy's whole-array forms, because the compiler takes seconds for each one that checks shapes.
+The whole search is one compiled call, because a call from Python unpacks some forty arrays, which takes a third of the
+time of an evaluation. Loops replace NumPy's whole-array forms, because each shape check takes the compiler seconds.
 """
 
 from __future__ import annotations
@@ -12,21 +12,24 @@ import numpy as np
 
 from cosfly.geometry.kernels import collect_hits, nearest_box, normal_of_box
 from cosfly.planners.muco.loss import BAND_ROWS, GREATEST, LEAST, difference_gradient, evaluate, remember_boxes
-from cosfly.planners.muco.nearby import known, nearest_among, nearest_of
+from cosfly.planners.muco.nearby import nearest_among, nearest_of, num_cached
 from cosfly.runtime.compiled import boolean, int64, njit
 
-TRIES, TRIES_WITH_VISIBILITY = 10, 3  # of one step
-REST_MAX = 8  # iterations at most without the visibility slope after it has not lowered the loss
+TRIES, TRIES_WITH_VISIBILITY = 10, 3  # trial steps per iteration, without and with the visibility slope
+VISIBILITY_PAUSE_MAX = 8  # iterations without the visibility slope, from the one whose loss it did not lower
 DAMPING_LEAST = 1e-3  # keeps the band system positive definite where no term has curvature
-DAMPING_FIRST, DAMPING_RISE, DAMPING_FALL = 5.0, 10.0, 0.5  # of a waypoint whose rough terms rise
+# Damping of a waypoint whose rough terms rise: its first value, and its factors after a failed and a successful trial.
+DAMPING_FIRST, DAMPING_RISE, DAMPING_FALL = 5.0, 10.0, 0.5
+CONTACT_CURVATURE = 1e5  # across the face of a touched obstacle: allows only steps along the face
+ALTITUDE_CURVATURE = 1e7  # in z at an altitude bound: keeps the waypoint at the bound
 
-# no_step: no step of any tried length lowers the loss. infeasible: at rest, but on a trajectory that breaks a bound.
+# no_step: no step of any tried length lowers the loss. infeasible: converged to a trajectory that breaks a bound.
 STOP_REASONS = ("converged", "iteration_limit", "no_step", "infeasible")
 CONVERGED, ITERATION_LIMIT, NO_STEP, INFEASIBLE = range(4)
 
 
 class Rules(NamedTuple):
-    """How to step and when to stop: the fields of MucoConfig of the same names."""
+    """Settings of the search: the fields of MucoConfig with the same names."""
 
     learning_rate: float
     step_cap_m: float
@@ -37,10 +40,14 @@ class Rules(NamedTuple):
 
 @njit(cache=True)
 def hold_bounds(points, problem, contacts, band, gradient):
-    """Remove from gradient and curvature, in place, what would lead straight out of the feasible region.
+    """Change gradient and curvature in place so that a step does not leave the feasible region directly.
 
-    A waypoint at the least or greatest altitude that is pulled beyond it keeps its z; one that touches an obstacle and
-    is pulled into it may only slide along it. The caller skips the ends of the trajectory.
+    A waypoint at an altitude bound keeps its z if the step would cross the bound. A waypoint that touches an obstacle
+    slides along the face if the step would enter the obstacle. The ends of the trajectory are included; the caller
+    ignores them.
+
+    Args:
+        points, contacts, gradient: (n, 3). band: (BAND_ROWS, 3 n).
     """
     for i in range(len(points)):
         normal = contacts[i]
@@ -49,25 +56,26 @@ def hold_bounds(points, problem, contacts, band, gradient):
             for a in range(3):
                 gradient[i, a] -= into * normal[a]
                 for b in range(a + 1):
-                    band[a - b, 3 * i + b] += 1e5 * normal[a] * normal[b]
+                    band[a - b, 3 * i + b] += CONTACT_CURVATURE * normal[a] * normal[b]
         at_floor = points[i, 2] <= problem.altitudes[i, LEAST] + 1e-9 and gradient[i, 2] > 0.0
         at_ceiling = points[i, 2] >= problem.altitudes[i, GREATEST] - 1e-9 and gradient[i, 2] < 0.0
         if at_floor or at_ceiling:
             gradient[i, 2] = 0.0
-            band[0, 3 * i + 2] += 1e7
+            band[0, 3 * i + 2] += ALTITUDE_CURVATURE
 
 
 @njit(cache=True)
 def solve_band(band, damping, gradient):
-    """Return the step -(H + damping)^-1 g of the interior waypoints, (n - 2, 3), by Cholesky's factors of a band.
+    """Solve (H + damping) step = -g for the interior waypoints by a banded Cholesky factorization.
 
     Args:
         band: (BAND_ROWS, 3 n) lower band of H. damping: (n,) per waypoint. gradient: (n, 3).
     Returns:
-        each waypoint's step by its own curvature alone, should rounding have made the model indefinite.
+        (n - 2, 3) m. If rounding has made H indefinite, its diagonal replaces it.
     """
     size, rows = 3 * len(gradient) - 6, BAND_ROWS
-    factor, step = np.empty((size + rows, rows)), np.empty(size)  # factor[j, k]: row j + k, column j
+    factor = np.empty((size + rows, rows))  # factor[j, k]: row j + k, column j
+    step = np.empty(size)
     factor[size:].fill(0.0)
     for j in range(size):
         for k in range(rows):
@@ -98,12 +106,14 @@ def solve_band(band, damping, gradient):
 
 @njit(cache=True)
 def try_step(points, steps, scale, cap_m, as_a_whole, problem, index, masked, state, trial):
-    """Return the loss of one trial step of the interior waypoints, infinite if not feasible, and if it was capped.
+    """Evaluate one trial step of the interior waypoints.
 
     Args:
-        points: (n, 3) m, kept. steps: (n - 2, 3) m. scale: share of it that is taken. cap_m: longest move of a
-            waypoint; longer ones are shortened each on its own, or all by the same factor (as_a_whole).
-        state, trial: written, what `evaluate` fills and the projected trajectory.
+        points: (n, 3) m, unchanged. steps: (n - 2, 3) m. scale: factor on the steps. cap_m: longest step of a waypoint.
+            as_a_whole: shorten all steps by the same factor, not only the steps that are too long.
+        state: written by `evaluate`. trial: (n, 3), written, the projected trajectory.
+    Returns:
+        The loss of the trial, infinity if it is not feasible, and whether any step was longer than the cap.
     """
     longest = move(points, steps, scale, cap_m, as_a_whole, trial)
     loss = np.inf
@@ -114,15 +124,23 @@ def try_step(points, steps, scale, cap_m, as_a_whole, problem, index, masked, st
 
 @njit(cache=True)
 def move(points, steps, scale, cap_m, as_a_whole, trial):
-    """Put the capped step of `try_step` into `trial`, (n, 3); return the longest of the uncapped steps, m."""
-    lengths, longest, last = np.empty(len(steps)), 0.0, len(points) - 1
+    """Write the points after the capped steps of `try_step` to `trial`, (n, 3).
+
+    Returns:
+        The length of the longest step before the cap, m.
+    """
+    lengths = np.empty(len(steps))
+    longest = 0.0
+    last = len(points) - 1
     for i in range(len(steps)):
         lengths[i] = np.sqrt(steps[i, 0] ** 2 + steps[i, 1] ** 2 + steps[i, 2] ** 2)
         longest = max(longest, lengths[i])
     for axis in range(3):
-        trial[0, axis], trial[last, axis] = points[0, axis], points[last, axis]
+        trial[0, axis] = points[0, axis]
+        trial[last, axis] = points[last, axis]
     for i in range(len(steps)):
-        share = scale * min(1.0, cap_m / max(longest if as_a_whole else lengths[i], 1e-12))
+        length = longest if as_a_whole else lengths[i]
+        share = scale * min(1.0, cap_m / max(length, 1e-12))
         for axis in range(3):
             trial[i + 1, axis] = points[i + 1, axis] + share * steps[i, axis]
     return longest
@@ -130,75 +148,99 @@ def move(points, steps, scale, cap_m, as_a_whole, trial):
 
 @njit(cache=True)
 def descend(points, problem, index, rules, states, history):
-    """Optimize a feasible trajectory in place; its ends stay.
+    """Optimize a feasible trajectory in place; its ends do not move.
 
-    The visibility term is a staircase that the model does not see: where its slope does not lower the loss, the step is
-    tried without it, and for 1, 2, 4 ... REST_MAX iterations it is not tried again.
+    The visibility term is piecewise constant, and its curvature is unknown. If a step along its slope does not lower
+    the loss, the step is tried without it, and the slope is ignored for the next 0, 1, 3 ... iterations.
 
     Args:
-        points: (n, 3) m, n >= 3. states: two of `make_state`, written. history: (iterations_max + 1,) the loss before
-            each iteration and after the last, written.
+        points: (n, 3) m, n >= 3. states: two of `make_state`, written. history: (iterations_max + 1,), written, the
+            loss before each iteration and after the last one.
     Returns:
-        the best trajectory (n, 3), its state, which waypoints are masked (n,), how many iterations and evaluations it
-        took, and a number in STOP_REASONS.
+        The best trajectory (n, 3), its state, the masked waypoints (n,) bool, the number of iterations, the number of
+        trial steps, and an index into STOP_REASONS.
     """
     now, spare = states
-    damping, trial = np.zeros(len(points)), np.empty_like(points)
+    damping = np.zeros(len(points))
+    trial = np.empty_like(points)
     masked = np.zeros(len(points), dtype=np.bool_)
     remember_boxes(points, problem, index, now.nearby)
     loss = evaluate(points, problem, index, masked, now)
-    masked = mask(points, problem, index, rules, masked, now)
+    masked = update_mask(points, problem, index, rules, masked, now)
     history[0] = loss
-    rest, next_rest, small_changes, num_tried = 0, 1, 0, 0
+    visibility_pause = 0
+    next_pause = 1
+    num_small_changes = 0
+    num_tried = 0
     for iteration in range(1, len(history)):
-        smooth, found = now.gradient.copy(), np.inf
-        if rest == 0 and now.visibility_gradient.any():
-            slope = _scaled_sum(smooth, now.visibility_gradient, 1.0)
-            found, tried = newton_step(
-                points, loss, slope, damping, int64(TRIES_WITH_VISIBILITY), rules, problem, index, masked, now, spare,
-                trial,
-            )  # fmt: skip
-            num_tried += tried
-            rest, next_rest = (next_rest, min(2 * next_rest, REST_MAX)) if found == np.inf else (0, 1)
-        rest = max(rest - 1, 0)
-        if found == np.inf:
-            found, tried = newton_step(
-                points, loss, smooth, damping, int64(TRIES), rules, problem, index, masked, now, spare, trial
+        trial_loss = np.inf
+        uses_visibility = visibility_pause == 0 and now.visibility_gradient.any()
+        for with_visibility in (True, False):
+            if with_visibility and not uses_visibility:
+                continue
+            if with_visibility:
+                gradient = _scaled_sum(now.gradient, now.visibility_gradient, 1.0)
+                num_tries = int64(TRIES_WITH_VISIBILITY)
+            else:
+                gradient = now.gradient.copy()
+                num_tries = int64(TRIES)
+            trial_loss, tried = newton_step(
+                points, loss, gradient, damping, num_tries, rules, problem, index, masked, now, spare, trial
             )
             num_tried += tried
-        if found == np.inf:
+            if trial_loss < np.inf:
+                break
+            if with_visibility:
+                visibility_pause = next_pause
+                next_pause = min(2 * next_pause, VISIBILITY_PAUSE_MAX)
+        if uses_visibility and visibility_pause == 0:  # the step along its slope lowered the loss
+            next_pause = 1
+        visibility_pause = max(visibility_pause - 1, 0)
+        if trial_loss == np.inf:
             return points, now, masked, iteration - 1, num_tried, NO_STEP
-        change, loss, history[iteration] = abs(found - loss), found, found
-        points, trial, now, spare = trial, points, spare, now
+        change = abs(trial_loss - loss)
+        loss = trial_loss
+        history[iteration] = loss
+        points, trial = trial, points
+        now, spare = spare, now
         remember_boxes(points, problem, index, now.nearby)
-        masked = mask(points, problem, index, rules, masked, now)
-        small_changes = small_changes + 1 if change < rules.tolerance * max(abs(loss), 1.0) else 0
-        if small_changes == 2:  # one small change may be a graze of the staircase that visibility is
+        masked = update_mask(points, problem, index, rules, masked, now)
+        if change < rules.tolerance * max(abs(loss), 1.0):
+            num_small_changes += 1
+        else:
+            num_small_changes = 0
+        if num_small_changes == 2:  # a single small change can come from one step of the piecewise visibility term
             return points, now, masked, iteration, num_tried, CONVERGED
     return points, now, masked, len(history) - 1, num_tried, ITERATION_LIMIT
 
 
 @njit(cache=True)
-def descend_as_the_paper(points, problem, index, rules, states, history):
+def descend_paper(points, problem, index, rules, states, history):
     """Run the paper's optimizer: plain steps along finite differences, capped per waypoint and projected.
 
-    The loss may rise. A projection that cannot make the trajectory feasible stops nothing; later steps may. Converged
-    when |change of the loss| is less than the tolerance, which is absolute here. Arguments and results as of `descend`;
-    the trajectory is the last feasible one.
+    The loss may rise. An infeasible trajectory does not stop the search. The search converges when the loss changes by
+    less than the tolerance, which is absolute here.
+
+    Args and Returns: as for `descend`; the returned trajectory is the last feasible one.
     """
     now, spare = states
-    best, trial, gradient = points.copy(), points.copy(), np.empty_like(points)
-    masked, is_free, reason = np.zeros(len(points), dtype=np.bool_), True, ITERATION_LIMIT
+    best = points.copy()
+    trial = points.copy()
+    gradient = np.empty_like(points)
+    masked = np.zeros(len(points), dtype=np.bool_)
+    is_free = True
+    reason = ITERATION_LIMIT
     remember_boxes(points, problem, index, now.nearby)
     history[0] = evaluate(points, problem, index, masked, now)
     num_done = 0
     for iteration in range(1, len(history)):
-        masked = mask(points, problem, index, rules, masked, now)
+        masked = update_mask(points, problem, index, rules, masked, now)
         difference_gradient(points, problem, index, masked, spare, gradient)
         steps = _scaled_sum(gradient, now.visibility_gradient, -rules.learning_rate)[1:-1]
         move(points, steps, 1.0, rules.step_cap_m, boolean(False), trial)
         is_free = project(trial, problem, index, int64(1), len(trial) - 1, now.nearby)
-        points, trial, num_done = trial, points, iteration
+        points, trial = trial, points
+        num_done = iteration
         remember_boxes(points, problem, index, now.nearby)
         history[iteration] = evaluate(points, problem, index, masked, now)
         if is_free:
@@ -213,30 +255,31 @@ def descend_as_the_paper(points, problem, index, rules, states, history):
 
 
 @njit(cache=True)
-def mask(points, problem, index, rules, masked, state):
-    """Return the waypoints in low-visibility runs, (n,); gradient and model in `state` change with them."""
-    found = low_visibility_runs(state.visibility, rules.low_visibility, rules.low_visibility_frames)
-    for i in range(len(found)):
-        if found[i] != masked[i]:
-            evaluate(points, problem, index, found, state)
+def update_mask(points, problem, index, rules, masked, state):
+    """Return which waypoints are in low-visibility runs, (n,) bool; evaluate `state` again where `masked` differs."""
+    new_mask = low_visibility_runs(state.visibility, rules.low_visibility, rules.low_visibility_frames)
+    for i in range(len(new_mask)):
+        if new_mask[i] != masked[i]:
+            evaluate(points, problem, index, new_mask, state)
             break
-    return found
+    return new_mask
 
 
 @njit(cache=True)
-def _scaled_sum(one, other, factor):
-    """Return factor * (one + other), (n, 3)."""
-    total = np.empty_like(one)
-    for i in range(len(one)):
+def _scaled_sum(left, right, factor):
+    """Return factor * (left + right), (n, 3)."""
+    total = np.empty_like(left)
+    for i in range(len(left)):
         for axis in range(3):
-            total[i, axis] = factor * (one[i, axis] + other[i, axis])
+            total[i, axis] = factor * (left[i, axis] + right[i, axis])
     return total
 
 
 @njit(cache=True)
 def low_visibility_runs(fractions, threshold, frames):
-    """Mark the waypoints in runs of at least `frames` neighbours that all see less than `threshold`, (n,) bool."""
-    marked, begin = np.zeros(len(fractions), dtype=np.bool_), 0
+    """Return which waypoints are in a run of at least `frames` with visibility below `threshold`, (n,) bool."""
+    marked = np.zeros(len(fractions), dtype=np.bool_)
+    begin = 0
     for i in range(len(fractions) + 1):
         if i == len(fractions) or fractions[i] >= threshold:
             for k in range(begin, i):
@@ -247,35 +290,40 @@ def low_visibility_runs(fractions, threshold, frames):
 
 @njit(cache=True)
 def newton_step(points, loss, gradient, damping, num_tries, rules, problem, index, masked, now, spare, trial):
-    """Look for a step against `gradient` that lowers the loss.
+    """Search for a step against `gradient` that lowers the loss.
 
-    A trial that fails only for what the rough terms of some waypoints rose by is solved again with these damped; any
-    other failure shortens the step, first as a whole where single waypoints were capped: a capped step may be no
-    descent, because neighbours move apart.
+    If only the rough terms (visibility, safety) of some waypoints raise the loss of a trial, the damping of these
+    waypoints grows and the system is solved again. Otherwise the step is shortened. The first time, if the cap
+    shortened single waypoints, all steps are shortened by the same factor instead: a step that is capped per waypoint
+    moves neighbours apart, and may not be a descent.
 
     Args:
-        points: (n, 3) m, kept. loss, now: its loss and state. gradient: (n, 3), changed. damping: (n,) of single
-            waypoints, Levenberg's way, changed if a step is found. spare, trial: written, of the last trial.
+        points: (n, 3) m, unchanged. loss, now: loss and state of `points`. gradient: (n, 3), changed. damping: (n,)
+            Levenberg damping per waypoint, changed if a step is found. spare, trial: written, state and points of the
+            last trial.
     Returns:
-        the loss of the trial, infinity if none lowers it, and how many were tried.
+        The loss of the trial, infinity if no trial lowers the loss, and the number of trials.
     """
-    band, raised = now.band.copy(), damping.copy()
+    band = now.band.copy()
+    raised = damping.copy()
     for column in range(band.shape[1]):
         band[0, column] += DAMPING_LEAST
     hold_bounds(points, problem, now.contacts, band, gradient)
-    steps, scale, as_a_whole = solve_band(band, raised, gradient), 1.0, boolean(False)
+    steps = solve_band(band, raised, gradient)
+    scale = 1.0
+    as_a_whole = boolean(False)
     for tried in range(1, num_tries + 1):
-        found, is_capped = try_step(
+        trial_loss, is_capped = try_step(
             points, steps, scale, rules.step_cap_m, as_a_whole, problem, index, masked, spare, trial
         )
-        if found < loss:
+        if trial_loss < loss:
             for i in range(len(damping)):
                 damping[i] = raised[i] * DAMPING_FALL if raised[i] > DAMPING_FIRST / 10 else 0.0
-            return found, tried
-        rise = 0.0
+            return trial_loss, tried
+        rough_rise = 0.0
         for i in range(len(raised)):
-            rise += max(spare.rough[i] - now.rough[i], 0.0)
-        if found < np.inf and rise > found - loss:
+            rough_rise += max(spare.rough[i] - now.rough[i], 0.0)
+        if trial_loss < np.inf and rough_rise > trial_loss - loss:
             for i in range(len(raised)):
                 if spare.rough[i] > now.rough[i]:
                     raised[i] = max(DAMPING_RISE * raised[i], DAMPING_FIRST)
@@ -292,37 +340,43 @@ def newton_step(points, loss, gradient, damping, num_tries, rules, problem, inde
 
 @njit(cache=True)
 def push_out(point, problem, index, nearby, i):
-    """Move waypoint i in place out of obstacles, within the altitude bounds; return its clearance, at most safety_m.
+    """Move waypoint i out of obstacles, in place and within the altitude bounds.
 
-    Up to pushes_max times along the outward normal of the nearest box. If the nominal distance is not reached, the best
-    place seen remains (the caller checks the relaxed floor).
+    The waypoint moves along the outward normal of the nearest box, at most pushes_max times. If it does not reach
+    safety_m, it ends where its clearance was greatest; the caller checks the relaxed distance.
+
+    Returns:
+        The clearance, m, at most safety_m.
     """
-    best, bx, by, bz = -np.inf, point[0], point[1], point[2]
-    last_x, last_y, last_z, share = 0.0, 0.0, 0.0, 1.0
+    best = -np.inf
+    best_x, best_y, best_z = point[0], point[1], point[2]
+    last_x, last_y, last_z = 0.0, 0.0, 0.0  # the normal of the previous push
+    share = 1.0
     for push in range(problem.pushes_max + 1):
         point[2] = min(max(point[2], problem.altitudes[i, LEAST]), problem.altitudes[i, GREATEST])
         gap, box = nearest_of(nearby, i, index, point[0], point[1], point[2], problem.safety_m)
         if gap > best:
-            best, bx, by, bz = gap, point[0], point[1], point[2]
+            best = gap
+            best_x, best_y, best_z = point[0], point[1], point[2]
         if box < 0 or push == problem.pushes_max:
             break
         nx, ny, nz = normal_of_box(index.rows, box, point[0], point[1], point[2])
         if nx * last_x + ny * last_y + nz * last_z < 0.0:
-            share *= 0.5  # between two obstacles: settle in the middle
+            share *= 0.5  # between two obstacles: converge to the middle
         last_x, last_y, last_z = nx, ny, nz
         shift = share * (problem.safety_m - gap + 1e-6)
         point[0] += shift * nx
         point[1] += shift * ny
         point[2] += shift * nz
-    point[0], point[1], point[2] = bx, by, bz
+    point[0], point[1], point[2] = best_x, best_y, best_z
     return best
 
 
 @njit(cache=True)
 def project(points, problem, index, begin, end, nearby):
-    """Bring waypoints [begin, end) into the feasible region in place; return whether the whole trajectory is feasible.
+    """Move waypoints [begin, end) into the feasible region, in place; return whether the whole trajectory is feasible.
 
-    Order as in the paper: altitude clamp, cap of the step from the waypoint before, push-out.
+    The order is that of the paper: altitude clamp, cap of the distance from the previous waypoint, push-out.
     """
     step_max = problem.step_max_m
     anchors, around, num_around, rows = nearby.anchors, nearby.around, nearby.num_around, index.rows
@@ -336,25 +390,28 @@ def project(points, problem, index, begin, end, nearby):
                 share = step_max / length
                 points[i, 0], points[i, 1], points[i, 2] = u + share * dx, v + share * dy, w + share * dz
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        count = known(anchors, num_around, i, x, y, z)
+        count = num_cached(anchors, num_around, i, x, y, z)
         if count > 0:
             _, box = nearest_among(rows, around, i, count, x, y, z, problem.safety_m)
-            count = count if box >= 0 else 0  # nothing too near
-        if count != 0:
+            if box < 0:
+                count = 0  # no box is too near
+        if count != 0:  # a box is too near, or the cache has no answer
             push_out(points[i], problem, index, nearby, i)
     return is_feasible(points, problem, index, nearby)
 
 
 @njit(cache=True)
 def is_feasible(points, problem, index, nearby):
-    """Return whether a trajectory keeps altitude bounds, step cap and relaxed floor, and hits nothing on its way."""
-    one, before, step_max = np.empty(1, dtype=np.int64), 0.0, problem.step_max_m
+    """Return whether a trajectory keeps altitude bounds, step length and relaxed distance, and hits no box between."""
+    first_hit = np.empty(1, dtype=np.int64)
+    gap_before = 0.0
+    step_max = problem.step_max_m
     anchors, around, num_around, rows = nearby.anchors, nearby.around, nearby.num_around, index.rows
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         if z < problem.altitudes[i, LEAST] - 1e-6 or z > problem.altitudes[i, GREATEST] + 1e-6:
             return False
-        count = known(anchors, num_around, i, x, y, z)
+        count = num_cached(anchors, num_around, i, x, y, z)
         if count >= 0:
             gap, _ = nearest_among(rows, around, i, count, x, y, z, problem.safety_m)
         else:
@@ -366,8 +423,8 @@ def is_feasible(points, problem, index, nearby):
             length = np.sqrt((x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2)
             if length > step_max * (1.0 + 1e-9):
                 return False
-            # A segment shorter than the clearances at its ends together reaches no box.
-            if length >= gap + before and collect_hits(index, u, v, w, x, y, z, 0.0, one) > 0:
+            # A segment that is shorter than the sum of the clearances at its ends reaches no box.
+            if length >= gap + gap_before and collect_hits(index, u, v, w, x, y, z, 0.0, first_hit) > 0:
                 return False
-        before = gap
+        gap_before = gap
     return True

@@ -1,4 +1,4 @@
-"""RRT*, PRM and B-spline PRM, by OMPL (extra `ompl`), limited by numbers of samples, not by time.
+"""RRT*, PRM and B-spline PRM from OMPL (extra `ompl`), limited by numbers of samples, not by time.
 
 Sources: Karaman and Frazzoli 2011; Kavraki et al. 1996; Koyuncu and Inalhan 2008 (the vertices of PRM's path are the
 control points of a cubic B-spline).
@@ -15,10 +15,12 @@ import numpy as np
 from cosfly.planners.reference.task import Task, planner
 from cosfly.runtime.errors import EnvironmentMissing
 
-RRT_CALLS, PRM_CALLS = 4000, 6000  # of the condition to stop, one or two for each sample
-RRT_RANGE_M = 15.0
-CONTROL_M = 8.0  # between control points
-EXACT_M = 1e-6
+# OMPL asks the termination condition once or twice per sample; the search ends after this many questions.
+RRT_TERMINATION_CALLS = 4000
+PRM_TERMINATION_CALLS = 6000
+RRT_RANGE_M = 15.0  # longest edge of the tree
+CONTROL_M = 8.0  # greatest distance between control points
+EXACT_M = 1e-6  # least size of the volume, and greatest distance of the last state from the goal
 
 
 def sampled(task: Task, method: str, *, is_spline: bool = False) -> np.ndarray | None:
@@ -29,48 +31,72 @@ def sampled(task: Task, method: str, *, is_spline: bool = False) -> np.ndarray |
         raise EnvironmentMissing("OMPL is not installed", got=str(error), fix='pip install "cosfly[ompl]"') from None
     util.setLogLevel(util.LogLevel.LOG_NONE)
     util.RNG.setSeed(int(task.rng.integers(1, 2**31)))
-    space, bounds = base.RealVectorStateSpace(3), base.RealVectorBounds(3)
-    for axis in range(3):
-        bounds.setLow(axis, float(task.low[axis]))
-        bounds.setHigh(axis, float(max(task.high[axis], task.low[axis] + EXACT_M)))
-    space.setBounds(bounds)
-    about = base.SpaceInformation(space)
-
-    def are_joined(one: Any, other: Any) -> bool:
-        ends = np.array([[state[axis] for axis in range(3)] for state in (one, other)])
-        return not task.hits(ends[:1], ends[1:])[0]
-
-    class Motions(base.MotionValidator):  # type: ignore[name-defined]  # imported as a value
-        def checkMotion(self, one: Any, other: Any, *_: Any) -> bool:
-            return are_joined(one, other)
-
-    about.setStateValidityChecker(lambda state: are_joined(state, state))
-    about.setMotionValidator(Motions(about))
-    about.setup()
-    problem, ends = base.ProblemDefinition(about), [space.allocState(), space.allocState()]
-    for state, place in zip(ends, (task.start, task.goal), strict=True):
-        for axis in range(3):
-            state[axis] = float(place[axis])
-    problem.setStartAndGoalStates(*ends)
-    problem.setOptimizationObjective(base.PathLengthOptimizationObjective(about))
-    search, calls = getattr(geometric, method)(about), itertools.count()
+    space_information = _space_information(base, task)
+    problem = _problem_definition(base, space_information, task)
+    search = getattr(geometric, method)(space_information)
     search.setProblemDefinition(problem)
     if method == "RRTstar":
         search.setRange(RRT_RANGE_M)
         search.setInformedSampling(True)
         search.setTreePruning(True)
         search.setup()
-        search.solve(base.PlannerTerminationCondition(lambda: next(calls) >= RRT_CALLS))
-    else:  # a roadmap first: PRM's own loop counts seconds, and asks the finished map when it must stop at once
+        search.solve(_stop_after(base, RRT_TERMINATION_CALLS))
+    else:  # PRM's own loop counts seconds, so the roadmap grows first and `solve` only queries it
         search.setup()
-        search.growRoadmapPtc(base.PlannerTerminationCondition(lambda: next(calls) >= PRM_CALLS))
+        search.growRoadmapPtc(_stop_after(base, PRM_TERMINATION_CALLS))
         search.solve(base.plannerAlwaysTerminatingCondition())
     path = problem.getSolutionPath()
     states = [] if path is None else [path.getState(k) for k in range(path.getStateCount())]
-    route = np.array([[state[axis] for axis in range(3)] for state in states]).reshape(-1, 3)
+    route = np.array([_coordinates(state) for state in states]).reshape(-1, 3)
     if not len(route) or np.linalg.norm(route[-1] - task.goal) > EXACT_M:
         return None
     return task.along(splined(route) if is_spline else route)
+
+
+def _space_information(base: Any, task: Task) -> Any:
+    """Return OMPL's description of the free volume of a task; base: the module `ompl.base`."""
+    space = base.RealVectorStateSpace(3)
+    bounds = base.RealVectorBounds(3)
+    for axis in range(3):
+        bounds.setLow(axis, float(task.low[axis]))
+        bounds.setHigh(axis, float(max(task.high[axis], task.low[axis] + EXACT_M)))
+    space.setBounds(bounds)
+    space_information = base.SpaceInformation(space)
+
+    def is_free(start: Any, end: Any) -> bool:
+        ends = np.array([_coordinates(start), _coordinates(end)])
+        return not task.hits(ends[:1], ends[1:])[0]
+
+    class FreeMotions(base.MotionValidator):  # type: ignore[name-defined]  # imported as a value
+        def checkMotion(self, start: Any, end: Any, *_: Any) -> bool:
+            return is_free(start, end)
+
+    space_information.setStateValidityChecker(lambda state: is_free(state, state))
+    space_information.setMotionValidator(FreeMotions(space_information))
+    space_information.setup()
+    return space_information
+
+
+def _problem_definition(base: Any, space_information: Any, task: Task) -> Any:
+    """Return OMPL's shortest-path problem from the start of a task to its goal."""
+    problem = base.ProblemDefinition(space_information)
+    ends = [space_information.allocState(), space_information.allocState()]
+    for state, point in zip(ends, (task.start, task.goal), strict=True):
+        for axis in range(3):
+            state[axis] = float(point[axis])
+    problem.setStartAndGoalStates(*ends)
+    problem.setOptimizationObjective(base.PathLengthOptimizationObjective(space_information))
+    return problem
+
+
+def _stop_after(base: Any, num_calls: int) -> Any:
+    """Return a termination condition that holds from its call number `num_calls` on, counted from 0."""
+    calls = itertools.count()
+    return base.PlannerTerminationCondition(lambda: next(calls) >= num_calls)
+
+
+def _coordinates(state: Any) -> list[float]:
+    return [state[axis] for axis in range(3)]
 
 
 def splined(route: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cosfly.geometry.kernels import BoxIndex, normals, segments_hit, signed_distances
+from cosfly.geometry.trajectory_metrics import distances_along_m
 from cosfly.planners.contract import Plan, PlanConfig, Planner, Scenario
 from cosfly.planners.smoothing import repair_to_limits
 
@@ -53,10 +54,9 @@ class Task:
 
     def along(self, route: np.ndarray) -> np.ndarray:
         """Return the trajectory of even speed along a route (m, 3), (num, 3)."""
-        lengths_m = np.linalg.norm(np.diff(route, axis=0), axis=1)
-        far_m = np.concatenate([[0.0], np.cumsum(lengths_m)])
-        wanted_m = np.linspace(0.0, far_m[-1], self.num)
-        return np.stack([np.interp(wanted_m, far_m, route[:, axis]) for axis in range(3)], axis=1)
+        along_m = distances_along_m(route)
+        wanted_m = np.linspace(0.0, along_m[-1], self.num)
+        return np.stack([np.interp(wanted_m, along_m, route[:, axis]) for axis in range(3)], axis=1)
 
 
 def make_task(
