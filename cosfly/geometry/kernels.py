@@ -291,13 +291,13 @@ def nearest_box(index, x, y, z, reach_m):
 
 @njit(cache=True)
 def collect_hits(index, ax, ay, az, bx, by, bz, inflate_m, out):
-    """Put the boxes that a segment touches, grown by `inflate_m`, into `out` and return their number.
+    """Write the boxes that a segment touches, grown by `inflate_m`, to `out` and return their number.
 
-    Stops when `out` is full, so an `out` of length 1 asks: is there any?
+    The search stops when `out` is full, so an `out` of length 1 tests whether there is any.
     """
-    found = 0
+    num_hits = 0
     if len(index.rows) == 0 or len(out) == 0:
-        return found
+        return num_hits
     cell, num_x, num_y = index.grid[CELL], index.shape[0], index.shape[1]
     ox, oy = index.grid[ORIGIN_X], index.grid[ORIGIN_Y]
     reach = CORNER * inflate_m
@@ -317,15 +317,15 @@ def collect_hits(index, ax, ay, az, bx, by, bz, inflate_m, out):
         for iy in range(first_y, last_y + 1):
             for place in range(index.starts[ix * num_y + iy], index.starts[ix * num_y + iy + 1]):
                 box = index.members[place]
-                known = False
-                for k in range(found):
-                    known = known or out[k] == box
-                if not known and segment_hits_box(index.rows, box, ax, ay, az, bx, by, bz, inflate_m):
-                    out[found] = box
-                    found += 1
-                    if found == len(out):
-                        return found
-    return found
+                is_listed = False
+                for k in range(num_hits):
+                    is_listed = is_listed or out[k] == box
+                if not is_listed and segment_hits_box(index.rows, box, ax, ay, az, bx, by, bz, inflate_m):
+                    out[num_hits] = box
+                    num_hits += 1
+                    if num_hits == len(out):
+                        return num_hits
+    return num_hits
 
 
 @njit(cache=True)
@@ -392,10 +392,11 @@ def segments_hit(index: BoxIndex, starts: np.ndarray, ends: np.ndarray, inflate_
 
 @njit(cache=True)
 def _segments_hit(index, starts, ends, inflate_m):
-    hits, one = np.zeros(len(starts), dtype=np.bool_), np.empty(1, dtype=np.int64)
+    hits = np.zeros(len(starts), dtype=np.bool_)
+    first_hit = np.empty(1, dtype=np.int64)
     for i in range(len(starts)):
         a, b = starts[i], ends[i]
-        hits[i] = collect_hits(index, a[0], a[1], a[2], b[0], b[1], b[2], inflate_m, one) > 0
+        hits[i] = collect_hits(index, a[0], a[1], a[2], b[0], b[1], b[2], inflate_m, first_hit) > 0
     return hits
 
 
@@ -415,14 +416,16 @@ def swept_distances(index: BoxIndex, points: np.ndarray, reach_m: float) -> tupl
 def _swept_distances(index, points, reach_m):
     num = len(points)
     distances, boxes = _signed_distances(index, points, reach_m)
-    own, shares, near = distances.copy(), np.zeros(num), np.empty(len(index.rows), dtype=np.int64)
+    point_distances = distances.copy()
+    shares = np.zeros(num)
+    near = np.empty(len(index.rows), dtype=np.int64)
     for i in range(num - 1):
         a, b = points[i], points[i + 1]
         if distances[i + 1] < distances[i]:
             distances[i], shares[i], boxes[i] = distances[i + 1], 1.0, boxes[i + 1]
         length = np.sqrt((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2 + (b[2] - a[2]) ** 2)
         # Distance changes by at most a metre per metre.
-        if distances[i] <= 0.0 or own[i] + own[i + 1] - length >= 2.0 * distances[i]:
+        if distances[i] <= 0.0 or point_distances[i] + point_distances[i + 1] - length >= 2.0 * distances[i]:
             continue
         for k in range(collect_hits(index, a[0], a[1], a[2], b[0], b[1], b[2], distances[i], near)):
             distance, share = segment_to_box(index.rows, near[k], a[0], a[1], a[2], b[0], b[1], b[2])
@@ -449,9 +452,9 @@ def visibility(index: BoxIndex, drones: np.ndarray, targets: np.ndarray) -> np.n
 def _visibility(index, drones, targets):
     fractions, boxes = np.empty(len(drones)), np.empty(len(index.rows), dtype=np.int64)
     for i in range(len(drones)):
-        p, x = drones[i], targets[i]
-        count = collect_hits(index, x[0], x[1], x[2], p[0], p[1], p[2], RAY_SPREAD_M, boxes)
-        fractions[i] = free_rays(index, boxes, count, p[0], p[1], p[2], x)
+        drone, target = drones[i], targets[i]
+        count = collect_hits(index, target[0], target[1], target[2], drone[0], drone[1], drone[2], RAY_SPREAD_M, boxes)
+        fractions[i] = free_rays(index, boxes, count, drone[0], drone[1], drone[2], target)
     return fractions
 
 

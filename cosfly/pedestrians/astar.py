@@ -50,7 +50,8 @@ def find_route(
     state = np.zeros(free.size, dtype=np.uint8)
     steps = np.empty((free.size, 2), dtype=np.int32)
     from_direction = np.empty(free.size, dtype=np.int8)
-    origin, target = int(start[1]) * num_x + int(start[0]), int(goal[1]) * num_x + int(goal[0])
+    origin = int(start[1]) * num_x + int(start[0])
+    target = int(goal[1]) * num_x + int(goal[0])
     classes = np.zeros(free.shape, dtype=np.uint8) if classes is None else classes
     least = 2 * int(costs.min())  # so that the estimate is never above the cost of a route
     if not _search(free, origin, target, state, steps, from_direction, classes, costs, least):

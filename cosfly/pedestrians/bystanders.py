@@ -1,8 +1,8 @@
 """Bystanders and cars around a pedestrian trajectory, clear of the target and of each other.
 
-They are placed one after the other. Each bystander passes the target at a moment of its own; the first is near from the
-start. Where a new one would collide, it waits a little before that place; if waiting does not help, it is drawn again,
-and skipped after some tries. So there may be fewer than requested.
+They are placed one after the other. Each bystander passes the target at a different time, the first at the start. A new
+one that would collide waits a little before that place. If waiting does not help, it is drawn again, and skipped after
+some tries, so there may be fewer than requested.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from cosfly.pedestrians.speed_model import (
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround
 from cosfly.runtime.seeding import draw_by_share
 
-MOST_WAITS, WAIT_S = 10, 3.0  # after this many waits it is drawn again
+MOST_WAITS = 10  # after this many waits a bystander is drawn again
+WAIT_S = 3.0  # duration of one wait
 KEEP_BACK_M = {"Pedestrians": 1.5, "Car": 7.0}  # distance from the place of waiting to that of the collision
 TURN_S = 2.0  # stop of bystanders at the end of their route, before they walk back
 PASS_M = (1.5, 7.0)  # distance from the target when it is passed
@@ -43,8 +44,11 @@ CHORD_M = 1.0  # a car's heading is that of the chord from this far behind to th
 
 @dataclass(frozen=True)
 class Trip:
-    """The route of a bystander or car with its stops. kind: of BUILDS. limits_mps: (k,) speeds without obstructions.
-    head_start_s: time on the route before the pedestrian trajectory begins."""
+    """The route of a bystander or car with its stops.
+
+    kind: a key of BUILDS. limits_mps: (k,) speeds at the waypoints, apart from stops. head_start_s: time on the route
+    before the pedestrian trajectory begins.
+    """
 
     kind: str
     route: PacedRoute
@@ -53,10 +57,11 @@ class Trip:
 
     def moved(self, time_s: np.ndarray, heights: Ground) -> Bystander:
         """Return the positions and headings at each time."""
-        positions_m = self._at(self.along_m(time_s))
+        along_m = self.along_m(time_s)
+        positions_m = self._at(along_m)
         if self.kind == "Car":
-            ahead, behind = (self._at(self.along_m(time_s) + sign * CHORD_M) for sign in (1.0, -1.0))
-            headings_rad = np.arctan2(*(ahead - behind).T[::-1])
+            chord = self._at(along_m + CHORD_M) - self._at(along_m - CHORD_M)
+            headings_rad = np.arctan2(chord[:, 1], chord[:, 0])
         else:
             headings_rad = headings_of(positions_m, time_s)
         return Bystander(self.kind, np.column_stack([positions_m, heights.height_at(positions_m)]), headings_rad)
@@ -72,15 +77,19 @@ class Trip:
 
     def waiting(self, before_m: float) -> Trip:
         """Return the trip with a stop of WAIT_S, or a longer one, at least KEEP_BACK_M before a place of the route."""
-        at = max(0, int(np.searchsorted(self.route.along_m, before_m - KEEP_BACK_M[self.kind], side="right")) - 1)
-        near = slice(max(0, at - STOP_GAP_MIN + 1), at + STOP_GAP_MIN)
+        stop_m = before_m - KEEP_BACK_M[self.kind]
+        waypoint = max(0, int(np.searchsorted(self.route.along_m, stop_m, side="right")) - 1)
+        first_near = max(0, waypoint - STOP_GAP_MIN + 1)
         stops_s = self.route.stops_s.copy()
-        stops_s[near.start + int(np.argmax(stops_s[near])) if stops_s[near].any() else at] += WAIT_S
+        stops_near_s = stops_s[first_near : waypoint + STOP_GAP_MIN]
+        if stops_near_s.any():
+            waypoint = first_near + int(np.argmax(stops_near_s))
+        stops_s[waypoint] += WAIT_S
         return replace(self, route=replace(self.route, stops_s=stops_s))
 
     def _at(self, along_m: np.ndarray) -> np.ndarray:
-        known_m = self.route.along_m
-        return np.column_stack([np.interp(along_m, known_m, self.route.polyline_m[:, k]) for k in (0, 1)])
+        route = self.route
+        return np.column_stack([np.interp(along_m, route.along_m, route.polyline_m[:, k]) for k in (0, 1)])
 
 
 def braked(limits_mps: np.ndarray, along_m: np.ndarray) -> np.ndarray:
@@ -104,10 +113,13 @@ def bystanders_of(
         for number in range(wanted):
             for _ in range(cfg.num_retries + 1):
                 is_car = kind == "Car"
-                trip = _draw_car(target, lanes, cfg, rng) if is_car else _draw_walk(target, number, ground, cfg, rng)
-                other = None if trip is None else avoid_collisions(trip, target.time_s, placed, ground.heights)
-                if other is not None:
-                    placed.append(replace(other, is_look_alike=not is_car and number < cfg.look_alikes))
+                if is_car:
+                    trip = _draw_car(target, lanes, cfg, rng)
+                else:
+                    trip = _draw_pedestrian(target, number, ground, cfg, rng)
+                bystander = None if trip is None else avoid_collisions(trip, target.time_s, placed, ground.heights)
+                if bystander is not None:
+                    placed.append(replace(bystander, is_look_alike=not is_car and number < cfg.look_alikes))
                     break
     return Bystanders(target.path_id, placed[1:])
 
@@ -115,18 +127,19 @@ def bystanders_of(
 def avoid_collisions(trip: Trip, time_s: np.ndarray, placed: list[Bystander], heights: Ground) -> Bystander | None:
     """Return the motion of a trip that waits for those already placed; None where waiting does not help."""
     for _ in range(MOST_WAITS + 1):
-        other = trip.moved(time_s, heights)
-        met = np.flatnonzero(np.min([gaps_m(other, one) for one in placed], axis=0) < 0.0)
-        if len(met) == 0:
-            return other
-        before_m = float(trip.along_m(time_s[met[:1] + 1])[0])
-        if met[0] == 0 and before_m < KEEP_BACK_M[trip.kind]:
+        bystander = trip.moved(time_s, heights)
+        least_gaps_m = np.min([gaps_m(bystander, neighbour) for neighbour in placed], axis=0)
+        collisions = np.flatnonzero(least_gaps_m < 0.0)
+        if len(collisions) == 0:
+            return bystander
+        before_m = float(trip.along_m(time_s[collisions[:1] + 1])[0])
+        if collisions[0] == 0 and before_m < KEEP_BACK_M[trip.kind]:
             return None
         trip = trip.waiting(before_m)
     return None
 
 
-def _draw_walk(
+def _draw_pedestrian(
     target: PedestrianTrajectory, number: int, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator
 ) -> Trip | None:
     """Draw a bystander's route that passes the target, back and forth for the duration; None if there is none."""
@@ -136,14 +149,20 @@ def _draw_walk(
     place = ground.sample_goal((int(x), int(y)), low, high, rng)
     if place is None:
         return None
-    reach = 0.5 * cfg.others_reach_m / cfg.resolution_m, cfg.others_reach_m / cfg.resolution_m
-    drawn = [ground.sample_goal(place, *reach, rng) for _ in range(1 + OPPOSITE_TRIES)]
-    ends = [np.subtract(end, place) for end in drawn if end is not None]
-    if len(ends) < 2:
+    reach_cells = cfg.others_reach_m / cfg.resolution_m
+    drawn = [ground.sample_goal(place, 0.5 * reach_cells, reach_cells, rng) for _ in range(1 + OPPOSITE_TRIES)]
+    goals = [goal for goal in drawn if goal is not None]
+    if len(goals) < 2:
         return None
-    pair = ends[0], min(ends[1:], key=lambda end: end @ ends[0] / np.linalg.norm(end))
-    legs = [ground.route(place, (int(x), int(y))) for x, y in pair + np.array(place)]
-    cells = np.concatenate([legs[0][:0:-1], legs[1]])
+    first = np.subtract(goals[0], place)
+
+    def cosine_to_first(goal: tuple[int, int]) -> float:  # up to a constant factor
+        offset = np.subtract(goal, place)
+        return offset @ first / np.linalg.norm(offset)
+
+    leg_back = ground.route(place, goals[0])
+    leg_ahead = ground.route(place, min(goals[1:], key=cosine_to_first))
+    cells = np.concatenate([leg_back[:0:-1], leg_ahead])
     pace = PACES[draw_by_share(cfg.pace, rng)]
     route = take_pace(ground.grid.centers_of(cells), pace, rng)
     trip = Trip("Pedestrians", route, speeds_at(route, pace, cfg, rng) * rng.uniform(*OWN_SPEED))
@@ -177,7 +196,8 @@ def _draw_car(
     number = near[rng.integers(len(near))]
     begin = int(rng.integers(len(lanes[number].points_m) - 1))
     pieces = [lanes[number].points_m[begin:]]
-    length_m, needed_m = 0.0, CAR_SPEED_MPS * float(target.time_s[-1])
+    length_m = 0.0
+    needed_m = CAR_SPEED_MPS * float(target.time_s[-1])
     while length_m < needed_m and lanes[number].onward:
         onward = lanes[number].onward
         # Turns prefer lanes near the trajectory, because traffic that leaves the view is of no use.
@@ -195,9 +215,9 @@ def _draw_car(
 
 
 def gaps_m(one: Bystander, two: Bystander) -> np.ndarray:
-    """Return the gap between the discs of two at each time step, (n - 1,) m, negative where they overlap.
+    """Return the gap between the discs of two bystanders in each time step, (n - 1,) m, negative where they overlap.
 
-    Between two times both move straight, so the nearest place within a step is that of the origin to a segment.
+    Both move straight within a step, so their distance is that of the origin from a segment of offsets.
     """
     apart = one.discs_m[:, :, None] - two.discs_m[:, None]  # (n, d, e, 2)
     start, along = apart[:-1], np.diff(apart, axis=0)

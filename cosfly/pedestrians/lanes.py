@@ -95,8 +95,9 @@ def lanes_of(box_map: BoxMap) -> list[Lane]:
 
 def _streets(roads: BoxMap) -> list[Street]:
     streets = []
-    rows = roads.centers[:, :2], roads.half_extents[:, :2], roads.rotations_deg
-    for center, half, rotation in zip(*rows, strict=True):
+    for center, half, rotation in zip(
+        roads.centers[:, :2], roads.half_extents[:, :2], roads.rotations_deg, strict=True
+    ):
         yaw = np.radians(rotation[1]) + (np.pi / 2.0 if half[1] > half[0] else 0.0)
         direction = np.array([np.cos(yaw), np.sin(yaw)])
         long, short = half.max(), half.min()
@@ -134,7 +135,7 @@ def _junctions(streets: list[Street]) -> tuple[list[float], list[list[Station]]]
         meeting = _meeting(one, two)
         if meeting is not None:
             place_m = one.at(meeting[0])
-            near = (k for k, known_m in enumerate(places_m) if np.linalg.norm(known_m - place_m) < SAME_PLACE_M)
+            near = (k for k, other_m in enumerate(places_m) if np.linalg.norm(other_m - place_m) < SAME_PLACE_M)
             number = next(near, len(places_m))
             if number == len(places_m):
                 places_m.append(place_m)
@@ -142,15 +143,15 @@ def _junctions(streets: list[Street]) -> tuple[list[float], list[list[Station]]]
             widths_m[number] = max(widths_m[number], one.width_m, two.width_m)
             stations[i].setdefault(number, meeting[0])
             stations[j].setdefault(number, meeting[1])
-    lists = []
-    for street, found in zip(streets, stations, strict=True):
-        along = sorted((along, number) for number, along in found.items())
-        if not along or along[0][0] > street.width_m:
-            along.insert(0, (0.0, -1))
-        if along[-1][0] < street.length_m - street.width_m:
-            along.append((street.length_m, -1))
-        lists.append(along)
-    return widths_m, lists
+    ordered_stations = []
+    for street, along_of in zip(streets, stations, strict=True):
+        ordered = sorted((along_m, number) for number, along_m in along_of.items())
+        if not ordered or ordered[0][0] > street.width_m:
+            ordered.insert(0, (0.0, -1))
+        if ordered[-1][0] < street.length_m - street.width_m:
+            ordered.append((street.length_m, -1))
+        ordered_stations.append(ordered)
+    return widths_m, ordered_stations
 
 
 def _lane(street: Street, first: Station, last: Station, widths_m: list[float], is_free: IsFree) -> Lane | None:
@@ -206,6 +207,6 @@ def _curve(one_m: np.ndarray, two_m: np.ndarray) -> np.ndarray:
     gap_m = float(np.linalg.norm(end - start))
     pull = 0.55 * gap_m / np.sqrt(2.0)
     a, b = start + pull * leave / np.linalg.norm(leave), end - pull * arrive / np.linalg.norm(arrive)
-    share = np.linspace(0.0, 1.0, max(4, int(1.2 * gap_m / STEP_M)))[1:-1, None]
-    rest = 1.0 - share
-    return rest**3 * start + 3 * rest**2 * share * a + 3 * rest * share**2 * b + share**3 * end
+    t = np.linspace(0.0, 1.0, max(4, int(1.2 * gap_m / STEP_M)))[1:-1, None]
+    u = 1.0 - t
+    return u**3 * start + 3 * u**2 * t * a + 3 * u * t**2 * b + t**3 * end

@@ -73,15 +73,17 @@ def _is_large(ring: shapely.LinearRing) -> bool:
 
 def run_propose(map_: Path, cfg: PedestriansConfig, out: Path) -> str:
     """Read a map, write a first `roi_polygon.json` and report what it holds."""
+    if out.is_dir():
+        raise InputError("a folder, not a file", where=out, fix="name another file")
     if out.exists():
-        what = "a folder, not a file" if out.is_dir() else "there is a region already"
-        raise InputError(what, where=out, fix="name another file" + ("" if out.is_dir() else ", or remove this one"))
+        raise InputError("there is a region already", where=out, fix="name another file, or remove this one")
     box_map = _read_map(map_)
     roi = propose(walkable_ground(box_map, cfg, where=map_), box_map.name)
     ground = walkable_ground(box_map, cfg, roi, where=map_, roi_where=out)
     write_roi(out, roi)
-    rings, num_cells = roi.rings(), ground.counts["cells_used"]
-    return f"polygons: {len(rings)}, holes: {sum(len(one.holes) for one in rings)}, walkable cells: {num_cells:,}"
+    polygons = roi.rings()
+    num_holes = sum(len(polygon.holes) for polygon in polygons)
+    return f"polygons: {len(polygons)}, holes: {num_holes}, walkable cells: {ground.counts['cells_used']:,}"
 
 
 def _read_map(path: Path) -> BoxMap:
@@ -108,10 +110,15 @@ class Editor:
     def __post_init__(self) -> None:
         num_x, num_y = empty_grid(self.box_map, self.cfg.resolution_m).size
         if max(num_x, num_y) > MOST_SIDE or num_x * num_y > MOST_CELLS:
-            got, expected = f"{num_x} x {num_y} cells", f"sides of {MOST_SIDE}, {MOST_CELLS:,} cells in all"
-            fix = "take a coarser pedestrians.resolution_m to draw with: a region is in metres"
-            raise InputError("the grid is too large for a page", where=self.where, got=got, expected=expected, fix=fix)
-        self.bare, self.opened = walkable_ground(self.box_map, self.cfg, where=self.where), None
+            raise InputError(
+                "the grid is too large for a page",
+                where=self.where,
+                got=f"{num_x} x {num_y} cells",
+                expected=f"sides of {MOST_SIDE}, {MOST_CELLS:,} cells in all",
+                fix="take a coarser pedestrians.resolution_m to draw with: a region is in metres",
+            )
+        self.bare = walkable_ground(self.box_map, self.cfg, where=self.where)
+        self.opened = None
         if self.path.exists():
             data = read_bytes(self.path, what="region of interest")
             self.opened = self.region_of(data, self.path)["roi"]
@@ -136,7 +143,7 @@ class Editor:
         return page(template, title=self.box_map.name, style=style, script=script, asks=True, data=data)
 
     def region_of(self, data: bytes, where: Path) -> dict[str, Any]:
-        """Read a file's bytes; gives the region and its cells."""
+        """Return the region in a file's bytes and its cells."""
         roi = parse_roi(data, where)
         check_roi(roi, self.box_map, where, refuse=True)
         return {"roi": roi.model_dump(), **self.cells(roi, where)}
@@ -160,20 +167,24 @@ class Editor:
     def save(self, data: bytes) -> dict[str, Any]:
         """Write the region, unless somebody else has written the file meanwhile."""
         roi = parse_roi(data, Path("the page"))
-        found = self.cells(roi)
+        figures = self.cells(roi)["figures"]
         with self.lock:
-            known = sha256_bytes(read_bytes(self.path)) if self.path.exists() else None
-            if known != self.digest:
-                what, fix = "the file was changed by somebody else; nothing is written", "start the editor again"
-                raise InputError(what, where=self.path, fix=fix)
+            digest = sha256_bytes(read_bytes(self.path)) if self.path.exists() else None
+            if digest != self.digest:
+                raise InputError(
+                    "the file was changed by somebody else; nothing is written",
+                    where=self.path,
+                    fix="start the editor again",
+                )
             write_roi(self.path, roi)
             self.digest = sha256_bytes(read_bytes(self.path))
-        return {"figures": found["figures"], "saved": str(self.path)}
+        return {"figures": figures, "saved": str(self.path)}
 
     def answer(self, name: str, data: bytes) -> bytes:
         """Answer what the page asks for; errors are messages for the page."""
         if name == "above":
-            grid, size_m = self.bare.grid, np.array(self.bare.grid.size) * self.bare.grid.resolution_m
+            grid = self.bare.grid
+            size_m = np.array(grid.size) * grid.resolution_m
             per_m = FROM_ABOVE_PX / size_m.max()
             width, height = (max(1, round(side)) for side in size_m * per_m)
             # A place is 0 in the middle of the first pixel.
@@ -181,15 +192,15 @@ class Editor:
             return png_bytes(draw_map(self.box_map, TopView(*corner, per_m, (width, height))))
         if name == "picture" and self.backdrop:
             return png_bytes(self.backdrop.picture)
-        asked: dict[str, Callable[[], dict[str, Any]]] = {
+        answers: dict[str, Callable[[], dict[str, Any]]] = {
             "cells": lambda: self.cells(parse_roi(data, Path("the page")) if data else None),
             "open": lambda: self.region_of(data, Path("the file")),
             "propose": lambda: {"roi": propose(self.bare, self.box_map.name).model_dump()},
             "save": lambda: self.save(data),
         }
-        if name not in asked:
+        if name not in answers:
             raise KeyError(name)
-        return json.dumps(asked[name]()).encode()
+        return json.dumps(answers[name]()).encode()
 
 
 def _encoded(picture: np.ndarray) -> str:
@@ -206,6 +217,10 @@ def open_editor(map_: Path, cfg: PedestriansConfig, roi: Path, port: int, backdr
     box_map = _read_map(map_)
     picture = None if backdrop is None else Backdrop.read(backdrop)
     if picture is not None and not picture.covers(box_map):
-        what = "the picture shows no part of the map"
-        raise InputError(what, where=backdrop, got=str(picture.frame()), expected=f"a picture of {box_map.name}")
+        raise InputError(
+            "the picture shows no part of the map",
+            where=backdrop,
+            got=str(picture.frame()),
+            expected=f"a picture of {box_map.name}",
+        )
     return PageServer(Editor(box_map, cfg, roi, map_, picture), port)

@@ -122,12 +122,13 @@ def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround, lanes
     """Return the function that makes one trajectory, and its bystanders and cars where the settings ask for them."""
 
     def work(item: Item) -> Outcome:
-        made = make_pedestrian(item.item_id, ground, cfg, rng_for(seed, STAGE, item.item_id), item.payload)
-        result = {"path": made.trajectory.as_json(), "retries": made.retries, "seconds": made.seconds}
+        pedestrian = make_pedestrian(item.item_id, ground, cfg, rng_for(seed, STAGE, item.item_id), item.payload)
+        trajectory = pedestrian.trajectory
+        record = {"path": trajectory.as_json(), "retries": pedestrian.retries, "seconds": pedestrian.seconds}
         if cfg.has_others:
             rng = rng_for(seed, STAGE, f"{item.item_id}/others")
-            result["bystanders"] = bystanders_of(made.trajectory, ground, lanes, cfg, rng).as_json()
-        return Outcome(result)
+            record["bystanders"] = bystanders_of(trajectory, ground, lanes, cfg, rng).as_json()
+        return Outcome(record)
 
     return work
 
@@ -168,8 +169,9 @@ def _write_bystanders(path: Path, records: list[dict], header: dict, cfg: Pedest
         placed = sum(other.kind == kind for bystanders in items for other in bystanders.others)
         counts[kind] = {"wanted": per_item * len(items), "placed": placed}
         if placed < per_item * len(items):
-            what = "pedestrians: only %d of %d bystanders of kind %s could be placed"
-            log.warning(what, placed, per_item * len(items), kind)
+            log.warning(
+                "pedestrians: only %d of %d bystanders of kind %s could be placed", placed, per_item * len(items), kind
+            )
     return counts
 
 
@@ -257,8 +259,9 @@ def draw_overview(ground: WalkableGround, paths: list[PedestrianTrajectory]) -> 
     for number, path in enumerate(paths):
         # Neighbours are far apart on the colour circle (golden ratio).
         hue_rgb = colorsys.hsv_to_rgb((0.02 + number * 0.618034) % 1.0, 0.85, (0.62, 0.85)[number % 2])
-        (red, green, blue), line = (round(part * 255) for part in hue_rgb), view.pixels(path.polyline_m)
+        red, green, blue = (round(part * 255) for part in hue_rgb)
         color = red, green, blue
+        line = view.pixels(path.polyline_m)
         draw_line(picture, line, color, thickness)
         draw_dot(picture, line[0], 7, PAPER)
         draw_dot(picture, line[0], 7, color, thickness)

@@ -96,15 +96,17 @@ class PedestriansConfig(Config):
 
     @model_validator(mode="after")
     def _ranges_are_ordered(self) -> PedestriansConfig:
-        wrong = []
+        problems = []
         if self.min_distance_m >= self.max_distance_m:
-            wrong.append(f"min_distance_m {self.min_distance_m} is not below max_distance_m {self.max_distance_m}")
+            problems.append(f"min_distance_m {self.min_distance_m} is not below max_distance_m {self.max_distance_m}")
         if self.look_alikes > self.others:
-            wrong.append(f"look_alikes {self.look_alikes} is above others {self.others}, which include them")
+            problems.append(f"look_alikes {self.look_alikes} is above others {self.others}, which include them")
         if 0 < self.max_detour < 1:
-            wrong.append(f"max_detour {self.max_detour} is below 1, but no route is shorter than straight; 0: no limit")
-        if wrong:
-            raise ValueError("; ".join(wrong))
+            problems.append(
+                f"max_detour {self.max_detour} is below 1, but no route is shorter than straight; 0: no limit"
+            )
+        if problems:
+            raise ValueError("; ".join(problems))
         return self
 
 
@@ -151,22 +153,26 @@ class WalkableGround:
     def sample_goal(
         self, start: tuple[int, int], min_cells: float, max_cells: float, rng: np.random.Generator
     ) -> tuple[int, int] | None:
-        """Draw a cell of `may_end` in the start's part, (x index, y index), at a straight distance within [min_cells,
-        max_cells], uniformly; None if there is none."""
-        (x, y), reach = start, int(max_cells)
-        left, low = max(0, x - reach), max(0, y - reach)
-        near = np.s_[low : y + reach + 1, left : x + reach + 1]
+        """Draw one cell of `may_end` in the start's part, (x index, y index), uniformly; None if there is none.
+
+        min_cells, max_cells: bounds of its straight distance from the start, both included.
+        """
+        x, y = start
+        reach = int(max_cells)
+        first_x, first_y = max(0, x - reach), max(0, y - reach)
+        near = np.s_[first_y : y + reach + 1, first_x : x + reach + 1]
         window = self.parts[near]
-        squared = (np.arange(window.shape[0])[:, None] + low - y) ** 2 + (np.arange(window.shape[1]) + left - x) ** 2
+        rows, columns = np.arange(window.shape[0])[:, None], np.arange(window.shape[1])
+        squared = (rows + first_y - y) ** 2 + (columns + first_x - x) ** 2
         fits = (window == self.parts[y, x]) & self.may_end[near]
         candidates = np.flatnonzero(fits & (squared >= min_cells**2) & (squared <= max_cells**2))
         if len(candidates) == 0:
             return None
         row, column = divmod(int(candidates[rng.integers(len(candidates))]), window.shape[1])
-        return column + left, row + low
+        return column + first_x, row + first_y
 
     def route(self, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
-        """Return the cells of a cheapest route between two of one part, (k, 2)."""
+        """Return the cells of a cheapest route between two cells of one part, (k, 2)."""
         cells = find_route(self.walkable, start, goal, self.footing, self.costs)
         assert cells is not None, "two cells of one part have no route between them"
         return cells
@@ -202,7 +208,8 @@ def walkable_ground(
         inflated = grids.inflate(grid, cfg.safety_radius_m)
         free = ~inflated.occupied
         num_free = _count(free)
-        has_surface, is_steep = _surface(box_map, cfg.ground, grid, free), None
+        has_surface = _surface(box_map, cfg.ground, grid, free)
+        is_steep = None
         if not box_map.ground.is_flat:
             columns, rows = np.meshgrid(*(np.arange(size) for size in grid.size))
             slopes = box_map.ground.slope_at(grid.centers_of(np.stack([columns.ravel(), rows.ravel()], axis=1)))
@@ -223,7 +230,8 @@ def walkable_ground(
     with timed(seconds, "connectivity"):
         parts = _parts_of_large_components(free, cfg.min_component_cells, counts, where if roi is None else roi_where)
     with timed(seconds, "footing"):
-        costs, footing = costs_of(cfg.open_cost, cfg.road_cost), footing_of(box_map, grid)
+        costs = costs_of(cfg.open_cost, cfg.road_cost)
+        footing = footing_of(box_map, grid)
     ground = WalkableGround(grid, inflated, parts, footing, box_map.ground, costs, is_in_roi, counts)
     if not ground.row_ends[-1]:
         raise NoPathError(
@@ -239,37 +247,38 @@ def _count(mask: np.ndarray) -> int:
 
 
 def _surface(box_map: BoxMap, ground: str, grid: grids.OccupancyGrid, free: np.ndarray) -> np.ndarray | None:
-    """Return the cells with ground as the settings want it, (ny, nx) bool; None for all cells, also where the map's
-    ground is unknown.
+    """Return the cells with the ground that the settings require, (ny, nx) bool; None for all cells.
 
-    It is unknown without ground boxes, or with neither streets nor squares and other ground under a small part of the
-    free cells. What lies outside a city model's data has no obstacles either: without ground boxes it looks like a
-    square.
+    It is None too where the map's ground is unknown: the map has no ground boxes, or no paved ones and others under a
+    small part of the free cells. Without ground boxes the land outside a city model's data looks like a square, because
+    it has no obstacles either.
     """
     if ground == "anywhere":
         return None
-    found = grids.surface(box_map, GROUND_KINDS, like=grid)
-    num_off, num_all = _count(grids.lies_off_ground(box_map, GROUND_KINDS)), _count(box_map.is_any_of(GROUND_KINDS))
+    has_ground = grids.surface(box_map, GROUND_KINDS, like=grid)
+    num_off = _count(grids.lies_off_ground(box_map, GROUND_KINDS))
+    num_all = _count(box_map.is_any_of(GROUND_KINDS))
     if num_off > OFF_GROUND_SHARE_MAX * num_all:
         log.warning(
             "%s: %d of %d ground boxes lie more than %g m off the ground of its header and are not walkable; "
             "if the map slopes, its header needs heights (ground)",
             box_map.name, num_off, num_all, grids.SURFACE_REACH_M,
         )  # fmt: skip
-    if found is None:
+    if has_ground is None:
         log.warning("%s has no ground boxes: people walk wherever there is no obstacle", box_map.name)
         return None
     paved = grids.surface(box_map, PAVED_KINDS, like=grid)
     if ground == "paved":
-        return np.zeros_like(found) if paved is None else paved
-    num_found, num_free = _count(found & free), _count(free)
-    if paved is None and num_found < SURFACE_SHARE_MIN * num_free:
+        return np.zeros_like(has_ground) if paved is None else paved
+    num_ground = _count(has_ground & free)
+    num_free = _count(free)
+    if paved is None and num_ground < SURFACE_SHARE_MIN * num_free:
         log.warning(
             "%s has no boxes of Roads, Sidewalks or Ground, and other ground under %d of %d free cells only: people "
-            "walk wherever there is no obstacle", box_map.name, num_found, num_free,
+            "walk wherever there is no obstacle", box_map.name, num_ground, num_free,
         )  # fmt: skip
         return None
-    return found
+    return has_ground
 
 
 def _parts_of_large_components(
@@ -299,26 +308,40 @@ def check_roi(roi: Roi, box_map: BoxMap, where: str | Path, *, refuse: bool = Fa
     region = roi.region()
     inside = shapely.intersection(region, shapely.box(*low[:2], *high[:2])).area / max(region.area, 1e-9)
     if refuse and inside < ROI_SHARE_MIN:
-        what, got = "the region of interest belongs to another map or other axes", f"{inside:.0%} of it on this map"
-        raise InputError(what, where=where, got=got, expected=f"at least {ROI_SHARE_MIN:.0%}")
+        raise InputError(
+            "the region of interest belongs to another map or other axes",
+            where=where,
+            got=f"{inside:.0%} of it on this map",
+            expected=f"at least {ROI_SHARE_MIN:.0%}",
+        )
     if 0.0 < inside < ROI_SHARE_MIN:
         log.warning("%s: %.0f %% of the region of interest lies outside the map", where, 100 * (1 - inside))
 
 
 def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | Path) -> None:
+    """Raise NoPathError if no cell is walkable."""
     if counts["cells_walkable"]:
         return
     if not counts["cells_free"]:
-        what, got = "the map has no walkable cell", f"{counts['cells_occupied']} of {counts['cells']} cells occupied"
-        expected = "free ground between the boxes"
-        fix = "lower safety_radius_m, or give ground boxes a ground type (Roads, Sidewalks, Terrain, Ground)"
-    elif counts["cells_in_roi"] is None:
-        what, got = "no free cell lies on the requested ground", f"{counts['cells_free']} free cells"
-        expected = "a free cell on such ground"
-        fix = "set ground to surfaces or anywhere"
-    else:
-        where, what = roi_where, "the region of interest has no walkable cell"
-        got = f"{counts['cells_in_roi']} of the map's {counts['cells']} cells inside, none of them free ground"
-        expected = "a region in the map's world metres"
-        fix = "draw it over free ground of this map"
-    raise NoPathError(what, where=where, got=got, expected=expected, fix=fix)
+        raise NoPathError(
+            "the map has no walkable cell",
+            where=where,
+            got=f"{counts['cells_occupied']} of {counts['cells']} cells occupied",
+            expected="free ground between the boxes",
+            fix="lower safety_radius_m, or give ground boxes a ground type (Roads, Sidewalks, Terrain, Ground)",
+        )
+    if counts["cells_in_roi"] is None:
+        raise NoPathError(
+            "no free cell lies on the requested ground",
+            where=where,
+            got=f"{counts['cells_free']} free cells",
+            expected="a free cell on such ground",
+            fix="set ground to surfaces or anywhere",
+        )
+    raise NoPathError(
+        "the region of interest has no walkable cell",
+        where=roi_where,
+        got=f"{counts['cells_in_roi']} of the map's {counts['cells']} cells inside, none of them free ground",
+        expected="a region in the map's world metres",
+        fix="draw it over free ground of this map",
+    )

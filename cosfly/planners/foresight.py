@@ -21,24 +21,27 @@ from cosfly.runtime.compiled import njit
 # --- candidate places: rings around the target, counted from the reference position -----------------------------------
 
 NUM_AZIMUTHS = 36
-BETWEEN_KEYS_S, BETWEEN_KEYS_CLIMBING_S = 1.5, 3.0  # the latter lets the drone climb from one of CLIMBS to the next
-# Azimuths between key frames relative to the turn of the reference: when climbing, a blocked orbit can stand still.
+BETWEEN_KEYS_S = 1.5
+BETWEEN_KEYS_CLIMBING_S = 3.0  # lets the drone climb from one of CLIMBS to the next
+# Greatest change of azimuth index between key frames, relative to the turn of the reference. When climbing it is large
+# enough that a blocked orbit can stop.
 MAX_TURN, MAX_TURN_CLIMBING = 2, 6
 
 # Rings as (steps outwards, steps up) from the reference position. A target below canopies is seen from farther away,
 # one behind a house from above; CLIMBS lead over obstacles.
 RINGS = ((-1, 0), (0, 0), (1, 0), (2, 0), (3, 0), (4, 0), (-1, 1), (0, 1))
 CLIMBS = ((0, 2), (1, 4), (2, 7), (2, 11))
-# Of the reference distance; with larger steps the drone could not change rings between key frames.
+# One step outwards is this share of the reference distance, at most STEP_OUT_MAX_M: with larger steps the drone could
+# not change rings between key frames.
 STEP_OUT_SHARE, STEP_OUT_MAX_M = 0.3, 8.0
 STEP_UP_M = 7.0
 
 # Costs of a place, in units of "the target hidden for one key frame" = 1. Deviations are squared shares of the
 # reference distance. Where bearing and altitude are the purpose, a deviation of 64 degrees costs as much as a hidden
 # target.
-BEARING_COST, ANY_BEARING_COST = 0.8, 0.007  # per rad^2 off the reference bearing; where any is allowed
-HIGH_COST, ANY_BEARING_HIGH_COST = 3.2, 0.8
-NEAR_COST, FAR_COST = 0.1, 0.03
+BEARING_COST, ANY_BEARING_COST = 0.8, 0.007  # per rad^2 off the reference bearing; the second where any is allowed
+HIGH_COST, ANY_BEARING_HIGH_COST = 3.2, 0.8  # above the reference altitude; the second where any bearing is allowed
+NEAR_COST, FAR_COST = 0.1, 0.03  # nearer and farther than the reference distance
 
 
 @dataclass(frozen=True)
@@ -91,8 +94,8 @@ def _links(rings: np.ndarray) -> np.ndarray:
     np.fill_diagonal(near, False)
     links = np.full(near.shape, -1)
     for ring in range(len(rings)):
-        found = [ring, *np.flatnonzero(near[ring]).tolist()]
-        links[ring, : len(found)] = found
+        linked = [ring, *np.flatnonzero(near[ring]).tolist()]
+        links[ring, : len(linked)] = linked
     return links
 
 
@@ -101,9 +104,9 @@ def _links(rings: np.ndarray) -> np.ndarray:
 # target is hidden from there. A metre costs the same in one step as in several: smoothing turns a jump from ring to
 # ring into a gentle change.
 
-WAY_COST = 0.02  # of a metre, where "the target hidden for one key frame" = 1
-NEIGHBOUR_SHARE = 0.3  # weight of the visibility at the key frame before and after
-SPEED_SHARE = 0.9  # of the limit: smoothing must be able to catch up
+WAY_COST = 0.02  # cost of a metre, where "the target hidden for one key frame" = 1
+NEIGHBOUR_SHARE = 0.3  # weight of the visibility at the previous key frame and of that at the next one
+SPEED_SHARE = 0.9  # of the speed limit, so that smoothing can catch up
 REACH_M = 12.0  # boxes farther away are ignored: two places with this clearance have nothing between them
 
 
@@ -121,20 +124,24 @@ def search_trajectory(
     aloft = boxes_aloft(obstacles, scenario.targets_m, lattice)
     gaps, hidden = np.zeros(places.shape[:2]), np.ones(places.shape[:2])
     _survey(places, scenario.targets_m[frames], obstacles, aloft.rows, clearance_m, REACH_M, gaps, hidden)
-    before, after = np.roll(hidden, 1, axis=0), np.roll(hidden, -1, axis=0)
-    before[0], after[-1] = hidden[0], hidden[-1]
-    own = (1.0 - 2.0 * NEIGHBOUR_SHARE) * hidden + NEIGHBOUR_SHARE * (before + after)
-    own[~scenario.reference.keeps_sight[frames]] = 0.0
-    own += lattice.costs.reshape(own.shape)
+    hidden_before, hidden_after = np.roll(hidden, 1, axis=0), np.roll(hidden, -1, axis=0)
+    hidden_before[0], hidden_after[-1] = hidden[0], hidden[-1]
+    place_costs = (1.0 - 2.0 * NEIGHBOUR_SHARE) * hidden + NEIGHBOUR_SHARE * (hidden_before + hidden_after)
+    place_costs[~scenario.reference.keeps_sight[frames]] = 0.0
+    place_costs += lattice.costs.reshape(place_costs.shape)
     longest_m = SPEED_SHARE * cfg.speed_max_mps * scenario.dt_s * np.diff(frames, prepend=frames[0])
     links, max_turn = lattice.links, lattice.max_turn
-    chosen = _cheapest(places, own, gaps, longest_m, aloft, clearance_m, links, num_azimuths, max_turn, WAY_COST)
+    chosen = _cheapest(
+        places, place_costs, gaps, longest_m, aloft, clearance_m, links, num_azimuths, max_turn, WAY_COST
+    )
     return None if chosen[0] < 0 else scenario.between(frames, places[np.arange(len(frames)), chosen])
 
 
 def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) -> BoxIndex:
     """Index the boxes that may be within REACH_M of a place: most boxes end far below a drone."""
-    rows, flat, aside_m = obstacles.rows, targets_m[:, :2], lattice.radius_max_m + REACH_M
+    rows = obstacles.rows
+    flat = targets_m[:, :2]
+    aside_m = lattice.radius_max_m + REACH_M
     keep = rows[:, kernels.HIGH_Z] >= lattice.places_m[:, :, 0, 2].min() - REACH_M
     keep &= (rows[:, [kernels.HIGH_X, kernels.HIGH_Y]] >= flat.min(axis=0) - aside_m).all(axis=1)
     keep &= (rows[:, [kernels.LOW_X, kernels.LOW_Y]] <= flat.max(axis=0) + aside_m).all(axis=1)
@@ -157,7 +164,8 @@ def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps, hidden):
             away = np.sqrt((places[key, c, 0] - target[0]) ** 2 + (places[key, c, 1] - target[1]) ** 2)
             away_max = max(away_max, away)
             least_slope = min(least_slope, (places[key, c, 2] - target[2] - FOOT_LOW_M) / max(away, 1.0))
-        horizon, num_near = make_horizon(index, target, away_max, least_slope), 0
+        horizon = make_horizon(index, target, away_max, least_slope)
+        num_near = 0
         for box in range(len(aloft)):
             if squared_gap(aloft, box, target[0], target[1], aloft[box, kernels.LOW_Z]) <= (away_max + reach_m) ** 2:
                 near[num_near] = box
@@ -174,23 +182,26 @@ def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps, hidden):
 
 
 @njit(cache=True)
-def _cheapest(places, own, gaps, longest_m, index, clearance_m, links, num_azimuths, max_turn, way_cost):
+def _cheapest(places, place_costs, gaps, longest_m, index, clearance_m, links, num_azimuths, max_turn, way_cost):
     """Return the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
-    places: (m, c, 3), c = rings * azimuths. own: (m, c) cost of a place. gaps: (m, c) m. longest_m: (m,) move into each
+    places: (m, c, 3), c = rings * azimuths. place_costs: (m, c). gaps: (m, c) m. longest_m: (m,) longest move into each
     key frame. links: (rings, r) previous rings, the first -1 ends the list.
     """
-    num_keys, num_places, one = len(places), places.shape[1], np.empty(1, dtype=np.int64)
-    cost, came_from = np.full((num_keys, num_places), np.inf), np.full((num_keys, num_places), -1, dtype=np.int64)
+    num_keys, num_places = len(places), places.shape[1]
+    first_hit = np.empty(1, dtype=np.int64)
+    cost = np.full((num_keys, num_places), np.inf)
+    came_from = np.full((num_keys, num_places), -1, dtype=np.int64)
     for key in range(num_keys):
         for c in range(num_places):
             if gaps[key, c] < clearance_m:
                 continue
             if key == 0:
-                cost[key, c] = own[key, c]
+                cost[key, c] = place_costs[key, c]
                 continue
             x, y, z = places[key, c, 0], places[key, c, 1], places[key, c, 2]
-            ring, azimuth, best = c // num_azimuths, c % num_azimuths, np.inf
+            ring, azimuth = c // num_azimuths, c % num_azimuths
+            best = np.inf
             for trial in range(2 * max_turn + 1):  # 0, -1, 1, -2, 2: the nearest first excludes most others
                 turn = (trial + 1) // 2 * (1 - 2 * (trial % 2))
                 column = (azimuth + turn) % num_azimuths
@@ -207,20 +218,22 @@ def _cheapest(places, own, gaps, longest_m, index, clearance_m, links, num_azimu
                         continue
                     # Distance changes by at most a metre per metre: with more clearance at both ends the line is free.
                     is_close = gaps[key, c] + gaps[key - 1, b] - length < 2.0 * clearance_m
-                    if is_close and collect_hits(index, u, v, w, x, y, z, clearance_m, one) > 0:
+                    if is_close and collect_hits(index, u, v, w, x, y, z, clearance_m, first_hit) > 0:
                         continue
-                    best, came_from[key, c] = guess, b
-            cost[key, c] = best + own[key, c]
+                    best = guess
+                    came_from[key, c] = b
+            cost[key, c] = best + place_costs[key, c]
     return cheapest_way(cost, came_from)
 
 
 @njit(cache=True)
 def cheapest_way(cost, came_from):
-    """Return the place of each of m key frames on the way of least cost, (m,), all -1 where none is finite.
+    """Return the place of each of m key frames on the way of least cost, (m,), all -1 if no cost is finite.
 
-    cost, came_from: (m, c) of the cheapest way to each place, and its place at the key frame before.
+    cost: (m, c) of the cheapest way to each place. came_from: (m, c) place at the previous key frame on that way.
     """
-    last, chosen = int(np.argmin(cost[-1])), np.full(len(cost), -1, dtype=np.int64)
+    last = int(np.argmin(cost[-1]))
+    chosen = np.full(len(cost), -1, dtype=np.int64)
     if cost[-1, last] < np.inf:
         chosen[-1] = last
         for key in range(len(cost) - 1, 0, -1):
@@ -241,13 +254,14 @@ def raw_trajectory(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> 
     Where the reference is free and sees the target wherever it must, it is the trajectory (`wished`).
     """
     requested = scenario.with_past(scenario.reference.places_m(scenario.targets_m, scenario.ground_m))
-    ahead, step_m = slice(scenario.start, None), cfg.speed_max_mps * scenario.dt_s
+    ahead = slice(scenario.start, None)
+    step_m = cfg.speed_max_mps * scenario.dt_s
     safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
     seen = ~scenario.reference.keeps_sight | (kernels.visibility(obstacles, requested, scenario.targets_m) == 1.0)
     if seen[ahead].all() and not unsafe(requested[ahead], obstacles, safety_m, SPEED_SHARE * step_m).any():
         return requested, "wished", safety_m
     for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):
-        found = search_trajectory(scenario, make_lattice(scenario, climbing=climbing), obstacles, cfg, clearance_m)
-        if found is not None:
-            return found, "climbing search" if climbing else "search", clearance_m
+        raw = search_trajectory(scenario, make_lattice(scenario, climbing=climbing), obstacles, cfg, clearance_m)
+        if raw is not None:
+            return raw, "climbing search" if climbing else "search", clearance_m
     raise scenario.no_path_error("no free places connect start and end", relaxed_m)

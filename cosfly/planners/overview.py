@@ -37,7 +37,9 @@ def _base_picture(
     box_map: BoxMap, pedestrians: list[PedestrianTrajectory], traces: list[DroneTrace]
 ) -> tuple[np.ndarray, TopView]:
     """Return a picture of the map around all trajectories, with the pedestrian trajectories on it, and its view."""
-    points_m = np.vstack([trajectory.positions_m for trajectory in (*pedestrians, *traces)])
+    points_m = np.vstack(
+        [*(pedestrian.positions_m for pedestrian in pedestrians), *(trace.positions_m for trace in traces)]
+    )
     view = TopView.around(points_m, LONGER_SIDE_PX, MARGIN_M)
     picture = (MAP_SHARE * draw_map(box_map, view) + WHITE_SHARE * 255).astype(np.uint8)
     for pedestrian in pedestrians:

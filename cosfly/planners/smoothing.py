@@ -18,16 +18,19 @@ from cosfly.geometry.kernels import BoxIndex, normals, swept_distances, visibili
 from cosfly.geometry.trajectory_metrics import CLEARANCE_TOLERANCE_M
 from cosfly.planners.contract import PlanConfig, Scenario
 
-# Weights of the squared distance to the raw trajectory: where any bearing is allowed; where the reference bearing
-# counts, and there at reference positions, whose halts count too; the largest for the sake of visibility.
-PULL_ANY_BEARING, PULL, PULL_AS_REQUESTED, PULL_FOR_VISIBILITY_MAX, PULL_RISE = 0.2, 20.0, 1000.0, 300.0, 4.0
-AS_REQUESTED_M = 0.5  # from the reference position
+# Weights (pulls) of the squared distance to the raw trajectory.
+PULL_ANY_BEARING = 0.2  # where any bearing is allowed
+PULL = 20.0  # where the reference bearing counts
+PULL_AS_REQUESTED = 1000.0  # and the raw waypoint is within AS_REQUESTED_M of it, so that halts stay halts
+PULL_FOR_VISIBILITY_MAX = 300.0  # no pull rises beyond this because of visibility
+PULL_RISE = 4.0  # factor per round
+AS_REQUESTED_M = 0.5
 # Weights of squared derivatives with respect to time: that of velocity shortens the trajectory.
 VELOCITY_S2, ACCELERATION_S4, JERK_S6 = 8.0, 30.0, 100.0
 DIFFERENCES = ((VELOCITY_S2, (-1.0, 1.0)), (ACCELERATION_S4, (1.0, -2.0, 1.0)), (JERK_S6, (-1.0, 3.0, -3.0, 1.0)))
-SPREAD_S = 1.0  # over which neighbours are pulled too
-ROUNDS, ROUNDS_MAX = 12, 24  # for visibility; for safety
-REPAIRS_MAX = 120  # rounds; between two boxes a trajectory oscillates
+SPREAD_S = 1.0  # standard deviation in time over which neighbours are pulled too
+ROUNDS, ROUNDS_MAX = 12, 24  # rounds at most for visibility, and for safety
+REPAIRS_MAX = 120  # rounds of a repair; between two boxes a trajectory oscillates
 VISIBILITY_LOSS = 0.01  # smaller losses are ignored; the five rays count in fifths
 ASTRAY_SHARE = 0.3  # of the reference distance: largest distance from the raw trajectory
 PULL_FIXED = 1e6  # of waypoints within the limits: they move by less than a centimetre
@@ -48,24 +51,28 @@ def smooth_trajectory(
         (n, 3), and facts: visibility of the raw trajectory, rounds, whether a smooth trajectory was found.
     """
     reference, dt_s = scenario.reference, scenario.dt_s
-    ahead, settled = slice(scenario.start, None), 0
-    if scenario.turns_back:  # until then it can neither follow the raw trajectory nor see as much
+    ahead = slice(scenario.start, None)
+    settled = 0
+    if scenario.turns_back:  # until `settled` the drone can neither follow the raw trajectory nor see as much
         change_m = np.linalg.norm(np.diff(raw[scenario.start - 1 : scenario.start + 2], n=2, axis=0))
         settled = scenario.start + SETTLES * int(np.ceil(change_m / (cfg.accel_max_mps2 * dt_s**2)))
-    seen_raw, astray_m = visibility(obstacles, raw, scenario.targets_m), ASTRAY_SHARE * reference.distance_m
-    band, pulls = smoothness_band(len(raw), dt_s), first_pulls(raw, scenario)
-    for tried in range(1, ROUNDS_MAX + 1):
-        points, blocked = _pulled_to(raw, pulls, band, scenario), np.zeros(len(raw), dtype=bool)
+    seen_raw = visibility(obstacles, raw, scenario.targets_m)
+    astray_m = ASTRAY_SHARE * reference.distance_m
+    band = smoothness_band(len(raw), dt_s)
+    pulls = first_pulls(raw, scenario)
+    for num_rounds in range(1, ROUNDS_MAX + 1):
+        points = _pulled_to(raw, pulls, band, scenario)
+        blocked = np.zeros(len(raw), dtype=bool)
         blocked[ahead] = unsafe(points[ahead], obstacles, clearance_m, cfg.speed_max_mps * dt_s)
         lost = np.maximum(seen_raw - visibility(obstacles, points, scenario.targets_m), 0.0) * reference.keeps_sight
         lost = np.maximum(lost, np.linalg.norm(points - raw, axis=1) > astray_m)
         lost[(lost < VISIBILITY_LOSS) | (pulls >= PULL_FOR_VISIBILITY_MAX)] = 0.0
         lost[:settled] = 0.0
         is_smooth = not blocked.any()
-        if is_smooth and (tried >= ROUNDS or not lost.any()):
+        if is_smooth and (num_rounds >= ROUNDS or not lost.any()):
             break
         pulls = pulls * PULL_RISE ** _spread(np.maximum(lost, blocked), SPREAD_S / dt_s)
-    facts = {"raw_visibility": round(float(seen_raw.mean()), 4), "rounds": tried, "smooth": is_smooth}
+    facts = {"raw_visibility": round(float(seen_raw.mean()), 4), "rounds": num_rounds, "smooth": is_smooth}
     return repair_to_limits(points if is_smooth else raw, scenario, obstacles, cfg), facts
 
 
@@ -75,7 +82,9 @@ def repair_to_limits(points: np.ndarray, scenario: Scenario, obstacles: BoxIndex
     Raises:
         NoPathError: If no such trajectory is found.
     """
-    goal, pulls, band = points.copy(), np.full(len(points), PULL_FIXED), smoothness_band(len(points), scenario.dt_s)
+    goal = points.copy()
+    pulls = np.full(len(points), PULL_FIXED)
+    band = smoothness_band(len(points), scenario.dt_s)
     least_m = cfg.relaxed_safety_m - CLEARANCE_TOLERANCE_M
     for _ in range(REPAIRS_MAX):
         written = np.round(points, 4)
@@ -97,7 +106,8 @@ def repair_to_limits(points: np.ndarray, scenario: Scenario, obstacles: BoxIndex
 
 def _pulled_to(goal: np.ndarray, pulls: np.ndarray, band: np.ndarray, scenario: Scenario) -> np.ndarray:
     """Return the smooth trajectory, (n, 3), pulled to a goal, (n, 3), with weights (n,), within the altitude bounds."""
-    system, goal = band.copy(), scenario.with_past(goal)
+    system = band.copy()
+    goal = scenario.with_past(goal)
     reference = scenario.reference
     low, high = (scenario.ground_m + bound for bound in (reference.altitude_min_m, reference.altitude_max_m))
     pulls = np.where(np.arange(len(pulls)) < len(scenario.past_m), PULL_PAST, pulls)
@@ -109,13 +119,13 @@ def _pulled_to(goal: np.ndarray, pulls: np.ndarray, band: np.ndarray, scenario: 
 
 def exceeds_limits(points: np.ndarray, cfg: PlanConfig, dt_s: float, num_past: int = 0) -> np.ndarray:
     """Return which waypoints, (n, 3), after the first `num_past` belong to a step that is too fast or abrupt."""
-    found = np.zeros(len(points), dtype=bool)
-    for order, most in ((1, cfg.speed_max_mps), (2, cfg.accel_max_mps2)):
-        over = np.linalg.norm(np.diff(points, n=order, axis=0), axis=1) > most * dt_s**order + 1e-9
-        over[: max(num_past - order, 0)] = False
+    exceeding = np.zeros(len(points), dtype=bool)
+    for order, limit in ((1, cfg.speed_max_mps), (2, cfg.accel_max_mps2)):
+        is_over = np.linalg.norm(np.diff(points, n=order, axis=0), axis=1) > limit * dt_s**order + 1e-9
+        is_over[: max(num_past - order, 0)] = False
         for k in range(order + 1):
-            found[k : k + len(over)] |= over
-    return found
+            exceeding[k : k + len(is_over)] |= is_over
+    return exceeding
 
 
 def first_pulls(raw: np.ndarray, scenario: Scenario) -> np.ndarray:
@@ -130,20 +140,22 @@ def smoothness_band(num_points: int, dt_s: float) -> np.ndarray:
     """Return the lower band of the matrix of squared derivatives of n points `dt_s` apart, (4, n)."""
     band = np.zeros((4, num_points))
     for weight, coefficients in DIFFERENCES:
-        order, num = len(coefficients) - 1, max(num_points - len(coefficients) + 1, 0)
-        for k, one in enumerate(coefficients):
-            for m, other in enumerate(coefficients[: k + 1]):
-                band[k - m, m : m + num] += weight / dt_s ** (2 * order) * one * other
+        order = len(coefficients) - 1
+        num = max(num_points - order, 0)
+        for k, row_coefficient in enumerate(coefficients):
+            for m, column_coefficient in enumerate(coefficients[: k + 1]):
+                band[k - m, m : m + num] += weight / dt_s ** (2 * order) * row_coefficient * column_coefficient
     return band
 
 
 def unsafe(points: np.ndarray, obstacles: BoxIndex, clearance_m: float, step_max_m: float) -> np.ndarray:
     """Return which waypoints belong to a step that is too long or too near a box, (n,) bool."""
-    found = swept_distances(obstacles, points, clearance_m)[0] < clearance_m - ROUNDING_M
-    steps = found[:-1] | (np.linalg.norm(np.diff(points, axis=0), axis=1) > step_max_m * (1.0 + ROUNDING_M))
-    found[:-1] |= steps
-    found[1:] |= steps
-    return found
+    is_unsafe = swept_distances(obstacles, points, clearance_m)[0] < clearance_m - ROUNDING_M
+    lengths_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    unsafe_steps = is_unsafe[:-1] | (lengths_m > step_max_m * (1.0 + ROUNDING_M))
+    is_unsafe[:-1] |= unsafe_steps
+    is_unsafe[1:] |= unsafe_steps
+    return is_unsafe
 
 
 def _spread(amounts: np.ndarray, sigma: float) -> np.ndarray:

@@ -26,8 +26,8 @@ from cosfly.runtime.compiled import njit
 # places that can be reached from each other: dynamic programming over time, places on rings around the target, edges
 # that keep their distance to boxes.
 
-# Places around the target: NUM_AZIMUTHS on each ring. The first ring is the normal one, the second steeper (into
-# canyons); the others climb over obstacles and are tried only where the first two do not suffice.
+# Places around the target: NUM_AZIMUTHS on each ring. The first ring is the normal one, the second is steeper (into
+# canyons). The others climb over obstacles and are tried only if the first two do not suffice.
 STEEP_RADIUS, STEEP_CLIMB_M = 0.6, 6.0
 NUM_CLIMBS = 5
 NUM_AZIMUTHS = 18
@@ -64,8 +64,16 @@ def search_start(
     climbs = np.maximum(rings[0, :, 1] - preferred_m[0], 0.0)[:, None] / 20.0
     turn_cost = TURN_COST if reference.any_bearing else TURN_COST_OF_STYLES
     extra = turn_cost * turns[None] ** 2 + CLIMB_COST * climbs + STEEP_COST * (np.arange(rings.shape[1]) > 0)[:, None]
-    sight = reference.keeps_sight[keys]
-    chosen = _search(places, targets_m[keys], keys * problem.dt_s, extra, sight, index, clearance_m, cfg.speed_max_mps)
+    chosen = _search(
+        places,
+        targets_m[keys],
+        keys * problem.dt_s,
+        extra,
+        reference.keeps_sight[keys],
+        index,
+        clearance_m,
+        cfg.speed_max_mps,
+    )
     return None if chosen[0] < 0 else scenario.between(keys, places[np.arange(len(keys)), chosen])
 
 
@@ -80,34 +88,38 @@ def _rings(distances_m: np.ndarray, preferred_m: np.ndarray, greatest_m: np.ndar
 
 
 @njit(cache=True)
-def _search(places, targets, times, extra, sight, index, clearance_m, speed_max_mps):
+def _search(places, targets, times, extra, keeps_sight, index, clearance_m, speed_max_mps):
     """Return the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
     places: (m, c, 3), c = rings * azimuths. targets: (m, 3). times: (m,) s. extra: (rings, azimuths) cost of a place
-    without visibility. sight: (m,) bool, whether visibility counts.
+    apart from visibility. keeps_sight: (m,) bool, whether visibility counts.
     """
     num_keys, num_places, num_azimuths = len(places), places.shape[1], extra.shape[1]
-    blockers, one = np.empty(len(index.rows), dtype=np.int64), np.empty(1, dtype=np.int64)
-    cost, came_from = np.full((num_keys, num_places), np.inf), np.full((num_keys, num_places), -1, dtype=np.int64)
-    own, guesses = np.empty(num_places), np.empty(num_places)
+    blockers = np.empty(len(index.rows), dtype=np.int64)
+    first_hit = np.empty(1, dtype=np.int64)
+    cost = np.full((num_keys, num_places), np.inf)
+    came_from = np.full((num_keys, num_places), -1, dtype=np.int64)
+    place_cost, guesses = np.empty(num_places), np.empty(num_places)
     for key in range(num_keys):
         for c in range(num_places):
-            p, x = places[key, c], targets[key]
+            p, target = places[key, c], targets[key]
             gap, _ = nearest_box(index, p[0], p[1], p[2], clearance_m)
-            own[c] = np.inf
+            place_cost[c] = np.inf
             if gap >= clearance_m:
                 seen = 1.0
-                if sight[key]:
-                    count = collect_hits(index, x[0], x[1], x[2], p[0], p[1], p[2], RAY_SPREAD_M, blockers)
-                    seen = free_rays(index, blockers, count, p[0], p[1], p[2], x)
-                own[c] = extra[c // num_azimuths, c % num_azimuths] + 1.0 - seen
+                if keeps_sight[key]:
+                    count = collect_hits(
+                        index, target[0], target[1], target[2], p[0], p[1], p[2], RAY_SPREAD_M, blockers
+                    )
+                    seen = free_rays(index, blockers, count, p[0], p[1], p[2], target)
+                place_cost[c] = extra[c // num_azimuths, c % num_azimuths] + 1.0 - seen
         if key == 0:
             for c in range(num_places):
-                cost[0, c] = own[c]
+                cost[0, c] = place_cost[c]
             continue
         seconds = times[key] - times[key - 1]
         for c in range(num_places):
-            if own[c] == np.inf:
+            if place_cost[c] == np.inf:
                 continue
             p = places[key, c]
             for b in range(num_places):
@@ -124,15 +136,16 @@ def _search(places, targets, times, extra, sight, index, clearance_m, speed_max_
                 if guesses[b] == np.inf:
                     break
                 q = places[key - 1, b]
-                if collect_hits(index, q[0], q[1], q[2], p[0], p[1], p[2], clearance_m, one) == 0:
-                    cost[key, c], came_from[key, c] = guesses[b] + own[c], b
+                if collect_hits(index, q[0], q[1], q[2], p[0], p[1], p[2], clearance_m, first_hit) == 0:
+                    cost[key, c] = guesses[b] + place_cost[c]
+                    came_from[key, c] = b
                     break
                 guesses[b] = np.inf
     return cheapest_way(cost, came_from)
 
 
-# Where no step of any length lowers the loss, its change is 0, which is within the tolerance.
-AT_REST = ("converged", "no_step", "no_interior_waypoint")
+# Reasons to stop that count as converged. If no step of any length lowers the loss, its change is 0.
+CONVERGED_REASONS = ("converged", "no_step", "no_interior_waypoint")
 
 
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
@@ -143,11 +156,11 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
     del solver["loss_history"]  # for tests and plots; a product does not need it
     limits = cfg.model_copy(update={"accel_max_mps2": np.inf}) if cfg.muco.step == "paper" else cfg
     points = repair_to_limits(points, scenario, obstacles, limits)
-    return Plan(points, {"start": kind, **solver}, is_converged=solver["stopped"] in AT_REST)
+    return Plan(points, {"start": kind, **solver}, is_converged=solver["stopped"] in CONVERGED_REASONS)
 
 
 def make_problem(scenario: Scenario, cfg: PlanConfig) -> Problem:
-    """Bring settings and scenario into the form of the compiled loss."""
+    """Convert settings and scenario to the form of the compiled loss."""
     muco, reference = cfg.muco, scenario.reference
     weights = np.array([getattr(muco, f"weight_{name}") for name in TERM_NAMES[:7]])
     # The band is relative to the settings' pitch and moves with the reference.
@@ -171,55 +184,61 @@ def make_problem(scenario: Scenario, cfg: PlanConfig) -> Problem:
 def start_trajectory(
     scenario: Scenario, problem: Problem, obstacles: BoxIndex, cfg: PlanConfig
 ) -> tuple[np.ndarray, str]:
-    """Return a feasible trajectory to start from and its kind: `behind`, the reference, or `search` where that is
-    blocked or does not see the target."""
+    """Return a feasible trajectory to start from, (n, 3), and its kind.
+
+    The kind is `behind` for the projected reference, or `search` where the reference is blocked or does not see enough
+    of the target.
+    """
     targets = problem.targets
-    plain = scenario.reference.places_m(targets, scenario.ground_m)
-    plain_is_free = bool(project(plain, problem, obstacles, 0, len(plain), nothing_nearby(len(plain))))
-    seen = np.where(problem.keeps_sight, visibility(obstacles, plain, targets), 1.0)
-    if plain_is_free and seen.mean() >= cfg.muco.start_visibility:
-        return plain, "behind"
+    behind = scenario.reference.places_m(targets, scenario.ground_m)
+    behind_is_free = bool(project(behind, problem, obstacles, 0, len(behind), nothing_nearby(len(behind))))
+    seen = np.where(problem.keeps_sight, visibility(obstacles, behind, targets), 1.0)
+    if behind_is_free and seen.mean() >= cfg.muco.start_visibility:
+        return behind, "behind"
     safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
     for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):
-        found = search_start(problem, scenario, obstacles, cfg, climbing=climbing, clearance_m=clearance_m)
-        if found is not None and is_feasible(found, problem, obstacles, nothing_nearby(len(found))):
-            return _rounded_off(found, problem, obstacles), "search"
-    if plain_is_free:
-        return plain, "behind"
+        searched = search_start(problem, scenario, obstacles, cfg, climbing=climbing, clearance_m=clearance_m)
+        if searched is not None and is_feasible(searched, problem, obstacles, nothing_nearby(len(searched))):
+            return _rounded_off(searched, problem, obstacles), "search"
+    if behind_is_free:
+        return behind, "behind"
     raise scenario.no_path_error("no free trajectory to start from", cfg.relaxed_safety_m)
 
 
-def _rounded_off(found: np.ndarray, problem: Problem, obstacles: BoxIndex) -> np.ndarray:
-    """Smooth the corners of a searched trajectory as far as it stays feasible, which saves many capped steps."""
+def _rounded_off(points: np.ndarray, problem: Problem, obstacles: BoxIndex) -> np.ndarray:
+    """Smooth the corners of a searched trajectory, (n, 3), as far as it stays feasible; saves many capped steps."""
     for smoothing_s in (3.0, 1.5, 0.75):
-        smooth = gaussian_filter1d(found, smoothing_s / problem.dt_s, axis=0, mode="nearest")
+        smooth = gaussian_filter1d(points, smoothing_s / problem.dt_s, axis=0, mode="nearest")
         if project(smooth, problem, obstacles, 0, len(smooth), nothing_nearby(len(smooth))):
             return smooth
-    return found
+    return points
 
 
 # --- optimisation -----------------------------------------------------------------------------------------------------
 
 
 def optimize(start: np.ndarray, problem: Problem, obstacles: BoxIndex, cfg: MucoConfig) -> tuple[np.ndarray, dict]:
-    """Optimize a feasible trajectory; its ends stay.
+    """Optimize a feasible trajectory; its ends do not move.
 
     Args:
         start: (n, 3), feasible.
     Returns:
-        (n, 3) and the solver's facts: iterations, loss at start and end and by term, why it stopped, the loss history.
+        (n, 3) and the solver's facts: numbers of iterations and evaluations, reason to stop, losses at start and end
+        and by term, number of masked waypoints, loss history.
     """
-    points, history = np.array(start, dtype=np.float64), np.zeros(cfg.iterations_max + 1)
+    points = np.array(start, dtype=np.float64)
+    has_interior = len(points) > 2  # otherwise only the loss is computed
+    history = np.zeros(cfg.iterations_max + 1 if has_interior else 1)
     rules = Rules(*(getattr(cfg, name) for name in Rules._fields))
     state, spare = (make_state(len(points), len(obstacles.rows)) for _ in range(2))
     spare = spare._replace(nearby=state.nearby)
-    history = history if len(points) > 2 else history[:1]  # without an interior waypoint only the loss is computed
-    run = descend_paper if cfg.step == "paper" else descend
-    found = run(points, problem, obstacles, rules, (state, spare), history)
-    points, state, masked, num_iterations, num_tried, reason = found
+    search = descend_paper if cfg.step == "paper" else descend
+    points, state, masked, num_iterations, num_tried, reason = search(
+        points, problem, obstacles, rules, (state, spare), history
+    )
     return points, {
         "iterations": num_iterations, "evaluations": num_tried,
-        "stopped": STOP_REASONS[reason] if len(points) > 2 else "no_interior_waypoint",
+        "stopped": STOP_REASONS[reason] if has_interior else "no_interior_waypoint",
         "loss_start": round(float(history[0]), 6), "loss_end": round(float(state.terms.sum()), 6),
         "terms": {name: round(float(value), 6) for name, value in zip(TERM_NAMES, state.terms, strict=True)},
         "num_masked": int(masked.sum()), "loss_history": history[: num_iterations + 1],
