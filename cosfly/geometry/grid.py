@@ -72,9 +72,13 @@ def empty_grid(box_map: BoxMap, resolution_m: float = RESOLUTION_M) -> Occupancy
     low, high = box_map.bounds()
     num_x, num_y = (max(1.0, math.ceil((high[k] - low[k] - TOUCH_M) / resolution_m)) for k in (0, 1))
     if num_x * num_y > MAX_CELLS:
-        got, expected = f"{num_x:.0f} x {num_y:.0f} cells of {resolution_m} m", f"at most {MAX_CELLS} cells"
-        fix = "remove the box that lies far out, or take a coarser resolution_m"
-        raise InputError("the map is too wide for a grid", where=box_map.name, got=got, expected=expected, fix=fix)
+        raise InputError(
+            "the map is too wide for a grid",
+            where=box_map.name,
+            got=f"{num_x:.0f} x {num_y:.0f} cells of {resolution_m} m",
+            expected=f"at most {MAX_CELLS} cells",
+            fix="remove the box that lies far out, or take a coarser resolution_m",
+        )
     return OccupancyGrid(float(low[0]), float(low[1]), resolution_m, np.zeros((int(num_y), int(num_x)), dtype=bool))
 
 
@@ -106,7 +110,8 @@ def occupancy(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M, like: Occupa
     boxes = box_map.select(blocks_walking(box_map, height_m=height_m))
     is_water = boxes.kinds == WATER
     lowest, highest = box_map.ground.range_under(boxes.mins, boxes.maxs)
-    lows, highs = np.where(is_water, -np.inf, lowest), np.where(is_water, np.inf, highest + height_m)
+    lows = np.where(is_water, -np.inf, lowest)
+    highs = np.where(is_water, np.inf, highest + height_m)
     _mark(boxes, grid, grid.occupied, np.ones(len(boxes), bool), lows=lows, highs=highs)
     return grid
 
@@ -130,9 +135,10 @@ def surface(box_map: BoxMap, kinds: Collection[int] = GROUND_KINDS, *, like: Occ
     Returns:
         (ny, nx) bool, cells that such a box overlaps; None if the map has no such box.
     """
-    boxes, found = _surfaces(box_map, kinds), np.zeros_like(like.occupied)
-    _mark(boxes, like, found, np.ones(len(boxes), bool))
-    return found if len(boxes) else None
+    boxes = _surfaces(box_map, kinds)
+    has_ground = np.zeros_like(like.occupied)
+    _mark(boxes, like, has_ground, np.ones(len(boxes), bool))
+    return has_ground if len(boxes) else None
 
 
 def surface_kinds(box_map: BoxMap, kinds: Collection[int], *, like: OccupancyGrid) -> np.ndarray:
@@ -144,16 +150,16 @@ def surface_kinds(box_map: BoxMap, kinds: Collection[int], *, like: OccupancyGri
     boxes = _surfaces(box_map, kinds)
     tops_m = np.round(boxes.maxs[:, 2] - boxes.ground.height_at(boxes.centers), 2)
     boxes = boxes.select(np.lexsort((_LAYER_OF[boxes.kinds], tops_m)))
-    found = np.zeros(like.occupied.shape, dtype=np.uint8)
-    _mark(boxes, like, found, boxes.kinds, touch=0.5 - TOUCH_M)
-    return found
+    cell_kinds = np.zeros(like.occupied.shape, dtype=np.uint8)
+    _mark(boxes, like, cell_kinds, boxes.kinds, touch=0.5 - TOUCH_M)
+    return cell_kinds
 
 
 def _mark(
-    boxes: BoxMap, grid: OccupancyGrid, found: np.ndarray, marks: np.ndarray,
+    boxes: BoxMap, grid: OccupancyGrid, cells: np.ndarray, marks: np.ndarray,
     *, lows: np.ndarray | float = -np.inf, highs: np.ndarray | float = np.inf, touch: float | None = None,
 ) -> None:  # fmt: skip
-    """Set the cells of `found` under boxes to the marks of the boxes.
+    """Set the cells, (ny, nx), under boxes to the marks, (n,), of the boxes.
 
     Args:
         lows, highs: (n,) m, the slice of a box that counts. touch: cells, how deep a slice must reach into a cell;
@@ -167,7 +173,7 @@ def _mark(
     ends_m = (np.full(len(boxes), end_m, dtype=np.float64) for end_m in (lows, highs))
     touch = TOUCH_M / grid.resolution_m if touch is None else touch
     # As bytes, so that masks and kinds share one compiled function.
-    _rasterise(corners, *ends_m, is_upright, touch, marks.view(np.uint8), found.view(np.uint8))
+    _rasterise(corners, *ends_m, is_upright, touch, marks.view(np.uint8), cells.view(np.uint8))
 
 
 @njit(cache=True)
@@ -240,14 +246,19 @@ def _fill_hull(points, count, touch, mark, cells):  # pragma: no cover (compiled
                 cells[row, column] = mark
 
 
-def compare(one: OccupancyGrid, other: OccupancyGrid) -> tuple[float, float]:
-    """Return equal cells / all cells of two grids, and the IoU of their occupied cells, 1 where there are none."""
-    same = (one.x_min_m, one.y_min_m, one.resolution_m) == (other.x_min_m, other.y_min_m, other.resolution_m)
-    if not same or one.occupied.shape != other.occupied.shape:
+def compare(left: OccupancyGrid, right: OccupancyGrid) -> tuple[float, float]:
+    """Return the share of cells that are equal in two grids, and the IoU of their occupied cells, 1 if there are none.
+
+    Raises:
+        ValueError: If the grids do not cover the same cells.
+    """
+    same_frame = (left.x_min_m, left.y_min_m, left.resolution_m) == (right.x_min_m, right.y_min_m, right.resolution_m)
+    if not same_frame or left.occupied.shape != right.occupied.shape:
         raise ValueError("the grids do not cover the same cells; make one of them with `like`")
-    union = int(np.count_nonzero(one.occupied | other.occupied))
-    intersection = int(np.count_nonzero(one.occupied & other.occupied))
-    return 1.0 - (union - intersection) / one.occupied.size, intersection / union if union else 1.0
+    union = int(np.count_nonzero(left.occupied | right.occupied))
+    intersection = int(np.count_nonzero(left.occupied & right.occupied))
+    agreement = 1.0 - (union - intersection) / left.occupied.size
+    return agreement, intersection / union if union else 1.0
 
 
 # --- cells to walkable ground -----------------------------------------------------------------------------------------
@@ -272,7 +283,8 @@ def inflate(grid: OccupancyGrid, radius_m: float) -> OccupancyGrid:
 
 def roi_mask(grid: OccupancyGrid, roi: Roi) -> np.ndarray:
     """Return which cells have their centre in a region of interest, (ny, nx) bool."""
-    region, cells = roi.region(), np.arange(max(grid.size))
+    region = roi.region()
+    cells = np.arange(max(grid.size))
     shapely.prepare(region)
     x, y = grid.centers_of(np.stack([cells, cells], axis=1)).T
     return np.stack([shapely.contains_xy(region, x[: grid.size[0]], row) for row in y[: grid.size[1]]])

@@ -98,13 +98,14 @@ def with_ranges(row: Style, ranges: Mapping[str, Range]) -> Style:
     Raises:
         ValueError: If the row has no such range, its ends are not in ascending order, or it is not positive.
     """
-    known = [one.name for one in fields(Style) if isinstance(getattr(row, one.name), tuple) and one.name != "purpose"]
+    names = [field.name for field in fields(Style) if field.name != "purpose"]
+    range_names = [name for name in names if isinstance(getattr(row, name), tuple)]
     for name, (low, high) in ranges.items():
-        if name not in known:
-            raise ValueError(f"{name} is not a range of this style; choose from {', '.join(known)}")
+        if name not in range_names:
+            raise ValueError(f"{name} is not a range of this style; choose from {', '.join(range_names)}")
         if low > high:
             raise ValueError(f"{name} must be [least, greatest], got [{low:g}, {high:g}]")
         if low <= 0 and name not in ("bearing_deg", "round_mps", "climb_m"):
             raise ValueError(f"{name} must be greater than 0, got {low:g}")
-    given: dict[str, Any] = dict(ranges)
-    return replace(row, **given)
+    replaced: dict[str, Any] = dict(ranges)
+    return replace(row, **replaced)

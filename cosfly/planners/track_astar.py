@@ -264,9 +264,9 @@ MAX_CELLS = 4_000_000  # a pedestrian trajectory of 50-100 m needs about 50 000
 def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
     """Plan one trajectory (the signature of `planners.contract`); nothing here is random."""
     for safety_m in (cfg.safety_distance_m, cfg.relaxed_safety_m):
-        found = search_trajectory(scenario, obstacles, cfg, safety_m)
-        if found is not None:
-            raw, facts = found
+        result = search_trajectory(scenario, obstacles, cfg, safety_m)
+        if result is not None:
+            raw, facts = result
             points, smoothing = smooth_trajectory(raw, scenario, obstacles, cfg, safety_m)
             return Plan(points, {"safety_m": safety_m, **facts, **smoothing})
     raise scenario.no_path_error("no free voxels connect start and end", cfg.relaxed_safety_m)
@@ -283,8 +283,8 @@ def search_trajectory(
         (n, 3) one position per target, and facts of the search; None if there is no path.
     """
     settings, targets, reference = cfg.track_astar, scenario.targets_m, scenario.reference
-    voxels, stride = make_voxels(scenario, cfg), frames_per_layer(cfg, scenario.dt_s)
-    frames, least_z, preferred_z, greatest_z = scenario.key_frames(stride)
+    voxels = make_voxels(scenario, cfg)
+    frames, least_z, preferred_z, greatest_z = scenario.key_frames(frames_per_layer(cfg, scenario.dt_s))
     places = reference.places_m(targets, scenario.ground_m)[frames, :2]
     costs = Costs(
         weights=np.array([getattr(settings, f"weight_{name}") for name in WEIGHTS]),
@@ -319,12 +319,17 @@ def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
     least_z, greatest_z = (scenario.ground_m + bound for bound in (reference.altitude_min_m, reference.altitude_max_m))
     num_z = np.floor((greatest_z.max() - least_z.min()) / settings.voxel_height_m + 1e-9) + 1
     if num_xy.prod() * num_z > MAX_CELLS:
-        what, got = "the pedestrian trajectory is too long for the voxel grid", f"{num_xy.prod() * num_z:.0f} voxels"
-        expected, fix = f"at most {MAX_CELLS}", "use another planner"
-        raise NoPathError(what, where=scenario.path_id, got=got, expected=expected, fix=fix)
+        raise NoPathError(
+            "the pedestrian trajectory is too long for the voxel grid",
+            where=scenario.path_id,
+            got=f"{num_xy.prod() * num_z:.0f} voxels",
+            expected=f"at most {MAX_CELLS}",
+            fix="use another planner",
+        )
     shape = np.array([*num_xy, num_z], dtype=np.int64)
     size = np.array([settings.voxel_m, settings.voxel_m, settings.voxel_height_m])
-    low, num_cells = np.array([*low_xy, least_z.min()]), int(shape.prod())
+    low = np.array([*low_xy, least_z.min()])
+    num_cells = int(shape.prod())
     lengths_m = np.sqrt(((MOVES * size) ** 2).sum(axis=1))
     x, y = (low[axis] + np.arange(shape[axis]) * size[axis] for axis in range(2))
     columns = np.zeros(shape[:2], dtype=np.bool_)

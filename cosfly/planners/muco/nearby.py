@@ -15,7 +15,7 @@ from cosfly.geometry.kernels import collect_hits, distance_if_nearer, nearest_bo
 from cosfly.runtime.compiled import njit
 
 MARGIN_M = 1.5  # validity of an entry, three steps of the default cap; more caches more boxes, less queries more often
-MOVED_M = 0.9  # an entry is renewed beyond this, so that the trial steps of the next iteration stay within MARGIN_M
+MOVED_M = 0.9  # an entry is updated beyond this, so that the trial steps of the next iteration stay within MARGIN_M
 ROOM = 32  # boxes in one entry; a longer list is not cached
 
 
@@ -46,7 +46,7 @@ def nothing_nearby(num_points):
 
 @njit(cache=True)
 def remember(nearby, index, points, targets, reach_m, spread_m):
-    """Renew the entries of waypoints that have moved more than MOVED_M, in place.
+    """Update the entries of waypoints that have moved more than MOVED_M, in place.
 
     Args:
         points, targets: (n, 3) m. reach_m: greatest distance of boxes around a waypoint in later queries. spread_m:

@@ -40,7 +40,7 @@ class Rules(NamedTuple):
 
 @njit(cache=True)
 def hold_bounds(points, problem, contacts, band, gradient):
-    """Change gradient and curvature in place so that a step does not leave the feasible region directly.
+    """Restrict gradient and curvature, in place, so that a step does not leave the feasible region directly.
 
     A waypoint at an altitude bound keeps its z if the step would cross the bound. A waypoint that touches an obstacle
     slides along the face if the step would enter the obstacle. The ends of the trajectory are included; the caller
