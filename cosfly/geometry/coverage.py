@@ -1,7 +1,7 @@
-"""How much of what could be flown was flown: heights, distances, directions, sizes, occlusion, styles, paces.
+"""Coverage of tracks: counts of frames by height, distance, direction, size, occlusion, style, pace and more.
 
-A student cannot learn what it never sees. Counts of frames in fixed bins, so that flights, runs and releases add up;
-each compared with those of `cosfly run showcase` (`default_coverage.json`).
+A student cannot learn situations that its data lack. The bins are fixed, so that the counts of tracks, runs and
+releases add up. Pages compare them with those of `cosfly run showcase` (`default_coverage.json`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ DEFAULT = Path(__file__).with_name("default_coverage.json")
 
 @dataclass(frozen=True)
 class Axis:
-    """Bins of one quantity: `num_bins` of `step` from `low`; what lies beyond counts in the outermost."""
+    """Bins of one quantity: `num_bins` of width `step` from `low`; values beyond count in the outermost bins."""
 
     title: str
     unit: str
@@ -32,20 +32,20 @@ class Axis:
 
     def counts(self, values: np.ndarray) -> list[int]:
         """Count the values, (n,), in each bin; NaN counts nowhere."""
-        known = np.asarray(values, dtype=np.float64)
-        known = known[~np.isnan(known)]
-        bins = np.clip(np.floor((known - self.low) / self.step), 0, self.num_bins - 1).astype(int)
+        numbers = np.asarray(values, dtype=np.float64)
+        numbers = numbers[~np.isnan(numbers)]
+        bins = np.clip(np.floor((numbers - self.low) / self.step), 0, self.num_bins - 1).astype(int)
         return np.bincount(bins, minlength=self.num_bins).tolist()
 
     def percentile(self, counts: list[int], share: float) -> float | None:
-        """Return the value that a share of the frames stay below, to a part of a bin; None without any."""
-        total = sum(counts)
-        if not total:
+        """Return the value below which a share of the frames lies, interpolated within its bin; None without frames."""
+        num_frames = sum(counts)
+        if not num_frames:
             return None
-        ends = np.cumsum(counts) / total
+        ends = np.cumsum(counts) / num_frames
         k = int(np.searchsorted(ends, share))
-        before = ends[k - 1] if k else 0.0
-        return float(self.low + self.step * (k + (share - before) / max(ends[k] - before, 1e-12)))
+        start = ends[k - 1] if k else 0.0
+        return float(self.low + self.step * (k + (share - start) / max(ends[k] - start, 1e-12)))
 
 
 AXES = {
@@ -62,8 +62,10 @@ PAIR = " | "  # between the two names of a pair
 
 
 class Coverage(Record):
-    """Frames by bin of each axis, by style, by pace, by label, which only captions tell, and where there is any by
-    weather, by time of day, and by both (skies), as "heavy_rain | night"."""
+    """Numbers of frames by bin of each axis, and by style, pace, label (of captions), weather and time of day.
+
+    skies: by both of the last two, such as "heavy_rain | night".
+    """
 
     frames: int = 0
     bins: dict[str, list[int]] = Field({})
@@ -77,9 +79,10 @@ class Coverage(Record):
     @field_validator("bins")
     @classmethod
     def _are_those_of_the_axes(cls, bins: dict[str, list[int]]) -> dict[str, list[int]]:
-        found = {name: len(counts) for name, counts in bins.items()}
-        if found and found != (wanted := {name: axis.num_bins for name, axis in AXES.items()}):
-            raise ValueError(f"bins must be {wanted}, or none; got {found}")
+        nums_bins = {name: len(counts) for name, counts in bins.items()}
+        expected = {name: axis.num_bins for name, axis in AXES.items()}
+        if bins and nums_bins != expected:
+            raise ValueError(f"bins must be {expected}, or none; got {nums_bins}")
         return bins
 
     @classmethod
@@ -92,8 +95,8 @@ class Coverage(Record):
         Args:
             seen: (n, 6) from the hip of the target to the drone (x, y, z, m), the target's heading (degrees), its
                 height (px) and its visible share; NaN where unknown.
-            styles, paces: of each frame. labels: of those that have one. skies: weather and time of day of each, None
-                where unknown.
+            styles, paces: one per frame. labels: one per frame with a label. skies: weather and time of day per
+                frame, None where unknown.
         """
         offsets_m, heading_deg, height_px, visibility = seen[:, :3], *seen[:, 3:].T
         azimuth_deg = azimuths_deg(offsets_m, heading_deg)
@@ -101,19 +104,20 @@ class Coverage(Record):
         values = (offsets_m[:, 2] + hip_height_m, distance_m, azimuth_deg, height_px, visibility)
         bins = {name: axis.counts(column) for (name, axis), column in zip(AXES.items(), values, strict=True)}
         pairs = list(skies)
-        weathers, times = ([pair[k] for pair in pairs if pair[k] is not None] for k in (0, 1))
+        weathers = [weather for weather, _ in pairs if weather is not None]
+        times = [time for _, time in pairs if time is not None]
         both = [PAIR.join((weather, time)) for weather, time in pairs if weather is not None and time is not None]
         named = [dict(sorted(Counter(names).items())) for names in (styles, paces, labels, weathers, times, both)]
         return cls(frames=sum(named[0].values()), bins=bins, **dict(zip(COUNTED, named, strict=True)))
 
     @classmethod
     def total(cls, parts: Iterable[Coverage]) -> Coverage:
-        """Add up the frames of many."""
+        """Add up the frames of several coverages."""
         parts = list(parts)
-        counted = [part.bins for part in parts if part.bins]
-        bins = {name: np.sum([one[name] for one in counted], axis=0).tolist() for name in AXES if counted}
-        named = {name: sum((Counter(getattr(part, name)) for part in parts), Counter()) for name in COUNTED}
-        counts = {name: dict(sorted(found.items())) for name, found in named.items()}
+        all_bins = [part.bins for part in parts if part.bins]
+        bins = {name: np.sum([part_bins[name] for part_bins in all_bins], axis=0).tolist() for name in AXES if all_bins}
+        counters = {name: sum((Counter(getattr(part, name)) for part in parts), Counter()) for name in COUNTED}
+        counts = {name: dict(sorted(counter.items())) for name, counter in counters.items()}
         return cls(frames=sum(part.frames for part in parts), bins=bins, **counts)
 
     def range_of(self, name: str) -> tuple[float | None, float | None]:
@@ -123,10 +127,10 @@ class Coverage(Record):
 
 
 def azimuths_deg(offsets_m: np.ndarray, headings_deg: np.ndarray) -> np.ndarray:
-    """Return where the drone stands as seen from the walker: (n,) degrees from the heading, -180 to 180, left positive.
+    """Return the azimuth of the drone relative to the target's heading, (n,) degrees, -180 to 180, left positive.
 
     Args:
-        offsets_m: (n, 3) from person to drone. headings_deg: (n,), the walking direction of the target.
+        offsets_m: (n, 3) from the target to the drone. headings_deg: (n,) of the target.
     """
     bearing = np.degrees(np.arctan2(offsets_m[:, 1], offsets_m[:, 0]))
     return (bearing - headings_deg + 180.0) % 360.0 - 180.0
@@ -134,5 +138,5 @@ def azimuths_deg(offsets_m: np.ndarray, headings_deg: np.ndarray) -> np.ndarray:
 
 @cache
 def default_coverage() -> Coverage:
-    """Return what the plain run that ships covers (`configs/showcase.yaml`)."""
+    """Return the coverage of the default run (`configs/showcase.yaml`), which is part of the package."""
     return validated(Coverage, read_json(DEFAULT), DEFAULT)

@@ -1,7 +1,7 @@
-"""What a flight teaches a policy: at each frame the velocities to command, and the places ahead.
+"""Actions and waypoints of a track, for policies: at each frame the velocities to command and the positions ahead.
 
-All of it is of the planned motion, as labels are: a perturbation that is drawn for each frame is no manoeuvre.
-Seen from a perturbed frame, the waypoints lead back to the plan.
+Both come from the planned motion, as labels do: a perturbation that is drawn for each frame is no manoeuvre. From a
+perturbed frame, the waypoints lead back to the plan.
 """
 
 from __future__ import annotations
@@ -23,31 +23,33 @@ NUM_WAYPOINTS = 10
 def without_perturbation(
     poses: np.ndarray, targets_m: np.ndarray, offsets: np.ndarray, target_offsets_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Take off what a perturbation added: the shifts of drone and person, the turn of the view, and the aim that
-    followed the shifts (cosfly/render/perturbation.py).
+    """Subtract a perturbation (cosfly/render/perturbation.py).
+
+    It consists of the shifts of drone and target, the turn of the view, and the new aim after the shifts.
 
     Args:
         poses, offsets: (n, 6) x, y, z in m, pitch, yaw, roll in degrees. targets_m, target_offsets_m: (n, 3).
     Returns:
-        poses (n, 6) and targets (n, 3); NaN where nobody recorded by how much a frame was perturbed.
+        poses (n, 6) and targets (n, 3); NaN where the perturbation of a frame is not recorded.
     """
     planned, targets = poses - offsets, targets_m - target_offsets_m
-    # A frame without a shift was not aimed again, whether or not its target is known. An unknown shift (NaN) counts as
-    # one.
+    # A frame without a shift was not aimed again, whether or not its target is known. An unknown shift (NaN) counts
+    # as a shift.
     is_shifted = (offsets[:, :3] != 0).any(axis=1) | (target_offsets_m != 0).any(axis=1)
-    aims = [np.degrees(look_at(eye[:, :3], at)).T for eye, at in ((poses, targets_m), (planned, targets))]
-    planned[:, 3:5] -= np.where(is_shifted[:, None], aims[0] - aims[1], 0.0)
+    aim = np.degrees(look_at(poses[:, :3], targets_m)).T
+    planned_aim = np.degrees(look_at(planned[:, :3], targets)).T
+    planned[:, 3:5] -= np.where(is_shifted[:, None], aim - planned_aim, 0.0)
     planned[:, 4] = wrap_deg(planned[:, 4])
     return planned, targets
 
 
 @dataclass(frozen=True)
 class PlannedMotion:
-    """The planned motion of a flight, n frames of k poses each.
+    """The planned motion of a track, n frames of k poses each.
 
-    time_s: (n,). poses: (n, 6) planned, at the frames; NaN where not known. between: (n, k - 1, 6) planned, after each
-    frame and before the next, at even times; of the last frame they are NaN. yaw_deg: (n,) of the frames as they were
-    drawn, whose axes actions and waypoints are in. positions_m: (n, 3), the same.
+    time_s: (n,). poses: (n, 6) planned poses at the frames; NaN where unknown. between: (n, k - 1, 6) planned poses
+    after each frame and before the next, at even times; NaN after the last frame. yaw_deg, positions_m: (n,), (n, 3) of
+    the frames as rendered, with perturbations; actions and waypoints are relative to these.
     """
 
     time_s: np.ndarray
@@ -62,36 +64,39 @@ class PlannedMotion:
 
     @cached_property
     def actions(self) -> np.ndarray:
-        """What flies each part of the step from a frame to the next, (n, k, 5) as ACTION: mean velocities in the axes
-        of the frame, and the camera's pitch at the part's end. NaN after the last frame."""
+        """Return the actions for the k parts of the step from each frame to the next, (n, k, 5) as ACTION.
+
+        They are mean velocities in the axes of the frame, and the camera's pitch at the part's end; NaN after the last
+        frame.
+        """
         n, k = len(self.poses), self.poses_a_frame
-        found = np.full((n, k, len(ACTION)), np.nan)
+        actions = np.full((n, k, len(ACTION)), np.nan)
         chain = np.concatenate([self.poses[:-1, None], self.between[:-1], self.poses[1:, None]], axis=1)
         part_s = np.diff(self.time_s)[:, None] / k
         steps = np.diff(chain, axis=1) / part_s[..., None]
-        found[:-1, :, :3] = in_axes_of(self.yaw_deg[:-1, None], steps[..., :3])
-        found[:-1, :, 3] = wrap_deg(np.diff(chain[..., 4], axis=1)) / part_s
-        found[:-1, :, 4] = chain[:, 1:, 3]
-        return found
+        actions[:-1, :, :3] = in_axes_of(self.yaw_deg[:-1, None], steps[..., :3])
+        actions[:-1, :, 3] = wrap_deg(np.diff(chain[..., 4], axis=1)) / part_s
+        actions[:-1, :, 4] = chain[:, 1:, 3]
+        return actions
 
     @cached_property
     def action(self) -> np.ndarray:
-        """What flies the whole step, (n, 5) as ACTION."""
+        """Return the action for the whole step from each frame to the next, (n, 5) as ACTION."""
         return np.concatenate([self.actions[..., :4].mean(axis=1), self.actions[:, -1, 4:]], axis=1)
 
     def waypoints(self, i: int) -> np.ndarray:
-        """Return the planned places of the next NUM_WAYPOINTS frames, fewer at the end, (m, 4) as WAYPOINT."""
+        """Return the planned positions at the next NUM_WAYPOINTS frames, fewer at the end, (m, 4) as WAYPOINT."""
         return self.poses[i + 1 : i + 1 + NUM_WAYPOINTS, [0, 1, 2, 4]]
 
     def body_waypoints(self, i: int) -> np.ndarray:
-        """Return the same as seen from the frame, (m, 4) as BODY_WAYPOINT."""
-        ahead = self.waypoints(i)
-        moved = in_axes_of(self.yaw_deg[i], ahead[:, :3] - self.positions_m[i])
-        return np.column_stack([moved, wrap_deg(ahead[:, 3] - self.yaw_deg[i])])
+        """Return the waypoints relative to the frame, (m, 4) as BODY_WAYPOINT."""
+        waypoints = self.waypoints(i)
+        offsets_m = in_axes_of(self.yaw_deg[i], waypoints[:, :3] - self.positions_m[i])
+        return np.column_stack([offsets_m, wrap_deg(waypoints[:, 3] - self.yaw_deg[i])])
 
 
 def in_axes_of(yaw_deg: np.ndarray | float, vectors: np.ndarray) -> np.ndarray:
-    """Turn world vectors, (..., 3), into forward, left and up of who looks that way."""
+    """Return world vectors, (..., 3), as forward, left and up components of a body with this yaw."""
     cos, sin = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
     x, y, z = np.moveaxis(vectors, -1, 0)
     return np.stack([x * cos + y * sin, y * cos - x * sin, z], axis=-1)

@@ -109,17 +109,19 @@ def run(
         InputError: If an input file is invalid.
         NothingKept: If no planner finds any trajectory.
     """
-    cfg, inputs, product = _without_missing(cfg), {"map": simplified_map, "paths": paths}, out / "benchmark.json"
+    cfg = _without_missing(cfg)
+    product = out / "benchmark.json"
+    inputs = {"map": simplified_map, "paths": paths}
     stage = StageFolder.open(out, "plan_benchmark", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return product
     box_map, _, done, planned, header = compare.plan_all(
         stage, cfg, simplified_map, paths, seed, most=cfg.scenarios, keeps_all=True, workers=workers, watch=watch
     )
-    found = header | summarize(planned, cfg.planners, rng_for(seed, "plan_benchmark", "intervals"))
-    found["notes"] = planner_notes(cfg.planners, cfg)
-    write_json(product, {**FORMAT.header, **found})
-    pages = {"benchmark.md": markdown(found).encode()} | draw_figures(found, planned, box_map)
+    benchmark = header | summarize(planned, cfg.planners, rng_for(seed, "plan_benchmark", "intervals"))
+    benchmark["notes"] = planner_notes(cfg.planners, cfg)
+    write_json(product, {**FORMAT.header, **benchmark})
+    pages = {"benchmark.md": markdown(benchmark).encode()} | draw_figures(benchmark, planned, box_map)
     for name, data in pages.items():
         write_bytes(out / name, data)
     outputs = [product, *(out / name for name in pages)]
@@ -149,11 +151,9 @@ def summarize(planned: dict[str, PlannedItem], planners: tuple[str, ...], rng: n
     """
     traces = [item.read_traces(path_id) for path_id, item in planned.items()]
     figures = {p: [compare.trajectory_figures(t[p]) if p in t else None for t in traces] for p in planners}
-    # Figures that a missing trajectory does not have are NaN.
-    tables = {
-        p: np.array([[(one or NO_TRAJECTORY).get(n, np.nan) for n in NAMES] for one in figures[p]]) for p in figures
-    }
-    means, (axes, *drawn) = compare.mean_figures(tables), compare.drawn_scores(tables, rng)
+    tables = {p: np.array([_table_row(trajectory) for trajectory in rows]) for p, rows in figures.items()}
+    means = compare.mean_figures(tables)
+    axes, *resampled_axes = compare.drawn_scores(tables, rng)
     both_found = all(p in means and np.isfinite(list(means[p].values())).all() for p in PAIR)
     groups = {group: [list(means[p].values()) for p in members if p in means] for group, members in GROUPS.items()}
     return {
@@ -163,8 +163,11 @@ def summarize(planned: dict[str, PlannedItem], planners: tuple[str, ...], rng: n
         "means": {p: _finite(row) for p, row in means.items()},
         "shortest_mean_m": round(compare.shortest_mean_m(means), 4),
         "axes": {
-            p: {"scores": row, "intervals": {axis: interval([one[p][axis] for one in drawn]) for axis in row}}
-            for p, row in axes.items()
+            p: {
+                "scores": scores,
+                "intervals": {axis: interval([sample[p][axis] for sample in resampled_axes]) for axis in scores},
+            }
+            for p, scores in axes.items()
         },
         "deltas": compare.deltas(*(means[p] for p in PAIR)) if both_found else {},
         "ranking": _ranking(means),
@@ -176,6 +179,11 @@ def summarize(planned: dict[str, PlannedItem], planners: tuple[str, ...], rng: n
     }
 
 
+def _table_row(figures: dict[str, float] | None) -> list[float]:
+    """Return the figures of one trajectory in the order of NAMES; NaN where a missing trajectory has none."""
+    return [(figures or NO_TRAJECTORY).get(name, np.nan) for name in NAMES]
+
+
 def _finite(figures: dict[str, float]) -> dict[str, float | None]:
     return {name: round(float(value), 4) if np.isfinite(value) else None for name, value in figures.items()}
 
@@ -185,11 +193,13 @@ def _ranking(means: Means) -> dict[str, dict[str, Any]]:
     columns = []
     for figure, more_is_better, _ in CRITERIA.values():
         values = np.array([row[figure] for row in means.values()])
-        known = np.isfinite(values)
-        low, span = values[known].min(), np.ptp(values[known])
+        is_finite = np.isfinite(values)
+        low = values[is_finite].min()
+        span = np.ptp(values[is_finite])
         share = (values - low) / span if span > 0 else np.full(len(values), float(more_is_better))
-        columns.append(np.where(known, share if more_is_better else 1.0 - share, 0.0))
-    normalized, planners = np.stack(columns, axis=1), list(means)
+        columns.append(np.where(is_finite, share if more_is_better else 1.0 - share, 0.0))
+    normalized = np.stack(columns, axis=1)
+    planners = list(means)
     scores = (normalized @ [weight for *_, weight in CRITERIA.values()]).round(4)
     return {
         planners[k]: {
@@ -201,65 +211,67 @@ def _ranking(means: Means) -> dict[str, dict[str, Any]]:
     }
 
 
-def markdown(found: dict[str, Any]) -> str:
+def markdown(benchmark: dict[str, Any]) -> str:
     """Return the tables of the paper, with its figures next to ours, as a page of text."""
-    parts = [f"# Planners on {len(found['scenarios'])} scenarios of {found['map']}, seed {found['seed']}"]
-    parts += [f"{title_of(planner)}: {note}." for planner, note in found["notes"].items()]
-    tables = [table for table in text_tables(found) if table.rows]
+    parts = [f"# Planners on {len(benchmark['scenarios'])} scenarios of {benchmark['map']}, seed {benchmark['seed']}"]
+    parts += [f"{title_of(planner)}: {note}." for planner, note in benchmark["notes"].items()]
+    tables = [table for table in text_tables(benchmark) if table.rows]
     return "\n\n".join([*parts, *(f"## {t.title}\n\n".replace("*", "\\*") + t.markdown() for t in tables)])
 
 
 def _printed(planner: str, *names: str) -> list[str]:
     """Return the paper's figures of a planner."""
-    digits, row = {"num_free": 0, "clearance_m": 2}, PAPER.get(planner)
+    row = PAPER.get(planner)
+    digits = {"num_free": 0, "clearance_m": 2}
     return [cell for name in names for cell in cells([getattr(row, name, None)], digits.get(name, 3))]
 
 
-def text_tables(found: dict[str, Any]) -> Iterator[TextTable]:
+def text_tables(benchmark: dict[str, Any]) -> Iterator[TextTable]:
     """Yield the tables of `benchmark.json` as text: axes, deltas, weighted score, feasibility, groups."""
-    means = found["means"]
+    means = benchmark["means"]
 
     def ours(planner: str, *names: str) -> list[str]:
         return cells(means[planner][name] for name in names)
 
     columns = ["visibility", "efficiency", "smoothness", "safety", "mean", "95 %", "paper", "collision", "clearance"]
-    shortest = f"{found['shortest_mean_m']:.2f} m (paper: {PAPER_SHORTEST_M} m)"
+    shortest = f"{benchmark['shortest_mean_m']:.2f} m (paper: {PAPER_SHORTEST_M} m)"
     yield TextTable(f"Four axes; efficiency to the shortest mean, {shortest}", ["planner", *columns], [
         [
             title_of(p), *cells(row["scores"][axis] for axis in AXES_AND_MEAN),
             " to ".join(cells(row["intervals"]["mean"])), *_printed(p, "axes_mean"),
             *ours(p, "collision_fraction", "clearance_min_m"),
         ]
-        for p, row in sorted(found["axes"].items(), key=lambda entry: -entry[1]["scores"]["mean"])
+        for p, row in sorted(benchmark["axes"].items(), key=lambda entry: -entry[1]["scores"]["mean"])
     ])  # fmt: skip
     yield TextTable(" minus ".join(map(title_of, PAIR)), ["figure", *map(title_of, PAIR), "delta", "%"], [
         [
-            words, *cells([*(means[p][name] for p in PAIR), found["deltas"][name]["delta"]], digits),
-            *cells([found["deltas"][name]["relative_percent"]], 1),
+            words, *cells([*(means[p][name] for p in PAIR), benchmark["deltas"][name]["delta"]], digits),
+            *cells([benchmark["deltas"][name]["relative_percent"]], 1),
         ]
-        for name, words, digits in FIGURES if found["deltas"]
+        for name, words, digits in FIGURES if benchmark["deltas"]
     ])  # fmt: skip
     words = ", ".join(f"{weight:g} {name}" for name, (*_, weight) in CRITERIA.items())
     title = f"Weighted score: {words}; each from the worst, 0, to the best, 1"
     yield TextTable(title, ["planner", "score", *CRITERIA, "paper"], [
         [f"{row['rank']} {title_of(p)}", *cells([row["score"], *row["normalized"].values()]), *_printed(p, "weighted")]
-        for p, row in found["ranking"].items()
+        for p, row in benchmark["ranking"].items()
     ])  # fmt: skip
     rows = []
-    for p, figures in found["figures"].items():
-        fractions = [one["collision_fraction"] for one in figures if one]
+    for p, figures in benchmark["figures"].items():
+        fractions = [trajectory["collision_fraction"] for trajectory in figures if trajectory]
         counts = [f"{count} of {len(figures)}" for count in (len(fractions), fractions.count(0.0))]
-        own = ours(p, "collision_fraction", "five_ray_mean", "clearance_min_m")
-        rows.append([title_of(p), GROUP_OF[p], *counts, *own, *_printed(p, "num_free", "visibility", "clearance_m")])
+        measured = ours(p, "collision_fraction", "five_ray_mean", "clearance_min_m")
+        printed = _printed(p, "num_free", "visibility", "clearance_m")
+        rows.append([title_of(p), GROUP_OF[p], *counts, *measured, *printed])
     columns = ["found", "free of collisions", "collision", "visibility", "clearance"]
-    printed = ["paper: free of 20", "paper: visibility", "paper: clearance"]
+    columns += ["paper: free of 20", "paper: visibility", "paper: clearance"]
     title = "Feasibility; a missing trajectory collides and sees nothing"
-    yield TextTable(title, ["planner", "group", *columns, *printed], rows)
+    yield TextTable(title, ["planner", "group", *columns], rows)
     names = ("five_ray_mean", "blocked_fraction", "collision_fraction", "clearance_min_m", "length_m")
     columns = ["visibility", "blocked", "collision", "clearance", "length", "paper: visibility"]
     yield TextTable("Groups; clearance and length in m", ["group", "planners", *columns], [
-        [group, str(own["num_planners"]), *cells([*(own["figures"][name] for name in names), PAPER_GROUPS.get(group)])]
-        for group, own in found["groups"].items()
+        [group, str(row["num_planners"]), *cells([*(row["figures"][name] for name in names), PAPER_GROUPS.get(group)])]
+        for group, row in benchmark["groups"].items()
     ])  # fmt: skip
 
 
@@ -267,12 +279,14 @@ def text_tables(found: dict[str, Any]) -> Iterator[TextTable]:
 # Each target-aware planner has its own color; generic planners are gray.
 
 GRAY = "#9a9a9a"
-# Scenarios shown in 3D; boxes are drawn within this margin of the trajectories and from this height on.
-NUM_SHOWN, ROOM_M, LEAST_M = 4, 10.0, 5.0
+# Scenarios shown in 3D. Boxes are drawn within ROOM_M of the trajectories if they are at least LEAST_M high.
+NUM_SHOWN = 4
+ROOM_M = 10.0
+LEAST_M = 5.0
 FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 
 
-def draw_figures(found: dict[str, Any], planned: dict[str, PlannedItem], box_map: BoxMap) -> dict[str, bytes]:
+def draw_figures(benchmark: dict[str, Any], planned: dict[str, PlannedItem], box_map: BoxMap) -> dict[str, bytes]:
     """Return the figures, file name -> PNG; none, with a warning, where matplotlib is not installed.
 
     Those of TA*+Smooth against MuCO are drawn only where both found trajectories.
@@ -286,13 +300,14 @@ def draw_figures(found: dict[str, Any], planned: dict[str, PlannedItem], box_map
         "axes_radar.png": ((8.0, 9.0), _radar), "axes_bars.png": ((13.0, 5.5), _bars),
         "axes_pairs.png": ((13.5, 8.0), _pairs),
     }  # fmt: skip
-    if found["deltas"]:
+    if benchmark["deltas"]:
         figures["deltas.png"] = (9.0, 4.5), _deltas
         figures["trajectories_3d.png"] = (14.0, 11.0), partial(_trajectories, planned=planned, box_map=box_map)
     pictures = {}
     for name, (size, draw) in figures.items():
-        figure, file = Figure(figsize=size, dpi=110, layout="constrained"), io.BytesIO()
-        draw(figure, found)
+        figure = Figure(figsize=size, dpi=110, layout="constrained")
+        draw(figure, benchmark)
+        file = io.BytesIO()
         figure.savefig(file, format="png", metadata={"Software": None})
         pictures[name] = file.getvalue()
     return pictures
@@ -302,12 +317,13 @@ def _color(planner: str) -> Any:
     return np.array(color_of(planner)) / 255.0 if planner in PLANNERS else GRAY
 
 
-def _radar(figure: Any, found: dict[str, Any]) -> None:
+def _radar(figure: Any, benchmark: dict[str, Any]) -> None:
     """Draw the four axes of our planners and the paper's seven as polygons (fig:appendix_h_alg3d_measured)."""
-    primary = [p for p in found["axes"] if p not in PAPER or PAPER[p].axes_mean is not None]
-    axes, angles = figure.add_subplot(projection="polar"), np.arange(len(AXES)) * 2.0 * np.pi / len(AXES)
-    for planner in primary or found["axes"]:
-        scores = found["axes"][planner]["scores"]
+    primary = [p for p in benchmark["axes"] if p not in PAPER or PAPER[p].axes_mean is not None]
+    axes = figure.add_subplot(projection="polar")
+    angles = np.arange(len(AXES)) * 2.0 * np.pi / len(AXES)
+    for planner in primary or benchmark["axes"]:
+        scores = benchmark["axes"][planner]["scores"]
         style = {"edgecolor": _color(planner), "lw": 2.0, "label": f"{title_of(planner)}: mean {scores['mean']:.3f}"}
         axes.fill(angles, [scores[name] for name in AXES], facecolor="none", **style)
     axes.set_xticks(angles, [name.replace("_", " ") for name in AXES])
@@ -315,48 +331,51 @@ def _radar(figure: Any, found: dict[str, Any]) -> None:
     figure.legend(loc="outside lower center", ncols=3)
 
 
-def _bars(figure: Any, found: dict[str, Any]) -> None:
-    axes, places, width = figure.add_subplot(), np.arange(len(found["axes"])), 0.8 / len(AXES_AND_MEAN)
+def _bars(figure: Any, benchmark: dict[str, Any]) -> None:
+    axes = figure.add_subplot()
+    places = np.arange(len(benchmark["axes"]))
+    width = 0.8 / len(AXES_AND_MEAN)
     shades = ("#3a6ea5", "#8fb8de", "#7fb069", "#e6aa68", "#303030")
     for k, (name, shade) in enumerate(zip(AXES_AND_MEAN, shades, strict=True)):
-        values = np.array([row["scores"][name] for row in found["axes"].values()])
-        spans = np.array([row["intervals"][name] for row in found["axes"].values()])
+        values = np.array([row["scores"][name] for row in benchmark["axes"].values()])
+        spans = np.array([row["intervals"][name] for row in benchmark["axes"].values()])
         whiskers = np.clip([values - spans[:, 0], spans[:, 1] - values], 0.0, None)
         style = {"yerr": whiskers, "error_kw": {"lw": 0.8}, "color": shade, "label": name.replace("_", " ")}
         axes.bar(places + (k - 2) * width, values, width, **style)
-    printed = {k: PAPER[p].axes_mean for k, p in enumerate(found["axes"]) if p in PAPER}
+    printed = {k: PAPER[p].axes_mean for k, p in enumerate(benchmark["axes"]) if p in PAPER}
     shown = [(k + 2 * width, value) for k, value in printed.items() if value is not None]
     if shown:
         axes.plot(*zip(*shown, strict=True), "D", color="#d1495b", ms=5, label="mean in the paper")
-    axes.set_xticks(places, [title_of(planner) for planner in found["axes"]], rotation=35, ha="right")
+    axes.set_xticks(places, [title_of(planner) for planner in benchmark["axes"]], rotation=35, ha="right")
     axes.set_title("Four axes, with 95 % bootstrap intervals over scenarios")
     figure.legend(loc="outside right upper")
 
 
-def _pairs(figure: Any, found: dict[str, Any]) -> None:
-    for place, (one, other) in enumerate(itertools.combinations(AXES, 2), 1):
+def _pairs(figure: Any, benchmark: dict[str, Any]) -> None:
+    for place, (x_axis, y_axis) in enumerate(itertools.combinations(AXES, 2), 1):
         axes = figure.add_subplot(2, 3, place)
-        for planner, row in found["axes"].items():
+        for planner, row in benchmark["axes"].items():
             style = {"ms": 8, "label": title_of(planner)} if planner in PLANNERS else {"ms": 5}
-            axes.plot(row["scores"][one], row["scores"][other], "o", color=_color(planner), **style)
-        axes.set(xlabel=one.replace("_", " "), ylabel=other.replace("_", " "))
+            axes.plot(row["scores"][x_axis], row["scores"][y_axis], "o", color=_color(planner), **style)
+        axes.set(xlabel=x_axis.replace("_", " "), ylabel=y_axis.replace("_", " "))
         axes.margins(0.2)
         axes.grid(alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=len(PLANNERS))
     figure.suptitle("The axes in pairs; gray: generic planners")
 
 
-def _deltas(figure: Any, found: dict[str, Any]) -> None:
+def _deltas(figure: Any, benchmark: dict[str, Any]) -> None:
     """Draw relative changes with their sign set so that TA*+Smooth is better on the right."""
     more_is_better = {"five_ray_mean", "clearance_min_m", "smoothness_score"}
     shown = {"blocked_fraction", "length_m", "accel_rms_mps2", "jerk_rms_mps3"} | more_is_better
-    axes, rows = figure.add_subplot(), []
+    axes = figure.add_subplot()
+    rows = []
     for name, title, _ in reversed(FIGURES):
-        base = found["means"]["muco"][name]
+        base = benchmark["means"]["muco"][name]
         if name in shown and base:
             sign = 100.0 / base * (1.0 if name in more_is_better else -1.0)
             words = title if name in more_is_better else f"less {title}"
-            rows.append((words, sign * (found["deltas"][name]["delta"] or 0.0)))
+            rows.append((words, sign * (benchmark["deltas"][name]["delta"] or 0.0)))
     for place, (_, change) in enumerate(rows):
         axes.barh(place, change, color=_color("track_astar") if change >= 0 else _color("muco"))
         axes.annotate(f"{change:+.1f} %", (max(change, 0.0), place), xytext=(6, -4), textcoords="offset points")
@@ -367,21 +386,23 @@ def _deltas(figure: Any, found: dict[str, Any]) -> None:
     axes.set_title("TA* + Smooth against MuCO")
 
 
-def _trajectories(figure: Any, found: dict[str, Any], planned: dict[str, PlannedItem], box_map: BoxMap) -> None:
+def _trajectories(figure: Any, benchmark: dict[str, Any], planned: dict[str, PlannedItem], box_map: BoxMap) -> None:
     """Draw the scenarios in which the visibility of TA*+Smooth exceeds that of MuCO most."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     from cosfly.geometry.kernels import NO_OBSTACLE_KINDS
 
     def gain(path_id: str) -> float:
-        one, other = (found["figures"][planner][found["scenarios"].index(path_id)] or {} for planner in PAIR)
-        return one.get("five_ray_mean", 0.0) - other.get("five_ray_mean", 0.0)
+        scenario = benchmark["scenarios"].index(path_id)
+        first, second = (benchmark["figures"][planner][scenario] or {} for planner in PAIR)
+        return first.get("five_ray_mean", 0.0) - second.get("five_ray_mean", 0.0)
 
     for place, path_id in enumerate(sorted(planned, key=gain, reverse=True)[:NUM_SHOWN], 1):
         traces = planned[path_id].read_traces(path_id)
         points = np.concatenate([trace.positions_m for trace in traces.values()])
         targets = next(iter(traces.values())).targets_m
-        low, high = np.minimum(points.min(axis=0), targets.min(axis=0)), points.max(axis=0)
+        low = np.minimum(points.min(axis=0), targets.min(axis=0))
+        high = points.max(axis=0)
         axes = figure.add_subplot(2, 2, place, projection="3d")
         near = (np.abs(box_map.centers - (low + high) / 2) <= (high - low) / 2 + ROOM_M)[:, :2].all(axis=1)
         near &= ~box_map.is_any_of(NO_OBSTACLE_KINDS) & (box_map.half_extents[:, 2] >= LEAST_M / 2.0)

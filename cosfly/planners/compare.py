@@ -62,20 +62,21 @@ Means = dict[str, dict[str, float]]  # planner -> mean figures or scores
 
 def trajectory_figures(trace: DroneTrace) -> dict[str, float]:
     """Return the figures of FIGURES of one drone trajectory."""
-    blocked, collides = 1.0 - trace.metrics["five_ray_mean"], float((trace.clearances_m < 0).mean())
-    figures = trace.metrics | {"blocked_fraction": round(blocked, 4), "collision_fraction": round(collides, 4)}
+    blocked_fraction = round(1.0 - trace.metrics["five_ray_mean"], 4)
+    collision_fraction = round(float((trace.clearances_m < 0).mean()), 4)
+    figures = trace.metrics | {"blocked_fraction": blocked_fraction, "collision_fraction": collision_fraction}
     return {name: float(figures[name]) for name in NAMES}
 
 
 def mean_figures(tables: dict[str, np.ndarray], sample: np.ndarray | slice = slice(None)) -> Means:
-    """Average tables (n, figures) over sampled rows; NaN is ignored, and a column without a number is infinite."""
-    found = {}
+    """Average tables (n, figures) over sampled rows; NaN is ignored, and the mean of a column of NaN is infinite."""
+    mean_rows = {}
     for planner, table in tables.items():
         rows = table[sample]
         counts = (~np.isnan(rows)).sum(axis=0)
         means = np.where(counts > 0, np.nansum(rows, axis=0) / np.maximum(counts, 1), np.inf)
-        found[planner] = dict(zip(NAMES, means.tolist(), strict=True))
-    return found
+        mean_rows[planner] = dict(zip(NAMES, means.tolist(), strict=True))
+    return mean_rows
 
 
 def shortest_mean_m(means: Means) -> float:
@@ -86,11 +87,13 @@ def shortest_mean_m(means: Means) -> float:
 
 def axis_scores(means: Means) -> Means:
     """Return the four axis scores and their mean for each planner (tab:appendix_h_four_axis_scores)."""
-    shortest_m, scores = shortest_mean_m(means), {}
+    shortest_m = shortest_mean_m(means)
+    scores = {}
     for planner, figures in means.items():
         clear = float(np.clip(figures["clearance_min_m"] / CLEARANCE_SCALE_M, 0.0, 1.0))
         efficiency = shortest_m / figures["length_m"] if figures["length_m"] > 0 else 1.0
-        smoothness, safety = 1.0 / (1.0 + figures["jerk_rms_mps3"]), (1.0 - figures["collision_fraction"]) * clear
+        smoothness = 1.0 / (1.0 + figures["jerk_rms_mps3"])
+        safety = (1.0 - figures["collision_fraction"]) * clear
         axes = [figures["five_ray_mean"], efficiency, smoothness, safety]
         rounded = [round(value, 4) for value in (*axes, sum(axes) / len(axes))]
         scores[planner] = dict(zip(AXES_AND_MEAN, rounded, strict=True))
@@ -143,14 +146,15 @@ def summarize(traces: dict[str, list[DroneTrace]], rng: np.random.Generator) -> 
         planner's figures minus its own, and the first planner's wins.
     """
     first, *others = traces
-    figures = {planner: [trajectory_figures(trace) for trace in own] for planner, own in traces.items()}
+    figures = {planner: [*map(trajectory_figures, planner_traces)] for planner, planner_traces in traces.items()}
     tables = {planner: np.array([list(row.values()) for row in rows]) for planner, rows in figures.items()}
     means = {p: {name: round(mean, 4) for name, mean in row.items()} for p, row in mean_figures(tables).items()}
     scores = drawn_scores(tables, rng)
 
     def difference(other: str, axis: str) -> dict[str, float]:
-        found, *drawn = (score[first][axis] - score[other][axis] for score in scores)
-        return dict(zip(("difference", "low", "high"), (round(found, 4), *interval(drawn)), strict=True))
+        measured, *resampled = (score[first][axis] - score[other][axis] for score in scores)
+        low, high = interval(resampled)
+        return {"difference": round(measured, 4), "low": low, "high": high}
 
     return {
         "means": means,
@@ -178,10 +182,11 @@ class CompareConfig(PlanConfig):
     def _are_known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         if len(set(names)) < len(names):
             raise ValueError("a planner is named twice")
-        known = tuple(known_planner(name) for name in names)
-        if len(known) < 2:
+        for name in names:
+            known_planner(name)
+        if len(names) < 2:
             raise ValueError(f"a comparison needs at least 2 planners; name another of {', '.join(ALL_PLANNERS)}")
-        return known
+        return names
 
 
 class PlannedItem(BaseModel):
@@ -199,19 +204,21 @@ class PlannedItem(BaseModel):
 def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int, keeps_all: bool) -> Work:
     """Load the map once; return the function that plans for one pedestrian trajectory with each planner.
 
-    keeps_all: Keep an item although a planner failed."""
+    keeps_all: Keep an item if only some planners failed.
+    """
     obstacles, screens = load_obstacles(simplified_map)
     settings = {name: cfg.model_copy(update={"planner": name}) for name in cfg.planners}
-    for own in settings.values():
-        warm_up(own)
+    for planner_cfg in settings.values():
+        warm_up(planner_cfg)
 
     def work(item: Item) -> Outcome:
         pedestrian, styles = item.payload
-        planned, errors = PlannedItem(traces={}, errors={}, times_ms={}), list[NoPathError]()
-        for name, own in settings.items():
+        planned = PlannedItem(traces={}, errors={}, times_ms={})
+        errors = list[NoPathError]()
+        for name, planner_cfg in settings.items():
             begin_s = time.perf_counter()
             try:
-                trace = plan_trajectory(pedestrian, obstacles, own, seed, screens, styles)
+                trace = plan_trajectory(pedestrian, obstacles, planner_cfg, seed, screens, styles)
                 planned.traces[name] = trace.as_json()
             except NoPathError as error:
                 errors.append(error)
@@ -238,10 +245,11 @@ def plan_all(
     items = make_items(pedestrians[:most], cfg, seed)
     done = run_items(stage, items, make_worker, (cfg, simplified_map, seed, keeps_all), **pool)
     if not done.tally.kept:
-        who = "a planner follows" if keeps_all else "all planners follow"
-        raise stage.nothing_kept(done.tally, expected=f"a pedestrian trajectory that {who}")
+        followers = "a planner follows" if keeps_all else "all planners follow"
+        raise stage.nothing_kept(done.tally, expected=f"a pedestrian trajectory that {followers}")
+    planned = {record.id: result_of(record, PlannedItem) for record in done.kept}
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
-    return box_map, pedestrians, done, {one.id: result_of(one, PlannedItem) for one in done.kept}, header
+    return box_map, pedestrians, done, planned, header
 
 
 def run(
@@ -257,15 +265,16 @@ def run(
         InputError: If an input file is invalid.
         NothingKept: If there is no pedestrian trajectory that all planners follow.
     """
-    inputs, product = {"map": simplified_map, "paths": paths}, out / "compare.json"
+    product = out / "compare.json"
+    inputs = {"map": simplified_map, "paths": paths}
     stage = StageFolder.open(out, "plan_compare", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return product
-    box_map, pedestrians, done, shared, header = plan_all(
+    box_map, pedestrians, done, planned, header = plan_all(
         stage, cfg, simplified_map, paths, seed, workers=workers, watch=watch
     )
-    by_path = [planned.read_traces(path_id) for path_id, planned in shared.items()]
-    traces = {name: [own[name] for own in by_path] for name in cfg.planners}
+    traces_by_path = [item.read_traces(path_id) for path_id, item in planned.items()]
+    traces = {name: [path_traces[name] for path_traces in traces_by_path] for name in cfg.planners}
     summary = {
         "planners": {name: ALL_PLANNERS[name] for name in traces},
         "notes": planner_notes(cfg.planners, cfg),
@@ -274,11 +283,11 @@ def run(
     }
     write_json(product, {**FORMAT.header, **header, **summary})
     outputs = [product, *(out / f"drone_trace_{name}.json" for name in traces), out / "compare_overlay.png"]
-    for path, (name, own) in zip(outputs[1:], traces.items(), strict=False):
-        write_traces(path, own, {**header, "planner": name})
-    compared = [pedestrian for pedestrian in pedestrians if pedestrian.path_id in shared]
+    for path, (name, planner_traces) in zip(outputs[1:], traces.items(), strict=False):
+        write_traces(path, planner_traces, {**header, "planner": name})
+    compared = [pedestrian for pedestrian in pedestrians if pedestrian.path_id in planned]
     write_bytes(outputs[-1], draw_compared(box_map, compared, traces))
-    stage.finish(outputs, done.tally, timings=timings(shared.values(), cfg.planners))
+    stage.finish(outputs, done.tally, timings=timings(planned.values(), cfg.planners))
     return product
 
 
@@ -307,22 +316,27 @@ def timings(items: Collection[PlannedItem], planners: Sequence[str]) -> Means:
 
 def text_tables(product: Path) -> list[TextTable]:
     """Read `compare.json` and its manifest as text tables: figures, axes, and the first planner's wins."""
-    found, times = read_object(product, what="comparison"), read_manifest(product.parent).facts["timings"]
-    first, *others = planners = list(found["means"])
-    titles, minus = [title_of(planner) for planner in planners], [f"minus {title_of(other)}" for other in others]
-    figures, axes = [], []
+    comparison = read_object(product, what="comparison")
+    times = read_manifest(product.parent).facts["timings"]
+    first, *others = planners = list(comparison["means"])
+    titles = [title_of(planner) for planner in planners]
+    minus = [f"minus {title_of(other)}" for other in others]
+    figures = []
     for name, words, digits in FIGURES:
-        figures.append([words, *cells((found["means"][planner][name] for planner in planners), digits)])
-        for change in (found["deltas"][other][name] for other in others):
+        row = [words, *cells((comparison["means"][planner][name] for planner in planners), digits)]
+        for other in others:
+            change = comparison["deltas"][other][name]
             relative = change["relative_percent"]
-            figures[-1] += [f"{change['delta']:+.{digits}f}", "n/a" if relative is None else f"{relative:+.1f}"]
+            row += [f"{change['delta']:+.{digits}f}", "n/a" if relative is None else f"{relative:+.1f}"]
+        figures.append(row)
     means_ms = cells((times[planner]["mean_ms"] for planner in planners), 1)
     figures.append(["planning time (ms)", *means_ms, *[""] * 2 * len(others)])
+    axes = []
     for name in AXES_AND_MEAN:
-        rows = [found["axis_differences"][other][name] for other in others]
-        apart = [f"{row['difference']:+.3f} ({row['low']:+.3f} to {row['high']:+.3f})" for row in rows]
-        axes.append([name.replace("_", " "), *cells(found["axes"][p][name] for p in planners), *apart])
-    rates = found["win_rates"]
+        intervals = [comparison["axis_differences"][other][name] for other in others]
+        differences = [f"{i['difference']:+.3f} ({i['low']:+.3f} to {i['high']:+.3f})" for i in intervals]
+        axes.append([name.replace("_", " "), *cells(comparison["axes"][p][name] for p in planners), *differences])
+    rates = comparison["win_rates"]
     wins = [
         [name.replace("_", " "), *(f"{rates[o][name]['count']} of {rates[o][name]['of']}" for o in others)]
         for name in rates[others[0]]

@@ -43,7 +43,8 @@ def merge(
     Source: sec:step2, "Merging adjacent boxes"; by centres: app:simworld:step3; the guard is ours.
     """
     mins, maxs = box_map.mins, box_map.maxs
-    labels, min_fill = np.arange(len(box_map)), np.zeros(len(box_map))
+    labels = np.arange(len(box_map))
+    min_fill = np.zeros(len(box_map))
     split = np.zeros(len(box_map), dtype=bool) if groups is None else groups
     lows, highs = (box_map.centers, box_map.centers) if by_center else (mins, maxs)
     for kind, (gap_m, least_share) in sorted(rules.items()):
@@ -211,7 +212,7 @@ class SimplifyConfig(Config):
 
 @dataclass(frozen=True)
 class Simplification:
-    """A simplified map and what each pass left: (name of the pass, boxes by kind), the first entry is the input."""
+    """A simplified map, and the name of each pass with the boxes by kind after it; the first entry is the input."""
 
     box_map: BoxMap
     passes: list[tuple[str, dict[str, int]]]
@@ -227,28 +228,35 @@ def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplification:
     shares = {VEGETATION: cfg.min_canopy_fill}
     gaps_m = {KINDS[name]: gap for name, gap in cfg.merge_gap_m.items() if gap is not None}
     rules = {kind: (gap_m, shares.get(kind, cfg.min_fill)) for kind, gap_m in gaps_m.items()}
-    fixed, ids = cfg.crop_strategy == "fixed", box_map.ids
+    ids = box_map.ids
+    is_fixed = cfg.crop_strategy == "fixed"
     apply: dict[str, Callable[[BoxMap], BoxMap]] = {
         "merge": lambda m: merge(m, rules, _merge_groups(box_map, cfg), by_center=cfg.merge_by == "center"),
-        "crop_tree": lambda m: crop_tree(m, cfg, ids, feet) if fixed else crop_tree_adaptive(m, cfg, ids),
+        "crop_tree": lambda m: crop_tree(m, cfg, ids, feet) if is_fixed else crop_tree_adaptive(m, cfg, ids),
         "crop_below_ground": lambda m: crop_below_ground(m, clip=cfg.below_ground == "clip"),
         "prune_nested": lambda m: prune_nested(m, cfg.nested_tolerance_m),
     }
-    result, passes = box_map, [("input", box_map.counts())]
-    for name in (name for name in apply if getattr(cfg, name)):
-        result = apply[name](result)
-        passes.append((name, result.counts()))
+    result = box_map
+    passes = [("input", box_map.counts())]
+    for name, apply_pass in apply.items():
+        if getattr(cfg, name):
+            result = apply_pass(result)
+            passes.append((name, result.counts()))
     records = [SimplifyPass(name=name, counts=counts) for name, counts in passes]
     header = box_map.header.model_copy(update={"passes": records, "simplify": cfg.all_values()})
     return Simplification(replace(result, header=header, meshes=Meshes()), passes)
 
 
 def _merge_groups(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
-    """Return groups that never merge, (n,) bool: bushes below the cut of trees with stems; boxes over a passage or an
-    arcade, and not on a box below, which would close it."""
+    """Return two groups of boxes that never merge with each other, (n,) bool.
+
+    True are trees with stems, apart from bushes below the cut, and boxes over a passage or an arcade, apart from boxes
+    on a box below: a merge would close the passage.
+    """
     cut_m = _ground_z_m(box_map) + cfg.cut_height_m
     mins, maxs = box_map.mins, box_map.maxs
-    is_plant, is_low = box_map.kinds == VEGETATION, mins[:, 2] <= cut_m
+    is_plant = box_map.kinds == VEGETATION
+    is_low = mins[:, 2] <= cut_m
     outlines = shapely.box(*mins[:, :2].T, *maxs[:, :2].T)
     above, below = shapely.STRtree(outlines[is_low]).query(outlines, predicate="covered_by")
     is_built_over = ~is_low & ~is_plant
@@ -340,10 +348,13 @@ def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarra
         num_pieces = int(np.ceil((high[row] - cuts[-1]) / cfg.adaptive_height_m - 1e-9))
         cuts += np.linspace(cuts[-1], high[row], num_pieces + 1)[1:].tolist()
         rows += [row] * (len(cuts) - 1)
-        keeps += [piece == int(len(cuts) > 2 and low[row] < split[row]) for piece in range(len(cuts) - 1)]
+        has_stem = len(cuts) > 2 and low[row] < split[row]
+        id_piece = 1 if has_stem else 0
+        keeps += [piece == id_piece for piece in range(len(cuts) - 1)]
         lows += cuts[:-1]
         highs += cuts[1:]
-    pieces, is_new = np.array(rows, dtype=np.int64), ~np.array(keeps, dtype=bool)
+    pieces = np.array(rows, dtype=np.int64)
+    is_new = ~np.array(keeps, dtype=bool)
     low_z, high_z = np.array(lows), np.array(highs)
     half, turns = _upright(box_map, pieces)
     is_stem = ((low_z < split[pieces]) & (low_z <= ground_z_m[pieces] + 1.0))[:, None]

@@ -34,16 +34,21 @@ def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
     before, after = (occupancy(m, like=grid) for m in (raw, simplified))
     cell_agreement, iou = compare(before, after)
     facts: dict = {"cells": list(grid.size), "cell_agreement": round(cell_agreement, 4), "iou": round(iou, 4)}
-    one, other = before.occupied, after.occupied
-    cells = {"free_in_both": ~one & ~other, "occupied_in_both": one & other}
-    cells |= {"raw_alone": one & ~other, "simplified_alone": other & ~one}
-    facts["agreement"] = {name: int(found.sum()) for name, found in cells.items()}
+    was_occupied, is_occupied = before.occupied, after.occupied
+    masks = {
+        "free_in_both": ~was_occupied & ~is_occupied,
+        "occupied_in_both": was_occupied & is_occupied,
+        "raw_alone": was_occupied & ~is_occupied,
+        "simplified_alone": is_occupied & ~was_occupied,
+    }
+    facts["agreement"] = {name: int(mask.sum()) for name, mask in masks.items()}
     for kind in ("Vegetation", "Buildings"):
-        under = [occupancy(m.select(m.kinds == KINDS[kind]), like=grid).occupied for m in (raw, simplified)]
-        differ = (before.occupied != after.occupied) & (under[0] | under[1])
-        facts["agreement"][f"differ_under_{kind}"] = int(differ.sum())
-    for name, occupied in (("raw", before), ("simplified", after)):
-        _, sizes = connected_parts(~inflate(occupied, SAFETY_RADIUS_M).occupied, 8)
+        is_under = np.zeros_like(was_occupied)
+        for box_map in (raw, simplified):
+            is_under |= occupancy(box_map.select(box_map.kinds == KINDS[kind]), like=grid).occupied
+        facts["agreement"][f"differ_under_{kind}"] = int(((was_occupied != is_occupied) & is_under).sum())
+    for name, grid_of_map in (("raw", before), ("simplified", after)):
+        _, sizes = connected_parts(~inflate(grid_of_map, SAFETY_RADIUS_M).occupied, 8)
         cell_m2 = grid.resolution_m**2
         facts[f"{name}_walkable_m2"] = round(float(sizes.sum()) * cell_m2, 1)
         facts[f"{name}_largest_part_m2"] = round(float(sizes.max()) * cell_m2, 1)
@@ -76,12 +81,17 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same
     raw = read_boxes(maps)
     result = simplify(raw, cfg)
     if len(result.box_map) == 0:
-        fix = "check the map's ground_z_m"
-        raise InputError("every box lies below the ground", where=maps, expected="boxes above it", fix=fix)
+        raise InputError(
+            "every box lies below the ground",
+            where=maps,
+            expected="boxes above it",
+            fix="check the map's ground_z_m",
+        )
     write_boxes(product, result.box_map)
     facts = report(raw, result, cfg)
     write_json(out / "simplify_report.json", facts)
-    view, halves = TopView.around(np.stack(raw.bounds()), PICTURE_PX), []
+    view = TopView.around(np.stack(raw.bounds()), PICTURE_PX)
+    halves = []
     for title, box_map in (("raw", raw), ("simplified", result.box_map)):  # obstacles at walking height, side by side
         shown = box_map.select(box_map.is_any_of(SURFACE_KINDS) | blocks_walking(box_map))
         area = facts["grid"][f"{title}_walkable_m2"]
