@@ -29,7 +29,7 @@ from cosfly.runtime.errors import NoPathError, nearest
 if TYPE_CHECKING:
     from cosfly.geometry.kernels import BoxIndex
 
-# In the order of comparisons, which hold the first against each of the others.
+# In the order of comparisons: the first is compared with each of the others.
 PLANNERS = {
     "foresight": "cosfly.planners.foresight:plan",
     "track_astar": "cosfly.planners.track_astar:plan",
@@ -248,12 +248,13 @@ class PlanConfig(Config):
 class TrackingReference:
     """The trajectory that a planner tracks, (n,) each, as closely as boxes, speed and visibility allow.
 
-    heading_rad: smoothed direction of the target, continuous. bearing_rad: of the drone as seen from the target,
-    counter-clockwise from the heading: 0 in front, pi behind. distance_m: slant distance to the hip point;
-    ground_distance_m: in the plane. pitch_rad: downward pitch of the view; the paper's three values do not agree.
-    altitude_m: above the ground under the target; altitude_min_m and altitude_max_m are hard bounds.
-    keeps_sight: bool, whether the target must be visible; elsewhere a planner ignores visibility. any_bearing: the
-    paper's reference, whose bearing is a start and a weak preference; otherwise bearing and altitude are the purpose.
+    heading_rad: smoothed direction of the target, continuous. bearing_rad: direction from the target to the drone,
+    counter-clockwise from the heading: 0 in front, pi behind. distance_m: slant distance to the hip point.
+    ground_distance_m: distance in the plane. pitch_rad: downward pitch of the view; it does not follow from the
+    distances, because the paper's three values do not agree. altitude_m: above the ground under the target;
+    altitude_min_m and altitude_max_m are hard bounds. keeps_sight: bool, whether the target must be visible; elsewhere
+    a planner ignores visibility. any_bearing: True for the paper's reference, whose bearing is a start and a weak
+    preference; for others bearing and altitude are the purpose.
     """
 
     heading_rad: np.ndarray
@@ -307,7 +308,9 @@ class Scenario:
     def key_frames(self, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return every stride-th frame and the last, with the least, preferred and greatest z at each, all (m,).
 
-        They keep the bounds of all frames around them: a trajectory is straight between them, the ground is not."""
+        The heights respect the bounds of all frames around a key frame, because a trajectory is straight between key
+        frames and the ground is not.
+        """
         from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
         frames = np.unique(np.append(np.arange(self.start, len(self.targets_m), stride), len(self.targets_m) - 1))

@@ -35,15 +35,16 @@ class Horizon(NamedTuple):
 
 @njit(cache=True)
 def make_horizon(index, target, reach_m, least_slope):
-    """Sort the boxes round a target by direction, so that a look from above tests the few that can hide it.
+    """Sort the boxes around a target by direction, so that `look` tests the few that can hide it.
 
-    Good for looks from within `reach_m` in the plane, from places that rise at least `least_slope` per horizontal metre
-    above the lowest foot: lower boxes are ignored. A ray that starts at height `low` or above and ends d away at p_z
-    has risen to low + (p_z - low) t at the share t of its way, and it is no nearer to a box at horizontal distance r
-    than t = (r - FOOT_SIDE_M) / d.
+    The horizon is valid for points within `reach_m` in the plane that rise at least `least_slope` per horizontal metre
+    above the lowest foot of the rays; boxes that cannot hide the target from there are ignored. A ray that starts at
+    height `low` or above and ends at height p_z and horizontal distance d has height low + (p_z - low) t at the share t
+    of its length. It reaches a box at horizontal distance r at t = (r - FOOT_SIDE_M) / d or later.
     """
     boxes, near, slopes, spans = _boxes_round(index, target, reach_m, least_slope)
-    counts, lists = np.zeros(NUM_SECTORS, dtype=np.int64), np.empty((NUM_SECTORS, len(boxes)), dtype=np.int64)
+    counts = np.zeros(NUM_SECTORS, dtype=np.int64)
+    lists = np.empty((NUM_SECTORS, len(boxes)), dtype=np.int64)
     steepest = np.full(NUM_SECTORS, -np.inf)
     for k in range(len(boxes)):
         first = int(np.floor(spans[k, 0] / (2.0 * np.pi) * NUM_SECTORS))
@@ -60,7 +61,8 @@ def make_horizon(index, target, reach_m, least_slope):
 def _boxes_round(index, target, reach_m, least_slope):
     """Return the boxes in reach that are steep enough: number, distance, slope, and first and last azimuth (2,)."""
     boxes = np.empty(len(index.rows), dtype=np.int64)
-    near, slopes, spans, num = np.empty(len(boxes)), np.empty(len(boxes)), np.empty((len(boxes), 2)), 0
+    near, slopes, spans = np.empty(len(boxes)), np.empty(len(boxes)), np.empty((len(boxes), 2))
+    num = 0
     if len(index.rows) == 0:
         return boxes, near, slopes, spans
     cell, num_x, num_y = index.grid[kernels.CELL], index.shape[0], index.shape[1]
@@ -68,14 +70,15 @@ def _boxes_round(index, target, reach_m, least_slope):
     last_x = min(int(np.floor((target[0] + reach_m - index.grid[kernels.ORIGIN_X]) / cell)), num_x - 1)
     first_y = min(max(int(np.floor((target[1] - reach_m - index.grid[kernels.ORIGIN_Y]) / cell)), 0), num_y)
     last_y = min(int(np.floor((target[1] + reach_m - index.grid[kernels.ORIGIN_Y]) / cell)), num_y - 1)
-    known, low = np.zeros(len(index.rows), dtype=np.bool_), target[2] + FOOT_LOW_M
+    is_visited = np.zeros(len(index.rows), dtype=np.bool_)
+    low = target[2] + FOOT_LOW_M
     for ix in range(first_x, last_x + 1):
         for iy in range(first_y, last_y + 1):
             for place in range(index.starts[ix * num_y + iy], index.starts[ix * num_y + iy + 1]):
                 box = index.members[place]
-                if known[box]:
+                if is_visited[box]:
                     continue
-                known[box] = True
+                is_visited[box] = True
                 rows = index.rows[box]
                 dx = max(rows[LOW_X] - target[0], 0.0, target[0] - rows[HIGH_X])
                 dy = max(rows[LOW_Y] - target[1], 0.0, target[1] - rows[HIGH_Y])

@@ -1,7 +1,7 @@
-"""Reference trajectories: the paper's, those of manoeuvre styles, segment after segment without jumps, and searches.
+"""Reference trajectories: that of the paper, those of manoeuvre styles (joined without jumps), and those of searches.
 
-A course is azimuth (world, radians), distance in the plane (m) and altitude (m) of the drone as seen from the target, a
-row for each frame.
+A course is an (n, 3) array, one row per frame: azimuth of the drone from the target (world, radians), distance in the
+plane (m) and altitude above the ground under the target (m).
 """
 
 from __future__ import annotations
@@ -21,26 +21,30 @@ from cosfly.planners.styles import REACQUIRE, Range, Style
 if TYPE_CHECKING:
     from cosfly.geometry.kernels import BoxIndex
 
-# Greatest speeds of the reference relative to the target between segments; within the drone's 10 m/s.
+# Greatest speeds of the reference relative to the target between segments, within the drone's 10 m/s: change of the
+# distance, motion around the target, climb.
 APART_MPS, ROUND_MPS, CLIMB_MPS = 4.0, 6.5, 3.5
-OVERSHOOT_M = 3.0  # of a drone that climbs or sinks at full speed, until it has turned
+OVERSHOOT_M = 3.0  # altitude that a drone at full climb or sink rate covers until it stops
 # Least and greatest rate of a distance and of an altitude that change throughout a segment.
 EVEN_APART_MPS, EVEN_CLIMB_MPS = (0.8, 2.0), (1.0, 2.2)
 ROUNDING_S = 1.0  # standard deviation of the smoothing of corners
 STEADY_RAD = np.radians(20.0)  # the drone ignores smaller turns of the target
 
-# Parameters are drawn again, at most DRAWS times, until visibility minus the share of positions near boxes reaches
-# GOOD.
-DRAWS, GOOD = 32, 0.99
-WAY_ROUND = 0.2  # penalty of half a turn around the target from the previous segment
+# Parameters of a segment are drawn at most DRAWS times, until the score of a course reaches GOOD_SCORE: its visibility
+# less the share of its positions near boxes, less TURN_PENALTY times the turn from the previous segment in half turns.
+DRAWS = 32
+GOOD_SCORE = 0.99
+TURN_PENALTY = 0.2
 
 
 def reference_of(
     names: list[str], scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator
 ) -> TrackingReference:
     """Return the reference of equally long segments in these styles; that of `follow` is the scenario's own."""
-    num, paper = len(scenario.targets_m), scenario.reference
-    course, paces_mps = np.empty((num, 3)), np.full(num, APART_MPS)
+    num = len(scenario.targets_m)
+    paper = scenario.reference
+    course = np.empty((num, 3))
+    paces_mps = np.full(num, APART_MPS)
     cuts = np.linspace(0, num, len(names) + 1).round().astype(int).tolist()
     for name, begin, end in zip(names, cuts[:-1], cuts[1:], strict=True):
         part = slice(begin, end)
@@ -48,8 +52,8 @@ def reference_of(
             azimuth = paper.heading_rad[part] + np.pi
             course[part] = np.column_stack([azimuth, paper.ground_distance_m[part], paper.altitude_m[part]])
             continue
-        before = float(course[begin - 1, 0]) if begin else None
-        course[part] = _best_course(cfg.style(name), part, before, scenario, obstacles, cfg, rng)
+        azimuth_before = float(course[begin - 1, 0]) if begin else None
+        course[part] = _best_course(cfg.style(name), part, azimuth_before, scenario, obstacles, cfg, rng)
         paces_mps[part] = rng.uniform(*cfg.style(name).pace_mps)
     return without_jumps(course, scenario, cfg, paces_mps)
 
@@ -64,7 +68,8 @@ def without_jumps(
         slewed = _slew(values, np.broadcast_to(np.asarray(speeds_mps) * dt_s, num))
         return gaussian_filter1d(slewed, ROUNDING_S / dt_s, mode="nearest")
 
-    apart_m, altitude_m = followed(course[:, 1], paces_mps), followed(course[:, 2], CLIMB_MPS)
+    apart_m = followed(course[:, 1], paces_mps)
+    altitude_m = followed(course[:, 2], CLIMB_MPS)
     azimuth = followed(np.unwrap(course[:, 0]), ROUND_MPS / np.maximum(apart_m, 1.0))
     over_hips_m = altitude_m - (scenario.targets_m[:, 2] - scenario.ground_m)
     return replace(
@@ -101,45 +106,52 @@ def continued_reference(scenario: Scenario, cfg: PlanConfig) -> TrackingReferenc
 
 
 def _best_course(
-    style: Style, part: slice, before: float | None, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig,
+    style: Style, part: slice, azimuth_before: float | None, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig,
     rng: np.random.Generator,
 ) -> np.ndarray:  # fmt: skip
-    """Draw the course of a segment, (k, 3), that sees the target and is free, or the best of DRAWS."""
+    """Draw courses of a segment, (k, 3), until one reaches GOOD_SCORE; return the best of at most DRAWS."""
     from cosfly.geometry.kernels import signed_distances, visibility
 
     targets_m = scenario.targets_m[part]
-    best, best_score, safety_m = np.empty(0), -np.inf, cfg.safety_distance_m
+    safety_m = cfg.safety_distance_m
+    best = np.empty(0)
+    best_score = -np.inf
     for _ in range(DRAWS):
-        course = _course(style, scenario, part, before, rng)
+        course = _course(style, scenario, part, azimuth_before, rng)
         places = positions_of(course, targets_m, scenario.ground_m[part])
         is_near = signed_distances(obstacles, places, safety_m)[0] < safety_m
         score = float(visibility(obstacles, places, targets_m).mean()) - float(is_near.mean())
-        if before is not None:
-            score -= WAY_ROUND * abs(np.angle(np.exp(1j * (course[0, 0] - before)))) / np.pi
+        if azimuth_before is not None:
+            score -= TURN_PENALTY * abs(np.angle(np.exp(1j * (course[0, 0] - azimuth_before)))) / np.pi
         if score > best_score:
             best, best_score = course, score
-        if score >= GOOD:
+        if score >= GOOD_SCORE:
             break
     return best
 
 
 def _course(
-    style: Style, scenario: Scenario, part: slice, before: float | None, rng: np.random.Generator
+    style: Style, scenario: Scenario, part: slice, azimuth_before: float | None, rng: np.random.Generator
 ) -> np.ndarray:
-    """Draw the course of one segment, (k, 3). before: azimuth at the end of the previous segment."""
-    targets_m, heading_rad, dt_s = scenario.targets_m[part], scenario.reference.heading_rad[part], scenario.dt_s
+    """Draw the course of one segment, (k, 3). azimuth_before: at the end of the previous segment."""
+    targets_m = scenario.targets_m[part]
+    heading_rad = scenario.reference.heading_rad[part]
+    dt_s = scenario.dt_s
     seconds = np.arange(len(targets_m)) * dt_s
     apart_m = _even(style.ground_distance_m, style.ground_distance_end_m, EVEN_APART_MPS, seconds, rng)
     altitude_m = _even(style.altitude_m, style.altitude_end_m, EVEN_CLIMB_MPS, seconds, rng)
     if style.bearing_deg is None:
-        bearing = rng.uniform(-np.pi, np.pi) if before is None else before - heading_rad[0]
+        bearing = rng.uniform(-np.pi, np.pi) if azimuth_before is None else azimuth_before - heading_rad[0]
     else:
         bearing = np.radians(rng.uniform(*style.bearing_deg))
     if style.hop_s is None:
         azimuth = _steady(heading_rad) + bearing + rng.uniform(*style.round_mps) * seconds / apart_m
         return np.column_stack([azimuth, apart_m, altitude_m])
-    # An approaching target is at this distance at the end of the halt, a leaving one at its start.
-    share, places, begin = 0.5 * (1.0 + np.cos(bearing)), np.empty((len(targets_m), 2)), 0
+    # In each halt the distance is the drawn one at one moment: at the end if the target approaches, at the start if it
+    # leaves.
+    share = 0.5 * (1.0 + np.cos(bearing))
+    places = np.empty((len(targets_m), 2))
+    begin = 0
     while begin < len(targets_m):
         end = min(begin + max(2, round(rng.uniform(*style.hop_s) / dt_s)), len(targets_m))
         moment = begin + round(share * (end - 1 - begin))
@@ -151,13 +163,13 @@ def _course(
 
 
 def _even(start: Range, end: Range | None, rates: Range, seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Change evenly from a value of one range to one of another, within rates per second, then stay there."""
+    """Draw a value of `start` and one of `end`; return the even change between them, (k,), at a rate within `rates`."""
     first = rng.uniform(*start)
     if end is None:
         return np.full(len(seconds), first)
-    way = rng.uniform(*end) - first
-    rate = np.clip(abs(way) / max(float(seconds[-1]), 1e-9), *rates)
-    return first + np.sign(way) * np.minimum(rate * seconds, abs(way))
+    change = rng.uniform(*end) - first
+    rate = np.clip(abs(change) / max(float(seconds[-1]), 1e-9), *rates)
+    return first + np.sign(change) * np.minimum(rate * seconds, abs(change))
 
 
 def _steady(heading_rad: np.ndarray) -> np.ndarray:
@@ -166,25 +178,25 @@ def _steady(heading_rad: np.ndarray) -> np.ndarray:
 
 
 def _slew(values: np.ndarray, steps_max: np.ndarray) -> np.ndarray:
-    """Follow values (n,) from the first on with steps of at most `steps_max` (n,)."""
+    """Return values that follow `values`, (n,), from the first on with steps of at most `steps_max`, (n,)."""
     followed = [float(values[0])]
-    for value, most in zip(values[1:].tolist(), steps_max[1:].tolist(), strict=True):
-        followed.append(followed[-1] + min(max(value - followed[-1], -most), most))
+    for value, step_max in zip(values[1:].tolist(), steps_max[1:].tolist(), strict=True):
+        followed.append(followed[-1] + min(max(value - followed[-1], -step_max), step_max))
     return np.array(followed)
 
 
 # --- reacquire --------------------------------------------------------------------------------------------------------
-# The drone starts low and away, at a place found at random from which the map hides the target for a while, and goes on
-# for a moment; then it climbs and moves behind the target's last heading until it sees the target. The trajectory is
+# The drone starts low and away, at a random place from which the map hides the target for a while. After the loss it
+# goes on for a moment, then it climbs and moves behind the target until it sees the target again. The trajectory is
 # judged by this outcome, not by its mean visibility.
 
 HIDING_TRIES = 120
-LOST_LEAST_S, LOST_MOST_S = 1.5, 15.0  # of the longest time without line of sight
-BEFORE_S, AFTER_S = 2.0, 3.0  # seen at least this long before the loss, and at the end
+LOST_LEAST_S, LOST_MOST_S = 1.5, 15.0  # bounds of the longest time without line of sight
+BEFORE_S, AFTER_S = 2.0, 3.0  # the target is seen at least this long before the loss, and at the end
 SEEN = 0.5  # mean visibility that counts as seen
-WAITS_S = 4.0  # before it searches
-DEEP_LOSS_S = 5.0  # required of the drawn course, so that small moves of the planner keep the target hidden
-LATE_SHARE = 0.5  # of the tries that follow the path of the target
+WAITS_S = 4.0  # time from the loss to the search
+DEEP_LOSS_S = 5.0  # least loss in the drawn course, so that small changes by the planner keep the target hidden
+PATH_SHARE = 0.5  # share of the tries that follow the path of the target
 
 
 def reacquire_reference(
@@ -193,7 +205,8 @@ def reacquire_reference(
     """Return a reference that loses the target and finds it again; None where the map does not hide the target."""
     from cosfly.geometry.kernels import signed_distances, visibility
 
-    targets, ground, dt_s, style = scenario.targets_m, scenario.ground_m, scenario.dt_s, cfg.style(REACQUIRE)
+    targets, ground, dt_s = scenario.targets_m, scenario.ground_m, scenario.dt_s
+    style = cfg.style(REACQUIRE)
     for _ in range(HIDING_TRIES):
         course = _watching(style, scenario, rng)
         searches_m = style.ground_distance_end_m or style.ground_distance_m
@@ -217,15 +230,19 @@ def reacquire_reference(
 def _watching(style: Style, scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
     """Draw a course, (n, 3), before the loss: at a bearing from the target, or behind it along its path."""
     targets, heading_rad = scenario.targets_m, scenario.reference.heading_rad
-    apart_m, altitude_m = rng.uniform(*style.ground_distance_m), rng.uniform(*style.altitude_m)
-    bearing, is_late = rng.uniform(-np.pi, np.pi), rng.random() < LATE_SHARE
-    azimuth, aparts_m = heading_rad + bearing, np.full(len(targets), apart_m)
-    if is_late:
+    apart_m = rng.uniform(*style.ground_distance_m)
+    altitude_m = rng.uniform(*style.altitude_m)
+    bearing = rng.uniform(-np.pi, np.pi)
+    follows_path = rng.random() < PATH_SHARE
+    azimuth = heading_rad + bearing
+    aparts_m = np.full(len(targets), apart_m)
+    if follows_path:
         along_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(targets[:, :2], axis=0).T))])
         start = -apart_m * np.array([np.cos(heading_rad[0]), np.sin(heading_rad[0])])
         away = np.stack([np.interp(along_m - apart_m, along_m, targets[:, k]) for k in (0, 1)], axis=1)
         away += np.clip(1.0 - along_m / apart_m, 0.0, 1.0)[:, None] * start - targets[:, :2]
-        azimuth, aparts_m = np.arctan2(away[:, 1], away[:, 0]), np.hypot(away[:, 0], away[:, 1])
+        azimuth = np.arctan2(away[:, 1], away[:, 0])
+        aparts_m = np.hypot(away[:, 0], away[:, 1])
     return np.column_stack([azimuth, aparts_m, np.full(len(targets), altitude_m)])
 
 

@@ -64,7 +64,7 @@ class Costs(NamedTuple):
     """Weights and lengths of the search; weights: (5,), places below.
 
     ring_m, least_z, preferred_z, greatest_z: (m,) of each layer. requested: (m, 2) reference position in the plane, NaN
-    where any on the ring is allowed. sight: (m,) weight of the blocked part of the rays. start: (3,).
+    if every position on the ring is allowed. sight: (m,) weight of the blocked part of the rays. start: (3,).
     """
 
     weights: np.ndarray
@@ -86,10 +86,13 @@ def search_layers(targets, reaches_m, voxels, costs, index, beam, corridor_m):
     targets: (m, 3) hip points of the layers. reaches_m: (m,) longest move into each layer.
     """
     num_layers, num_cells = len(targets), len(voxels.clearances)
-    cells, parents = np.empty((num_layers, beam), dtype=np.int64), np.empty((num_layers, beam), dtype=np.int64)
+    cells = np.empty((num_layers, beam), dtype=np.int64)
+    parents = np.empty((num_layers, beam), dtype=np.int64)
     best = np.full(num_cells, np.inf)
-    came_from, came_by = np.empty(num_cells, dtype=np.int64), np.empty(num_cells, dtype=np.int64)
-    touched, num_seen = np.empty(num_cells, dtype=np.int64), 0
+    came_from = np.empty(num_cells, dtype=np.int64)
+    came_by = np.empty(num_cells, dtype=np.int64)
+    touched = np.empty(num_cells, dtype=np.int64)
+    num_seen = 0
     cost_before, move_before = np.empty(beam), np.empty(beam, dtype=np.int64)
     size = 0
     for layer in range(num_layers):
@@ -110,7 +113,8 @@ def search_layers(targets, reaches_m, voxels, costs, index, beam, corridor_m):
             cost_before[b], move_before[b] = total[b], came_by[chosen[b]]
         for place in range(num):
             best[touched[place]] = np.inf
-    way, b = np.empty(num_layers, dtype=np.int64), int(np.argmin(cost_before[:size]))
+    way = np.empty(num_layers, dtype=np.int64)
+    b = int(np.argmin(cost_before[:size]))
     cost = cost_before[b]
     for layer in range(num_layers - 1, -1, -1):
         way[layer] = cells[layer, b]
@@ -174,21 +178,25 @@ def _choose(touched, best, target, layer, voxels, costs, index, beam):
 
     Visibility is computed only where the cost without it is within the beam.
     """
-    bounds, reach_m = np.empty(len(touched)), 0.0
+    bounds = np.empty(len(touched))  # costs if the target is visible
+    reach_m = 0.0
     for k in range(len(touched)):
         cell = touched[k]
         x, y, z = _place(cell, voxels)
         away = np.sqrt((x - target[0]) ** 2 + (y - target[1]) ** 2)
-        reach_m, aside = max(reach_m, away), away - costs.ring_m[layer]
+        reach_m = max(reach_m, away)
+        aside = away - costs.ring_m[layer]
         requested_x, requested_y = costs.requested[layer, 0], costs.requested[layer, 1]
         if not np.isnan(requested_x):
             aside = np.sqrt((x - requested_x) ** 2 + (y - requested_y) ** 2)
-        climb, gap = z - costs.preferred_z[layer], voxels.clearances[cell]  # known from the expansion
+        climb = z - costs.preferred_z[layer]
+        gap = voxels.clearances[cell]  # computed by the expansion
         near = max(0.0, 1.0 - gap / costs.influence_m)
         off = costs.weights[TRACKING] * np.sqrt(aside * aside + climb * climb) / voxels.size[0]
         bounds[k] = best[cell] + off + costs.weights[SAFETY] * near * near
     horizon = make_horizon(index, target, reach_m, 0.0)
-    total, num = np.full(len(touched), np.inf), 0
+    total = np.full(len(touched), np.inf)
+    num = 0
     limit = np.partition(bounds, beam - 1)[beam - 1] if len(touched) > beam else np.inf
     for k in range(len(touched)):  # those within the beam if all cells saw everything
         if bounds[k] <= limit:
@@ -203,12 +211,15 @@ def _choose(touched, best, target, layer, voxels, costs, index, beam):
             if num % 256 == 0:
                 limit = np.partition(total, beam - 1)[beam - 1]
     limit = np.partition(total, beam - 1)[beam - 1] if num > beam else np.inf
-    chosen, kept, size = np.empty(min(num, beam), dtype=np.int64), np.empty(min(num, beam)), 0
+    chosen = np.empty(min(num, beam), dtype=np.int64)
+    chosen_costs = np.empty(min(num, beam))
+    size = 0
     for k in range(len(touched)):
         if total[k] <= limit and total[k] < np.inf and size < beam:
-            chosen[size], kept[size] = touched[k], total[k]
+            chosen[size] = touched[k]
+            chosen_costs[size] = total[k]
             size += 1
-    return chosen[:size], kept[:size], num
+    return chosen[:size], chosen_costs[:size], num
 
 
 @njit(cache=True, inline="always")

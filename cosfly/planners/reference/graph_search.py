@@ -42,8 +42,10 @@ def along_voxels(task: Task, *, weight: float = 1.0, any_angle: bool = False) ->
 @njit(cache=True)
 def _search(places, shape, start, voxel_m, index, clearance_m, weight, any_angle):
     """Return the numbers of the places on the path from `start` to the last one, the goal, (m,); empty if none."""
-    goal, one = len(places) - 1, np.empty(1, dtype=np.int64)
-    cost, done = np.full(goal + 1, np.inf), np.zeros(goal + 1, dtype=np.bool_)
+    goal = len(places) - 1
+    first_hit = np.empty(1, dtype=np.int64)
+    cost = np.full(goal + 1, np.inf)
+    done = np.zeros(goal + 1, dtype=np.bool_)
     parent = np.full(goal + 1, -1, dtype=np.int64)
     cost[start], parent[start] = 0.0, start
     queue = [(0.0, start)]
@@ -54,7 +56,7 @@ def _search(places, shape, start, voxel_m, index, clearance_m, weight, any_angle
         done[cell] = True
         ix, iy, iz = cell // (shape[1] * shape[2]), (cell // shape[2]) % shape[1], cell % shape[2]
         for move in range(len(MOVES) + 1):
-            there = goal  # a neighbour of the cells round it
+            there = goal  # the last move: from cells near the goal to the goal
             if move < len(MOVES):
                 jx, jy, jz = ix + MOVES[move, 0], iy + MOVES[move, 1], iz + MOVES[move, 2]
                 if not (0 <= jx < shape[0] and 0 <= jy < shape[1] and 0 <= jz < shape[2]):
@@ -65,10 +67,14 @@ def _search(places, shape, start, voxel_m, index, clearance_m, weight, any_angle
             if done[there]:
                 continue
             via = cell
-            if any_angle and parent[cell] != cell and _are_joined(places, parent[cell], there, index, clearance_m, one):
+            if (
+                any_angle
+                and parent[cell] != cell
+                and _are_joined(places, parent[cell], there, index, clearance_m, first_hit)
+            ):
                 via = parent[cell]
             longer = cost[via] + _apart(places, via, there)
-            if longer < cost[there] and (via != cell or _are_joined(places, via, there, index, clearance_m, one)):
+            if longer < cost[there] and (via != cell or _are_joined(places, via, there, index, clearance_m, first_hit)):
                 cost[there], parent[there] = longer, via
                 heapq.heappush(queue, (longer + weight * _apart(places, there, goal), there))
     way = np.empty(0, dtype=np.int64)
@@ -81,9 +87,9 @@ def _search(places, shape, start, voxel_m, index, clearance_m, weight, any_angle
 
 
 @njit(cache=True, inline="always")
-def _are_joined(places, a, b, index, clearance_m, one):
+def _are_joined(places, a, b, index, clearance_m, first_hit):
     p, q = places[a], places[b]
-    return collect_hits(index, p[0], p[1], p[2], q[0], q[1], q[2], clearance_m, one) == 0
+    return collect_hits(index, p[0], p[1], p[2], q[0], q[1], q[2], clearance_m, first_hit) == 0
 
 
 @njit(cache=True, inline="always")
@@ -96,8 +102,11 @@ def _over_corners(task: Task) -> np.ndarray | None:
     """Search the corners; return the trajectory, (num, 3), None if there is no path."""
     places = np.vstack([task.start, task.goal, _corners(task)])
     to_goal_m = np.linalg.norm(places - task.goal, axis=1)
-    cost, parent, done = np.full(len(places), np.inf), np.full(len(places), -1), np.zeros(len(places), dtype=bool)
-    cost[0], queue = 0.0, [(to_goal_m[0], 0)]
+    cost = np.full(len(places), np.inf)
+    parent = np.full(len(places), -1)
+    done = np.zeros(len(places), dtype=bool)
+    cost[0] = 0.0
+    queue = [(to_goal_m[0], 0)]
     while queue and not done[1]:
         here = heapq.heappop(queue)[1]
         if done[here]:
@@ -120,7 +129,8 @@ def _over_corners(task: Task) -> np.ndarray | None:
 
 def _corners(task: Task) -> np.ndarray:
     """Return the free corners of boxes in the volume, (m, 3), those nearest to the straight line first."""
-    rows, beyond_m = task.obstacles.rows, task.clearance_m + BEYOND_M
+    rows = task.obstacles.rows
+    beyond_m = task.clearance_m + BEYOND_M
     keep = rows[:, HIGH_Z] + task.clearance_m > task.low[2]
     keep &= (rows[:, [HIGH_X, HIGH_Y]] >= task.low[:2]).all(axis=1)
     keep &= (rows[:, [LOW_X, LOW_Y]] <= task.high[:2]).all(axis=1)

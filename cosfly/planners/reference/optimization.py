@@ -2,7 +2,7 @@
 
 Sources: Kyriakopoulos and Saridis 1988 (minimum jerk), Khatib 1986 (potential field), Quinlan and Khatib 1993 (elastic
 band), Ratliff et al. 2009 (CHOMP), Schulman et al. 2014 and Zhu et al. 1997 (TrajOpt by L-BFGS-B). Each returns its
-trajectory, (num, 3), even where a box still blocks it: the repair is that of task.py.
+trajectory, (num, 3), even where a box still blocks it; task.py repairs it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ def minimum_jerk(task: Task) -> np.ndarray:
 
 # --- potential field --------------------------------------------------------------------------------------------------
 
-STEP_M, STEPS_MAX = 0.5, 4000
+STEP_M = 0.5
+STEPS_MAX = 4000
 FIELD_REACH_M = 8.0
 FIELD_M3 = 40.0  # repulsion against an attraction of 1: they balance 3.4 m from a box
 
@@ -34,14 +35,14 @@ def potential_field(task: Task) -> np.ndarray | None:
     route = [task.start]
     for _ in range(STEPS_MAX):
         here = route[-1]
-        left = task.goal - here
-        left_m = float(np.linalg.norm(left))
-        if left_m <= STEP_M:
+        to_goal = task.goal - here
+        to_goal_m = float(np.linalg.norm(to_goal))
+        if to_goal_m <= STEP_M:
             return task.along(np.array([*route, task.goal]))
         gaps_m, away = task.near(here[None], FIELD_REACH_M)
         gap_m = max(float(gaps_m[0]), 0.1)
         push = FIELD_M3 * (1.0 / gap_m - 1.0 / FIELD_REACH_M) / gap_m**2 * away[0]
-        force = left / left_m + push
+        force = to_goal / to_goal_m + push
         route.append(np.clip(here + STEP_M * force / max(float(np.linalg.norm(force)), 1e-9), task.low, task.high))
     return None
 
@@ -49,7 +50,8 @@ def potential_field(task: Task) -> np.ndarray | None:
 # --- elastic band -----------------------------------------------------------------------------------------------------
 
 BAND_ITERATIONS = 200
-CONTRACTION, REPULSION = 0.4, 0.3  # of the way to the middle of both neighbours; of the intrusion
+CONTRACTION = 0.4  # share of the way to the middle of both neighbours
+REPULSION = 0.3  # share of the intrusion
 INFLUENCE_M = 2.0  # beyond the clearance
 
 
@@ -68,7 +70,8 @@ def elastic_band(task: Task) -> np.ndarray | None:
 
 # --- CHOMP-lite -------------------------------------------------------------------------------------------------------
 
-DESCENTS, RATE = 200, 0.1
+DESCENTS = 200
+RATE = 0.1
 OBSTACLE_WEIGHT = 400.0
 OBSTACLE_BEYOND_M = 2.0  # the obstacle cost begins this far beyond the clearance
 
@@ -79,7 +82,8 @@ def chomp(task: Task) -> np.ndarray:
     Lite: the cost of a position counts once for each waypoint, not for each body part and metre. In the metric of the
     smoothness, the gradient of the smoothness is the difference from the straight line, which is its minimum.
     """
-    line, reach_m = task.line(), task.clearance_m + OBSTACLE_BEYOND_M
+    line = task.line()
+    reach_m = task.clearance_m + OBSTACLE_BEYOND_M
     metric = smoothness_band(task.num, task.dt_s)
     metric[0, [0, -1]] += PULL_FIXED  # both ends stay
     points = line.copy()
@@ -105,11 +109,11 @@ def trajopt(task: Task) -> np.ndarray:
     points = task.line()
     bounds = list(zip(np.tile(task.low, task.num - 2), np.tile(task.high, task.num - 2), strict=True))
     for weight in HINGE_WEIGHTS if bounds else ():
-        found = minimize(
+        result = minimize(
             _loss, points[1:-1].ravel(), (task, weight), method="L-BFGS-B", jac=True, bounds=bounds,
             options={"maxiter": ITERATIONS},
         )  # fmt: skip
-        points[1:-1] = found.x.reshape(-1, 3)
+        points[1:-1] = result.x.reshape(-1, 3)
     return points
 
 

@@ -41,11 +41,15 @@ class Task:
         return segments_hit(self.obstacles, starts, ends, self.clearance_m)
 
     def near(self, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance of points (n, 3) to boxes, (n,) m, at most `reach_m`, and (n, 3) unit vectors away from
-        the nearest, zero where none is in reach."""
+        """Return the distances of points, (n, 3), to boxes and the directions away from the nearest box.
+
+        Returns:
+            (n,) m, at most `reach_m`, and (n, 3) unit vectors, zero where no box is in reach.
+        """
         gaps_m, boxes = signed_distances(self.obstacles, points, reach_m)
-        away, found = np.zeros_like(points), boxes >= 0
-        away[found] = normals(self.obstacles, points[found], boxes[found])
+        away = np.zeros_like(points)
+        is_near = boxes >= 0
+        away[is_near] = normals(self.obstacles, points[is_near], boxes[is_near])
         return gaps_m, away
 
     def line(self) -> np.ndarray:
@@ -78,16 +82,17 @@ def make_task(
 def _free_place(
     place: np.ndarray, low: np.ndarray, high: np.ndarray, obstacles: BoxIndex, clearance_m: float
 ) -> np.ndarray | None:
+    """Return the free place on a grid around `place` that is nearest to it, (3,); None if there is none in reach."""
     steps = np.arange(-FREE_REACH_M, FREE_REACH_M + 1e-9, FREE_STEP_M)
     offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     offsets = offsets[np.argsort((offsets**2).sum(axis=1), kind="stable")]
     places = np.clip(place, low, high) + offsets
     places = places[((places >= low) & (places <= high)).all(axis=1)]
     for begin in range(0, len(places), 1024):
-        some = places[begin : begin + 1024]
-        free = ~segments_hit(obstacles, some, some, clearance_m)
-        if free.any():
-            return some[int(np.argmax(free))]
+        batch = places[begin : begin + 1024]
+        is_free = ~segments_hit(obstacles, batch, batch, clearance_m)
+        if is_free.any():
+            return batch[int(np.argmax(is_free))]
     return None
 
 
@@ -101,12 +106,14 @@ def planner(find: Callable[[Task], np.ndarray | None]) -> Planner:
     def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
         for clearance_m in (cfg.safety_distance_m, cfg.relaxed_safety_m):
             task = make_task(scenario, obstacles, cfg, rng, clearance_m)
-            if task is not None and (found := find(task)) is not None:
-                found = np.clip(found, task.low, task.high)
-                repaired = repair_to_limits(found, scenario, obstacles, cfg)
-                moved_m = float(np.linalg.norm(repaired - found, axis=1).max())
+            points = None if task is None else find(task)
+            if task is not None and points is not None:
+                points = np.clip(points, task.low, task.high)
+                repaired = repair_to_limits(points, scenario, obstacles, cfg)
+                moved_m = float(np.linalg.norm(repaired - points, axis=1).max())
                 return Plan(repaired, {"clearance_m": clearance_m, "repaired_m": round(moved_m, 4)})
-        what = "no free path leads from the first reference position to the last"
-        raise scenario.no_path_error(what, cfg.relaxed_safety_m)
+        raise scenario.no_path_error(
+            "no free path leads from the first reference position to the last", cfg.relaxed_safety_m
+        )
 
     return plan
