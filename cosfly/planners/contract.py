@@ -148,10 +148,7 @@ class PlanConfig(Config):
     )
     heading_smoothing_s: ClassVar[float] = 4.0  # standard deviation of the target's heading filter, s; 0: none
     five_ray_mean_min: float = Field(
-        limits.FIVE_RAY_MEAN_MIN,
-        ge=0,
-        le=1,
-        description="a trajectory of lower mean five-ray visibility is dropped",
+        limits.FIVE_RAY_MEAN_MIN, ge=0, le=1, description="a trajectory of lower mean five-ray visibility is dropped"
     )
     accel_rms_max_mps2: ClassVar[float] = limits.ACCEL_RMS_MAX_MPS2  # of greater RMS acceleration: dropped
     jerk_rms_max_mps3: ClassVar[float] = limits.JERK_RMS_MAX_MPS3  # of greater RMS jerk: dropped
