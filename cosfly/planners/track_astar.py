@@ -86,11 +86,9 @@ def search_layers(targets, reaches_m, voxels, costs, index, beam, corridor_m):
     targets: (m, 3) hip points of the layers. reaches_m: (m,) longest move into each layer.
     """
     num_layers, num_cells = len(targets), len(voxels.clearances)
-    cells = np.empty((num_layers, beam), dtype=np.int64)
-    parents = np.empty((num_layers, beam), dtype=np.int64)
+    cells, parents = np.empty((num_layers, beam), dtype=np.int64), np.empty((num_layers, beam), dtype=np.int64)
     best = np.full(num_cells, np.inf)
-    came_from = np.empty(num_cells, dtype=np.int64)
-    came_by = np.empty(num_cells, dtype=np.int64)
+    came_from, came_by = np.empty(num_cells, dtype=np.int64), np.empty(num_cells, dtype=np.int64)
     touched = np.empty(num_cells, dtype=np.int64)
     num_seen = 0
     cost_before, move_before = np.empty(beam), np.empty(beam, dtype=np.int64)

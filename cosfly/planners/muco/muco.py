@@ -64,16 +64,9 @@ def search_start(
     climbs = np.maximum(rings[0, :, 1] - preferred_m[0], 0.0)[:, None] / 20.0
     turn_cost = TURN_COST if reference.any_bearing else TURN_COST_OF_STYLES
     extra = turn_cost * turns[None] ** 2 + CLIMB_COST * climbs + STEEP_COST * (np.arange(rings.shape[1]) > 0)[:, None]
-    chosen = _search(
-        places,
-        targets_m[keys],
-        keys * problem.dt_s,
-        extra,
-        reference.keeps_sight[keys],
-        index,
-        clearance_m,
-        cfg.speed_max_mps,
-    )
+    times_s = keys * problem.dt_s
+    keeps_sight = reference.keeps_sight[keys]
+    chosen = _search(places, targets_m[keys], times_s, extra, keeps_sight, index, clearance_m, cfg.speed_max_mps)
     return None if chosen[0] < 0 else scenario.between(keys, places[np.arange(len(keys)), chosen])
 
 
@@ -102,16 +95,14 @@ def _search(places, targets, times, extra, keeps_sight, index, clearance_m, spee
     place_cost, guesses = np.empty(num_places), np.empty(num_places)
     for key in range(num_keys):
         for c in range(num_places):
-            p, target = places[key, c], targets[key]
+            p, hip = places[key, c], targets[key]
             gap, _ = nearest_box(index, p[0], p[1], p[2], clearance_m)
             place_cost[c] = np.inf
             if gap >= clearance_m:
                 seen = 1.0
                 if keeps_sight[key]:
-                    count = collect_hits(
-                        index, target[0], target[1], target[2], p[0], p[1], p[2], RAY_SPREAD_M, blockers
-                    )
-                    seen = free_rays(index, blockers, count, p[0], p[1], p[2], target)
+                    count = collect_hits(index, hip[0], hip[1], hip[2], p[0], p[1], p[2], RAY_SPREAD_M, blockers)
+                    seen = free_rays(index, blockers, count, p[0], p[1], p[2], hip)
                 place_cost[c] = extra[c // num_azimuths, c % num_azimuths] + 1.0 - seen
         if key == 0:
             for c in range(num_places):

@@ -43,11 +43,7 @@ def hold_bounds(points, problem, contacts, band, gradient):
     """Restrict gradient and curvature, in place, so that a step does not leave the feasible region directly.
 
     A waypoint at an altitude bound keeps its z if the step would cross the bound. A waypoint that touches an obstacle
-    slides along the face if the step would enter the obstacle. The ends of the trajectory are included; the caller
-    ignores them.
-
-    Args:
-        points, contacts, gradient: (n, 3). band: (BAND_ROWS, 3 n).
+    slides along the face if the step would enter the obstacle. The caller ignores the ends of the trajectory.
     """
     for i in range(len(points)):
         normal = contacts[i]
@@ -136,8 +132,7 @@ def move(points, steps, scale, cap_m, as_a_whole, trial):
         lengths[i] = np.sqrt(steps[i, 0] ** 2 + steps[i, 1] ** 2 + steps[i, 2] ** 2)
         longest = max(longest, lengths[i])
     for axis in range(3):
-        trial[0, axis] = points[0, axis]
-        trial[last, axis] = points[last, axis]
+        trial[0, axis], trial[last, axis] = points[0, axis], points[last, axis]
     for i in range(len(steps)):
         length = longest if as_a_whole else lengths[i]
         share = scale * min(1.0, cap_m / max(length, 1e-12))
@@ -205,10 +200,7 @@ def descend(points, problem, index, rules, states, history):
         now, spare = spare, now
         remember_boxes(points, problem, index, now.nearby)
         masked = update_mask(points, problem, index, rules, masked, now)
-        if change < rules.tolerance * max(abs(loss), 1.0):
-            num_small_changes += 1
-        else:
-            num_small_changes = 0
+        num_small_changes = num_small_changes + 1 if change < rules.tolerance * max(abs(loss), 1.0) else 0
         if num_small_changes == 2:  # a single small change can come from one step of the piecewise visibility term
             return points, now, masked, iteration, num_tried, CONVERGED
     return points, now, masked, len(history) - 1, num_tried, ITERATION_LIMIT
