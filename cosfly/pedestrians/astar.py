@@ -73,8 +73,11 @@ def route_cost(cells: np.ndarray) -> float:
 
 @njit(cache=True)
 def _search(free, origin, target, state, steps, from_direction, classes, costs, least):  # pragma: no cover (compiled)
-    """Run A* until the target is closed; return whether it was reached. The arrays are (cells,), steps (cells, 2), in
-    halves: a step costs the sum of its two cells."""
+    """Run A* until the target is closed; return whether it was reached.
+
+    state, from_direction: (cells,), written. steps: (cells, 2), written, weighted straight and diagonal steps times
+    two: a step costs the sum of its two cells.
+    """
     num_y, num_x = free.shape
     target_x, target_y = target % num_x, target // num_x
     heap = np.empty((1024, 3), dtype=np.float64)  # estimated total, then cost to go: depth first in a tie; the cell
@@ -107,17 +110,17 @@ def _search(free, origin, target, state, steps, from_direction, classes, costs, 
             straight = steps[cell, STRAIGHT] + (cost if direction < 4 else 0)
             diagonal = steps[cell, DIAGONAL] + (cost if direction >= 4 else 0)
             if state[neighbour] == _OPEN:
-                known = steps[neighbour, STRAIGHT] + steps[neighbour, DIAGONAL] * SQRT2
-                if straight + diagonal * SQRT2 >= known:
+                open_cost = steps[neighbour, STRAIGHT] + steps[neighbour, DIAGONAL] * SQRT2
+                if straight + diagonal * SQRT2 >= open_cost:
                     continue
             state[neighbour] = _OPEN
             steps[neighbour, STRAIGHT], steps[neighbour, DIAGONAL] = straight, diagonal
             from_direction[neighbour] = direction
             apart_x, apart_y = abs(target_x - next_x), abs(target_y - next_y)
-            left_diagonal = least * min(apart_x, apart_y)
-            left_straight = least * max(apart_x, apart_y) - left_diagonal
-            total = (straight + left_straight) + (diagonal + left_diagonal) * SQRT2
-            to_go = left_straight + left_diagonal * SQRT2
+            diagonal_to_go = least * min(apart_x, apart_y)
+            straight_to_go = least * max(apart_x, apart_y) - diagonal_to_go
+            total = (straight + straight_to_go) + (diagonal + diagonal_to_go) * SQRT2
+            to_go = straight_to_go + diagonal_to_go * SQRT2
             heap, size = _push(heap, size, total, to_go, neighbour)
     return False
 
@@ -150,9 +153,9 @@ def _pop(heap, size):  # pragma: no cover (compiled)
         child = 2 * place + 1
         if child >= size:
             break
-        other = child + 1
-        if other < size and _is_before(heap[other, TOTAL], heap[other, TO_GO], heap[child, TOTAL], heap[child, TO_GO]):
-            child = other
+        right = child + 1
+        if right < size and _is_before(heap[right, TOTAL], heap[right, TO_GO], heap[child, TOTAL], heap[child, TO_GO]):
+            child = right
         if not _is_before(heap[child, TOTAL], heap[child, TO_GO], total, to_go):
             break
         _move(heap, child, place)

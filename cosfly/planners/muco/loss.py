@@ -22,10 +22,10 @@ from cosfly.runtime.compiled import int64, njit
 
 @njit(cache=True)
 def window_rays(rows, boxes, num_boxes, x, y, z, step_m, tx, ty, tz, free):
-    """Put `free_rays` of a point and its six neighbours at +-step_m into `free`, (7,): middle, -x, +x, -y, +y, -z, +z.
+    """Write `free_rays` of a point and its six neighbours at +-step_m to `free`, (7,): middle, -x, +x, -y, +y, -z, +z.
 
-    From (x, y, z) to (tx, ty, tz): the same tests as seven calls of `free_rays`, but each box sees each of the twelve
-    ends of the rays once.
+    The rays go from (x, y, z) and its neighbours to (tx, ty, tz). The tests are those of seven calls of `free_rays`,
+    but each of the twelve ends of the rays is converted to the frame of a box only once.
     """
     blocked = np.zeros((7, 5), dtype=np.bool_)
     ends, feet = np.empty((7, 3)), np.empty((5, 3))
@@ -101,9 +101,9 @@ class State(NamedTuple):
 
     terms: (9,) the loss by term. gradient, visibility_gradient: (n, 3), the first without the second.
     band: (BAND_ROWS, 3 n) the lower band of the curvature. visibility: (n,) five-ray visibility. rough: (n,) share of
-    each waypoint in the terms that have kinks and stairs, visibility and safety.
-    blockers: (k,) buffer of box numbers. contacts: (n, 3) unit normal of the obstacle that a waypoint touches, or zero.
-    nearby: boxes remembered from earlier evaluations; states may share them.
+    each waypoint in the terms that are not smooth, visibility and safety. blockers: (k,) buffer of box numbers.
+    contacts: (n, 3) unit normal of the obstacle that a waypoint touches, or zero. nearby: cached boxes from earlier
+    evaluations; states may share them.
     """
 
     terms: np.ndarray
@@ -140,7 +140,7 @@ def evaluate(points, problem, index, masked, state):
 
     Args:
         points: (n, 3) m. masked: (n,) bool, waypoints in a low-visibility run: their visibility and view-angle terms
-            stay in the loss but out of gradient and curvature.
+            count in the loss, but not in gradient and curvature.
     """
     state.terms.fill(0.0)
     state.gradient.fill(0.0)
@@ -277,7 +277,7 @@ def visibility_terms(points, problem, index, masked, state):
 
 @njit(cache=True)
 def chain_curvature(problem, state):
-    """Set the curvature to that of smoothness, jerk and altitude oscillation: the same wherever the waypoints are."""
+    """Set the curvature to that of smoothness, jerk and altitude oscillation, which is the same for all positions."""
     band, num_points, weights = state.band, len(problem.targets), problem.weights
     band.fill(0.0)
     for coefficients, weight in ((SECOND_DIFFERENCE, weights[SMOOTHNESS]), (THIRD_DIFFERENCE, weights[JERK])):
