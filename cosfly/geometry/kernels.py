@@ -373,10 +373,10 @@ def normals(index: BoxIndex, points: np.ndarray, boxes: np.ndarray) -> np.ndarra
 
 @njit(cache=True)
 def _normals(index, points, boxes):
-    found = np.empty((len(points), 3))
+    units = np.empty((len(points), 3))
     for i in range(len(points)):
-        found[i] = normal_of_box(index.rows, boxes[i], points[i, 0], points[i, 1], points[i, 2])
-    return found
+        units[i] = normal_of_box(index.rows, boxes[i], points[i, 0], points[i, 1], points[i, 2])
+    return units
 
 
 def segments_hit(index: BoxIndex, starts: np.ndarray, ends: np.ndarray, inflate_m: float = 0.0) -> np.ndarray:

@@ -124,20 +124,26 @@ def _most_of_one(ids: np.ndarray, states: np.ndarray, state: int) -> int:
 
 @njit(cache=True, nogil=True)
 def _reproject(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, moving, flat):  # type: ignore
-    """Return counts (5,), errors (k,) and which of them are not on flat ground, and ids (m,) of points well inside one
-    instance with their states: FIRM with their own depth and id, MOVED farther, RENAMED with another id there."""
+    """Reproject the points of frame a into frame b.
+
+    Returns:
+        counts (5,); depth errors (k,) and whether each is off flat ground (k,); ids (m,) and states (m,) of points well
+        inside one instance. FIRM: the same depth and id in b; MOVED: b is farther there; RENAMED: another id in b.
+    """
     height, width = depth_a.shape
     others_height, others_width = depth_b.shape
     has_ids = inst_a.shape[0] > 0 and inst_b.shape[0] > 0
     counts = np.zeros(5, np.int64)
-    errors, num_errors = np.empty(COLUMNS * GRID_ROWS), 0
+    errors = np.empty(COLUMNS * GRID_ROWS)
     standing = np.zeros(COLUMNS * GRID_ROWS, np.bool_)
-    ids, states, num_ids = np.empty(COLUMNS * GRID_ROWS, np.int64), np.empty(COLUMNS * GRID_ROWS, np.uint8), 0
+    ids, states = np.empty(COLUMNS * GRID_ROWS, np.int64), np.empty(COLUMNS * GRID_ROWS, np.uint8)
+    num_errors, num_ids = 0, 0
     for j in range(GRID_ROWS):
         v = int((j + 0.5) * height / GRID_ROWS)
         for i in range(COLUMNS):
             u = int((i + 0.5) * width / COLUMNS)
-            d, own = float(depth_a[v, u]), _code(inst_a, v, u) if has_ids else 0
+            d = float(depth_a[v, u])
+            own = _code(inst_a, v, u) if has_ids else 0
             if not (d > 0.0 and d < FAR_M) or moving[own & 255]:
                 continue
             s, t, z = _reprojected(u, v, d, intrinsics, others, turn, shift)

@@ -1,1 +1,1 @@
-"""Step 3: walks over the free ground."""
+"""Step 3: pedestrian trajectories over the free ground."""

@@ -1,1 +1,1 @@
-"""Step 4: a drone flight for every walk."""
+"""Step 4: a drone trajectory for every pedestrian trajectory."""
