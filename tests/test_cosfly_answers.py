@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from cosfly.formats.captions import Coc
 from cosfly.llm.answer_text import normalize_action, parse_answer
 from cosfly.llm.contract import Reply
-from cosfly.llm.protocol import Response, error_words, read_body, read_completion, read_models
+from cosfly.llm.protocol import BadReply, Response, error_words, read_body, read_completion, read_models
 from cosfly.runtime.model_json import find_object
 
 GOOD = {
@@ -36,7 +36,10 @@ def changed(**fields: object) -> str:
 
 
 def completed(body: bytes) -> Reply | str:
-    return read_completion(Response(200, body), "plain")
+    try:
+        return read_completion(Response(200, body), "plain")
+    except BadReply as problem:
+        return str(problem)
 
 
 def completion(message: object, **choice: object) -> bytes:

@@ -27,8 +27,7 @@ from caption.truth.vocabulary import Vocabulary
 from cosfly.formats.captions import Caption, Usage, read_captions, write_captions
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook, BudgetSpent
-from cosfly.llm.client import STOP_AFTER_FAILURES
-from cosfly.llm.contract import NoAnswer, Troubles
+from cosfly.llm.contract import STOP_AFTER_FAILURES, NoAnswer, Troubles
 from cosfly.runtime.console import SECONDS_BETWEEN_LINES
 from cosfly.runtime.errors import CosflyError, InputError, TeacherError
 from cosfly.runtime.run_dir import Failed, StageFolder, Tally, read_failures, write_failures

@@ -30,8 +30,8 @@ from caption.writing.contract import more_fields, way_of
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Reply
-from cosfly.llm.protocol import read_body, thoughts_of
-from cosfly.llm.refusals import MEANINGS, Refusal
+from cosfly.llm.protocol import BadReply, read_body, thoughts_of
+from cosfly.llm.refusals import MEANINGS, Refusal, RefusedRequest
 from cosfly.runtime.errors import TeacherError
 from cosfly.runtime.json_io import parse_json
 from cosfly.viz.frame_views import VIEW_FILES
@@ -107,15 +107,16 @@ class _Examination:
         endpoint = self.cfg.endpoint.model_copy(update={"max_tokens": max_tokens})
         request = endpoint.request(messages, [], schema or {}, seed=0)  # sampled as a run samples
         try:
-            response, found = await self.client.ask_once(request, schema)
+            response, reply = await self.client.ask_once(request, schema)
         except (TimeoutError, httpx.RequestError) as error:
-            return _Probe(None, self.client.words_of(error))
-        if isinstance(found, Refusal):
-            fix = "" if found.kind == "unknown" else f"; {found.meaning.fix}"
-            return _Probe(None, found.summary + fix, found)
-        if isinstance(found, str):
-            return _Probe(None, found)
-        return _Probe(found, "", None, thoughts_of(read_body(response.body)))
+            return _Probe(None, self.client.message_of(error))
+        except RefusedRequest as error:
+            refusal = error.refusal
+            fix = "" if refusal.kind == "unknown" else f"; {refusal.meaning.fix}"
+            return _Probe(None, refusal.summary + fix, refusal)
+        except BadReply as error:
+            return _Probe(None, str(error))
+        return _Probe(reply, "", None, thoughts_of(read_body(response.body)))
 
     async def _text(self) -> bool:
         probe = await self._ask([_user("Reply with the one word: ready")], self.cfg.endpoint.max_tokens)

@@ -1,4 +1,4 @@
-"""What the answer of a teacher or a student must look like: its JSON schema, and how it is read (sec:appendix_e)."""
+"""The form of an answer of a teacher or student: its JSON schema, and the check of a raw answer (sec:appendix_e)."""
 
 from __future__ import annotations
 
@@ -21,43 +21,49 @@ _DECISION = re.compile(
 )
 
 MIN_CHARACTERS = {"critical_components": 20, "reasoning_trace": 30}
-# A Chinese character carries about as much as three Latin letters, so the same thought is a third as long.
+# A Chinese character carries about as much meaning as three Latin letters.
 MIN_CHARACTERS_ZH = {"critical_components": 7, "reasoning_trace": 10}
-MAX_DECISION_CHARACTERS = 100  # with all that may stand round a token
-MAX_CHARACTERS = {"critical_components": 1200, "reasoning_trace": 1600}  # bounded: a server may pad for ever
+MAX_DECISION_CHARACTERS = 100  # of an action token with quotes, numbers or words around it
+MAX_CHARACTERS = {"critical_components": 1200, "reasoning_trace": 1600}  # a server may pad without end
 
 
 def normalize_action(text: str) -> str | None:
-    """Return the token for any spelling (spaces, hyphens, case; quotes, brackets; `Decision:` before it), else None."""
+    """Return the action token in any spelling (spaces, hyphens, case, quotes, `Decision:`); None for other text."""
     if BY_LETTERS.get(text.replace("_", "")) == text:
         return text
     if len(text) > MAX_DECISION_CHARACTERS:
         return None
     plain = "".join(char for char in unicodedata.normalize("NFKC", text) if unicodedata.category(char) != "Cf")
-    found = _DECISION.fullmatch(plain.lower())
-    return BY_LETTERS.get(re.sub(r"[\s_-]", "", found["action"])) if found else None
+    match = _DECISION.fullmatch(plain.lower())
+    return BY_LETTERS.get(re.sub(r"[\s_-]", "", match["action"])) if match else None
 
 
 def answer_schema(decision: str | None = None, language: Language = "en", more: Mapping[str, dict] = {}) -> dict:
-    """Return the JSON schema of an answer; a given decision is the enum's one value.
+    """Return the JSON schema of an answer.
 
     Args:
-        more: further fields and their schemas; they stand after the texts and before the decision.
+        decision: The only decision that is allowed; None allows all.
+        more: Further fields and their schemas; they follow the texts and precede the decision.
     """
     properties: dict[str, dict] = {
         name: {"type": "string", "minLength": characters, "maxLength": MAX_CHARACTERS[name]}
-        for name, characters in (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS).items()
+        for name, characters in _min_characters(language).items()
     }
     properties |= more
     properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(TOKENS)}
     return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
 
 
+def _min_characters(language: Language) -> dict[str, int]:
+    return MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS
+
+
 @dataclass(frozen=True)
 class Parsed:
-    """A checked answer: `coc` is None when the structure is wrong, for the `reason`. recovered: from which wrappings.
+    """A checked answer.
 
-    therefore: the action of that field, where it was asked for. more: the other further fields, as they came.
+    coc: The answer; None if its structure is wrong. reason: The problem then. recovered: Wrappings that were removed.
+    therefore: The action in that field, if the prompt asks for it. more: The other further fields, unchecked.
     """
 
     coc: Coc | None
@@ -68,12 +74,12 @@ class Parsed:
 
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
-_DOTS = ("...", "…", "⋯", "。。。", "···")  # in the place of a text
+_DOTS = ("...", "…", "⋯", "。。。", "···")  # placeholders of a text
 _LEFT_OUT = re.compile(r"\.{3,}|…+|⋯+|。{3,}|·{3,}")
 _SLOT = re.compile(r"\{[^{}]*\}")
 _HAN = re.compile(r"[\u4e00-\u9fff]+")
 _LATIN = re.compile(r"[A-Za-z]{2,}")
-# All of it is Chinese but for numbers, marks, slots and single letters: most texts, and one scan tells.
+# Chinese with numbers, punctuation, slots and single letters: one scan recognizes most texts.
 _ZH = r"[\u4e00-\u9fff\d\s，。、；：（）！？%/.,;:()-]*+"
 _PLAIN_ZH = re.compile(_ZH + r"(?:(?:\{[^{}]*\}|[A-Za-z](?![A-Za-z{]))" + _ZH + ")*+")
 _OTHER_LETTER = re.compile(r"[^\W\d_a-zA-Z\u00c0-\u024f\u4e00-\u9fff]")
@@ -92,9 +98,9 @@ def parse_answer(
     control characters inside strings. Anything else is a failure with a reason word.
 
     Args:
-        more: names of the further fields that were asked for.
-        finish_reason: why the writer ended, where it is known.
-        optional: those of `more` that an answer may leave out.
+        more: Names of the further fields that the prompt asks for.
+        finish_reason: Why the model stopped, if it is known.
+        optional: Fields of `more` that an answer may omit.
     """
     names = (*FIELDS, *more)
     found = find_object(text, names, finish_reason)
@@ -122,8 +128,8 @@ def parse_answer(
 
 
 def _problem_of(texts: Mapping[str, str], language: Language) -> str | None:
-    """Return what makes a text none of a caption: it is short, stands for another one, or is in another language."""
-    for name, min_characters in (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS).items():
+    """Return the reason why a text is not a caption: too short, a placeholder, or in another language."""
+    for name, min_characters in _min_characters(language).items():
         text = texts[name]
         if len(text) < min_characters:
             return f"{name}_too_short"
@@ -136,44 +142,47 @@ def _problem_of(texts: Mapping[str, str], language: Language) -> str | None:
 
 
 def _is_left_out(text: str, min_characters: int) -> bool:
-    """Return whether dots stand for the text, or for its beginning or end."""
+    """Return whether dots replace the text, its beginning or its end."""
     at_an_end = _LEFT_OUT.match(text) or _LEFT_OUT.search(text, len(text) - 3)
     return at_an_end is not None or len(_LEFT_OUT.sub("", text).strip()) < min_characters
 
 
 def is_in_script(text: str, language: Language) -> bool:
-    """Return whether a text is written in its language: Chinese has no more Latin words than characters.
+    """Return whether a text is in its language: Chinese may hold as many Latin words as characters, English vice versa.
 
-    Letters of other scripts are of neither. The names in slots are no words.
+    Each letter of another script counts against the language. Slot names are ignored.
     """
     if text.isascii() if language == "en" else _PLAIN_ZH.fullmatch(text):
         return True
     text = _SLOT.sub("", text)
-    num_han, num_words = sum(map(len, _HAN.findall(text))), len(_LATIN.findall(text))
+    num_han = sum(map(len, _HAN.findall(text)))
+    num_words = len(_LATIN.findall(text))
     num_others = len(_OTHER_LETTER.findall(text))
-    return num_words + num_others <= num_han if language == "zh" else num_han + num_others <= num_words
+    if language == "zh":
+        return num_words + num_others <= num_han
+    return num_han + num_others <= num_words
 
 
 # --- sentences -------------------------------------------------------------------------------------------------------
 
-# A point after these ends no sentence, nor does one inside a number.
+# A full stop after these abbreviations or inside a number does not end a sentence.
 _ABBREVIATIONS = ("approx", "ca", "vs", "deg", "i\\.e", "e\\.g", "resp", "max", "min", "avg", "horiz")
 _POINT = r"(?<=\.)(?=\s|$)" + "".join(rf"(?<!\b(?i:{word})\.)" for word in _ABBREVIATIONS)
-# Begins with one class of characters, for which the engine looks by itself: twice as fast as with alternatives.
+# The pattern begins with one character class, which the regex engine searches twice as fast as alternatives.
 _MARKS = ".。！？!?\n"
 END = re.compile(rf"[{_MARKS}](?:(?<=[。！？!?])[。！？!?]*|(?<=\n)|{_POINT})\s*")
 
 
 def sentences_of(coc: Coc) -> Iterator[tuple[str, str]]:
-    """Yield (name, text) of the sentences of both texts of an answer, in order."""
+    """Yield (name, text) of each sentence of both texts of an answer, in order: C1, C2, ..., R1, R2, ..."""
     for letter, text in (("C", coc.critical_components), ("R", coc.reasoning_trace)):
         for number, part in enumerate(cut_sentences(text), 1):
             yield f"{letter}{number}", part.strip()
 
 
-@lru_cache(maxsize=256)  # an English text is cut again when its mirror is held against it
+@lru_cache(maxsize=256)  # an English text is cut again for the comparison with its mirrored text
 def cut_sentences(text: str) -> tuple[str, ...]:
-    """Cut a text at the ends of its sentences; together the pieces are the text."""
+    """Cut a text at the ends of its sentences; the joined pieces are the text from its first sentence on."""
     pieces: list[str] = []
     ends = [0, *(match.end() for match in END.finditer(text)), len(text)]
     for piece in (text[start:end] for start, end in pairwise(ends)):

@@ -1,9 +1,9 @@
-"""The journal of answers: each is written before anything is derived from it, and nothing is asked twice; the budget.
+"""The journal of answers, which no run requests twice, and the budget of tokens and money.
 
-A folder has one journal per track, `answers/<track>.jsonl`, written by one process. An answer is handed to the system
-as it arrives, so a killed process loses none; a thread waits for the disk, once for all answers that arrived meanwhile.
-Only tracks in progress are in memory. All runs into one folder count towards its budget of tokens and money, from the
-journal, so that repeating a command does not spend it twice.
+A folder has one journal per track, `answers/<track>.jsonl`, written by one process. Each answer is written to the file
+before anything is derived from it, so a killed process loses none. A thread syncs the disk, once for all answers that
+arrived meanwhile. Only tracks in progress are in memory. The budget counts the answers in the journals of all runs into
+one folder, so repeating a command does not spend it twice.
 """
 
 from __future__ import annotations
@@ -34,13 +34,14 @@ from cosfly.runtime.model_json import CONTEXT_FULL
 log = logging.getLogger(__name__)
 
 MOST_OPEN_FILES = 64
-BYTES_PER_TOKEN = 3  # a low guess, so that the budget holds
+MOST_NAME_BYTES = 200  # of a file name without its ending; file systems allow 255 with it
+BYTES_PER_TOKEN = 3  # of a prompt; a low estimate keeps the spending within the budget
 PIXELS_PER_TOKEN = 28 * 28  # of common vision encoders
 _PLAIN_NAME = re.compile(r"\w[\w.+-]*")
 
 
 class Answer(BaseModel):
-    """A line of a journal. usage: empty if the server reports none."""
+    """A line of a journal. usage: Empty if the server reports none."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
@@ -63,7 +64,7 @@ class Answer(BaseModel):
 
 
 def answer_key(model: str, request: Request) -> str:
-    """Return the digest of what an answer depends on: image bytes, prompt, model and sampling."""
+    """Return the digest of all that determines an answer: image bytes, prompt, model, sampling and schema."""
     texts = [
         message
         if isinstance(message["content"], str)
@@ -90,17 +91,20 @@ class AnswerBook:
             for answer in read_answers(Journal(path)):
                 self._count(answer)
         self._tracks: dict[str, tuple[Journal, dict[str, Answer]]] = {}  # a track's journal, and its answers by key
-        self._disk, self._disk_lock = ThreadPoolExecutor(1, "journal"), asyncio.Lock()
+        self._disk = ThreadPoolExecutor(1, "journal")
+        self._disk_lock = asyncio.Lock()
         self._unsynced = set[Journal]()
         self._disk_error: CosflyError | OSError | None = None
 
     def get(self, track: str, key: str) -> Answer | None:
         """Return the recorded answer of a key."""
-        return self._open(track)[1].get(key)
+        _, answers = self._open(track)
+        return answers.get(key)
 
     def latency_s(self, track: str, sample_id: str) -> float:
         """Return the total time of the answers about one window."""
-        return sum(one.latency_s for one in self._open(track)[1].values() if one.sample_id == sample_id)
+        _, answers = self._open(track)
+        return sum(answer.latency_s for answer in answers.values() if answer.sample_id == sample_id)
 
     async def put(self, track: str, answer: Answer) -> None:
         """Write an answer, and wait until it is on the disk; StorageError if the disk is full or not writable."""
@@ -112,11 +116,12 @@ class AnswerBook:
         async with self._disk_lock:
             if self._disk_error is not None:  # a later sync may succeed without the lost lines
                 raise self._disk_error
-            if journal in self._unsynced:  # else synced by another answer that waited
+            if journal in self._unsynced:  # otherwise another answer has synced it meanwhile
                 await self._sync()
 
     async def _sync(self) -> None:
-        batch, self._unsynced = self._unsynced, set()
+        batch = self._unsynced
+        self._unsynced = set()
 
         def sync_all() -> None:
             for journal in batch:
@@ -137,11 +142,12 @@ class AnswerBook:
     def forget(self, track: str) -> None:
         """Remove a finished track from memory; its journal stays on the disk."""
         if track in self._tracks:
-            self._tracks.pop(track)[0].close()
+            journal, _ = self._tracks.pop(track)
+            journal.close()
 
     def _open(self, track: str) -> tuple[Journal, dict[str, Answer]]:
         if track not in self._tracks:
-            is_plain = _PLAIN_NAME.fullmatch(track) is not None and len(track.encode()) <= 200
+            is_plain = _PLAIN_NAME.fullmatch(track) is not None and len(track.encode()) <= MOST_NAME_BYTES
             name = track if is_plain else f"flight-{sha256_bytes(track.encode())}"
             journal = Journal(self.folder / f"{name}.jsonl")
             self._tracks[track] = journal, {answer.key: answer for answer in read_answers(journal)}
@@ -166,7 +172,7 @@ class AnswerBook:
 
 
 class BudgetConfig(Config):
-    """Limits over all runs into one folder, a judge's tokens included."""
+    """Limits over all runs into one folder, including the tokens of a judge."""
 
     price_prompt: float = Field(0.0, ge=0, description="price of a million prompt tokens, in your currency")
     price_completion: float = Field(0.0, ge=0, description="price of a million answer tokens, in your currency")
@@ -191,17 +197,19 @@ class BudgetSpent(TeacherError):
 class Budget:
     """The shared budget of several journals of answers.
 
-    A request is sent only if it and all in flight, each taken at the largest size so far, fit; until then it waits. If
-    it does not fit alone, the budget is spent.
+    A request is sent when it fits together with all requests in flight, each counted with the largest size so far. Until
+    then it waits. If it does not fit alone, the budget is spent.
     """
 
     def __init__(self, cfg: BudgetConfig, *counts: Counter[str], first_prompt: int, first_completion: int) -> None:
         """
         Args:
             counts: `AnswerBook.totals` of each journal.
-            first_prompt, first_completion: assumed tokens of a request until one is answered.
+            first_prompt, first_completion: Assumed tokens of a request until one is answered.
         """
-        self.cfg, self._counts, self._first = cfg, counts, (first_prompt, first_completion)
+        self.cfg = cfg
+        self._counts = counts
+        self._first = (first_prompt, first_completion)
         self._largest: dict[int, tuple[int, int]] = {}  # prompt and completion tokens by number of pictures
         self._in_flight = Counter[int]()  # requests by number of pictures
         self._freed = asyncio.Event()
@@ -233,26 +241,36 @@ class Budget:
             self._freed.set()
 
     def _exceeded_by_another(self, num_pictures: int) -> BudgetSpent | None:
-        """Return which limit one more request might exceed."""
-        totals, prompt, completion = self.totals, 0, 0
+        """Return the error of a limit that one more request might exceed; None if it fits."""
+        prompt = completion = 0
         for pictures, count in (self._in_flight + Counter([num_pictures])).items():
-            one_prompt, one_completion = self._largest.get(pictures, self._first)
-            prompt, completion = prompt + count * one_prompt, completion + count * one_completion
-        tokens, spent = totals["prompt_tokens"] + totals["completion_tokens"], None
+            largest_prompt, largest_completion = self._largest.get(pictures, self._first)
+            prompt += count * largest_prompt
+            completion += count * largest_completion
+        totals = self.totals
+        tokens = totals["prompt_tokens"] + totals["completion_tokens"]
         if self.cfg.max_tokens is not None and tokens + prompt + completion > self.cfg.max_tokens:
-            spent, limit = f"{tokens:,} of at most {self.cfg.max_tokens:,} tokens are used", "max_tokens"
-        elif self.cfg.max_cost is not None and self.spent + self.cfg.cost(prompt, completion) > self.cfg.max_cost:
-            spent, limit = f"{self.spent:.4f} of at most {self.cfg.max_cost:g} are spent", "max_cost"
-        return None if spent is None else BudgetSpent(spent, where=f"budget.{limit}", fix="raise the limit")
+            problem = f"{tokens:,} of at most {self.cfg.max_tokens:,} tokens are used"
+            return BudgetSpent(problem, where="budget.max_tokens", fix="raise the limit")
+        if self.cfg.max_cost is not None and self.spent + self.cfg.cost(prompt, completion) > self.cfg.max_cost:
+            problem = f"{self.spent:.4f} of at most {self.cfg.max_cost:g} are spent"
+            return BudgetSpent(problem, where="budget.max_cost", fix="raise the limit")
+        return None
 
     def note(self, usage: Usage | None, where: str, num_pictures: int = 0) -> None:
         """Record the size of an answered request; raises TeacherError if a limit is set and no usage is reported."""
         if usage is not None:
             prompt, completion = self._largest.get(num_pictures, (0, 0))
-            self._largest[num_pictures] = max(prompt, usage.prompt_tokens), max(completion, usage.completion_tokens)
+            self._largest[num_pictures] = (
+                max(prompt, usage.prompt_tokens),
+                max(completion, usage.completion_tokens),
+            )
         elif self.cfg.max_cost is not None or self.cfg.max_tokens is not None:
-            what = "the endpoint reports no token usage, so a limit of tokens or cost cannot be kept"
-            raise TeacherError(what, where=where, fix="remove --max-cost and --max-tokens, and use --limit")
+            raise TeacherError(
+                "the endpoint reports no token usage, so a limit of tokens or cost cannot be kept",
+                where=where,
+                fix="remove --max-cost and --max-tokens, and use --limit",
+            )
 
 
 class KeptAnswers:
@@ -264,10 +282,10 @@ class KeptAnswers:
         """
         Args:
             book: None records nothing. budget: None sets no limit.
-            only: sample ids about which the engine may be asked; None: all. Others get recorded answers only.
+            only: Ids of the samples for which the engine may be asked; None: all. Others get recorded answers only.
         """
         self.engine, self.book, self.budget, self.only = engine, book, budget, only
-        self._asking: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()  # key -> held while it is asked
+        self._asking: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()  # by key, held during a request
 
     async def ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
         """Return the recorded answer, or ask the engine.
@@ -277,12 +295,15 @@ class KeptAnswers:
             BudgetSpent: The request might exceed a limit.
             TeacherError: No request will be answered.
         """
-        key, engine, num_pictures = answer_key(self.engine.model, request), self.engine, len(request.digests)
-        async with self._asking.setdefault(key, asyncio.Lock()):  # of equal requests the second takes the first answer
-            known = None if self.book is None else self.book.get(track, key)
-            is_retried = self.only is not None and sample_id in self.only  # perhaps by a server with a larger context
-            if known is not None and not (is_retried and known.finish_reason == CONTEXT_FULL):
-                return known.reply
+        engine = self.engine
+        key = answer_key(engine.model, request)
+        num_pictures = len(request.digests)
+        # Equal requests wait for each other, so that the second takes the answer of the first.
+        async with self._asking.setdefault(key, asyncio.Lock()):
+            recorded = None if self.book is None else self.book.get(track, key)
+            is_retried = self.only is not None and sample_id in self.only  # the context may be larger now
+            if recorded is not None and not (is_retried and recorded.finish_reason == CONTEXT_FULL):
+                return recorded.reply
             if self.only is not None and not is_retried:
                 raise NoAnswer("not_asked", "this run asks about other windows only")
             async with self.budget.request(num_pictures) if self.budget else contextlib.nullcontext():
@@ -290,11 +311,17 @@ class KeptAnswers:
                 reply = await engine.answer(request)
                 if self.book is not None:
                     answer = Answer(
-                        key=key, sample_id=sample_id, purpose=purpose, model=engine.model, text=reply.text,
-                        usage=reply.usage.model_dump() if reply.usage else {}, structured=reply.structured,
-                        finish_reason=reply.finish_reason, latency_s=round(time.monotonic() - start_s, 3),
+                        key=key,
+                        sample_id=sample_id,
+                        purpose=purpose,
+                        model=engine.model,
+                        text=reply.text,
+                        usage=reply.usage.model_dump() if reply.usage else {},
+                        structured=reply.structured,
+                        finish_reason=reply.finish_reason,
+                        latency_s=round(time.monotonic() - start_s, 3),
                         time=round(time.time(), 3),
-                    )  # fmt: skip
+                    )
                     await self.book.put(track, answer)  # on the disk before anything is derived from it
             if self.budget is not None:
                 self.budget.note(reply.usage, engine.where, num_pictures)

@@ -1,4 +1,4 @@
-"""Engine `endpoint`: a client for one server of chat completions, in bounded time and memory whatever it sends.
+"""Engine `endpoint`: a client for one server of chat completions, with bounds on the time and memory of each request.
 
 The key comes from the environment variable COSFLY_API_KEY and is sent in the request header only.
 """
@@ -23,8 +23,8 @@ from pydantic import Field
 
 from cosfly.llm import protocol
 from cosfly.llm.contract import NoAnswer, Reply, Request, Troubles
-from cosfly.llm.protocol import KEY_VARIABLE, Response
-from cosfly.llm.refusals import MEANINGS, Refusal, kind_of
+from cosfly.llm.protocol import KEY_VARIABLE, BadReply, Response
+from cosfly.llm.refusals import MEANINGS, Refusal, RefusedRequest, kind_of
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import TeacherError
 from cosfly.runtime.model_json import CONTEXT_FULL
@@ -32,11 +32,11 @@ from cosfly.runtime.model_json import CONTEXT_FULL
 log = logging.getLogger(__name__)
 
 TOTAL_TIMEOUT_S = 900.0  # limit of one answer with all its tries
-STOP_AFTER_FAILURES = 20  # unanswered windows or samples in a row that end a run
 BUSY_STATUS = frozenset({429, 503, 529})
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # after a failure: the pause doubles, with jitter
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # the pause after a failed try doubles in this range, with jitter
+MOST_DOUBLINGS = 60  # keeps the power of two finite; the pause has reached its maximum long before
 MOST_REPLY_MB = 4.0  # of one answer, uncompressed
-MOST_ERROR_TEXT = 300  # characters of a server's error text that are kept
+MOST_ERROR_TEXT = 300  # characters of a server's error text; the rest is dropped
 HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
 RETRY_AFTER = re.compile(r"[0-9]{1,20}(\.[0-9]*)?(e[0-9]{1,2})?")  # in seconds
 _tls = functools.cache(httpx.create_ssl_context)  # certificates are read once: it takes longer than a request
@@ -67,8 +67,11 @@ class ConcurrencyLimit:
     """
 
     def __init__(self, ceiling: int) -> None:
-        self.ceiling, self.limit, self.num_active = ceiling, float(ceiling), 0
-        self._held_until_s, self._decreased_s = 0.0, -math.inf
+        self.ceiling = ceiling
+        self.limit = float(ceiling)
+        self.num_active = 0
+        self._held_until_s = 0.0
+        self._decreased_s = -math.inf
         self._changed = asyncio.Condition()
 
     @contextlib.asynccontextmanager
@@ -95,7 +98,8 @@ class ConcurrencyLimit:
         """Record that the server is overloaded. Requests sent before the last decrease do not count again."""
         now_s = time.monotonic()
         if sent_s >= self._decreased_s:
-            self.limit, self._decreased_s = max(1.0, self.limit / 2.0), now_s
+            self.limit = max(1.0, self.limit / 2.0)
+            self._decreased_s = now_s
         if retry_after_s is not None:
             self._held_until_s = max(self._held_until_s, now_s + retry_after_s)
 
@@ -115,16 +119,22 @@ class ChatClient:
         except ValueError as error:
             raise TeacherError(str(error)) from None
         self.url = self.where = protocol.base_url(url)
-        self.cfg, self.model, self.troubles = cfg, "", troubles or Troubles()
+        self.cfg = cfg
+        self.model = ""
+        self.troubles = troubles or Troubles()
         self.concurrency = ConcurrencyLimit(cfg.concurrency)
-        self.context: int | None = None  # most tokens of prompt and answer together, if the server tells it
-        self._asks_for_schema, self._has_warned_of_context = cfg.json_schema, False
+        self.context: int | None = None  # most tokens of prompt and answer together, if the server reports it
+        self._asks_for_schema = cfg.json_schema
+        self._has_warned_of_context = False
         self._key = os.environ.get(KEY_VARIABLE, "")
         if not (self._key.isascii() and self._key.isprintable()):  # an error of httpx would quote it
-            what = "the API key contains a character that no header can contain, perhaps a line break"
-            raise TeacherError(what, where=KEY_VARIABLE, fix="check the environment variable")
+            raise TeacherError(
+                "the API key contains a character that no header can contain, perhaps a line break",
+                where=KEY_VARIABLE,
+                fix="check the environment variable",
+            )
         self._free = [self._connect()]
-        self._jitter = random.Random()  # of retry pauses only: no product depends on it
+        self._jitter = random.Random()  # for retry pauses only: no product depends on it
 
     async def close(self) -> None:
         """Close all connections; none may be in use."""
@@ -137,10 +147,11 @@ class ChatClient:
         """Send a request until it is answered.
 
         Raises:
-            NoAnswer: The tries or the time of the settings are used up, or the server refuses this request.
+            NoAnswer: The number of tries or the time limit is exceeded, or the server refuses this request.
             TeacherError: No request will be answered.
         """
-        num_tries, deadline_s = 0, math.inf
+        num_tries = 0
+        deadline_s = math.inf
         while True:
             try:
                 async with self.concurrency.slot():
@@ -152,54 +163,78 @@ class ChatClient:
             except NoAnswer as error:
                 if error.is_final:
                     raise
-                failed = error
-            longest_s = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** min(num_tries, 60))
-            pause_s = self._jitter.uniform(0.5, 1.0) * longest_s if failed.wait_s is None else failed.wait_s
+                failure = error
+            longest_s = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** min(num_tries, MOST_DOUBLINGS))
+            pause_s = self._jitter.uniform(0.5, 1.0) * longest_s if failure.wait_s is None else failure.wait_s
             num_tries += 1
-            is_last, is_late = num_tries >= self.cfg.max_tries, time.monotonic() + pause_s >= deadline_s
-            if self.troubles.failed(failed.detail):
+            is_last = num_tries >= self.cfg.max_tries
+            is_late = time.monotonic() + pause_s >= deadline_s
+            if self.troubles.failed(failure.detail):
                 action = "giving up" if is_last or is_late else "trying again"
-                log.warning("%s: %s; %s, failed tries so far: %d", self.where, failed.detail, action, self.troubles.num)
+                count = self.troubles.num
+                log.warning("%s: %s; %s, failed tries so far: %d", self.where, failure.detail, action, count)
             if is_last:
-                raise failed
+                raise failure
             if is_late:
-                detail = f"no answer within {TOTAL_TIMEOUT_S:g} s; the last error: {failed.detail}"
+                detail = f"no answer within {TOTAL_TIMEOUT_S:g} s; the last error: {failure.detail}"
                 raise NoAnswer("total_timeout", detail)
             await asyncio.sleep(pause_s)
 
     async def _try(self, request: Request, sent_s: float) -> Reply:
-        """Send a request once, and again without its schema if the server refuses the schema.
+        """Try to get the answer of a request.
 
         Raises:
-            NoAnswer: This try is not answered, or if `is_final` the request never will be.
-            TeacherError: No request ever will be.
+            NoAnswer: This try is not answered, or with `is_final` the request never will be.
+            TeacherError: No request will be answered.
         """
-        refused_schema: Refusal | None = None
         try:
-            schema = request.schema if self._asks_for_schema else None
-            response, found = await self.ask_once(request, schema)
-            if schema is not None and isinstance(found, Refusal) and found.kind == "schema":
-                refused_schema = found
-                response, found = await self.ask_once(request, None)
+            reply = await self._ask(request)
         except (TimeoutError, httpx.RequestError) as error:  # also a compressed body
             is_late = isinstance(error, TimeoutError | httpx.TimeoutException)
-            raise NoAnswer("timeout" if is_late else "connection", self.words_of(error)) from None
-        if isinstance(found, str):
-            raise NoAnswer("bad_reply", found)
-        if isinstance(found, Refusal):
-            raise self._refused(found, sent_s, response.retry_after_s)
+            raise NoAnswer("timeout" if is_late else "connection", self.message_of(error)) from None
+        except BadReply as error:
+            raise NoAnswer("bad_reply", str(error)) from None
+        except RefusedRequest as error:
+            raise self._refused(error.refusal, sent_s, error.wait_s) from None
         self.concurrency.succeeded()
-        if refused_schema is not None and self._asks_for_schema:
+        return self._with_full_context(reply, request)
+
+    async def _ask(self, request: Request) -> Reply:
+        """Send a request once, and again without its schema if the server refuses the schema; raises as `ask_once`."""
+        schema = request.schema if self._asks_for_schema else None
+        try:
+            _, reply = await self.ask_once(request, schema)
+            return reply
+        except RefusedRequest as error:
+            if schema is None or error.refusal.kind != "schema":
+                raise
+            refused_schema = error.refusal
+        _, reply = await self.ask_once(request, None)
+        if self._asks_for_schema:
             log.warning("%s: refuses a JSON schema (%s); asking without one", self.where, refused_schema.summary)
             self._asks_for_schema = False
-        return self._with_full_context(found, request)
+        return reply
+
+    async def ask_once(self, request: Request, schema: dict | None) -> tuple[Response, Reply]:
+        """Send one request once; return the response and the reply in it.
+
+        Raises:
+            RefusedRequest: The server refuses the request.
+            BadReply: The response holds no reply.
+            TimeoutError, httpx.TimeoutException: The response was not complete in time.
+            httpx.RequestError: The connection failed, or the body is compressed.
+        """
+        body = protocol.encode_body(protocol.request_body(self.model, request, schema))
+        response = await self._exchange("chat/completions", body)
+        return response, self._read(response, is_structured=schema is not None)
 
     def _refused(self, refusal: Refusal, sent_s: float, wait_s: float | None) -> NoAnswer | TeacherError:
-        """Return the error of a refusal: of this try, of this request, or of every request."""
+        """Return the error of a refused request: NoAnswer for this try or this request, TeacherError for all."""
         if refusal.meaning.ends_run:
             return self._error(refusal.meaning.what, got=refusal.summary, fix=refusal.meaning.fix)
         if refusal.may_pass:
-            is_long = wait_s is not None and wait_s > TOTAL_TIMEOUT_S  # gives up this request, holds no other
+            # A longer wait ends this request, but does not delay the others.
+            is_long = wait_s is not None and wait_s > TOTAL_TIMEOUT_S
             if refusal.status in BUSY_STATUS:
                 self.concurrency.was_busy(sent_s, None if is_long else wait_s)
             asked = f" (asks to wait {wait_s:.0f} s)" if is_long else ""
@@ -211,14 +246,18 @@ class ChatClient:
 
         vLLM shortens `max_tokens` to the rest of the context and reports only "length".
         """
-        most, usage = request.sampling.get("max_tokens"), reply.usage
-        is_cut = reply.finish_reason == "length" and type(most) is int and usage and 0 < usage.completion_tokens < most
-        if not is_cut or usage is None or (self.context and usage.total < self.context - 1):
+        most = request.sampling.get("max_tokens")
+        usage = reply.usage
+        if reply.finish_reason != "length" or type(most) is not int or usage is None:
+            return reply
+        is_short = 0 < usage.completion_tokens < most
+        if not is_short or (self.context and usage.total < self.context - 1):
             return reply
         if not self._has_warned_of_context:
             self._has_warned_of_context = True
-            cut, meaning = f"an answer was cut after {usage.completion_tokens} of {most} tokens", MEANINGS["too_long"]
-            log.warning("%s: %s: %s; %s", self.where, cut, meaning.what, meaning.fix)
+            problem = f"an answer was cut after {usage.completion_tokens} of {most} tokens"
+            meaning = MEANINGS["too_long"]
+            log.warning("%s: %s: %s; %s", self.where, problem, meaning.what, meaning.fix)
         return replace(reply, finish_reason=CONTEXT_FULL)
 
     async def start(self) -> None:
@@ -232,9 +271,9 @@ class ChatClient:
             response = await self._exchange("models")
         except (TimeoutError, httpx.RequestError) as error:
             fix = "start the server or check its address"
-            raise self._error("cannot reach the teacher", got=self.words_of(error), fix=fix) from None
+            raise self._error("cannot reach the teacher", got=self.message_of(error), fix=fix) from None
         if response.status in (401, 403):
-            raise self._refused(self.refusal(response), 0.0, None)
+            raise self._refused(self._refusal(response), 0.0, None)
         entries = None if response.is_cut else protocol.read_models(response)
         names = [entry["id"] for entry in entries or ()]
         if wanted in names or (wanted is None and len(names) == 1):
@@ -245,77 +284,74 @@ class ChatClient:
             self.model = wanted  # some hosts list no models; the first request shows whether it exists
         elif entries is None:
             what = "the server returns no list of models, so it may not be an OpenAI-compatible endpoint"
-            raise self._error(what, got=self.refusal(response).summary, fix="check the URL, or set --model")
+            raise self._error(what, got=self._refusal(response).summary, fix="check the URL, or set --model")
         elif not names:
             raise self._error("the endpoint lists no model with a usable name", fix="set --model")
         else:
             what = "the endpoint does not have this model" if wanted else "the endpoint has several models"
-            got, expected = wanted or f"{len(names)} models", f"one of {', '.join(names[:8])}"
-            raise self._error(what, got=got, expected=expected, fix="set --model")
+            got = wanted or f"{len(names)} models"
+            raise self._error(what, got=got, expected=f"one of {', '.join(names[:8])}", fix="set --model")
 
     # --- responses ---
 
-    def read(self, response: Response, *, is_structured: bool) -> Reply | Refusal | str:
-        """Return the reply of a response, the refusal in it (some servers send it with status 200), or what is wrong
-        with it."""
-        if response.status != 200:
-            return self.refusal(response)
-        if response.is_cut:
-            return f"longer than {MOST_REPLY_MB:g} MB"
-        found = protocol.read_completion(response, "json_schema" if is_structured else "plain")
-        if isinstance(found, Reply):
-            return found
-        kind = kind_of(200, found) if found.startswith(protocol.ERROR_INSTEAD) else "unknown"
-        return self.clean(found) if kind == "unknown" else Refusal(200, kind, self.clean(found))
+    def _read(self, response: Response, *, is_structured: bool) -> Reply:
+        """Return the reply in a response; raises RefusedRequest or BadReply.
 
-    def refusal(self, response: Response) -> Refusal:
+        Some servers send a refusal with status 200.
+        """
+        if response.status != 200:
+            raise RefusedRequest(self._refusal(response), response.retry_after_s)
+        if response.is_cut:
+            raise BadReply(f"longer than {MOST_REPLY_MB:g} MB")
+        try:
+            return protocol.read_completion(response, "json_schema" if is_structured else "plain")
+        except BadReply as error:
+            problem = str(error)
+            kind = kind_of(200, problem) if error.is_error else "unknown"
+        text = self._clean(problem)
+        if kind == "unknown":
+            raise BadReply(text)
+        raise RefusedRequest(Refusal(200, kind, text), response.retry_after_s)
+
+    def _refusal(self, response: Response) -> Refusal:
         """Return the refusal in a response whose status is not 200."""
-        text = response.body.decode("utf-8", "replace")  # whatever charset it claims
+        text = response.body.decode("utf-8", "replace")  # the charset in the header is ignored
         try:
             message = protocol.error_words(protocol.read_body(response.body))
         except ValueError:
             message = text
-        return Refusal(response.status, kind_of(response.status, text), self.clean(message))
+        return Refusal(response.status, kind_of(response.status, text), self._clean(message))
 
     def _error(self, what: str, **parts: Any) -> TeacherError:
         return TeacherError(what, where=self.where, **parts)
 
-    def words_of(self, error: Exception) -> str:
-        """Return the words for an exchange that failed."""
+    def message_of(self, error: Exception) -> str:
+        """Return the message of an exchange that failed."""
         if isinstance(error, TimeoutError | httpx.TimeoutException):
             return f"no answer within {self.cfg.timeout_s:g} s"
-        return self.clean(f"{type(error).__name__} {error}")
+        return self._clean(f"{type(error).__name__} {error}")
 
-    def clean(self, text: str) -> str:
+    def _clean(self, text: str) -> str:
         """Return a server's text in one short printable line, without the key if the server echoes it."""
         text = " ".join(text.split())
         if self._key:
             text = text.replace(self._key, "***")
         return "".join(character if character.isprintable() else "?" for character in text[:MOST_ERROR_TEXT])
 
-    # --- connections: one per request in flight, each in its own client. httpx searches a pool of 64 connections at
-    # every request, which takes longer than sending fifteen pictures. ---
-
-    async def ask_once(self, request: Request, schema: dict | None) -> tuple[Response, Reply | Refusal | str]:
-        """Send one request once; return the response, and what `read` finds in it.
-
-        Raises:
-            TimeoutError, httpx.TimeoutException: The response was not complete in time.
-            httpx.RequestError: The connection failed, or the body is compressed.
-        """
-        body = protocol.encode_body(protocol.request_body(self.model, request, schema))
-        response = await self._exchange("chat/completions", body)
-        return response, self.read(response, is_structured=schema is not None)
+    # --- connections ---
+    # Each request in flight has a client of its own with one connection: for every request httpx searches its pool, and
+    # with 64 connections that takes longer than sending fifteen pictures.
 
     async def _exchange(self, path: str, content: bytes | None = None) -> Response:
-        """Send one request, a POST if it has a content, and read the response. Redirects are not followed."""
-        method, url = "GET" if content is None else "POST", f"{self.url}/{path}"
-        body, most_bytes = bytearray(), int(MOST_REPLY_MB * 1e6)
+        """Send one request, a POST if it has content, and read the response. Redirects are not followed."""
+        method = "GET" if content is None else "POST"
+        body = bytearray()
+        most_bytes = int(MOST_REPLY_MB * 1e6)
         connection = self._free.pop() if self._free else self._connect()
         try:
             async with (
                 asyncio.timeout(self.cfg.timeout_s),
-                connection.stream(method, url, content=content, headers=HEADERS) as response,
+                connection.stream(method, f"{self.url}/{path}", content=content, headers=HEADERS) as response,
             ):
                 encoding = response.headers.get("content-encoding", "identity")
                 if encoding.strip().lower() not in ("", "identity"):
@@ -327,7 +363,7 @@ class ChatClient:
                 wait = response.headers.get("retry-after", "").strip()
                 wait_s = float(wait) if RETRY_AFTER.fullmatch(wait) else None
                 return Response(response.status_code, bytes(body[:most_bytes]), len(body) > most_bytes, wait_s)
-        except (httpx.InvalidURL, UnicodeError) as error:  # also of the address of a redirect
+        except (httpx.InvalidURL, UnicodeError) as error:  # also for the address of a redirect
             raise httpx.UnsupportedProtocol(f"invalid address: {type(error).__name__}") from None
         finally:
             self._free.append(connection)
@@ -338,5 +374,8 @@ class ChatClient:
         try:
             return httpx.AsyncClient(headers=headers, timeout=self.cfg.timeout_s, limits=limits, verify=_tls())
         except (httpx.InvalidURL, ValueError, ImportError, OSError) as error:
-            what, where = "the proxy or the certificates cannot be used", "HTTPS_PROXY, ALL_PROXY, SSL_CERT_FILE, ..."
-            raise TeacherError(what, where=where, got=type(error).__name__) from None
+            raise TeacherError(
+                "the proxy or the certificates cannot be used",
+                where="HTTPS_PROXY, ALL_PROXY, SSL_CERT_FILE, ...",
+                got=type(error).__name__,
+            ) from None

@@ -15,10 +15,9 @@ from cosfly.runtime.json_io import dump_json
 
 KEY_VARIABLE = "COSFLY_API_KEY"
 THOUGHT_FIELDS = ("reasoning_content", "reasoning", "thinking", "reasoning_details")  # of a message
-TEXT_PARTS = (None, "text", "output_text")
-ERROR_INSTEAD = "an error in place of an answer"  # with status 200
+TEXT_PARTS = (None, "text", "output_text")  # types of the parts of a message that hold its text
 ENDED = ("error", "abort")  # finish reasons of an answer that a server gave up; SGLang sends them with status 200
-MOST_NAME = 256  # characters of a name that is kept, such as a model or a finish reason
+MOST_NAME = 256  # characters of a name, such as a model or a finish reason; longer ones are dropped
 
 
 # --- addresses --------------------------------------------------------------------------------------------------------
@@ -28,22 +27,22 @@ def check_url(url: str) -> None:
     """Check that a URL is usable and contains no secret, since it is written to `run.yaml` and shown in messages.
 
     Raises:
-        ValueError: Says what is wrong, without parts of the URL that may be secret.
+        ValueError: The message names the problem without the parts of the URL that may be secret.
     """
-    shown = "" if "@" in url else f", got {re.split('[?#]', url)[0][:200]!r}"
+    got = "" if "@" in url else f", got {re.split('[?#]', url)[0][:200]!r}"
     if re.search("[@?#]", url):
-        what = "a URL must not contain a user, password, query or fragment, since it is recorded"
-        raise ValueError(f"{what}; set the key in the environment variable {KEY_VARIABLE}{shown}")
+        problem = "a URL must not contain a user, password, query or fragment, since it is recorded"
+        raise ValueError(f"{problem}; set the key in the environment variable {KEY_VARIABLE}{got}")
     try:
         parts = httpx.URL(url)
-        parts.raw_host.decode("ascii").encode("idna")  # as the resolver does
+        parts.raw_host.decode("ascii").encode("idna")  # the encoding that the resolver uses
     except (httpx.InvalidURL, ValueError):
         parts = httpx.URL("")
     is_host = parts.scheme in ("http", "https") and parts.host and "%" not in parts.host
     is_port = parts.port is None or 0 < parts.port < 65_536
     if not (is_host and is_port) or re.search(r"[\s\x00-\x1f\x7f]", url):
-        what = "a URL must begin with http:// or https:// and a host name, with a port below 65536 and no blanks"
-        raise ValueError(f"{what}{shown}")
+        problem = "a URL must begin with http:// or https:// and a host name, with a port below 65536 and no blanks"
+        raise ValueError(f"{problem}{got}")
 
 
 def base_url(url: str) -> str:
@@ -56,16 +55,16 @@ def base_url(url: str) -> str:
 
 
 def request_body(model: str, request: Request, schema: dict | None = None) -> dict[str, Any]:
-    """Return a request's body. schema: the JSON schema that the answer must have, if the server is asked for it."""
+    """Return the body of a request. schema: The JSON schema that the server must enforce; None enforces none."""
     body = {"model": model, "messages": request.messages, **request.sampling}
     if schema is None:
         return body
-    wanted = {"name": "chain_of_cause", "strict": True, "schema": schema}
-    return body | {"response_format": {"type": "json_schema", "json_schema": wanted}}
+    json_schema = {"name": "chain_of_cause", "strict": True, "schema": schema}
+    return body | {"response_format": {"type": "json_schema", "json_schema": json_schema}}
 
 
 def encode_body(payload: dict) -> bytes:
-    """Write a request as JSON. Data URLs, a megabyte of them, need no escaping: they are copied in, not scanned."""
+    """Return a request as JSON. Data URLs (a megabyte per request) need no escaping, so they are inserted unscanned."""
     urls: list[str] = []
 
     def with_placeholder(part: dict) -> dict:
@@ -81,8 +80,8 @@ def encode_body(payload: dict) -> bytes:
         for message in payload["messages"]
     ]
     pieces = re.split(rb'"\\u0000(\d+)"', dump_json(payload | {"messages": messages}).encode())
-    for at in range(1, len(pieces), 2):
-        pieces[at] = b'"' + urls[int(pieces[at])].encode("ascii") + b'"'
+    for index in range(1, len(pieces), 2):  # every other piece is the number of a URL
+        pieces[index] = b'"' + urls[int(pieces[index])].encode("ascii") + b'"'
     return b"".join(pieces)
 
 
@@ -91,12 +90,20 @@ def encode_body(payload: dict) -> bytes:
 
 @dataclass(frozen=True)
 class Response:
-    """A server's response. body: cut at the size limit (`is_cut`). retry_after_s: None if not given in seconds."""
+    """A response of a server. is_cut: The body exceeds the size limit. retry_after_s: None unless given in seconds."""
 
     status: int
     body: bytes
     is_cut: bool = False
     retry_after_s: float | None = None
+
+
+class BadReply(Exception):
+    """A response with status 200 that holds no usable reply. is_error: It holds an error of the server instead."""
+
+    def __init__(self, problem: str, *, is_error: bool = False) -> None:
+        super().__init__(problem)
+        self.is_error = is_error
 
 
 def read_body(content: bytes) -> Any:
@@ -116,7 +123,7 @@ def read_body(content: bytes) -> Any:
 
 
 def _writable(value: Any) -> Any:
-    """Replace surrogates that no file can hold, in all texts of a JSON value."""
+    """Replace unpaired surrogates, which UTF-8 cannot encode, in all texts of a JSON value."""
     if isinstance(value, str):
         return value if value.isascii() else value.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
     if isinstance(value, dict):
@@ -139,28 +146,38 @@ def error_words(value: Any) -> str:
     return str(error.get("message", error) if isinstance(error, dict) else error)
 
 
-def read_completion(response: Response, structured: str) -> Reply | str:
-    """Return the reply in a response, or what is wrong with it. structured: as in `Reply`.
+def read_completion(response: Response, structured: str) -> Reply:
+    """Return the reply in a response, after checks of all types and sizes. structured: As in `Reply`.
 
-    Types and sizes are checked: a server is not trusted.
+    Raises:
+        BadReply: The response holds no reply.
     """
     value = _object(response)
     if value is None:
-        return "the body is not JSON"
+        raise BadReply("the body is not JSON")
     choices = value.get("choices")
     if not isinstance(choices, list) or not choices or not isinstance(choices[0], dict):
-        return f"{ERROR_INSTEAD}: {error_words(value)}" if value.get("error") else "no choices"
-    choice, finish_reason = choices[0], choices[0].get("finish_reason")
-    if choice.get("error") or finish_reason in ENDED:
-        return f"{ERROR_INSTEAD}: {error_words(choice) if choice.get('error') else finish_reason}"
+        if value.get("error"):
+            raise _error_instead(error_words(value))
+        raise BadReply("no choices")
+    choice = choices[0]
+    finish_reason = choice.get("finish_reason")
+    if choice.get("error"):
+        raise _error_instead(error_words(choice))
+    if finish_reason in ENDED:
+        raise _error_instead(finish_reason)
     text = _final_text(choice["message"] if isinstance(choice.get("message"), dict) else {})
     if text is None:
-        return "no text in the message"
+        raise BadReply("no text in the message")
     return Reply(text, _usage(value.get("usage")), structured, _name(finish_reason))
 
 
+def _error_instead(words: str) -> BadReply:
+    return BadReply(f"an error in place of an answer: {words}", is_error=True)
+
+
 def _name(value: Any) -> str | None:
-    """Return a printable name of bounded length, None if the value is none."""
+    """Return a value that is a printable name of bounded length, else None."""
     return value if isinstance(value, str) and value.isprintable() and 0 < len(value) <= MOST_NAME else None
 
 
@@ -193,7 +210,7 @@ def _usage(value: Any) -> Usage | None:
 
 def read_models(response: Response) -> list[dict[str, Any]] | None:
     """Return the entries of a list of models, each with a usable `id`; None if the response has no list."""
-    listed = (_object(response) or {}).get("data") if response.status == 200 else None
-    if not isinstance(listed, list):
+    entries = (_object(response) or {}).get("data") if response.status == 200 else None
+    if not isinstance(entries, list):
         return None
-    return [entry for entry in listed if isinstance(entry, dict) and _name(entry.get("id"))]
+    return [entry for entry in entries if isinstance(entry, dict) and _name(entry.get("id"))]

@@ -136,3 +136,12 @@ class Refusal:
     @property
     def may_pass(self) -> bool:
         return self.kind == "unknown" and (self.status in AWAY or self.status >= 500)
+
+
+class RefusedRequest(Exception):
+    """A request was refused. wait_s: How long the server asks to wait, if it does."""
+
+    def __init__(self, refusal: Refusal, wait_s: float | None) -> None:
+        super().__init__(refusal.summary)
+        self.refusal = refusal
+        self.wait_s = wait_s

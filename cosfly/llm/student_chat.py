@@ -1,4 +1,4 @@
-"""A student's chat: prompt, order of pictures and their pixels, the same in training, inference and serving."""
+"""The chat of a student: prompt, order of pictures and their pixels, identical in training, inference and serving."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from cosfly.runtime.json_io import FileFormat, read_model, write_model
 from cosfly.viz.frame_views import View, encode_picture, frame_label
 
 IMAGE_ENCODING: Literal["png"] = "png"
-IMAGE_PART: dict[str, Any] = {"type": "image"}  # a picture as chat templates know it
+IMAGE_PART: dict[str, Any] = {"type": "image"}  # a picture in the input of a chat template
 MAX_ANSWER_TOKENS = 512  # 1.5 times the longest answer in training
 
 
@@ -41,7 +41,7 @@ def chat_messages(prompt: Prompt, frames: Sequence[Sequence[dict[str, Any]]]) ->
     """Return the chat of a sample: system text, each frame's pictures after its name, question.
 
     Args:
-        frames: the picture parts of each frame, oldest first; a frame without pictures is not named.
+        frames: Picture parts of each frame, oldest first; a frame without pictures gets no label.
     """
     content: list[dict[str, Any]] = []
     for number, pictures in enumerate(frames):
@@ -52,14 +52,14 @@ def chat_messages(prompt: Prompt, frames: Sequence[Sequence[dict[str, Any]]]) ->
 
 
 class EncodedImage(NamedTuple):
-    """One picture of a request: its base64 data URL, and the sha256 of its bytes."""
+    """One picture of a request: its base64 data URL and the sha256 of its bytes."""
 
     url: str
     digest: str
 
 
 def picture_to_send(rgb: np.ndarray, max_pixels: int) -> EncodedImage:
-    """Encode a picture, (h, w, 3) uint8 RGB, without loss, scaled down to `max_pixels`; 0: not scaled."""
+    """Encode a picture, (h, w, 3) uint8 RGB, without loss, scaled down to `max_pixels`; 0 disables scaling."""
     height_px, width_px = rgb.shape[:2]
     scale = math.sqrt(max_pixels / (width_px * height_px))
     if max_pixels and scale < 1.0:
@@ -73,19 +73,20 @@ def picture_to_send(rgb: np.ndarray, max_pixels: int) -> EncodedImage:
 def student_request(
     prompt: Prompt, frames: Sequence[Sequence[EncodedImage]], schema: dict, sampling: EndpointConfig, seed: int = 0
 ) -> Request:
-    """Return a request to an engine. frames: the pictures of each frame, oldest first. schema: of the answer."""
-    parts = [[{"type": "image_url", "image_url": {"url": one.url}} for one in pictures] for pictures in frames]
+    """Return a request to an engine. frames: Pictures of each frame, oldest first. schema: That of the answer."""
+    parts = [[{"type": "image_url", "image_url": {"url": picture.url}} for picture in pictures] for pictures in frames]
     digests = [picture.digest for pictures in frames for picture in pictures]
     return sampling.request(chat_messages(prompt, parts), digests, schema, seed)
 
 
 # --- the chat format of training --------------------------------------------------------------------------------------
 
-CHAT_FORMAT_FILE, CHAT_FORMAT = "cosfly_student.json", FileFormat("cosfly.student", "1.0", "student")
+CHAT_FORMAT_FILE = "cosfly_student.json"
+CHAT_FORMAT = FileFormat("cosfly.student", "1.0", "student")
 
 
 class FrameFormat(BaseModel):
-    """The pictures of a frame: their views in order, width and height of each, and the far end of depth pictures."""
+    """The pictures of a frame: their views in order, width and height, and the largest depth in depth pictures."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -97,8 +98,8 @@ class FrameFormat(BaseModel):
 class ChatFormat(BaseModel):
     """`cosfly_student.json`, next to a student's weights: the form of its chats in training.
 
-    prompts: one question per language. num_frames: of a window. looks: picture formats of all training samples, sorted.
-    max_pixels: limit of its image processor.
+    prompts: One question per language. num_frames: Frames of a window. looks: Picture formats of all training samples,
+    sorted. max_pixels: Limit of the image processor.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -109,28 +110,32 @@ class ChatFormat(BaseModel):
     max_pixels: int = Field(ge=1)
 
 
-def write_chat_format(folder: Path, taught: ChatFormat) -> None:
+def write_chat_format(folder: Path, chat_format: ChatFormat) -> None:
     """Write `cosfly_student.json` into the folder of a student's weights."""
-    write_model(folder / CHAT_FORMAT_FILE, taught, CHAT_FORMAT)
+    write_model(folder / CHAT_FORMAT_FILE, chat_format, CHAT_FORMAT)
 
 
 def read_chat_format(folder: Path) -> ChatFormat:
     """Read `cosfly_student.json` from the folder of a student's weights or the output directory above it."""
-    place = _place_of(folder)
-    return read_model(place / CHAT_FORMAT_FILE, ChatFormat, CHAT_FORMAT, tree=place)
+    student = _student_folder(folder)
+    return read_model(student / CHAT_FORMAT_FILE, ChatFormat, CHAT_FORMAT, tree=student)
 
 
 def student_files(folder: Path) -> dict[str, Path]:
-    """Return the files that identify a student, chat format and weights, as inputs of a stage: name -> path."""
-    place = _place_of(folder)
-    return {f"student/{path.name}": path for path in (place / CHAT_FORMAT_FILE, *sorted(place.glob("*.safetensors")))}
+    """Return the files that identify a student, its chat format and weights, by name, as inputs of a stage."""
+    student = _student_folder(folder)
+    files = (student / CHAT_FORMAT_FILE, *sorted(student.glob("*.safetensors")))
+    return {f"student/{path.name}": path for path in files}
 
 
-def _place_of(folder: Path) -> Path:
-    places = [folder, folder / "adapter", folder / "model"]
-    place = next((place for place in places if (place / CHAT_FORMAT_FILE).is_file()), None)
-    if place is None:
-        what = f"the folder contains no {CHAT_FORMAT_FILE}, which describes the student's training"
-        expected, fix = "it in the folder, in adapter/ or in model/", "pass the output of cosfly distill train or merge"
-        raise InputError(what, where=folder, expected=expected, fix=fix)
-    return place
+def _student_folder(folder: Path) -> Path:
+    """Return the folder of a student's weights: a folder itself, or `adapter` or `model` in it."""
+    for candidate in (folder, folder / "adapter", folder / "model"):
+        if (candidate / CHAT_FORMAT_FILE).is_file():
+            return candidate
+    raise InputError(
+        f"the folder contains no {CHAT_FORMAT_FILE}, which describes the student's training",
+        where=folder,
+        expected="the file in the folder, in adapter/ or in model/",
+        fix="pass the output of cosfly distill train or merge",
+    )

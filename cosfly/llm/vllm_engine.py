@@ -50,10 +50,15 @@ class VllmEngine:
             num_images: most pictures of one request. settings: section of `vllm` and `endpoint`, for messages.
         """
         if not (folder / "config.json").is_file():
-            what, expected = "this is not a model folder", "a folder with config.json"
-            raise InputError(what, where=folder, expected=expected, fix="check --teacher")
-        self.folder, self.model, self.where = folder, folder.name, f"vllm:{folder}"
-        self.cfg, self.sampling, self.num_images, self.settings = cfg, sampling, num_images, settings
+            expected = "a folder with config.json"
+            raise InputError("this is not a model folder", where=folder, expected=expected, fix="check --teacher")
+        self.folder = folder
+        self.model = folder.name
+        self.where = f"vllm:{folder}"
+        self.cfg = cfg
+        self.sampling = sampling
+        self.num_images = num_images
+        self.settings = settings
         self._thread = ThreadPoolExecutor(1, "vllm")  # vLLM is called from one thread only
         self._new: queue.SimpleQueue[tuple[Request, Future[Reply]] | None] = queue.SimpleQueue()
         self._open: dict[str, Future[Reply]] = {}
@@ -85,27 +90,27 @@ class VllmEngine:
         if importlib.util.find_spec("vllm") is None:
             raise EnvironmentMissing("the vLLM engine is not installed", where=self.where, fix=INSTALL)
         os.environ.setdefault("VLLM_NO_USAGE_STATS", "1")  # no telemetry
-        place = "vllm.engine"
+        section = "vllm.engine"
         try:
             from vllm import LLM
 
-            place = "endpoint"
+            section = "endpoint"
             self.parameters(self.sampling.request([], [], {}, 0))
-            place = "vllm.engine"
+            section = "vllm.engine"
             return LLM(**self.arguments())
         except (ImportError, RuntimeError, TypeError, ValueError, OSError) as error:
-            if isinstance(error, TypeError) or (place == "endpoint" and isinstance(error, ValueError)):
-                what, where = f"vLLM refuses a setting of {place}", f"{self.settings}.{place}"
-                raise ConfigError(what, where=where, got=_one_line(error)) from None
-            what, got = "the vLLM engine does not start", _one_line(error)
-            raise EnvironmentMissing(what, where=self.where, got=got) from None
+            got = _one_line(error)
+            if isinstance(error, TypeError) or (section == "endpoint" and isinstance(error, ValueError)):
+                where = f"{self.settings}.{section}"
+                raise ConfigError(f"vLLM refuses a setting of {section}", where=where, got=got) from None
+            raise EnvironmentMissing("the vLLM engine does not start", where=self.where, got=got) from None
 
     def arguments(self) -> dict[str, Any]:
         """Return the keyword arguments of `vllm.LLM`."""
         length = {} if self.cfg.max_model_len is None else {"max_model_len": self.cfg.max_model_len}
         return {
             "model": str(self.folder),
-            "limit_mm_per_prompt": {"image": self.num_images, "video": 0},  # else memory is reserved for a video
+            "limit_mm_per_prompt": {"image": self.num_images, "video": 0},  # otherwise it reserves memory for a video
             "gpu_memory_utilization": 0.9,
             # Free whitespace lets a model pad without end and slows decoding several times. vLLM forbids it only for a
             # named backend; "auto" is refused.
@@ -130,19 +135,19 @@ class VllmEngine:
                 self._add_new(llm)
                 if self._open and not self._is_closing:
                     self._step(llm)
-            except Exception as error:  # else those who wait would wait forever
+            except Exception as error:  # otherwise open requests would wait forever
                 self._break(error)
 
     def _add_new(self, llm: Any) -> None:
         """Add new requests to vLLM; wait for one if there is nothing else to do."""
         for number in range(min(ADDED_PER_STEP, self.cfg.batch - len(self._open))):
             try:
-                found = self._new.get(block=not (self._open or number))
+                entry = self._new.get(block=not (self._open or number))
             except queue.Empty:
                 return
-            if found is None:
+            if entry is None:  # the engine closes
                 return
-            request, answered = found
+            request, answered = entry
             if answered.set_running_or_notify_cancel():
                 self._add(llm, request, answered)
 
@@ -150,31 +155,32 @@ class VllmEngine:
         if self._broken is not None:
             answered.set_exception(self._broken)
             return
-        more = {"use_tqdm": False, "chat_template_kwargs": request.sampling.get("chat_template_kwargs")}
+        options = {"use_tqdm": False, "chat_template_kwargs": request.sampling.get("chat_template_kwargs")}
         try:
-            [name] = llm.enqueue_chat([request.messages], [self.parameters(request)], **more)
+            [name] = llm.enqueue_chat([request.messages], [self.parameters(request)], **options)
             self._open[str(name).partition("-")[0]] = answered  # vLLM adds a random suffix that outputs lack
-        except (ValueError, RuntimeError) as error:  # of a prompt that vLLM cannot process
+        except (ValueError, RuntimeError) as error:  # vLLM cannot process the prompt
             answered.set_exception(NoAnswer("engine", _one_line(error), is_final=True))
-        except Exception as error:  # its process has ended, or a bug: no request will be answered
+        except Exception as error:  # the process of vLLM has ended, or a bug: no request will be answered
             self._break(error, answered)
 
     def _step(self, llm: Any) -> None:
         structured = "json_schema" if self.sampling.json_schema else "plain"
         for output in [output for output in llm.llm_engine.step() if output.finished]:
-            answered, completion = self._open.pop(output.request_id), output.outputs[0]
-            num_prompt, num_completion = len(output.prompt_token_ids or ()), len(completion.token_ids)
-            usage = Usage(prompt_tokens=num_prompt, completion_tokens=num_completion)
+            answered = self._open.pop(output.request_id)
+            completion = output.outputs[0]
+            num_prompt = len(output.prompt_token_ids or ())
+            usage = Usage(prompt_tokens=num_prompt, completion_tokens=len(completion.token_ids))
             if completion.finish_reason in FINISHED:
                 answered.set_result(Reply(completion.text, usage, structured, completion.finish_reason))
             else:
                 answered.set_exception(NoAnswer("engine", f"it ended with {completion.finish_reason!r}"))
 
-    def _break(self, error: Exception, *more: Future[Reply]) -> None:
+    def _break(self, error: Exception, *unopened: Future[Reply]) -> None:
         got = f"{type(error).__name__}: {_one_line(error)}"
-        fix = "read its messages above, then run the same command again: recorded answers are reused"
+        fix = "read the messages of vLLM above, then run the same command again: recorded answers are reused"
         self._broken = TeacherError("the vLLM engine failed", where=self.where, got=got, fix=fix)
-        for answered in (*more, *self._open.values()):
+        for answered in (*unopened, *self._open.values()):
             answered.set_exception(self._broken)
         self._open.clear()
 

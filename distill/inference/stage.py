@@ -16,8 +16,8 @@ from pydantic import Field
 from cosfly.formats.predictions import PREDICTIONS, Split
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.answers import Answer, AnswerBook, KeptAnswers, answer_key
-from cosfly.llm.client import STOP_AFTER_FAILURES, ChatClient
-from cosfly.llm.contract import Engine, NoAnswer, Request, started
+from cosfly.llm.client import ChatClient
+from cosfly.llm.contract import STOP_AFTER_FAILURES, Engine, NoAnswer, Request, started
 from cosfly.llm.student_chat import (
     CHAT_FORMAT_FILE,
     StudentEndpointConfig,
