@@ -5,8 +5,8 @@
         trajectory.json
         frames_playback/frame_00000/{rgb.png, depth_float32.png or depth.npy, instance.png, meta.json}
 
-Axes inside the tree are CARLA's (left-handed). They are converted here and, for `meta.json`, in frames.py; everything
-else sees the right-handed frame. Unknown keys are kept in `Track.raw` and survive a read-write round trip.
+Axes inside the tree are CARLA's (left-handed). This module converts them, and frames.py those of `meta.json`; all other
+code uses right-handed axes. Unknown keys are kept in `Track.raw` and survive a read-write round trip.
 """
 
 from __future__ import annotations
@@ -46,33 +46,35 @@ from cosfly.runtime.json_io import MISSING, read_object, validated, write_json
 Value = TypeVar("Value")
 
 SCHEMA, SCHEMA_VERSION = "drone_nav_traj_v7", "7.0.0"
-WAYPOINT_TOLERANCE_M = 1e-5  # the public readers' own bound on nav_waypoint.t1_world
+WAYPOINT_TOLERANCE_M = 1e-5  # the bound of the public readers on nav_waypoint.t1_world
+STEP_TOLERANCE_S = 1e-3  # largest difference between a time step and the median step
 BBOX = ("xmin", "ymin", "xmax", "ymax")
 ORIGINAL = "ORI"  # the folder of a clean track
-TARGET_FILE = "target.png"  # of a track: the target, cut out of the frame of its goal
+TARGET_FILE = "target.png"  # in a track's folder: the target, cut out of the frame of the goal
 TREE_ACTION = ("forward_mps", "right_mps", "up_mps", "yaw_rate_degps", "gimbal_pitch_deg")  # motion.ACTION, mirrored
-LEGIBILITY = ("height_px", "contrast", "legible")  # of a point's target: cosfly/render/camera.py
-EVENTS = ("position", "rotation")  # of a frame of a perturbed track; their outcomes: docs/files.md
-# Frames of a perturbed track by what was applied, with the shares of the paper, where each event has a probability of
-# 0.6 (tab:augmentation_states).
+TREE_ACTION_SIGNS = np.array([1.0, -1.0, 1.0, -1.0, 1.0])  # left to right, counter-clockwise to clockwise
+LEGIBILITY = ("height_px", "contrast", "legible")  # fields of a point's target, measured in cosfly/render/camera.py
+EVENTS = ("position", "rotation")  # events of a perturbed frame; docs/files.md lists their outcomes
+# States of the frames of a perturbed track, and the shares of the paper. Each event has a probability of 0.6
+# (tab:augmentation_states). Index: 1 if the position is perturbed, plus 2 if the rotation is.
 STATES = {"unperturbed": 0.16, "position only": 0.24, "rotation only": 0.24, "full": 0.36}
-DATASET_FORMAT = "cosfly_playback"  # of the tracks that cosfly makes
-# Names that the record of presets may use: the paper names it, no public file shows it.
+DATASET_FORMAT = "cosfly_playback"  # marks tracks that cosfly made
+# Keys under which a file may store the names of weather presets: the paper names none, and no public file has any.
 WEATHER_KEYS = {
     "weather": ("weather_name", "weather", "preset", "name"),
     "time_of_day": ("tod_name", "time_of_day", "tod"),
 }
-# A heading is the way from so many frames before to so many after; who moves less stands.
-HEADING_FRAMES, STANDS_M = 2, 0.1
+HEADING_FRAMES = 2  # a heading points from the position this many frames before to that as many frames after
+STANDS_M = 0.1  # a target that moves less between these two stands
 
 
 @dataclass(frozen=True)
 class TargetRecord:
-    """What the frames of a track show of its target, n frames; NaN where null or unknown.
+    """The target in the n frames of a track; values that are null or unknown are NaN.
 
     in_view, visible: (n,) bool, `visible` accounts for occlusion. depth_m: (n,) z-depth. uv: (n, 2) px. bbox: (n, 4)
     xmin, ymin, xmax, ymax px of the projected 3D box. visibility: (n,) rendered score in [0, 1]. mask_bbox: (n, 4) of
-    the target's pixels; legible: (n,) bool; both None where the file has no such field.
+    the target's pixels. legible: (n,) bool. The last two are None if the file has no such field.
     """
 
     in_view: np.ndarray
@@ -87,8 +89,11 @@ class TargetRecord:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """What was applied to each of n frames: zero where nothing, NaN where the file does not say (public files only say
-    that there was something). is_perturbed: (n,) bool. drone_m, rotation_deg, target_m: (n, 3)."""
+    """The offsets that were applied to each of n frames.
+
+    is_perturbed: (n,) bool. drone_m, rotation_deg, target_m: (n, 3), zero if nothing was applied, NaN if unknown:
+    public files store only that there was an offset.
+    """
 
     is_perturbed: np.ndarray
     drone_m: np.ndarray
@@ -101,11 +106,12 @@ class Track:
     """One `trajectory.json`, n points, in right-handed axes: poses, times, target and camera, and optional records.
 
     time_s: (n,) strictly increasing. positions_m: (n, 3). rotations_deg: (n, 3) pitch, yaw, roll of the camera.
-    targets_m: (n, 3) hip of the target, NaN where the file has none. intrinsics: (n, 3, 3) of a camera that zooms, None
-    where `camera` is that of all frames; use `camera_at`. segments, mission: as planned. between: (n, k - 1, 6) planned
-    poses after each frame, of a trajectory planned at k times the rate of its frames; NaN after the last. people: what
-    they look like. goal: whom to follow. bystanders: (n, 5), frames.BYSTANDER_COLUMNS. These are None where the file
-    does not say.
+    targets_m: (n, 3) hip of the target, NaN if the file has none. segments, mission: As planned.
+
+    Optional fields, None if the file has none. intrinsics: (n, 3, 3) of a camera that zooms; otherwise `camera` is that
+    of all frames (`camera_at` covers both). between: (n, k - 1, 6) planned poses after each frame, of a trajectory
+    planned at k times the frame rate; NaN after the last frame. people: Their appearance. goal: The description of the
+    target. bystanders: (n, 5), frames.BYSTANDER_COLUMNS.
     """
 
     town: str
@@ -122,8 +128,8 @@ class Track:
     is_original: bool = True
     folder: Path | None = None
     raw: dict = field(default_factory=dict)
-    issues: tuple[str, ...] = ()  # what a tolerant reader accepted
-    run: str = ""  # where tracks of several runs are put together
+    issues: tuple[str, ...] = ()  # deviations that a tolerant reader accepted
+    run: str = ""  # set if tracks of several runs are combined
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
     intrinsics: np.ndarray | None = None
@@ -131,14 +137,14 @@ class Track:
     people: People | None = None
     goal: Goal | None = None
     bystanders: np.ndarray | None = None
-    given_id: str | None = None  # where tracks of several towns or runs share the plain one (places.py)
+    given_id: str | None = None  # set if the plain id is not unique among several towns or runs (places.py)
 
     def __len__(self) -> int:
         return len(self.time_s)
 
     @property
     def flight_id(self) -> str:
-        """`trajectory_1776047127_ORI`, the stem of its sample ids."""
+        """The id of the track, such as `trajectory_1776047127_ORI`, with which its sample ids begin."""
         return self.given_id or f"{self.trajectory}_{self.variant}"
 
     def camera_at(self, index: int) -> Camera:
@@ -147,8 +153,9 @@ class Track:
 
     @property
     def fovs_deg(self) -> tuple[float, float]:
-        """Least and greatest field of view."""
-        fovs = [self.camera_at(i).fov_deg for i in range(len(self) if self.intrinsics is not None else 1)]
+        """Smallest and largest field of view, degrees."""
+        num_cameras = 1 if self.intrinsics is None else len(self)
+        fovs = [self.camera_at(i).fov_deg for i in range(num_cameras)]
         return min(fovs), max(fovs)
 
     @cached_property
@@ -161,7 +168,7 @@ class Track:
 
     @property
     def keeps_sight(self) -> np.ndarray:
-        """Whether each frame is judged by how much it sees of the target, (n,) bool."""
+        """Whether the visibility of the target counts in each frame, (n,) bool."""
         keeps = np.ones(len(self), dtype=bool)
         for part in self.segments:
             keeps[part.begin : part.end] = part.keeps_sight
@@ -169,22 +176,23 @@ class Track:
 
     @cached_property
     def target_headings_deg(self) -> np.ndarray:
-        """Heading of the target, (n,) counter-clockwise from east; NaN before its first step and where unknown."""
+        """Heading of the target, (n,) counter-clockwise from east; NaN before its first step or if unknown."""
         frames = np.arange(len(self))
-        ahead, behind = np.minimum(frames + HEADING_FRAMES, len(self) - 1), np.maximum(frames - HEADING_FRAMES, 0)
+        ahead = np.minimum(frames + HEADING_FRAMES, len(self) - 1)
+        behind = np.maximum(frames - HEADING_FRAMES, 0)
         steps = self.targets_m[ahead, :2] - self.targets_m[behind, :2]
         moves = np.linalg.norm(np.nan_to_num(steps), axis=1) >= STANDS_M
-        last = np.maximum.accumulate(np.where(moves, frames, -1))  # who stands keeps the last direction
+        last = np.maximum.accumulate(np.where(moves, frames, -1))  # a standing target keeps the last heading
         return np.where(last >= 0, np.degrees(np.arctan2(steps[:, 1], steps[:, 0]))[last], np.nan)
 
     @property
     def walked_m(self) -> np.ndarray:
-        """Target positions without perturbation, (n, 3); NaN where unknown."""
+        """Target positions without perturbation, (n, 3); NaN if unknown."""
         return self.targets_m - self.perturbation.target_m
 
     @cached_property
     def planned(self) -> tuple[np.ndarray, np.ndarray]:
-        """Poses (n, 6) and target positions (n, 3) without perturbation; NaN where unknown."""
+        """Poses (n, 6) and target positions (n, 3) without perturbation; NaN if unknown."""
         poses = np.hstack([self.positions_m, self.rotations_deg])
         if self.is_original:
             return poses, self.targets_m
@@ -204,17 +212,17 @@ class Track:
 
     @property
     def weather(self) -> dict[str, str | None]:
-        """Names of the presets of weather and time of day; None where the file has none."""
-        word = self.raw.get("weather")
-        found = {"weather": word} if isinstance(word, str) else object_of(self.raw, "weather")
-        given = {name: value for name, value in found.items() if isinstance(value, str)}
+        """Names of the presets of weather and time of day; None if the file has none."""
+        value = self.raw.get("weather")
+        record = {"weather": value} if isinstance(value, str) else object_of(self.raw, "weather")
+        texts = {key: text for key, text in record.items() if isinstance(text, str)}
         return {
-            own: next((given[name] for name in names if name in given), None) for own, names in WEATHER_KEYS.items()
+            preset: next((texts[key] for key in keys if key in texts), None) for preset, keys in WEATHER_KEYS.items()
         }
 
     @cached_property
     def weather_record(self) -> WeatherRecord | None:
-        """The whole record of weather; None where the file has none in the paper's form."""
+        """The complete weather record; None if the file has none in the paper's form."""
         try:
             return WeatherRecord.model_validate(self.raw.get("weather"))
         except ValidationError:
@@ -225,33 +233,39 @@ class Track:
         return object_of(points[index], key) if index < len(points) else {}
 
     def legibility_at(self, index: int) -> dict[str, float | bool | None]:
-        """Return the LEGIBILITY fields of a point; None where the file does not say."""
-        point = self._point(index, "target")
-        return {name: v if isinstance(v := point.get(name), bool) or is_number(v) else None for name in LEGIBILITY}
+        """Return the LEGIBILITY fields of a point; None for a field that is missing or invalid."""
+        target = self._point(index, "target")
+        values = {name: target.get(name) for name in LEGIBILITY}
+        return {name: value if isinstance(value, bool) or is_number(value) else None for name, value in values.items()}
 
     def events(self, index: int) -> dict[str, str] | None:
-        """Return the outcome of a point's EVENTS (none, applied, fallback); None where the file does not say."""
-        point = self._point(index, "perturbation")
-        return {event: point[event] for event in EVENTS} if all(isinstance(point.get(e), str) for e in EVENTS) else None
+        """Return the outcome of a point's EVENTS (none, applied, fallback); None if the file does not store them."""
+        perturbation = self._point(index, "perturbation")
+        if not all(isinstance(perturbation.get(event), str) for event in EVENTS):
+            return None
+        return {event: perturbation[event] for event in EVENTS}
 
     @cached_property
     def states(self) -> list[str | None]:
-        """Which of STATES each frame is in, after fallbacks; None where the file does not say."""
-        shifts, found = self.perturbation, list[str | None]()
+        """State of each frame after fallbacks, one of STATES; None if unknown."""
+        offsets = self.perturbation
+        names = list(STATES)
+        states = list[str | None]()
         for i in range(len(self)):
             point = self._point(i, "perturbation")
-            shifted = _was_moved(np.stack([shifts.drone_m[i], shifts.target_m[i]]), point.get("drone_position"))
-            turned = _was_moved(shifts.rotation_deg[i : i + 1], point.get("drone_rotation"))
-            found.append(None if shifted is None or turned is None else list(STATES)[shifted + 2 * turned])
-        return found
+            positions = np.stack([offsets.drone_m[i], offsets.target_m[i]])
+            is_shifted = _was_moved(positions, point.get("drone_position"))
+            is_turned = _was_moved(offsets.rotation_deg[i : i + 1], point.get("drone_rotation"))
+            states.append(None if is_shifted is None or is_turned is None else names[is_shifted + 2 * is_turned])
+        return states
 
     @property
     def is_ours(self) -> bool:
-        """Whether cosfly made it."""
+        """Whether cosfly made the track."""
         return self.raw.get("dataset_format") == DATASET_FORMAT
 
     def target_picture(self, index: int) -> dict[str, str | bytes] | None:
-        """Return the picture of the target and its name, at the frame of the goal only."""
+        """Return the picture of the target and its name; None for other frames than that of the goal."""
         path = None if self.folder is None else self.folder / TARGET_FILE
         if self.goal is None or self.goal.frame != index or path is None or not path.is_file():
             return None
@@ -263,13 +277,13 @@ class Track:
         return self.folder / frame_name(index)
 
     def missing_frames(self, names: tuple[str, ...] = FRAME_FILES) -> list[int]:
-        """Return the points that lack one of the files, by their names in the public layout."""
+        """Return the indices of the points that lack one of the files, named as in the public layout."""
         folders = [self.frame_folder(i) for i in range(len(self))]
         return [i for i, folder in enumerate(folders) if not all(frame_path(folder, name).is_file() for name in names)]
 
 
 def _was_moved(offsets: np.ndarray, flag: object) -> bool | None:
-    """Return whether any offset is not zero; where they are unknown, the file's flag; None without one."""
+    """Return whether any offset (k, 3) is not zero; if unknown, the flag in the file, or None without a flag."""
     is_known = ~np.isnan(offsets).any(axis=1)
     if (offsets[is_known] != 0).any() or is_known.all():
         return bool((offsets[is_known] != 0).any())
@@ -283,10 +297,10 @@ def read_track(folder: Path, *, strict: bool = True) -> Track:
     """Read one track's folder.
 
     Args:
-        strict: every rule of the layout must hold. Otherwise older names and missing optional fields are accepted and
-            listed in `Track.issues`; poses and times must be there and finite either way.
+        strict: True requires every rule of the layout. False accepts older names and missing optional fields and lists
+            them in `Track.issues`. Poses and times must be finite in both cases.
     Raises:
-        InputError: names the file, the point and the field.
+        InputError: The message names the file, the point and the field.
     """
     path = folder / "trajectory.json"
     raw = read_object(path, what="trajectory", tree=tree_of_track(folder))
@@ -296,34 +310,53 @@ def read_track(folder: Path, *, strict: bool = True) -> Track:
         reader.equal(name, raw.get(name), expected)
     points = reader.points(raw)
     time_s, poses = reader.times(points), mirror_poses(reader.poses(points))
-    targets, others = ([object_of(p, name) for p in points] for name in ("target", "others"))
-    if not all(target or p.get("target", "missing") is None for target, p in zip(targets, points, strict=True)):
-        reader.issue("points[].target", "missing", "an object, or null where there is nobody")
+    targets = [object_of(point, "target") for point in points]
+    others = [object_of(point, "others") for point in points]
+    if not all(target or point.get("target", "missing") is None for target, point in zip(targets, points, strict=True)):
+        reader.issue("points[].target", "missing", "an object, or null without a target")
     bystanders = np.column_stack([_numbers_of(others, name) for name in BYSTANDER_COLUMNS])
     segments, mission = reader.optional(lambda: read_flown(raw, len(points), str(path))) or ((), None)
-    people = reader.optional(lambda: validated(People, raw["people"], f"{path}: people")) if "people" in raw else None
-    has_goal = raw.get("goal") is not None and "absent" not in object_of(raw, "goal")
-    goal = reader.optional(lambda: read_goal(raw["goal"], len(points), f"{path}: goal")) if has_goal else None
-    if {"params", "mode"} & object_of(raw, "weather").keys():  # public files may use the name for something else
+    people = goal = None
+    if "people" in raw:
+        people = reader.optional(lambda: validated(People, raw["people"], f"{path}: people"))
+    if raw.get("goal") is not None and "absent" not in object_of(raw, "goal"):
+        goal = reader.optional(lambda: read_goal(raw["goal"], len(points), f"{path}: goal"))
+    if {"params", "mode"} & object_of(raw, "weather").keys():  # public files may use this key otherwise
         reader.optional(lambda: validated(WeatherRecord, raw["weather"], f"{path}: weather"))
     is_original = bool(object_of(raw, "augmentation").get("is_original", variant == ORIGINAL))
     camera = reader.camera(raw.get("camera"))
-    intrinsics, between = reader.intrinsics(points, camera), reader.between(points)
     return Track(
-        town, trajectory, variant, camera, time_s, poses[:, :3], poses[:, 3:],
-        mirror_poses(_vectors_of(targets, "world_location", XYZ)), _target_view(targets),
-        _perturbation(points, is_original), source=object_of(raw, "source"), is_original=is_original, folder=folder,
-        raw=raw, issues=tuple(reader.issues), segments=segments, mission=mirrored(mission),
-        intrinsics=intrinsics, between=between, people=people, goal=goal,
+        town=town,
+        trajectory=trajectory,
+        variant=variant,
+        camera=camera,
+        time_s=time_s,
+        positions_m=poses[:, :3],
+        rotations_deg=poses[:, 3:],
+        targets_m=mirror_poses(_vectors_of(targets, "world_location", XYZ)),
+        target=_target_view(targets),
+        perturbation=_perturbation(points, is_original),
+        source=object_of(raw, "source"),
+        is_original=is_original,
+        folder=folder,
+        raw=raw,
+        segments=segments,
+        mission=mirrored(mission),
+        intrinsics=reader.intrinsics(points, camera),
+        between=reader.between(points),
+        people=people,
+        goal=goal,
         bystanders=None if np.isnan(bystanders[:, 0]).any() else bystanders,
-    )  # fmt: skip
+        issues=tuple(reader.issues),  # last: the calls above add to it
+    )
 
 
 class _FieldReader:
-    """Checks fields of one file: strict raises, tolerant notes."""
+    """Reads and checks the fields of one file. A deviation raises if `strict`; otherwise `issues` records it."""
 
     def __init__(self, path: Path, strict: bool) -> None:
-        self.path, self.strict = path, strict
+        self.path = path
+        self.strict = strict
         self.issues: list[str] = []
 
     def error(self, message: str, where: str, got: object, expected: str) -> InputError:
@@ -340,7 +373,7 @@ class _FieldReader:
         self.note(self.error("breaks the layout", where, got, expected))
 
     def optional(self, read: Callable[[], Value]) -> Value | None:
-        """Return an optional field; None, with a note, where it holds something else of this name."""
+        """Return an optional field; record an issue and return None if its content is invalid."""
         try:
             return read()
         except InputError as error:
@@ -367,13 +400,14 @@ class _FieldReader:
             where = f"points[{int(np.argmax(steps <= 0)) + 1}].timing.trace_timestamp"
             raise self.error("time does not increase", where, float(steps.min()), "strictly increasing times")
         dt_s = step_s(time_s)
-        if len(steps) and np.abs(steps - dt_s).max() > 1e-3:
+        if len(steps) and np.abs(steps - dt_s).max() > STEP_TOLERANCE_S:
             got = f"steps of {steps.min():.3f} to {steps.max():.3f} s"
             self.issue("points[].timing.trace_timestamp", got, f"even steps, most are {dt_s:g} s")
         return time_s
 
     def time(self, i: int, point: dict) -> float:
-        timing, where = object_of(point, "timing"), f"points[{i}].timing"
+        timing = object_of(point, "timing")
+        where = f"points[{i}].timing"
         if self.strict or "trace_timestamp" in timing:
             return self.number(where, timing, "trace_timestamp")
         return self.number(where, timing if "timestamp" in timing else point, "timestamp")
@@ -392,58 +426,67 @@ class _FieldReader:
         poses = np.array([[self.number(where, group, name) for name in POSE] for where, group in groups])
         for i, point in enumerate(points):
             nav = point.get("nav_waypoint")
-            found = nav.get("t1_world") if isinstance(nav, dict) else "missing"
-            expected, is_right = "null at the last point", found is None
+            waypoint = nav.get("t1_world") if isinstance(nav, dict) else "missing"
             if i + 1 < len(points):
-                following = poses[i + 1, :3]
-                expected = f"the next point's position {following.tolist()}"
-                is_right = bool((np.abs(np.subtract(_parts_of(found, XYZ), following)) <= WAYPOINT_TOLERANCE_M).all())
+                next_m = poses[i + 1, :3]
+                expected = f"the next point's position {next_m.tolist()}"
+                distances_m = np.abs(np.subtract(_parts_of(waypoint, XYZ), next_m))
+                is_right = bool((distances_m <= WAYPOINT_TOLERANCE_M).all())
+            else:
+                expected = "null at the last point"
+                is_right = waypoint is None
             if not is_right:
-                self.issue(f"points[{i}].nav_waypoint.t1_world", repr(found)[:60], expected)
-                break  # one note is enough
+                self.issue(f"points[{i}].nav_waypoint.t1_world", repr(waypoint)[:60], expected)
+                break  # one issue per file
         return poses
 
     def between(self, points: list[dict]) -> np.ndarray | None:
-        """Read planned poses after each point and before the next, (n, k - 1, 6), NaN after the last; None without."""
+        """Read the planned poses between points, (n, k - 1, 6), NaN after the last point; None if there are none."""
         if len(points) < 2 or not any(point.get("between") for point in points):
             return None
-        found = numbers([point.get("between") for point in points[:-1]], None, None, len(POSE))
-        if found is None:
-            self.issue("points[].between", "something else", "as many poses of 6 finite numbers after each point")
+        poses = numbers([point.get("between") for point in points[:-1]], None, None, len(POSE))
+        if poses is None:
+            self.issue("points[].between", "something else", "equally many poses of 6 finite numbers at each point")
             return None
-        return np.concatenate([mirror_poses(found), np.full((1, *found.shape[1:]), np.nan)])
+        return np.concatenate([mirror_poses(poses), np.full((1, *poses.shape[1:]), np.nan)])
 
     def camera(self, group: Any) -> Camera:
         if not isinstance(group, dict):
             raise InputError("missing", where=f"{self.path}: camera", expected="width, height, intrinsic")
-        width, height = self.number("camera", group, "width"), self.number("camera", group, "height")
+        width = self.number("camera", group, "width")
+        height = self.number("camera", group, "height")
         matrix = numbers(group.get("intrinsic"), 3, 3)
         if matrix is None or matrix[0, 0] <= 0 or width < 1 or height < 1:
-            got, expected = repr(group.get("intrinsic"))[:60], "a 3x3 matrix with a positive focal length"
+            got = repr(group.get("intrinsic"))[:60]
+            expected = "a 3x3 matrix with a positive focal length"
             raise self.error("not a camera", "camera.intrinsic", got, expected)
         check_pixels(width * height, f"{self.path}: camera", f"{width:g} x {height:g} px")
         return Camera(int(width), int(height), matrix)
 
     def intrinsics(self, points: list[dict], camera: Camera) -> np.ndarray | None:
-        """Read matrices of the frames, (n, 3, 3); None where `camera` is that of all."""
-        found, size = [camera.intrinsic] * len(points), {"width": camera.width_px, "height": camera.height_px}
-        for i, own in enumerate(object_of(point, "camera").get("intrinsic") for point in points):
+        """Read the matrix of each frame, (n, 3, 3); None if all are that of `camera`."""
+        matrices = [camera.intrinsic] * len(points)
+        size = {"width": camera.width_px, "height": camera.height_px}
+        for i, point in enumerate(points):
+            value = object_of(point, "camera").get("intrinsic")
+            if value is None:
+                continue
             try:
-                found[i] = camera.intrinsic if own is None else self.camera({**size, "intrinsic": own}).intrinsic
+                matrices[i] = self.camera({**size, "intrinsic": value}).intrinsic
             except InputError as error:
                 self.issue(f"points[{i}].camera.intrinsic", error.got, error.expected or "a camera")
-        return None if (np.array(found) == camera.intrinsic).all() else np.array(found)
+        return None if (np.array(matrices) == camera.intrinsic).all() else np.array(matrices)
 
 
 def object_of(group: dict, key: str) -> dict:
-    """Return the object under a key; an empty one where there is none, or something else."""
+    """Return the object under a key; an empty one for anything else."""
     value = group.get(key)
     return value if isinstance(value, dict) else {}
 
 
 def _parts_of(value: Any, names: tuple[str, ...]) -> list:
     """Return the numbers of {"x": .., "y": ..} or [.., ..]; NaN for anything else, nulls included."""
-    parts = [value.get(n) for n in names] if isinstance(value, dict) else value
+    parts = [value.get(name) for name in names] if isinstance(value, dict) else value
     if isinstance(parts, list) and len(parts) == len(names) and all(map(is_number, parts)):
         return parts
     return [np.nan] * len(names)
@@ -475,16 +518,20 @@ def _target_view(targets: list[dict]) -> TargetRecord:
 
 
 def _perturbation(points: list[dict], is_original: bool) -> Perturbation:
-    groups, told = ([object_of(p, "perturbation") for p in points], [p.get("is_perturbed") for p in points])
+    groups = [object_of(point, "perturbation") for point in points]
+    flags = [point.get("is_perturbed") for point in points]
 
     def offsets(key: str, names: tuple[str, ...]) -> np.ndarray:
-        found = mirror_poses(_vectors_of(groups, key, names))
-        is_none = [is_original or p is False or g.get(key) is False for p, g in zip(told, groups, strict=True)]
-        found[np.isnan(found).any(axis=1) & np.array(is_none)] = 0.0
-        return found
+        """Read the offsets under a key, (n, 3); zero if the file has none and states that nothing was applied."""
+        vectors = mirror_poses(_vectors_of(groups, key, names))
+        is_zero = [
+            is_original or flag is False or group.get(key) is False for flag, group in zip(flags, groups, strict=True)
+        ]
+        vectors[np.isnan(vectors).any(axis=1) & np.array(is_zero)] = 0.0
+        return vectors
 
     return Perturbation(
-        is_perturbed=np.array([bool(one) for one in told]),
+        is_perturbed=np.array([bool(flag) for flag in flags]),
         drone_m=offsets("drone_position", XYZ),
         rotation_deg=offsets("drone_rotation", ANGLES),
         target_m=offsets("target_position", XYZ),
@@ -495,11 +542,13 @@ def _perturbation(points: list[dict], is_original: bool) -> Perturbation:
 
 
 def write_track(folder: Path, track: Track) -> None:
-    """Write `trajectory.json` into a folder. Unknown keys of `track.raw` are kept, known ones set from the arrays."""
+    """Write `trajectory.json` into a folder. Unknown keys of `track.raw` are kept, known ones follow the arrays."""
     raw = copy.deepcopy(track.raw)
     points = raw.pop("points", None) or raw.pop("waypoints", None) or [{} for _ in range(len(track))]
     assert len(points) == len(track), "raw points and columns differ in number"
-    camera, target, perturbation = track.camera, track.target, track.perturbation
+    camera = track.camera
+    target = track.target
+    perturbation = track.perturbation
     raw |= {
         "schema": SCHEMA, "schema_version": SCHEMA_VERSION, "trace_dir": track.variant,
         "dataset_format": raw.get("dataset_format", DATASET_FORMAT), "frames_dir": raw.get("frames_dir", FRAMES_DIR),
@@ -512,6 +561,7 @@ def write_track(folder: Path, track: Track) -> None:
         | object_of(raw, "augmentation") | {"is_original": track.is_original},
     }  # fmt: skip
     poses = mirror_poses(np.hstack([track.positions_m, track.rotations_deg])) + 0.0
+    # Group and key in a point, names of the components, values by point.
     vectors: list[tuple[str, str, tuple[str, ...], np.ndarray | None]] = [
         ("target", "world_location", XYZ, mirror_poses(track.targets_m)),
         ("target", "image_uv", (), target.uv),
@@ -522,14 +572,15 @@ def write_track(folder: Path, track: Track) -> None:
         ("target", "mask_bbox_2d", BBOX, target.mask_bbox),
     ]
     for i, point in enumerate(points):
-        time_s, is_last = float(track.time_s[i]), i + 1 == len(points)
-        following = None if is_last else dict(zip(XYZ, poses[i + 1, :3].tolist(), strict=True))
+        time_s = float(track.time_s[i])
+        is_last = i + 1 == len(points)
+        waypoint = None if is_last else dict(zip(XYZ, poses[i + 1, :3].tolist(), strict=True))
         point |= {
             "index": i,
             "is_perturbed": bool(perturbation.is_perturbed[i]),
             "timing": {"sim_timestamp": time_s, **object_of(point, "timing"), "trace_timestamp": time_s},
             "drone_pose": {**object_of(point, "drone_pose"), **dict(zip(POSE, poses[i].tolist(), strict=True))},
-            "nav_waypoint": {**object_of(point, "nav_waypoint"), "t1_world": following},
+            "nav_waypoint": {**object_of(point, "nav_waypoint"), "t1_world": waypoint},
             "perturbation": object_of(point, "perturbation"),
             "action": _tree_action(track.motion.action[i]),
         }
@@ -537,34 +588,47 @@ def write_track(folder: Path, track: Track) -> None:
             point["between"] = None if is_last else (mirror_poses(track.between[i]) + 0.0).tolist()
         if track.intrinsics is not None:
             point["camera"] = {**object_of(point, "camera"), **track.camera_at(i).focal_record()}
-        is_nobody = "target" in point and point["target"] is None and np.isnan(track.targets_m[i]).all()
-        if not is_nobody:
+        has_no_target = "target" in point and point["target"] is None and np.isnan(track.targets_m[i]).all()
+        if not has_no_target:
             point["target"] = _target(object_of(point, "target"), target, i)
         for group, key, names, values in vectors:
-            if values is not None and not (is_nobody and group == "target"):
+            if values is not None and not (has_no_target and group == "target"):
                 _put_vector(point[group], key, names, values[i])
     write_json(folder / "trajectory.json", raw | {"points": points})
 
 
 def _tree_action(action: np.ndarray) -> dict[str, float] | None:
-    """Return an action in the tree's axes: to the right, and clockwise."""
+    """Return an action in the tree's axes by name; None if it is unknown."""
     if np.isnan(action).any():
         return None
-    return dict(zip(TREE_ACTION, (action * [1.0, -1.0, 1.0, -1.0, 1.0] + 0.0).tolist(), strict=True))
+    return dict(zip(TREE_ACTION, (action * TREE_ACTION_SIGNS + 0.0).tolist(), strict=True))
 
 
 def _target(group: dict, target: TargetRecord, i: int) -> dict:
-    """Return the target of point i without its vectors; what else the file says of it stays."""
-    depth_m, visibility = (None if np.isnan(v) else float(v) for v in (target.depth_m[i], target.visibility[i]))
-    found = {"enabled": True} | group
-    found |= {"visible": bool(target.visible[i]), "in_view": bool(target.in_view[i]), "depth": depth_m}
-    return found if visibility is None and "visibility" not in found else found | {"visibility": visibility}
+    """Return the target of point i without its vectors; unknown keys of the file are kept."""
+    fields = {
+        "enabled": True,
+        **group,
+        "visible": bool(target.visible[i]),
+        "in_view": bool(target.in_view[i]),
+        "depth": None if np.isnan(target.depth_m[i]) else float(target.depth_m[i]),
+    }
+    if not np.isnan(target.visibility[i]):
+        fields["visibility"] = float(target.visibility[i])
+    elif "visibility" in fields:
+        fields["visibility"] = None
+    return fields
 
 
 def _put_vector(group: dict, key: str, names: tuple[str, ...], values: np.ndarray) -> None:
-    """Set a vector in the form that the file uses already (object or list); ours is the object where it has names."""
-    if isinstance(group.get(key), bool) and (np.isnan(values).any() if group[key] else not values.any()):
-        return  # a public file says whether there was an offset, not which
-    found: list | None = None if np.isnan(values).any() else (values + 0.0).tolist()
-    is_plain = found is None or isinstance(group.get(key), list) or not names
-    group[key] = found if is_plain else dict(zip(names, found or (), strict=True))
+    """Set a vector as null, as a list if the file has a list or there are no names, else as an object."""
+    present = group.get(key)
+    is_unknown = bool(np.isnan(values).any())
+    if (present is True and is_unknown) or (present is False and not values.any()):
+        return  # a public file stores only whether there was an offset
+    if is_unknown:
+        group[key] = None
+    elif isinstance(present, list) or not names:
+        group[key] = (values + 0.0).tolist()
+    else:
+        group[key] = dict(zip(names, (values + 0.0).tolist(), strict=True))

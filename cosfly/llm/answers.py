@@ -197,8 +197,8 @@ class BudgetSpent(TeacherError):
 class Budget:
     """The shared budget of several journals of answers.
 
-    A request is sent when it fits together with all requests in flight, each counted with the largest size so far. Until
-    then it waits. If it does not fit alone, the budget is spent.
+    A request waits until it fits together with all requests in flight, each counted with the largest size so far. If it
+    does not fit alone, the budget is spent.
     """
 
     def __init__(self, cfg: BudgetConfig, *counts: Counter[str], first_prompt: int, first_completion: int) -> None:

@@ -1,8 +1,8 @@
-"""The directory of one stage: its lock, its records, and the inputs that it was made of.
+"""The directory of one stage: its lock, its records, and the digests of its inputs.
 
-`stage.json` is written first (settings, digests of inputs, seed, code version), `items.jsonl` grows while items are
-finished, `failures.jsonl` and `manifest.json` are written last: a manifest means that the stage is complete. The
-digests find what was changed, exchanged or mixed up; they are no signatures against somebody who changes records too.
+`stage.json` is written first (settings, digests of inputs, seed, code version). `items.jsonl` grows with each finished
+item. `failures.jsonl` and `manifest.json` are written last: a manifest means that the stage is complete. The digests
+detect files that were changed, exchanged or mixed up; they are no signatures against someone who changes records too.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ STAGE_FORMAT = FileFormat("cosfly.stage", "1.0", "stage record")
 MANIFEST_FORMAT = FileFormat("cosfly.manifest", "1.0", "manifest")
 RECORDS = {"manifest.json": MANIFEST_FORMAT.schema, "stage.json": STAGE_FORMAT.schema}
 TRACK_FILE = "trajectory.json"
-BEGUN = ("stage.json", "items.jsonl", "failures.jsonl", EVENTS, "preflight.json")  # there before anything is finished
-ROLES = {"maps": "boxes", "map": "simplified"}  # a product that stages call by two names
-NUM_NAMED = 5  # files that an error names
+BEGUN = ("stage.json", "items.jsonl", "failures.jsonl", EVENTS, "preflight.json")  # present before any item is finished
+ROLES = {"maps": "boxes", "map": "simplified"}  # input names of some stages -> the name of that product in others
+NUM_NAMED = 5  # most files that an error lists
 
 Resume = Literal["never", "if-same"]
 
@@ -69,23 +69,23 @@ Resume = Literal["never", "if-same"]
 
 
 class FolderLock(FileLock):
-    """The system's lock on `.lock` in a folder, held until release, the last reference, or the end of the process."""
+    """The system's lock on `.lock` in a folder, held until release, its last reference or the end of the process."""
 
     def __enter__(self) -> Self:  # `hold_folder` has acquired it
         return self
 
     def release(self, force: bool = True) -> None:
-        """Release the folder and remove the file, so that a finished folder holds products only."""
+        """Release the folder and remove the file, so that a finished folder holds only products."""
         if self.is_locked:
             with contextlib.suppress(OSError):
-                os.unlink(self.lock_file)  # while it is locked: a process that waits for this file makes its own
+                os.unlink(self.lock_file)  # while locked: a process that waits for this file then creates its own
             super().release(force)
 
 
 def hold_folder(folder: Path) -> FolderLock:
-    """Lock a folder, which is created if needed; ResumeError where another process holds it.
+    """Lock a folder, which is created if needed; raises ResumeError if another process holds it.
 
-    A process may lock a folder again while it still refers to the first lock, as after an error in a notebook.
+    A process that still refers to a lock may lock the folder again, as after an error in a notebook.
     """
     path = folder.resolve() / LOCK
     with storage_errors(path):
@@ -97,8 +97,8 @@ def hold_folder(folder: Path) -> FolderLock:
             fix = "wait for it or stop it, then run the same command again; or choose another --out"
             raise ResumeError("another process is at work in this folder", where=path.parent, fix=fix) from None
         except NotImplementedError:
-            what = "the file system has no locks"
-            raise StorageError(what, where=path.parent, fix="choose another --out") from None
+            fix = "choose another --out"
+            raise StorageError("the file system has no locks", where=path.parent, fix=fix) from None
     return lock
 
 
@@ -129,9 +129,9 @@ class StageInput(_Record):
 
 
 class StageRecord(_Record):
-    """`stage.json`: what the folder was started with.
+    """`stage.json`: the settings, inputs and version with which a folder was started.
 
-    package_files: sha256 of data that ships with cosfly and may change with its version, such as prompts.
+    package_files: sha256 of data that are part of cosfly and may change with its version, such as prompts.
     """
 
     stage: str
@@ -151,7 +151,7 @@ class Output(_Record):
 
 
 class Kept(_Record):
-    """A line of `items.jsonl`: the item is done; `result` is the stage's own."""
+    """A line of `items.jsonl`: the item is finished; each stage defines its `result`."""
 
     id: str
     status: Literal["kept"] = "kept"
@@ -160,7 +160,7 @@ class Kept(_Record):
 
 
 class Dropped(_Record):
-    """A line of `items.jsonl`: the item is done, and a rule of the stage drops it."""
+    """A line of `items.jsonl`: the item is finished, and a rule of the stage drops it."""
 
     id: str
     status: Literal["dropped"] = "dropped"
@@ -170,7 +170,7 @@ class Dropped(_Record):
 
 
 class Failed(_Record):
-    """A line of `items.jsonl`, and without its status of `failures.jsonl`: the item will be tried again."""
+    """A line of `items.jsonl`, and without `status` of `failures.jsonl`: a later run tries the item again."""
 
     id: str
     status: Literal["failed"] = "failed"
@@ -180,11 +180,11 @@ class Failed(_Record):
 
 ItemRecord = Kept | Dropped | Failed
 _ITEM: TypeAdapter[ItemRecord] = TypeAdapter(Annotated[ItemRecord, Field(discriminator="status")])
-read_item = _ITEM.validate_python  # of a line of `items.jsonl`
+read_item = _ITEM.validate_python  # parses a line of `items.jsonl`
 
 
 def result_of(record: Kept | Dropped, model: type[Model]) -> Model:
-    """Return the result of an item, which may have been done by an earlier run, as the stage's own model."""
+    """Return the result of an item, which an earlier run may have finished, as a model of its stage."""
     return validated(model, record.result, f"items.jsonl: {record.id}: result")
 
 
@@ -199,7 +199,7 @@ def read_failures(path: Path) -> list[Failed]:
 
 
 class Tally(BaseModel):
-    """The counts of a stage's items: kept + dropped + failed = input, always."""
+    """The counts of the items of a stage: kept + dropped + failed = input."""
 
     input: int = 0
     kept: int = 0
@@ -218,7 +218,7 @@ class Tally(BaseModel):
         return None
 
     def check(self) -> None:
-        """Assert that nothing was lost: a tally that does not add up is a bug of ours, not of the input."""
+        """Assert that each item has one outcome; a violation is a bug, not an error of the input."""
         total = self.kept + self.dropped.total() + self.failed.total()
         assert total == self.input, f"{total} outcomes for {self.input} items: {self}"
 
@@ -231,15 +231,15 @@ class Tally(BaseModel):
 
     def __str__(self) -> str:
         text = f"{self.kept} kept"
-        for word, reasons in (("dropped", self.dropped), ("failed", self.failed)):
+        for outcome, reasons in (("dropped", self.dropped), ("failed", self.failed)):
             if reasons:
-                listed = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
-                text += f", {reasons.total()} {word} ({listed})"
+                by_reason = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
+                text += f", {reasons.total()} {outcome} ({by_reason})"
         return f"{text} of {self.input}"
 
 
 class Manifest(_Record, extra="allow"):
-    """`manifest.json`: the products of a finished stage; `facts` are the stage's own."""
+    """`manifest.json`: the products of a finished stage; each stage defines its further `facts`."""
 
     stage: str
     outputs: list[Output]
@@ -265,14 +265,17 @@ def read_stage_record(folder: Path) -> StageRecord:
 
 
 class StageFolder:
-    """One stage's output folder, opened for one set of settings and inputs.
+    """The output folder of a stage, opened for one set of settings and inputs.
 
     `open` writes `stage.json`; `finish` writes `manifest.json`. If the folder is already complete for the same settings
     and inputs, and no item failed, `is_complete` is true and the stage has nothing to do.
     """
 
     def __init__(self, path: Path, stage: str, is_complete: bool, lock: FolderLock | None = None) -> None:
-        self.path, self.stage, self.is_complete, self._lock = path, stage, is_complete, lock
+        self.path = path
+        self.stage = stage
+        self.is_complete = is_complete
+        self._lock = lock
         self.started_s = time.monotonic()
 
     @classmethod
@@ -293,10 +296,10 @@ class StageFolder:
 
         Args:
             inputs: Name -> file or folder that the stage reads.
-            resume: `never` refuses a folder that holds work; `if-same` wants equal settings, inputs and seed.
-            package_files: Name -> file or flat folder of the package that decides what is made.
+            resume: `never` refuses a folder that holds work; `if-same` requires equal settings, inputs and seed.
+            package_files: Name -> file or flat folder of the package that determines the products.
             audited: Names of inputs that the stage itself compares with their records, item by item.
-            begun: Files and folders that the stage writes before anything is finished, next to those of every stage.
+            begun: Files and folders that this stage writes before any item is finished, in addition to BEGUN.
         """
         record = StageRecord(
             stage=stage,
@@ -313,7 +316,8 @@ class StageFolder:
             _check_same(out, record, resume)
             if not manifest.counts.failed:
                 _check_outputs_exist(out, manifest)
-                if (out / LOCK).exists():  # left by a kill, unless it is held or the disk is read-only
+                # A kill has left the lock file, unless it is held or the disk is read-only.
+                if (out / LOCK).exists():
                     with contextlib.suppress(ResumeError, StorageError):
                         hold_folder(out).release()
                 log.debug("%s: complete for the same settings and inputs: %s", stage, out)
@@ -332,7 +336,7 @@ class StageFolder:
         return cls(out, stage, False, lock)
 
     def reopen(self) -> None:
-        """Make a complete stage one that has more to do."""
+        """Continue a complete stage, which is incomplete then."""
         self._lock = hold_folder(self.path)
         refuse_links(self.path)
         (self.path / "manifest.json").unlink()
@@ -343,14 +347,14 @@ class StageFolder:
         return Journal(self.path / "items.jsonl")
 
     def items(self) -> Iterator[ItemRecord]:
-        """Yield the outcomes in the journal; an item that failed and was tried again has several."""
+        """Yield the outcomes in the journal; an item that was tried again has several."""
         return self.journal.read_as(read_item)
 
     def finish(self, outputs: Iterable[Path], tally: Tally, **facts: Any) -> None:
-        """Write the manifest: the stage is complete. NothingKept where no item was kept; what was written stays.
+        """Write the manifest, which completes the stage; raises NothingKept if no item was kept.
 
         Args:
-            outputs: Files inside the folder; of a folder with many files, its checksum file.
+            outputs: Files inside the folder; for a folder with many files, its checksum file.
             facts: Further JSON-able facts for the manifest.
         """
         tally.check()
@@ -359,8 +363,8 @@ class StageFolder:
         if lost := lost_steps(self.path):
             facts["lost_steps"] = lost
         files = [
-            Output(path=str(p.relative_to(self.path)), bytes=p.stat().st_size, sha256=sha256_file(p))
-            for p in sorted(outputs)
+            Output(path=str(path.relative_to(self.path)), bytes=path.stat().st_size, sha256=sha256_file(path))
+            for path in sorted(outputs)
         ]
         seconds = round(time.monotonic() - self.started_s, 3)
         manifest = Manifest(stage=self.stage, outputs=files, counts=tally, seconds=seconds, **facts)
@@ -374,12 +378,14 @@ class StageFolder:
     def nothing_kept(
         self, tally: Tally, *, expected: str | None = None, where: Path | None = None, fix: str | None = None
     ) -> NothingKept:
-        """Return the error of a stage that has nothing for the next one, with its counts and its first failure.
+        """Return the error of a stage that kept nothing, with its counts and its first failure.
 
-        where: The file that says why; None: the stage's folder.
+        where: The file that shows the cause; None: the folder of the stage.
         """
-        path, got = self.path / "failures.jsonl", str(tally)
-        if failures := read_failures(path) if path.exists() else []:
+        got = str(tally)
+        path = self.path / "failures.jsonl"
+        failures = read_failures(path) if path.exists() else []
+        if failures:
             got += f"; the first failure: {failures[0].message}"
         fix = fix or "fix what failures.jsonl and items.jsonl there name, or change settings and choose another --out"
         what = f"{self.stage} kept nothing, so the next stage has no input"
@@ -387,52 +393,62 @@ class StageFolder:
 
 
 def _prepare_resume(out: Path, record: StageRecord, resume: Resume, begun: Collection[str]) -> None:
-    """Make a folder ready to be resumed; ResumeError where it may not be."""
+    """Prepare a folder for new work or a resume; raises ResumeError if it holds other work or foreign files."""
     if not (out / "stage.json").exists():
-        # A kill may have come while the record was being written.
+        # A kill during the write of the record leaves its partial file.
         if any(entry.name != LOCK and not entry.match(".stage.json.*.partial") for entry in out.iterdir()):
-            what = "the output folder holds files that are not cosfly's"
-            raise ResumeError(what, where=out, fix="choose an empty --out")
+            problem = "the output folder holds files that are not cosfly's"
+            raise ResumeError(problem, where=out, fix="choose an empty --out")
     elif _holds_work(out, begun):
         _check_same(out, record, resume)
-    else:  # An attempt that ended before anything was finished binds nobody to its settings.
-        # stage.json stays until the new one is written: without it a kill would leave what looks like foreign files.
+    else:
+        # An attempt that finished nothing may be repeated with other settings. Its stage.json stays until the new one
+        # is written: without it, the other files would look foreign after a kill.
         for path in (out / name for name in begun if name != "stage.json"):
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def _holds_work(out: Path, begun: Collection[str]) -> bool:
-    """Return whether a stage folder holds anything that was finished, and not only the records of failures."""
+    """Return whether a stage folder holds finished items or products, not only records of failures."""
     if any(not isinstance(item, Failed) for item in Journal(out / "items.jsonl").read_as(read_item)):
         return True
-    files = (path.relative_to(out).parts for path in out.rglob("*") if path.is_file())
-    return any(
-        parts[0] not in (*begun, LOCK) and not any(part.endswith(".partial") for part in parts) for parts in files
-    )
+    for path in out.rglob("*"):
+        parts = path.relative_to(out).parts
+        is_partial = any(part.endswith(".partial") for part in parts)
+        if parts[0] not in (*begun, LOCK) and not is_partial and path.is_file():
+            return True
+    return False
 
 
 def _check_same(out: Path, record: StageRecord, resume: Resume) -> None:
-    """Raise ResumeError where the work in a folder may not be resumed as `record` says."""
-    found = read_stage_record(out)
+    """Raise ResumeError if `record` does not agree with the record of the work in a folder."""
+    previous = read_stage_record(out)
     if resume == "never":
         raise ResumeError("the folder already holds work", where=out, fix="choose another --out, or --resume if-same")
-    before, after = (flattened(one.config) | {"seed": one.seed} for one in (found, record))
+    before = flattened(previous.config) | {"seed": previous.seed}
+    after = flattened(record.config) | {"seed": record.seed}
     differences = [
         f"{key} was {before.get(key)!r}, is {after.get(key)!r}"
         for key in sorted(before.keys() | after.keys(), key=lambda key: (key == "seed", key))
         if before.get(key) != after.get(key)
     ]
-    for name in sorted(found.inputs.keys() | record.inputs.keys()):
-        old, new = found.inputs.get(name), record.inputs.get(name)
+    for name in sorted(previous.inputs.keys() | record.inputs.keys()):
+        old = previous.inputs.get(name)
+        new = record.inputs.get(name)
         if old is None or new is None or old.sha256 != new.sha256:
             differences.append(f"the input {name} ({new.path if new else 'none'}) has changed")
-    files = record.package_files
-    differences += [f"the {name} changed" for name, own in found.package_files.items() if files.get(name, own) != own]
+    for name, digest in previous.package_files.items():
+        if record.package_files.get(name, digest) != digest:
+            differences.append(f"the {name} changed")
     if differences:
-        what, fix = "the folder holds work made with other settings or inputs", "choose another --out, or restore them"
-        raise ResumeError(what, where=out, got="; ".join(differences), fix=fix)
-    if found.code_version != record.code_version:
-        log.warning("%s: resumed by version %s, started by %s", out, record.code_version, found.code_version)
+        raise ResumeError(
+            "the folder holds work made with other settings or inputs",
+            where=out,
+            got="; ".join(differences),
+            fix="choose another --out, or restore them",
+        )
+    if previous.code_version != record.code_version:
+        log.warning("%s: resumed by version %s, started by %s", out, record.code_version, previous.code_version)
 
 
 def _digest(path: Path) -> str:
@@ -442,7 +458,7 @@ def _digest(path: Path) -> str:
 
 
 def flattened(config: Any, prefix: str = "") -> dict[str, Any]:
-    """Return every value of nested objects by its dotted path."""
+    """Return all values of nested objects by their dotted paths."""
     if not isinstance(config, dict) or not config:
         return {prefix: config}
     parts = (flattened(value, f"{prefix}.{key}".removeprefix(".")) for key, value in config.items())
@@ -453,9 +469,12 @@ def _check_outputs_exist(out: Path, manifest: Manifest) -> None:
     for entry in manifest.outputs:
         path = inside(out, entry.path)
         if not path.is_file() or path.stat().st_size != entry.bytes:
-            what = "the manifest calls this stage complete, but a product is missing or has another size"
-            fix = f"remove {out} and run the stage again"
-            raise VerifyError(what, where=path, expected=f"{entry.bytes} bytes", fix=fix)
+            raise VerifyError(
+                "the manifest calls this stage complete, but a product is missing or has another size",
+                where=path,
+                expected=f"{entry.bytes} bytes",
+                fix=f"remove {out} and run the stage again",
+            )
 
 
 # --- digests of products ----------------------------------------------------------------------------------------------
@@ -467,7 +486,7 @@ def fingerprint(path: Path) -> str:
         fix = "check the path, or run the stage that makes it"
         raise InputError("there is no such file or folder", where=path, fix=fix)
     if not path.is_dir():
-        return sha256_file(path)  # an error where it is a pipe or a device
+        return sha256_file(path)  # raises for a pipe or a device
     if manifest := _record(path, "manifest.json"):
         return sha256_bytes(dump_json(manifest.get("outputs", [])).encode())
     digest = hashlib.sha256()
@@ -477,14 +496,17 @@ def fingerprint(path: Path) -> str:
 
 
 def folder_digests(folder: Path) -> dict[str, str]:
-    """Return the sha256 of each file of a track by its name: from `checksums.sha256` where it is listed there."""
-    listed = read_checksums(folder) if (folder / CHECKSUMS).is_file() else {}
-    found = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    return listed | {name: sha256_file(folder / name) for name in found if name != CHECKSUMS and name not in listed}
+    """Return the sha256 of each file of a track by its name; those in `checksums.sha256` are not computed again."""
+    digests = read_checksums(folder) if (folder / CHECKSUMS).is_file() else {}
+    for path in folder.rglob("*"):
+        name = path.relative_to(folder).as_posix()
+        if name != CHECKSUMS and name not in digests and path.is_file():
+            digests[name] = sha256_file(path)
+    return digests
 
 
 def recorded_digests(folder: Path) -> dict[str, str]:
-    """Return the sha256 of a finished stage's products by their paths; empty where there is no manifest of ours."""
+    """Return the sha256 of a finished stage's products by their paths; empty without a manifest of cosfly."""
     outputs = read_manifest(folder).outputs if _record(folder, "manifest.json") else []
     return {output.path: output.sha256 for output in outputs}
 
@@ -498,10 +520,10 @@ def digest_of(digests: Mapping[str, str]) -> str:
 
 
 def checked_inputs(inputs: Mapping[str, Path], audited: Collection[str] = ()) -> dict[str, StageInput]:
-    """Return the fingerprints of what a stage reads, once it is known to be finished, unchanged and of one origin.
+    """Check that the inputs of a stage are finished, unchanged and belong together; return their fingerprints.
 
     Args:
-        inputs: Name -> file or folder; of several runs with a number in front, as `2.data`.
+        inputs: Name -> file or folder. With several runs, names have the number of the run as a prefix: `2.data`.
         audited: Names of inputs whose files the stage itself compares with their records, one by one.
     """
     for name, path in inputs.items():
@@ -509,75 +531,88 @@ def checked_inputs(inputs: Mapping[str, Path], audited: Collection[str] = ()) ->
         try:
             str(path).encode()
         except UnicodeEncodeError:
-            what = "a name that is not UTF-8 text cannot be recorded"
-            raise InputError(what, where=path, fix="rename it") from None
+            problem = "a name that is not UTF-8 text cannot be recorded"
+            raise InputError(problem, where=path, fix="rename it") from None
         if name not in audited:
             _check_finished(path)
-    found = {name: StageInput(path=str(path), sha256=fingerprint(path)) for name, path in sorted(inputs.items())}
+    records = {name: StageInput(path=str(path), sha256=fingerprint(path)) for name, path in sorted(inputs.items())}
     for name, path in inputs.items():
-        _check_belongs(name, path, inputs, found)
-    return found
+        _check_belongs(name, path, inputs, records)
+    return records
 
 
 def _record(folder: Path, name: str) -> dict[str, Any] | None:
-    """Return a record of ours as JSON; None where there is none: others write files of these names too."""
+    """Return a record of cosfly as JSON; None for no file or one of another tool with the same name."""
     value = read_json(folder / name) if (folder / name).is_file() else None
     return value if isinstance(value, dict) and value.get("schema") == RECORDS[name] else None
 
 
 def _stage_folder(path: Path) -> Path | None:
-    """Return the folder of the stage that made an input: itself, its parent or the parent's parent; None: not ours."""
-    places = [path] if path.is_dir() else path.absolute().parents[:2]
-    return next((place for place in places if any(_record(place, name) for name in RECORDS)), None)
+    """Return the folder of the stage that made an input: a folder itself, or the first or second parent of a file."""
+    candidates = [path] if path.is_dir() else path.absolute().parents[:2]
+    return next((folder for folder in candidates if any(_record(folder, name) for name in RECORDS)), None)
 
 
 def record_of(product: Path) -> StageRecord | None:
-    """Return the record of the stage that made a product; None where there is none."""
+    """Return the record of the stage that made a product; None if there is none."""
     folder = _stage_folder(product)
     return read_stage_record(folder) if folder is not None and _record(folder, "stage.json") else None
 
 
 def _check_finished(path: Path) -> None:
-    """Compare an input with the manifest of its stage: a file with its line, a folder with all of them."""
+    """Check that the stage of an input is complete, and that the file, or all files of the folder, are unchanged."""
     folder = _stage_folder(path)
     if folder is None or not path.exists():
         return
     for name in RECORDS:
         if not _record(folder, name):
-            what, got = "the stage that makes this is not finished, or its records are gone", f"no {name} in {folder}"
-            fix = "run that stage again; to use what is there as it is, copy it to a folder of its own"
-            raise VerifyError(what, where=path, got=got, expected=f"{name} of that stage", fix=fix)
-    name, wrong = os.path.relpath(path, folder), list[str]()
-    for listed, digest in recorded_digests(folder).items():
-        file = inside(folder, listed)
-        if path.is_dir() or listed == name:
+            raise VerifyError(
+                "the stage that makes this is not finished, or its records are gone",
+                where=path,
+                got=f"no {name} in {folder}",
+                expected=f"{name} of that stage",
+                fix="run that stage again; to use its files as they are, copy them to a folder of their own",
+            )
+    name = os.path.relpath(path, folder)
+    problems = list[str]()
+    for output, digest in recorded_digests(folder).items():
+        file = inside(folder, output)
+        if path.is_dir() or output == name:
             if not file.is_file():
-                wrong.append(f"{file} is missing")
+                problems.append(f"{file} is missing")
             elif sha256_file(file) != digest:
-                wrong.append(f"{file} has other bytes")
-    if wrong:
-        more = f" and {len(wrong) - NUM_NAMED} more" if len(wrong) > NUM_NAMED else ""
-        what = "the files of this stage are not those that it finished"
-        expected = "the files whose digests are in its records"
-        fix = "put the files back or make them again; to use a file that you changed, copy it to a folder of its own"
-        raise VerifyError(what, where=folder, got="; ".join(wrong[:NUM_NAMED]) + more, expected=expected, fix=fix)
+                problems.append(f"{file} has other bytes")
+    if problems:
+        more = f" and {len(problems) - NUM_NAMED} more" if len(problems) > NUM_NAMED else ""
+        raise VerifyError(
+            "the files of this stage are not those that it finished",
+            where=folder,
+            got="; ".join(problems[:NUM_NAMED]) + more,
+            expected="the files whose digests are in its records",
+            fix="restore the files or make them again; to use a file that you changed, copy it to a folder of its own",
+        )
 
 
-def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], found: Mapping[str, StageInput]) -> None:
-    """Check that each input which an input was made of, and which is given too, is the one given."""
+def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], records: Mapping[str, StageInput]) -> None:
+    """Check that an input was made from the other inputs of the same run, as far as its stage read them."""
     if (record := record_of(path)) is None:
         return
-    front = name.rpartition(".")[0]
-    peers = {_role(other): other for other in inputs if other.rpartition(".")[0] == front}
+    run = name.rpartition(".")[0]
+    peers = {_role(other): other for other in inputs if other.rpartition(".")[0] == run}
     for role, peer in peers.items():
-        made_of = [(other, entry) for other, entry in record.inputs.items() if _role(other) == role]
-        if made_of and peer != name and all(entry.sha256 != found[peer].sha256 for _, entry in made_of):
-            wanted, entry = made_of[0]
-            what, got = f"it was made of another input {wanted!r} than the one given with it", f"given: {inputs[peer]}"
-            fix = f"give the two that belong together, or make {path.name} again"
-            raise VerifyError(what, where=path, got=got, expected=f"{entry.path}, as it was then", fix=fix)
+        sources = [(source, entry) for source, entry in record.inputs.items() if _role(source) == role]
+        if sources and peer != name and all(entry.sha256 != records[peer].sha256 for _, entry in sources):
+            source, entry = sources[0]
+            raise VerifyError(
+                f"it was made of another input {source!r} than the one given with it",
+                where=path,
+                got=f"given: {inputs[peer]}",
+                expected=f"{entry.path}, as it was then",
+                fix=f"give the two that belong together, or make {path.name} again",
+            )
 
 
 def _role(name: str) -> str:
+    """Return the name of an input without the number of its run, the same in all stages."""
     role = name.rpartition(".")[2]
     return ROLES.get(role, role)
