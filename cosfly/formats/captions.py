@@ -21,14 +21,14 @@ Writing = Literal["slots", "prose"]
 Modality = Literal["observed", "predicted", "hypothetical"]
 SentenceState = Literal["proved", "contradicted", "unread"]
 Verdict = Literal["CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN"]
-# The motion of a label: of a clean track itself, of its clean twin, of a perturbed track without the recorded offsets,
-# or, where they are not recorded, of the perturbed track: then the label holds noise.
+# The motion from which a label follows: that of a clean track itself (flight), of the clean twin, of a perturbed track
+# without the recorded offsets, or of the perturbed track itself if none are recorded; such a label is noisy.
 LabelFrom = Literal["flight", "twin", "offsets", "perturbed"]
 CAPTION_VERSION: Literal["2.0"] = "2.0"
 
 
 class Usage(Record):
-    """Tokens of one answer or of several; 0 where a server does not count them."""
+    """Tokens of one or several answers; 0 if a server does not count them."""
 
     prompt_tokens: int = 0
     completion_tokens: int = 0
@@ -65,14 +65,14 @@ def verdict_on(decision: str, label: str | None, contradicted: Collection[str]) 
 
 
 class Action(NamedTuple):
-    """One action. group: the heading of tables. en: an infinitive."""
+    """One action. group: Heading in tables. en: Infinitive phrase."""
 
     group: str
     en: str
     zh: str
 
 
-# In the order of prompts, schemas and tables.
+# The order of prompts, schemas and tables. Columns: group, en, zh.
 ACTIONS = {
     "track_straight": Action("tracking", "keep tracking straight ahead", "保持直线跟踪"),
     "yaw_left_to_follow": Action("heading", "yaw left to follow", "向左偏航跟随"),
@@ -93,49 +93,53 @@ ACTIONS = {
     "return_to_home": Action("recovery", "return to home", "返航"),
 }
 TOKENS = tuple(ACTIONS)
-ORDERS = ("break_off", "return_to_home")  # by a mission; geometry never implies them
-BY_LETTERS = {token.replace("_", ""): token for token in TOKENS}
+ORDERS = ("break_off", "return_to_home")  # only a mission orders these; geometry never implies them
+BY_LETTERS = {token.replace("_", ""): token for token in TOKENS}  # tokens by their letters
 
 
 def not_in_set(token: object, where: object) -> InputError:
     """Return the error of a decision that is not in the set."""
-    what, expected = "not an action of the closed set", f"one of {', '.join(TOKENS)}"
-    return InputError(what, where=str(where), got=str(token), expected=expected)
+    expected = f"one of {', '.join(TOKENS)}"
+    return InputError("not an action of the closed set", where=str(where), got=str(token), expected=expected)
 
 
 # --- captions.jsonl ---------------------------------------------------------------------------------------------------
 
 
-OWN_PROMPTS = "prompts"  # next to `captions.jsonl`: the prompts of its author, where they do not ship
-QUESTIONS = ("user_en", "user_zh")  # of them, what is asked of a window
-GOAL_WORDS: dict[Language, str] = {"en": "Goal: follow %s.", "zh": "任务：跟踪%s。"}  # in a prompt, a line of its own
+OWN_PROMPTS = "prompts"  # folder next to `captions.jsonl` with prompts that are not part of cosfly
+QUESTIONS = ("user_en", "user_zh")  # the prompts that ask about a window
+GOAL_WORDS: dict[Language, str] = {"en": "Goal: follow %s.", "zh": "任务：跟踪%s。"}  # one line of a prompt
 GOAL_BEGINS = tuple(words.partition("%s")[0] for words in GOAL_WORDS.values())
-PICTURES_MARK = "<pictures>"  # in a prompt: the place of the sentence about the pictures
+PICTURES_MARK = "<pictures>"  # replaced in a prompt by the sentence about the pictures
 
 
 class Prompt(Record):
-    """A question in one language. That of a caption holds PICTURES_MARK, as teacher and student see other pictures; the
-    lines after it hold measurements and the mission.
+    """A question in one language.
+
+    The question of a caption holds PICTURES_MARK, because teacher and student see different pictures. The lines after
+    the mark hold measurements and the mission.
     """
 
     system: str
     user: str
 
     def told(self, pictures: str, *, measured: bool = True) -> Prompt:
-        """Return the question with the sentence about the pictures, with or without measurements; the goal stays."""
-        begin, mark, end = self.user.partition(PICTURES_MARK)
-        first, *lines = end.split("\n")
-        kept = [first, *(line for line in lines if line.startswith(GOAL_BEGINS))]
-        user = self.user if measured or not mark else begin + mark + "\n".join(kept)
+        """Return the question with a sentence about the pictures, with or without measurements; the goal is kept."""
+        user = self.user
+        begin, mark, end = user.partition(PICTURES_MARK)
+        if mark and not measured:
+            first, *lines = end.split("\n")
+            goals = [line for line in lines if line.startswith(GOAL_BEGINS)]
+            user = begin + mark + "\n".join([first, *goals])
         return Prompt(system=self.system, user=user.replace(PICTURES_MARK, pictures))
 
 
 _Value = TypeVar("_Value")
-_Given = Annotated[_Value | None, Field(exclude_if=partial(is_, None))]  # a key that is skipped where it has no value
+_Given = Annotated[_Value | None, Field(exclude_if=partial(is_, None))]  # a key that is not written without a value
 
 
 class TeacherSettings(Record):
-    """How a teacher was asked; the rule teacher has a seed only."""
+    """The sampling settings of a teacher; the rule teacher has only a seed."""
 
     temperature: _Given[float] = None
     top_p: _Given[float] = None
@@ -145,8 +149,11 @@ class TeacherSettings(Record):
 
 
 class TeacherRecord(Record):
-    """Who answered. structured: how the answer's shape was enforced (see Reply). run: of a student's predictions for
-    several trees, the one of these captions."""
+    """The author of an answer.
+
+    structured: How the form of the answer was enforced (see Reply). run: The run of these captions, if a student
+    predicted for several trees.
+    """
 
     kind: TeacherKind
     model: str
@@ -156,7 +163,7 @@ class TeacherRecord(Record):
 
 
 class JudgeRecord(Record, frozen=False):
-    """A judge's verdict on a conflict: one of Judgement, or `unjudged`; overruled_by: geometry or text."""
+    """The verdict of a judge on a conflict: one of Judgement, or `unjudged`. overruled_by: geometry or text."""
 
     verdict: str
     reason: str
@@ -165,8 +172,10 @@ class JudgeRecord(Record, frozen=False):
 
 
 class RepairRecord(Record, frozen=False):
-    """The regeneration of a rejected answer. rung: the attempt that fixed it (hint, multi_sample, anchored, fix_label).
-    outcome: repaired, failed, no_label."""
+    """The regeneration of a rejected answer.
+
+    rung: The attempt that fixed it (hint, multi_sample, anchored, fix_label). outcome: repaired, failed, no_label.
+    """
 
     strategy: str
     rung: str | None = None
@@ -177,7 +186,10 @@ class RepairRecord(Record, frozen=False):
 
 
 class KeyframeRecord(Record, frozen=False):
-    """Why a window was chosen (start, change, stride); windows skipped up to the next; label changes among them."""
+    """Why a window was chosen (start, change, stride), and the windows that were skipped until the next one.
+
+    missed: Number of label changes among the skipped windows.
+    """
 
     reason: str
     skipped: int
@@ -190,9 +202,9 @@ Pixels = Annotated[int, Field(ge=1, le=1 << 20)]
 class Claim(BaseModel):
     """One statement of a sentence.
 
-    sentence: `C1` is the first of critical_components, `R1` of reasoning_trace. quantity: with its aspect (`distance`,
-    `trend:speed`), or `decision`. at: `t4`, `t0-t4`; empty: the current frame, the whole window. unit: m, mps, deg ...
-    quote: its words in the sentence.
+    sentence: `C1` is the first of critical_components, `R1` the first of reasoning_trace. quantity: With its aspect
+    (`distance`, `trend:speed`), or `decision`. at: `t4` or `t0-t4`; None: the current frame, or the whole window. unit:
+    Such as m, mps, deg. quote: The words of the statement in the sentence.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -200,14 +212,14 @@ class Claim(BaseModel):
     sentence: str
     quantity: str
     at: str | None = None
-    value: Annotated[float, Field(strict=True)] | str  # true is no 1.0
+    value: Annotated[float, Field(strict=True)] | str  # strict: true is not 1.0
     unit: str | None = None
     modality: Modality = "observed"
     quote: _Given[str] = None
 
 
 class Template(Record):
-    """The two texts of an answer with slots in place of facts. claims: of words outside slots, which they quote."""
+    """The two texts of an answer with slots in place of facts. claims: Claims of the words outside slots."""
 
     critical_components: str
     reasoning_trace: str
@@ -217,7 +229,7 @@ class Template(Record):
 class Evidence(Record):
     """The evidence for the states of a caption's sentences: the column `evidence` of a release.
 
-    slots: templates of the texts. problems: contradictions. contradicted: decisions that the track contradicts.
+    slots: Templates of the texts. problems: Contradictions. contradicted: Decisions that the track contradicts.
     """
 
     slots: _Given[dict[Language, Template]] = None
@@ -226,10 +238,13 @@ class Evidence(Record):
 
 
 class Checks(Record, frozen=False):
-    """Results of checks. structure, bilingual: `ok` or a reason. refused: reasons for refusing answers of the right
-    structure. evidence: `ok` or the contradictions. sentences: language -> state of each sentence of both texts, in
-    order. contradicted: decisions that the track contradicts. recovered: fixes of the answers' text. frame: a picture's
-    problem. refusal: the server's words where it refused the window, or how it cut the answer short."""
+    """Results of the checks of a caption.
+
+    structure, bilingual: `ok` or a reason. refused: Why answers of the right structure were refused. evidence: `ok` or
+    the contradictions. sentences: By language, the state of each sentence of both texts, in order. contradicted:
+    Decisions that the track contradicts. recovered: Fixes of the text of the answers. frame: The problem of a picture.
+    refusal: The message of a server that refused the window, or the reason why it cut the answer.
+    """
 
     keyframe: _Given[KeyframeRecord] = None
     structure: _Given[str] = None
@@ -246,7 +261,7 @@ class Checks(Record, frozen=False):
 class Caption(BaseModel):
     """One line of `captions.jsonl`: one window, its answers and their checks.
 
-    en, zh: None where no answer of the right structure exists; `zh` also in files of English alone.
+    en, zh: None without an answer of the right structure; `zh` also in English-only files.
     """
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -260,19 +275,19 @@ class Caption(BaseModel):
     window: list[int]
     future: list[int]
     prompt: dict[str, Prompt]  # language -> prompt, with PICTURES_MARK
-    prompt_hash: str  # of what the teacher was asked
-    picture_px: tuple[Pixels, Pixels]  # (width, height) of a picture that was sent, which pixel values refer to
-    depth_range_m: float | None = None  # dark end of the depth pictures; None: none was sent
+    prompt_hash: str  # of the question to the teacher
+    picture_px: tuple[Pixels, Pixels]  # (width, height) of the sent pictures, to which pixel values refer
+    depth_range_m: float | None = None  # largest depth in the depth pictures; None: none was sent
     teacher: TeacherRecord
-    usage: Usage  # of the teacher, all asks
+    usage: Usage  # of all requests to the teacher
     attempts: int
     writing: Writing = "prose"  # how the texts were made: filled slots or prose
-    therefore: str | None = None  # the decision that the reasoning came to, before the decision itself
+    therefore: str | None = None  # the decision at the end of the reasoning, before the final decision
     en: Coc | None = None
     zh: Coc | None = None
-    slots: dict[Language, Template] | None = None  # what the texts were filled from
+    slots: dict[Language, Template] | None = None  # the templates of the texts
     label_from: LabelFrom
-    label: str | None  # ground-truth decision from the future geometry; None: geometry cannot tell
+    label: str | None  # ground-truth decision from the future geometry; None: undetermined
     verdict: Verdict | None = None
     judge: JudgeRecord | None = None
     repair: RepairRecord | None = None
@@ -293,7 +308,7 @@ class Caption(BaseModel):
 
 def line_of(caption: Caption) -> bytes:
     """Return a caption as its line of `captions.jsonl`, end included."""
-    # Three quarters of the time of pydantic_core.to_json.
+    # This takes three quarters of the time of pydantic_core.to_json.
     return Caption.__pydantic_serializer__.to_json(caption) + b"\n"
 
 
@@ -303,7 +318,7 @@ def write_captions(path: Path, captions: Iterable[Caption]) -> int:
 
 
 def write_caption_lines(path: Path, lines: Iterable[bytes]) -> int:
-    """Write captions that are lines already (`line_of`); return their number."""
+    """Write the lines of captions (`line_of`); return their number."""
     count = 0
     with atomic_file(path) as file:
         for line in lines:

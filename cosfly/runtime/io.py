@@ -1,7 +1,7 @@
-"""Read and write files: regular ones of a bounded size, atomic writes, checksums, directories that appear whole.
+"""Read regular files of bounded size; write files and folders atomically; checksums.
 
-A pipe would block for ever, a device never end, and a link may lead out of a tree. What the system reports about a file
-becomes an InputError or a StorageError here and nowhere else.
+A pipe could block forever, a device never ends, and a link may lead out of a tree. Only this module converts errors of
+the system about a file to InputError or StorageError.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from cosfly.runtime.errors import InputError, StorageError
 log = logging.getLogger(__name__)
 
 MB = 1_000_000
-FILE_MB = 2_048  # read as a whole: the trajectories of a town are some 100 MB a million frames
-LINE_MB = 64  # of a JSON-lines file: a caption with its evidence has some 8 kB
-UNPACK_FACTOR = 100  # largest ratio of unpacked to packed size: JSON packs to a third, indented JSON to a 15th
-SMALL_UNPACKED_MB = 64  # what any packed file may unpack to, however small it is
+FILE_MB = 2_048  # of a file that is read as a whole; the trajectories of a million frames have about 100 MB
+LINE_MB = 64  # of a line of a JSON-lines file; a caption with its evidence has about 8 kB
+UNPACK_FACTOR = 100  # largest ratio of unpacked to packed size; it is 3 for JSON and 15 for indented JSON
+SMALL_UNPACKED_MB = 64  # unpacked size that is allowed for any ratio
 CHECK_PATH = "check the path"
 SPLIT = "split it, or cut out the part that is needed"
 GZIP_MAGIC = b"\x1f\x8b"
@@ -41,9 +41,9 @@ NO_SUCH_PLACE = frozenset({errno.ENOENT, errno.EEXIST, errno.EISDIR, errno.ENAME
 
 
 class LinkedPath(PosixPath):
-    """A directory or file that the user trusts: links below it are followed wherever they lead.
+    """A directory or file that the user trusts: all links below it are followed.
 
-    Every path derived from it is one too, also in another process, so readers need no option.
+    Every path derived from it is a LinkedPath too, also in another process, so readers need no option.
     """
 
 
@@ -59,16 +59,15 @@ def open_file(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Pa
     """Open a regular file to read its bytes.
 
     Args:
-        what, fix: Words for the message.
-        tree: The directory whose files are being read: a link that leads out of it is refused. None: the user named
-            this file.
+        what, fix: Name of the file and advice for messages.
+        tree: The directory of the file: a link that leads out of it is refused. None: the user named this file.
     """
     if tree is not None:
         check_stays_below(path, tree)
     try:
-        # A named pipe without a writer would hold a plain open for ever.
+        # Without O_NONBLOCK, opening a named pipe without a writer would block forever.
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except (OSError, ValueError) as error:  # ValueError: a name that no system has
+    except (OSError, ValueError) as error:  # ValueError: an invalid name
         got = "a socket" if getattr(error, "errno", 0) == errno.ENXIO else getattr(error, "strerror", str(error))
         raise InputError(f"cannot read the {what}", where=path, got=got, fix=fix) from None
     mode = os.fstat(number).st_mode
@@ -81,7 +80,7 @@ def open_file(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Pa
 
 @contextlib.contextmanager
 def disk_errors(path: Path, what: str, fix: str = CHECK_PATH) -> Iterator[None]:
-    """Convert an OSError while a file is read into an InputError."""
+    """Convert an OSError during reading to an InputError."""
     try:
         yield
     except OSError as error:
@@ -97,7 +96,7 @@ def read_bytes(
     most_mb: float = FILE_MB,
     span: tuple[int, int] | None = None,
 ) -> bytes:
-    """Read a file of at most `most_mb`, or a span of it (first byte, number); other arguments as for `open_file`."""
+    """Read a file of at most `most_mb`, or a span (first byte, length) of it; other arguments as for `open_file`."""
     with open_file(path, what=what, fix=fix, tree=tree) as file, disk_errors(path, what, fix):
         first, size = span or (0, os.fstat(file.fileno()).st_size)
         if size > most_mb * MB:
@@ -125,7 +124,7 @@ def decoded(data: bytes, where: object) -> str:
 
 
 def read_lines(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> Iterator[bytes]:
-    """Yield the lines of a file, each with its end and of at most LINE_MB."""
+    """Yield the lines of a file, each with its line end; a line has at most LINE_MB."""
     with open_file(path, what=what, fix=fix, tree=tree) as file:
         for number in itertools.count(1):
             with disk_errors(path, what, fix):
@@ -139,7 +138,7 @@ def read_lines(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: P
 
 
 def read_unpacked(path: Path, *, what: str = "file", most_mb: float = FILE_MB) -> bytes:
-    """Read a whole file, and unpack it where it is gzipped."""
+    """Read a whole file, and unpack it if it is gzipped."""
     data = read_bytes(path, what=what, most_mb=most_mb)
     if not data.startswith(GZIP_MAGIC):
         return data
@@ -153,7 +152,7 @@ def read_unpacked(path: Path, *, what: str = "file", most_mb: float = FILE_MB) -
         raise over_limit(path, "more, unpacked", f"{most_mb:,g} MB in one piece", SPLIT)
     if len(unpacked) > by_factor:
         got = f"{len(data):,} bytes that unpack to more"
-        raise over_limit(path, got, f"{UNPACK_FACTOR} times the file", "if you trust it, gunzip it before")
+        raise over_limit(path, got, f"{UNPACK_FACTOR} times the file", "if you trust it, gunzip it first")
     return unpacked
 
 
@@ -169,12 +168,13 @@ def sha256_bytes(data: bytes) -> str:
 
 
 def files_named(tree: Path, name: str) -> list[Path]:
-    """Return the files of a name below a tree, sorted; hidden entries, and what is below a match, are skipped.
+    """Return the files with a name below a tree, sorted; skip hidden entries and the folders below a match.
 
-    A linked directory is entered if it leads to a place inside the tree's parent directory, or anywhere with
-    `follow_links`; others are logged.
+    A linked directory is entered if it is inside the tree's parent directory, or anywhere with `follow_links`; others
+    are logged.
     """
-    found, root = list[Path](), os.path.realpath(tree)
+    matches = list[Path]()
+    root = os.path.realpath(tree)
     waiting: list[tuple[Path, tuple[str, ...]]] = [(tree, (root,))]
     parent = os.path.dirname(root)
     while waiting:
@@ -182,7 +182,7 @@ def files_named(tree: Path, name: str) -> list[Path]:
         with disk_errors(folder, "folder"), os.scandir(folder) as listed:
             entries = {entry.name: entry for entry in listed if not entry.name.startswith(".")}
         if name in entries:
-            found.append(folder / name)
+            matches.append(folder / name)
             continue
         for entry in entries.values():
             if entry.is_dir(follow_symlinks=False):
@@ -191,9 +191,9 @@ def files_named(tree: Path, name: str) -> list[Path]:
                 real = os.path.realpath(entry.path)
                 if not (isinstance(tree, LinkedPath) or is_below(real, parent)):
                     log.warning("%s: leads to %s, skipped; --set follow_links=true follows it", entry.path, real)
-                elif real not in above and real != parent:  # a link to a folder above would go round for ever
+                elif real not in above and real != parent:  # a link to a folder above would be followed forever
                     waiting.append((folder / entry.name, (*above, real)))
-    return sorted(found)
+    return sorted(matches)
 
 
 # --- names and links --------------------------------------------------------------------------------------------------
@@ -214,14 +214,17 @@ def check_stays_below(path: Path, tree: Path, *, in_parent: bool = False) -> Non
     blobs = [str(folder.parent / "blobs") for folder in Path(root).parents if folder.name == "snapshots"][:1]
     if not any(is_below(real, allowed) for allowed in (os.path.dirname(root) if in_parent else root, *blobs)):
         raise InputError(
-            "a link leads out of its folder", where=path, got=real, expected=f"a file below {tree}",
+            "a link leads out of its folder",
+            where=path,
+            got=real,
+            expected=f"a file below {tree}",
             fix="if you trust it, --set follow_links=true",
-        )  # fmt: skip
+        )
 
 
 def real_path(path: Path) -> str:
-    """Return `os.path.realpath`, in a sixth of the time where the system can be asked."""
-    with contextlib.suppress(OSError, AttributeError):  # not there, or another system
+    """Return `os.path.realpath`; on Linux the kernel resolves it in a sixth of the time."""
+    with contextlib.suppress(OSError, AttributeError):  # no such file, or another system
         number = os.open(path, os.O_PATH | os.O_CLOEXEC)
         try:
             return os.readlink(f"/proc/self/fd/{number}")
@@ -236,7 +239,7 @@ def is_below(path: str, root: str) -> bool:
 
 
 def inside(root: Path, name: str, *, in_parent: bool = False) -> Path:
-    """Join a name from a file to a root; InputError where it leads out, by its parts or by a link.
+    """Join a name from a file to a root; raises InputError if it leads out, by its parts or by a link.
 
     in_parent: A link may lead into the parent directory of the root.
     """
@@ -246,7 +249,7 @@ def inside(root: Path, name: str, *, in_parent: bool = False) -> Path:
 
 
 def _plain_name(root: Path, name: str) -> str:
-    """Return a name without detours, which may still lead out by a link."""
+    """Return a normalized name without `..`; a link may still lead out."""
     plain = os.path.normpath(name)
     if "\0" in name or max(len(part.encode("utf-8", "surrogatepass")) for part in plain.split(os.sep)) > LONGEST_NAME:
         expected = f"parts of at most {LONGEST_NAME} bytes"
@@ -261,13 +264,14 @@ def refuse_link(path: Path) -> None:
     if path.is_symlink():
         raise StorageError(
             "this path is a link, and cosfly does not write through links",
-            where=path, got=f"a link to {os.readlink(path)}",
-            fix="remove it, or put what it leads to in its place; the folder that --out names may itself be a link",
-        )  # fmt: skip
+            where=path,
+            got=f"a link to {os.readlink(path)}",
+            fix="remove it, or replace it by its target; only the folder that --out names may be a link",
+        )
 
 
 def refuse_links(folder: Path) -> None:
-    """Refuse to write into a folder that contains a link at any depth; the folder itself may be one."""
+    """Refuse to write into a folder that contains a link at any depth; the folder itself may be a link."""
     with os.scandir(folder) as entries:
         for entry in entries:
             if entry.is_symlink():
@@ -319,7 +323,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _renamed(path: Path) -> Iterator[Path]:
-    """Yield a temporary name, once what killed processes left under such names is removed, and rename it at the end."""
+    """Remove temporary files of killed processes, yield a temporary name, and rename that file or folder at the end."""
     refuse_link(path)
     begin, end = f".{path.name}.", ".partial"
     partial = path.with_name(f"{begin}{os.getpid()}{end}")
@@ -332,14 +336,14 @@ def _renamed(path: Path) -> Iterator[Path]:
         try:
             yield partial
             os.replace(partial, path)
-        except BaseException:  # on a full disk it would hold the space that is needed
+        except BaseException:  # a partial file would occupy space on a full disk
             with contextlib.suppress(OSError):
                 _remove(partial)
             raise
 
 
 def _is_another(pid: int) -> bool:
-    """Return whether another process has this id."""
+    """Return whether another running process has this id."""
     with contextlib.suppress(PermissionError):
         try:
             os.kill(pid, 0)
@@ -356,11 +360,11 @@ def _remove(path: Path) -> None:
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove files and folders with temporary names; a folder with checksums appeared whole and is not searched."""
-    for place, folders, files in os.walk(folder):
+    """Remove files and folders with temporary names; a folder with checksums is complete and not searched."""
+    for parent, folders, files in os.walk(folder):
         partials = {name for name in (*folders, *files) if name.startswith(".") and name.endswith(".partial")}
         for name in partials:
-            _remove(Path(place, name))
+            _remove(Path(parent, name))
         folders[:] = [] if CHECKSUMS in files else [name for name in folders if name not in partials]
 
 
@@ -381,17 +385,18 @@ def checksum_lines(digests: Mapping[str, str]) -> str:
 
 
 def read_checksums(folder: Path) -> dict[str, str]:
-    """Read `checksums.sha256`: relative name -> hex digest; InputError where a name leads out of the folder."""
+    """Read `checksums.sha256`: relative name -> hex digest; raises InputError if a name leads out of the folder."""
     path = folder / CHECKSUMS
-    digests, checked = dict[str, str](), {""}  # each folder once: a track has thousands of files
+    digests = dict[str, str]()
+    checked = {""}  # folders: each is checked once, since a track has thousands of files
     for number, line in enumerate(read_text(path, what="checksums", tree=folder).splitlines(), 1):
         digest, _, name = line.partition("  ")
         if len(digest) != 64 or not name:
             raise InputError("a broken checksum line", where=f"{path}:{number}", got=line[:80])
         plain = _plain_name(folder, name)
-        above = os.path.dirname(plain)
-        if above not in checked or os.path.islink(f"{folder}{os.sep}{plain}"):
+        parent = os.path.dirname(plain)
+        if parent not in checked or os.path.islink(f"{folder}{os.sep}{plain}"):
             check_stays_below(folder / plain, folder)
-            checked.add(above)
+            checked.add(parent)
         digests[plain] = digest
     return digests
