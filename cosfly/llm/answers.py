@@ -261,10 +261,7 @@ class Budget:
         """Record the size of an answered request; raises TeacherError if a limit is set and no usage is reported."""
         if usage is not None:
             prompt, completion = self._largest.get(num_pictures, (0, 0))
-            self._largest[num_pictures] = (
-                max(prompt, usage.prompt_tokens),
-                max(completion, usage.completion_tokens),
-            )
+            self._largest[num_pictures] = (max(prompt, usage.prompt_tokens), max(completion, usage.completion_tokens))
         elif self.cfg.max_cost is not None or self.cfg.max_tokens is not None:
             raise TeacherError(
                 "the endpoint reports no token usage, so a limit of tokens or cost cannot be kept",
