@@ -20,7 +20,7 @@ LARGEST = 1e18  # no length or time is larger in any unit, and no square or sum 
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a JSON value is a number no larger than a length or a time can be; true and false are none."""
+    """Return whether a JSON value is a number of at most LARGEST; true and false are not numbers."""
     return type(value) in (int, float) and abs(value) <= LARGEST
 
 
@@ -31,20 +31,20 @@ def rounded(vector: np.ndarray, digits: int = 6) -> list[float]:
 
 def records(value: dict, name: str, where: Path | str) -> list[dict]:
     """Read a list of objects; raises InputError for anything else."""
-    found = value.get(name)
-    if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
+    entries = value.get(name)
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise InputError("not a list of objects", where=f"{where}: {name}")
-    return found
+    return entries
 
 
 def read_items(path: Path, form: FileFormat, name: str, parse: Callable[[dict, str], Item]) -> list[Item]:
-    """Read the items of a product, as `parse` makes them of a record and its place."""
+    """Read the items of a product; `parse` converts a record and its place, for messages, to an item."""
     value = check_schema(read_json(path, what=form.what), form, path)
     return [parse(record, f"{path}: {name}[{i}]") for i, record in enumerate(records(value, name, path))]
 
 
 def write_items(path: Path, form: FileFormat, name: str, items: list[Any], header: dict[str, Any]) -> None:
-    """Write what `read_items` reads; `header` holds the map's name, the seed and what else a stage wants on record."""
+    """Write what `read_items` reads; `header` holds further fields, such as the name of the map and the seed."""
     write_json(path, {**form.header, **header, name: [item.as_json() for item in items]}, indent=None)
 
 
@@ -54,42 +54,48 @@ def step_field(items: list[Any]) -> dict[str, float | None]:
 
 
 def text_id(record: dict, where: str) -> str:
-    """Read the `id` of a record; raises InputError where it is missing or no text."""
-    if isinstance(found := record.get("id"), str):
-        return found
-    what, got = (MISSING, None) if found is None else ("not an id", repr(found)[:60])
-    raise InputError(what, where=f"{where}.id", got=got, expected="text")
+    """Read the `id` of a record; raises InputError if it is missing or not text."""
+    value = record.get("id")
+    if value is None:
+        raise InputError(MISSING, where=f"{where}.id", expected="text")
+    if not isinstance(value, str):
+        raise InputError("not an id", where=f"{where}.id", got=repr(value)[:60], expected="text")
+    return value
 
 
 def numbers(value: Any, *shape: int | None) -> np.ndarray | None:
-    """Return lists of numbers, one in another, as float64 of a shape, in which None is any length; None where they are
-    something else, or a number is not finite or too large."""
+    """Return nested lists of numbers as float64 of a shape, in which None is any length.
+
+    Returns:
+        None for another shape or content, or if a number is not finite or exceeds LARGEST.
+    """
     try:
-        found = np.array(value, dtype=np.float64)
+        array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
         return None
-    fits = found.ndim == len(shape) and all(wanted in (None, n) for wanted, n in zip(shape, found.shape, strict=True))
-    return found if fits and (np.abs(found) <= LARGEST).all() else None  # NaN is not
+    if array.ndim != len(shape) or any(side not in (None, n) for side, n in zip(shape, array.shape, strict=True)):
+        return None
+    return array if (np.abs(array) <= LARGEST).all() else None  # NaN fails
 
 
 def column(record: dict, name: str, where: str, *shape: int | None) -> np.ndarray:
     """Read numbers of a shape, in which None is any length but 0; raises InputError for anything else."""
     sides = " x ".join("any number" if side is None else str(side) for side in shape)
-    found = numbers(record.get(name), *shape)
-    if found is None or len(found) == 0:
+    values = numbers(record.get(name), *shape)
+    if values is None or len(values) == 0:
         what, got = ("not a column", repr(record[name])[:60]) if name in record else (MISSING, None)
         raise InputError(what, where=f"{where}.{name}", got=got, expected=f"a list of finite numbers, {sides}")
-    return found
+    return values
 
 
 def columns(record: dict, names: Iterable[str], where: str, length: int | None = None) -> np.ndarray:
     """Read columns of one length as one array, (n, number of names) float64."""
-    found: list[np.ndarray] = []
+    arrays: list[np.ndarray] = []
     for name in names:
-        found.append(column(record, name, where, len(found[0]) if found else length))
-    return np.stack(found, axis=1)
+        arrays.append(column(record, name, where, len(arrays[0]) if arrays else length))
+    return np.stack(arrays, axis=1)
 
 
 def as_columns(values: np.ndarray, names: Iterable[str]) -> dict[str, list[float]]:
-    """Return what `columns` reads, to four decimals."""
+    """Return columns in the form that `columns` reads, to four decimals."""
     return {name: rounded(values[:, k], 4) for k, name in enumerate(names)}

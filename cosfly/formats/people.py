@@ -15,7 +15,7 @@ from cosfly.runtime.json_io import validated
 Words = dict[Language, str]
 
 
-# Linear RGB as a renderer takes it. So far apart that in any daylight each is seen as what it is called.
+# Words and linear RGB for a renderer. The colours are far enough apart to be recognized in any daylight.
 COLORS: dict[str, tuple[Words, tuple[float, float, float]]] = {
     "red": ({"en": "red", "zh": "红色"}, (0.55, 0.02, 0.02)),
     "orange": ({"en": "orange", "zh": "橙色"}, (0.75, 0.21, 0.01)),
@@ -30,7 +30,7 @@ COLORS: dict[str, tuple[Words, tuple[float, float, float]]] = {
     "black": ({"en": "black", "zh": "黑色"}, (0.012, 0.012, 0.014)),
 }
 
-# Slot -> what may be worn there, and its words. "" is nothing: a bare head, no bag.
+# Slot -> (name, English, Chinese) of its garments. "" is none: a bare head, no bag.
 _WORN = (
     ("top", (("t_shirt", "T-shirt", "T恤"), ("jacket", "jacket", "夹克"), ("coat", "long coat", "长大衣"))),
     ("legs", (("trousers", "trousers", "长裤"), ("shorts", "shorts", "短裤"), ("skirt", "skirt", "裙子"))),
@@ -41,13 +41,13 @@ GARMENTS: dict[str, dict[str, Words]] = {
     slot: {name: {"en": en, "zh": zh} for name, en, zh in garments} for slot, garments in _WORN
 }
 FIGURES: dict[str, Words] = {"woman": {"en": "woman", "zh": "女子"}, "man": {"en": "man", "zh": "男子"}}
-EMPTY_SHARE = {"hat": 0.6, "bag": 0.4}  # of people, who have none
-HAIR = ("brown", "grey", "black")  # a cap of such a colour is taken for hair from the air: no hat has it
+EMPTY_SHARE = {"hat": 0.6, "bag": 0.4}  # share of people without one
+HAIR = ("brown", "grey", "black")  # no hat has these colours: from the air it would look like hair
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """What one person looks like: names of the rows above; the colour of a missing garment is ""."""
+    """The appearance of one person, in the names of the tables above; the colour of a missing garment is ""."""
 
     figure: str
     top: str
@@ -71,20 +71,24 @@ class Appearance:
 
     def differences(self, other: Appearance) -> tuple[str, ...]:
         """Return the fields in which two people differ; a garment counts once."""
-        mine, theirs = asdict(self), asdict(other)
-        differing = {name.removesuffix("_color") for name in mine if mine[name] != theirs[name]}
+        fields = asdict(self)
+        other_fields = asdict(other)
+        differing = {name.removesuffix("_color") for name in fields if fields[name] != other_fields[name]}
         return tuple(slot for slot in ("figure", *GARMENTS) if slot in differing)
 
 
 @dataclass(frozen=True)
 class People:
-    """What the people of one track look like: the target, and the others by instance id."""
+    """The appearance of the people in one track: the target, and the bystanders by instance id."""
 
     target: Appearance
     others: dict[int, Appearance]
 
     def most_alike(self, numbers: Iterable[int]) -> tuple[int, int] | tuple[None, None]:
-        """Return the id of the person most like the target, the greatest of several, and the number of differences."""
+        """Return the id of the person most similar to the target, and the number of differences.
+
+        Of several equally similar ones, the largest id; (None, None) without any.
+        """
         differing = [(len(self.target.differences(self.others[number])), -number) for number in numbers]
         if not differing:
             return None, None
@@ -102,12 +106,12 @@ def _rows(name: str, record: dict) -> tuple[str, ...]:
 
 GARMENT_TERMS = ("top", "legs", "bag", "hat")
 PLACE_TERMS = ("left", "right", "near", "far", "Vegetation", "Poles", "Car", "TrafficLight", "Fences", "Buildings")
-GOAL_TERMS = ("figure", *GARMENT_TERMS, *PLACE_TERMS)  # what a goal may use, in the order of its words
+GOAL_TERMS = ("figure", *GARMENT_TERMS, *PLACE_TERMS)  # the terms that a goal may use, in the order of its words
 
 
 @dataclass(frozen=True)
 class Goal:
-    """Whom to follow, in words that are true of the target alone in one frame. says: the GOAL_TERMS that they use."""
+    """A description that is true only of the target in one frame. says: The GOAL_TERMS that it uses."""
 
     frame: Annotated[int, Field(strict=True, ge=0)]
     en: str
@@ -115,14 +119,17 @@ class Goal:
     says: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        if self.says != tuple(term for term in GOAL_TERMS if term in self.says) or not {*self.says} & {*GARMENT_TERMS}:
+        in_order = tuple(term for term in GOAL_TERMS if term in self.says)
+        if self.says != in_order or not {*self.says} & {*GARMENT_TERMS}:
             raise ValueError(f"says must name some of {', '.join(GOAL_TERMS)} in this order, and a garment")
 
 
 def read_goal(record: Any, num_frames: int, where: str) -> Goal:
-    """Return the goal of a track of `num_frames` frames that a record holds."""
+    """Read the goal of a track of `num_frames` frames from a record."""
     goal = validated(Goal, record, where)
     if goal.frame >= num_frames:
-        got, expected = str(goal.frame), f"below {num_frames}"
-        raise InputError("the goal's frame does not exist", where=f"{where}.frame", got=got, expected=expected)
+        expected = f"below {num_frames}"
+        raise InputError(
+            "the goal's frame does not exist", where=f"{where}.frame", got=str(goal.frame), expected=expected
+        )
     return goal

@@ -54,7 +54,7 @@ class Roi(RoiPolygon):
         return shapely.union_all(areas)
 
     def check_map(self, box_map: BoxMap, where: str | Path) -> None:
-        """Check that a file which says where it was drawn was drawn on this map."""
+        """Check that the map and the axes in the file, if it holds them, are those of this map."""
         for name, got, expected in (("map", self.map, box_map.name), ("axes", self.axes, AXES)):
             if got not in ("", expected):
                 what, fix = "a region of interest of another map", "draw it on this map: cosfly roi edit"

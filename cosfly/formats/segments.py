@@ -1,6 +1,6 @@
-"""Manoeuvre styles of a trajectory's parts and the mission that ends it, in `drone_trace.json` and `trajectory.json`.
+"""The manoeuvre styles of a trajectory and the mission that ends it, in `drone_trace.json` and `trajectory.json`.
 
-A file without them follows the target from end to end, as the paper's do, without a mission.
+A trajectory without them, as in the paper, follows the target from beginning to end.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Coordinate = Annotated[float, Field(strict=True, ge=-LARGEST, le=LARGEST)]
 
 @dataclass(frozen=True)
 class Segment:
-    """Frames [begin, end) of one style. keeps_sight: whether they are judged by how much they see of the target."""
+    """Frames [begin, end) of one manoeuvre style. keeps_sight: Whether the visibility of the target counts in them."""
 
     style: str
     begin: Frame
@@ -50,8 +50,10 @@ class Mission:
     home_m: Home
 
     def order_at(self, frame: int) -> str | None:
-        """Return the decision that is ordered at a frame, None before the first."""
-        return None if frame < self.at_frame else "break_off" if frame < self.home_frame else "return_to_home"
+        """Return the decision that the mission orders at a frame, None before the first."""
+        if frame < self.at_frame:
+            return None
+        return "break_off" if frame < self.home_frame else "return_to_home"
 
 
 class _Flown(BaseModel):
@@ -60,7 +62,7 @@ class _Flown(BaseModel):
 
 
 def flown_as_json(segments: tuple[Segment, ...], mission: Mission | None) -> dict:
-    """Return the keys that `read_flown` reads; none for a trajectory that follows from end to end."""
+    """Return the keys that `read_flown` reads; none without segments and mission."""
     record: dict = {"segments": [asdict(part) for part in segments]} if segments else {}
     if mission is not None:
         record["mission"] = {name: getattr(mission, name) for name in ("kind", "at_frame", "home_frame")}
@@ -79,8 +81,11 @@ def mirrored(mission: Mission | None) -> Mission | None:
 def read_flown(record: dict, num_frames: int, where: str) -> tuple[tuple[Segment, ...], Mission | None]:
     """Return segments and mission of a record of `num_frames` frames. where: file and place of the record."""
     flown = validated(_Flown, {name: record.get(name) for name in _Flown.model_fields}, where)
-    segments, mission = flown.segments or (), flown.mission
-    frames = {f"segments[{k}].{name}": getattr(p, name) for k, p in enumerate(segments) for name in ("begin", "end")}
+    segments = flown.segments or ()
+    mission = flown.mission
+    frames: dict[str, int] = {}
+    for k, part in enumerate(segments):
+        frames |= {f"segments[{k}].begin": part.begin, f"segments[{k}].end": part.end}
     if mission is not None:
         frames |= {"mission.at_frame": mission.at_frame, "mission.home_frame": mission.home_frame}
     for name, frame in frames.items():

@@ -67,13 +67,16 @@ def find_object(text: str, names: Collection[str], finish_reason: str | None = N
     """
     if len(text) > MAX_CHARACTERS:
         return Found(None, "too_long")
-    found, cut = _found(text, names), _CUT.get((finish_reason or "").lower())
-    is_sure = cut is None or (found.value is not None and found.is_end)
-    return found if is_sure else Found(None, cut, found.recovered, False)
+    found = _found(text, names)
+    cut = _CUT.get((finish_reason or "").lower())
+    if cut is None or (found.value is not None and found.is_end):
+        return found
+    return Found(None, cut, found.recovered, is_end=False)
 
 
 def _found(text: str, names: Collection[str]) -> Found:
-    message, names_by_plain = _read_message(text), {_plain(name): name for name in names}
+    message = _read_message(text)
+    names_by_plain = {_plain(name): name for name in names}
     for one in reversed(message.objects):
         if (inner := _unwrapped(one.value, names_by_plain)) is None:
             continue
@@ -91,7 +94,8 @@ def _found(text: str, names: Collection[str]) -> Found:
             "wrapped": inner is not one.value,
             "key_names": renamed.keys() != inner.keys(),
         }
-        kinds, is_end = tuple(filter(recovered.get, recovered)), _NOTHING.fullmatch(around[1]) is not None
+        kinds = tuple(filter(recovered.get, recovered))
+        is_end = _NOTHING.fullmatch(around[1]) is not None
         return Found(None if problem else renamed, problem, kinds, is_end)
     if message.broken_at >= 0:
         return Found(None, "broken_json", is_end=False)
@@ -158,16 +162,20 @@ class _Message:
 
 
 def _read_message(text: str) -> _Message:
-    read, message, at, num_scanned = _reader(), _Message(), 0, 0
+    read = _reader()
+    message = _Message()
+    at = num_scanned = 0
     while mark := _MARK.search(text, at):
         at = mark.end()
         if mark.lastgroup == "opens":
-            message.has_thoughts, close = True, _CLOSE.search(text, at)
+            message.has_thoughts = True
+            close = _CLOSE.search(text, at)
             if close is None:
                 message.is_thought = True
                 break
             at = close.end()
-            message.start = message.start if message.objects else at
+            if not message.objects:
+                message.start = at
         elif mark.lastgroup == "closes":  # everything before it is thought
             message = _Message(at, has_thoughts=True)
         else:
@@ -175,7 +183,7 @@ def _read_message(text: str) -> _Message:
                 message.objects.append(read(text, mark.start()))
                 at = message.objects[-1].end
             except (ValueError, RecursionError) as error:
-                # It has a key in quotes, or is not closed: it was meant as an object.
+                # A quoted key or a missing closing brace shows that an object was intended.
                 if _KEY.match(text, at) or text.find("}", at) < 0:
                     message.broken_at = mark.start()
                 num_scanned += getattr(error, "pos", len(text)) - at
@@ -186,7 +194,7 @@ def _read_message(text: str) -> _Message:
 
 
 def _reader() -> Callable[[str, int], _Object]:
-    """Return a function that reads the object at a place of a text, and notes the reason why its value is refused."""
+    """Return a function that reads the object at a position of a text and records why its value is refused."""
     problems = list[str]()
 
     def members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
