@@ -14,11 +14,10 @@ TEMPLATE = "cosfly/viz/templates/coverage.html"
 
 def coverage_html(coverage: Coverage) -> str:
     """Return a histogram for each axis, with the range of 90 % of the frames, and a table for each kind of name."""
-    bins, plain = coverage.bins, default_coverage().bins
-    histograms = [
-        _histogram(axis, bins.get(name, []), plain[name]) | {"title": title, "range": own, "range_of_plain": of_plain}
-        for (name, axis), (title, own, of_plain) in zip(AXES.items(), ranges(coverage), strict=True)
-    ]
+    histograms = []
+    for (name, axis), (title, span, default_span) in zip(AXES.items(), ranges(coverage), strict=True):
+        bars = _histogram(axis, coverage.bins.get(name, []), default_coverage().bins[name])
+        histograms.append(bars | {"title": title, "range": span, "range_of_plain": default_span})
     names = {kind: shares(coverage, kind) for kind in NAMED}
     return fragment(TEMPLATE, histograms=histograms, names=names, skies=_skies(coverage.skies))
 
@@ -47,7 +46,8 @@ def ranges(coverage: Coverage) -> list[tuple[str, str, str]]:
 
 def shares(coverage: Coverage, kind: str) -> list[tuple[str, int, str, str]]:
     """Return a row for each name of a kind of NAMED: name, frames, share, share in the default run."""
-    counts, plain = getattr(coverage, kind), getattr(default_coverage(), kind)
+    counts = getattr(coverage, kind)
+    plain = getattr(default_coverage(), kind)
     if not counts:
         return []
     names = sorted({*counts, *plain}, key=lambda name: (-counts.get(name, 0), name))

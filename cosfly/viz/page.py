@@ -1,5 +1,7 @@
-"""Self-contained HTML pages from templates with a common base page and style, and Markdown pages. Every text that a
-template prints is cut and escaped (autoescape), except markup of the templates, style and script."""
+"""Self-contained HTML pages from templates with a common base page and style, and Markdown pages.
+
+Texts that a template prints are cut and escaped, except the markup of templates, style and script.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,9 @@ def run_name(folder: Path) -> str:
 def _policy(script: str, asks: bool) -> str:
     """Return a content policy that allows only the page's own script, by its hash: no other script, request or form."""
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    allowed = (f"script-src 'sha256-{digest}'; " if script else "") + ("connect-src 'self'; " if asks else "")
+    allowed = f"script-src 'sha256-{digest}'; " if script else ""
+    if asks:
+        allowed += "connect-src 'self'; "
     return f"default-src 'none'; {allowed}img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 

@@ -29,12 +29,14 @@ class PageServer:
     """A server of one page for this machine only, under `address`, which nobody can guess."""
 
     def __init__(self, site: Site, port: int) -> None:
-        self.site, self.token = site, secrets.token_urlsafe(24)
+        self.site = site
+        self.token = secrets.token_urlsafe(24)
         try:
             self.http = ThreadingHTTPServer((HOST, port), type("Handler", (_Handler,), {"server_of_page": self}))
         except OSError as error:
-            what, fix = "the port cannot be opened", "pass another --port, or none to use a free one"
-            raise EnvironmentMissing(what, where=f"{HOST}:{port}", got=error.strerror, fix=fix) from None
+            where = f"{HOST}:{port}"
+            fix = "pass another --port, or none to use a free one"
+            raise EnvironmentMissing("the port cannot be opened", where=where, got=error.strerror, fix=fix) from None
         self.host = f"{HOST}:{self.http.server_address[1]}"
         self.address = f"http://{self.host}/{self.token}/"
 
@@ -49,7 +51,8 @@ class PageServer:
 class _Handler(BaseHTTPRequestHandler):
     server_of_page: PageServer
     timeout = 30
-    server_version, sys_version = "cosfly", ""
+    server_version = "cosfly"
+    sys_version = ""
 
     def do_GET(self) -> None:
         if self._name() != "":

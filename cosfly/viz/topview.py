@@ -1,5 +1,7 @@
-"""Drawing of maps from above, and of lines, dots and texts of overviews and plots. Places on a picture are floats, px
-from its top left corner, rounded to a sixteenth."""
+"""Drawing of maps from above, and of lines, dots and texts for overviews and plots.
+
+Places on a picture are floats, px from its top left corner, rounded to a sixteenth.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,7 @@ COLORS: dict[str, tuple[int, int, int]] = {
 OTHER_COLOR = (230, 90, 140)
 PAPER, INK, HALO = (250, 248, 242), (30, 30, 30), (255, 255, 255)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
-FRACTION_BITS = 4  # of a place, as OpenCV takes it
+FRACTION_BITS = 4  # of a place's fixed-point coordinates, for OpenCV
 Color = Sequence[float]  # RGB, 0..255
 
 
@@ -109,7 +111,7 @@ def draw_text(
     """Write text with its baseline at y; return the x of its end. align: 0 begins at x, 0.5 is centred, 1 ends at x."""
     width = cv2.getTextSize(text, FONT, scale, 1)[0][0]
     left, base = round(x - align * width), round(y)
-    if halo is not None:  # of the same letters: thicker ones are wider in OpenCV 5
+    if halo is not None:  # of shifted letters: thicker ones are wider in OpenCV 5
         for dx, dy in product((-1, 0, 1), repeat=2):
             cv2.putText(picture, text, (left + dx, base + dy), FONT, scale, halo, 1, cv2.LINE_AA)
     cv2.putText(picture, text, (left, base), FONT, scale, color, 1, cv2.LINE_AA)
