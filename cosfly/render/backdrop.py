@@ -1,5 +1,8 @@
-"""A rendered map from above: the backdrop of the editor of regions (sec:appendix_g_mask_editor), in square tiles, each
-seen from straight above its middle: the ground is in place to the pixel, and a wall of 30 m leans by 2 m at most."""
+"""A rendered map from above: the backdrop of the editor of regions (sec:appendix_g_mask_editor).
+
+Each square tile is drawn from straight above its middle. So the ground is in place to the pixel, and a wall of 30 m
+leans by 2 m at most.
+"""
 
 from __future__ import annotations
 

@@ -14,10 +14,11 @@ import numpy as np
 from cosfly.geometry.axes import BODY_FROM_CAMERA, mirror_poses
 
 CARLA_VERSION = "0.9.16"
-SIMULATED_STEP_S = 0.05  # of synchronous mode (sec:step5)
-DEPTH_RANGE_M, DEPTH_STEPS = 1000.0, 2**24 - 1
+SIMULATED_STEP_S = 0.05  # time step of synchronous mode (sec:step5)
+DEPTH_RANGE_M = 1000.0
+DEPTH_STEPS = 2**24 - 1
 DEPTH_STEP_M = DEPTH_RANGE_M / DEPTH_STEPS
-ACTOR_BITS = 0xFFFF  # of an actor's number, in pictures
+ACTOR_BITS = 0xFFFF  # the bits of an actor's number that pictures hold
 CM_PER_M = 100.0
 FAR_CM = 65504.0  # the largest half-precision number: UnrealCV's depth of the sky and of all beyond
 
@@ -29,8 +30,8 @@ def unreal_pose(position_m: np.ndarray, rotation_deg: np.ndarray) -> list[float]
 
 def world_pose(pose: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     """Convert a pose of Unreal to position, (3,) m, and rotation, (3,) degrees."""
-    found = mirror_poses(np.array(pose)) + 0.0
-    return found[:3], found[3:]
+    mirrored = mirror_poses(np.array(pose)) + 0.0  # no negative zeros
+    return mirrored[:3], mirrored[3:]
 
 
 def camera_rotation_deg(camera_pose: np.ndarray) -> np.ndarray:

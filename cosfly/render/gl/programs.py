@@ -14,7 +14,9 @@ from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.io import read_text
 
 # Shader files after light.glsl.
-FAIR, WEATHER_SKY, WEATHER_SCENE = ("look.glsl",), ("weather.glsl",), ("weather.glsl", "weather_scene.glsl")
+FAIR = ("look.glsl",)
+WEATHER_SKY = ("weather.glsl",)
+WEATHER_SCENE = ("weather.glsl", "weather_scene.glsl")
 
 
 def open_context() -> Any:
@@ -33,15 +35,19 @@ def open_context() -> Any:
 
 def sources(vertex: tuple[str, ...], fragment: tuple[str, ...], define: str = "") -> tuple[str, str]:
     """Return the texts of a program of these files."""
-    folder, head = Path(__file__).parent, "#version 330 core\n" + define
+    folder = Path(__file__).parent
+    head = "#version 330 core\n" + define
     texts = ["\n".join(read_text(folder / name) for name in names) for names in (vertex, fragment)]
     return head + texts[0], head + texts[1]
 
 
 @dataclass(frozen=True)
 class Programs:
-    """The programs of one kind of weather. materials, near_movers: one for each material, the latter with shadows
-    of movers; rain: None in fair weather.
+    """The programs of one kind of weather.
+
+    Attributes:
+        materials, near_movers: One for each material; those of near_movers also draw the shadows of movers.
+        rain: None in fair weather.
     """
 
     materials: list[Any]
@@ -51,18 +57,22 @@ class Programs:
 
 
 def programs_of(context: Any, define: str | None, *, snaps: bool) -> Programs:
-    """Compile the programs of fair weather (None), or of one with these defines. snaps: for GPUs (scene.frag.glsl)."""
-    of_sky = ("light.glsl", *(FAIR if define is None else WEATHER_SKY), "sky.frag.glsl")
-    of_surfaces = ("light.glsl", *(FAIR if define is None else WEATHER_SCENE), "scene.frag.glsl")
-    defines = "#define SNAPS\n" * snaps + (define or "")
-    vertex, fragment = sources(("part.glsl", "scene.vert.glsl"), of_surfaces, defines)
+    """Compile the programs of fair weather (None), or of a weather with these defines.
+
+    Args:
+        snaps: Whether the device snaps triangles to a grid, as GPUs do (scene.frag.glsl).
+    """
+    sky_files = ("light.glsl", *(FAIR if define is None else WEATHER_SKY), "sky.frag.glsl")
+    scene_files = ("light.glsl", *(FAIR if define is None else WEATHER_SCENE), "scene.frag.glsl")
+    defines = ("#define SNAPS\n" if snaps else "") + (define or "")
+    vertex, fragment = sources(("part.glsl", "scene.vert.glsl"), scene_files, defines)
 
     def program(material: int, near: str) -> Any:
         text = fragment.replace(" MATERIAL;", f" {material};").replace("NEAR_MOVERS;", f"{near};")
         return context.program(vertex, text)
 
     materials, near_movers = ([program(m, near) for m in range(NUM_MATERIALS)] for near in ("false", "true"))
-    sky = context.program(*sources(("screen.vert.glsl",), of_sky, define or ""))
+    sky = context.program(*sources(("screen.vert.glsl",), sky_files, define or ""))
     rain = sources(("screen.vert.glsl",), ("light.glsl", "rain.frag.glsl"))
     return Programs(materials, near_movers, sky, None if define is None else context.program(*rain))
 
@@ -95,7 +105,8 @@ class LooseTriangles:
         self._firsts = {material: 3 * np.searchsorted(rows, numbers) for material, rows in loose.things.items()}
         self._num_indices: dict[int, int] = {}
         self._arrays: dict[tuple[int, int], Any] = {}
-        self.centers, self.radii = loose.centers.astype(np.float32), loose.radii.astype(np.float32)
+        self.centers = loose.centers.astype(np.float32)
+        self.radii = loose.radii.astype(np.float32)
         for material, rows in loose.vertices.items():
             self._write(material, np.arange(len(rows)))
 

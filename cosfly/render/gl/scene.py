@@ -20,8 +20,8 @@ from cosfly.render.gl.shapes import BUILDING_COLORS, PLAIN_COLORS, TILE_COLORS, 
 from cosfly.render.surfaces import Solids, Triangles, are_solids, drape, is_draped, layers_of, solids_of
 
 # --- solids -----------------------------------------------------------------------------------------------------------
-# Meshes have walls with storeys and windows, flat roofs, tiles on sloping roofs; plain paint if a file has colours. The
-# shader draws patterns in the axes of a part, so every plane of a building is a part of its own.
+# Buildings get walls with storeys and windows, flat roofs, and tiles on sloping roofs; a mesh with colours of its own
+# gets plain paint. The shader draws patterns in the axes of a part, so each plane of a building is a part.
 
 STEEP = 0.35  # largest z of a wall's normal
 FLAT = 0.94  # least z of a flat roof's normal
@@ -32,10 +32,11 @@ THINNEST_M = 0.01
 
 
 def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.ndarray) -> Loose:
-    """Return the triangles of solids, both sides, for the shader. ids: (n,) of the map's boxes."""
+    """Return the triangles of solids, both sides, for the shader. ids: (n,) instance ids of the map's boxes."""
     if not len(solids):
         return Loose({}, {}, np.zeros((0, 3)), np.zeros(0))
-    normals, rows, kinds = solids.normals, solids.rows, box_map.kinds[solids.rows]
+    normals = solids.normals
+    kinds = box_map.kinds[solids.rows]
     is_house = (kinds == KINDS["Buildings"]) & np.isnan(solids.colors).any(axis=1)
     is_wall = is_house & (np.abs(normals[:, 2]) < STEEP)
     is_flat = is_house & (np.abs(normals[:, 2]) > FLAT)
@@ -52,7 +53,8 @@ def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.
     np.maximum.at(ends, planes, local.max(axis=1))
     center = ((begins + ends) / 2.0)[planes]
     half = np.maximum((ends - begins) / 2.0, THINNEST_M)[planes]
-    seeds, paint = seeds_of(box_map.ids[rows]), solids.colors
+    seeds = seeds_of(box_map.ids[solids.rows])
+    paint = solids.colors
     for material, palette in ((parts.FACADE, BUILDING_COLORS), (parts.TILES, TILE_COLORS), (parts.PLAIN, PLAIN_COLORS)):
         picked = palette[(contract.chance(seeds, 0) * len(palette)).astype(int)]
         paint = np.where(np.isnan(paint) & (materials == material)[:, None], picked, paint)
@@ -64,17 +66,22 @@ def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.
         "half": half,
         "quaternion": Rotation.from_matrix(axes.transpose(0, 2, 1)).as_quat(),
         "color": np.column_stack([paint, seeds * 0.999]),
-        "tag": parts.tags(kinds, materials, ids[rows]),
+        "tag": parts.tags(kinds, materials, ids[solids.rows]),
     }.items():
         vertices[name] = values[:, None]
     vertices["bias"] = LAYER_STEP * STANDING_LAYER
     backs = vertices[:, ::-1].copy()
     backs["normal"] *= -1.0
-    both, things, of = np.concatenate([vertices, backs]), np.tile(solids.things, 2), np.tile(materials, 2)
-    chosen = {int(m): np.lexsort((things, of != m))[: np.count_nonzero(of == m)] for m in np.unique(of)}
+    vertices = np.concatenate([vertices, backs])
+    things = np.tile(solids.things, 2)
+    materials = np.tile(materials, 2)
+    rows_of = {
+        int(material): np.lexsort((things, materials != material))[: np.count_nonzero(materials == material)]
+        for material in np.unique(materials)
+    }
     return Loose(
-        {m: both[rows].reshape(-1) for m, rows in chosen.items()},
-        {m: things[rows] for m, rows in chosen.items()},
+        {material: vertices[rows].reshape(-1) for material, rows in rows_of.items()},
+        {material: things[rows] for material, rows in rows_of.items()},
         (low + high) / 2.0 - origin_m,
         np.linalg.norm(high - low, axis=1) / 2.0,
     )
@@ -117,7 +124,7 @@ def _planes(
 
 # --- lamps ------------------------------------------------------------------------------------------------------------
 
-# Lamps along the streets of a map without any give light and are not drawn, since no box represents them.
+# On a map without lamps, lamps along the streets give light. They are not drawn, since no box represents them.
 STREETS = ("Roads", "Sidewalks")
 ALONG_M = 16.0  # distance from one to the next along a street
 APART_M = 12.0  # least distance of any two
