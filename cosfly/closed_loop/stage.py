@@ -7,6 +7,7 @@ one batch to the student. An episode is on the disk once it has ended.
 from __future__ import annotations
 
 import logging
+import math
 import os
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
@@ -76,13 +77,17 @@ class OpenEpisode:
         self, episode: str, simulation: ClosedLoopTrajectory, controls: dict[str, Control], num_frames: int
     ) -> None:
         """Start an episode and record its lead frames."""
-        plan, lead = simulation.planned, simulation.reset()
-        self.episode, self.simulation, self.frames = episode, simulation, list[EpisodeFrame]()
-        self.controller, self.moments = Controller(controls, simulation.drone, lead[-1]), deque(lead, num_frames)
+        plan = simulation.planned
+        lead = simulation.reset()
+        self.episode = episode
+        self.simulation = simulation
+        self.frames = list[EpisodeFrame]()
+        self.controller = Controller(controls, simulation.drone, lead[-1])
+        self.moments = deque(lead, num_frames)
         poses = np.hstack([plan.positions_m, plan.rotations_deg])
-        between = np.empty((len(poses), 0, 6))
-        flown = PlannedMotion(plan.time_s, poses, between, plan.rotations_deg[:, 1], plan.positions_m).action
-        for moment, command in zip(lead[:-1], flown, strict=False):
+        no_poses_between = np.empty((len(poses), 0, 6))
+        motion = PlannedMotion(plan.time_s, poses, no_poses_between, plan.rotations_deg[:, 1], plan.positions_m)
+        for moment, command in zip(lead[:-1], motion.action, strict=False):
             self.note(moment, EngineDecision("lead"), command, float(plan.clearances_m[moment.index]))
 
     def note(self, moment: Moment, decision: EngineDecision, command: np.ndarray | None, clearance_m: float) -> None:
@@ -101,22 +106,26 @@ class OpenEpisode:
 
     def step(self, decision: EngineDecision) -> None:
         """Fly a decision; an invalid command counts as the student's failure, and the drone hovers."""
-        now, command = self.moments[-1], decision.command
+        now = self.moments[-1]
+        command = decision.command
         if command is not None and self.simulation.drone.problem_of(command):
-            decision, command = replace(decision, answer="invalid", action=None, command=None), None
+            decision = replace(decision, answer="invalid", action=None, command=None)
+            command = None
         if command is None:
             command = self.controller.command(decision.action if decision.answer == "ok" else None, now)
         reached = self.simulation.step(command)
         self.note(now, decision, command, reached.clearance_m)
         self.moments.append(reached)
 
-    def record(self, about: dict[str, Any]) -> Episode:
-        """Record the last frame and return the record. about: fields that all episodes share."""
-        simulation, plan, last = self.simulation, self.simulation.planned, self.moments[-1]
+    def record(self, shared: dict[str, Any]) -> Episode:
+        """Record the last frame and return the record. shared: fields that all episodes have in common."""
+        simulation = self.simulation
+        plan = simulation.planned
+        last = self.moments[-1]
         camera = simulation.script.cameras[0]
         self.note(last, EngineDecision("end"), None, last.clearance_m)
         return Episode(
-            **about, episode=self.episode, town=simulation.airspace.town, walk=plan.path_id,
+            **shared, episode=self.episode, town=simulation.airspace.town, walk=plan.path_id,
             style=difficulty_of(plan, simulation.num_lead - 1, simulation.airspace.surroundings.obstacles),
             dt_s=simulation.dt_s, camera_px=(camera.width_px, camera.height_px), fov_deg=camera.fov_deg,
             drone_radius_m=simulation.drone.radius_m, ended=simulation.ended, frames=tuple(self.frames),
@@ -131,26 +140,32 @@ class EpisodeRunner:
         self, cfg: ClosedLoopConfig, out: Path, seed: int, num_workers: int, list_sha256: str | None = None
     ) -> None:
         os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num_workers)))
-        self.out, self.engine = out, open_engine(cfg.fly, cfg.caption, cfg.infer, seed, out / ANSWERS)
+        self.out = out
+        self.engine = open_engine(cfg.fly, cfg.caption, cfg.infer, seed, out / ANSWERS)
         self.controls = read_controls(cfg.fly.table, TOKENS)
-        self.about = {
+        self.shared = {  # fields of every record
             "student": self.engine.name, "engine": cfg.fly.engine, "seed": seed, "list_sha256": list_sha256,
             "controller_sha256": None if cfg.fly.engine == "planner" else sha256_file(cfg.fly.table),
         }  # fmt: skip
 
     def fly(self, episodes: Mapping[str, Callable[[], ClosedLoopTrajectory]], map_sha256: str) -> Outcome:
         """Fly episodes to their ends and write each record; episodes with a record are skipped."""
-        controls, num_frames, about = self.controls, self.engine.num_frames, self.about | {"map_sha256": map_sha256}
-        missing = {name: opened for name, opened in episodes.items() if not episode_file(self.out, name).exists()}
-        open_ones = [OpenEpisode(name, opened(), controls, num_frames) for name, opened in missing.items()]
-        while open_ones:
-            observations = [Observation(one.episode, one.simulation, tuple(one.moments)) for one in open_ones]
-            for one, decision in zip(open_ones, self.engine.decide(observations), strict=True):
-                one.step(decision)
+        shared = self.shared | {"map_sha256": map_sha256}
+        active = [
+            OpenEpisode(name, open_simulation(), self.controls, self.engine.num_frames)
+            for name, open_simulation in episodes.items()
+            if not episode_file(self.out, name).exists()
+        ]
+        while active:
+            observations = [
+                Observation(episode.episode, episode.simulation, tuple(episode.moments)) for episode in active
+            ]
+            for episode, decision in zip(active, self.engine.decide(observations), strict=True):
+                episode.step(decision)
                 advance()
-            for one in [one for one in open_ones if one.simulation.ended is not None]:
-                write_episode(episode_file(self.out, one.episode), one.record(about))
-                open_ones.remove(one)
+            for episode in [episode for episode in active if episode.simulation.ended is not None]:
+                write_episode(episode_file(self.out, episode.episode), episode.record(shared))
+                active.remove(episode)
         return Outcome({"flights": list(episodes)})
 
 
@@ -168,8 +183,12 @@ def run(
         TeacherError: The student's engine cannot be used.
     """
     if cfg.render.frame_stride != 1:
-        what, got = "the camera of an episode renders every pose", f"render.frame_stride={cfg.render.frame_stride}"
-        raise ConfigError(what, where="render", got=got, fix="remove render.frame_stride")
+        raise ConfigError(
+            "the camera of an episode renders every pose",
+            where="render",
+            got=f"render.frame_stride={cfg.render.frame_stride}",
+            fix="remove render.frame_stride",
+        )
     read_controls(cfg.fly.table, TOKENS)
     common: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch, "resume": resume}
     inputs = {"boxes": boxes, "simplified": simplified, "paths": paths} | ({"others": others} if others else {})
@@ -179,21 +198,23 @@ def run(
     )  # fmt: skip
     if not stage.is_complete:
         plans = planning.run(cfg.plan, simplified, paths, out / PLAN, **common)
-        num = 1 if cfg.fly.asks_model else workers
-        worker_args = (cfg, (boxes, simplified, plans, others), stage.path, seed, num)
+        num_workers = 1 if cfg.fly.asks_model else workers
+        worker_args = (cfg, (boxes, simplified, plans, others), stage.path, seed, num_workers)
         traces = read_traces(plans)
-        reasons = [trace.drop_reason or (len(trace.time_s) <= cfg.fly.lead_frames and "too_short") for trace in traces]
-        flown = [n for n, reason in enumerate(reasons) if not reason]
-        dropped = Counter(str(reason) for reason in reasons if reason)
+        reasons = [_drop_reason(trace, cfg.fly) for trace in traces]
+        flown = [n for n, reason in enumerate(reasons) if reason is None]
+        dropped = Counter(reason for reason in reasons if reason is not None)
         if not flown:
             expected = f"an accepted plan of more than fly.lead_frames={cfg.fly.lead_frames} frames"
             raise stage.nothing_kept(Tally(input=len(traces), dropped=dropped), expected=expected)
         ordered = sorted(flown, key=lambda n: (Airspace.area_of(traces[n].targets_m), n))
-        items, most = [], min(cfg.fly.batch, -(-len(flown) // num))
-        for batch in (ordered[k : k + most] for k in range(0, len(ordered), most)):
+        batch_size = min(cfg.fly.batch, math.ceil(len(flown) / num_workers))
+        items = []
+        for start in range(0, len(ordered), batch_size):
+            batch = ordered[start : start + batch_size]
             steps = sum(len(_cut(traces[n], cfg.fly).time_s) - cfg.fly.lead_frames for n in batch)
             items.append(Item(f"{traces[batch[0]].path_id} and {len(batch) - 1}", batch, steps))
-        run_items(stage, items, make_worker, worker_args, workers=num, watch=watch)
+        run_items(stage, items, make_worker, worker_args, workers=num_workers, watch=watch)
         names = [traces[n].path_id for n in flown]
         finish_episodes(stage, cfg.fly, seed, names, dropped, obstacle_index(read_boxes(simplified)))
     if cfg.fly.tree:
@@ -207,7 +228,8 @@ def finish_episodes(
 ) -> None:  # fmt: skip
     """Write the score of the flown episodes and, with the obstacles of one map, `drone_trace.json`; end the stage."""
     files = [path for name in episodes if (path := episode_file(stage.path, name)).exists()]
-    dropped, failed = dropped or Counter(), +Counter({"flights": len(episodes) - len(files)})
+    dropped = dropped or Counter()
+    failed = +Counter({"flights": len(episodes) - len(files)})  # + removes a count of 0
     tally = Tally(input=len(episodes) + dropped.total(), kept=len(files), dropped=dropped, failed=failed)
     if not files:
         raise stage.nothing_kept(tally)
@@ -218,32 +240,45 @@ def finish_episodes(
         outputs.append(stage.path / TRACES)
     score = score_episodes(map(read_episode, files), trained_on=fly.trained_on, seed=seed)
     write_model(stage.path / SCORE, score, SCORE_FORMAT)
-    ended = Counter[str](one.ended for one in score.flights)
-    decisions = sum(sum(one.answers.values()) for one in score.flights)
+    ended = Counter[str](episode.ended for episode in score.flights)
+    decisions = sum(sum(episode.answers.values()) for episode in score.flights)
     stage.finish(outputs, tally, flown=dict(sorted(ended.items())) | {"decisions": decisions})
     log.info(
         "fly: %s: target in the picture in %.1f %%, visible in %.1f %% of the frames; %s; %d decisions",
         fly.student, *(100 * (score.figures[name].value or 0.0) for name in ("in_picture", "in_view")),
-        ", ".join(f"{count} {how}" for how, count in sorted(ended.items())), decisions,
+        ", ".join(f"{count} {end}" for end, count in sorted(ended.items())), decisions,
     )  # fmt: skip
 
 
 def make_worker(
-    cfg: ClosedLoopConfig, inputs: tuple[Path, Path, Path, Path | None], out: Path, seed: int, num: int
+    cfg: ClosedLoopConfig, inputs: tuple[Path, Path, Path, Path | None], out: Path, seed: int, num_workers: int
 ) -> Work:
     """Open a renderer and an engine in this process; return the function that flies the episodes of an item."""
     boxes, simplified, plans, others = inputs
-    runner, traces = EpisodeRunner(cfg, out, seed, num), read_traces(plans)
-    (bystanders, num_others), map_sha256 = rendering.bystanders_of(others, traces), sha256_file(boxes)
-    space = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed, num_others=num_others)
+    runner = EpisodeRunner(cfg, out, seed, num_workers)
+    traces = read_traces(plans)
+    bystanders, num_others = rendering.bystanders_of(others, traces)
+    map_sha256 = sha256_file(boxes)
+    airspace = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed, num_others=num_others)
 
-    def opened(n: int) -> ClosedLoopTrajectory:
-        cast, flown = bystanders.get(traces[n].path_id, ()), _cut(traces[n], cfg.fly)
+    def open_simulation(n: int) -> ClosedLoopTrajectory:
         return ClosedLoopTrajectory(
-            space, flown, number=n, num_lead=cfg.fly.lead_frames, lost_s=cfg.fly.lost_s, others=cast
+            airspace,
+            _cut(traces[n], cfg.fly),
+            number=n,
+            num_lead=cfg.fly.lead_frames,
+            lost_s=cfg.fly.lost_s,
+            others=bystanders.get(traces[n].path_id, ()),
         )
 
-    return lambda item: runner.fly({traces[n].path_id: partial(opened, n) for n in item.payload}, map_sha256)
+    return lambda item: runner.fly({traces[n].path_id: partial(open_simulation, n) for n in item.payload}, map_sha256)
+
+
+def _drop_reason(trace: DroneTrace, cfg: FlyConfig) -> str | None:
+    """Return why a plan is not flown; None if it is."""
+    if trace.drop_reason:
+        return trace.drop_reason
+    return "too_short" if len(trace.time_s) <= cfg.lead_frames else None
 
 
 def _cut(trace: DroneTrace, cfg: FlyConfig) -> DroneTrace:
@@ -252,7 +287,7 @@ def _cut(trace: DroneTrace, cfg: FlyConfig) -> DroneTrace:
 
 
 def difficulty_of(plan: DroneTrace, start: int, obstacles: BoxIndex) -> PathDifficulty:
-    """Return how hard a pedestrian trajectory is to follow; of its plan only the pose at frame `start` counts."""
+    """Return how hard a pedestrian trajectory is to follow; the plan contributes only its pose at frame `start`."""
     headings = headings_of(plan.targets_m, plan.time_s)
     turn_rad = np.abs(np.diff(np.unwrap(headings))).sum()
     away = plan.positions_m[start] - plan.targets_m[start]
@@ -265,21 +300,35 @@ def difficulty_of(plan: DroneTrace, start: int, obstacles: BoxIndex) -> PathDiff
 
 def trace_of(record: Episode, obstacles: BoxIndex) -> DroneTrace:
     """Return a flown episode as a drone trajectory, for `render` and `inspect`."""
-    rows = [(f.time_s, f.pose, f.target_m, f.clearance_m, f.pose[2] - f.height_m) for f in record.frames]
+    frames = record.frames
     return flown_trace(
-        obstacles, *map(np.array, zip(*rows, strict=True)), path_id=record.walk, planner=f"flown by {record.student}",
-        solver={"ended": record.ended}, pace=record.style.pace,
-    )  # fmt: skip
+        obstacles,
+        time_s=np.array([frame.time_s for frame in frames]),
+        poses=np.array([frame.pose for frame in frames]),
+        targets_m=np.array([frame.target_m for frame in frames]),
+        clearances_m=np.array([frame.clearance_m for frame in frames]),
+        ground_m=np.array([frame.pose[2] - frame.height_m for frame in frames]),
+        path_id=record.walk,
+        planner=f"flown by {record.student}",
+        solver={"ended": record.ended},
+        pace=record.style.pace,
+    )
 
 
 def flown_trace(
     obstacles: BoxIndex, time_s: np.ndarray, poses: np.ndarray, targets_m: np.ndarray, clearances_m: np.ndarray,
-    ground_m: np.ndarray, **about: Any,
+    ground_m: np.ndarray, **fields: Any,
 ) -> DroneTrace:  # fmt: skip
-    """Return n flown frames as a drone trajectory. poses: (n, 6); targets_m: (n, 3); others (n,); about: its fields."""
+    """Return n flown frames as a drone trajectory.
+
+    Args:
+        poses: (n, 6) position in m and rotation in degrees.
+        targets_m: (n, 3). The other arrays are (n,).
+        fields: Further fields of the trajectory.
+    """
     seen = visibility(obstacles, poses[:, :3], targets_m)
     metrics = trajectory_metrics(poses[:, :3], targets_m, seen, clearances_m, ground_m, step_s(time_s))
     return DroneTrace(
         time_s=time_s, positions_m=poses[:, :3], rotations_deg=poses[:, 3:], targets_m=targets_m, visibility=seen,
-        clearances_m=clearances_m, metrics=metrics, **about,
+        clearances_m=clearances_m, metrics=metrics, **fields,
     )  # fmt: skip
