@@ -97,16 +97,18 @@ def build(plan: WorldPlan, name: str, seed: int) -> Town:
 
 
 def _place_objects(town: Town, plan: WorldPlan) -> None:
-    """Place the largest first, each as near the middle of the town as it finds room; soft boxes make room."""
-    boxes, taken, outlines = BoxList(), list[BaseGeometry](), footprints(town.layout)
+    """Place the named objects, the largest first, each as near the middle of the town as there is room.
+
+    Soft boxes below an object, such as trees, are removed; hard ones block it.
+    """
+    boxes = BoxList()
+    taken = list[BaseGeometry]()  # outlines of the placed objects
+    outlines = footprints(town.layout)
     hard = outlines[of_kinds(town.layout, *HARD)]
     pavements = shapely.union_all(outlines[of_kinds(town.layout, "Sidewalks")])
     for thing, count in sorted(plan.known_objects(), key=lambda pair: -math.prod(pair[0].size_m)):
         if thing.where == "layout":
-            crossings = town.plan.num_blocks + 1 if town.plan.river_m else 0
-            built = min(count, town.plan.bridges or crossings, crossings)
-            town.placed += [Placed(thing.name, number, (0.0, 0.0), 0.0, 1.0, (0, 0)) for number in range(built)]
-            town.not_placed += [(thing.name, "no street to carry it")] * (count - built)
+            _count_bridges(town, thing, count)
             continue
         free = _free_area(town, thing)
         for number in range(count):
@@ -114,25 +116,42 @@ def _place_objects(town: Town, plan: WorldPlan) -> None:
             if place is None:
                 town.not_placed.append((thing.name, "no water in the plan" if free.is_empty else "no room"))
                 continue
-            outline, yaw, scale = place
-            xy, first = (outline.centroid.x, outline.centroid.y), len(boxes)
-            _add_object(boxes, thing, xy, yaw, scale)
-            town.placed.append(Placed(thing.name, number, xy, yaw, scale, (first, len(boxes))))
+            outline, yaw_deg, scale = place
+            xy = (outline.centroid.x, outline.centroid.y)
+            first = len(boxes)
+            _add_object(boxes, thing, xy, yaw_deg, scale)
+            town.placed.append(Placed(thing.name, number, xy, yaw_deg, scale, (first, len(boxes))))
             taken.append(outline)
-            line = shapely.shortest_line(outline, pavements)
-            if any(part[0] == "Buildings" for part in thing.parts) and line.length > 0.5:  # pave the way to a building
-                (x0, y0), (x1, y1) = line.coords
-                middle, turn = ((x0 + x1) / 2, (y0 + y1) / 2), math.degrees(math.atan2(y1 - y0, x1 - x0))
-                boxes.add("Sidewalks", middle, (line.length + 2.0, PATH_M), PAVED_TOP_M - SLAB_M, PAVED_TOP_M, turn)
+            if any(part[0] == "Buildings" for part in thing.parts):
+                _pave_way(boxes, outline, pavements)
     town.placement = boxes.box_map()
     soft = of_kinds(town.layout, *SOFT)
     covered = shapely.intersects(outlines, shapely.union_all(taken).buffer(0.5)) if taken else np.zeros(len(soft), bool)
     town.layout = town.layout.select(np.flatnonzero(~(soft & covered)))
 
 
+def _count_bridges(town: Town, thing: Object, count: int) -> None:
+    """Record which of `count` bridges the layout has: at most one where a street crosses the river."""
+    crossings = town.plan.num_blocks + 1 if town.plan.river_m else 0
+    num_built = min(count, town.plan.bridges or crossings, crossings)
+    town.placed += [Placed(thing.name, number, (0.0, 0.0), 0.0, 1.0, (0, 0)) for number in range(num_built)]
+    town.not_placed += [(thing.name, "no street to carry it")] * (count - num_built)
+
+
+def _pave_way(boxes: BoxList, outline: BaseGeometry, pavements: BaseGeometry) -> None:
+    """Add a path from a building to the nearest pavement, if there is a gap."""
+    line = shapely.shortest_line(outline, pavements)
+    if line.length > 0.5:
+        (x0, y0), (x1, y1) = line.coords
+        middle = ((x0 + x1) / 2, (y0 + y1) / 2)
+        yaw_deg = math.degrees(math.atan2(y1 - y0, x1 - x0))
+        boxes.add("Sidewalks", middle, (line.length + 2.0, PATH_M), PAVED_TOP_M - SLAB_M, PAVED_TOP_M, yaw_deg)
+
+
 def _free_area(town: Town, thing: Object) -> BaseGeometry:
-    """Return the area of an object's kind of place: open blocks, the quay along the water, or the water off it."""
-    plan, half = town.plan, town.plan.size_m / 2
+    """Return the area where an object may be placed: open blocks, the quay along the water, or the water."""
+    plan = town.plan
+    half = plan.size_m / 2
     if thing.where == "open":
         built = shapely.STRtree(footprints(town.layout)[of_kinds(town.layout, "Buildings")])
         blocks = [shapely.box(*low, *high) for low, high in town.streets.blocks()]
@@ -148,7 +167,10 @@ def _free_area(town: Town, thing: Object) -> BaseGeometry:
 def _find_place(
     thing: Object, free: BaseGeometry, hard: np.ndarray, taken: list[BaseGeometry]
 ) -> tuple[BaseGeometry, float, float] | None:
-    """Return the outline nearest to the middle of the town into which an object fits, its yaw and its scale."""
+    """Return the free outline of an object that is nearest to the middle of the town, its yaw and its scale.
+
+    None if the object fits nowhere, even at its least scale.
+    """
     if free.is_empty:
         return None
     by_water = thing.where != "open"
@@ -156,32 +178,36 @@ def _find_place(
     low_x, low_y, high_x, high_y = free.bounds
     anchor = (0.0, high_y if by_water else 0.0)
     x, y = np.meshgrid(np.arange(low_x, high_x, STEP_M), np.arange(low_y, high_y, STEP_M))
-    places = np.stack([x.ravel(), y.ravel()], axis=1)
-    if by_water:  # on the quay, or as far as the landing: at the upper edge of the free area
-        places[:, 1] = high_y - thing.size_m[1] / 2 - 0.3
-    places = places[np.argsort(np.hypot(*(places - anchor).T), kind="stable")]
+    centers = np.stack([x.ravel(), y.ravel()], axis=1)
+    if by_water:  # at the upper edge of the free area: on the quay, or next to the landing
+        centers[:, 1] = high_y - thing.size_m[1] / 2 - 0.3
+    centers = centers[np.argsort(np.hypot(*(centers - anchor).T), kind="stable")]
+    x, y = centers.T
     for scale in (step for step in SCALES if step >= thing.least_scale - 1e-9):
-        for yaw in (0.0,) if by_water else (0.0, 90.0):
-            a, b = (side * scale / 2 for side in (thing.size_m if yaw == 0 else thing.size_m[::-1]))
-            outlines = shapely.box(places[:, 0] - a, places[:, 1] - b, places[:, 0] + a, places[:, 1] + b)
+        for yaw_deg in (0.0,) if by_water else (0.0, 90.0):
+            size_m = thing.size_m if yaw_deg == 0 else thing.size_m[::-1]
+            half_x, half_y = (side * scale / 2 for side in size_m)
+            outlines = shapely.box(x - half_x, y - half_y, x + half_x, y + half_y)
             for outline in outlines[shapely.contains_properly(free, outlines)]:
                 if not len(tree.query(outline, predicate="dwithin", distance=SPACE_M / 2)):
-                    return outline, yaw, scale
+                    return outline, yaw_deg, scale
     return None
 
 
 def _add_object(boxes: BoxList, thing: Object, xy: tuple[float, float], yaw_deg: float, scale: float) -> None:
-    """Add an object's boxes; if scaled, its height shrinks as its footprint does."""
-    c, s = (1.0, 0.0) if yaw_deg % 180 == 0 else (0.0, 1.0)
+    """Add an object's boxes; the heights of its high parts are scaled like its footprint."""
+    cos, sin = (1.0, 0.0) if yaw_deg % 180 == 0 else (0.0, 1.0)
     for kind, x, y, wide, deep, low, high in thing.parts:
-        middle = (xy[0] + scale * (c * x - s * y), xy[1] + scale * (s * x + c * y))
-        rises = scale if high > 1.0 else 1.0
-        boxes.add(kind, middle, (wide * scale, deep * scale), low * (rises if low > 0 else 1.0), high * rises, yaw_deg)
+        middle = (xy[0] + scale * (cos * x - sin * y), xy[1] + scale * (sin * x + cos * y))
+        height_scale = scale if high > 1.0 else 1.0
+        scaled_low = low * height_scale if low > 0 else low
+        boxes.add(kind, middle, (wide * scale, deep * scale), scaled_low, high * height_scale, yaw_deg)
 
 
 def _set_trees(town: Town, plan: WorldPlan, rng: np.random.Generator) -> None:
     """Fell the trees in front of doors, then fell or plant until their number is within the plan's range."""
-    outlines, sizes = footprints(town.boxes), 2 * town.boxes.half_extents[:, :2]
+    outlines = footprints(town.boxes)
+    sizes = 2 * town.boxes.half_extents[:, :2]
     ways = outlines[of_kinds(town.boxes, "Sidewalks") & (sizes.min(1) <= PATH_M)]
     if len(ways):
         before_door = shapely.dwithin(outlines[: len(town.layout)], shapely.union_all(ways), 0.8)
@@ -198,20 +224,23 @@ def _set_trees(town: Town, plan: WorldPlan, rng: np.random.Generator) -> None:
 
 def _planted(town: Town, count: int, rng: np.random.Generator) -> BoxMap:
     """Return new trees on lawns and gardens, clear of all other boxes and of the ways."""
-    world, boxes = town.boxes, BoxList()
+    world = town.boxes
+    boxes = BoxList()
     outlines = footprints(world)
     lawns = outlines[of_kinds(world, "Terrain") & (np.abs(world.maxs[:, 2] - LAWN_TOP_M) < 0.005)]
     standing = ~of_kinds(world, "Roads", "Sidewalks", "Terrain", "RoadLines") & (world.maxs[:, 2] > 0.0)
     blocked = [*outlines[standing], *outlines[of_kinds(world, "Roads", "Sidewalks")], *outlines[len(town.layout) :]]
-    tree, weights = shapely.STRtree(blocked), shapely.area(lawns)
+    obstacles = shapely.STRtree(blocked)
+    weights = shapely.area(lawns)
     if not len(lawns) or not weights.sum():
         return boxes.box_map()
     bounds = shapely.bounds(lawns)
     for row in rng.choice(len(lawns), 40 * count, p=weights / weights.sum()):
-        xy, crown = rng.uniform(bounds[row, :2], bounds[row, 2:]), rng.uniform(3.0, 5.5)
-        own = shapely.box(*(xy - crown / 2), *(xy + crown / 2))
-        if not len(tree.query(own, predicate="dwithin", distance=0.4)):
-            boxes.add("Vegetation", xy, (crown, crown * rng.uniform(0.9, 1.1)), 0.0, rng.uniform(5.0, 11.0))
+        xy = rng.uniform(bounds[row, :2], bounds[row, 2:])
+        crown_m = rng.uniform(3.0, 5.5)
+        outline = shapely.box(*(xy - crown_m / 2), *(xy + crown_m / 2))
+        if not len(obstacles.query(outline, predicate="dwithin", distance=0.4)):
+            boxes.add("Vegetation", xy, (crown_m, crown_m * rng.uniform(0.9, 1.1)), 0.0, rng.uniform(5.0, 11.0))
             if len(boxes) == count:
                 break
     return boxes.box_map()
@@ -233,9 +262,9 @@ def _asset_tables() -> dict[str, dict[str, Size]]:
 
 def asset_for(kind: str, size_m: Size) -> tuple[str, Size]:
     """Return the asset with the most similar box, and its size; one named after the kind if none is similar."""
-    stretches = {
-        name: [math.log(a / b) for a, b in zip(size_m, own, strict=True)]
-        for name, own in _asset_tables().get(kind, {}).items()
+    stretches = {  # logarithms of the factors along x, y, z that turn the asset into the box
+        name: [math.log(wanted / asset) for wanted, asset in zip(size_m, asset_size_m, strict=True)]
+        for name, asset_size_m in _asset_tables().get(kind, {}).items()
     }
     name = min(stretches, key=lambda name: sum(x * x for x in stretches[name]), default=None)
     if (
@@ -274,12 +303,14 @@ def placement_nodes(town: Town) -> list[dict[str, Any]]:
 
 def _box_node(box_map: BoxMap, row: int, name: str, asset: str | None = None) -> dict[str, Any]:
     """Return the node of a box: Unreal's axes, cm; the foot of an asset at the location."""
-    size, (x, y, z) = 2 * box_map.half_extents[row], box_map.centers[row]
-    own = assets()[asset] if asset else ()
-    if not asset:
-        asset, own = asset_for(KIND_NAMES[int(box_map.kinds[row])], size.tolist())
-    place = x, -y, z - size[2] / 2
-    return _node(f"GEN_BP_{name}_{row}", asset, place, -box_map.rotations_deg[row, 1], size / own)
+    size = 2 * box_map.half_extents[row]
+    x, y, z = box_map.centers[row]
+    if asset:
+        asset_size_m = assets()[asset]
+    else:
+        asset, asset_size_m = asset_for(KIND_NAMES[int(box_map.kinds[row])], size.tolist())
+    foot = x, -y, z - size[2] / 2
+    return _node(f"GEN_BP_{name}_{row}", asset, foot, -box_map.rotations_deg[row, 1], size / asset_size_m)
 
 
 def _node(name: str, asset: str, place: Any, yaw_deg: float, scale: Any) -> dict[str, Any]:
