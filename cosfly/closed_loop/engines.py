@@ -47,7 +47,7 @@ NO_SET = "decision_not_in_closed_set"  # of readable answers with an unknown dec
 
 @dataclass(frozen=True)
 class EngineDecision:
-    """A student's decision. command: of one that returns commands, (5,) as ACTION."""
+    """A student's decision. command: (5,) as ACTION, of a student that returns commands."""
 
     answer: Answer
     action: str | None = None
@@ -99,7 +99,8 @@ class BaselineEngine:
     num_frames = 1
 
     def __init__(self, name: str, seed: int) -> None:
-        self.name, self._seed = name, seed
+        self.name = name
+        self._seed = seed
 
     def decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:
         if self.name != "random":
@@ -109,39 +110,49 @@ class BaselineEngine:
 
 
 class PlannerEngine:
-    """The upper bound: flies from any pose to the next pose of the plan, which knows the whole trajectory."""
+    """The upper bound: it flies from any pose to the next pose of the plan, which knows the whole trajectory."""
 
-    name, num_frames = "planner", 1
+    name = "planner"
+    num_frames = 1
 
     def decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:
-        return [EngineDecision("ok", command=self.to_next(one.simulation, one.moments[-1])) for one in observations]
+        commands = [self.to_next(observation.simulation, observation.moments[-1]) for observation in observations]
+        return [EngineDecision("ok", command=command) for command in commands]
 
     @staticmethod
     def to_next(simulation: ClosedLoopTrajectory, now: Moment) -> np.ndarray:
         """Return the command that leads to the plan's next pose, or as near as the drone's limits allow."""
-        planned, i, dt_s, drone = simulation.planned, now.index + 1, simulation.dt_s, simulation.drone
-        velocity = in_axes_of(now.rotation_deg[1], planned.positions_m[i] - now.position_m) / dt_s
-        turn_degps = float(wrap_deg(planned.rotations_deg[i, 1] - now.rotation_deg[1])) / dt_s
-        command = drone.within_speed(np.array([*velocity, turn_degps, planned.rotations_deg[i, 0]]))
-        return np.clip(command, *drone.bounds)
+        dt_s = simulation.dt_s
+        position_m = simulation.planned.positions_m[now.index + 1]
+        pitch_deg, yaw_deg, _ = simulation.planned.rotations_deg[now.index + 1]
+        velocity_mps = in_axes_of(now.rotation_deg[1], position_m - now.position_m) / dt_s
+        turn_degps = float(wrap_deg(yaw_deg - now.rotation_deg[1])) / dt_s
+        command = simulation.drone.within_speed(np.array([*velocity_mps, turn_degps, pitch_deg]))
+        return np.clip(command, *simulation.drone.bounds)
 
 
 class PromptedEngine:
-    """A student that is asked as a teacher (caption/teachers): the rules, a model behind an endpoint or in vLLM. A
-    trained one (`caption.student.folder`) gets the prompts and pictures of its training. All episodes at once."""
+    """A student that is asked like a teacher (caption/teachers): the rules, a model behind an endpoint or in vLLM.
+
+    A trained student (`caption.student.folder`) gets the prompts and pictures of its training.
+    """
 
     def __init__(self, cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed: int, answers: Path) -> None:
-        is_local, place = cfg.engine == "transformers", Path(cfg.student.partition(":")[2])
-        folder = cfg.adapter or place if is_local else cfg.as_student  # with the chat format of a trained student
-        if cfg.engine == "vllm" and (place / CHAT_FORMAT_FILE).is_file():
-            folder = folder or place
+        is_local = cfg.engine == "transformers"
+        model = Path(cfg.student.partition(":")[2])
+        folder = cfg.adapter or model if is_local else cfg.as_student  # with the chat format of a trained student
+        if cfg.engine == "vllm" and (model / CHAT_FORMAT_FILE).is_file():
+            folder = folder or model
         update: dict[str, Any] = {"teacher": "rules" if is_local else cfg.student}
         if folder is not None:
             update["student"] = caption.student.model_copy(update={"folder": folder})
         self.vocabulary = vocabulary_of(caption)
-        self.cfg, self.limit_s = as_taught(caption.model_copy(update=update), self.vocabulary), cfg.answer_limit_s
-        self.num_frames, self._is_rules = self.cfg.window.num_frames, cfg.engine == "rules"
-        self._book, self._runner = AnswerBook(answers), asyncio.Runner()
+        self.cfg = as_taught(caption.model_copy(update=update), self.vocabulary)
+        self.limit_s = cfg.answer_limit_s
+        self.num_frames = self.cfg.window.num_frames
+        self._is_rules = cfg.engine == "rules"
+        self._book = AnswerBook(answers)
+        self._runner = asyncio.Runner()
         self._scratch = tempfile.TemporaryDirectory(prefix="cosfly-fly-")
         self._open(cfg, infer, seed)
 
@@ -184,11 +195,13 @@ class PromptedEngine:
         return EngineDecision("ok", parsed.coc.flight_decision, words, answer_s)
 
     def _question(self, observation: Observation) -> Question:
-        script, moments = observation.simulation.script, observation.moments
+        script = observation.simulation.script
+        moments = observation.moments
         place = script.town, script.trajectory, script.variant
         targets = [moment.target for moment in moments]
         bystanders = [[moment.bystanders.get(BYSTANDER_COLUMNS[k]) for k in (0, 1, 4)] for moment in moments]
-        poses, seen = ("time_s", "position_m", "rotation_deg", "target_m"), ("in_view", "visible", "visibility")
+        poses = ("time_s", "position_m", "rotation_deg", "target_m")
+        seen = ("in_view", "visible", "visibility")
         frames = observed_frames(
             *(np.array([getattr(moment, name) for moment in moments]) for name in poses),
             np.array([target.image_uv or [math.nan] * 2 for target in targets]),
@@ -196,22 +209,24 @@ class PromptedEngine:
             *(np.array([getattr(target, name) for target in targets]) for name in seen),
             np.array([bool(target.legible) for target in targets]), *np.array(bystanders, dtype=np.float64).T,
         )  # fmt: skip
-        folders, indices = (
-            tuple(one) for one in zip(*((self._folder(place, m), m.index) for m in moments), strict=True)
-        )
-        name, (height_px, width_px, _) = sample_id(f"{place[1]}_{place[2]}", indices[-1]), moments[-1].frame.rgb.shape
+        folders = tuple(self._folder(place, moment) for moment in moments)
+        indices = tuple(moment.index for moment in moments)
+        name = sample_id(f"{script.trajectory}_{script.variant}", indices[-1])
+        height_px, width_px, _ = moments[-1].frame.rgb.shape
         files = (frozenset(FILE_NAMES.values()),) * len(moments)
         window = ObservedWindow(name, *place, indices, width_px, height_px, frames, folders, files)
         return make_question(window, self.cfg.image, self.cfg.writing, self.vocabulary)
 
     def _folder(self, place: tuple[str, str, str], moment: Moment) -> Path:
         """Write a frame for the student, remove the oldest one, and return the frame's folder."""
-        if self._is_rules:  # see no pictures
+        if self._is_rules:  # they see no pictures
             return Path()
-        above = Path(self._scratch.name, *place)
-        folder, frame = above / frame_name(moment.index), moment.frame
+        track_folder = Path(self._scratch.name, *place)
+        folder = track_folder / frame_name(moment.index)
+        frame = moment.frame
         if not folder.is_dir():
-            shutil.rmtree(above / frame_name(max(moment.index - self.cfg.window.num_frames, 0)), ignore_errors=True)
+            oldest = max(moment.index - self.cfg.window.num_frames, 0)
+            shutil.rmtree(track_folder / frame_name(oldest), ignore_errors=True)
             folder.mkdir(parents=True)
             (folder / FILE_NAMES["rgb"]).write_bytes(rgb_bytes(frame.rgb))
             (folder / FILE_NAMES["instance"]).write_bytes(instance_bytes(frame.kinds, frame.ids))
@@ -221,24 +236,30 @@ class PromptedEngine:
 
 
 class LocalEngine(PromptedEngine):
-    """A student in this process (distill/inference); all episodes are one batch."""
+    """A student in this process (distill/inference); the questions of all episodes are one batch."""
 
     def _open(self, cfg: FlyConfig, infer: InferConfig, seed: int) -> None:
-        model, trees = Path(cfg.student.partition(":")[2]), {"": Path(self._scratch.name)}
-        inputs = Inputs((), trees, model, cfg.adapter)
-        self._local, self.name = local_answers(infer, inputs, self._book), inputs.name
+        model = Path(cfg.student.partition(":")[2])
+        inputs = Inputs((), {"": Path(self._scratch.name)}, model, cfg.adapter)
+        self._local = local_answers(infer, inputs, self._book)
+        self.name = inputs.name
 
     async def _ask_all(self, questions: Sequence[Question]) -> list[EngineDecision]:
         begun_s = time.monotonic()
-        found = [one async for one in self._local.answers(map(self._sample, questions), lambda count, told="": None)]
+        samples = map(self._sample, questions)
+        results = [result async for result in self._local.answers(samples, lambda count, told="": None)]
         answer_s = time.monotonic() - begun_s  # of the whole batch
         if answer_s > self.limit_s:
-            return [EngineDecision("late", answer_s=answer_s)] * len(found)
-        return [
-            self._read(one.found.text, question, answer_s if one.is_new else None, one.found.finish_reason)
-            if isinstance(one.found, BookAnswer) else EngineDecision("none", words=one.found.message[:MOST_WORDS])
-            for one, question in zip(found, questions, strict=True)
-        ]  # fmt: skip
+            return [EngineDecision("late", answer_s=answer_s)] * len(results)
+        decisions = []
+        for result, question in zip(results, questions, strict=True):
+            answer = result.found
+            if isinstance(answer, BookAnswer):
+                time_s = answer_s if result.is_new else None
+                decisions.append(self._read(answer.text, question, time_s, answer.finish_reason))
+            else:
+                decisions.append(EngineDecision("none", words=answer.message[:MOST_WORDS]))
+        return decisions
 
     @staticmethod
     def _sample(question: Question) -> Sample:
