@@ -49,8 +49,9 @@ def observe(simulation: ClosedLoopTrajectory, now: Moment, *, depth: bool = Fals
     """
     ground_m = float(simulation.airspace.ground.height_at(now.position_m[None])[0])
     pitch_deg, yaw_deg, _ = now.rotation_deg
-    height_m, velocity = float(now.position_m[2]) - ground_m, in_axes_of(float(yaw_deg), now.velocity_mps)
-    state = np.array([*velocity, height_m, wrap_deg(yaw_deg), pitch_deg, now.time_s], dtype=np.float32)
+    height_m = float(now.position_m[2]) - ground_m
+    velocity_mps = in_axes_of(float(yaw_deg), now.velocity_mps)
+    state = np.array([*velocity_mps, height_m, wrap_deg(yaw_deg), pitch_deg, now.time_s], dtype=np.float32)
     goal = words_of(("figure", *SLOTS), simulation.script.clothes.looks)["en"]
     seen = {"rgb": now.frame.rgb, "state": np.clip(state, STATE_LOW, STATE_HIGH), "goal": goal}
     return seen | {"depth": now.frame.depth} if depth else seen
@@ -63,7 +64,10 @@ class Policy:
 
     def __init__(self, spec: str, limit_s: float, seed: int) -> None:
         """Start the process of `spec`, a module:Class that is importable from the working directory."""
-        self.name, self._limit_s, self._seed, self._episode = spec, limit_s, seed, ""
+        self.name = spec
+        self._limit_s = limit_s
+        self._seed = seed
+        self._episode = ""
         self._process: subprocess.Popen | None = None
         self._failure: EngineDecision | None = None
         self._start()
@@ -77,12 +81,16 @@ class Policy:
             start_new_session=True,
         )  # fmt: skip
         remote.close()
-        self._num_late, self._awaits_reply = 0, True
+        self._num_late = 0
+        self._awaits_reply = True
         answer, message = self._ask(None, START_LIMIT_S)
         if answer != "ok":
-            what, got = "the policy cannot be created", f"{self.name}: {message}"
-            expected = "module:Class with reset(goal, seed) and act(observation), importable from here"
-            raise InputError(what, where="--policy", got=got, expected=expected)
+            raise InputError(
+                "the policy cannot be created",
+                where="--policy",
+                got=f"{self.name}: {message}",
+                expected="module:Class with reset(goal, seed) and act(observation), importable from here",
+            )
 
     def close(self) -> int | None:
         """End the process and its children; return its exit status."""
@@ -99,9 +107,12 @@ class Policy:
         return [self._decide(observation) for observation in observations]
 
     def _decide(self, observation: Observation) -> EngineDecision:
-        begun_s, seen = time.monotonic(), observe(observation.simulation, observation.moments[-1], depth=True)
+        begun_s = time.monotonic()
+        seen = observe(observation.simulation, observation.moments[-1], depth=True)
         if observation.episode != self._episode:
-            self._episode, self._failure, self._num_late = observation.episode, None, 0
+            self._episode = observation.episode
+            self._failure = None
+            self._num_late = 0
             try:
                 if self._process is None or self._awaits_reply:
                     self._start()

@@ -52,19 +52,24 @@ def run(
         ConfigError: Another planner than foresight, or render settings that differ from the student's.
         NothingKept: No decision gives a trajectory.
     """
-    inputs, seed = {"flown": flown, "boxes": boxes, "simplified": simplified}, _seed_of(flown, cfg)
+    inputs = {"flown": flown, "boxes": boxes, "simplified": simplified}
+    seed = _seed_of(flown, cfg)
     plans = read_traces(flown / PLAN / TRACES)
     if (planners := {plan.planner for plan in plans} | {cfg.plan.planner}) != {"foresight"}:
-        what, where = "only foresight can plan from a flown pose", f"plan.planner, and {flown / PLAN}"
-        raise ConfigError(what, where=where, got=", ".join(sorted(planners)), fix="fly with plan.planner=foresight")
+        raise ConfigError(
+            "only foresight can plan from a flown pose",
+            where=f"plan.planner, and {flown / PLAN}",
+            got=", ".join(sorted(planners)),
+            fix="fly with plan.planner=foresight",
+        )
     begun = (TREE, CAPTIONS)
     stage = StageFolder.open(out, "relabel", config=cfg, inputs=inputs, seed=seed, resume=resume, begun=begun)
     if not stage.is_complete:
         items = []
-        for episode in sorted(one.episode for one in read_score(flown).flights):
+        for episode in sorted(score.episode for score in read_score(flown).flights):
             record = read_episode(episode_file(flown, episode))
-            places = range(record.num_lead, len(record.frames) - 1, cfg.fly.relabel.stride)
-            items += [Item(f"{episode}_f{i:05d}", (episode, i)) for i in places]
+            decisions = range(record.num_lead, len(record.frames) - 1, cfg.fly.relabel.stride)
+            items += [Item(f"{episode}_f{i:05d}", (episode, i)) for i in decisions]
         done = run_items(stage, items, make_worker, (cfg, flown, boxes, simplified, seed), workers=workers, watch=watch)
         results = [outcome.result for outcome in done.kept]
         traces = [DroneTrace.from_json(result["trace"], "relabel") for result in results]
@@ -83,12 +88,18 @@ def _seed_of(flown: Path, cfg: ClosedLoopConfig) -> int:
     if begun.stage != "fly":
         raise InputError("not the output of `cosfly fly --map --paths`", where=flown, got=f"stage {begun.stage}")
     if "others" in begun.inputs:
-        what, fix = "--relabel does not render the bystanders of these episodes", "fly without --others"
-        raise InputError(what, where=flown, fix=fix)
-    was, now = (flattened(part, "render") for part in (begun.config["render"], cfg.recorded()["render"]))
+        raise InputError(
+            "--relabel does not render the bystanders of these episodes", where=flown, fix="fly without --others"
+        )
+    was = flattened(begun.config["render"], "render")
+    now = flattened(cfg.recorded()["render"], "render")
     if changed := [f"{key} was {was.get(key)!r}, is {value!r}" for key, value in now.items() if was.get(key) != value]:
-        what, fix = "these render settings are not those of the student", "use the settings of the episodes"
-        raise ConfigError(what, where=flown, got="; ".join(changed), fix=fix)
+        raise ConfigError(
+            "these render settings are not those of the student",
+            where=flown,
+            got="; ".join(changed),
+            fix="use the settings of the episodes",
+        )
     return begun.seed
 
 
@@ -150,7 +161,8 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
 
 def _planned_on(plan: DroneTrace, flown: Sequence[EpisodeFrame], space: Airspace, cfg: PlanConfig) -> DroneTrace:
     """Return a plan that begins with the flown frames of a student; raises as `plan_on`."""
-    poses, obstacles = np.array([frame.pose for frame in flown]), space.surroundings.obstacles
+    poses = np.array([frame.pose for frame in flown])
+    obstacles = space.surroundings.obstacles
     positions_m = plan_on(plan.path_id, plan.targets_m, step_s(plan.time_s), poses[:, :3], obstacles, cfg)
     pitch_rad, yaw_rad = look_at(positions_m, plan.targets_m)
     rotations_deg = np.degrees(np.stack([pitch_rad, yaw_rad, 0.0 * yaw_rad], axis=1))
@@ -161,10 +173,13 @@ def _planned_on(plan: DroneTrace, flown: Sequence[EpisodeFrame], space: Airspace
 
 
 def _reasons(record: Episode, i: int, future: FutureMotion) -> list[str]:
-    """Return why the decision at frame i was a mistake, if it was."""
-    soon = record.frames[i : i + round(LOSS_S / record.dt_s) + 1]
-    reasons = ["nearly_lost"] if not all(frame.visible for frame in soon) else []
-    action, motion = record.frames[i].action, measure(future)
+    """Return the reasons why the decision at frame i is a mistake; none if it is not."""
+    reasons = []
+    next_frames = record.frames[i : i + round(LOSS_S / record.dt_s) + 1]
+    if not all(frame.visible for frame in next_frames):
+        reasons.append("nearly_lost")
+    action = record.frames[i].action
+    motion = measure(future)
     if action is not None and TABLE.verdict_of(action, motion, TABLE.label_of(motion)) == "HARD_CONFLICT":
         reasons.append("hard_conflict")
     return reasons
