@@ -48,7 +48,7 @@ def test_the_same_commands_give_the_same_flight_and_the_same_pictures_whatever_w
         assert np.array_equal(one.position_m, two.position_m)
         assert np.array_equal(one.rotation_deg, two.rotation_deg)
         assert np.array_equal(one.frame.rgb, two.frame.rgb)
-        assert one.target == two.target
+        assert one.target.model_dump() == two.target.model_dump()
 
 
 def test_a_held_command_is_reached_as_fast_as_the_drone_can_and_no_faster(airspace, planned):
