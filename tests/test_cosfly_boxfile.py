@@ -86,9 +86,9 @@ def test_longitude_and_latitude_become_metres(tmp_path):
     """At 52 degrees north a degree of latitude is 111,267 m, one of longitude 68,677 m (tables of WGS 84)."""
     ring = [[4.0, 52.0], [4.001, 52.0], [4.001, 52.001], [4.0, 52.001], [4.0, 52.0]]
     text = collection(feature("Polygon", [ring], type="Buildings", height_m=9))
-    with pytest.raises(InputError, match=r"not in m;.*maps\.boxes\.units=degrees"):
+    with pytest.raises(InputError, match=r"do not look like m;.*maps\.boxes\.units=degrees"):
         loaded(tmp_path, text, ".geojson")
-    with pytest.raises(InputError, match="not in degrees"):
+    with pytest.raises(InputError, match="do not look like degrees"):
         loaded(tmp_path, text.replace("52.001", "58.001"), ".geojson", units="degrees")
     box_map = loaded(tmp_path, text, ".geojson", units="degrees")
     size = sorted(box_map.half_extents[0, :2] * 2)

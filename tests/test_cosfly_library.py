@@ -137,6 +137,7 @@ TAKING = {
         [
             lambda the_map, **more: cosfly.render_frames(the_map, [0, 0, 60], **VIEW, **more or FIXED),
             lambda the_map: cosfly.render_frames(the_map, [0, 0, 60], **VIEW, weather_mode="random_per_path"),
+            lambda the_map: cosfly.render_frames(the_map, [0, 0, 60], **VIEW, weather_mode="by_weight"),
         ],
     ),
 }

@@ -140,7 +140,7 @@ HOSTILE = {
     "empty.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 0}]), "no triangles"),
     "sparse.glb": (
         one_triangle(FLAT, accessors=[{"componentType": 5126, "type": "VEC3", "count": 3}]),
-        "sparse numbers",
+        "sparse accessor",
     ),
     "loop.glb": (one_triangle(FLAT, nodes=[{"mesh": 0, "children": [0]}], scenes=[{"nodes": [0]}]), "two parents"),
     "packed.glb": (one_triangle(FLAT, extensionsRequired=["EXT_meshopt_compression"]), "plain glTF"),
@@ -156,7 +156,7 @@ HOSTILE = {
     "deep.gltf": (b'{"asset": {}, "nodes": ' + b"[" * 90 + b"]" * 90 + b"}", "deep"),
     "nan.obj": (b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "finite"),
     "corner.obj": (b"v 0 0 0\nv 1 0 0\nf 1 2 9\n", "malformed"),
-    "from_end.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n", "from the end"),
+    "from_end.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n", "negative vertex indices"),
     "library.obj": (b"mtllib ../secret.mtl\n", "outside of its folder"),
     "absolute.obj": (b"mtllib /etc/passwd\n", "outside of its folder"),
     "nothing.obj": (b"# nothing\n", "no triangles"),

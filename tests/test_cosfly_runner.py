@@ -72,7 +72,7 @@ def test_a_record_is_the_last_of_its_item_and_a_failure_undoes_nothing(tmp_path)
     assert (kept.result, failed.message.partition(";")[2]) == ({"square": 4}, " got x")
     assert (finished.tally.kept, finished.tally.failed) == (1, {"input": 1})
     (tmp_path / "s/items.jsonl").write_text("damaged meanwhile\n")
-    with pytest.raises(InputError, match=r"damaged meanwhile.*same command again"):
+    with pytest.raises(InputError, match=r"changed while the command.*same command again"):
         list(finished.records)
 
 

@@ -167,11 +167,11 @@ class Job:
         num_failed = sum(sum(reasons.values()) for reasons in failed.values())
         if num_failed > self.cfg.max_failed:
             raise InputError(
-                "some items failed; the others are done",
+                "more items failed than the settings accept; the others are done",
                 where=where,
                 got=str(failed),
                 expected=f"at most {self.cfg.max_failed} (max_failed)",
-                fix="fix what the records name and run the same command again: only the failed ones are done again",
+                fix="fix the causes in failures.jsonl, and run the same command again for the failed items",
             )
 
 

@@ -85,7 +85,12 @@ class FollowEnv(gymnasium.Env):
                 raise InputError("the list has no such episode", where=self.task, got=repr(k)[:40], expected=expected)
             town, number = self.listed[k]
             if not self._begin(benchmark.episode_of(self.task, world_of(benchmark.HELD_OUT[town]), number)):
-                raise InputError("the episode cannot be flown", where=f"{self.task}: {town}", got=str(number))
+                raise InputError(
+                    "no episode can be made: no drone trajectory was found, or it is too short",
+                    where=f"{self.task}: {town}",
+                    got=f"trajectory {number}",
+                    fix="choose another options['episode']",
+                )
         else:
             world = world_of(benchmark.TRAINING[int(self.np_random.integers(len(benchmark.TRAINING)))])
             numbers = self.np_random.integers(100_000, size=benchmark.TRIES).tolist()

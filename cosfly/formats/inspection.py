@@ -132,8 +132,8 @@ def read_inspection(path: Path) -> Inspection:
     inspection = read_model(path, Inspection, INSPECT_FORMAT)
     counts = Counter(flight.folder for flight in inspection.flights)
     if twice := [folder for folder, count in counts.items() if count > 1]:
-        where, expected = f"{path}: flights", "one for each folder"
-        raise InputError("a flight has two records", where=where, got=twice[0], expected=expected)
+        where, expected = f"{path}: flights", "one record for each folder of a track"
+        raise InputError("a track has two records", where=where, got=twice[0], expected=expected)
     return inspection
 
 

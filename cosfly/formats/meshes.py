@@ -119,7 +119,12 @@ def _read_gltf(data: bytes, folder: _Folder, binary: bytes = b"") -> dict[str, M
     document = parse_document(data, folder.path)
     accessors, views = document.get("accessors", []), document.get("bufferViews", [])
     if document.get("extensionsRequired") or any("sparse" in a or "bufferView" not in a for a in accessors):
-        raise InputError("the mesh needs an extension or sparse numbers", where=folder.path, expected="plain glTF 2.0")
+        raise InputError(
+            "the mesh requires a glTF extension, a sparse accessor or an accessor without data",
+            where=folder.path,
+            expected="plain glTF 2.0",
+            fix="export it again without compression and other extensions",
+        )
     nodes, owners = [dict(node) for node in document.get("nodes", ())], list[tuple[int, dict]]()
     inner = [child for node in nodes for child in node.get("children", ())]
     every = sorted(set(range(len(nodes))) - set(inner))
@@ -198,8 +203,12 @@ def _placed(shape: Any, world: np.ndarray, color: np.ndarray) -> Mesh:
 def _read_obj(data: bytes, folder: _Folder) -> dict[str, Mesh]:
     """Read an OBJ; of its materials the diffuse colours (`Kd`) of those without a picture."""
     if re.search(r"(?m)^[ \t]*f[ \t].*-", text := decoded(data, folder.path)):
-        what, expected = "the mesh counts vertices from the end", "indices from 1"
-        raise InputError(what, where=folder.path, expected=expected)
+        raise InputError(
+            "the OBJ file uses negative vertex indices, which are not supported",
+            where=folder.path,
+            expected="indices from 1",
+            fix="export the mesh with absolute indices",
+        )
     for name in re.findall(r"(?m)^[ \t]*mtllib[ \t]+(.*)$", text):
         folder.read(name.strip())  # trimesh would pass over what cannot be read
     scene, found = _scene(text.encode(), "obj", folder, folder, process=False), list[Mesh]()

@@ -57,8 +57,13 @@ class Roi(RoiPolygon):
         """Check that the map and the axes in the file, if it holds them, are those of this map."""
         for name, got, expected in (("map", self.map, box_map.name), ("axes", self.axes, AXES)):
             if got not in ("", expected):
-                what, fix = "a region of interest of another map", "draw it on this map: cosfly roi edit"
-                raise InputError(what, where=f"{where}: {name}", got=got, expected=expected, fix=fix)
+                raise InputError(
+                    f"the region of interest was drawn with another value of {name}",
+                    where=f"{where}: {name}",
+                    got=got,
+                    expected=expected,
+                    fix="draw it on this map: cosfly roi edit",
+                )
 
 
 def write_roi(path: Path, roi: Roi) -> None:

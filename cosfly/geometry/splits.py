@@ -136,7 +136,7 @@ def assign_splits(
     seed: int,
     *,
     too_few: Literal["refuse", "fill"],
-    what: str = "walks",
+    what: str = "pedestrian trajectories",
     fix: str = "give more of them, or set a fraction to 0",
 ) -> dict[str, Split]:
     """Assign groups to splits: group -> split.

@@ -219,7 +219,7 @@ def _to_metres(cfg: BoxesConfig, places: np.ndarray, path: Path) -> Callable[[np
     if (cfg.units == "degrees" and not may_be_degrees) or (cfg.units == "m" and may_be_degrees and size > 0):
         other_unit = "degrees" if cfg.units == "m" else "m"
         raise InputError(
-            f"the coordinates are not in {cfg.units}",
+            f"the coordinates do not look like {cfg.units}",
             where=path,
             got=f"{low.tolist()} to {high.tolist()}",
             expected="wider than 2 m" if cfg.units == "m" else "longitude and latitude of one town",

@@ -106,8 +106,13 @@ def box_map_of(answers: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
         position_m, rotation_deg = world_pose((*box[:3], *box[6:]))
         rows[number] = position_m, box[3:6], rotation_deg, KINDS[label]
     if not rows:
-        expected = "objects of get_environment_objects"
-        raise InputError("the town has no objects", where=where, got=f"{len(answers.rows)}", expected=expected)
+        raise InputError(
+            "no object of the town can be used",
+            where=where,
+            got=f"{len(answers.rows)} objects, dropped: {dict(dropped)}",
+            expected="an object of get_environment_objects with a box of its own",
+            fix="check the loaded town",
+        )
     header = MapHeader(
         name=cfg.name or answers.town, source=MapSource(tool="CARLA", version=answers.version, file=answers.town),
         licence=cfg.licence, credits=cfg.credits, extent_sources={"engine": len(rows)}, num_objects=len(answers.rows),

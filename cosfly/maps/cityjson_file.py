@@ -303,10 +303,10 @@ def _resolve_instance(geometry: _Geometry, vertices: _Vertices, where: str) -> _
         )
     if type(anchor) is not int or not 0 <= anchor < len(vertices.part_vertices):
         raise InputError(
-            "the instance has no place",
+            "the instance must have exactly one reference point",
             where=f"{where}.boundaries",
             got=repr(geometry.boundaries)[:40],
-            expected="one vertex index",
+            expected="the index of one vertex",
         )
     if len(geometry.transformationMatrix) != 16:
         expected = "16 finite numbers, row by row"
@@ -339,8 +339,10 @@ def _rings(surface: Any, vertices: np.ndarray, where: str) -> Surface:
                 expected=f"0 to {len(vertices) - 1}",
             )
         rings.append(vertices[ring])
-    if not rings or not all(np.isfinite(ring).all() for ring in rings):
-        raise InputError("the surface has no finite vertices", where=where, expected="a list of rings")
+    if not rings:
+        raise InputError("the surface has no rings", where=where, expected="at least one ring")
+    if not all(np.isfinite(ring).all() for ring in rings):
+        raise InputError("a vertex of the surface is not finite", where=where, expected="finite coordinates")
     if (num_vertices := sum(map(len, rings))) > MOST_VERTICES:
         raise over_limit(where, f"a surface of {num_vertices:,} vertices", f"{MOST_VERTICES:,}", "simplify it")
     return rings

@@ -109,7 +109,12 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
         kept.append((one.name, one.class_name, source))
     counts = {source: sum(row[2] == source for row in kept) for source in SOURCES}
     if not rows:
-        raise InputError("the level has no objects", where=where, got=f"{len(objects)}", expected="vget /objects")
+        raise InputError(
+            "no object of the level can be used",
+            where=where,
+            got=f"{len(objects)} objects of vget /objects, dropped: {dict(dropped)}",
+            fix="check the loaded level and the table of sizes",
+        )
     share = counts["default"] / len(rows)
     if cfg.most_default is not None and share > cfg.most_default:
         classes = Counter(row[1] for row in kept if row[2] == "default").most_common(5)

@@ -111,11 +111,11 @@ class Editor:
         num_x, num_y = empty_grid(self.box_map, self.cfg.resolution_m).size
         if max(num_x, num_y) > MOST_SIDE or num_x * num_y > MOST_CELLS:
             raise InputError(
-                "the grid is too large for a page",
+                "the grid is too large for the editor's page",
                 where=self.where,
                 got=f"{num_x} x {num_y} cells",
-                expected=f"sides of {MOST_SIDE}, {MOST_CELLS:,} cells in all",
-                fix="take a coarser pedestrians.resolution_m to draw with: a region is in metres",
+                expected=f"at most {MOST_SIDE} cells a side and {MOST_CELLS:,} cells in all",
+                fix="set a larger pedestrians.resolution_m while you draw: the region is saved in metres",
             )
         self.bare = walkable_ground(self.box_map, self.cfg, where=self.where)
         self.opened = None

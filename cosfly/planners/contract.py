@@ -186,7 +186,8 @@ class PlanConfig(Config):
     def _are_ranges(cls, ranges: dict[str, dict[str, Range]]) -> dict[str, dict[str, Range]]:
         for name, style_ranges in ranges.items():
             if name not in ROWS:
-                raise ValueError(f"style {name!r} does not exist or has no ranges{nearest(name, ROWS)}")
+                choices = ", ".join(ROWS)
+                raise ValueError(f"{name!r} is not a style with ranges{nearest(name, ROWS)}; choose from {choices}")
             with_ranges(ROWS[name], style_ranges)
         return ranges
 

@@ -252,7 +252,7 @@ def bystanders_of(others: Path | None, traces: list[DroneTrace]) -> tuple[dict[s
     for trace in traces:
         where = f"{others}: {trace.path_id}"
         if trace.path_id not in by_path:
-            raise InputError("the file has no bystanders of a path", where=where, fix=FROM_ONE_RUN)
+            raise InputError("the file has no bystanders for this trajectory", where=where, fix=FROM_ONE_RUN)
         if other_lengths := {len(other.positions_m) for other in by_path[trace.path_id]} - {len(trace.time_s)}:
             raise InputError(
                 "bystanders have other times than the trajectory",

@@ -209,7 +209,7 @@ class UnrealCvRenderer(SimulatorRenderer):
     def _check_place(self, position_m: np.ndarray, found: str | bytes) -> None:
         numbers = self._server.numbers(found, 3)
         if numbers is None:
-            raise NoAnswerError(f"its position is {found!r}")
+            raise NoAnswerError(f"the camera's position is {found!r}, not three numbers")
         place_m = world_pose([*(part / self._cfg.coord_scale for part in numbers), 0.0, 0.0, 0.0])[0]
         place_m[2] -= self._cfg.coord_z_offset
         if np.linalg.norm(place_m - position_m) > SAME_PLACE_M:

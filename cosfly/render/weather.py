@@ -161,7 +161,8 @@ def _read_pool(
     presets = build(model, read_yaml(path), path).presets
     pool = {preset_token(key): preset for key, preset in presets.items()}
     if len(pool) < len(presets):
-        raise ConfigError("two presets have the same name", where=path, got=", ".join(presets))
+        what = "two presets have the same name if case, blanks and hyphens are ignored"
+        raise ConfigError(what, where=path, got=", ".join(presets), fix="rename one")
     if problems := _unknown(name, pool, field):
         raise ConfigError("; ".join(problems), where=path)
     return pool

@@ -73,8 +73,12 @@ class Journal:
                     file.seek(line_byte)
                     record = _record_of(file.readline())
                 if record is None:
-                    fix = "run the same command again: the item of the line is done again"
-                    raise InputError("a line was damaged meanwhile", where=f"{self.path}: byte {line_byte}", fix=fix)
+                    fix = "run the same command again: the item of this line is done again"
+                    raise InputError(
+                        "a line of the journal changed while the command was running",
+                        where=f"{self.path}: byte {line_byte}",
+                        fix=fix,
+                    )
                 yield record
 
     def append(self, record: dict, *, sync: bool = True) -> int:

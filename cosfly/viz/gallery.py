@@ -77,7 +77,7 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
         debug = Overlay(box_map, ids).draw(rgb, read_instance(folder)[1], meta)
     else:
         fix = "pass --map boxes_3d.json, or render with --set render.debug=true"
-        raise InputError("the frame has no debug.png", where=folder, expected="it, or the map", fix=fix)
+        raise InputError("the frame has no debug.png, and no map is given", where=folder, fix=fix)
     panels = [rgb, read_view(folder, "depth"), read_view(folder, "segmentation"), debug]
     titles = (
         f"RGB, {meta.camera.fov_deg:.0f} deg",

@@ -106,13 +106,14 @@ class WorldPlan(BaseModel):
         for name, (least, most) in (limits | {"trees_per_ha": (0.0, 400.0)}).items():
             low, high = getattr(self, name)
             if not least <= low <= high <= most:
-                raise ValueError(f"{name} is from {low:g} to {high:g}, not a range within {least:g} to {most:g}")
+                raise ValueError(f"{name} is {low:g} to {high:g}, but must be a range within {least:g} to {most:g}")
         if self.plazas + self.greens >= self.blocks_along**2:
             raise ValueError(f"{self.plazas} plazas and {self.greens} greens leave no block of {self.blocks_along**2}")
         narrowest_m = self.block_m * (1.0 - self.unevenness) / (1.0 + self.unevenness)
         if narrowest_m < MIN_BLOCK_M + 1.0 or self.setback_m > narrowest_m / 5:
-            what = f"blocks as narrow as {narrowest_m:.1f} m, less than {MIN_BLOCK_M + 1.0:g} m or five times setback_m"
-            raise ValueError(f"{what}: raise block_m, or lower unevenness or setback_m")
+            expected = f"at least {MIN_BLOCK_M + 1.0:g} m and at least five times setback_m"
+            fix = "raise block_m, or lower unevenness or setback_m"
+            raise ValueError(f"the narrowest block is {narrowest_m:.1f} m wide, but must be {expected}; {fix}")
         return self
 
     def known_objects(self) -> list[tuple[Object, int]]:

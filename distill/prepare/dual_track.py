@@ -146,7 +146,7 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
     # Two passes: the splits must be known before the first window is written.
     paired, courses, tally = _survey(stage, cfg, runs)
     walks = walks_of(courses)
-    fix = "give more flights, set a fraction to 0, or --set distill.dual_track.too_few=fill"
+    fix = "add trajectories, set a fraction to 0, or --set distill.dual_track.too_few=fill"
     owners = cfg.assigned({flight.key for flight in paired}, walks, seed, "both tracks", fix)
     with SplitFiles(out, COLUMNS).writing() as files:
         facts = _write(files, cfg, paired, walks, {key: split for key, (_, split) in owners.items()})

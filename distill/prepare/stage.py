@@ -400,7 +400,7 @@ def _survey(windows: _Windows, seed: int) -> tuple[WindowRanks, Counter[str]]:
 def _choose(cfg: PrepareConfig, windows: _Windows, ranks: WindowRanks, seed: int) -> _Selection:
     windows.walks = windows.flights.walks()
     keys = {flight: flight.rpartition("/")[0] for flight in ranks.flights}
-    fix = "caption more flights, set a fraction to 0, or --set distill.prepare.too_few=fill"
+    fix = "caption more trajectories, set a fraction to 0, or --set distill.prepare.too_few=fill"
     owners = cfg.assigned(set(keys.values()), windows.walks, seed, "usable captions", fix)
     split_of = {key: split for key, (_, split) in owners.items()}
     train = {flight for flight, key in keys.items() if split_of[key] == "train"}
