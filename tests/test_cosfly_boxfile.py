@@ -117,7 +117,7 @@ def test_all_that_is_wrong_with_a_table_is_told(tmp_path, subtests):
             (PLAIN.replace("20,4,12", "20,1e18,12"), "line 2: the box is empty"),
             (PLAIN.replace("7,Buildings", "8,Buildings"), "id is not a whole number, each once"),
             (PLAIN.replace("7,Buildings", "x,Buildings"), "id is not a whole number, each once"),
-            (PLAIN.replace(",", ";"), "no column type.*by commas"),
+            (PLAIN.replace(",", ";"), "no column type.*separated by commas"),
             ("", "holds no boxes"),
             (PLAIN + "\"a", "not a table"),
         ]:  # fmt: skip

@@ -49,7 +49,8 @@ def read_controls(path: Path, tokens: tuple[str, ...]) -> dict[str, Control]:
     """Read a table, which needs a row for each token."""
     found = build(ControlTable, read_yaml(path), path).actions
     if lacking := [token for token in tokens if token not in found]:
-        raise ConfigError("decisions without a row", where=path, got=", ".join(lacking), fix="add the rows")
+        what = "the table has no command for some decisions"
+        raise ConfigError(what, where=path, got=", ".join(lacking), fix="add an entry for each under actions")
     return found
 
 

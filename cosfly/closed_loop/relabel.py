@@ -95,10 +95,10 @@ def _seed_of(flown: Path, cfg: ClosedLoopConfig) -> int:
     now = flattened(cfg.recorded()["render"], "render")
     if changed := [f"{key} was {was.get(key)!r}, is {value!r}" for key, value in now.items() if was.get(key) != value]:
         raise ConfigError(
-            "these render settings are not those of the student",
+            "the render settings differ from those of the recorded episodes",
             where=flown,
             got="; ".join(changed),
-            fix="use the settings of the episodes",
+            fix="use the settings in stage.json of the episodes",
         )
     return begun.seed
 

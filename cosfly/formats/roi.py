@@ -121,6 +121,6 @@ def _polygons_of(features: list[Feature], path: Path) -> list[dict[str, Any]]:
             points, *holes = (ring[:-1].tolist() for ring in rings)
             polygons.append({"points_world": points, "holes": holes})
     if problems:
-        expected = "polygons in the map's world metres, x east and y north; longitude and latitude are not"
+        expected = "polygons in the map's world metres, x east and y north, not in longitude and latitude"
         raise InputError.of_all(problems, where=path, expected=expected)
     return polygons

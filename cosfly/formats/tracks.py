@@ -74,11 +74,15 @@ def read_twin(track: Track) -> Track | None:
     if twin is None:
         return None
     has_same_times = len(twin) == len(track) and np.abs(twin.time_s - track.time_s).max() < TWIN_TOLERANCE_S
-    if not (twin.is_original and has_same_times):
+    if not twin.is_original:
+        raise VerifyError(
+            "the track in the clean track's folder is not clean", where=twin.folder, got="is_original false"
+        )
+    if not has_same_times:
         raise VerifyError(
             "the clean track does not belong to the perturbed track next to it",
             where=twin.folder,
-            got=f"{_time_span(twin)}, is_original {twin.is_original}",
+            got=_time_span(twin),
             expected=_time_span(track),
         )
     return twin

@@ -32,7 +32,7 @@ def check_url(url: str) -> None:
     got = "" if "@" in url else f", got {re.split('[?#]', url)[0][:200]!r}"
     if re.search("[@?#]", url):
         problem = "a URL must not contain a user, password, query or fragment, since it is recorded"
-        raise ValueError(f"{problem}; set the key in the environment variable {KEY_VARIABLE}{got}")
+        raise ValueError(f"{problem}{got}; set the key in the environment variable {KEY_VARIABLE}")
     try:
         parts = httpx.URL(url)
         parts.raw_host.decode("ascii").encode("idna")  # the encoding that the resolver uses

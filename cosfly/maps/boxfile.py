@@ -178,7 +178,9 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
                 problems += [f"no column {name}" for name in ("type", *PLACE) if name not in names]
                 problems += [f"column {name} occurs twice" for name, count in Counter(names).items() if count > 1]
                 if problems:
-                    raise InputError.of_all(problems, where=path, expected=f"columns {', '.join(COLUMNS)}, by commas")
+                    raise InputError.of_all(
+                        problems, where=path, expected=f"columns {', '.join(COLUMNS)}, separated by commas"
+                    )
                 continue
             problem = "" if len(cells) == len(names) else f"{len(cells)} cells, but {len(names)} in the first line"
             values = {name: cell for name, cell in zip(names, cells, strict=False) if cell and name in COLUMNS}

@@ -84,7 +84,8 @@ def cover(
     the side and at the share) that leaves the least empty area.
     """
     if not 0 < min_fill <= 1 or not min_size_m > 0 or not all(0 < share < 1 for share in shares):
-        raise ValueError(f"min_fill {min_fill}, min_size_m {min_size_m}, shares {shares}")
+        got = f"got {min_fill}, {min_size_m} and {shares}"
+        raise ValueError(f"min_fill and shares must be between 0 and 1, and min_size_m above 0; {got}")
     done: list[Rectangle] = []
     waiting = [(piece, 0) for piece in polygons_of(polygon)]
     while waiting:

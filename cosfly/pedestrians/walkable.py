@@ -309,10 +309,11 @@ def check_roi(roi: Roi, box_map: BoxMap, where: str | Path, *, refuse: bool = Fa
     inside = shapely.intersection(region, shapely.box(*low[:2], *high[:2])).area / max(region.area, 1e-9)
     if refuse and inside < ROI_SHARE_MIN:
         raise InputError(
-            "the region of interest belongs to another map or other axes",
+            "most of the region of interest lies outside the map",
             where=where,
-            got=f"{inside:.0%} of it on this map",
+            got=f"{inside:.0%} of it on the map",
             expected=f"at least {ROI_SHARE_MIN:.0%}",
+            fix="draw it on this map, in its world metres: x is east, y is north",
         )
     if 0.0 < inside < ROI_SHARE_MIN:
         log.warning("%s: %.0f %% of the region of interest lies outside the map", where, 100 * (1 - inside))

@@ -180,7 +180,7 @@ def _plan_once(
     clearances, _, _ = swept_distances(obstacles, positions, CLEARANCE_CAP_M)
     if clearances.min() < cfg.relaxed_safety_m - CLEARANCE_TOLERANCE_M:
         raise NoPathError(
-            f"planner {cfg.planner} found no trajectory that is free of collisions",
+            f"planner {cfg.planner} found no trajectory with enough clearance",
             where=pedestrian.path_id,
             got=f"a least clearance of {clearances.min():.2f} m",
             expected=f"at least {cfg.relaxed_safety_m:g} m everywhere",

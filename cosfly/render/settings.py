@@ -93,8 +93,8 @@ class RenderConfig(WeatherConfig):
     def _fovs_are_possible(cls, fovs: tuple[float, ...]) -> tuple[float, ...]:
         for fov in fovs:
             if not LEAST_FOV_DEG <= fov <= MOST_FOV_DEG:
-                span = f"(0, 180) degrees, {LEAST_FOV_DEG} to {MOST_FOV_DEG}"
-                raise ValueError(f"every field of view must lie in {span}; got {fov:g}")
+                span = f"{LEAST_FOV_DEG} to {MOST_FOV_DEG} degrees"
+                raise ValueError(f"every field of view must be {span}; got {fov:g}")
         return fovs
 
     @model_validator(mode="after")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 import secrets
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice, product
@@ -161,8 +161,10 @@ def _read_pool(
     presets = build(model, read_yaml(path), path).presets
     pool = {preset_token(key): preset for key, preset in presets.items()}
     if len(pool) < len(presets):
+        tokens = Counter(map(preset_token, presets))
+        twins = [key for key in presets if tokens[preset_token(key)] > 1]
         what = "two presets have the same name if case, blanks and hyphens are ignored"
-        raise ConfigError(what, where=path, got=", ".join(presets), fix="rename one")
+        raise ConfigError(what, where=path, got=", ".join(twins), fix="rename one")
     if problems := _unknown(name, pool, field):
         raise ConfigError("; ".join(problems), where=path)
     return pool

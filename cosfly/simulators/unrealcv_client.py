@@ -149,8 +149,8 @@ def _opened(cfg: UnrealCvConfig, port: int, connection: UnrealCvConnection) -> U
             break
         time.sleep(0.5)
     connection.close()
-    fix = "see `vget /level/name` in the wanted level, or set no level"
-    raise ConfigError("the server has no such level", where=before, got=cfg.level, fix=fix)
+    fix = "open the level by hand and set the name that `vget /level/name` answers, or leave the level unset"
+    raise ConfigError("the server did not open the level", where=before, got=cfg.level, fix=fix)
 
 
 def _client(cfg: UnrealCvConfig, port: int) -> Any:
