@@ -31,7 +31,7 @@ def tree(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(tree, tmp_path_factory) -> tuple[bytes, list[int]]:
-    """Give what an undisturbed run makes, and the seeds of what it asks in English."""
+    """Return what an undisturbed run makes, and the seeds of what it asks in English."""
     with deciding() as server:
         path = run(settings(server.url), tree, tmp_path_factory.mktemp("whole") / "out")
     bodies = [json.loads(body) for body in server.bodies]

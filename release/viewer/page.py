@@ -111,7 +111,10 @@ def _printable(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_printable(one) for one in value]
     if isinstance(value, dict):
-        return {_printable(key): one if key == "pictures" else _printable(one) for key, one in value.items()}
+        return {
+            _printable(key): one if key in ("pictures", TARGET_PICTURE) else _printable(one)
+            for key, one in value.items()
+        }
     return value
 
 
@@ -391,7 +394,7 @@ def _frame(row: Mapping[str, Any], pictures: dict[View, str], caption: dict[str,
         "fov_deg": round(row["fov_deg"], 1),
         "box": box.tolist() if np.isfinite(box).all() else None,
         "pictures": pictures,
-        "target_picture": base64.b64encode(picture["bytes"]).decode() if picture else None,
+        TARGET_PICTURE: base64.b64encode(picture["bytes"]).decode() if picture else None,
         "caption": caption,
     }
 
