@@ -13,6 +13,7 @@ from specimens_students import MAX_PIXELS, inputs_of, load, log_of, losses_of, r
 from cosfly.runtime.errors import InputError  # noqa: E402
 from distill.student.checkpoint import Progress  # noqa: E402
 from distill.student.model import load_student  # noqa: E402
+from distill.training import fit  # noqa: E402
 from distill.training.fit import Validation, judged  # noqa: E402
 from distill.training.settings import TrainConfig  # noqa: E402
 
@@ -41,25 +42,28 @@ def test_a_model_trained_in_full_is_a_whole_folder(place, tmp_path):
 
 
 @pytest.mark.slow
-def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path):
-    settings = {"learning_rate": 5.0, "validate_every_steps": 1, "patience": 2, "keep_checkpoints": 1, "max_steps": 12}
+def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path, monkeypatch):
+    losses = iter([4.0, 3.0, 1.0, 2.0, 1.5, 0.5])  # before the first step, then after each: the best is step 2
+    monkeypatch.setattr(fit, "validate", lambda *_: Validation(samples=4, loss=next(losses)))
+    settings = {"validate_every_steps": 1, "patience": 2, "keep_checkpoints": 1}
     out = tmp_path / "out"
     run(place, out, **settings)
     manifest = json.loads((out / "manifest.json").read_text())
-    best, steps = manifest["best_step"], manifest["steps"]
-    assert steps == best + 2 < 12
-    scores = {r["step"]: r["validation"]["loss"] for r in log_of(out, "validation") if r["step"]}
-    assert min(scores, key=scores.__getitem__) == best
-    kept = load_file(out / "checkpoints" / f"step_{best:08d}" / "weights.safetensors")
+    assert (manifest["best_step"], manifest["steps"]) == (2, 4)
+    assert [r["validation"]["loss"] for r in log_of(out, "validation")] == [4.0, 3.0, 1.0, 2.0, 1.5]
+    best, last = (out / "checkpoints" / f"step_{step:08d}" / "weights.safetensors" for step in (2, 4))
+    kept, newest = load_file(best), load_file(last)
     product = load_file(out / "adapter" / "adapter_model.safetensors")
-    for name, tensor in product.items():
-        assert torch.equal(tensor, kept[name.replace(".weight", ".default.weight")]), name
+    product = {name.replace(".weight", ".default.weight"): tensor for name, tensor in product.items()}
+    assert product.keys() == kept.keys()
+    assert all(torch.equal(tensor, kept[name]) for name, tensor in product.items())
+    assert not all(torch.equal(tensor, newest[name]) for name, tensor in product.items())
     (out / "manifest.json").unlink()
     run(place, out, **settings)  # it has ended: nothing is done again
-    assert json.loads((out / "manifest.json").read_text())["steps"] == steps
+    assert json.loads((out / "manifest.json").read_text())["steps"] == 4
+    assert next(losses) == 0.5
     (out / "manifest.json").unlink()
-    weights = out / "checkpoints" / f"step_{best:08d}" / "weights.safetensors"
-    weights.write_bytes(weights.read_bytes()[:-7])
+    best.write_bytes(best.read_bytes()[:-7])
     with pytest.raises(InputError, match=r"best validation is damaged.*weights\.safetensors"):
         run(place, out, **settings)
 
