@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from caption.run.released import read_released
+from caption.stage.released import read_released
 from cosfly.formats.frames import depth_bytes
 from cosfly.runtime.io import sha256_file
 from release import columns

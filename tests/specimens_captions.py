@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from teacher_server import TeacherServer
 
+from caption.answer_formats.contract import Draft, way_of
 from caption.schema import CaptionConfig
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.rules import write_templates
-from caption.truth.facts import Facts
-from caption.writing.contract import Draft, way_of
+from caption.verification.facts import Facts
 from cosfly.formats.captions import Coc
 from cosfly.llm.answer_text import Parsed
 

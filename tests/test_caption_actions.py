@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tables import each
 
 from caption.schema import FutureMotion
-from caption.truth.actions import TABLE, Thresholds, measure
+from caption.verification.actions import TABLE, Thresholds, measure
 
 THRESHOLDS = Thresholds()
 

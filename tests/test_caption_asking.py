@@ -9,8 +9,8 @@ import pytest
 from specimens_captions import deciding, report_of, settings
 from teacher_server import is_mirror, kept_answers
 
-from caption.run import asking
-from caption.run.stage import run
+from caption.stage import asking
+from caption.stage.stage import run
 from cosfly.formats.captions import read_captions
 from cosfly.llm import client
 from cosfly.runtime.errors import TeacherError
@@ -28,7 +28,7 @@ LIMITED = """
 import json, resource, sys
 from pathlib import Path
 from caption.schema import CaptionConfig
-from caption.run.stage import run
+from caption.stage.stage import run
 from cosfly.runtime.errors import StorageError
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
 try:

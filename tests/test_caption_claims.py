@@ -7,8 +7,8 @@ from specimens_captions import FACTS
 from tables import each
 
 from caption.schema import Judged
-from caption.truth.claims import judge_sentence
-from caption.truth.facts import Facts
+from caption.verification.claims import judge_sentence
+from caption.verification.facts import Facts
 from cosfly.formats.captions import Claim, Language
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from specimens_captions import VOCABULARY
 from tables import each
 
-from caption.run.compare import compare
-from caption.run.window_loop import Trial, caption_window
-from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, RepairConfig, WindowConfig
+from caption.stage.compare import compare
+from caption.stage.window_loop import Trial, caption_window
+from caption.stage.windows import cut_windows
 from caption.teachers.teacher import RuleTeacher
 from cosfly.formats.captions import Caption, Coc
 from specimens import make_flight

@@ -10,9 +10,9 @@ from specimens_captions import VOCABULARY, deciding, report_of, settings
 from tables import each
 from teacher_server import ENGLISH, TeacherServer, refusal
 
-from caption.run.forecast import make_forecast
-from caption.run.stage import run
 from caption.schema import CaptionConfig
+from caption.stage.forecast import make_forecast
+from caption.stage.stage import run
 from caption.teachers.doctor import ODD_WORD, Finding, examine_endpoint
 
 TOKENS_PER_IMAGE, CONTEXT = 220, 8192

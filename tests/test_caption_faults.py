@@ -13,7 +13,7 @@ from specimens_captions import deciding, report_of, settings
 from tables import each
 from teacher_server import MODEL, is_mirror, refusal
 
-from caption.run.stage import run
+from caption.stage.stage import run
 from cosfly.formats.captions import read_captions
 from cosfly.runtime.errors import TeacherError
 from specimens import make_playback_tree
@@ -88,7 +88,7 @@ def test_what_is_the_servers_fault_ends_the_run_and_is_no_windows(tree, tmp_path
 def test_a_server_that_refuses_every_window_ends_the_run_and_retry_failed_asks_again(
     tree, tmp_path, whole, monkeypatch
 ):
-    monkeypatch.setattr("caption.run.asking.STOP_AFTER_FAILURES", 3)
+    monkeypatch.setattr("caption.stage.asking.STOP_AFTER_FAILURES", 3)
     out, behaviour = tmp_path / "out", Switched(400, NOT_KNOWN)
     with deciding(respond=behaviour) as server:
         cfg = settings(server.url, endpoint={"concurrency": 1})

@@ -9,8 +9,8 @@ from specimens_distill import prepared
 from tables import each
 from teacher_server import MODEL, TeacherServer
 
-from caption.run.stage import run
 from caption.schema import CaptionConfig
+from caption.stage.stage import run
 from caption.teachers.foreign import read_foreign
 from cosfly.formats.captions import Caption, read_captions, write_captions
 from cosfly.inspection import stage as inspection

@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from caption.run.windows import cut_windows
+from caption.answer_formats.contract import way_of
 from caption.schema import WindowConfig
+from caption.stage.windows import cut_windows
 from caption.teachers.prompt_files import shipped_prompts
 from caption.teachers.prompts import user_prompts
 from caption.teachers.rules import describe
-from caption.truth.facts import measure_facts
-from caption.truth.references import find_fact, number_holds, parse_reference
-from caption.truth.vocabulary import Vocabulary
-from caption.writing.contract import way_of
+from caption.verification.facts import measure_facts
+from caption.verification.references import find_fact, number_holds, parse_reference
+from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import Coc, Prompt
 from cosfly.formats.people import Goal
 from cosfly.formats.playback import read_track

@@ -8,8 +8,8 @@ from specimens_captions import VOCABULARY
 from tables import each
 from teacher_server import TeacherServer
 
-from caption.run.stage import run
 from caption.schema import CaptionConfig, JudgeConfig
+from caption.stage.stage import run
 from caption.teachers.judge import JUDGEMENTS, UNJUDGED, check_judge, gold_conflicts, judge_messages, parse_judgement
 from cosfly.formats.captions import read_captions
 from cosfly.runtime.errors import TeacherError

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from commands import invoke
 
-from caption.run.stage import run
 from caption.schema import CaptionConfig
+from caption.stage.stage import run
 from caption.teachers.prompt_files import PROMPTS, export_prompts, own_prompts, shipped_prompts
 from cosfly.formats.captions import OWN_PROMPTS, read_captions
 from cosfly.runtime.errors import ConfigError, ResumeError

@@ -5,7 +5,7 @@ import dataclasses
 from specimens_captions import GAP
 from tables import each
 
-from caption.truth.references import Fact, look_up, parse_reference, word_holds
+from caption.verification.references import Fact, look_up, parse_reference, word_holds
 
 FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0))
 

@@ -19,8 +19,8 @@ from specimens_captions import settings as quick
 from tables import each
 from teacher_server import MODEL, Sent, Wild, obedient_answer
 
-from caption.run.stage import run
 from caption.schema import CaptionConfig
+from caption.stage.stage import run
 from cosfly.llm.client import KEY_VARIABLE
 from cosfly.runtime.errors import NothingKept, TeacherError
 

@@ -16,14 +16,14 @@ from specimens_captions import GAP, WAY, report_of, saying, settings
 from tables import each
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror
 
-from caption.run.stage import run
-from caption.run.windows import cut_windows
+from caption.answer_formats.contract import Draft, Refused
+from caption.answer_formats.filling import Filler
+from caption.answer_formats.slots import fact_table
+from caption.answer_formats.templates import Sentence, read_sentence
 from caption.schema import WindowConfig
-from caption.truth.facts import Facts, measure_facts
-from caption.writing.contract import Draft, Refused
-from caption.writing.filling import Filler
-from caption.writing.slots import fact_table
-from caption.writing.templates import Sentence, read_sentence
+from caption.stage.stage import run
+from caption.stage.windows import cut_windows
+from caption.verification.facts import Facts, measure_facts
 from cosfly.formats.captions import Coc, Language, read_captions
 from cosfly.llm.answer_text import Parsed
 from cosfly.runtime.errors import NothingKept

@@ -7,11 +7,11 @@ from collections import Counter
 
 import pytest
 
-from caption.run import stage
-from caption.run.stage import run
-from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig
-from caption.truth.actions import TABLE, measure
+from caption.stage import stage
+from caption.stage.stage import run
+from caption.stage.windows import cut_windows
+from caption.verification.actions import TABLE, measure
 from cosfly.formats.captions import read_captions
 from cosfly.formats.playback import read_track, write_track
 from cosfly.formats.tracks import find_tracks

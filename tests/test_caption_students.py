@@ -11,8 +11,8 @@ from specimens_captions import VOCABULARY
 from specimens_distill import prepared
 from teacher_server import TeacherServer
 
-from caption.run.stage import run
 from caption.schema import CaptionConfig
+from caption.stage.stage import run
 from caption.teachers.students import as_taught
 from cosfly.formats.captions import read_captions
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE, read_chat_format, write_chat_format

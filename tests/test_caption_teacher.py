@@ -14,8 +14,8 @@ from specimens_captions import settings as quick
 from tables import each
 from teacher_server import TeacherServer
 
-from caption.run.stage import run
 from caption.schema import CaptionConfig
+from caption.stage.stage import run
 from cosfly.formats.captions import read_captions
 from cosfly.llm.client import KEY_VARIABLE, ConcurrencyLimit
 from cosfly.runtime.errors import CosflyError, NothingKept, TeacherError

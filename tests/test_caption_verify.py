@@ -9,11 +9,11 @@ import numpy as np
 from specimens_captions import write_answers
 from tables import each
 
-from caption.run.windows import cut_windows
+from caption.answer_formats.prose import judge_prose
 from caption.schema import WindowConfig
-from caption.truth.facts import Facts, measure_facts
-from caption.truth.mirror import check_mirror, flight_numbers
-from caption.writing.prose import judge_prose
+from caption.stage.windows import cut_windows
+from caption.verification.facts import Facts, measure_facts
+from caption.verification.mirror import check_mirror, flight_numbers
 from cosfly.formats.captions import ACTIONS, TOKENS, Coc
 from specimens import make_flight
 

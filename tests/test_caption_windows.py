@@ -13,13 +13,13 @@ from specimens_captions import VOCABULARY
 from tables import each
 from teacher_server import TeacherServer
 
-from caption.run.stage import run
-from caption.run.windows import as_flown, choose_keyframes, current_frames, cut_future, cut_windows, missed_changes
 from caption.schema import CaptionConfig, FutureMotion, ImageConfig, ObservedWindow, WindowConfig, observed_frames
+from caption.stage.stage import run
+from caption.stage.windows import as_flown, choose_keyframes, current_frames, cut_future, cut_windows, missed_changes
 from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import make_question, question_messages
-from caption.truth.actions import TABLE, measure
-from caption.truth.facts import measure_facts
+from caption.verification.actions import TABLE, measure
+from caption.verification.facts import measure_facts
 from cosfly.formats.boxes import MapHeader, make_box_map
 from cosfly.formats.playback import Perturbation, Track, read_track, write_track
 from cosfly.formats.segments import Mission

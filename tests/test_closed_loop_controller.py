@@ -6,7 +6,7 @@ from specimens_planning import town_of, walk_along
 from tables import each
 
 from caption.schema import FutureMotion
-from caption.truth.actions import TABLE, Motion, Thresholds, measure
+from caption.verification.actions import TABLE, Motion, Thresholds, measure
 from cosfly.closed_loop.controller import Controller, read_controls
 from cosfly.closed_loop.engines import EngineDecision
 from cosfly.closed_loop.settings import CONTROLLER_FILE, Drone

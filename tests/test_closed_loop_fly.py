@@ -9,8 +9,8 @@ from commands import invoke
 from specimens_distill import prepared
 from teacher_server import TeacherServer
 
-from caption.run.stage import run as caption_tree
 from caption.schema import CaptionConfig
+from caption.stage.stage import run as caption_tree
 from cosfly.formats.captions import read_captions
 from cosfly.formats.episodes import EPISODES, Episode, read_episode
 from cosfly.formats.playback import read_track

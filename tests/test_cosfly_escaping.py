@@ -15,9 +15,9 @@ from markdown_it import MarkdownIt
 from pydantic import BaseModel, ValidationError
 from rich.table import Table
 
-from caption.run.report import page_html
-from caption.run.stage import run as caption
 from caption.schema import CaptionConfig
+from caption.stage.report import page_html
+from caption.stage.stage import run as caption
 from cosfly.formats.captions import Caption, read_captions
 from cosfly.formats.inspection import Inspection, read_inspection
 from cosfly.inspection.report import report_html
@@ -151,7 +151,7 @@ def test_the_page_of_an_inspection_shows_forged_records(inspection):
 
 def test_the_page_of_a_captioning_run_shows_forged_captions(tree, tmp_path):
     done = caption(CaptionConfig(), tree, tmp_path / "caption").parent
-    from caption.run.ledger import CaptionReport
+    from caption.stage.ledger import CaptionReport
 
     value = read_json(done / "caption_report.json")
     report = CaptionReport.model_validate({k: v for k, v in value.items() if k not in ("schema", "schema_version")})

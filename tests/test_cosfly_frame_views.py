@@ -11,9 +11,9 @@ from PIL import Image
 from specimens_captions import VOCABULARY
 from tables import each
 
-from caption.run.window_loop import caption_window
-from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, ImageConfig, Window, WindowConfig
+from caption.stage.window_loop import caption_window
+from caption.stage.windows import cut_windows
 from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import make_question, question_messages
 from caption.teachers.teacher import RuleTeacher

@@ -18,8 +18,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from public_reader import Refused, read_public
 from specimens_foreign import NOBODY, write_foreign_tree
 
-from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
+from caption.stage import stage as caption_stage
 from cosfly.formats.captions import read_captions
 from cosfly.formats.inspection import read_inspection
 from cosfly.formats.playback import read_track, write_track

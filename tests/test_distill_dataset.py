@@ -97,8 +97,8 @@ def test_which_captions_teach_and_how_much():
 
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory):
-    from caption.run.stage import run as caption_run
     from caption.schema import CaptionConfig
+    from caption.stage.stage import run as caption_run
     from cosfly.formats.captions import read_captions
 
     root = tmp_path_factory.mktemp("asked")

@@ -17,7 +17,7 @@ pytest.importorskip("peft", reason="needs the extra distill")
 
 from teacher_server import kept_answers  # noqa: E402
 
-from caption.writing.contract import more_fields  # noqa: E402
+from caption.answer_formats.contract import more_fields  # noqa: E402
 from cosfly.formats.predictions import Prediction, read_predictions  # noqa: E402
 from cosfly.llm.answer_text import answer_schema, parse_answer  # noqa: E402
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE  # noqa: E402

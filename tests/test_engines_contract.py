@@ -20,8 +20,8 @@ from specimens_captions import settings
 from specimens_distill import make_captions, prepared
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror, kept_answers
 
-from caption.run.stage import run
 from caption.schema import CaptionConfig
+from caption.stage.stage import run
 from caption.teachers import teacher
 from caption.teachers.teacher import make_engine
 from cosfly.formats.captions import Usage, read_captions

@@ -10,8 +10,8 @@ from specimens_planning import WORLDS, assert_safe, town_of, walk_along
 from tables import each
 
 from caption.schema import FutureMotion
-from caption.truth.actions import TABLE as ACTION_TABLE
-from caption.truth.actions import measure
+from caption.verification.actions import TABLE as ACTION_TABLE
+from caption.verification.actions import measure
 from cosfly.formats.captions import TOKENS
 from cosfly.formats.frames import LEGIBLE_HEIGHT_PX, Camera
 from cosfly.formats.pedestrian_paths import paces_of, walk_id

@@ -15,8 +15,8 @@ from PIL import Image
 from specimens_foreign import write_foreign_tree
 from specimens_release import FREE, all_bytes, make_caption, make_inspection, rewrite_captions, source_of
 
-from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
+from caption.stage import stage as caption_stage
 from cosfly.formats.captions import write_captions
 from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback import read_track

@@ -21,7 +21,7 @@ from release_lies import Lie, Row, box_moved, captioned, ids_of_things_exchanged
 from release_tampering import depth_of, errors_in, forge, set_depth
 from teacher_server import TeacherServer
 
-from caption.run.released import read_released
+from caption.stage.released import read_released
 from cosfly.formats.captions import write_captions
 from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.settings import RunConfig

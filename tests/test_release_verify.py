@@ -20,7 +20,7 @@ from specimens_foreign import hub_snapshot, write_foreign_tree
 from specimens_release import run_here
 from tables import each
 
-from caption.run.released import read_released
+from caption.stage.released import read_released
 from cosfly.formats.frames import instance_bytes
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import write_bytes

@@ -16,6 +16,7 @@ import cv2
 import httpx
 import numpy as np
 
+from caption.answer_formats.contract import more_fields, way_of
 from caption.schema import CaptionConfig, ObservedWindow, observed_frames
 from caption.teachers.prompts import (
     MAX_RETURNED_CHARACTERS,
@@ -25,8 +26,7 @@ from caption.teachers.prompts import (
     text_of,
     way_prompt,
 )
-from caption.truth.vocabulary import Vocabulary
-from caption.writing.contract import more_fields, way_of
+from caption.verification.vocabulary import Vocabulary
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Reply

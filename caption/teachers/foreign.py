@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from caption.answer_formats.contract import Draft
 from caption.schema import CaptionConfig
 from caption.teachers.prompts import Question
-from caption.writing.contract import Draft
 from cosfly.formats.captions import Coc, Language, TeacherRecord, TeacherSettings, Writing
 from cosfly.formats.predictions import FAILED, Prediction, read_predictions
 from cosfly.llm.contract import NoAnswer, Reply

@@ -17,8 +17,8 @@ from typing import Literal, get_args
 from rich.table import Table
 
 from caption.schema import JudgeConfig, Judgement
-from caption.truth.facts import Facts
-from caption.truth.vocabulary import Vocabulary
+from caption.verification.facts import Facts
+from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import Coc, JudgeRecord, Language
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook, Budget, KeptAnswers

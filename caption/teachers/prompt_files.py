@@ -13,7 +13,7 @@ from pathlib import Path
 from string import Template
 
 from caption.schema import CaptionConfig
-from caption.truth.vocabulary import Vocabulary
+from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import OWN_PROMPTS
 from cosfly.runtime.errors import ConfigError, InputError, nearest
 from cosfly.runtime.io import read_text, refuse_links, storage_errors, write_bytes

@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
+from caption.answer_formats.contract import Draft, WayOfWriting, way_of
 from caption.schema import ImageConfig, ObservedFrame, ObservedWindow
 from caption.teachers.images import FrameSource, pictures_of
 from caption.teachers.prompt_files import prompt_format
-from caption.truth.facts import Facts, measure_facts
-from caption.truth.glossary import load_glossary
-from caption.truth.vocabulary import Vocabulary
-from caption.writing.contract import Draft, WayOfWriting, way_of
+from caption.verification.facts import Facts, measure_facts
+from caption.verification.glossary import load_glossary
+from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import ACTIONS, GOAL_WORDS, PICTURES_MARK, TOKENS, Language, Prompt, Writing
 from cosfly.formats.segments import MISSION_KINDS
 from cosfly.runtime.io import sha256_bytes

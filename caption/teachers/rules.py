@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 
-from caption.truth.facts import Facts
-from caption.truth.references import QUANTITIES, Fact, find_fact, parse_reference
+from caption.verification.facts import Facts
+from caption.verification.references import QUANTITIES, Fact, find_fact, parse_reference
 from cosfly.runtime.config import read_yaml
 
 Both = tuple[str, str]  # English, Chinese

@@ -14,11 +14,11 @@ from string import Template
 
 import numpy as np
 
+from caption.answer_formats.contract import Draft
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import Terms
 from caption.teachers.prompts import Question, decision_words, system_prompt
-from caption.truth.vocabulary import Vocabulary
-from caption.writing.contract import Draft
+from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import Language, Prompt
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.client import EndpointConfig

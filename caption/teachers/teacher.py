@@ -20,14 +20,14 @@ from typing import Protocol
 import numpy as np
 from pydantic_core import to_json
 
+from caption.answer_formats.contract import Draft, more_fields, way_of
 from caption.schema import CaptionConfig, ImageConfig
 from caption.teachers.foreign import FileTeacher, StudentTeacher, Terms
 from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import Question, mirror_messages, question_messages
 from caption.teachers.rules import MODEL, write_templates
 from caption.teachers.students import TaughtStudent
-from caption.truth.vocabulary import Vocabulary
-from caption.writing.contract import Draft, more_fields, way_of
+from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import TeacherRecord, TeacherSettings, Writing
 from cosfly.formats.places import flight_of
 from cosfly.llm.answer_text import answer_schema

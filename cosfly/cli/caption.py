@@ -56,10 +56,10 @@ def caption(
     if check and cfg.teacher_kind == "endpoint" and not is_student and not (target / "answers").exists():
         _examine_endpoint(cfg.teacher, cfg)
     if plan_only:
-        forecast = job.call("caption.run.forecast:make_forecast", cfg, tree, target)
+        forecast = job.call("caption.stage.forecast:make_forecast", cfg, tree, target)
         options.print_table((), forecast, "What this run will take")
     else:
-        job.run("caption.run.stage", cfg, tree, target, retry_failed=retry_failed)
+        job.run("caption.stage.stage", cfg, tree, target, retry_failed=retry_failed)
 
 
 @command("cosfly caption doctor http://localhost:8000", "caption", model=MODEL)
@@ -123,8 +123,8 @@ def compare_strategies(
     conflicts: Annotated[int, Option(min=1, help="Stop after so many conflicts.")] = 50,
 ) -> None:
     """Compare hint, multi_sample, anchored and cascade on the same conflicts: consistency, text, requests, tokens."""
-    from caption.run.compare import comparison_table
+    from caption.stage.compare import comparison_table
     from cosfly.runtime.console import console
 
-    comparison = job.call("caption.run.compare", job.cfg.caption, job.tree(data), out, conflicts=conflicts)
+    comparison = job.call("caption.stage.compare", job.cfg.caption, job.tree(data), out, conflicts=conflicts)
     console.print(comparison_table(comparison))

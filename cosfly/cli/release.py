@@ -54,7 +54,7 @@ def verify(
     json_file: Annotated[Path | None, Option("--json", help="File for the findings, as JSON.")] = None,
 ) -> None:
     """Check that a release agrees with its records and with geometry. Exit with 1 if anything is wrong."""
-    from caption.run.released import read_released
+    from caption.stage.released import read_released
     from cosfly.runtime.json_io import write_json
 
     report = job.call("release.verify.verify:verify", folder, level=level, reader=read_released)

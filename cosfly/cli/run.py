@@ -43,7 +43,7 @@ def run(
 
 
 def _print_estimate(cfg: RunConfig, out: Path) -> None:
-    from caption.run.progress import duration
+    from caption.stage.progress import duration
     from cosfly.pipeline import runs
 
     rows = runs.estimate(cfg, out)

@@ -18,12 +18,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from caption.answer_formats.contract import Draft, more_fields
 from caption.schema import CaptionConfig, ObservedWindow, observed_frames
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.prompts import Question, make_question
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import first_budget, open_teacher
-from caption.writing.contract import Draft, more_fields
 from cosfly.closed_loop.settings import BASELINES, FlyConfig
 from cosfly.closed_loop.stepper import ClosedLoopTrajectory, Moment
 from cosfly.formats.captions import TOKENS

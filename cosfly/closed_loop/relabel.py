@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from caption.run import stage as captioning
 from caption.schema import FutureMotion
-from caption.truth.actions import TABLE, measure
+from caption.stage import stage as captioning
+from caption.verification.actions import TABLE, measure
 from cosfly.closed_loop.engines import PlannerEngine
 from cosfly.closed_loop.measures import LOSS_S
 from cosfly.closed_loop.stage import PLAN, TRACES, TREE, ClosedLoopConfig, flown_trace

@@ -16,7 +16,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel
 
-import caption.run.stage
+import caption.stage.stage
 import cosfly
 import cosfly.inspection.stage
 import cosfly.maps.stage
@@ -92,7 +92,7 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
         stage("plan", cosfly.planners.stage.run, simplified, paths, seed=seed, **pool),
         stage("render", cosfly.render.stage.run, boxes, simplified, traces, others=others, seed=seed, **pool),
         stage("inspect", cosfly.inspection.stage.run, simplified, traces, tree, **pool),
-        stage("caption", caption.run.stage.run, tree, seed=seed, **pool),
+        stage("caption", caption.stage.stage.run, tree, seed=seed, **pool),
         joint_release(cfg, sources, into or out, resume),
     ]
 

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from caption.run.progress import duration
+from caption.stage.progress import duration
 from cosfly.formats.inspection import undecided
 from cosfly.formats.pedestrian_paths import read_paths, walk_id
 from cosfly.formats.traces import read_traces

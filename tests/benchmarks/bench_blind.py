@@ -19,9 +19,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from caption.run.windows import current_frames, cut_future, label_motion, order_comes_within
 from caption.schema import WindowConfig
-from caption.truth.actions import TABLE, measure
+from caption.stage.windows import current_frames, cut_future, label_motion, order_comes_within
+from caption.verification.actions import TABLE, measure
 from cosfly.formats.captions import TOKENS
 from cosfly.formats.pedestrian_paths import walk_id
 from cosfly.formats.playback import Track

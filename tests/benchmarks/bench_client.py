@@ -26,10 +26,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from specimens_captions import VOCABULARY
 from teacher_server import CHINESE, ENGLISH
 
-from caption.run.asking import Asking
-from caption.run.flights import allot, named_flights
-from caption.run.stage import open_stage
 from caption.schema import CaptionConfig
+from caption.stage.asking import Asking
+from caption.stage.flights import allot, named_flights
+from caption.stage.stage import open_stage
 from caption.teachers.images import FrameEncoder
 from caption.teachers.teacher import SharedFrames
 from cosfly.formats.frames import SKY_DEPTH_M

@@ -13,19 +13,19 @@ from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 
-from caption.run.asking import ANSWERS, Asked, Asking, common_causes, read_quarantine
-from caption.run.flights import PARTS, Allotted, allot, named_flights, parts_of, restore_parts
-from caption.run.ledger import Ledger
-from caption.run.reasons import explained
-from caption.run.report import write_page
-from caption.run.window_loop import caption_prepared, prepare
 from caption.schema import CaptionConfig, Window
+from caption.stage.asking import ANSWERS, Asked, Asking, common_causes, read_quarantine
+from caption.stage.flights import PARTS, Allotted, allot, named_flights, parts_of, restore_parts
+from caption.stage.ledger import Ledger
+from caption.stage.reasons import explained
+from caption.stage.report import write_page
+from caption.stage.window_loop import caption_prepared, prepare
 from caption.teachers.foreign import given_samples
 from caption.teachers.prompt_files import PROMPTS, keep_own_prompts, vocabulary_of
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
-from caption.truth.glossary import GLOSSARY_FILE
-from caption.truth.vocabulary import Vocabulary
+from caption.verification.glossary import GLOSSARY_FILE
+from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import caption_lines, line_of, write_caption_lines
 from cosfly.formats.places import flight_of
 from cosfly.llm.contract import run_until_interrupted

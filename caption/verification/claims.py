@@ -1,7 +1,7 @@
 """Claims: what a sentence states, in a form that can be compared exactly with the facts.
 
 A claim names a fact by its reference (references.py) and gives its value. A teacher that writes slots claims what it
-says in words of its own (caption/writing/slots.py).
+says in words of its own (caption/answer_formats/slots.py).
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from caption.schema import Judged
-from caption.truth.coverage import cover
-from caption.truth.facts import Facts
-from caption.truth.numerals import Numeral
-from caption.truth.references import (
+from caption.verification.coverage import cover
+from caption.verification.facts import Facts
+from caption.verification.numerals import Numeral
+from caption.verification.references import (
     MOTIONS,
     STEPS,
     TURNING,
@@ -26,9 +26,9 @@ from caption.truth.references import (
     parse_reference,
     word_holds,
 )
-from caption.truth.said import SCENE
-from caption.truth.sizes import BOUND_SHARE, RATIO_SLACK, about_share, numeral_of, written_digits
-from caption.truth.stated import read_stated
+from caption.verification.said import SCENE
+from caption.verification.sizes import BOUND_SHARE, RATIO_SLACK, about_share, numeral_of, written_digits
+from caption.verification.stated import read_stated
 from cosfly.formats.captions import Claim, Language, SentenceState
 from cosfly.llm.answer_text import normalize_action
 

@@ -13,19 +13,19 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
+from caption.answer_formats.contract import Draft, Refused, WayOfWriting
+from caption.answer_formats.earned import is_earned
+from caption.answer_formats.filling import Filler, facts_of
+from caption.answer_formats.outside import SLOT_MARK
+from caption.answer_formats.templates import Sentence, read_sentence
 from caption.schema import Judged
-from caption.truth.claims import judge_sentence
-from caption.truth.facts import Facts
-from caption.truth.glossary import load_glossary, written_units
-from caption.truth.mirror import TEXTS, lacking
-from caption.truth.references import QUANTITIES
-from caption.truth.sizes import same_size
-from caption.truth.stated import Pole, read_stated
-from caption.writing.contract import Draft, Refused, WayOfWriting
-from caption.writing.earned import is_earned
-from caption.writing.filling import Filler, facts_of
-from caption.writing.outside import SLOT_MARK
-from caption.writing.templates import Sentence, read_sentence
+from caption.verification.claims import judge_sentence
+from caption.verification.facts import Facts
+from caption.verification.glossary import load_glossary, written_units
+from caption.verification.mirror import TEXTS, lacking
+from caption.verification.references import QUANTITIES
+from caption.verification.sizes import same_size
+from caption.verification.stated import Pole, read_stated
 from cosfly.formats.captions import Claim, Coc, Language, Modality, SentenceState, Template, Writing
 from cosfly.llm.answer_text import Parsed, cut_sentences
 

@@ -10,12 +10,12 @@ import asyncio
 from itertools import islice
 from pathlib import Path
 
-from caption.run.asking import ANSWERS
-from caption.run.flights import allot, named_flights
-from caption.run.progress import duration
-from caption.run.stage import open_stage
-from caption.run.window_loop import caption_window
 from caption.schema import CaptionConfig
+from caption.stage.asking import ANSWERS
+from caption.stage.flights import allot, named_flights
+from caption.stage.progress import duration
+from caption.stage.stage import open_stage
+from caption.stage.window_loop import caption_window
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import first_budget, open_teacher

@@ -1,6 +1,6 @@
 """Templates: sentences with slots in place of facts, read once; filling.py fills them for each window.
 
-    The gap {trend:distance} from {distance@t0} to {distance}.     a reference of truth/references.py in braces
+    The gap {trend:distance} from {distance@t0} to {distance}.     a reference of verification/references.py in braces
     {trending:distance}  {box@t4}  {decision}  {side:decision}     and what texts need beyond references
 
 A number is filled in with its unit, in the digits of the table of quantities. Where a slot of its sentence says what
@@ -17,13 +17,13 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from typing import Literal, NamedTuple
 
-from caption.truth.facts import Facts
-from caption.truth.glossary import load_glossary
-from caption.truth.references import ANGLES, MOTIONS, QUANTITIES, Quantity, Reference, Series, parse_reference
-from caption.truth.vocabulary import terms_in
-from caption.writing.contract import Refused
-from caption.writing.earned import is_earned
-from caption.writing.outside import SLOT_MARK, check_outside, decisions_named, decisions_opposed, states_beside
+from caption.answer_formats.contract import Refused
+from caption.answer_formats.earned import is_earned
+from caption.answer_formats.outside import SLOT_MARK, check_outside, decisions_named, decisions_opposed, states_beside
+from caption.verification.facts import Facts
+from caption.verification.glossary import load_glossary
+from caption.verification.references import ANGLES, MOTIONS, QUANTITIES, Quantity, Reference, Series, parse_reference
+from caption.verification.vocabulary import terms_in
 from cosfly.formats.captions import ACTIONS, Language, SentenceState
 from cosfly.llm.answer_text import is_in_script
 from cosfly.runtime.errors import nearest

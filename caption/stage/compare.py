@@ -17,13 +17,13 @@ from typing import get_args
 
 from rich.table import Table
 
-from caption.run.asking import ANSWERS
-from caption.run.flights import allot, named_flights
-from caption.run.window_loop import Trial, try_strategy
 from caption.schema import CaptionConfig, Strategy, Window
+from caption.stage.asking import ANSWERS
+from caption.stage.flights import allot, named_flights
+from caption.stage.window_loop import Trial, try_strategy
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
-from caption.truth.vocabulary import Vocabulary
+from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import Coc
 from cosfly.llm.answers import AnswerBook
 from cosfly.llm.contract import NoAnswer, run_until_interrupted

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 
-from caption.truth.facts import Facts
-from caption.truth.glossary import load_glossary
-from caption.truth.numerals import Numeral, read_numerals
-from caption.truth.references import Series
-from caption.truth.vocabulary import terms_in
+from caption.verification.facts import Facts
+from caption.verification.glossary import load_glossary
+from caption.verification.numerals import Numeral, read_numerals
+from caption.verification.references import Series
+from caption.verification.vocabulary import terms_in
 from cosfly.formats.captions import Coc, Language
 from cosfly.llm.answer_text import cut_sentences, is_in_script
 

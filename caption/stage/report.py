@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from caption.run.ledger import CaptionReport
+from caption.stage.ledger import CaptionReport
 from cosfly.formats.captions import TOKENS, Caption, Language
 from cosfly.formats.frames import frame_name
 from cosfly.formats.places import flight_of
@@ -56,7 +56,7 @@ def page_html(
     teacher = report.teacher
     verdicts = [("First answers", report.verdicts_of_first_answers), ("Accepted captions", report.verdicts_of_accepted)]
     return page(
-        "caption/run/report.html", title=name, style=STYLE, report=report, meanings=VERDICTS, states=STATES,
+        "caption/stage/report.html", title=name, style=STYLE, report=report, meanings=VERDICTS, states=STATES,
         who=f"teacher: {teacher.kind}, model {teacher.model}" if teacher else "teacher: none, model unknown",
         is_rules=teacher is not None and teacher.kind == "rules", tiles=_tiles(report), verdicts=verdicts, share=_share,
         language_names=LANGUAGE_NAMES,

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 
-from caption.run.windows import current_frames, cut_windows
 from caption.schema import CaptionConfig, Window, WindowConfig
+from caption.stage.windows import current_frames, cut_windows
 from cosfly.formats.captions import caption_lines, write_caption_lines
 from cosfly.formats.places import ALL_TRACKS, TrackChoice, flight_ids, flight_of, place_of
 from cosfly.formats.playback import Track, read_track

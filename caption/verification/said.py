@@ -6,14 +6,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import combinations, permutations
 
-from caption.truth.borne_out import bears_out_number
-from caption.truth.facts import Facts
-from caption.truth.glossary import LANGUAGES
-from caption.truth.numerals import Numeral, numbers_in
-from caption.truth.poles import Pair, poles_between, poles_of, side_word
-from caption.truth.references import QUANTITIES, TURNING, Fact, look_up, parse_reference
-from caption.truth.sizes import both_ways, is_share, same_size, ways
-from caption.truth.stated import Pole, Stated, read_stated
+from caption.verification.borne_out import bears_out_number
+from caption.verification.facts import Facts
+from caption.verification.glossary import LANGUAGES
+from caption.verification.numerals import Numeral, numbers_in
+from caption.verification.poles import Pair, poles_between, poles_of, side_word
+from caption.verification.references import QUANTITIES, TURNING, Fact, look_up, parse_reference
+from caption.verification.sizes import both_ways, is_share, same_size, ways
+from caption.verification.stated import Pole, Stated, read_stated
 from cosfly.formats.captions import Claim, Language
 
 HOUR_DEG = 30.0

@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 
-from caption.truth.facts import Facts
-from caption.truth.references import QUANTITIES, Fact, Missing, Reference, find_fact, look_up, span_of
-from caption.writing.contract import DECISION_REASON, Refused
-from caption.writing.templates import NEITHER, TURNS, Sentence, Slot, read_sentence, units_behind, words_of
+from caption.answer_formats.contract import DECISION_REASON, Refused
+from caption.answer_formats.templates import NEITHER, TURNS, Sentence, Slot, read_sentence, units_behind, words_of
+from caption.verification.facts import Facts
+from caption.verification.references import QUANTITIES, Fact, Missing, Reference, find_fact, look_up, span_of
 from cosfly.formats.captions import ACTIONS, Language
 
 _DIRECTIONS = {

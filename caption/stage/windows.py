@@ -21,7 +21,7 @@ from caption.schema import (
     WindowConfig,
     observed_frames,
 )
-from caption.truth.actions import TABLE, measure
+from caption.verification.actions import TABLE, measure
 from cosfly.formats.captions import KeyframeRecord, LabelFrom, Language
 from cosfly.formats.frames import files_in
 from cosfly.formats.places import sample_id

@@ -11,17 +11,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+from caption.answer_formats.contract import Draft, Refused, refuse_decision
 from caption.schema import CaptionConfig, Judged, Strategy, Window
 from caption.teachers.foreign import Terms
 from caption.teachers.judge import Case, Judge
 from caption.teachers.prompts import Correction, Question, make_question, prompt_hash
 from caption.teachers.teacher import Teacher, terms_of
-from caption.truth.actions import TABLE, Motion, measure
-from caption.truth.facts import Facts
-from caption.truth.mirror import check_translation
-from caption.truth.references import measured_series
-from caption.truth.vocabulary import Vocabulary
-from caption.writing.contract import Draft, Refused, refuse_decision
+from caption.verification.actions import TABLE, Motion, measure
+from caption.verification.facts import Facts
+from caption.verification.mirror import check_translation
+from caption.verification.references import measured_series
+from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import (
     ACTIONS,
     Caption,

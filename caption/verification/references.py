@@ -19,7 +19,7 @@ from itertools import pairwise
 from operator import attrgetter
 from typing import Literal, NamedTuple
 
-from caption.truth.facts import STANDING_MPS, Facts, wrapped
+from caption.verification.facts import STANDING_MPS, Facts, wrapped
 
 Series = Sequence[float | None]
 Missing = Literal["unknown_reference", "unobserved_frame", "unknown_fact"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from caption.truth.numerals import Numeral
-from caption.truth.stated import Stated, read_stated
+from caption.verification.numerals import Numeral
+from caption.verification.stated import Stated, read_stated
 from cosfly.formats.captions import Claim, Language
 
 RATIO_SLACK = 0.13  # of shares and multiples in words: "a third" of 0.30 to 0.38

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
-from caption.truth.glossary import Unit, written_units
+from caption.verification.glossary import Unit, written_units
 from cosfly.formats.captions import Language
 
 _UNIT_GROUPS = ("unit", "half_of", "word_of")

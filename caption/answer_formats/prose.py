@@ -6,14 +6,14 @@ import re
 from collections.abc import Iterator, Mapping
 from functools import cache
 
+from caption.answer_formats.contract import Draft, Refused, WayOfWriting
 from caption.schema import Judged
-from caption.truth.borne_out import bears_out_number
-from caption.truth.facts import Facts
-from caption.truth.glossary import listed, mentions
-from caption.truth.mirror import check_mirror, flight_numbers
-from caption.truth.numerals import Numeral
-from caption.truth.stated import Pole, Stated, read_stated, subject_before
-from caption.writing.contract import Draft, Refused, WayOfWriting
+from caption.verification.borne_out import bears_out_number
+from caption.verification.facts import Facts
+from caption.verification.glossary import listed, mentions
+from caption.verification.mirror import check_mirror, flight_numbers
+from caption.verification.numerals import Numeral
+from caption.verification.stated import Pole, Stated, read_stated, subject_before
 from cosfly.formats.captions import Coc, Language, Writing
 from cosfly.llm.answer_text import Parsed, sentences_of
 

@@ -15,8 +15,8 @@ from functools import cache
 from types import MappingProxyType
 from typing import NamedTuple
 
-from caption.truth.glossary import words_beside
-from caption.truth.references import ANGLES, QUANTITIES, STEPS, TURNING, Reference
+from caption.verification.glossary import words_beside
+from caption.verification.references import ANGLES, QUANTITIES, STEPS, TURNING, Reference
 from cosfly.formats.captions import Language
 
 _PLACES = ("offset_x", "offset_y")

@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from itertools import combinations, pairwise
 
-from caption.truth.facts import Facts, wrapped
-from caption.truth.glossary import mentions
-from caption.truth.numerals import Numeral
-from caption.truth.references import QUANTITIES, Fact, Quantity, Reference, look_up, word_holds
-from caption.truth.sizes import about_share, both_ways
-from caption.truth.stated import Pole
+from caption.verification.facts import Facts, wrapped
+from caption.verification.glossary import mentions
+from caption.verification.numerals import Numeral
+from caption.verification.references import QUANTITIES, Fact, Quantity, Reference, look_up, word_holds
+from caption.verification.sizes import about_share, both_ways
+from caption.verification.stated import Pole
 
 _RATES = {"mps": "m", "dps": "deg", "px": "px"}  # pixels per second are written as pixels
 _SHARE_SLACK = 0.02

@@ -9,9 +9,9 @@ from __future__ import annotations
 import re
 from functools import lru_cache
 
-from caption.truth.glossary import load_glossary
-from caption.truth.numerals import read_numerals
-from caption.writing.contract import Refused
+from caption.answer_formats.contract import Refused
+from caption.verification.glossary import load_glossary
+from caption.verification.numerals import read_numerals
 from cosfly.formats.captions import ACTIONS, Language
 
 SLOT_MARK = "¤"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from string import Template
 
-from caption.truth.glossary import load_glossary, term_pattern
+from caption.verification.glossary import load_glossary, term_pattern
 from cosfly.formats.captions import ACTIONS
 
 # Terms that a translation must have besides the names of the actions: English -> Chinese.

@@ -11,15 +11,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from caption.truth.borne_out import bears_out_number, bears_out_own, bears_out_pole
-from caption.truth.facts import Facts
-from caption.truth.glossary import mentions
-from caption.truth.numerals import Numeral
-from caption.truth.poles import ACTION_WORDS
-from caption.truth.references import QUANTITIES
-from caption.truth.said import Said, frames_of
-from caption.truth.sizes import may_mean, same_size
-from caption.truth.stated import Pole, Stated, lexicon_of, read_stated
+from caption.verification.borne_out import bears_out_number, bears_out_own, bears_out_pole
+from caption.verification.facts import Facts
+from caption.verification.glossary import mentions
+from caption.verification.numerals import Numeral
+from caption.verification.poles import ACTION_WORDS
+from caption.verification.references import QUANTITIES
+from caption.verification.said import Said, frames_of
+from caption.verification.sizes import may_mean, same_size
+from caption.verification.stated import Pole, Stated, lexicon_of, read_stated
 from cosfly.formats.captions import Claim, Language
 
 # Words, negated or not, that say that the person is seen, and that not all is.

@@ -9,8 +9,8 @@ import re
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 
-from caption.truth.glossary import GlossaryFile, glossary_file
-from caption.truth.numerals import Numeral, read_numerals
+from caption.verification.glossary import GlossaryFile, glossary_file
+from caption.verification.numerals import Numeral, read_numerals
 from cosfly.formats.captions import Language
 
 

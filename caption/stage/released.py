@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from caption.run.windows import LabelMotion, cut_future, label_motion
 from caption.schema import FutureMotion
+from caption.stage.windows import LabelMotion, cut_future, label_motion
 from caption.teachers.prompts import mission_lines
-from caption.truth.actions import TABLE, ActionTable, Motion, Thresholds, measure
+from caption.verification.actions import TABLE, ActionTable, Motion, Thresholds, measure
 from cosfly.formats.captions import ORDERS
 from cosfly.formats.shown_captions import Mismatch, ReleasedTrack, ShownCaption
 

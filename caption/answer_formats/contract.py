@@ -12,14 +12,14 @@ from functools import lru_cache
 from typing import Any, Protocol
 
 from caption.schema import Judged
-from caption.truth.facts import Facts
-from caption.truth.vocabulary import Vocabulary
+from caption.verification.facts import Facts
+from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import TOKENS, Coc, Language, Template, Writing
 from cosfly.llm.answer_text import Parsed
 
 WAYS: dict[Writing, str] = {
-    "slots": "caption.writing.slots:Slots",
-    "prose": "caption.writing.prose:Prose",
+    "slots": "caption.answer_formats.slots:Slots",
+    "prose": "caption.answer_formats.prose:Prose",
 }
 DECISION_REASON = "decision_against_reasoning"
 

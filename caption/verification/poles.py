@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
-from caption.truth.references import TURNED
+from caption.verification.references import TURNED
 from cosfly.formats.captions import Claim
 
 Pair = tuple[str, str]  # dimension, value

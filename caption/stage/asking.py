@@ -16,14 +16,14 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from caption.run.flights import Allotted
-from caption.run.progress import Display
-from caption.run.reasons import explained
-from caption.run.window_loop import caption_window
 from caption.schema import CaptionConfig, Window
+from caption.stage.flights import Allotted
+from caption.stage.progress import Display
+from caption.stage.reasons import explained
+from caption.stage.window_loop import caption_window
 from caption.teachers.judge import open_judge
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
-from caption.truth.vocabulary import Vocabulary
+from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import Caption, Usage, read_captions, write_captions
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook, BudgetSpent
