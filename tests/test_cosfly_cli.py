@@ -73,7 +73,7 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
     for words, parts in (
         (("config", "check", "quikstart"), ("quikstart", "did you mean 'quickstart'", "simworld")),
         (("config", "check", "quickstart", "--set", "a..b=1"), ("--set", "a..b=1", "key=value")),
-        (("config", "check", "quickstart", "--set", no_file), ("no such file", "maps.boxes", "none.csv")),
+        (("config", "check", "quickstart", "--set", no_file), ("does not exist", "maps.boxes", "none.csv")),
         (("simplify", "--map", "nope.json", "--out", "x"), ("nope.json", "no such file")),
         (("simplify", "--map", "town.csv", "--out", "x"), ("town.csv", "cosfly maps --source boxes")),
         (("maps", "--out", "/proc/x"), ("/proc/x", "cannot write", "--out")),
@@ -83,8 +83,14 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
         (("view", "town", "--out", "x"), ("town", "there is no such folder", "check the path")),
         (("simplify", "--map", "zero.json", "--out", "x"), ("zero.json", "a device", "a regular file")),
         (("caption", "prompts", "--export", "taken"), ("taken", "cannot write", "--out")),
-        (("run", "quickstart", "--out", "stage"), ("stage: the folder of a stage", "choose another --out")),
-        (("run", "quickstart", "--out", "stage", "--dry-run"), ("stage: the folder of a stage", "another --out")),
+        (
+            ("run", "quickstart", "--out", "stage"),
+            ("stage: the output directory is the folder of a stage", "choose another --out"),
+        ),
+        (
+            ("run", "quickstart", "--out", "stage", "--dry-run"),
+            ("stage: the output directory is the folder of a stage", "another --out"),
+        ),
         (("--log-file", "no/log.txt", "config", "show"), ("cannot write the log",)),
     ):
         with subtests.test(words=words):

@@ -260,7 +260,7 @@ def test_a_whole_flight_along_a_planted_wall_keeps_the_planners_clearance(gap_m,
 @each(("data", "word"), [
     ({"fovs_deg": [0]}, "field of view"),
     ({"fovs_deg": []}, "fovs_deg"),
-    ({"tracks": ["clean", "clean"]}, "twice"),
+    ({"tracks": ["clean", "clean"]}, "only once"),
     ({"town": "../x"}, "letters"),
     ({"widht_px": 3}, "width_px"),
     ({"perturbation": {"sampling": "square"}}, "sampling"),

@@ -89,7 +89,7 @@ def prompts(
     elif export is not None and check is None:
         typer.echo(f"{export}: {len(export_prompts(export, vocabulary_of(job.cfg.caption).prompts))} prompts")
     else:
-        raise typer.BadParameter("give either --export DIR or --check DIR")
+        raise typer.BadParameter("pass either --export DIR or --check DIR")
 
 
 @command("cosfly caption judge-check http://localhost:8000", "caption", model=JUDGE_MODEL)

@@ -37,7 +37,7 @@ def prepare(
     if captions or data or not sources:
         trees = job.trees(data)
         if len(trees) != len(captions or []):
-            raise typer.BadParameter("give one --captions for each --data, or run directories")
+            raise typer.BadParameter("pass one --captions for each --data, or pass run directories")
         sources += [RunSource.of_files(*files) for files in zip(trees, captions or [], strict=True)]
     job.run("distill.prepare.stage", job.cfg.distill.prepare, sources, out)
 
@@ -109,9 +109,12 @@ def evaluate(
 ) -> None:
     """Score predictions: parse rate, decisions, verdicts, BERTScore and evidence, with baselines and intervals."""
     folders = {"en": bertscore_en, "zh": bertscore_zh}
-    models = {language: folder for language, folder in folders.items() if folder is not None}
-    more = {"bertscore_models": models, "data": data or [], "judged": judged or []}
-    job.run("distill.evaluation.stage", job.cfg.distill.evaluate, predictions, dataset, out, **more)
+    extras = {
+        "bertscore_models": {language: folder for language, folder in folders.items() if folder is not None},
+        "data": data or [],
+        "judged": judged or [],
+    }
+    job.run("distill.evaluation.stage", job.cfg.distill.evaluate, predictions, dataset, out, **extras)
 
 
 @command("cosfly distill report evaluation-2B evaluation-4B --out report", common="seed resume")
@@ -124,14 +127,14 @@ def report(
     job.run("distill.evaluation.compare", evaluations, out)
 
 
-FLOWN = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR; baselines: track_straight, random; ceiling: planner."
+FLYING = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR; baselines: track_straight, random; ceiling: planner."
 
 
 @command(
     "cosfly fly --map maps/boxes_3d.json --paths pedestrians/path.json --student rules --out flown",
     "fly plan render caption distill",
     STAGE,
-    student=SettingOption("fly.student", FLOWN, default="rules"),
+    student=SettingOption("fly.student", FLYING, default="rules"),
     as_student=SettingOption("fly.as_student", "Folder of `distill train` or `merge`: the model behind a URL.", Path),
     adapter=SettingOption("fly.adapter", "Adapter of transformers:MODEL_DIR.", Path),
 )
@@ -150,22 +153,26 @@ def fly(
     from cosfly.closed_loop.stage import ClosedLoopConfig
 
     cfg = job.cfg
-    if policy and (cfg.fly.student != "rules" or "fly.student" in job.set_by_options):
-        raise typer.BadParameter("give either --policy or --student")
-    flown = cfg.fly.model_copy(update={"student": f"policy:{policy}"}) if policy else cfg.fly
-    run = ClosedLoopConfig(fly=flown, plan=cfg.plan, render=cfg.render, caption=cfg.caption, infer=cfg.distill.infer)
+    fly = cfg.fly
+    if policy:
+        if fly.student != "rules" or "fly.student" in job.set_by_options:
+            raise typer.BadParameter("pass either --policy or --student, not both")
+        fly = fly.model_copy(update={"student": f"policy:{policy}"})
+    run = ClosedLoopConfig(fly=fly, plan=cfg.plan, render=cfg.render, caption=cfg.caption, infer=cfg.distill.infer)
     if relabel is not None:
         if map_ is None or paths or env or policy:
-            raise typer.BadParameter("--relabel takes --map only; its folder holds the rest")
+            raise typer.BadParameter("--relabel needs --map, and does not allow --paths, --env and --policy")
         job.run("cosfly.closed_loop.relabel", run, relabel, map_, simplified or map_, out)
     elif env is not None:
         if map_ or paths or simplified or others:
-            raise typer.BadParameter("--env has its own maps and pedestrians")
+            raise typer.BadParameter(
+                "--env has its own maps and pedestrians; remove --map, --paths, --simplified and --others"
+            )
         from cosfly.envs.listed import ListConfig
 
         job.run("cosfly.envs.listed", ListConfig(**dict(run), env=env), out)
     elif map_ is None or paths is None:
-        raise typer.BadParameter("give --map and --paths, or --env")
+        raise typer.BadParameter("pass --map and --paths, or pass --env")
     else:
         job.run("cosfly.closed_loop.stage", run, map_, simplified or map_, paths, out, others=others)
 
@@ -180,6 +187,8 @@ def leaderboard(
     """Compare students: figures with intervals, and frames of their best and worst trajectories."""
     from cosfly.closed_loop.leaderboard import LeaderboardConfig
 
-    parts = [text.partition("=") if "=" in text else ("", "", text) for text in folders]
-    named = [(name, Path(folder)) for name, _, folder in parts]
-    job.run("cosfly.closed_loop.leaderboard", LeaderboardConfig(rounds=rounds), named, out)
+    named_folders = []
+    for text in folders:
+        name, separator, folder = text.partition("=")
+        named_folders.append((name, Path(folder)) if separator else ("", Path(text)))
+    job.run("cosfly.closed_loop.leaderboard", LeaderboardConfig(rounds=rounds), named_folders, out)

@@ -133,10 +133,10 @@ class Job:
         trees = self.trees(data)
         if len(trees) > 1:
             raise InputError(
-                "this command takes one playback tree",
+                "the command takes one playback tree, but several are given",
                 where="--data",
                 got=f"{len(trees)}: {', '.join(map(str, trees))}",
-                fix="run it once for each tree; distill and release take the results of several together",
+                fix="run the command once for each tree",
             )
         return trees[0]
 
@@ -148,10 +148,10 @@ class Job:
             if (candidate / "manifest.json").exists() and candidate.resolve().name == "render":
                 return [self.cfg.opened(candidate)]
         raise InputError(
-            "there is no playback tree",
+            "the command has no playback tree to read",
             where=Path.cwd(),
-            got="no --data, and the current directory is not a run directory",
-            fix="add --data DIR",
+            got="no --data, in a directory that is not a run directory",
+            fix="add --data DIR, or change to a run directory",
         )
 
     def finish(self, product: Path, out: Path) -> None:
@@ -167,11 +167,11 @@ class Job:
         num_failed = sum(sum(reasons.values()) for reasons in failed.values())
         if num_failed > self.cfg.max_failed:
             raise InputError(
-                "more items failed than the settings accept; the others are done",
+                "more items failed than max_failed allows; all other items are complete",
                 where=where,
                 got=str(failed),
-                expected=f"at most {self.cfg.max_failed} (max_failed)",
-                fix="fix the causes in failures.jsonl, and run the same command again for the failed items",
+                expected=f"at most {self.cfg.max_failed}",
+                fix="fix the causes in failures.jsonl, and run the command again for the failed items",
             )
 
 
@@ -335,13 +335,13 @@ def _town_of(cfg: RunConfig, name: str | None) -> RunConfig:
         return cfg.of_town(name)
     if name is not None:
         raise ConfigError(
-            f"there is no such town{nearest(name, cfg.towns)}",
+            f"the configuration has no town of this name{nearest(name, cfg.towns)}",
             where="--town",
             got=name,
-            expected=names or "a configuration with towns",
+            expected=f"one of {names}" if names else "a configuration with towns",
         )
     if cfg.towns:
-        log.warning("%s has towns; choose one with --town, of %s: the shared settings are used", cfg.name, names)
+        log.warning("no --town is given, so the settings that the towns %s share are used", names)
     return cfg
 
 

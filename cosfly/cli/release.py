@@ -37,7 +37,7 @@ def build(
         trees = job.trees(data)
         inspections: list[Path | None] = list(inspected) if inspected else [None for _ in trees]
         if not len(trees) == len(captions or []) == len(inspections):
-            problem = "give one --captions and at most one --inspect for each --data, or run directories"
+            problem = "pass one --captions and at most one --inspect for each --data, or pass run directories"
             raise typer.BadParameter(problem)
         sources += [Source.of_files(*files) for files in zip(trees, captions or [], inspections, strict=True)]
     job.run("release.package.stage", job.cfg.release, sources, out)

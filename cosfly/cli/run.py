@@ -138,7 +138,7 @@ def bench(
 
     counts = [int(word) if word.isdecimal() else 0 for word in workers.split(",")]
     if min(counts) < 1:
-        raise typer.BadParameter("give whole numbers from 1 up, separated by commas", param_hint="'--workers'")
+        raise typer.BadParameter("pass whole numbers of 1 or more, separated by commas", param_hint="'--workers'")
     measured = benchmark.run(job.cfg, config, out, stage, counts)
     for title, (head, *rows) in benchmark.tables(measured).items():  # the widest fits eighty columns
         options.print_table(head, rows, title, box=SIMPLE_HEAD, padding=0, show_edge=False)

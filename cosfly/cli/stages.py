@@ -277,7 +277,7 @@ def review(
     product = folder / "inspect.json" if folder.is_dir() else folder
     if accept or reject:
         if not (by and reason):
-            raise typer.BadParameter("give the reviewer and the reason", param_hint="'--by', '--reason'")
+            raise typer.BadParameter("a decision needs a reviewer and a reason", param_hint="'--by', '--reason'")
         choices = [
             Choice.model_validate({"folder": name, "verdict": verdict, "reason": reason})
             for verdict, names in (("accepted", accept), ("rejected", reject))

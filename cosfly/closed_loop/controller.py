@@ -1,7 +1,7 @@
-"""The controller: turns a decision into a command, by a table with one row per action (controller.yaml).
+"""The controller: turns a decision into a command by a table with one row per action (controller.yaml).
 
-It knows what a drone knows of itself, its pose, home position and height, but never the target's position. The camera
-keeps its aim: the point ahead, at hip height, at which it looked when the episode began.
+It knows the drone's pose, its home position and its height, but never the target's position. The camera keeps its aim:
+the point ahead of the drone, at hip height, at which it looks when the episode begins.
 """
 
 from __future__ import annotations
@@ -20,7 +20,10 @@ from cosfly.geometry.motion import in_axes_of
 from cosfly.runtime.config import Config, build, read_yaml
 from cosfly.runtime.errors import ConfigError
 
-AIM_MOST_M = 100.0  # distance of the aim of a camera that looks at the horizon
+AIM_MOST_M = 100.0  # greatest distance of the aim, for a camera that looks at the horizon
+LEAST_DOWN_DEG = 0.1  # least downward pitch that the aim is computed from
+LEAST_HEIGHT_M = 1.0  # least height over the aim that the aim is computed from
+AT_HOME_M = 1.0  # nearer to home the drone does not turn towards it
 
 
 class Control(Config):
@@ -46,45 +49,61 @@ class ControlTable(Config):
 
 
 def read_controls(path: Path, tokens: tuple[str, ...]) -> dict[str, Control]:
-    """Read a table, which needs a row for each token."""
-    found = build(ControlTable, read_yaml(path), path).actions
-    if lacking := [token for token in tokens if token not in found]:
-        what = "the table has no command for some decisions"
-        raise ConfigError(what, where=path, got=", ".join(lacking), fix="add an entry for each under actions")
-    return found
+    """Read a table and check that it has a row for each token."""
+    controls = build(ControlTable, read_yaml(path), path).actions
+    if missing := [token for token in tokens if token not in controls]:
+        raise ConfigError(
+            "the controller table has no command for some decisions",
+            where=path,
+            got=f"no {', no '.join(missing)}",
+            fix="add an entry for each of them under actions",
+        )
+    return controls
 
 
 class Controller:
     """The controller of one episode."""
 
     def __init__(self, controls: dict[str, Control], drone: Drone, start: Moment) -> None:
-        self.controls, self.drone = controls, drone
-        self._home, self._height_m = start.position_m, start.height_m - TARGET_HEIGHT_M
-        down = np.tan(np.radians(max(-start.rotation_deg[0], 0.1)))
-        self.aim_m = float(min(max(self._height_m, 1.0) / down, AIM_MOST_M))
+        self.controls = controls
+        self.drone = drone
+        self._home_m = start.position_m
+        self._height_m = start.height_m - TARGET_HEIGHT_M  # over the target's hip
+        slope = np.tan(np.radians(max(-start.rotation_deg[0], LEAST_DOWN_DEG)))
+        self.aim_m = float(min(max(self._height_m, LEAST_HEIGHT_M) / slope, AIM_MOST_M))  # over ground
         self.pace_mps = max(0.0, float(in_axes_of(start.rotation_deg[1], start.velocity_mps)[0]))
-        self._side = 1.0
+        self._search_side = 1.0  # the side of the last turn: 1 left, -1 right
 
     def command(self, action: str | None, now: Moment) -> np.ndarray:
-        """Return the command of a decision, (5,) as ACTION; without a decision the drone hovers and keeps its pace."""
+        """Return the command of a decision, (5,) as ACTION; without one the drone hovers and the pace is kept."""
         row = self.controls[action] if action is not None else Control(source="hovers")
         self.pace_mps = 0.0 if row.stops else max(0.0, self.pace_mps + row.pace_step_mps)
         self.pace_mps = min(self.pace_mps, self.drone.speed_max_mps)
-        ahead, yaw_rate = row.ahead_mps + self.pace_mps * row.with_pace, row.yaw_rate_degps
-        left, yaw_deg = row.left_mps, now.rotation_deg[1]
-        if row.turn == "orbit":
-            yaw_rate = -float(np.degrees(left / self.aim_m))
+        ahead_mps = row.ahead_mps + (self.pace_mps if row.with_pace else 0.0)
+        left_mps = row.left_mps
+        yaw_rate_degps = row.yaw_rate_degps
+        if row.turn == "rate" and yaw_rate_degps:
+            self._search_side = float(np.sign(yaw_rate_degps))
+        elif row.turn == "orbit":
+            yaw_rate_degps = -float(np.degrees(left_mps / self.aim_m))
         elif row.turn == "search":
-            yaw_rate *= self._side
+            yaw_rate_degps *= self._search_side
         elif row.turn == "home":
-            way = self._home - now.position_m
-            away_m = float(np.hypot(*way[:2]))
-            ahead, left, _ = in_axes_of(yaw_deg, way * min(row.ahead_mps / max(away_m, 1e-9), 1.0))
-            _, bearing = look_at(now.position_m, self._home)
-            off_deg = float(wrap_deg(np.degrees(bearing) - yaw_deg)) if away_m > 1.0 else 0.0
-            yaw_rate = float(np.clip(off_deg, -row.yaw_rate_degps, row.yaw_rate_degps))
-        if row.turn == "rate" and yaw_rate:
-            self._side = float(np.sign(yaw_rate))
-        over_aim_m = self._height_m + now.position_m[2] - self._home[2]
+            ahead_mps, left_mps, yaw_rate_degps = self._home_velocity(row, now)
+        over_aim_m = self._height_m + now.position_m[2] - self._home_m[2]
         pitch_deg = -float(np.degrees(np.arctan2(over_aim_m, self.aim_m)))
-        return self.drone.within_speed(np.clip([ahead, left, row.up_mps, yaw_rate, pitch_deg], *self.drone.bounds))
+        command = np.clip([ahead_mps, left_mps, row.up_mps, yaw_rate_degps, pitch_deg], *self.drone.bounds)
+        return self.drone.within_speed(command)
+
+    def _home_velocity(self, row: Control, now: Moment) -> tuple[float, float, float]:
+        """Return the velocities ahead and to the left (m/s) and the yaw rate (degrees/s) of the way home."""
+        yaw_deg = now.rotation_deg[1]
+        offset_m = self._home_m - now.position_m
+        distance_m = float(np.hypot(*offset_m[:2]))
+        ahead_mps, left_mps, _ = in_axes_of(yaw_deg, offset_m * min(row.ahead_mps / max(distance_m, 1e-9), 1.0))
+        turn_deg = 0.0
+        if distance_m > AT_HOME_M:
+            _, bearing = look_at(now.position_m, self._home_m)
+            turn_deg = float(wrap_deg(np.degrees(bearing) - yaw_deg))
+        yaw_rate_degps = float(np.clip(turn_deg, -row.yaw_rate_degps, row.yaw_rate_degps))
+        return float(ahead_mps), float(left_mps), yaw_rate_degps

@@ -27,29 +27,30 @@ from cosfly.viz.page import page
 from distill.evaluation.pages import COLORS, STYLE, bars, shown_as
 
 HEADLINE = ("success", "in_view", "tracked_frames", "kept_s", "lost", "crashed")
-STRIP_FRAMES, STRIP_PX = 8, 200
+STRIP_FRAMES = 8  # pictures of an episode
+STRIP_PX = 200  # their width
 BOARD_FORMAT = FileFormat("cosfly.leaderboard", "1.0", "leaderboard")
 
 
 class LeaderboardConfig(Config):
     """Settings of `cosfly leaderboard`, given as options."""
 
-    rounds: bool = False
+    rounds: bool = False  # the students are rounds of one student, in order
 
 
 class Standing(Record):
-    """One student of a table. gain: of a round, the change of its figures from the round before."""
+    """One student of a table."""
 
     name: str
     role: Literal["student", "floor", "ceiling"]
     score: Score
-    gain: dict[str, Figure] | None = None
+    gain: dict[str, Figure] | None = None  # of a round: the change of its figures since the previous round
 
 
 class StudentTable(Record):
-    """Students with the same episodes. episodes: digest of each folder's episodes."""
+    """Students with the same episodes."""
 
-    episodes: tuple[str, ...]
+    episodes: tuple[str, ...]  # digest of the episodes of each folder
     standings: tuple[Standing, ...]
 
 
@@ -68,22 +69,30 @@ def run(
     """Read named folders of `cosfly fly`; write `leaderboard.json` and `leaderboard.html`, and return the page's path.
 
     Args:
-        folders: name and folder; "" names it after its student.
+        folders: Name and folder; with the name "" the folder is named after its student.
+
     Raises:
         InputError: Two folders of one name contain the same episode.
     """
     students: dict[str, StudentFolders] = {}
     for name, folder in folders:
         score = read_score(folder)
-        own = students.setdefault(name or score.student, {})
-        known = {(one.town, one.episode) for other in own.values() for one in other.flights}
-        if twice := [one for one in score.flights if (one.town, one.episode) in known]:
-            what, got = "two folders of one name contain the same episode", f"{twice[0].town}, {twice[0].episode}"
-            raise InputError(what, where=f"{name or score.student}: {folder}", got=got, fix="name them: NAME=DIR")
-        own[folder] = score
+        student = name or score.student
+        scores = students.setdefault(student, {})
+        earlier = {(flight.town, flight.episode) for other in scores.values() for flight in other.flights}
+        for flight in score.flights:
+            if (flight.town, flight.episode) in earlier:
+                raise InputError(
+                    "two folders of the same student contain the same episode",
+                    where=f"{student}: {folder}",
+                    got=f"{flight.town}, {flight.episode}",
+                    fix="give each folder its own name: NAME=DIR",
+                )
+        scores[folder] = score
     inputs = {f"{number}/{name}": folder for number, (name, folder) in enumerate(folders)}
     stage = StageFolder.open(out, "leaderboard", config=cfg, inputs=inputs, seed=seed, resume=resume)
-    path, record = out / "leaderboard.html", out / "leaderboard.json"
+    path = out / "leaderboard.html"
+    record = out / "leaderboard.json"
     if not stage.is_complete:
         board = Leaderboard(tables=tuple(tables_of(students, cfg, seed)))
         write_model(record, board, BOARD_FORMAT)
@@ -95,62 +104,98 @@ def run(
 def tables_of(students: Mapping[str, StudentFolders], cfg: LeaderboardConfig, seed: int) -> list[StudentTable]:
     """Return one table for each set of episodes, sorted by success, or by round."""
     groups: dict[tuple[str, ...], list[Standing]] = {}
-    for name, own in students.items():
-        scores = list(own.values())
-        digests, first = tuple(sorted(score.episodes_sha256 for score in scores)), scores[0]
-        role: Any = "floor" if first.engine in BASELINES else "ceiling" if first.engine == "planner" else "student"
-        towns = [score.trained_on for score in scores]
-        merged = score_measured(
-            [one for score in scores for one in score.flights], seed, student=first.student, engine=first.engine,
-            episodes_sha256=sha256_bytes(" ".join(digests).encode()),
-            list_sha256=first.list_sha256 if len(scores) == 1 else None,
-            trained_on=None if None in towns else sorted({town for known in towns for town in known or ()}),
-        )  # fmt: skip
-        group, gain = groups.setdefault(digests, []), None
+    for name, folders in students.items():
+        scores = list(folders.values())
+        digests = tuple(sorted(score.episodes_sha256 for score in scores))
+        merged = _merged_score(scores, digests, seed)
+        group = groups.setdefault(digests, [])
+        gain = None
         if cfg.rounds and group:
             gain = figures_of(merged.flights, rng_for(seed, "leaderboard", "gains"), group[-1].score.flights)
-        group.append(Standing(name=name, role=role, score=merged, gain=gain))
+        group.append(Standing(name=name, role=_role_of(merged.engine), score=merged, gain=gain))
     if not cfg.rounds:
         for group in groups.values():
-            group.sort(key=lambda one: [-(one.score.figures[name].value or 0.0) for name in ("success", "in_view")])
+            group.sort(key=_rank)
     return [StudentTable(episodes=digests, standings=tuple(group)) for digests, group in groups.items()]
+
+
+def _merged_score(scores: list[Score], digests: tuple[str, ...], seed: int) -> Score:
+    """Return the score of one student over all its folders; `trained_on` is known only if all of them know it."""
+    first = scores[0]
+    trained_on = None
+    if all(score.trained_on is not None for score in scores):
+        trained_on = sorted({town for score in scores for town in score.trained_on or ()})
+    return score_measured(
+        [flight for score in scores for flight in score.flights],
+        seed,
+        student=first.student,
+        engine=first.engine,
+        episodes_sha256=sha256_bytes(" ".join(digests).encode()),
+        list_sha256=first.list_sha256 if len(scores) == 1 else None,
+        trained_on=trained_on,
+    )
+
+
+def _role_of(engine: str) -> Literal["student", "floor", "ceiling"]:
+    if engine in BASELINES:
+        return "floor"
+    return "ceiling" if engine == "planner" else "student"
+
+
+def _rank(standing: Standing) -> list[float]:
+    return [-(standing.score.figures[name].value or 0.0) for name in ("success", "in_view")]
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
 
 
 def _shown(name: str, figure: Figure, *, signed: bool = False) -> str:
-    return shown_as(f"{{:{'+' * signed}{'.1%' if name in SHARES else '.2f'}}}", figure)
+    sign = "+" if signed else ""
+    digits = ".1%" if name in SHARES else ".2f"
+    return shown_as(f"{{:{sign}{digits}}}", figure)
 
 
 def page_of(board: Leaderboard, students: Mapping[str, StudentFolders]) -> str:
     """Return the page; a student whose episodes were deleted has figures but no pictures."""
     tables = []
     for table in board.tables:
-        drawn = {"success": "success", "target visible": "in_view"}
-        groups = {w: {one.name: one.score.figures[name] for one in table.standings} for w, name in drawn.items()}
-        strips = [strip for one in table.standings for strip in _strips(one, students[one.name])]
-        tables.append({"table": table, "chart": bars(groups), "strips": strips})
+        chart = {
+            title: {standing.name: standing.score.figures[measure] for standing in table.standings}
+            for title, measure in (("success", "success"), ("target visible", "in_view"))
+        }
+        strips = [strip for standing in table.standings for strip in _strips(standing, students[standing.name])]
+        tables.append({"table": table, "chart": bars(chart), "strips": strips})
     return page(
         "cosfly/closed_loop/leaderboard.html", title="Closed loop", style=STYLE, tables=tables, measures=MEASURES,
         headline=HEADLINE, shown=_shown, colors=COLORS, width_px=STRIP_PX,
     )  # fmt: skip
 
 
-def _strips(standing: Standing, own: StudentFolders) -> list[dict[str, Any]]:
+def _strips(standing: Standing, folders: StudentFolders) -> list[dict[str, Any]]:
     """Return frames of the episodes with the largest and smallest share of frames with a visible target."""
-    places = {(one.town, one.episode): folder for folder, score in own.items() for one in score.flights}
-    shares = {(one.town, one.episode): one.sums["in_view"] for one in standing.score.flights}
-    ranked, strips = sorted(shares, key=lambda key: (shares[key][0] / shares[key][1], key[1])), []
-    for title, key in (("best", ranked[-1]), ("worst", ranked[0])):
-        path, tree = episode_file(places[key], key[1]), places[key] / "render"
+    folder_of = {(flight.town, flight.episode): folder for folder, score in folders.items() for flight in score.flights}
+    shares = {}
+    for flight in standing.score.flights:
+        num_in_view, num_frames = flight.sums["in_view"]
+        shares[flight.town, flight.episode] = num_in_view / num_frames
+    ranked = sorted(shares, key=lambda key: (shares[key], key[1]))
+    strips = []
+    for title, (town, episode) in (("best", ranked[-1]), ("worst", ranked[0])):
+        folder = folder_of[town, episode]
+        path = episode_file(folder, episode)
         if not path.is_file():
             continue
         record = read_episode(path)
-        tracks = (read_track(folder) for folder in find_tracks(tree)) if tree.is_dir() else ()
-        track = next((one for one in tracks if one.source.get("scenario_id") == record.walk), None)
-        chosen = np.unique(np.linspace(record.num_lead, len(record.frames) - 1, STRIP_FRAMES).astype(int)).tolist()
-        frames = [(record.frames[i], track and thumbnail(track.frame_folder(i), STRIP_PX)) for i in chosen]
-        name, seen = f"{standing.name}: {title}: {', '.join(key)}", shares[key][0] / shares[key][1]
-        strips.append({"title": name, "ended": record.ended, "seen": seen, "frames": frames})
+        tree = folder / "render"
+        tracks = (read_track(track_folder) for track_folder in find_tracks(tree)) if tree.is_dir() else ()
+        track = next((track for track in tracks if track.source.get("scenario_id") == record.walk), None)
+        indices = np.unique(np.linspace(record.num_lead, len(record.frames) - 1, STRIP_FRAMES).astype(int)).tolist()
+        strips.append(
+            {
+                "title": f"{standing.name}: {title}: {town}, {episode}",
+                "ended": record.ended,
+                "seen": shares[town, episode],
+                "frames": [(record.frames[i], track and thumbnail(track.frame_folder(i), STRIP_PX)) for i in indices],
+            }
+        )
     return strips

@@ -89,7 +89,7 @@ class Policy:
                 "the policy cannot be created",
                 where="--policy",
                 got=f"{self.name}: {message}",
-                expected="module:Class with reset(goal, seed) and act(observation), importable from here",
+                expected="an importable module:Class with the methods reset(goal, seed) and act(observation)",
             )
 
     def close(self) -> int | None:
@@ -170,7 +170,7 @@ class Policy:
         answer, value = json.loads(self._connection.recv_bytes(MOST_REPLY_BYTES))
         numbers = value if isinstance(value, list) else []
         if answer not in ("ok", "unreadable", "none") or not all(isinstance(one, int | float) for one in numbers):
-            raise ValueError(answer)
+            raise ValueError(f"the policy process sent an unknown reply: {answer!r}")
         return answer, value
 
 

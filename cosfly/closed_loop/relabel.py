@@ -57,10 +57,10 @@ def run(
     plans = read_traces(flown / PLAN / TRACES)
     if (planners := {plan.planner for plan in plans} | {cfg.plan.planner}) != {"foresight"}:
         raise ConfigError(
-            "only foresight can plan from a flown pose",
+            "relabeling needs the planner foresight, because no other planner starts at a pose of the student",
             where=f"plan.planner, and {flown / PLAN}",
             got=", ".join(sorted(planners)),
-            fix="fly with plan.planner=foresight",
+            fix="fly the student again with --set plan.planner=foresight, and relabel with the same setting",
         )
     begun = (TREE, CAPTIONS)
     stage = StageFolder.open(out, "relabel", config=cfg, inputs=inputs, seed=seed, resume=resume, begun=begun)
@@ -86,10 +86,13 @@ def _seed_of(flown: Path, cfg: ClosedLoopConfig) -> int:
     """Return the seed of a flown folder, which decides clothes and weather; check that the pictures are the same."""
     begun = read_stage_record(flown)
     if begun.stage != "fly":
-        raise InputError("not the output of `cosfly fly --map --paths`", where=flown, got=f"stage {begun.stage}")
+        what = "the folder is not the output of `cosfly fly --map --paths`"
+        raise InputError(what, where=flown, got=f"output of the stage {begun.stage}")
     if "others" in begun.inputs:
         raise InputError(
-            "--relabel does not render the bystanders of these episodes", where=flown, fix="fly without --others"
+            "these episodes have bystanders, which --relabel cannot render",
+            where=flown,
+            fix="fly the student again without --others",
         )
     was = flattened(begun.config["render"], "render")
     now = flattened(cfg.recorded()["render"], "render")
@@ -98,7 +101,7 @@ def _seed_of(flown: Path, cfg: ClosedLoopConfig) -> int:
             "the render settings differ from those of the recorded episodes",
             where=flown,
             got="; ".join(changed),
-            fix="use the settings in stage.json of the episodes",
+            fix="use the render settings in stage.json of this folder",
         )
     return begun.seed
 

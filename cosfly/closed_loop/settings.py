@@ -39,13 +39,13 @@ class Drone:
         """Return why a command is invalid, None if it is valid."""
         command = np.asarray(command, dtype=np.float64)
         if command.shape != (len(ACTION),) or not np.isfinite(command).all():
-            return f"a command is {len(ACTION)} finite numbers: {', '.join(ACTION)}"
+            return f"a command must be {len(ACTION)} finite numbers: {', '.join(ACTION)}"
         low, high = self.bounds
         if (outside := (command < low) | (command > high)).any():
             k = int(np.argmax(outside))
-            return f"{ACTION[k]} {command[k]:g} is outside {low[k]:g} to {high[k]:g}"
+            return f"{ACTION[k]} must be from {low[k]:g} to {high[k]:g}, got {command[k]:g}"
         if (speed_mps := float(np.hypot(*command[:2]))) > self.speed_max_mps * (1 + ROUNDING):
-            return f"a speed of {speed_mps:g} m/s over ground is more than {self.speed_max_mps:g}"
+            return f"the speed over ground must be at most {self.speed_max_mps:g} m/s, got {speed_mps:g}"
         return None
 
     def within_speed(self, command: np.ndarray) -> np.ndarray:
@@ -110,9 +110,9 @@ class FlyConfig(Config):
     @model_validator(mode="after")
     def _is_known(self) -> Self:
         if self.engine not in ENGINES:
-            raise ValueError(f"unknown student {self.student!r}{nearest(self.student, ENGINES)}; known are {KINDS}")
+            raise ValueError(f"student {self.student!r} does not exist{nearest(self.student, ENGINES)}; use {KINDS}")
         if self.adapter is not None and self.engine != "transformers":
-            raise ValueError(f"only transformers:MODEL_DIR takes an adapter, got student {self.student!r}")
+            raise ValueError(f"an adapter needs a student transformers:MODEL_DIR, but the student is {self.student!r}")
         return self
 
     def recorded(self) -> dict[str, Any]:

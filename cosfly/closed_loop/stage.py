@@ -184,7 +184,7 @@ def run(
     """
     if cfg.render.frame_stride != 1:
         raise ConfigError(
-            "the camera of an episode renders every pose",
+            "an episode renders every frame, so render.frame_stride must be 1",
             where="render",
             got=f"render.frame_stride={cfg.render.frame_stride}",
             fix="remove render.frame_stride",
@@ -205,7 +205,7 @@ def run(
         flown = [n for n, reason in enumerate(reasons) if reason is None]
         dropped = Counter(reason for reason in reasons if reason is not None)
         if not flown:
-            expected = f"an accepted plan of more than fly.lead_frames={cfg.fly.lead_frames} frames"
+            expected = f"at least one accepted trajectory of more than {cfg.fly.lead_frames} frames (fly.lead_frames)"
             raise stage.nothing_kept(Tally(input=len(traces), dropped=dropped), expected=expected)
         ordered = sorted(flown, key=lambda n: (Airspace.area_of(traces[n].targets_m), n))
         batch_size = min(cfg.fly.batch, math.ceil(len(flown) / num_workers))

@@ -1,7 +1,7 @@
-"""The simulation of one closed-loop episode: a command moves the drone, and the renderer draws what it then sees.
+"""The simulation of one closed-loop episode: a command moves the drone, and the renderer draws its new view.
 
-The drone is a point with inertia: velocity, yaw and camera pitch reach the commanded values within its limits.
-That is a stabilised multicopter as its autopilot presents it, without wind.
+The drone is a point with inertia: its velocity, yaw rate and camera pitch approach the commanded values within its
+limits. This models a multicopter with an autopilot, without wind.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ from cosfly.render.track import draw_frame, written_target
 from cosfly.render.weather import read_pools, weather_of
 
 RATE_HZ = 20.0  # of the autopilot
-LEAVES_M = 100.0  # beyond the map's bounds the drone has left
-AREA_M, AREA_STEP_M = 420.0, 200.0  # size and spacing of the areas that are lit at once
+LEAVES_M = 100.0  # farther outside the map's bounds the drone has left the map
+AREA_M = 420.0  # side of the area that is lit at once
+AREA_STEP_M = 200.0  # spacing of such areas
 
 
 def as_drawn(cfg: RenderConfig, seed: int) -> RenderConfig:
@@ -49,45 +50,51 @@ class Airspace:
     ) -> None:
         """
         Args:
-            boxes: are drawn. simplified: are obstacles. num_others: bystanders, as the renderer counts them.
+            boxes: The map that is drawn.
+            simplified: The map whose boxes are obstacles.
+            num_others: Number of ids that the bystanders of an episode need at most.
         """
-        self.cfg, self.seed = as_drawn(cfg, seed).model_copy(update={"first_timestamp": cfg.first_timestamp or 0}), seed
-        self.renderer, self.pools = renderer_of(cfg, boxes, seed, num_others), read_pools(cfg)
-        self.surroundings, self.ground = Surroundings(simplified), simplified.ground
-        self.town, self.bounds_m = town_folder(cfg.town or boxes.name), boxes.bounds()
-        self._lit: object = None
+        self.cfg = as_drawn(cfg, seed).model_copy(update={"first_timestamp": cfg.first_timestamp or 0})
+        self.seed = seed
+        self.renderer = renderer_of(cfg, boxes, seed, num_others)
+        self.pools = read_pools(cfg)
+        self.surroundings = Surroundings(simplified)
+        self.ground = simplified.ground
+        self.town = town_folder(cfg.town or boxes.name)
+        self.bounds_m = boxes.bounds()
+        self._lit: object = None  # area and weather that the renderer is prepared for
 
     @staticmethod
     def area_of(targets_m: np.ndarray) -> tuple[float, float]:
-        """Return the grid centre of the area that is lit for a trajectory: neighbours share it."""
+        """Return the centre (x, y) of the area that is lit for a trajectory; trajectories near each other share it."""
         x, y = np.round(targets_m.mean(axis=0)[:2] / AREA_STEP_M) * AREA_STEP_M + 0.0
         return float(x), float(y)
 
     def light(self, targets_m: np.ndarray, weather: WeatherParams | None) -> None:
         """Prepare the renderer for a pedestrian trajectory."""
         middle = np.array(self.area_of(targets_m))
-        wanted = (*middle, None if weather is None else weather.model_dump_json())
-        if wanted != self._lit:
-            (low, high), half = self.bounds_m, AREA_M / 2.0
+        key = (*middle, None if weather is None else weather.model_dump_json())
+        if key != self._lit:
+            low, high = self.bounds_m
+            half = AREA_M / 2.0
             self.renderer.prepare(np.append(middle - half, low[2]), np.append(middle + half, high[2]), weather)
-            self._lit = wanted
+            self._lit = key
 
 
 @dataclass(frozen=True)
 class Moment:
-    """One frame of an episode. position_m, rotation_deg (pitch, yaw, roll), velocity_mps: (3,) world. target: as in
-    `meta.json`; target_m: its hip, (3,). clearance_m: the least since the previous frame."""
+    """One frame of an episode."""
 
     index: int
     time_s: float
-    position_m: np.ndarray
-    rotation_deg: np.ndarray
-    velocity_mps: np.ndarray
-    target_m: np.ndarray
-    target: TargetMeta
+    position_m: np.ndarray  # (3,) world
+    rotation_deg: np.ndarray  # (3,) pitch, yaw, roll
+    velocity_mps: np.ndarray  # (3,) world
+    target_m: np.ndarray  # (3,) hip of the target, world
+    target: TargetMeta  # as in `meta.json`
     bystanders: dict[str, float | None]  # as `BystandersMeta.people_of`; empty without bystanders
     frame: Frame
-    clearance_m: float
+    clearance_m: float  # the least since the previous frame
     height_m: float  # over the ground under the target
 
     @property
@@ -97,8 +104,8 @@ class Moment:
 
 
 class ClosedLoopTrajectory:
-    """One episode behind one pedestrian. `reset` returns the lead frames, `step` flies a command for one time step and
-    returns the next frame; `ended`: how the episode ended, None before. `script`: what is drawn."""
+    """One episode behind one pedestrian. `reset` returns the lead frames; `step` flies a command for one time step and
+    returns the next frame. `ended` is None until the episode ends. `script` describes what is drawn."""
 
     def __init__(
         self, airspace: Airspace, planned: DroneTrace, *, number: int = 0, num_lead: int = 5, drone: Drone = Drone(),
@@ -106,14 +113,19 @@ class ClosedLoopTrajectory:
     ) -> None:  # fmt: skip
         """
         Args:
-            planned: a plan; its first num_lead frames (2 or more) are flown, the others give the target's positions.
-            number: of the trajectory, for its weather.
-            lost_s: the episode ends after so long without a visible target; 0: never.
+            planned: A plan. The drone starts with its first num_lead frames (2 or more); of the other frames only the
+                target's positions are used.
+            number: Index of the trajectory, which its weather depends on.
+            lost_s: The episode ends after this time without a visible target; 0 for never.
         """
         if not 2 <= num_lead < len(planned.time_s):
-            raise ValueError(f"num_lead must be 2 to {len(planned.time_s) - 1}, not {num_lead}")
-        self.airspace, self.planned, self.drone = airspace, planned, drone
-        self.num_lead, self.lost_s, self.dt_s = num_lead, lost_s, step_s(planned.time_s)
+            raise ValueError(f"num_lead must be from 2 to {len(planned.time_s) - 1}, got {num_lead}")
+        self.airspace = airspace
+        self.planned = planned
+        self.drone = drone
+        self.num_lead = num_lead
+        self.lost_s = lost_s
+        self.dt_s = step_s(planned.time_s)
         weather = weather_of(airspace.cfg, airspace.pools, number)
         plain = replace(planned, segments=(), mission=None)  # segments and mission describe the plan only
         self.script = make_track_script(
@@ -122,18 +134,20 @@ class ClosedLoopTrajectory:
         self._begin()
 
     def _begin(self) -> None:
-        planned, last = self.planned, self.num_lead - 1
+        planned = self.planned
+        last = self.num_lead - 1
         flown = Poses(planned.positions_m, planned.rotations_deg, planned.targets_m, planned.clearances_m)
-        self.script = replace(self.script, perturbed=PerturbedTrack.unperturbed(flown))  # which copies it
-        self.poses = self.script.perturbed.poses  # written as it is flown; what lies ahead is still the plan
-        self.index, self._unseen_s = last, 0.0
+        self.script = replace(self.script, perturbed=PerturbedTrack.unperturbed(flown))  # which copies the poses
+        self.poses = self.script.perturbed.poses  # up to `index` those of the episode, then still those of the plan
+        self.index = last
+        self._unseen_s = 0.0
         self.ended: Ended | None = None
         self.velocity_mps = (flown.positions_m[last] - flown.positions_m[last - 1]) / self.dt_s
         turned_deg = wrap_deg(flown.rotations_deg[last, 1] - flown.rotations_deg[last - 1, 1])
         self.yaw_rate_degps = float(turned_deg) / self.dt_s
 
     def reset(self) -> tuple[Moment, ...]:
-        """Start from the beginning; return the lead frames, of which the last is the present one."""
+        """Start from the beginning; return the lead frames, whose last one is the present frame."""
         self._begin()
         steps = np.diff(self.poses.positions_m[: self.num_lead], axis=0) / self.dt_s
         velocities = [steps[0], *steps]
@@ -141,24 +155,26 @@ class ClosedLoopTrajectory:
 
     def step(self, command: np.ndarray) -> Moment:
         """Fly a command, (5,) as ACTION in the level axes of the present frame; return the next frame."""
-        if self.ended is not None or (problem := self.drone.problem_of(command)):
-            raise ValueError(f"the episode has ended: {self.ended}" if self.ended else problem)
-        places, yaw_deg, pitch_deg = self._path(np.asarray(command, dtype=np.float64))
-        (low, high), i = self.airspace.bounds_m, self.index + 1
-        gaps, _, _ = swept_distances(self.airspace.surroundings.obstacles, places, CLEARANCE_CAP_M)
-        over_ground = places[:, 2] - self.airspace.ground.height_at(places)
-        gaps = np.minimum(gaps[:-1], np.minimum(over_ground[:-1], over_ground[1:]))  # of each part of the path
-        hits = np.flatnonzero(gaps < self.drone.radius_m)
-        end = int(hits[0]) if len(hits) else len(places) - 1  # the drone stops before the part that touches
-        clearance_m = min(float(gaps[: end + 1].min()), self.script.others.distance_m(i, places[end]))
+        if self.ended is not None:
+            raise ValueError(f"the episode has already ended with {self.ended!r}; call reset first")
+        if problem := self.drone.problem_of(command):
+            raise ValueError(problem)
+        path_m, yaw_deg, pitch_deg = self._path(np.asarray(command, dtype=np.float64))
+        gaps_m = self._clearances(path_m)
+        hits = np.flatnonzero(gaps_m < self.drone.radius_m)
+        end = int(hits[0]) if len(hits) else len(path_m) - 1  # the drone stops before the part that touches
+        i = self.index + 1
+        clearance_m = min(float(gaps_m[: end + 1].min()), self.script.others.distance_m(i, path_m[end]))
         self.index = i
-        self.poses.positions_m[i], self.poses.rotations_deg[i] = places[end], [pitch_deg, yaw_deg, 0.0]
+        self.poses.positions_m[i] = path_m[end]
+        self.poses.rotations_deg[i] = [pitch_deg, yaw_deg, 0.0]
         self.poses.clearances_m[i - 1 : i + 1] = clearance_m
         moment = self._drawn(i, self.velocity_mps.copy(), clearance_m)
         self._unseen_s = 0.0 if moment.target.visible else self._unseen_s + self.dt_s
+        low, high = self.airspace.bounds_m
         if clearance_m < self.drone.radius_m:
             self.ended = "crashed"
-        elif (np.maximum(low - places[-1], places[-1] - high)[:2] > LEAVES_M).any():
+        elif (np.maximum(low - path_m[-1], path_m[-1] - high)[:2] > LEAVES_M).any():
             self.ended = "left"
         elif i == len(self.planned.time_s) - 1:
             self.ended = "finished"
@@ -166,38 +182,59 @@ class ClosedLoopTrajectory:
             self.ended = "lost"
         return moment
 
+    def _clearances(self, path_m: np.ndarray) -> np.ndarray:
+        """Return the distance of each part of a path, (k + 1, 3), to obstacles and ground, (k,)."""
+        gaps_m, _, _ = swept_distances(self.airspace.surroundings.obstacles, path_m, CLEARANCE_CAP_M)
+        over_ground_m = path_m[:, 2] - self.airspace.ground.height_at(path_m)
+        return np.minimum(gaps_m[:-1], np.minimum(over_ground_m[:-1], over_ground_m[1:]))
+
     def _path(self, command: np.ndarray) -> tuple[np.ndarray, float, float]:
         """Return the positions within one step, (k + 1, 3), and yaw and pitch at its end, degrees."""
-        place, (pitch_deg, yaw_deg, _) = self.poses.positions_m[self.index], self.poses.rotations_deg[self.index]
-        num, drone = max(1, round(self.dt_s * RATE_HZ)), self.drone
-        part_s, yaw_rad = self.dt_s / num, np.radians(yaw_deg)
-        cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-        wanted = np.array([command[0] * cos - command[1] * sin, command[0] * sin + command[1] * cos, command[2]])
-        places = [place]
-        for _ in range(num):
-            change = wanted - self.velocity_mps
-            size = float(np.linalg.norm(change))
-            self.velocity_mps = self.velocity_mps + change * min(1.0, drone.accel_max_mps2 * part_s / max(size, 1e-9))
-            places.append(places[-1] + self.velocity_mps * part_s)
-            most = drone.yaw_accel_max_degps2 * part_s
-            self.yaw_rate_degps += float(np.clip(command[3] - self.yaw_rate_degps, -most, most))
+        drone = self.drone
+        num_parts = max(1, round(self.dt_s * RATE_HZ))
+        part_s = self.dt_s / num_parts
+        # Largest changes within one part.
+        speed_step_mps = drone.accel_max_mps2 * part_s
+        yaw_rate_step_degps = drone.yaw_accel_max_degps2 * part_s
+        pitch_step_deg = drone.gimbal_rate_max_degps * part_s
+        pitch_deg, yaw_deg, _ = self.poses.rotations_deg[self.index]
+        ahead_mps, left_mps, up_mps, commanded_yaw_rate_degps, commanded_pitch_deg = command
+        cos, sin = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
+        commanded_mps = np.array([ahead_mps * cos - left_mps * sin, ahead_mps * sin + left_mps * cos, up_mps])
+        path_m = [self.poses.positions_m[self.index]]
+        for _ in range(num_parts):
+            change_mps = commanded_mps - self.velocity_mps
+            size_mps = float(np.linalg.norm(change_mps))
+            self.velocity_mps = self.velocity_mps + change_mps * min(1.0, speed_step_mps / max(size_mps, 1e-9))
+            path_m.append(path_m[-1] + self.velocity_mps * part_s)
+            change_degps = commanded_yaw_rate_degps - self.yaw_rate_degps
+            self.yaw_rate_degps += float(np.clip(change_degps, -yaw_rate_step_degps, yaw_rate_step_degps))
             yaw_deg += self.yaw_rate_degps * part_s
-            tilt = drone.gimbal_rate_max_degps * part_s
-            pitch_deg += float(np.clip(command[4] - pitch_deg, -tilt, tilt))
-        return np.array(places), float(wrap_deg(yaw_deg)), float(pitch_deg)
+            pitch_deg += float(np.clip(commanded_pitch_deg - pitch_deg, -pitch_step_deg, pitch_step_deg))
+        return np.array(path_m), float(wrap_deg(yaw_deg)), float(pitch_deg)
 
     def _drawn(self, i: int, velocity_mps: np.ndarray, clearance_m: float) -> Moment:
-        script, poses = self.script, self.poses
+        """Draw frame i and return it with its measures."""
+        script = self.script
+        poses = self.poses
         self.airspace.light(poses.targets_m, None if script.weather is None else script.weather.params)
         frame, target, others = draw_frame(
             self.airspace.renderer, script, i, poses, self.airspace.cfg.visible_threshold
         )
         target = written_target(target, frame)
-        position_m, target_m = poses.positions_m[i].copy(), poses.targets_m[i].copy()
+        position_m = poses.positions_m[i].copy()
+        target_m = poses.targets_m[i].copy()
         people = script.others.people(script.clothes.looks) if self.airspace.renderer.dresses else None
-        bystanders = {} if others is None else others.people_of(target_m, people)
-        height_m = float(position_m[2] - (target_m[2] - TARGET_HEIGHT_M))
         return Moment(
-            i, float(script.trace.time_s[i]), position_m, poses.rotations_deg[i].copy(), velocity_mps,
-            target_m, target, bystanders, frame, clearance_m, height_m,
-        )  # fmt: skip
+            index=i,
+            time_s=float(script.trace.time_s[i]),
+            position_m=position_m,
+            rotation_deg=poses.rotations_deg[i].copy(),
+            velocity_mps=velocity_mps,
+            target_m=target_m,
+            target=target,
+            bystanders={} if others is None else others.people_of(target_m, people),
+            frame=frame,
+            clearance_m=clearance_m,
+            height_m=float(position_m[2] - (target_m[2] - TARGET_HEIGHT_M)),
+        )

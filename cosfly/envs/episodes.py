@@ -87,8 +87,10 @@ def read_list(name: str) -> tuple[str, tuple[tuple[str, int], ...], str]:
     lists = read_model(EPISODES_FILE, EpisodeLists, EPISODES_FORMAT).lists
     episodes = lists.get(env, {}).get(list_name)
     if episodes is None:
-        problem = "unknown list" if env in lists else f"unknown environment{nearest(name, lists)}"
-        raise InputError(problem, where="--env", got=name, expected=", ".join(lists.get(env, lists)))
+        problem = "the environment has no list of this name"
+        if env not in lists:
+            problem = f"there is no environment of this name{nearest(name, lists)}"
+        raise InputError(problem, where="--env", got=name, expected=f"one of {', '.join(lists.get(env, lists))}")
     task = [env, [[HELD_OUT[town]._asdict(), number] for town, number in episodes], SIZE_PX, FOV_DEG, NUM_DECISIONS]
     return env, episodes, sha256_bytes(dump_json(task).encode())
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache, partial
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 
 from cosfly.closed_loop.stage import ClosedLoopConfig, EpisodeRunner, finish_episodes
@@ -16,9 +17,9 @@ from cosfly.runtime.worker import Item, Outcome, Work
 
 
 class ListConfig(ClosedLoopConfig):
-    """The settings of `cosfly fly --env`. env: as in `read_list`."""
+    """The settings of `cosfly fly --env`."""
 
-    env: str
+    env: str  # environment and list, as in `read_list`
 
 
 def run(
@@ -34,35 +35,40 @@ def run(
     files = {"controller": cfg.fly.table, "episodes": benchmark.EPISODES_FILE}
     stage = StageFolder.open(out, "fly", config=cfg, inputs={}, seed=seed, resume=resume, package_files=files)
     if not stage.is_complete:
-        num, items = 1 if cfg.fly.asks_model else workers, []
-        for town, listed in groupby(episodes, key=lambda one: one[0]):
-            numbers = [number for _, number in listed]
-            for batch in (numbers[k : k + cfg.fly.batch] for k in range(0, len(numbers), cfg.fly.batch)):
+        items = []
+        for town, town_episodes in groupby(episodes, key=itemgetter(0)):
+            numbers = [number for _, number in town_episodes]
+            for begin in range(0, len(numbers), cfg.fly.batch):
+                batch = numbers[begin : begin + cfg.fly.batch]
                 items.append(Item(f"{town} {batch[0]}", (town, batch), benchmark.NUM_DECISIONS * len(batch)))
-        run_items(stage, items, make_worker, (cfg, stage.path, seed, num), workers=num, watch=watch)
+        num_workers = 1 if cfg.fly.asks_model else workers
+        worker_args = (cfg, stage.path, seed, num_workers)
+        run_items(stage, items, make_worker, worker_args, workers=num_workers, watch=watch)
         finish_episodes(stage, cfg.fly, seed, [benchmark.episode_id(*episode) for episode in episodes])
     return out
 
 
-def make_worker(cfg: ListConfig, out: Path, seed: int, num: int) -> Work:
+def make_worker(cfg: ListConfig, out: Path, seed: int, num_workers: int) -> Work:
     """Open an engine in this process; return the function that flies some episodes of a town."""
     task, _, digest = benchmark.read_list(cfg.env)
-    runner = EpisodeRunner(cfg, out, seed, num, list_sha256=digest)
+    runner = EpisodeRunner(cfg, out, seed, num_workers, list_sha256=digest)
 
     @lru_cache(maxsize=1)
     def airspace_of(town: str) -> tuple[benchmark.BenchmarkWorld, Airspace]:
         world = benchmark.world_of(benchmark.HELD_OUT[town])
         return world, world.airspace(task)
 
-    def opened(town: str, number: int) -> ClosedLoopTrajectory:
-        world, space = airspace_of(town)
-        if (episode := benchmark.episode_of(task, world, number)) is None:
-            raise InputError("the episode cannot be flown", where=f"{cfg.env}: {town}", got=str(number))
-        return episode.simulation(space)
+    def open_episode(town: str, number: int) -> ClosedLoopTrajectory:
+        world, airspace = airspace_of(town)
+        episode = benchmark.episode_of(task, world, number)
+        if episode is None:
+            problem = "the trajectory gives no episode, because its drone trajectory is missing or too short"
+            raise InputError(problem, where=f"{cfg.env}: {town}, trajectory {number}")
+        return episode.simulation(airspace)
 
     def work(item: Item) -> Outcome:
         town, numbers = item.payload
-        episodes = {benchmark.episode_id(town, number): partial(opened, town, number) for number in numbers}
+        episodes = {benchmark.episode_id(town, number): partial(open_episode, town, number) for number in numbers}
         return runner.fly(episodes, airspace_of(town)[0].sha256)
 
     return work

@@ -1,7 +1,7 @@
 """Baselines that predict a decision without pictures, from the geometry of the past frames.
 
-The geometry is a row of numbers; a network and a rule are fitted on such rows. `is_drawn_ahead` reports labels that may
-depend on a random event after these frames.
+`past_of` makes a row of numbers from a window; a network and a decision tree (the rule) are fitted on such rows.
+`is_drawn_ahead` reports whether a label may depend on a random event after the window.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ LEAST_WINDOWS = 100  # fewest windows that a network is fitted on
 HIDDEN = 32  # units of the network's hidden layer
 ROUNDS = 120  # iterations of its optimiser
 PENALTY = 1e-3  # on the squares of its weights
-STANDS_MPS = 0.2  # a slower target stands
-TURNS_DEG = 45.0  # a target whose heading changes by more turns
+STANDS_MPS = 0.2  # below this speed the target stands
+TURNS_DEG = 45.0  # a larger change of heading is a turn
 DRAWN_AHEAD = (
     f"another part of the flight begins, or the walker stops, sets off or turns by more than {TURNS_DEG:g} degrees"
 )
@@ -31,7 +31,7 @@ Decider = Callable[[np.ndarray], np.ndarray]  # pasts (n, d) -> numbers of decis
 Rule = int | tuple[int, float, "Rule", "Rule"]
 
 
-def past_of(flight: Track, window: Sequence[int], is_ordered: bool) -> np.ndarray:
+def past_of(track: Track, window: Sequence[int], is_ordered: bool) -> np.ndarray:
     """Return the geometry of the last LOOKS_BACK frames of a window as a row of numbers, (d,).
 
     The row does not depend on the window's place and time. Poses are exact: the perturbation is removed where it is
@@ -39,32 +39,40 @@ def past_of(flight: Track, window: Sequence[int], is_ordered: bool) -> np.ndarra
     bearings in radians. The row holds velocities and speeds of drone and target, yaw and pitch, position, distance,
     bearing and visibility of the target, and whether a mission's order is in force.
     """
-    at = [window[0]] * (LOOKS_BACK - len(window)) + list(window[-LOOKS_BACK:])
-    planned = flight.planned[0][at]
-    walked_m = flight.walked_m[at]
-    poses = np.where(np.isnan(planned), np.hstack([flight.positions_m[at], flight.rotations_deg[at]]), planned)
-    targets_m = np.where(np.isnan(walked_m), flight.targets_m[at], walked_m)
+    frames = [window[0]] * (LOOKS_BACK - len(window)) + list(window[-LOOKS_BACK:])
+    planned = track.planned[0][frames]
+    walked_m = track.walked_m[frames]
+    poses = np.where(np.isnan(planned), np.hstack([track.positions_m[frames], track.rotations_deg[frames]]), planned)
     yaw_deg = float(poses[-1, 4])
-    step_s = np.diff(flight.time_s[at])[:, None]
+    drone_m = in_axes_of(yaw_deg, poses[:, :3] - poses[-1, :3])
+    target_m = in_axes_of(yaw_deg, np.where(np.isnan(walked_m), track.targets_m[frames], walked_m) - poses[-1, :3])
+    step_s = np.diff(track.time_s[frames])[:, None]
     step_s[step_s == 0] = np.nan  # a repeated frame
-    drone_m, target_m = (in_axes_of(yaw_deg, places_m - poses[-1, :3]) for places_m in (poses[:, :3], targets_m))
     drone_mps = np.diff(drone_m, axis=0) / step_s
     target_mps = np.diff(target_m, axis=0) / step_s
-    away = target_m - drone_m
-    apart_m = np.hypot(away[:, 0], away[:, 1])
-    speeds = np.linalg.norm(target_mps, axis=1)
-    bearing = np.arctan2(away[-1, 1], away[-1, 0])
-    seen_from = bearing - np.arctan2(target_mps[-1, 1], target_mps[-1, 0])
-    moves = speeds[-1] > STANDS_MPS
-    turned_deg = np.asarray(wrap_deg(poses[:-1, 4] - yaw_deg))
-    last = [bearing, moves * np.cos(seen_from), moves * np.sin(seen_from), is_ordered]
-    drone_speeds = np.linalg.norm(drone_mps, axis=1)
-    parts = [drone_mps, drone_speeds, target_mps, speeds, away[-1], apart_m, np.diff(apart_m), turned_deg]
-    parts += [poses[:, 3], flight.target.visible[at], np.array(last, dtype=float)]
+    target_speeds = np.linalg.norm(target_mps, axis=1)
+    offsets_m = target_m - drone_m
+    distances_m = np.hypot(offsets_m[:, 0], offsets_m[:, 1])
+    bearing = np.arctan2(offsets_m[-1, 1], offsets_m[-1, 0])
+    aspect = bearing - np.arctan2(target_mps[-1, 1], target_mps[-1, 0])  # between the view and the target's heading
+    moves = target_speeds[-1] > STANDS_MPS
+    parts = [
+        drone_mps,
+        np.linalg.norm(drone_mps, axis=1),
+        target_mps,
+        target_speeds,
+        offsets_m[-1],
+        distances_m,
+        np.diff(distances_m),
+        np.asarray(wrap_deg(poses[:-1, 4] - yaw_deg)),
+        poses[:, 3],
+        track.target.visible[frames],
+        np.array([bearing, moves * np.cos(aspect), moves * np.sin(aspect), is_ordered], dtype=float),
+    ]
     return np.nan_to_num(np.concatenate([part.ravel() for part in parts]))
 
 
-def is_drawn_ahead(flight: Track, now: int, last: int, is_ordered: bool) -> bool | None:
+def is_drawn_ahead(track: Track, now: int, last: int, is_ordered: bool) -> bool | None:
     """Return whether DRAWN_AHEAD holds after frame `now`, up to frame `last`, the last one that the label depends on.
 
     Random events within a part, such as the times of hops, are not recorded and not counted. While a mission's order is
@@ -73,14 +81,14 @@ def is_drawn_ahead(flight: Track, now: int, last: int, is_ordered: bool) -> bool
     if is_ordered:
         return False
     span = slice(max(0, now - 1), last + 1)
-    steps_m = np.diff(flight.walked_m[span, :2], axis=0)
-    steps_s = np.diff(flight.time_s[span])
+    steps_m = np.diff(track.walked_m[span, :2], axis=0)
+    steps_s = np.diff(track.time_s[span])
     if now < 1 or not np.isfinite(steps_m).all():
         return None
     moves = np.hypot(*steps_m.T) > STANDS_MPS * steps_s
     headings_deg = np.degrees(np.arctan2(steps_m[:, 1], steps_m[:, 0]))
     turns = moves & moves[0] & (np.abs(wrap_deg(headings_deg - float(headings_deg[0]))) > TURNS_DEG)
-    begins = any(now < part.begin <= last for part in flight.segments)
+    begins = any(now < part.begin <= last for part in track.segments)
     return bool(begins or (moves != moves[0]).any() or turns.any())
 
 
@@ -88,7 +96,8 @@ def fit_network(table: np.ndarray, labels: np.ndarray, rng: np.random.Generator)
     """Fit a network of one hidden layer by cross entropy with a small penalty on its weights.
 
     Args:
-        table: (n, d). labels: (n,) numbers of decisions, weighted by their frequency.
+        table: (n, d) pasts.
+        labels: (n,) numbers of decisions.
 
     Source: L-BFGS, Liu and Nocedal 1989.
     """
@@ -97,33 +106,39 @@ def fit_network(table: np.ndarray, labels: np.ndarray, rng: np.random.Generator)
 
     center = table.mean(axis=0)
     spread = table.std(axis=0)
-    num = int(labels.max()) + 1
     spread[spread == 0] = 1.0
-    sizes = [(table.shape[1], HIDDEN), (HIDDEN,), (HIDDEN, num), (num,)]
-    ends = np.cumsum([math.prod(size) for size in sizes])[:-1]
-
-    def layers(flat: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        first, bias, second, last = (part.reshape(s) for part, s in zip(np.split(flat, ends), sizes, strict=True))
-        hidden = np.tanh(rows @ first + bias)
-        return hidden, hidden @ second + last, second
-
-    def cost(flat: np.ndarray) -> tuple[float, np.ndarray]:
-        hidden, scores, second = layers(flat, inputs)
-        logs = scores - logsumexp(scores, axis=1, keepdims=True)
-        score_gradient = (np.exp(logs) - is_label) / len(inputs)
-        back = score_gradient @ second.T * (1.0 - hidden**2)
-        gradients = [inputs.T @ back, back.sum(axis=0), hidden.T @ score_gradient, score_gradient.sum(axis=0)]
-        gradient = np.concatenate([part.ravel() for part in gradients]) + PENALTY * flat
-        return float(-(logs * is_label).sum() / len(inputs) + PENALTY / 2 * flat @ flat), gradient
+    num_decisions = int(labels.max()) + 1
+    shapes = [(table.shape[1], HIDDEN), (HIDDEN,), (HIDDEN, num_decisions), (num_decisions,)]
+    ends = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
 
     def scaled(rows: np.ndarray) -> np.ndarray:
         return np.clip((rows - center) / spread, -5.0, 5.0)
 
+    def apply(weights: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the hidden layer, the scores of the decisions, and the weights of the second layer."""
+        parts = zip(np.split(weights, ends), shapes, strict=True)
+        first, first_bias, second, second_bias = (part.reshape(shape) for part, shape in parts)
+        hidden = np.tanh(rows @ first + first_bias)
+        return hidden, hidden @ second + second_bias, second
+
+    def cost(weights: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the cross entropy with the penalty, and its gradient."""
+        hidden, scores, second = apply(weights, inputs)
+        logs = scores - logsumexp(scores, axis=1, keepdims=True)
+        by_score = (np.exp(logs) - is_label) / len(inputs)
+        by_hidden = by_score @ second.T * (1.0 - hidden**2)
+        gradients = [inputs.T @ by_hidden, by_hidden.sum(axis=0), hidden.T @ by_score, by_score.sum(axis=0)]
+        gradient = np.concatenate([part.ravel() for part in gradients]) + PENALTY * weights
+        return float(-(logs * is_label).sum() / len(inputs) + PENALTY / 2 * weights @ weights), gradient
+
     inputs = scaled(table)
-    is_label = np.eye(num)[labels]
-    begin = np.concatenate([(rng.normal(size=s) / math.sqrt(s[0]) * (len(s) == 2)).ravel() for s in sizes])
-    weights = minimize(cost, begin, jac=True, method="L-BFGS-B", options={"maxiter": ROUNDS}).x
-    return lambda rows: layers(weights, scaled(rows))[1].argmax(axis=1)
+    is_label = np.eye(num_decisions)[labels]
+    start = []
+    for shape in shapes:
+        values = rng.normal(size=shape) / math.sqrt(shape[0])
+        start.append((values if len(shape) == 2 else 0.0 * values).ravel())  # a bias starts at 0
+    fitted = minimize(cost, np.concatenate(start), jac=True, method="L-BFGS-B", options={"maxiter": ROUNDS}).x
+    return lambda rows: apply(fitted, scaled(rows))[1].argmax(axis=1)
 
 
 def fit_deciders(table: np.ndarray, labels: np.ndarray, rng: np.random.Generator) -> dict[str, Decider]:
@@ -136,18 +151,24 @@ def fit_deciders(table: np.ndarray, labels: np.ndarray, rng: np.random.Generator
 
 
 def fit_rule(table: np.ndarray, labels: np.ndarray, depth: int = 2) -> Rule:
-    """Fit a decision tree: at each node the threshold of the least Gini impurity; labels (n,): numbers of decisions."""
+    """Fit a decision tree with the threshold of the least Gini impurity at each node.
+
+    Args:
+        table: (n, d) pasts.
+        labels: (n,) numbers of decisions.
+    """
     counts = np.bincount(labels)
-    best = (-1.0, 0, 0.0)  # purity, column, threshold
     if depth == 0 or (counts > 0).sum() < 2:
         return int(counts.argmax())
+    best = (-1.0, 0, 0.0)  # purity, column, threshold
     is_label = np.eye(len(counts))[labels]
     sizes = np.arange(1, len(labels))[:, None]
     for column in range(table.shape[1]):
         order = np.argsort(table[:, column])
-        values, below = table[order, column], np.cumsum(is_label[order], axis=0)[:-1]
+        values = table[order, column]
+        below = np.cumsum(is_label[order], axis=0)[:-1]
         purity = (below**2 / sizes + (counts - below) ** 2 / (len(labels) - sizes)).sum(axis=1)
-        purity[values[1:] == values[:-1]] = -1.0  # no threshold lies between equals
+        purity[values[1:] == values[:-1]] = -1.0  # no threshold lies between equal values
         split = int(purity.argmax())
         best = max(best, (float(purity[split]), column, float(values[split])))
     if best[0] < 0:

@@ -66,15 +66,16 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
         ConfigError: The stage has no items, or a server processes them. ResumeError: `out` is not empty.
     """
     if stage not in STAGES:
-        raise ConfigError("this stage cannot be measured", where="--stage", got=stage, expected=", ".join(STAGES))
+        problem = "this stage cannot be measured"
+        raise ConfigError(problem, where="--stage", got=stage, expected=f"one of {', '.join(STAGES)}")
     if out.exists() and any(out.iterdir()):
         raise ResumeError("the output directory is not empty", where=out, fix="choose another --out")
     if stage == "caption" and (cfg.caption.teacher_kind not in EMBEDDED or cfg.caption.judge.url):
         raise ConfigError(
-            "captions of a server do not depend on the number of workers",
+            "only teachers in this process can be measured, because a server does not become faster with more workers",
             where="caption.teacher",
             got=cfg.caption.teacher,
-            expected="an embedded teacher, no judge",
+            expected=f"a teacher of the kind {' or '.join(sorted(EMBEDDED))}, and no caption.judge",
             fix="--set caption.teacher=rules",
         )
     rows = [_measure(cfg, run_folder, out / f"workers_{count}", stage, count) for count in sorted(set(workers))]

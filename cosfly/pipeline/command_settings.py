@@ -64,7 +64,7 @@ class CommandConfig(Config):
     @model_validator(mode="after")
     def _address_is_used(self) -> CommandConfig:
         if self.ray.address and self.engine != "ray":
-            raise ValueError(f"ray.address is {self.ray.address}, but engine is {self.engine}: add --engine ray")
+            raise ValueError(f"ray.address is {self.ray.address}, but engine is {self.engine}; add --engine ray")
         return self
 
 

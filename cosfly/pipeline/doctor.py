@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 
 from cosfly.runtime.errors import EnvironmentMissing
 
-OPTIONAL_PACKAGES = {  # name -> what needs it, and what to install
+OPTIONAL_PACKAGES = {  # name: the purpose, and the packages to install
     "torch": ("students", "cosfly[distill]"),
     "transformers": ("students", "cosfly[distill]"),
     "peft": ("students", "cosfly[distill]"),
@@ -26,30 +26,27 @@ OPTIONAL_PACKAGES = {  # name -> what needs it, and what to install
     "carla": ("CARLA's maps and pictures", "cosfly[carla]"),
     "unrealcv": ("UnrealCV's maps and pictures", "cosfly[unrealcv]; then --no-deps unrealcv"),
 }
+FRAMES_PER_GIB = 200  # a 1280x720 frame takes about 5 MB, nearly all of it float32 depth
+LEAST_FREE_GIB = 5
 GPU_QUERY = ("--query-gpu=name,memory.total,driver_version", "--format=csv,noheader")
 
 
 class Check(NamedTuple):
-    """One line of the table. state: `missing` stops the main job; `optional` does not."""
+    """One line of the table."""
 
     name: str
-    state: Literal["ok", "missing", "optional"]
+    state: Literal["ok", "missing", "optional"]  # `missing` prevents `cosfly run`; `optional` does not
     detail: str
 
 
 def examine(folder: Path) -> Iterator[Check]:
-    """Yield the checks of this machine; runs will be written to `folder`."""
+    """Check this machine, whose runs are written below `folder`, and yield the results."""
     memory_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     yield Check("python", "ok", f"{platform.python_version()} on {platform.platform()}")
     yield Check("machine", "ok", f"{len(os.sched_getaffinity(0))} cores, {memory_gib:.0f} GiB memory")
-    place = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
-    free = shutil.disk_usage(place).free / 2**30
-    # A 1280x720 frame takes about 5 MB, nearly all of it float32 depth.
-    detail = f"{free:.1f} GiB free at {place.resolve()}, room for about {int(free * 200):,} frames of 1280x720"
-    fix = "" if free > 5 else "; free some space, or name another disk with --out"
-    yield Check("disk", "missing" if fix else "ok", detail + fix)
-    yield _gl()
-    yield _gpu()
+    yield _check_disk(folder)
+    yield _check_gl()
+    yield _check_gpu()
     for name, (purpose, install) in OPTIONAL_PACKAGES.items():
         if importlib.util.find_spec(name) is None:
             yield Check(name, "optional", f'not installed; for {purpose}: pip install "{install}"')
@@ -57,7 +54,17 @@ def examine(folder: Path) -> Iterator[Check]:
             yield Check(name, "ok", importlib.metadata.version(name.replace("_", "-")))
 
 
-def _gl() -> Check:
+def _check_disk(folder: Path) -> Check:
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    free_gib = shutil.disk_usage(existing).free / 2**30
+    num_frames = int(free_gib * FRAMES_PER_GIB)
+    detail = f"{free_gib:.1f} GiB free at {existing.resolve()}, room for about {num_frames:,} frames of 1280x720"
+    if free_gib > LEAST_FREE_GIB:
+        return Check("disk", "ok", detail)
+    return Check("disk", "missing", f"{detail}; free some space, or name another disk with --out")
+
+
+def _check_gl() -> Check:
     from cosfly.formats.boxes import make_box_map
     from cosfly.render.stage import open_renderer
 
@@ -69,11 +76,11 @@ def _gl() -> Check:
     return Check("GL (renderer)", "ok", renderer.device)
 
 
-def _gpu() -> Check:
+def _check_gpu() -> Check:
     try:
         done = subprocess.run(["nvidia-smi", *GPU_QUERY], capture_output=True, text=True, timeout=20, check=False)
     except FileNotFoundError:
-        return Check("GPU", "optional", "no nvidia-smi: frames are rendered and students trained on the CPU")
+        return Check("GPU", "optional", "nvidia-smi is not installed, so the CPU renders frames and trains students")
     except subprocess.TimeoutExpired:
         return Check("GPU", "optional", "nvidia-smi does not answer")
     if done.returncode != 0:

@@ -28,7 +28,7 @@ from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import read_object
 
 DERIVED = "work"
-UNEXPECTED = "the file is not as a stage writes it"
+UNEXPECTED = "the file does not have the structure that its stage writes"
 FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "mean": lambda values: float(np.mean(values)),
     "std": lambda values: float(np.std(values)),

@@ -34,20 +34,20 @@ from cosfly.simplify.passes import SimplifyConfig, simplify
 
 __all__ = ["BoxMap", "DroneTrace", "Frame", "load_map", "plan", "read_captions", "render_frames"]
 
-# Settings that a function uses; it refuses the others of the section.
-OF_PEDESTRIAN = PedestriansConfig.model_fields.keys() - {*("num_paths", "others", "look_alikes", "traffic")}
-OF_PACE = {"pace", "hurry_speed_mps", "dt_s"}
-OF_PICTURE = {"backend", "look", "rim", *WeatherConfig.model_fields}
-STEP_S = 0.5  # between the places of `render_frames`, for the person's stride
-FILE_SETTING = {"simworld": "world", "cityjson": "path", "boxes": "path"}  # of a source: which setting names its file
+# Settings that a function accepts; it rejects the others of the section.
+PEDESTRIAN_SETTINGS = PedestriansConfig.model_fields.keys() - {"num_paths", "others", "look_alikes", "traffic"}
+PACE_SETTINGS = {"pace", "hurry_speed_mps", "dt_s"}  # of a pedestrian on a given route
+PICTURE_SETTINGS = {"backend", "look", "rim", *WeatherConfig.model_fields}
+STEP_S = 0.5  # time between the positions of `render_frames`, for the stride of the person
+FILE_SETTING = {"simworld": "world", "cityjson": "path", "boxes": "path"}  # source: the setting that names its file
 
 
 def load_map(path: str | Path | None = None, *, source: str | None = None, seed: int = 0, **settings: Any) -> BoxMap:
     """Load or generate a map.
 
     Args:
-        path: `boxes_3d.json`, `step2_simplified.json`, a table or GeoJSON of boxes, or a source's file; None generates
-            a town.
+        path: `boxes_3d.json`, `step2_simplified.json`, a table or GeoJSON of boxes, or the file of a source; None
+            generates a town.
         source: `synthetic`, `simworld`, `cityjson`, `boxes` or `carla`; None chooses by the file. CARLA is queried in
             another process, so a script that uses it needs `if __name__ == "__main__":`.
         settings: Of the source, as in `maps.<source>` of a configuration: `load_map(size_m=400)`.
@@ -59,11 +59,16 @@ def load_map(path: str | Path | None = None, *, source: str | None = None, seed:
         return read_boxes(path)
     source = source or ("synthetic" if path is None else "boxes")
     if source not in SOURCES:
-        raise ConfigError("there is no such source of maps", got=source, expected=", ".join(SOURCES))
+        expected = f"one of {', '.join(SOURCES)}"
+        raise ConfigError("there is no map source of this name", where="load_map", got=source, expected=expected)
     if path is not None:
         if source not in FILE_SETTING:
-            fix = f"omit the path, or choose another source than {source}"
-            raise ConfigError("this source reads no file", where="load_map", got=str(path), fix=fix)
+            raise ConfigError(
+                f"the map source {source} reads no file, but a path is given",
+                where="load_map",
+                got=str(path),
+                fix="omit the path, or choose another source",
+            )
         _check_taken(settings, settings.keys() - {FILE_SETTING[source]}, "load_map")
         settings[FILE_SETTING[source]] = path
     return load_source(build(MapsConfig, {"source": source, source: settings}, "load_map"), seed=seed)
@@ -84,31 +89,33 @@ def plan(
     """
     from cosfly.geometry.kernels import obstacle_index
 
-    walking = build(PedestriansConfig, pedestrian or {}, "plan: pedestrian")
-    _check_taken(pedestrian or {}, OF_PEDESTRIAN if route_m is None else OF_PACE, "plan: pedestrian")
+    pedestrian = pedestrian or {}
+    walking = build(PedestriansConfig, pedestrian, "plan: pedestrian")
+    _check_taken(pedestrian, PEDESTRIAN_SETTINGS if route_m is None else PACE_SETTINGS, "plan: pedestrian")
     cfg = build(PlanConfig, settings, "plan")
     _check_taken(settings, settings.keys() - ({"track_astar"} - {cfg.planner}), "plan")
     if not box_map.header.passes:
         box_map = simplify(box_map, SimplifyConfig()).box_map
     rng = rng_for(seed, "pedestrians", "path_00000")
     if route_m is None:
-        person = make_pedestrian("path_00000", walkable_ground(box_map, walking), walking, rng).trajectory
+        target = make_pedestrian("path_00000", walkable_ground(box_map, walking), walking, rng).trajectory
     else:
         route_m = _checked_route(route_m)
-        person = follow_route("path_00000", route_m, box_map.ground, walking, rng, rng.spawn(1)[0])
-    return plan_trajectory(person, obstacle_index(box_map), cfg, seed, screens_of(box_map))
+        target = follow_route("path_00000", route_m, box_map.ground, walking, rng, rng.spawn(1)[0])
+    return plan_trajectory(target, obstacle_index(box_map), cfg, seed, screens_of(box_map))
 
 
-def _checked_route(given: Any) -> np.ndarray:
-    """Return a route, (k, 2) m, checked."""
+def _checked_route(route: Any) -> np.ndarray:
+    """Return a route as an array, (k, 2) float64 m; raise InputError if it is none."""
     try:
-        route_m, got = np.asarray(given, dtype=np.float64), ""
+        route_m = np.asarray(route, dtype=np.float64)
+        got = f"an array of shape {route_m.shape}"
     except (TypeError, ValueError):
-        route_m, got = np.empty(0), repr(given)[:60]
+        route_m = np.empty(0)
+        got = repr(route)[:60]
     is_route = route_m.ndim == 2 and route_m.shape[1] == 2 and len(route_m) >= 2 and np.isfinite(route_m).all()
     if not is_route or not np.diff(route_m, axis=0).any(axis=1).all():
-        expected = "(k, 2) finite positions in m, at least two, successive ones different"
-        got = got or f"an array of shape {route_m.shape}"
+        expected = "an array (k, 2) of finite metres, at least two rows, with no row equal to the next"
         raise InputError("the route is invalid", where="route_m", got=got, expected=expected)
     return route_m
 
@@ -137,19 +144,19 @@ def render_frames(
     Returns:
         n frames: rgb (h, w, 3) uint8, depth (h, w) float32 z-depth in m, kinds and instance ids (h, w).
     """
-    positions = _places(position_m, "position_m")
-    targets = None if target_m is None else _places(target_m, "target_m", len(positions))
+    positions = _rows_of_three(position_m, "position_m")
+    targets = None if target_m is None else _rows_of_three(target_m, "target_m", len(positions))
     if rotation_deg is not None:
-        rotations = _places(rotation_deg, "rotation_deg", len(positions))
+        rotations = _rows_of_three(rotation_deg, "rotation_deg", len(positions))
     elif targets is not None:
         pitch, yaw = look_at(positions, targets)
         rotations = np.degrees(np.column_stack([pitch, yaw, np.zeros(len(positions))]))
     else:
-        expected = "rotation_deg, or target_m to look at"
-        raise InputError("the camera has no direction", where="render_frames", expected=expected)
+        fix = "pass rotation_deg, or the target_m that it looks at"
+        raise InputError("the camera has no direction", where="render_frames", fix=fix)
     camera = {"width_px": size_px[0], "height_px": size_px[1], "fovs_deg": [fov_deg]}
     cfg = build(RenderConfig, settings | camera, "render_frames")
-    _check_taken(settings, OF_PICTURE, "render_frames")
+    _check_taken(settings, PICTURE_SETTINGS, "render_frames")
     if cfg.weather_seed < 0:
         cfg = cfg.model_copy(update={"weather_seed": random_seed()})
     weather = weather_of(cfg, read_pools(cfg), 0)
@@ -166,16 +173,22 @@ def render_frames(
 
 
 def _check_taken(settings: dict[str, Any], taken: Collection[str], where: str) -> None:
+    """Raise ConfigError if a function ignores some of its settings."""
     if ignored := sorted(settings.keys() - taken):
-        expected = f"one of {', '.join(sorted(taken)) or 'none'}, or an argument of the function"
-        raise ConfigError(f"{', '.join(ignored)}: has no effect here", where=where, expected=expected)
+        raise ConfigError(
+            "some settings have no effect here",
+            where=where,
+            got=", ".join(ignored),
+            expected=f"settings among {', '.join(sorted(taken))}" if taken else None,
+            fix="remove these settings",
+        )
 
 
-def _places(values: Any, name: str, count: int | None = None) -> np.ndarray:
-    """Return (n, 3) of one row or n."""
-    places = np.atleast_2d(np.asarray(values, dtype=np.float64))
-    if places.ndim != 2 or places.shape[1] != 3 or len(places) == 0 or count not in (None, len(places)):
-        expected = "(3,) or (n, 3)" if count is None else f"({count}, 3), as position_m"
-        got = f"an array of shape {places.shape}"
+def _rows_of_three(values: Any, name: str, count: int | None = None) -> np.ndarray:
+    """Return an argument of (3,) or (n, 3) as (n, 3) float64; if `count` is given, n must be equal to it."""
+    rows = np.atleast_2d(np.asarray(values, dtype=np.float64))
+    if rows.ndim != 2 or rows.shape[1] != 3 or len(rows) == 0 or count not in (None, len(rows)):
+        expected = "(3,) or (n, 3)" if count is None else f"({count}, 3), the shape of position_m"
+        got = f"an array of shape {rows.shape}"
         raise InputError("the array has the wrong shape", where=name, got=got, expected=expected)
-    return places
+    return rows

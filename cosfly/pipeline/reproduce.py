@@ -122,9 +122,9 @@ def run(
     done = [stage.name for stage in summarize(folder).stages if stage.state == "complete"]
     if missing := [name for name in STAGES if name not in done]:
         raise InputError(
-            "the run has no drone trajectories yet",
+            "the run directory has no complete drone trajectories",
             where=folder,
-            got=f"no {', no '.join(missing)}",
+            got=f"incomplete stages: {', '.join(missing)}",
             fix=f"one town at a time: {folder}/{next(iter(cfg.towns))}" if cfg.towns else f"cosfly run {folder}",
         )
     sample = measure(cfg, folder, out, pedestrians, done, pool | {"seed": seed, "resume": resume})
@@ -192,7 +192,7 @@ def our_figures(table: PaperTable, reader: FigureReader) -> tuple[dict[str, list
             continue
         named_rows = figures[0] or {}
         if not isinstance(named_rows, dict):
-            raise InputError(UNEXPECTED, where=place, got=str(named_rows)[:80], expected="names with figures")
+            raise InputError(UNEXPECTED, where=place, got=str(named_rows)[:80], expected="figures by name")
         rows |= {key: _as_list(row) for key, row in named_rows.items()}
     return rows, sources
 

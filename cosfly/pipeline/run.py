@@ -161,10 +161,10 @@ def check(cfg: RunConfig) -> dict[str, RunConfig]:
     for town in towns.values() or [cfg]:
         if missing := sorted(set(cfg.release.modalities) - set(town.render.modalities)):
             raise ConfigError(
-                "the release needs pictures that are not rendered",
+                "the release needs kinds of pictures that the run does not render",
                 where="render.modalities",
-                got=f"no {', no '.join(missing)}",
-                fix=f"render them, or --set 'release.modalities=[{', '.join(town.render.modalities)}]'",
+                got=f"{', '.join(missing)} missing",
+                fix=f"render them, or pass --set 'release.modalities=[{', '.join(town.render.modalities)}]'",
             )
     return towns
 
@@ -186,9 +186,9 @@ def check_out(out: Path) -> None:
     """Refuse to make a run in the folder of a stage: its tree would hold a second one."""
     if (out / "stage.json").exists() and not (out / "run.yaml").exists():
         raise ResumeError(
-            "the folder of a stage, not of a run",
+            "the output directory is the folder of a stage",
             where=out,
-            got="stage.json in it",
+            got="a stage.json without a run.yaml",
             fix="choose another --out, or the run directory above it",
         )
 
@@ -207,7 +207,7 @@ def _check_files(cfg: RunConfig) -> None:
     files = getattr(cfg.maps, cfg.maps.source).inputs()
     if missing := {name: str(path) for name, path in files.items() if not path.exists()}:
         where = f"maps.{cfg.maps.source}: {', '.join(missing)}"
-        raise InputError("there is no such file", where=where, got=", ".join(missing.values()))
+        raise InputError("an input file of the map does not exist", where=where, got=", ".join(missing.values()))
 
 
 def _run_town(cfg: RunConfig, out: Path, town_stages: list[Stage]) -> list[StageResult]:

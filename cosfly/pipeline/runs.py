@@ -29,34 +29,31 @@ PAGES = ("viewer.html", "contact_sheet.png", "inspect/report.html", "caption/rep
 
 @dataclass(frozen=True)
 class StageSummary:
-    """One stage of a run.
+    """One stage of a run."""
 
-    name: `stage`, or `town/stage` in a run with towns. tally: outcomes of its items so far; None before it began.
-    """
-
-    name: str
+    name: str  # `stage`, or `town/stage` in a run with towns
     folder: Path
     state: Literal["complete", "begun", "to do"]
-    tally: Tally | None = None
-    seconds: float | None = None
+    tally: Tally | None = None  # outcomes of its items so far; None before it began
+    seconds: float | None = None  # None before it is complete
 
     @property
     def size_bytes(self) -> int:
-        """The disk space of its files, links not followed."""
+        """The disk space of its files; links are not followed."""
         total = 0
         for folder, _, names in os.walk(self.folder):
             for name in names:
-                with contextlib.suppress(OSError):  # a file that a running stage removes meanwhile
+                with contextlib.suppress(OSError):  # a running stage may remove the file meanwhile
                     total += os.lstat(os.path.join(folder, name)).st_size
         return total
 
 
 @dataclass(frozen=True)
 class RunSummary:
-    """One run directory. held: `, running now` while a process holds it, else an empty text."""
+    """One run directory."""
 
     cfg: RunConfig
-    held: str
+    held: str  # `, running now` while a process holds the directory, else empty
     stages: list[StageSummary]
 
     @property
@@ -77,7 +74,7 @@ class RunSummary:
         return sum(summary.tally.kept for summary in self.stages if summary.folder.name == stage and summary.tally)
 
     def waiting(self) -> dict[Path, int]:
-        """Return folder of an inspection -> number of its tracks that wait for a manual decision, if there are any."""
+        """Return, for each inspection with tracks that wait for a manual decision, its folder and their number."""
         waiting = {}
         for stage in self.stages:
             if stage.folder.name == "inspect" and stage.state == "complete":
@@ -89,31 +86,33 @@ def summarize(run: Path) -> RunSummary:
     """Return the summary of a run directory.
 
     Raises:
-        InputError: It is not a run directory. ConfigError: Its `run.yaml` is not of this version.
+        InputError: It is not a run directory.
+        ConfigError: Its `run.yaml` is not of this version.
     """
     if not (run / "run.yaml").is_file():
         raise InputError(
-            "not a run directory",
+            "the folder is not a run directory",
             where=run,
-            got="no run.yaml",
+            got="no run.yaml in it",
             expected="a directory that `cosfly run` made",
-            fix="find runs with cosfly list DIR",
+            fix="run `cosfly list DIR` to find run directories below a folder",
         )
     cfg = load(RunConfig, run / "run.yaml")
-    names = [f"{town}/{name}" for town in cfg.towns for name in STAGES[:-1]]
-    names = [*names, "release"] if cfg.towns else list(STAGES)
+    names = list(STAGES)
+    if cfg.towns:  # one release is made of all towns
+        names = [*(f"{town}/{name}" for town in cfg.towns for name in STAGES[:-1]), "release"]
     stages = [_stage(name, run / name) for name in names]
     return RunSummary(cfg, ", running now" if is_held(run) else "", stages)
 
 
 def find_runs(root: Path, depth: int = 2) -> Iterator[Path]:
-    """Yield the run directories below a folder by name; the towns of a run are part of it.
+    """Yield the run directories below a folder, sorted by name; the towns of a run are not yielded themselves.
 
     Raises:
         InputError: There is no such folder.
     """
     if not root.is_dir():
-        raise InputError("no such folder", where=root, expected="a folder with runs")
+        raise InputError("the folder does not exist", where=root, expected="a folder with run directories")
     if (root / "run.yaml").is_file():
         yield root
     elif depth:
@@ -137,11 +136,10 @@ def _stage(name: str, folder: Path) -> StageSummary:
 
 # --- estimates --------------------------------------------------------------------------------------------------------
 
-# Stage -> its unit, seconds per unit, MB per unit; rates of frames are per million pixels. Measured in
-# `cosfly run showcase` (docs/first-runs.md; 2 cores, AMD EPYC, idle): 3 pedestrians, 858 frames of 0.9216 Mpx, 804
-# windows by `rules`.
+# Measured in `cosfly run showcase` (docs/first-runs.md; 2 cores, AMD EPYC, idle): 3 pedestrians, 858 frames of
+# 0.9216 Mpx, 804 windows by `rules`. Rates of frames are per million pixels.
 BASIS = "`cosfly run showcase` on a 2-core machine (docs/first-runs.md)"
-RATES = {
+RATES = {  # stage: unit, seconds per unit, MB per unit
     "maps": ("map", 0.2, 1.1),
     "simplify": ("map", 5.6, 1.2),
     "pedestrians": ("pedestrians", 4.6 / 3, 0.3 / 3),
@@ -151,19 +149,20 @@ RATES = {
     "caption": ("windows", 4.0 / 804, 7.4 / 804),
     "release": ("frames", 7.8 / 790.7, 1842 / 790.7),
 }
-# Frames of a trajectory over the frames of the straight line between its ends (50 to 100 m at 1.2 m/s, 2 frames/s:
-# 143).
+# Measured ratio of the frames of a trajectory to those of the straight line between its ends (50 to 100 m at 1.2 m/s
+# with 2 frames/s: 143).
 DETOUR = 1.14
+MOST_LISTED = 4  # trajectories named in a remark
 
 
 @dataclass(frozen=True)
 class StageEstimate:
-    """The estimate of one stage. seconds: None if they depend on the teacher; 0 if the stage is complete."""
+    """The estimate of one stage."""
 
     name: str
-    count: int
-    seconds: float | None
-    bytes: float
+    count: int  # of its units
+    seconds: float | None  # None if they depend on the teacher; 0 if the stage is complete
+    bytes: float  # 0 if the stage is complete
     is_done: bool
 
     @property
@@ -173,7 +172,7 @@ class StageEstimate:
 
 
 def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
-    """Estimate each stage of a run; of several towns, each stage of each town, then the release.
+    """Estimate each stage of a run; with several towns, each stage of each town, and then the release.
 
     Raises:
         CosflyError: A product of the run cannot be read.
@@ -192,8 +191,9 @@ def _estimates(cfg: RunConfig, out: Path, names: tuple[str, ...]) -> Iterator[St
     pedestrians = cfg.pedestrians
     window = cfg.caption.window
     frames = _frames_by_trajectory(cfg, out)
-    starts = [max(0, count - window.num_frames + 1 - window.future_frames) for count in frames]  # of whole windows
-    num_windows = sum(math.ceil(count / window.stride) for count in starts)
+    # Number of frames of each trajectory at which a whole window can begin.
+    num_starts = [max(0, count - window.num_frames + 1 - window.future_frames) for count in frames]
+    num_windows = sum(math.ceil(count / window.stride) for count in num_starts)
     num_tracks = len(cfg.render.tracks)
     counts = {
         "map": 1,
@@ -206,7 +206,7 @@ def _estimates(cfg: RunConfig, out: Path, names: tuple[str, ...]) -> Iterator[St
 
 
 def _frames_by_trajectory(cfg: RunConfig, out: Path) -> list[int]:
-    """Return the number of frames of each trajectory: of the plans if they are complete, else as expected."""
+    """Return the number of frames of each trajectory: from the plans if they are complete, else an estimate."""
     pedestrians = cfg.pedestrians
     stride = cfg.render.frame_stride
     paths = out / "pedestrians/path.json"
@@ -224,11 +224,10 @@ def _frames_by_trajectory(cfg: RunConfig, out: Path) -> list[int]:
 def _estimate(name: str, count: int, cfg: RunConfig, out: Path) -> StageEstimate:
     if _is_complete(out / name):
         return StageEstimate(name, count, 0.0, 0.0, True)
-    unit, *rates = RATES[name]
+    unit, unit_s, unit_mb = RATES[name]
     scale = count * (cfg.render.width_px * cfg.render.height_px / 1e6 if unit == "frames" else 1)
-    seconds, size_mb = (rate * scale for rate in rates)
     is_known = name != "caption" or cfg.caption.teacher_kind == "rules"
-    return StageEstimate(name, count, seconds if is_known else None, size_mb * 1e6, False)
+    return StageEstimate(name, count, unit_s * scale if is_known else None, unit_mb * scale * 1e6, False)
 
 
 def _is_complete(folder: Path) -> bool:
@@ -236,7 +235,7 @@ def _is_complete(folder: Path) -> bool:
 
 
 def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
-    """Return the basis of the figures, their totals, and what prevents the run."""
+    """Return lines for the user: the basis of the estimates, their totals, and reasons why the run may fail."""
     needed = sum(row.bytes for row in rows)
     time = duration(sum(row.seconds or 0.0 for row in rows))
     unknown = [row.name for row in rows if row.seconds is None]
@@ -254,18 +253,18 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
 
 
 def caveats(cfg: RunConfig) -> list[str]:
-    """Return the settings that apply to some trajectories only, and the trajectories that are too dark to see."""
+    """Return remarks on settings that apply to some trajectories only, and on trajectories that are too dark."""
     lines = cfg.plan.remarks()
     towns = {name: cfg.of_town(name) for name in cfg.towns} or {cfg.name: cfg}
     for name, town in towns.items():
         num_paths = town.pedestrians.num_paths
         if dark := dark_trajectories(town.render, num_paths, partial(load_map, town.maps, seed=town.seed)):
-            listed = ", ".join(map(walk_id, dark[:4]))
-            if len(dark) > 4:
+            listed = ", ".join(map(walk_id, dark[:MOST_LISTED]))
+            if len(dark) > MOST_LISTED:
                 listed += ", ..."
             lines.append(
                 f"{name}: {len(dark)} of {num_paths} trajectories are dark ({listed}): they are at night, on a map "
-                "without street lamps, roads and pavements, so nobody will see the target. Choose another time of day "
+                "without street lamps, roads and pavements, so the target cannot be seen. Choose another time of day "
                 "(render.tod_name, render.tod_pool), another render.weather_seed, or a map with streets"
             )
     return lines

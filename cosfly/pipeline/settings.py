@@ -64,43 +64,52 @@ class RunConfig(CommandConfig):
 
     def _check_town(self, name: str) -> None:
         if not TOWN_NAME.fullmatch(name) or name == "release":
-            expected = "letters, digits, _ and -, and not 'release'"
-            raise ConfigError(f"{name!r} is not a name for a town", where="towns", expected=expected)
+            expected = "1 to 60 letters, digits, underscores and hyphens, and not release"
+            raise ConfigError("a town cannot have this name", where="towns", got=name, expected=expected)
         self.of_town(name)
 
     def of_town(self, name: str) -> RunConfig:
         """Return the settings of one town's run. Its seed derives from the run's seed and the town's name.
 
         Raises:
-            ConfigError: Its settings are invalid; names the town and the setting.
+            ConfigError: Its settings are invalid; the error names the town and the setting.
         """
         changes = self.towns[name]
         if "towns" in changes:
-            raise ConfigError("a town cannot have towns", where=f"towns.{name}.towns", fix="list them one by one")
-        maps = changes.get("maps", {})
-        if isinstance(maps, dict):
-            source = maps.get("source", "synthetic")
-            own = maps.get(source, {}) if isinstance(source, str) else {}
-            maps = {**maps, "source": source} | ({source: {"name": name} | own} if isinstance(own, dict) else {})
+            fix = "move its towns to the outer section towns"
+            raise ConfigError("a town cannot contain towns", where=f"towns.{name}.towns", fix=fix)
         seed = int(rng_for(self.seed, "run", name).integers(2**31))
         shared = self.model_dump(mode="json", exclude={"towns", "maps"}) | {"name": name, "seed": seed}
-        rest = {setting: value for setting, value in changes.items() if setting != "maps"}
-        return build(RunConfig, _merged(self, shared, rest) | {"maps": maps}, f"towns.{name}")
+        changes_but_maps = {setting: value for setting, value in changes.items() if setting != "maps"}
+        maps = _named_maps(changes.get("maps", {}), name)
+        return build(RunConfig, _merged(self, shared, changes_but_maps) | {"maps": maps}, f"towns.{name}")
+
+
+def _named_maps(maps: Any, town: str) -> Any:
+    """Return a town's section `maps`, in which the map has the town's name unless it has one; `build` checks it."""
+    if not isinstance(maps, dict):
+        return maps
+    source = maps.get("source", "synthetic")
+    maps = {**maps, "source": source}
+    source_settings = maps.get(source, {}) if isinstance(source, str) else {}
+    if isinstance(source_settings, dict):
+        maps[source] = {"name": town} | source_settings
+    return maps
 
 
 def _merged(group: Config, settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """Return a group's settings with changes applied; a mapping that is one value, such as shares, is replaced."""
+    """Return the settings of a group with changes applied; a mapping that is a value, such as shares, is replaced."""
     result = dict(settings)
     for name, value in changes.items():
-        within = getattr(group, name, None)
-        if isinstance(within, Config) and isinstance(value, dict):
-            value = _merged(within, settings[name], value)
+        subgroup = getattr(group, name, None)
+        if isinstance(subgroup, Config) and isinstance(value, dict):
+            value = _merged(subgroup, settings[name], value)
         result[name] = value
     return result
 
 
 def run_checks(checks: Iterable[Callable[[], object]], where: str) -> None:
-    """Run all checks, and raise the error of the one that fails, or one error for several."""
+    """Run all checks; raise the error of the one that fails, or one error for all that fail."""
     problems = list[CosflyError]()
     for check in checks:
         try:

@@ -37,9 +37,9 @@ def explain(cfg: BaseModel, section: str | None = None) -> list[Setting]:
     selected = [s for s in settings if s.name == section or s.name.startswith(f"{section}.")]
     if not selected:
         raise ConfigError(
-            f"no such section or setting{nearest(section, [setting.name for setting in settings])}",
+            f"there is no section or setting of this name{nearest(section, [setting.name for setting in settings])}",
             got=section,
-            expected="for instance plan or plan.muco, after the name of a file or of a shipped configuration",
+            expected="a name such as plan or plan.muco, after that of the configuration",
         )
     return selected
 

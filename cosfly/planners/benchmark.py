@@ -135,7 +135,8 @@ def _without_missing(cfg: BenchmarkConfig) -> BenchmarkConfig:
     if not sampling or importlib.util.find_spec("ompl") is not None:
         return cfg
     if len(sampling) == len(cfg.planners):
-        raise EnvironmentMissing("OMPL is not installed", expected="a planner that does not need it", fix=INSTALL)
+        fix = f"name a planner that does not need it, or install it: {INSTALL}"
+        raise EnvironmentMissing("OMPL is not installed, and all chosen planners need it", fix=fix)
     log.warning("OMPL is not installed; skipped: %s; %s", ", ".join(sampling), INSTALL)
     return cfg.model_copy(update={"planners": tuple(name for name in cfg.planners if name not in sampling)})
 

@@ -181,11 +181,11 @@ class CompareConfig(PlanConfig):
     @classmethod
     def _are_known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         if len(set(names)) < len(names):
-            raise ValueError("a planner is named twice")
+            raise ValueError("each planner may occur only once")
         for name in names:
             known_planner(name)
         if len(names) < 2:
-            raise ValueError(f"a comparison needs at least 2 planners; name another of {', '.join(ALL_PLANNERS)}")
+            raise ValueError(f"a comparison needs at least two planners; add one of {', '.join(ALL_PLANNERS)}")
         return names
 
 
@@ -245,8 +245,8 @@ def plan_all(
     items = make_items(pedestrians[:most], cfg, seed)
     done = run_items(stage, items, make_worker, (cfg, simplified_map, seed, keeps_all), **pool)
     if not done.tally.kept:
-        followers = "a planner follows" if keeps_all else "all planners follow"
-        raise stage.nothing_kept(done.tally, expected=f"a pedestrian trajectory that {followers}")
+        followers = "at least one planner" if keeps_all else "every planner"
+        raise stage.nothing_kept(done.tally, expected=f"a pedestrian trajectory that {followers} can follow")
     planned = {record.id: result_of(record, PlannedItem) for record in done.kept}
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
     return box_map, pedestrians, done, planned, header

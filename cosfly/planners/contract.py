@@ -69,7 +69,7 @@ def known_planner(name: str) -> str:
     """Return the name; raise ValueError where it is not in ALL_PLANNERS."""
     if name not in ALL_PLANNERS:
         raise ValueError(
-            f"planner {name!r} does not exist{nearest(name, ALL_PLANNERS)}; choose one of {', '.join(ALL_PLANNERS)}"
+            f"there is no planner {name!r}{nearest(name, ALL_PLANNERS)}; choose one of {', '.join(ALL_PLANNERS)}"
         )
     return name
 
@@ -174,9 +174,9 @@ class PlanConfig(Config):
     def _are_shares(cls, shares: dict[str, float]) -> dict[str, float]:
         for name, share in shares.items():
             if name not in NAMES:
-                raise ValueError(f"style {name!r} does not exist{nearest(name, NAMES)}; choose from {', '.join(NAMES)}")
+                raise ValueError(f"there is no style {name!r}{nearest(name, NAMES)}; choose from {', '.join(NAMES)}")
             if share < 0:
-                raise ValueError(f"the share of {name} must not be negative, got {share}")
+                raise ValueError(f"the share of {name} must be 0 or more, got {share}")
         if sum(shares.values()) <= 0:
             raise ValueError("the shares of the styles must add up to more than 0")
         return shares
@@ -187,7 +187,7 @@ class PlanConfig(Config):
         for name, style_ranges in ranges.items():
             if name not in ROWS:
                 choices = ", ".join(ROWS)
-                raise ValueError(f"{name!r} is not a style with ranges{nearest(name, ROWS)}; choose from {choices}")
+                raise ValueError(f"there is no style {name!r} with ranges{nearest(name, ROWS)}; choose from {choices}")
             with_ranges(ROWS[name], style_ranges)
         return ranges
 
@@ -195,14 +195,14 @@ class PlanConfig(Config):
     def _check(self) -> PlanConfig:
         problems = []
         if self.relaxed_safety_m > self.safety_distance_m:
-            problems.append("relaxed_safety_m may not exceed safety_distance_m")
+            problems.append("relaxed_safety_m must be at most safety_distance_m")
         if not self.altitude_min_m <= self.altitude_preferred_m <= self.altitude_max_m:
             problems.append("altitude_min_m, altitude_preferred_m and altitude_max_m must be in ascending order")
         for name, row in self._rows().items():
             if (highest_m := row.altitude_range_m[1]) > self.altitude_max_m:
-                problems.append(f"style_ranges.{name} goes up to {highest_m:g} m, above altitude_max_m")
+                problems.append(f"style_ranges.{name} must not go above altitude_max_m, got {highest_m:g} m")
             if (fastest_mps := max(map(abs, row.round_mps))) >= self.speed_max_mps:
-                problems.append(f"style_ranges.{name}.round_mps is up to {fastest_mps:g}, no less than speed_max_mps")
+                problems.append(f"style_ranges.{name}.round_mps must stay below speed_max_mps, got {fastest_mps:g}")
         if problems:
             raise ValueError("; ".join(problems))
         return self

@@ -264,4 +264,4 @@ def raw_trajectory(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> 
         raw = search_trajectory(scenario, make_lattice(scenario, climbing=climbing), obstacles, cfg, clearance_m)
         if raw is not None:
             return raw, "climbing search" if climbing else "search", clearance_m
-    raise scenario.no_path_error("no free places connect start and end", relaxed_m)
+    raise scenario.no_path_error("no collision-free path connects the start with the end", relaxed_m)

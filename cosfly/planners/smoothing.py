@@ -101,7 +101,9 @@ def repair_to_limits(points: np.ndarray, scenario: Scenario, obstacles: BoxIndex
             np.add.at(goal, ends, away)
         pulls = pulls / PULL_RISE ** _spread(exceeding, SPREAD_S / scenario.dt_s)
         points = _pulled_to(goal, pulls, band, scenario)
-    raise scenario.no_path_error("no trajectory within the limits of speed and acceleration", cfg.relaxed_safety_m)
+    raise scenario.no_path_error(
+        "smoothing found no trajectory within the limits of speed and acceleration", cfg.relaxed_safety_m
+    )
 
 
 def _pulled_to(goal: np.ndarray, pulls: np.ndarray, band: np.ndarray, scenario: Scenario) -> np.ndarray:

@@ -52,25 +52,26 @@ def make_scenario(pedestrian: PedestrianTrajectory, obstacles: BoxIndex, cfg: Pl
     path_id = pedestrian.path_id
     targets = pedestrian.positions_m + np.array([0.0, 0.0, TARGET_HEIGHT_M])
     if len(targets) < 2:
-        raise NoPathError("the pedestrian trajectory has one point only", where=path_id, expected="two points or more")
+        problem = "the pedestrian trajectory has too few points"
+        raise NoPathError(problem, where=path_id, got=str(len(targets)), expected="at least 2")
     dt_s = step_s(pedestrian.time_s)
     steps_s = np.diff(pedestrian.time_s)
     is_uneven = np.abs(steps_s - max(dt_s, 0.0)) > 1e-3
     if dt_s <= 0 or is_uneven.any():
         first = int(np.argmax(is_uneven))
         raise NoPathError(
-            "time stamps do not increase in equal steps",
+            "the time stamps of the pedestrian trajectory do not increase in equal steps",
             where=f"{path_id}: t[{first + 1}]",
             got=f"a step of {steps_s[first]:g} s",
-            expected=f"{abs(dt_s):g} s, the median",
+            expected=f"steps of {abs(dt_s):g} s, the median",
         )
     if (farthest_m := np.abs(targets).max()) > COORDINATE_MAX_M:
         raise NoPathError(
-            "a coordinate is too large",
+            "the pedestrian trajectory is too far from the origin of the map",
             where=path_id,
             got=f"{farthest_m:g} m",
             expected=f"at most {COORDINATE_MAX_M:g} m",
-            fix="move the map's origin near the pedestrian trajectories",
+            fix="move the origin of the map near the pedestrian trajectories",
         )
     hits = segments_hit(obstacles, targets[:-1], targets[1:])
     if hits.any():
@@ -78,7 +79,7 @@ def make_scenario(pedestrian: PedestrianTrajectory, obstacles: BoxIndex, cfg: Pl
         raise NoPathError(
             "the pedestrian trajectory passes through an obstacle",
             where=path_id,
-            got=f"{int(hits.sum())} steps inside a box, the first at ({x:.1f}, {y:.1f})",
+            got=f"{int(hits.sum())} steps through a box, the first at ({x:.1f}, {y:.1f}) m",
             fix="plan on the map that the pedestrian trajectories were made for",
         )
     return Scenario(path_id, targets, np.array(pedestrian.positions_m[:, 2]), follow(targets, cfg, dt_s), dt_s)
@@ -182,7 +183,7 @@ def _plan_once(
         raise NoPathError(
             f"planner {cfg.planner} found no trajectory with enough clearance",
             where=pedestrian.path_id,
-            got=f"a least clearance of {clearances.min():.2f} m",
+            got=f"a clearance of {clearances.min():.2f} m at the narrowest place",
             expected=f"at least {cfg.relaxed_safety_m:g} m everywhere",
         )
     seen = visibility(obstacles, positions, targets)
@@ -265,7 +266,9 @@ def read_inputs(simplified_map: Path, paths: Path) -> tuple[BoxMap, list[Pedestr
     box_map, pedestrians = read_boxes(simplified_map), read_paths(paths)
     where = f"{paths}: paths"
     if not pedestrians:
-        raise InputError("there are no pedestrian trajectories", where=where, fix="run the pedestrians stage again")
+        raise InputError(
+            "the file contains no pedestrian trajectories", where=where, fix="run the pedestrians stage again"
+        )
     (path_id, count), *_ = Counter(pedestrian.path_id for pedestrian in pedestrians).most_common(1)
     if count > 1:
         raise InputError("a path id occurs more than once", where=where, got=path_id, expected="unique ids")

@@ -329,11 +329,11 @@ def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
     num_z = np.floor((greatest_z.max() - least_z.min()) / settings.voxel_height_m + 1e-9) + 1
     if num_xy.prod() * num_z > MAX_CELLS:
         raise NoPathError(
-            "the pedestrian trajectory is too long for the voxel grid",
+            "the pedestrian trajectory covers too large an area for the voxel grid",
             where=scenario.path_id,
             got=f"{num_xy.prod() * num_z:.0f} voxels",
             expected=f"at most {MAX_CELLS}",
-            fix="use another planner",
+            fix="use another planner, or a larger plan.track_astar.voxel_m",
         )
     shape = np.array([*num_xy, num_z], dtype=np.int64)
     size = np.array([settings.voxel_m, settings.voxel_m, settings.voxel_height_m])

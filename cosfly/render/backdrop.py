@@ -73,10 +73,12 @@ def run(
     west, south, east, north = bounds_m or (*low[:2].tolist(), *high[:2].tolist())
     size = np.ceil(np.array([east - west, north - south]) * pixels_per_m)
     if not ((size >= 1).all() and (size <= LONGEST_SIDE_PX).all()):
-        got = f"{size[0]:g} x {size[1]:g} px of {west:g} {south:g} {east:g} {north:g}"
-        expected = f"1 to {LONGEST_SIDE_PX} px each way"
-        fix = "set other --bounds or fewer --pixels-per-m"
-        raise ConfigError("the picture cannot have this size", where="--bounds", got=got, expected=expected, fix=fix)
+        got = f"{size[0]:g} x {size[1]:g} px for the bounds {west:g} {south:g} {east:g} {north:g}"
+        expected = f"1 to {LONGEST_SIDE_PX} px on each side"
+        fix = "change --bounds or --pixels-per-m"
+        raise ConfigError(
+            "the picture would be too large, or empty", where="--bounds", got=got, expected=expected, fix=fix
+        )
     frame = WorldFrame(west_m=west, north_m=north, metres_per_px=1.0 / pixels_per_m)
     view = TopView(west, north, pixels_per_m, (int(size[0]), int(size[1])))
     write_backdrop(out, png_bytes(draw_backdrop(cfg, box_map, view, seed)), frame)

@@ -111,7 +111,7 @@ class CarlaRenderer(SimulatorRenderer):
             except RuntimeError as error:
                 num_failed += 1
                 log.warning("%s: health check %d of %d failed: %s", self.device, num_failed, HEALTH_CHECKS, error)
-        log.error("%s: the server does not answer: the worker ends", self.device)
+        log.error("%s: the server does not answer, so the worker ends", self.device)
         os._exit(1)
 
     def close(self) -> None:
@@ -167,7 +167,7 @@ class CarlaRenderer(SimulatorRenderer):
                 try:
                     number, data = inbox.get(timeout=max(0.0, until_s - time.monotonic()))
                 except queue.Empty:
-                    raise NoPictureError(f"camera {name}: nothing of tick {frame} in {picture_s:g} s") from None
+                    raise NoPictureError(f"camera {name} sent no picture of tick {frame} in {picture_s:g} s") from None
                 if number == frame:
                     pictures[name] = np.frombuffer(data, np.uint8).reshape(*self._size_px[::-1], 4)
         return pictures
@@ -184,7 +184,7 @@ class CarlaRenderer(SimulatorRenderer):
             for key, text in (attributes | (self._cfg.rgb_attributes if name == "rgb" else {})).items():
                 if not blueprint.has_attribute(key):
                     fix = "remove it from render.carla.rgb_attributes"
-                    raise RenderError("the camera has no such attribute", where=self.device, got=key, fix=fix)
+                    raise RenderError("the camera has no attribute of this name", where=self.device, got=key, fix=fix)
                 blueprint.set_attribute(key, text)
             inbox: queue.SimpleQueue = queue.SimpleQueue()
             camera = self._spawned(blueprint, pose)
@@ -304,6 +304,6 @@ def _ids_in_pictures(server: CarlaConnection, box_map: BoxMap, num_others: int) 
         fix = "export the map from this town (cosfly maps --source carla), or name its town in render.carla.town"
         raise InputError(what, where=where, got=box_map.name, fix=fix)
     if num_found < len(box_map) or num_doubtful:
-        what = "%s: %d of %d boxes have an id in pictures; %d of those share 16 bits with another"
+        what = "%s: %d of %d boxes have an id in the pictures; %d of these share their 16-bit id with another box"
         log.warning(what, where, num_found, len(box_map), num_doubtful)
     return table

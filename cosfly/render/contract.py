@@ -275,4 +275,5 @@ def chance(seeds: np.ndarray, number: int) -> np.ndarray:
 def check_pose(camera_pose: np.ndarray, intrinsic: np.ndarray) -> None:
     """Raise RenderError where a camera is not finite."""
     if not (np.isfinite(camera_pose).all() and np.isfinite(intrinsic).all()):
-        raise RenderError("the camera pose is not finite", got=str(camera_pose.tolist()))
+        got = f"pose {camera_pose.tolist()}, intrinsic matrix {intrinsic.tolist()}"
+        raise RenderError("the camera has numbers that are not finite", got=got)

@@ -1,5 +1,5 @@
-"""People and cars of a trajectory as renderers draw them: clothes, gait along the path, bystanders, and the figure of a
-walking person as solids for any renderer."""
+"""People and cars of a trajectory as renderers draw them: clothes, gait along the path and bystanders, and the figure
+of a walking person as solids for any renderer."""
 
 from __future__ import annotations
 
@@ -24,51 +24,55 @@ SHOES = np.array([[0.03, 0.025, 0.02], [0.55, 0.55, 0.53], [0.14, 0.07, 0.03]])
 
 
 def choose_clothes(rng: np.random.Generator, looks: Appearance | None = None) -> Clothes:
-    """Choose an appearance at random, or only what a given appearance does not fix."""
+    """Choose clothes at random: an appearance, unless one is given, and the colours of hair, skin and shoes."""
     looks = looks or draw_appearance(rng)
     return Clothes(looks, *(palette[rng.integers(len(palette))] for palette in (HAIR_RGB, SKIN, SHOES)))
 
 
 def draw_appearance(rng: np.random.Generator) -> Appearance:
-    """Draw a person, every garment and colour equally likely where all is seen, bare heads and hands by EMPTY_SHARE."""
+    """Choose an appearance at random, whose garments can all be seen.
+
+    Garments and colours are equally likely; EMPTY_SHARE is the share of people without a hat or a bag.
+    """
     while True:
-        drawn = {"figure": _one(rng, tuple(FIGURES))}
+        fields = {"figure": _choose(rng, tuple(FIGURES))}
         for slot in GARMENTS:
-            drawn |= _worn(rng, slot)
-        if (person := Appearance(**drawn)).is_all_seen:
+            fields |= _choose_garment(rng, slot)
+        if (person := Appearance(**fields)).is_all_seen:
             return person
 
 
 def look_alike(person: Appearance, rng: np.random.Generator) -> Appearance:
-    """Draw an appearance that differs from a given one in one garment or its colour."""
-    slot = _one(rng, tuple(GARMENTS))
+    """Choose an appearance at random that differs from a given one in one garment or its colour."""
+    slot = _choose(rng, tuple(GARMENTS))
     while True:
-        other = replace(person, **_worn(rng, slot))
+        other = replace(person, **_choose_garment(rng, slot))
         if person.differences(other) and other.is_all_seen:
             return other
 
 
-def _worn(rng: np.random.Generator, slot: str) -> dict[str, str]:
+def _choose_garment(rng: np.random.Generator, slot: str) -> dict[str, str]:
+    """Return the fields of an appearance for a garment and its colour; nobody wears a hat in a colour of hair."""
     if rng.random() < EMPTY_SHARE.get(slot, 0.0):
         return {slot: "", f"{slot}_color": ""}
     colors = tuple(color for color in COLORS if slot != "hat" or color not in HAIR)
-    return {slot: _one(rng, tuple(filter(None, GARMENTS[slot]))), f"{slot}_color": _one(rng, colors)}
+    return {slot: _choose(rng, tuple(filter(None, GARMENTS[slot]))), f"{slot}_color": _choose(rng, colors)}
 
 
-def _one(rng: np.random.Generator, names: tuple[str, ...]) -> str:
+def _choose(rng: np.random.Generator, names: tuple[str, ...]) -> str:
     return names[rng.integers(len(names))]
 
 
 @dataclass(frozen=True)
 class Gait:
-    """Motion of a person, n frames: headings_rad (n,), phases_rad (n,) of the stride, swings (n,) in [0, 1]."""
+    """Motion of a person in n frames."""
 
-    headings_rad: np.ndarray
-    phases_rad: np.ndarray
-    swings: np.ndarray
+    headings_rad: np.ndarray  # (n,)
+    phases_rad: np.ndarray  # (n,) of the stride
+    swings: np.ndarray  # (n,) in [0, 1], of arms and legs; 0 for a standing person
 
     def since(self, first: int) -> Gait:
-        """Return the gait from a frame on."""
+        """Return the gait from frame `first` on."""
         return Gait(*(values[first:] for values in vars(self).values()))
 
     def posed(self, i: int, hip_m: np.ndarray, clothes: Clothes) -> PosedPerson:
@@ -94,28 +98,34 @@ SHARE_DIGITS = 6
 
 @dataclass(frozen=True)
 class DressedBystanders:
-    """All bystanders of one trajectory: gaits and clothes of pedestrians, a seed for the paint of each."""
+    """The n bystanders of one trajectory, pedestrians and cars."""
 
     others: list[Bystander]
-    gaits: list[Gait]
-    clothes: list[Clothes]
-    seeds: np.ndarray
+    gaits: list[Gait]  # used for pedestrians only
+    clothes: list[Clothes]  # used for pedestrians only
+    seeds: np.ndarray  # (n,) in [0, 1), for the paint of cars
 
     def __len__(self) -> int:
         return len(self.others)
 
     def people(self, target: Appearance) -> People:
-        """Return the appearance of the target and of every pedestrian."""
-        pedestrians = (number for number, other in enumerate(self.others) if other.kind == "Pedestrians")
-        return People(target, {other_id(number): self.clothes[number].looks for number in pedestrians})
+        """Return the appearance of the target and of every pedestrian among the bystanders."""
+        looks = {
+            other_id(number): self.clothes[number].looks
+            for number, other in enumerate(self.others)
+            if other.kind == "Pedestrians"
+        }
+        return People(target, looks)
 
     def posed(self, i: int) -> list[PosedBystander]:
         """Return all bystanders in frame i."""
         bystanders = []
         for number, other in enumerate(self.others):
             center_m = other.centers_m[i]
-            body: PosedPerson | PosedCar = self.gaits[number].posed(i, center_m, self.clothes[number])
-            if other.kind != "Pedestrians":
+            body: PosedPerson | PosedCar
+            if other.kind == "Pedestrians":
+                body = self.gaits[number].posed(i, center_m, self.clothes[number])
+            else:
                 heading_rad = float(other.headings_rad[i])
                 body = PosedCar(center_m, heading_rad, other.build.half_extents_m, float(self.seeds[number]))
             bystanders.append(PosedBystander(other_id(number), body))
@@ -141,11 +151,11 @@ class DressedBystanders:
         )
 
     def distance_m(self, i: int, point_m: np.ndarray) -> float:
-        """Return the distance of a point, (3,), to the nearest box of frame i; infinity without bystanders."""
+        """Return the distance of a point, (3,), to the nearest bystander in frame i; infinity without bystanders."""
         return min((float(distances_to_boxes_m(point_m, other.at(i))[0]) for other in self.others), default=np.inf)
 
     def are_in_the_way(self, i: int, person_m: np.ndarray) -> bool:
-        """Return whether a person at a hip point, (3,), would touch a bystander."""
+        """Return whether a person with the hip at a point, (3,), would touch a bystander in frame i."""
         return any(other.at(i).gap_to_person_m(person_m) < 0.0 for other in self.others)
 
 
@@ -173,31 +183,27 @@ HIP_SWING_RAD, ARM_SWING_RAD, KNEE_BEND_RAD = 0.25, 0.38, 0.65  # largest angles
 HIP_M, KNEE_M, ANKLE_M, SHOULDER_M = 0.93, 0.50, 0.085, 1.45  # heights of joints
 SIZES = {"woman": 0.96, "man": 1.0}
 BREADTHS = {"woman": 0.84, "man": 1.05}
+LIMB_OVERLAP = 0.6  # a limb reaches beyond its joints by this share of its radius
 # Garments that hang open below the waist: low end, high end, radii ahead and aside, m.
 HEMS = {"jacket": (0.82, 1.12, 0.15, 0.19), "coat": (0.46, 1.14, 0.22, 0.235), "skirt": (0.47, 1.04, 0.24, 0.26)}
 
 
 @dataclass(frozen=True)
 class PersonFigure:
-    """A posed figure, k solids and b bones, m, world.
+    """A posed figure: k solids that are drawn, and b bones (capsules) that cast the shadow. Axes: world."""
 
-    shapes: k of ball, rounded (a box), limb (thicker at its upper end), disc, each within half_m (k, 3) of centers_m
-    (k, 3), turned by turns (k, 3, 3); colors: (k, 3) linear RGB; bones_m: (b, 2, 3), the ends of the capsules that cast
-    the shadow; bone_radii_m: (b,).
-    """
-
-    shapes: tuple[str, ...]
-    centers_m: np.ndarray
-    turns: np.ndarray
-    half_m: np.ndarray
-    colors: np.ndarray
-    bones_m: np.ndarray
-    bone_radii_m: np.ndarray
+    shapes: tuple[str, ...]  # k of: ball, rounded (a box), limb (thicker at its upper end), disc
+    centers_m: np.ndarray  # (k, 3)
+    turns: np.ndarray  # (k, 3, 3) world_from_solid
+    half_m: np.ndarray  # (k, 3) half sizes in the solid's own axes
+    colors: np.ndarray  # (k, 3) linear RGB
+    bones_m: np.ndarray  # (b, 2, 3) ends
+    bone_radii_m: np.ndarray  # (b,)
 
 
 @dataclass
 class _Body:
-    """The pieces of a figure in the person's own axes: x forward, y left, z up, feet at 0."""
+    """The pieces of a figure in the person's own axes: x forward, y left, z up, feet at 0; metres and radians."""
 
     solids: list[tuple] = field(default_factory=list)  # (shape, center, half, color, pitch, roll)
     limbs: list[tuple] = field(default_factory=list)  # (low, high, radius, color)
@@ -214,112 +220,124 @@ class _Body:
         self.limbs.append((low, high, radius, color))
 
     def placed(self, feet_m: np.ndarray, heading_rad: float, size: float) -> PersonFigure:
-        """Return the figure at a place; all pieces at once, four times as fast as one by one."""
+        """Return the figure at a place. It turns all pieces at once, which is four times as fast as one by one."""
         shapes, centers, half, colors, pitch, roll = zip(*self.solids, strict=True)
         turns = rotation_matrices(np.column_stack([pitch, np.zeros(len(pitch)), roll]))
-        low, high, radius, limb_colors = (np.array(column) for column in zip(*self.limbs, strict=True))
-        length = np.linalg.norm(high - low, axis=1)
-        z = (high - low) / length[:, None]
-        x = np.stack([z[:, 2], 0.0 * length, -z[:, 0]], axis=1) / np.hypot(z[:, 0], z[:, 2])[:, None]
+        limb_lows, limb_highs, limb_radii, limb_colors = (np.array(column) for column in zip(*self.limbs, strict=True))
+        lengths = np.linalg.norm(limb_highs - limb_lows, axis=1)
+        z = (limb_highs - limb_lows) / lengths[:, None]
+        x = np.stack([z[:, 2], 0.0 * lengths, -z[:, 0]], axis=1) / np.hypot(z[:, 0], z[:, 2])[:, None]
         limb_turns = np.stack([x, np.cross(z, x), z], axis=2)
-        limb_half = np.stack([radius, radius, length / 2.0 + 0.6 * radius], axis=1)
-        from_, to, bone_radii = (np.array(column) for column in zip(*self.bones, strict=True))
+        limb_half = np.stack([limb_radii, limb_radii, lengths / 2.0 + LIMB_OVERLAP * limb_radii], axis=1)
+        bone_lows, bone_highs, bone_radii = (np.array(column) for column in zip(*self.bones, strict=True))
         turn = rotation_matrix(0.0, heading_rad, 0.0)
         return PersonFigure(
-            (*shapes, *["limb"] * len(length)),
-            feet_m + size * np.concatenate([centers, (low + high) / 2.0]) @ turn.T,
-            turn @ np.concatenate([turns, limb_turns]),
-            size * np.concatenate([half, limb_half]),
-            np.concatenate([colors, limb_colors]),
-            feet_m + size * np.stack([from_, to], axis=1) @ turn.T,
-            size * bone_radii,
+            shapes=(*shapes, *["limb"] * len(lengths)),
+            centers_m=feet_m + size * np.concatenate([centers, (limb_lows + limb_highs) / 2.0]) @ turn.T,
+            turns=turn @ np.concatenate([turns, limb_turns]),
+            half_m=size * np.concatenate([half, limb_half]),
+            colors=np.concatenate([colors, limb_colors]),
+            bones_m=feet_m + size * np.stack([bone_lows, bone_highs], axis=1) @ turn.T,
+            bone_radii_m=size * bone_radii,
         )
 
 
 def figure_of(person: PosedPerson) -> PersonFigure:
     """Build the figure of a posed person."""
-    figure, swing, clothes = _Body(), person.swing, person.clothes
-    size, breadth = SIZES[clothes.looks.figure], BREADTHS[clothes.looks.figure]
-    sides = ((1.0, person.phase_rad), (-1.0, person.phase_rad + np.pi))
-    feet = [_leg(figure, side, phase, swing, clothes) for side, phase in sides]
-    lift = size * (min(foot[2] for foot in feet) - ANKLE_M)  # the lower foot is on the ground
+    body = _Body()
+    swing = person.swing
+    clothes = person.clothes
+    size = SIZES[clothes.looks.figure]
+    breadth = BREADTHS[clothes.looks.figure]
+    sides = ((1.0, person.phase_rad), (-1.0, person.phase_rad + np.pi))  # left, right
+    ankles = [_leg(body, side, phase, swing, clothes) for side, phase in sides]
+    lift_m = size * (min(ankle[2] for ankle in ankles) - ANKLE_M)  # so that the lower foot is on the ground
     for side, phase in sides:
-        _arm(figure, breadth * side, phase, swing, clothes)
-    _trunk(figure, breadth, swing, clothes)
-    _head(figure, clothes)
-    if clothes.looks.bag == "backpack":  # with two straps
-        figure.solid("rounded", [-0.205, 0.0, 1.24], [0.10, 0.155, 0.22], clothes.color("bag"))
-        for side in (-1.0, 1.0):
-            figure.solid("rounded", [0.0, 0.11 * breadth * side, 1.33], [0.145, 0.025, 0.17], clothes.color("bag"))
-    elif clothes.looks.bag:  # at the right hip, with a strap across
-        figure.solid("rounded", [0.0, -0.285, 0.88], [0.15, 0.075, 0.12], clothes.color("bag"))
-        figure.solid("rounded", [0.0, -0.05, 1.21], [0.15, 0.025, 0.33], clothes.color("bag"), roll_rad=-0.58)
-    return figure.placed(person.hip_m - [0.0, 0.0, TARGET_HEIGHT_M + lift], person.heading_rad, size)
+        _arm(body, breadth * side, phase, swing, clothes)
+    _trunk(body, breadth, swing, clothes)
+    _head(body, clothes)
+    _bag(body, breadth, clothes)
+    return body.placed(person.hip_m - [0.0, 0.0, TARGET_HEIGHT_M + lift_m], person.heading_rad, size)
 
 
 def _swung(angle_rad: float, length: float) -> np.ndarray:
-    """Return a vector hanging down, turned forward by an angle."""
+    """Return a vector that points down, turned forward by an angle."""
     return length * np.array([np.sin(angle_rad), 0.0, -np.cos(angle_rad)])
 
 
-def _leg(figure: _Body, side: float, phase: float, swing: float, clothes: Clothes) -> np.ndarray:
+def _leg(body: _Body, side: float, phase: float, swing: float, clothes: Clothes) -> np.ndarray:
     """Add thigh, shin and shoe; return the ankle."""
     hip = np.array([0.0, 0.09 * side, HIP_M])
     angle = HIP_SWING_RAD * swing * np.sin(phase)
     bend = swing * (0.12 + KNEE_BEND_RAD * max(0.0, np.cos(phase)) ** 1.5)  # the leg that swings forward is bent
     knee = hip + _swung(angle, HIP_M - KNEE_M)
     ankle = knee + _swung(angle - bend, KNEE_M - ANKLE_M)
-    legs, cloth = clothes.looks.legs, clothes.color("legs")
-    figure.limb(knee, hip, 0.088, clothes.skin if legs == "skirt" else cloth)
-    figure.limb(ankle - [0, 0, 0.02], knee, 0.066, cloth if legs == "trousers" else clothes.skin)
+    legs = clothes.looks.legs
+    cloth = clothes.color("legs")
+    body.limb(knee, hip, 0.088, clothes.skin if legs == "skirt" else cloth)
+    body.limb(ankle - [0, 0, 0.02], knee, 0.066, cloth if legs == "trousers" else clothes.skin)
     toe = 0.5 * (angle - bend)
     center = ankle + np.array([0.048 * np.cos(toe), 0.0, -0.043 + 0.048 * np.sin(toe)])
-    figure.solid("rounded", center.tolist(), [0.115, 0.048, 0.042], clothes.shoes, pitch_rad=-toe)
+    body.solid("rounded", center.tolist(), [0.115, 0.048, 0.042], clothes.shoes, pitch_rad=-toe)
     is_wide = clothes.looks.top == "coat" or legs == "skirt"
-    figure.bones.append((ankle - [0, 0, 0.05], hip, 0.12 if is_wide else 0.085))
+    body.bones.append((ankle - [0, 0, 0.05], hip, 0.12 if is_wide else 0.085))
     return ankle
 
 
-def _arm(figure: _Body, side: float, phase: float, swing: float, clothes: Clothes) -> None:
+def _arm(body: _Body, side: float, phase: float, swing: float, clothes: Clothes) -> None:
     shoulder = np.array([0.0, 0.205 * side, SHOULDER_M - 0.03])
     angle = -ARM_SWING_RAD * swing * np.sin(phase)
     elbow = shoulder + _swung(angle, 0.29) + [0.0, 0.025 * side, 0.0]
     wrist = elbow + _swung(angle + 0.18 + 0.3 * swing, 0.25)
     is_bare = clothes.looks.top == "t_shirt"
-    figure.limb(elbow, shoulder, 0.058, clothes.color("top"))
-    figure.limb(wrist, elbow, 0.041 if is_bare else 0.055, clothes.skin if is_bare else clothes.color("top"))
-    figure.solid("ball", (wrist + np.array([0.01, 0, -0.05])).tolist(), [0.04, 0.03, 0.065], clothes.skin)
-    figure.bones.append((wrist, shoulder, 0.05))
+    body.limb(elbow, shoulder, 0.058, clothes.color("top"))
+    body.limb(wrist, elbow, 0.041 if is_bare else 0.055, clothes.skin if is_bare else clothes.color("top"))
+    body.solid("ball", (wrist + np.array([0.01, 0, -0.05])).tolist(), [0.04, 0.03, 0.065], clothes.skin)
+    body.bones.append((wrist, shoulder, 0.05))
 
 
-def _trunk(figure: _Body, breadth: float, swing: float, clothes: Clothes) -> None:
+def _trunk(body: _Body, breadth: float, swing: float, clothes: Clothes) -> None:
     lean = 0.03 * swing
     top = clothes.color("top")
     covered = top if clothes.looks.top in HEMS else clothes.color("legs")
-    figure.solid("rounded", [0.0, 0.0, 0.95], [0.115, 0.165, 0.12], covered)
-    figure.solid("limb", [0.01, 0.0, 1.22], [0.125, 0.195 * breadth, 0.29], top, pitch_rad=lean)
-    figure.solid("ball", [0.015, 0.0, 1.42], [0.10, 0.205 * breadth, 0.085], top, pitch_rad=lean)
+    body.solid("rounded", [0.0, 0.0, 0.95], [0.115, 0.165, 0.12], covered)
+    body.solid("limb", [0.01, 0.0, 1.22], [0.125, 0.195 * breadth, 0.29], top, pitch_rad=lean)
+    body.solid("ball", [0.015, 0.0, 1.42], [0.10, 0.205 * breadth, 0.085], top, pitch_rad=lean)
     for slot in ("top", "legs"):
         if (garment := getattr(clothes.looks, slot)) in HEMS:
             low, high, ahead, aside = HEMS[garment]
-            middle, half = [0.0, 0.0, (low + high) / 2.0], [ahead, aside, (high - low) / 2.0]
-            figure.solid("limb", middle, half, clothes.color(slot), pitch_rad=np.pi)
-    figure.bones.append((np.array([0.0, 0.0, 0.95]), np.array([0.01, 0.0, 1.36]), 0.17))
+            center = [0.0, 0.0, (low + high) / 2.0]
+            half = [ahead, aside, (high - low) / 2.0]
+            body.solid("limb", center, half, clothes.color(slot), pitch_rad=np.pi)
+    body.bones.append((np.array([0.0, 0.0, 0.95]), np.array([0.01, 0.0, 1.36]), 0.17))
 
 
-def _head(figure: _Body, clothes: Clothes) -> None:
-    hat, skin, hair = clothes.looks.hat, clothes.skin, clothes.hair
-    figure.limb(np.array([0.01, 0.0, 1.46]), np.array([0.025, 0.0, 1.60]), 0.055, skin)
-    figure.solid("ball", [0.035, 0.0, 1.665], [0.10, 0.078, 0.125], skin)
-    figure.solid("ball", [0.008, 0.0, 1.68 if hat else 1.70], [0.105, 0.088, 0.10], hair)
-    figure.solid("ball", [0.132, 0.0, 1.65], [0.02, 0.016, 0.025], skin)
+def _head(body: _Body, clothes: Clothes) -> None:
+    hat = clothes.looks.hat
+    skin = clothes.skin
+    hair = clothes.hair
+    body.limb(np.array([0.01, 0.0, 1.46]), np.array([0.025, 0.0, 1.60]), 0.055, skin)
+    body.solid("ball", [0.035, 0.0, 1.665], [0.10, 0.078, 0.125], skin)
+    body.solid("ball", [0.008, 0.0, 1.68 if hat else 1.70], [0.105, 0.088, 0.10], hair)
+    body.solid("ball", [0.132, 0.0, 1.65], [0.02, 0.016, 0.025], skin)
     if clothes.looks.figure == "woman":
-        figure.solid("ball", [-0.055, 0.0, 1.55], [0.075, 0.105, 0.20], hair)
+        body.solid("ball", [-0.055, 0.0, 1.55], [0.075, 0.105, 0.20], hair)
     if hat:
         color = clothes.color("hat")
-        figure.solid("ball", [0.01, 0.0, 1.70], [0.118, 0.102, 0.10], color)
+        body.solid("ball", [0.01, 0.0, 1.70], [0.118, 0.102, 0.10], color)
         if hat == "cap":
-            figure.solid("rounded", [0.14, 0.0, 1.70], [0.085, 0.075, 0.012], color, pitch_rad=0.15)
+            body.solid("rounded", [0.14, 0.0, 1.70], [0.085, 0.075, 0.012], color, pitch_rad=0.15)
         else:
-            figure.solid("disc", [0.01, 0.0, 1.69], [0.235, 0.225, 0.012], color)
-    figure.bones.append((np.array([0.02, 0.0, 1.60]), np.array([0.02, 0.0, 1.70]), 0.14 if hat == "brim" else 0.095))
+            body.solid("disc", [0.01, 0.0, 1.69], [0.235, 0.225, 0.012], color)
+    body.bones.append((np.array([0.02, 0.0, 1.60]), np.array([0.02, 0.0, 1.70]), 0.14 if hat == "brim" else 0.095))
+
+
+def _bag(body: _Body, breadth: float, clothes: Clothes) -> None:
+    bag = clothes.looks.bag
+    if bag == "backpack":  # with two straps
+        body.solid("rounded", [-0.205, 0.0, 1.24], [0.10, 0.155, 0.22], clothes.color("bag"))
+        for side in (-1.0, 1.0):
+            body.solid("rounded", [0.0, 0.11 * breadth * side, 1.33], [0.145, 0.025, 0.17], clothes.color("bag"))
+    elif bag:  # at the right hip, with a strap across the chest
+        body.solid("rounded", [0.0, -0.285, 0.88], [0.15, 0.075, 0.12], clothes.color("bag"))
+        body.solid("rounded", [0.0, -0.05, 1.21], [0.15, 0.025, 0.33], clothes.color("bag"), roll_rad=-0.58)

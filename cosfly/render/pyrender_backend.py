@@ -53,7 +53,7 @@ def _open_screen(width_px: int, height_px: int) -> Any:
     # Without libEGL, PyOpenGL raises errors of its own or an ImportError, and pyrender's platforms bare assertions.
     except Exception as error:
         fix = f"apt-get install {contract.DEBIAN_PACKAGES}"
-        raise EnvironmentMissing("no OpenGL without a window (EGL)", got=str(error), fix=fix) from None
+        raise EnvironmentMissing("OpenGL cannot draw without a window (EGL)", got=str(error), fix=fix) from None
     screen._renderer._program_cache = ShaderProgramCache(str(Path(__file__).parent / "pyrender_shaders"))
     # pyrender has loaded the EGL functions by now, also where someone imported OpenGL for another platform before.
     from OpenGL.EGL import eglDestroyContext
@@ -85,8 +85,8 @@ class PyrenderRenderer:
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
         """Check that no weather is asked for; there are no shadows to compute."""
         if weather is not None:
-            fix = "use render.backend gl, or weather_mode off"
-            raise RenderError("the renderer pyrender draws no weather", fix=fix)
+            fix = "set render.backend to gl, or render.weather_mode to off"
+            raise RenderError("the renderer pyrender cannot draw weather", fix=fix)
 
     def render(
         self, camera_pose: np.ndarray, intrinsic: np.ndarray, person: PosedPerson | None, others: Others = ()

@@ -81,11 +81,11 @@ def check_outside_rim(trace: DroneTrace, box_map: BoxMap) -> None:
     town = np.stack([corner[:2] for corner in box_map.bounds()])
     if (away_m := float(_away_m(trace.positions_m[:, :2], town).max())) > FLIGHTS_TO_M:
         raise RenderError(
-            "the trajectory enters the rim",
+            "the trajectory flies too far into the rim around the map",
             where=trace.path_id,
-            got=f"{away_m:.0f} m beyond the map's bounds",
-            expected=f"at most {FLIGHTS_TO_M:g} m: houses and trees begin at {SOLIDS_FROM_M:g} m",
-            fix="--set render.rim=false",
+            got=f"{away_m:.0f} m outside the bounds of the map",
+            expected=f"at most {FLIGHTS_TO_M:g} m, because houses and trees begin at {SOLIDS_FROM_M:g} m",
+            fix="render without the rim: --set render.rim=false",
         )
 
 

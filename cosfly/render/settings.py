@@ -94,30 +94,30 @@ class RenderConfig(WeatherConfig):
         for fov in fovs:
             if not LEAST_FOV_DEG <= fov <= MOST_FOV_DEG:
                 span = f"{LEAST_FOV_DEG} to {MOST_FOV_DEG} degrees"
-                raise ValueError(f"every field of view must be {span}; got {fov:g}")
+                raise ValueError(f"every field of view must be from {span}, got {fov:g}")
         return fovs
 
     @model_validator(mode="after")
     def _weather_can_be_drawn(self) -> RenderConfig:
         if self.backend in SIMULATORS and (self.look != Look() or self.rim):
-            raise ValueError(f"backend {self.backend} has its own sun, air and horizon: remove look and rim")
+            raise ValueError(f"backend {self.backend} draws its own sun, air and horizon; remove look and rim")
         if self.weather_mode != "off" and self.backend in ("pyrender", "unrealcv"):
-            raise ValueError(f"backend {self.backend} draws no weather: use gl or carla, or weather_mode off")
+            raise ValueError(f"backend {self.backend} cannot draw weather; use gl or carla, or weather_mode off")
         if self.weather_mode != "off" and self.look != Look():
-            fix = "remove it (--set 'render.look={}'), or use weather_mode off"
-            raise ValueError(f"look is for trajectories without weather: {fix}")
+            fix = "remove look (--set 'render.look={}'), or set weather_mode to off"
+            raise ValueError(f"look cannot be combined with weather; {fix}")
         return self
 
     @field_validator("tracks", "modalities")
     @classmethod
     def _each_once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         if len(set(names)) != len(names):
-            raise ValueError("a name occurs twice")
+            raise ValueError("each name may occur only once")
         return names
 
     @field_validator("town")
     @classmethod
     def _town_is_a_name(cls, town: str | None) -> str | None:
         if town is not None and folder_name(town) != town:
-            raise ValueError("only letters, digits, dot, hyphen and underscore, and no dot in front")
+            raise ValueError("use only letters, digits, dots, hyphens and underscores, and no dot at the start")
         return town

@@ -83,8 +83,8 @@ class SimulatorRenderer(ABC):
         fov_deg = round(Camera(width, height, intrinsic).fov_deg, 6)  # all that a simulator knows of a lens
         f = focal_px(width, fov_deg)
         if not np.allclose(intrinsic, [[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]], atol=1e-3):
-            what = "the simulator has no such lens"
-            expected = "square pixels and the principal point in the middle"
+            what = "the simulator cannot draw with this intrinsic matrix"
+            expected = "square pixels, and the principal point in the middle of the picture"
             raise RenderError(what, where=self.device, got=str(intrinsic.tolist()), expected=expected)
         bodies: dict[int, Body] = {} if person is None else {PERSON_ID: person}
         bodies |= {other.instance_id: other.body for other in others}
@@ -101,8 +101,8 @@ class SimulatorRenderer(ABC):
         if isinstance(problem, EnvironmentMissing):
             raise problem
         if isinstance(problem, NoPictureError):
-            raise RenderError("a camera sends no picture", where=self.device, got=str(problem), fix=FIX)
-        raise EnvironmentMissing("the server does not answer any more", where=self.device, got=str(problem), fix=FIX)
+            raise RenderError("a camera of the simulator sent no picture", where=self.device, got=str(problem), fix=FIX)
+        raise EnvironmentMissing("the simulator does not answer any more", where=self.device, got=str(problem), fix=FIX)
 
 
 def placement_of(body: Body, lead_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

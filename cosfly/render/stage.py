@@ -185,11 +185,11 @@ def run(
     passed = {n: t for n, t in enumerate(all_traces) if t.drop_reason is None and cfg.path_index in (None, n)}
     if not passed:
         tally = Tally(input=len(all_traces), dropped=Counter(str(trace.drop_reason) for trace in all_traces))
-        raise stage.nothing_kept(tally, expected="a trajectory that the planner accepted")
+        raise stage.nothing_kept(tally, expected="at least one trajectory that the planner accepted")
     _, num_others = bystanders_of(others, all_traces)
     ids = instance_ids(box_map, num_others)
     if num_shared := int((ids == SHARED_ID).sum()):
-        log.warning("render: %d boxes share the instance id %d: ids have 16 bits", num_shared, SHARED_ID)
+        log.warning("render: %d boxes share the instance id %d, because ids have 16 bits", num_shared, SHARED_ID)
     town, updates = _names(stage, cfg, box_map.name, traces, others, seed)
     cfg = cfg.model_copy(update=updates)
     weathers = weathers_of(cfg, pools, (trace.drawn_as(number).number for number, trace in passed.items()))
@@ -199,7 +199,10 @@ def run(
         if fog_hides(weathers[trace.drawn_as(number).number], nearest_m):
             hidden.append(trace.path_id)
     if hidden:
-        log.warning("render: fog hides the target in all frames of %s: plan nearer, or in other weather", hidden)
+        log.warning(
+            "render: fog hides the target in all frames of %s; plan nearer, or choose other weather",
+            hidden,
+        )
     items = [
         Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track), len(trace.time_s[:: cfg.frame_stride]))
         for number, trace in passed.items()
@@ -255,10 +258,10 @@ def bystanders_of(others: Path | None, traces: list[DroneTrace]) -> tuple[dict[s
             raise InputError("the file has no bystanders for this trajectory", where=where, fix=FROM_ONE_RUN)
         if other_lengths := {len(other.positions_m) for other in by_path[trace.path_id]} - {len(trace.time_s)}:
             raise InputError(
-                "bystanders have other times than the trajectory",
+                "a bystander has more or fewer positions than the trajectory",
                 where=where,
                 got=f"{other_lengths.pop()} positions",
-                expected=str(len(trace.time_s)),
+                expected=f"{len(trace.time_s)} positions",
                 fix=FROM_ONE_RUN,
             )
     return by_path, max(map(len, by_path.values()), default=0)

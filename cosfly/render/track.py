@@ -80,13 +80,13 @@ def check_track(trace: DroneTrace, surroundings: Surroundings) -> None:
     below_m = np.array([surroundings.below_ground_m(place) for place in trace.targets_m - [0.0, 0.0, TARGET_HEIGHT_M]])
     fix_path = "generate the pedestrian trajectory again on this map"
     for what, deep_m, most_m, expected, fix in (
-        ("a camera is inside a box", depths_m, TOUCH_M, "a camera in the open", "plan again on this map"),
+        ("a camera is inside a box", depths_m, TOUCH_M, "a camera outside all boxes", "plan again on this map"),
         ("the target is under the ground", below_m, STEP_UP_M, "feet on the ground", fix_path),
     ):
         is_too_deep = deep_m > most_m
         if is_too_deep.any():
             i = int(np.argmax(is_too_deep))
-            got = f"{deep_m[i]:.2f} m deep; {np.count_nonzero(is_too_deep)} of {len(is_too_deep)} frames"
+            got = f"a depth of {deep_m[i]:.2f} m; {np.count_nonzero(is_too_deep)} of {len(is_too_deep)} frames"
             raise RenderError(what, where=f"{trace.path_id}: frame {i}", got=got, expected=expected, fix=fix)
 
 

@@ -118,11 +118,11 @@ class UnrealCvRenderer(SimulatorRenderer):
             self._ids[color] = NO_INSTANCE if row is None else ids[row]
             self._kinds[color] = KINDS[kind_of(class_name) or "Other"] if row is None else self._map.kinds[row]
         if not linked:
-            what = "no box of the map is in the level"
-            fix = "export the level: cosfly maps --source unrealcv"
+            what = "no box of the map is in the level that the server has loaded"
+            fix = "export the map from this level (cosfly maps --source unrealcv)"
             raise InputError(what, where=self._server.where, got=self._map.name, fix=fix)
         if len(linked) < len(self._map) or num_doubtful:
-            what = "%s: %d of %d boxes are objects of the level; %d objects have no colour of their own"
+            what = "%s: %d of %d boxes are objects of the level; %d objects share their colour with another"
             log.warning(what, self._server.where, len(linked), len(self._map), num_doubtful)
         self._check_scale(linked)
 
@@ -146,11 +146,11 @@ class UnrealCvRenderer(SimulatorRenderer):
         scale = scale or float("nan")  # all in one place
         high_m = float(np.median(raw[:, 2] / scale - middles_m[:, 2]))
         raise ConfigError(
-            "the level has another scale than the map: the camera would be at ground level, or outside the town",
+            "the scale or the height of the map differs from the level, so the camera would be at wrong places",
             where=self._server.where,
-            got=f"coord_scale {self._cfg.coord_scale:g}, coord_z_offset {self._cfg.coord_z_offset:g}: objects are "
-            f"{gap_m:.1f} m from their boxes",
-            expected=f"coord_scale {scale:.4g}, coord_z_offset {high_m:.2f}",
+            got=f"objects {gap_m:.1f} m from their boxes with coord_scale {self._cfg.coord_scale:g} and coord_z_offset "
+            f"{self._cfg.coord_z_offset:g}",
+            expected=f"about coord_scale {scale:.4g} and coord_z_offset {high_m:.2f}",
             fix="set --coord-scale and --coord-z-offset, or export the map from this level",
         )
 
@@ -175,8 +175,8 @@ class UnrealCvRenderer(SimulatorRenderer):
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
         """Remove everybody; the level's own weather stays."""
         if weather is not None:
-            fix = "use backend gl or carla"
-            raise RenderError("the renderer unrealcv draws no weather", where=self.device, fix=fix)
+            fix = "set render.backend to gl or carla, or render.weather_mode to off"
+            raise RenderError("the renderer unrealcv cannot draw weather", where=self.device, fix=fix)
         with self._server.asking("UnrealCV did not remove people"):
             for number in list(self._spawned):
                 self._server.run(self._removal(number))
@@ -209,7 +209,7 @@ class UnrealCvRenderer(SimulatorRenderer):
     def _check_place(self, position_m: np.ndarray, found: str | bytes) -> None:
         numbers = self._server.numbers(found, 3)
         if numbers is None:
-            raise NoAnswerError(f"the camera's position is {found!r}, not three numbers")
+            raise NoAnswerError(f"the server sent {found!r} instead of the three numbers of the camera's position")
         place_m = world_pose([*(part / self._cfg.coord_scale for part in numbers), 0.0, 0.0, 0.0])[0]
         place_m[2] -= self._cfg.coord_z_offset
         if np.linalg.norm(place_m - position_m) > SAME_PLACE_M:
@@ -217,8 +217,8 @@ class UnrealCvRenderer(SimulatorRenderer):
             over_m = both[:, 2] - self._map.ground.height_at(both)
             places = zip(both.round(2).tolist(), over_m, strict=True)
             got, expected = (f"{place}, {over:.1f} m over the ground" for place, over in places)
-            what = "the camera is not where it was put"
-            fix = "find what moves it, as a pawn's gravity, or use another camera (render.unrealcv.camera)"
+            what = "the camera is not at the requested position"
+            fix = "stop the level from moving it (for example by gravity), or choose another render.unrealcv.camera"
             raise RenderError(what, where=self.device, got=got, expected=expected, fix=fix)
 
     def _decoded(self, lit: str | bytes, mask: str | bytes, depth: str | bytes) -> Frame:
@@ -227,12 +227,13 @@ class UnrealCvRenderer(SimulatorRenderer):
         pictures = []
         for name, data in (("lit", lit), ("object_mask", mask)):
             if isinstance(data, str):
-                raise InputError("the server sent no picture", where=name, got=repr(data)[:80])
+                raise InputError("the server sent a text instead of a picture", where=name, got=repr(data)[:80])
             pictures.append(parse_picture(data, name, flags=cv2.IMREAD_COLOR))
         raw = parse_array(depth if isinstance(depth, bytes) else depth.encode(), "depth", dtype=np.float32, ndim=2)
         for picture in (*pictures, raw):
             if (got := picture.shape[:2]) != shape:
-                raise InputError("a picture has another size", where=self.device, got=str(got), expected=str(shape))
+                problem = "a picture of the server has the wrong height or width"
+                raise InputError(problem, where=self.device, got=f"{got} px", expected=f"{shape} px")
         colors = pictures[1].astype(np.int64) @ [1, 1 << 8, 1 << 16]  # blue, green, red
         kinds = self._kinds[colors]
         ids = self._ids[colors]

@@ -82,17 +82,17 @@ class WeatherConfig(Config):
             name = getattr(self, field)
             pool = getattr(self, pool_field)
             if name is None and self.weather_mode == "fixed":
-                problems.append(f"{field} is needed in weather_mode fixed")
+                problems.append(f"weather_mode fixed needs {field}")
             if name is not None and self.weather_mode != "fixed":
-                problems.append(f"{field} is for weather_mode fixed, and the mode is {self.weather_mode}")
+                problems.append(f"{field} needs weather_mode fixed, but the mode is {self.weather_mode}")
             if pool is None:
                 problems += _unknown(name, presets, field)
             if pool is not None and self.weather_mode == "off":
-                problems.append(f"{pool_field} is given, and weather_mode is off")
+                problems.append(f"{pool_field} has no effect, because weather_mode is off")
         if not sum(self.sky_shares.values()) > 0:
             problems.append("sky_shares must add up to more than 0")
         if self.weather_mode != "by_weight" and self.sky_shares != type(self).model_fields["sky_shares"].default:
-            problems.append(f"sky_shares is for weather_mode by_weight, and the mode is {self.weather_mode}")
+            problems.append(f"sky_shares needs weather_mode by_weight, but the mode is {self.weather_mode}")
         if problems:
             raise ValueError("; ".join(problems))
         return self
@@ -144,9 +144,9 @@ def read_pools(cfg: WeatherConfig) -> Pools:
         kinds = pools.pairs_by_kind()
         if missing := [kind for kind, share in cfg.sky_shares.items() if share and kind not in kinds]:
             raise ConfigError(
-                "no preset belongs to a kind of sky",
+                "a kind of sky has a share, but no preset belongs to it",
                 where="render.sky_shares",
-                got=f"a share of {', '.join(missing)}",
+                got=", ".join(missing),
                 fix="remove the share, or add presets of this kind to the pools",
             )
     return pools
@@ -163,8 +163,8 @@ def _read_pool(
     if len(pool) < len(presets):
         tokens = Counter(map(preset_token, presets))
         twins = [key for key in presets if tokens[preset_token(key)] > 1]
-        what = "two presets have the same name if case, blanks and hyphens are ignored"
-        raise ConfigError(what, where=path, got=", ".join(twins), fix="rename one")
+        what = "two presets have the same name, because case, blanks and hyphens are ignored"
+        raise ConfigError(what, where=path, got=", ".join(twins), fix="rename one of them")
     if problems := _unknown(name, pool, field):
         raise ConfigError("; ".join(problems), where=path)
     return pool
@@ -174,7 +174,8 @@ def _unknown(name: str | None, presets: Mapping[str, Any], field: str) -> list[s
     """Return the problem with a preset's name, in a list that is empty if the preset exists or no name is set."""
     if name is None or preset_token(name) in presets:
         return []
-    return [f"{field}: unknown preset {name!r}{nearest(preset_token(name), presets)}; there are {', '.join(presets)}"]
+    hint = nearest(preset_token(name), presets)
+    return [f"{field}: there is no preset {name!r}{hint}; choose one of {', '.join(presets)}"]
 
 
 def path_seed(weather_seed: int, path_index: int) -> int:

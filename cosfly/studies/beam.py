@@ -39,7 +39,7 @@ class BeamConfig(PlanConfig):
     @classmethod
     def _include_papers_beam(cls, beams: tuple[int, ...]) -> tuple[int, ...]:
         if PAPER_BEAM not in beams:
-            raise ValueError(f"the paper's beam {PAPER_BEAM}, which the others are compared with, is missing")
+            raise ValueError(f"beams must include the paper's {PAPER_BEAM}, because the others are compared with it")
         return beams
 
     def at_beam(self, beam: int) -> PlanConfig:

@@ -53,7 +53,7 @@ def run(frame: Path, out: Path) -> dict[str, Any]:
     depths = truth[measured]
     if not depths.size or depths.min() == depths.max() or depths.min() < 0:
         got = f"{depths.min():g} to {depths.max():g} m" if depths.size else "no measured pixel"
-        expected = "at least two, above 0 m"
+        expected = "at least two different depths of 0 m or more"
         raise InputError("the depth image has too few depths for a study", where=file, got=got, expected=expected)
     decoded = {f"{bits}-bit": quantised(truth, measured, bits)[1] for bits in BITS}
     decoded["32-bit float"] = truth.astype(np.float32).astype(np.float64)
@@ -77,11 +77,11 @@ def _read_npy(file: Path) -> np.ndarray:
     kind = parse_array_header(memoryview(data), file, what="depth image").dtype
     if kind.kind in "iu":
         raise InputError(
-            "the unit of the depth image is not known",
+            "the unit of the depth image is unknown, because its numbers are integers",
             where=file,
             got=str(kind),
             expected="float32 or float64",
-            fix='save metres, for instance np.save("depth.npy", image / 1000.0) for millimetres',
+            fix='save metres as float32; from millimetres: np.save("depth.npy", (image / 1000).astype("float32"))',
         )
     dtype = np.float64 if kind == np.float64 else np.float32
     return parse_array(data, file, dtype=dtype, ndim=2, what="depth image")

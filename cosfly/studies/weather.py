@@ -52,14 +52,14 @@ def run(
     """
     all_traces = read_traces(traces)
     if not 0 <= trajectory < len(all_traces):
-        expected = f"0 to {len(all_traces) - 1}"
-        raise InputError("there is no such trajectory", where=traces, got=trajectory, expected=expected)
+        expected = f"an index from 0 to {len(all_traces) - 1}"
+        raise InputError("the file has no trajectory with this index", where=traces, got=trajectory, expected=expected)
     trace = all_traces[trajectory]
     index = int(np.argmax(trace.rotations_deg[:, 0])) if frame is None else frame
     if not 0 <= index < len(trace.time_s):
-        expected = f"0 to {len(trace.time_s) - 1}"
+        expected = f"an index from 0 to {len(trace.time_s) - 1}"
         where = f"{traces}: {trace.path_id}"
-        raise InputError("the trajectory has no such frame", where=where, got=index, expected=expected)
+        raise InputError("the trajectory has no frame with this index", where=where, got=index, expected=expected)
     box_map = read_boxes(boxes)
     check_ground(box_map, boxes)
     pose = world_from_camera(trace.positions_m[index], trace.rotations_deg[index])

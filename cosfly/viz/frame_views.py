@@ -64,10 +64,10 @@ class Pictures:
         """Check that a file of (width, height) gives pictures of `size_px`."""
         if scaled_size(*found_px, max(self.size_px)) != self.size_px:
             raise InputError(
-                "the picture has another size than the prompt says",
+                "the picture does not fit the size that the prompt states",
                 where=file,
                 got="{} x {} px".format(*found_px),
-                expected="{} x {} px, or larger and of this shape".format(*self.size_px),
+                expected="at least {} x {} px, with this ratio of the sides".format(*self.size_px),
                 fix="pass the playback tree that was captioned",
             )
 

@@ -77,7 +77,7 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
         debug = Overlay(box_map, ids).draw(rgb, read_instance(folder)[1], meta)
     else:
         fix = "pass --map boxes_3d.json, or render with --set render.debug=true"
-        raise InputError("the frame has no debug.png, and no map is given", where=folder, fix=fix)
+        raise InputError("the frame has no debug.png, and no map is given to draw one", where=folder, fix=fix)
     panels = [rgb, read_view(folder, "depth"), read_view(folder, "segmentation"), debug]
     titles = (
         f"RGB, {meta.camera.fov_deg:.0f} deg",
@@ -118,7 +118,9 @@ def _first_clean(tree: Path, choice: TrackChoice, *names: str) -> tuple[Track, l
 def _frames_with(track: Track, *names: str) -> list[int]:
     frames = sorted(set(range(len(track))) - set(track.missing_frames(names)))
     if not frames:
-        raise InputError("the track has no frames to show", where=track.folder, expected=", ".join(names))
+        raise InputError(
+            "the track has no complete frame to show", where=track.folder, expected=f"a frame with {', '.join(names)}"
+        )
     return frames
 
 

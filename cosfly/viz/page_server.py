@@ -35,7 +35,7 @@ class PageServer:
             self.http = ThreadingHTTPServer((HOST, port), type("Handler", (_Handler,), {"server_of_page": self}))
         except OSError as error:
             where = f"{HOST}:{port}"
-            fix = "pass another --port, or none to use a free one"
+            fix = "pass another --port, or omit it to use a free port"
             raise EnvironmentMissing("the port cannot be opened", where=where, got=error.strerror, fix=fix) from None
         self.host = f"{HOST}:{self.http.server_address[1]}"
         self.address = f"http://{self.host}/{self.token}/"

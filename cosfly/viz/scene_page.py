@@ -101,7 +101,7 @@ def run(
     room_bytes -= sum(60 * track.rows.size for track in tracks)
     if room_bytes < 0:
         fix = "raise --max-mb, or use a simplified map and fewer paths"
-        raise InputError("the page is too large", where=map_, expected=f"at most {max_mb:g} MB", fix=fix)
+        raise InputError("the scene page would be too large", where=map_, expected=f"at most {max_mb:g} MB", fix=fix)
     notes += _add_pictures(tracks, room_bytes, picture_px)
     content["tracks"] = [
         {

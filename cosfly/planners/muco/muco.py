@@ -193,7 +193,7 @@ def start_trajectory(
             return _rounded_off(searched, problem, obstacles), "search"
     if behind_is_free:
         return behind, "behind"
-    raise scenario.no_path_error("no free trajectory to start from", cfg.relaxed_safety_m)
+    raise scenario.no_path_error("MuCO found no collision-free trajectory to start with", cfg.relaxed_safety_m)
 
 
 def _rounded_off(points: np.ndarray, problem: Problem, obstacles: BoxIndex) -> np.ndarray:

@@ -113,7 +113,7 @@ def planner(find: Callable[[Task], np.ndarray | None]) -> Planner:
                 moved_m = float(np.linalg.norm(repaired - points, axis=1).max())
                 return Plan(repaired, {"clearance_m": clearance_m, "repaired_m": round(moved_m, 4)})
         raise scenario.no_path_error(
-            "no free path leads from the first reference position to the last", cfg.relaxed_safety_m
+            "no collision-free path connects the first reference position with the last", cfg.relaxed_safety_m
         )
 
     return plan

@@ -10,32 +10,34 @@ from itertools import pairwise
 
 import numpy as np
 
-# Mesh numbers, the order of `all_meshes`.
+# Mesh numbers: the order of `all_meshes`.
 BOX, BLOB_FINE, BLOB, BLOB_COARSE, CYLINDER, CONE, CABIN, ROUNDED, SPHERE, LIMB = range(10)
 
 
 @dataclass(frozen=True)
 class UnitMesh:
-    """Vertices (n, 6) and triangles (k, 3)."""
+    """A triangle mesh in the cube [-1, 1]^3."""
 
-    vertices: np.ndarray
-    triangles: np.ndarray
+    vertices: np.ndarray  # (n, 6) float32: position, unit normal
+    triangles: np.ndarray  # (k, 3) int32 rows of vertices
 
 
 def all_meshes() -> list[UnitMesh]:
-    """Return every mesh, in the order of the numbers above."""
-    return [
-        prism(1.0, 1.0),
-        blob(2),
-        blob(1),
-        blob(0),
-        revolved([(0.0, -1.0), (1.0, -1.0), (1.0, 1.0), (0.0, 1.0)], 10),
-        revolved([(0.0, -1.0), (1.0, -1.0), (0.42, 0.0), (0.0, 1.0)], 9),
-        prism(0.66, 0.84),
-        superquadric(0.45, 12, 7),
-        superquadric(1.0, 14, 9),
-        revolved([(0.0, -1.0), (0.55, -0.96), (0.74, -0.85), (0.92, 0.3), (0.95, 0.85), (0.6, 0.97), (0.0, 1.0)], 10),
-    ]
+    """Return every mesh, in the order of the mesh numbers."""
+    limb = [(0.0, -1.0), (0.55, -0.96), (0.74, -0.85), (0.92, 0.3), (0.95, 0.85), (0.6, 0.97), (0.0, 1.0)]
+    meshes = {
+        BOX: prism(1.0, 1.0),
+        BLOB_FINE: blob(2),
+        BLOB: blob(1),
+        BLOB_COARSE: blob(0),
+        CYLINDER: revolved([(0.0, -1.0), (1.0, -1.0), (1.0, 1.0), (0.0, 1.0)], 10),
+        CONE: revolved([(0.0, -1.0), (1.0, -1.0), (0.42, 0.0), (0.0, 1.0)], 9),
+        CABIN: prism(0.66, 0.84),
+        ROUNDED: superquadric(0.45, 12, 7),
+        SPHERE: superquadric(1.0, 14, 9),
+        LIMB: revolved(limb, 10),
+    }
+    return [meshes[number] for number in range(len(meshes))]
 
 
 def prism(top_x: float, top_y: float) -> UnitMesh:
@@ -52,36 +54,45 @@ def prism(top_x: float, top_y: float) -> UnitMesh:
 
 
 def revolved(profile: list[tuple[float, float]], num_sides: int) -> UnitMesh:
-    """Return a profile of (radius, z), from the bottom up, turned about z; sharp between the profile's segments."""
+    """Return the solid of a profile that turns about z, with sharp edges between the segments of the profile.
+
+    Args:
+        profile: (radius, z), from the bottom up.
+    """
     angles = np.arange(num_sides + 1) * 2.0 * np.pi / num_sides
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     vertices: list[list[float]] = []
     triangles: list[tuple[int, int, int]] = []
-    for (r0, z0), (r1, z1) in pairwise(profile):
-        slope = np.array([z1 - z0, r0 - r1]) / np.hypot(z1 - z0, r1 - r0)  # outward (radial, z)
+    for (low_radius, low_z), (high_radius, high_z) in pairwise(profile):
+        normal = np.array([high_z - low_z, low_radius - high_radius])  # outward: radial, z
+        radial, z = normal / np.hypot(high_z - low_z, high_radius - low_radius)
         first = len(vertices)
         for direction in around:
-            normal = [*(direction * slope[0]), slope[1]]
-            vertices += [[*(direction * r0), z0, *normal], [*(direction * r1), z1, *normal]]
+            vertices.append([*(direction * low_radius), low_z, *(direction * radial), z])
+            vertices.append([*(direction * high_radius), high_z, *(direction * radial), z])
         for side in range(num_sides):
-            a = first + 2 * side
-            triangles += [(a, a + 2, a + 3)] if r0 > 0 else []
-            triangles += [(a, a + 3, a + 1)] if r1 > 0 else []
+            low = first + 2 * side  # its neighbours: low + 1 above it, low + 2 next to it, low + 3 above that
+            if low_radius > 0:
+                triangles.append((low, low + 2, low + 3))
+            if high_radius > 0:
+                triangles.append((low, low + 3, low + 1))
     return UnitMesh(np.array(vertices, np.float32), np.array(triangles, np.int32))
 
 
 def superquadric(exponent: float, num_sides: int, num_rings: int) -> UnitMesh:
-    """Return a rounded solid: exponent 1 is the sphere, towards 0 the cube."""
+    """Return a rounded solid between the cube (exponent 0) and the sphere (exponent 1)."""
 
-    def power(values: np.ndarray, e: float) -> np.ndarray:
-        return np.sign(values) * np.abs(values) ** e
+    def signed_power(values: np.ndarray, power: float) -> np.ndarray:
+        return np.sign(values) * np.abs(values) ** power
 
     latitude = np.linspace(-np.pi / 2, np.pi / 2, num_rings + 1)[:, None]
     longitude = (np.arange(num_sides + 1) * 2.0 * np.pi / num_sides)[None, :]
 
-    def surface(e: float) -> np.ndarray:
-        ring = power(np.cos(latitude), e)
-        x, y, z = ring * power(np.cos(longitude), e), ring * power(np.sin(longitude), e), power(np.sin(latitude), e)
+    def surface(power: float) -> np.ndarray:
+        radius = signed_power(np.cos(latitude), power)
+        x = radius * signed_power(np.cos(longitude), power)
+        y = radius * signed_power(np.sin(longitude), power)
+        z = signed_power(np.sin(latitude), power)
         return np.stack(np.broadcast_arrays(x, y, z), axis=-1).reshape(-1, 3)
 
     normals = surface(2.0 - exponent)  # the superquadric's normal has the complementary exponent
@@ -94,7 +105,7 @@ def superquadric(exponent: float, num_sides: int, num_rings: int) -> UnitMesh:
 
 
 def blob(num_subdivisions: int) -> UnitMesh:
-    """Return an icosphere, dented inwards by a fixed smooth pattern: the outline of foliage. Radius at most 1."""
+    """Return the outline of foliage: an icosphere of radius 1 at most, dented inwards by a fixed smooth pattern."""
     golden = (1.0 + 5.0**0.5) / 2.0
     points = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0), (0, -1, golden), (0, 1, golden)]
     points += [(0, -1, -golden), (0, 1, -golden), (golden, 0, -1), (golden, 0, 1), (-golden, 0, -1), (-golden, 0, 1)]
@@ -104,7 +115,7 @@ def blob(num_subdivisions: int) -> UnitMesh:
         (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7),
         (9, 8, 1),
     ])  # fmt: skip
-    for _ in range(num_subdivisions):
+    for _ in range(num_subdivisions):  # each splits a triangle into four, at the middles of its edges
         a, b, c = triangles.T
         edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
         edges, numbers = np.unique(edges, axis=0, return_inverse=True)

@@ -23,9 +23,16 @@ GROUND_MATERIALS = (SIDEWALK, ROAD_LINE, ROAD, GRAVEL, WATER, GRASS)
 DRAW_ORDER = (*(m for m in range(NUM_MATERIALS) if m not in GROUND_MATERIALS), *GROUND_MATERIALS)
 
 PART = np.dtype(
-    [("center", "3f4"), ("half", "3f4"), ("quaternion", "4f4"), ("color", "4f4"), ("tag", "u4"), ("bias", "f4")]
+    [
+        ("center", "3f4"),  # m, relative to the scene's origin
+        ("half", "3f4"),  # half sizes, m
+        ("quaternion", "4f4"),  # world_from_part: x, y, z, w
+        ("color", "4f4"),  # linear RGB, and the seed of its object in [0, 1)
+        ("tag", "u4"),  # as packed by `tags`
+        ("bias", "f4"),  # depth bias of its layer
+    ]
 )
-# A vertex of a loose triangle, which belongs to no mesh: position and normal as in a mesh, then the fields of its part.
+# A vertex of a triangle of no mesh: position and normal as in a mesh, then the fields of its part.
 LOOSE_VERTEX = np.dtype([("position", "3f4"), ("normal", "3f4"), *((name, PART[name]) for name in PART.names or ())])
 
 BRIGHT = 0.5  # least red of a lamp's glass; its housing is darker
@@ -33,24 +40,23 @@ BRIGHT = 0.5  # least red of a lamp's glass; its housing is darker
 SMALLEST_PX = 0.4  # a smaller object is not drawn
 FAR_PX = 14.0  # a smaller object is drawn in its simple form
 NEVER_PX = 1e9  # no object is as large
+LEAST_HALF_M = 1e-3  # half size of a flat part
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Drawable parts, k of them. Positions are relative to the scene's origin.
+    """k drawable parts of objects. Positions are relative to the scene's origin.
 
-    records: (k,) PART; mesh: (k,) mesh numbers; centers: (k, 3) float64, the records' centers before they were rounded;
-    object_centers (k, 3), object_radii (k,): the whole object a part belongs to; a part is drawn while the object's
-    radius on the image lies in [min_px, max_px).
+    A part is drawn while the radius of its object on the image lies in [min_px, max_px).
     """
 
-    records: np.ndarray
-    mesh: np.ndarray
-    centers: np.ndarray
-    object_centers: np.ndarray
-    object_radii: np.ndarray
-    min_px: np.ndarray
-    max_px: np.ndarray
+    records: np.ndarray  # (k,) PART
+    mesh: np.ndarray  # (k,) uint8 mesh numbers
+    centers: np.ndarray  # (k, 3) float64 m, the centers of the records before rounding
+    object_centers: np.ndarray  # (k, 3) float32 m
+    object_radii: np.ndarray  # (k,) float32 m
+    min_px: np.ndarray  # (k,) float32
+    max_px: np.ndarray  # (k,) float32
 
     def __len__(self) -> int:
         return len(self.records)
@@ -62,35 +68,32 @@ class Parts:
     def select(self, keep: np.ndarray) -> Parts:
         return Parts(*(column[keep] for column in vars(self).values()))
 
-    def about(self, place: np.ndarray) -> Parts:
-        """Return the same parts relative to a place, (3,): float32 is most precise near 0."""
-        if not place.any():
+    def about(self, origin_m: np.ndarray) -> Parts:
+        """Return the same parts relative to a further origin, (3,): float32 is most precise near 0."""
+        if not origin_m.any():
             return self
         records = self.records.copy()
-        records["center"] = self.centers - place
-        object_centers = (self.object_centers - place).astype(np.float32)
-        return replace(self, records=records, centers=self.centers - place, object_centers=object_centers)
+        records["center"] = self.centers - origin_m
+        object_centers = (self.object_centers - origin_m).astype(np.float32)
+        return replace(self, records=records, centers=self.centers - origin_m, object_centers=object_centers)
 
     def lamps(self) -> np.ndarray:
-        """Return the places of the lit lamps, (n, 3)."""
+        """Return the positions of the lit lamps, (n, 3)."""
         is_lamp = (materials_of(self.records) == LAMP) & (self.records["color"][:, 0] > BRIGHT)
         return self.records["center"][is_lamp].astype(np.float64)
 
 
 @dataclass(frozen=True)
 class Boxes:
-    """The boxes of one kind: centers, half (n, 3); turns (n, 3, 3) world_from_box; ids (n,); seeds (n,) in [0, 1).
+    """n boxes of one kind."""
 
-    tiers: (n,) in [0, 1), of surfaces in their layer.
-    """
-
-    centers: np.ndarray
-    half: np.ndarray
-    turns: np.ndarray
-    ids: np.ndarray
-    seeds: np.ndarray
+    centers: np.ndarray  # (n, 3) m, relative to the scene's origin
+    half: np.ndarray  # (n, 3) half sizes, m
+    turns: np.ndarray  # (n, 3, 3) world_from_box
+    ids: np.ndarray  # (n,) instance ids
+    seeds: np.ndarray  # (n,) in [0, 1)
     kind: int
-    tiers: np.ndarray
+    tiers: np.ndarray  # (n,) in [0, 1), the order of surfaces in one layer
 
     def __len__(self) -> int:
         return len(self.centers)
@@ -124,40 +127,51 @@ class Boxes:
         """Return one part of each box.
 
         Args:
-            half: (n, 3) or (3,) half sizes of the part, in its own axes. color: (n, 3) or (3,) linear RGB. offset: (n,
-                3) from the box's centre, in box axes. turn: (3, 3) or (n, 3, 3) box_from_part.
+            mesh, material: Their numbers.
+            half: (n, 3) or (3,) half sizes of the part in its own axes, m.
+            color: (n, 3) or (3,) linear RGB.
+            offset: (n, 3) from the centre of the box, in box axes, m.
+            turn: (3, 3) or (n, 3, 3) box_from_part.
+            min_px, max_px: The part is drawn while the radius of the box on the image lies in [min_px, max_px).
+            layer: Of a surface; None for what stands on the ground.
         """
-        n = len(self)
-        records = np.zeros(n, PART)
-        records["center"] = centers = self.centers.astype(np.float64)
+        num_boxes = len(self)
+        centers = self.centers.astype(np.float64)
+        records = np.zeros(num_boxes, PART)
+        records["center"] = centers
         if offset is not None:
-            from_middle = np.einsum("nij,nj->ni", self.turns, offset)
-            records["center"] += from_middle
-            centers = centers + from_middle
-        records["half"] = np.maximum(half, 1e-3)
-        if n:
+            offset_m = np.einsum("nij,nj->ni", self.turns, offset)
+            records["center"] += offset_m
+            centers = centers + offset_m
+        records["half"] = np.maximum(half, LEAST_HALF_M)
+        if num_boxes:
             records["quaternion"] = Rotation.from_matrix(self.turns if turn is None else self.turns @ turn).as_quat()
         records["color"][:, :3] = color
         records["color"][:, 3] = self.seeds
         records["tag"] = tags(self.kind, material, self.ids)
         records["bias"] = LAYER_STEP * (STANDING_LAYER if layer is None else layer + self.tiers)
-        radii = np.linalg.norm(self.half, axis=1).astype(np.float32)
-        sizes = np.full(n, min_px, np.float32), np.full(n, max_px, np.float32)
-        return Parts(records, np.full(n, mesh, np.uint8), centers, self.centers.astype(np.float32), radii, *sizes)
+        return Parts(
+            records=records,
+            mesh=np.full(num_boxes, mesh, np.uint8),
+            centers=centers,
+            object_centers=self.centers.astype(np.float32),
+            object_radii=np.linalg.norm(self.half, axis=1).astype(np.float32),
+            min_px=np.full(num_boxes, min_px, np.float32),
+            max_px=np.full(num_boxes, max_px, np.float32),
+        )
 
 
 @dataclass(frozen=True)
 class Loose:
-    """Triangles by material. vertices: (3 k,) LOOSE_VERTEX, three to a triangle, relative to the scene's origin.
+    """Triangles of no mesh: those of n things (meshes of a map), and the ground.
 
-    things: (k,) ascending, the thing of each triangle; centers (n, 3) float64, radii (n,) of things. Triangles of a
-    material without things are the ground: always drawn, without a shadow.
+    Triangles of a material without things are the ground, which is always drawn and casts no shadow.
     """
 
-    vertices: dict[int, np.ndarray]
-    things: dict[int, np.ndarray]
-    centers: np.ndarray
-    radii: np.ndarray
+    vertices: dict[int, np.ndarray]  # by material: (3 k,) LOOSE_VERTEX, three to a triangle
+    things: dict[int, np.ndarray]  # by material: (k,) ascending, the row of the thing of each triangle
+    centers: np.ndarray  # (n, 3) float64 of things, relative to the scene's origin
+    radii: np.ndarray  # (n,) of things, m
 
 
 def tags(kinds: np.ndarray | int, materials: np.ndarray | int, ids: np.ndarray) -> np.ndarray:
@@ -176,11 +190,11 @@ def materials_of(records: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class CameraView:
-    """A camera relative to the scene's origin: world_from_camera (3, 3), eye (3,), intrinsic (3, 3) px."""
+    """A camera, relative to the scene's origin."""
 
-    world_from_camera: np.ndarray
-    eye: np.ndarray
-    intrinsic: np.ndarray
+    world_from_camera: np.ndarray  # (3, 3)
+    eye: np.ndarray  # (3,) m
+    intrinsic: np.ndarray  # (3, 3) px
     width_px: int
     height_px: int
 
@@ -194,15 +208,18 @@ class CameraView:
         """Return the rows of the spheres that may be seen, the nearest first.
 
         Args:
-            centers: (n, 3), relative to the scene's origin. radii: (n,) float32.
+            centers: (n, 3), relative to the scene's origin.
+            radii: (n,) float32, m.
         """
-        least_px, most_px = (np.full(len(radii), size, np.float32) for size in (SMALLEST_PX, np.inf))
+        least_px = np.full(len(radii), SMALLEST_PX, np.float32)
+        most_px = np.full(len(radii), np.inf, np.float32)
         rows, away = self._spheres(centers.astype(np.float32), radii, least_px, most_px)
         return rows[np.argsort(away, kind="stable")]
 
     def _spheres(
         self, centers: np.ndarray, radii: np.ndarray, min_px: np.ndarray, max_px: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
+        """Call `spheres_in_view` for this camera."""
         middle = self.intrinsic[:2, 2]
         size = np.array([self.width_px, self.height_px])
         tangents = np.maximum(middle, size - middle) / np.diag(self.intrinsic)[:2]
@@ -222,11 +239,11 @@ class CameraView:
             return None
         if in_camera[:, 2].min() <= NEAR_M:
             return 0, 0, self.width_px, self.height_px
-        places = in_camera @ self.intrinsic.T
-        places = places[:, :2] / places[:, 2:]
+        projected = in_camera @ self.intrinsic.T
+        pixels = projected[:, :2] / projected[:, 2:]
         size = [self.width_px, self.height_px]
-        x0, y0 = np.clip(np.floor(places.min(axis=0)) - 1, 0, size).astype(int).tolist()
-        x1, y1 = np.clip(np.ceil(places.max(axis=0)) + 1, 0, size).astype(int).tolist()
+        x0, y0 = np.clip(np.floor(pixels.min(axis=0)) - 1, 0, size).astype(int).tolist()
+        x1, y1 = np.clip(np.ceil(pixels.max(axis=0)) + 1, 0, size).astype(int).tolist()
         return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
 
 
@@ -237,17 +254,21 @@ def spheres_in_view(  # type: ignore[no-untyped-def]
     """Find the spheres that a camera may see with a radius on the image in [min_px, max_px), in one pass.
 
     Args:
-        centers: (k, 3) float32 m; radii, min_px, max_px: (k,) float32; eye: (3,) float32 m; turn: (3, 3) float32,
-            world_from_camera.
-        tangents, slants: (2,) float64, of the widest angles to the sides and up: tangent, and 1 / cosine. focal_px:
-            float.
+        centers: (k, 3) float32, m.
+        radii, min_px, max_px: (k,) float32.
+        eye: (3,) float32, m.
+        turn: (3, 3) float32, world_from_camera.
+        tangents, slants: (2,) float64, tangent and 1 / cosine of the widest angles to the sides and up.
+        focal_px: float.
+
     Returns:
-        rows (n,) int64, in their order; (n,) float32 m, how far along the axis each begins.
+        (n,) int64 ascending rows of the spheres in view, and (n,) float32 m, where each begins along the optical axis.
     """
     rows = np.empty(len(centers), np.int64)
     away = np.empty(len(centers), np.float32)
     count = 0
-    near, focal = np.float32(NEAR_M), np.float32(focal_px)
+    near = np.float32(NEAR_M)
+    focal = np.float32(focal_px)
     for k in range(len(centers)):
         dx, dy, dz = centers[k, 0] - eye[0], centers[k, 1] - eye[1], centers[k, 2] - eye[2]
         radius = radii[k]
@@ -260,6 +281,7 @@ def spheres_in_view(  # type: ignore[no-untyped-def]
             continue
         size_px = focal * radius / max(np.sqrt(x * x + y * y + z * z) - radius, near)
         if min_px[k] <= size_px < max_px[k]:
-            rows[count], away[count] = k, z - radius
+            rows[count] = k
+            away[count] = z - radius
             count += 1
     return rows[:count], away[:count]

@@ -27,10 +27,12 @@ def open_context() -> Any:
         settings: Any = {"backend": "egl"}  # moderngl's own annotation of this argument is wrong
         return moderngl.create_context(require=330, standalone=True, **settings)
     except ImportError as error:
-        raise EnvironmentMissing("the package moderngl is missing", got=str(error), fix="pip install cosfly") from None
+        raise EnvironmentMissing(
+            "the package moderngl is not installed", got=str(error), fix="pip install cosfly"
+        ) from None
     except Exception as error:  # glcontext raises a bare Exception, and OSError where the library is missing
-        fix = f"apt-get install {DEBIAN_PACKAGES} (these serve the CPU too)"
-        raise EnvironmentMissing("no OpenGL without a window (EGL)", got=str(error), fix=fix) from None
+        fix = f"apt-get install {DEBIAN_PACKAGES} (needed also to render on the CPU)"
+        raise EnvironmentMissing("OpenGL cannot draw without a window (EGL)", got=str(error), fix=fix) from None
 
 
 def sources(vertex: tuple[str, ...], fragment: tuple[str, ...], define: str = "") -> tuple[str, str]:
