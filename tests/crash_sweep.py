@@ -133,19 +133,15 @@ TRAINING = (
 )  # fmt: skip
 SHORT = {  # what commands have in common
     "tiny": " ".join(f"--set {setting}" for setting in TINY),
-    "training": " ".join(f"--set distill.train.{setting}" for setting in TRAINING),
-    "maps": "{base}/maps/boxes_3d.json",
-    "simple": "{base}/simplify/step2_simplified.json",
-    "walks": "{base}/pedestrians/path.json",
-    "traces": "{base}/plan/drone_trace.json",
-    "tree": "{base}/render",
-    "release": "{base}/release/dataset",
+    "training": " ".join(f"--set distill.train.{setting}" for setting in TRAINING), "maps": "{base}/maps/boxes_3d.json",
+    "simple": "{base}/simplify/step2_simplified.json", "walks": "{base}/pedestrians/path.json",
+    "traces": "{base}/plan/drone_trace.json", "tree": "{base}/render", "release": "{base}/release/dataset",
     "towns": "--set 'towns={one: {}, two: {maps: {synthetic: {size_m: 120}}}}'",
     "three": "--map {maps} --simplified {simple} --traces {traces} {tiny}",
     "asked": "--teacher {teacher} --set caption.endpoint.concurrency=1 --no-check {tiny}",
     "set": "--dataset {students}/set --data {students}/tree",
     "small": "--set distill.infer.max_new_tokens=4 --set distill.infer.device=cpu --set distill.infer.max_pixels=4096",
-}
+}  # fmt: skip
 
 
 def copy_stage(place: Place, out: Path, stage: str) -> None:

@@ -4,6 +4,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from cosfly.runtime.pool import Watch
+
+# A stopped worker is lost after 4 s, long before its item has taken too long: a busy machine does not exchange the two.
+QUICK = Watch(item_limit_s=6.0, heartbeat_s=0.1, check_s=0.4, probe_s=0.3, failed_checks=10)
+
 
 def wait_until(holds: Callable[[], object], patience_s: float = 60.0) -> None:
     until_s = time.monotonic() + patience_s

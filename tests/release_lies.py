@@ -33,24 +33,12 @@ def perturbed(rows: Rows) -> Rows:
     return flight_of(rows, next(row for row in rows if row["track"] == "perturbed"))
 
 
-def trajectory(rows: Rows) -> Rows:
-    return [row for row in rows if row["trajectory"] == clean(rows)[0]["trajectory"]]
-
-
 def captioned(rows: Rows) -> Rows:
     return [row for row in rows if row["has_caption"]]
 
 
 def seen(rows: Rows) -> Rows:
     return [row for row in clean(rows) if row["target_visible"]]
-
-
-def other_flight(rows: Rows) -> Rows:
-    """A clean flight of another trajectory; where there is none, the perturbed one."""
-    own = clean(rows)[0]
-    others = (row for row in rows if row["track"] == "clean" and row["trajectory"] != own["trajectory"])
-    one = next(others, None)
-    return perturbed(rows) if one is None else flight_of(rows, one)
 
 
 def at(choose: Choose, k: int) -> Choose:
@@ -67,13 +55,6 @@ def first(choose: Choose, holds: Callable[[Row], Any]) -> Choose:
 
 def everything(rows: Rows) -> Rows:
     return rows
-
-
-shifted = first(perturbed, lambda row: row["perturbation"]["position"] == "applied")
-
-
-def twin_of(rows: Rows, row: Row) -> Row:
-    return next(one for one in clean(rows) if one["frame_index"] == row["frame_index"])
 
 
 def put(choose: Choose, **values: Any) -> Lie:
@@ -174,10 +155,6 @@ def another_camera(row: Row) -> None:
     row["fov_deg"] = round(math.degrees(2 * math.atan(row["width_px"] / (2 * row["intrinsics"]["fx"]))), 6)
 
 
-def farther_on_its_line(row: Row) -> None:
-    row["target"] = {axis: row["pose"][axis] + 1.4 * (row["target"][axis] - row["pose"][axis]) for axis in XYZ}
-
-
 def mirrored_world(row: Row) -> None:
     for place in filter(None, (row["pose"], row["target"])):
         place["x_m"], place["y_m"] = place["y_m"], place["x_m"]
@@ -204,11 +181,6 @@ DECISIONS = ("decision", "caption_en_flight_decision", "caption_zh_flight_decisi
 def hard_conflict_called_soft(row: Row) -> None:
     wrong = "move_backward" if row["label"] != "move_backward" else "ascend"
     row.update(dict.fromkeys(DECISIONS, wrong), verdict="SOFT_CONFLICT")
-
-
-def along_the_ray(depth: np.ndarray, row: Row) -> np.ndarray:
-    k, (v, u) = row["intrinsics"], np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
-    return depth * np.sqrt(((u - k["cx"]) / k["fx"]) ** 2 + ((v - k["cy"]) / k["fy"]) ** 2 + 1)
 
 
 def not_a_number(row: Row) -> None:
@@ -252,13 +224,6 @@ def second_person(pixels: np.ndarray, ids: np.ndarray) -> None:
     pixels[-4:, -4:] = (12, 255, 255)
 
 
-def without_the_person(kind: tuple[int, ...] | int) -> Callable[[np.ndarray, np.ndarray], None]:
-    def painted(pixels: np.ndarray, ids: np.ndarray) -> None:
-        pixels[ids == 65535, : 3 if isinstance(kind, tuple) else 1] = kind
-
-    return painted
-
-
 not_hovering = first(captioned, lambda row: row["decision"] != "hover")
 caption, middle, middle_seen = at(captioned, 0), half(clean), half(seen)
 ids_of_things_exchanged = change(middle, with_ids(ids_exchanged))
@@ -278,15 +243,12 @@ LIES_OF_ROWS: dict[str, Lie] = {
     "all_targets_null": change(everything, nobody_followed),
     "infinite_angle": change(at(clean, 1), lambda r: r["drone_offset"].update(roll_deg=math.inf)),
     "field_of_view_against_focal_length": put(clean, fov_deg=75.0),
-    "focal_lengths_exchanged": turned(clean, lambda r: r["intrinsics"].update(fy=r["intrinsics"]["fy"] * 1.1)),
     "target_pixel_moved": change(at(seen, 1), add("target_uv", 3.0, "u_px")),
     "box_moved": box_moved,
     "target_depth_against_depth": change(at(seen, 1), add("target_depth_m", 5.0)),
-    "pose_of_the_next_frame": lambda rows: with_poses(clean(rows)[4:5], clean(rows)[5:6]),
     "poses_of_two_frames_exchanged": lambda rows: with_poses(clean(rows)[4:10:5], clean(rows)[9:3:-5]),
     "pose_jumps": turned(at(clean, 6), add("pose", 20.0, "x_m")),
     "window_into_the_future": alter(caption, caption_window=lambda w: [i + 1 for i in w]),
-    "window_with_a_gap": alter(caption, caption_window=lambda w: [w[0] - 1, *w[1:]]),
     "decision_differs_between_languages": put(not_hovering, caption_zh_flight_decision="hover"),
     "decision_and_label_changed_together": put(
         not_hovering, **dict.fromkeys((*DECISIONS, "label"), "hover"), verdict="CONSISTENT"
@@ -296,26 +258,17 @@ LIES_OF_ROWS: dict[str, Lie] = {
     "walk_of_nobody": walk_of_nobody,
     "pair_lost": put(clean, pair=None),
 }  # fmt: skip
-POSES = ("pose", "target", "target_uv", "target_bbox", "target_depth_m", "target_heading_deg", "intrinsics", "fov_deg")
 LIES_OF_PIXELS: dict[str, Lie] = {
     "another_camera_all_along": turned(clean, another_camera),
     "box_against_mask": change(at(seen, 1), add("target_mask_bbox", 2.0, "xmin_px", "xmax_px")),
-    "target_far_behind_on_its_line": turned(seen, farther_on_its_line),
-    "poses_of_two_flights_exchanged": lambda rows: [
-        swap(a, b, *POSES) for a, b in zip(clean(rows), other_flight(rows), strict=False)] and None,
     "world_turned": turned(clean, mirrored_world),
     "depth_of_neighbours_exchanged": swapped(perturbed, 4, 5, "depth"),
-    "depth_of_the_twin": lambda rows: swap(shifted(rows)[0], twin_of(rows, shifted(rows)[0]), "depth"),
-    "instances_of_neighbours_exchanged": swapped(perturbed, 4, 5, "instance"),
     "depth_doubled": change(at(seen, 2), with_depth(lambda depth, _: depth * 2)),
     "depth_not_a_number": change(at(clean, 3), not_a_number),
-    "distance_along_the_ray": change(clean, with_depth(along_the_ray)),
     "depth_in_centimetres_called_lossless": change(clean, with_depth(lambda depth, _: np.round(depth, 2))),
-    "depth_scaled_by_a_fiftieth": change(everything, with_depth(lambda depth, _: depth * 1.02)),
     "depth_set_off": change(everything, with_depth(lambda depth, _: depth + 0.3)),
     "thing_farther_in_one_frame": change(middle, one_thing_farther),
     "empty_instances": change(at(seen, 2), with_ids(lambda pixels, _: pixels.fill(0))),
-    "person_painted_over": change(at(seen, 2), with_ids(without_the_person((1, 0, 0)))),
     "second_person_far_away": change(middle_seen, with_ids(second_person, box=True)),
     "ids_of_things_exchanged": ids_of_things_exchanged,
     "frame_mirrored_with_its_boxes": change(middle_seen, frame_mirrored_with_its_boxes),

@@ -43,22 +43,16 @@ def write_foreign_tree(
 
 def _header(variant: str, is_clean: bool, k: int, points: list[dict]) -> dict:
     return {
-        "schema": "drone_nav_traj_v7",
-        "schema_version": "7.0.0",
-        "dataset_format": "v7",
+        "schema": "drone_nav_traj_v7", "schema_version": "7.0.0", "dataset_format": "v7",
         "source": {"path_index": k, "scenario_id": k, "scenario_name": f"path_{k}", "algorithm": "oneshot"},
         "camera": {
-            "width": WIDTH,
-            "height": HEIGHT,
-            "focal_length_px": FOCAL,
+            "width": WIDTH, "height": HEIGHT, "focal_length_px": FOCAL,
             "intrinsic": [[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]],
         },
-        "trace_dir": variant,
-        "frames_dir": "frames_playback",
+        "trace_dir": variant, "frames_dir": "frames_playback",
         "augmentation": {"enabled": True, "aug_index": 0 if is_clean else 1, "is_original": is_clean},
-        "lens": {"k1": 0.0},  # real files hold more than anybody listed
-        "points": points,
-    }
+        "lens": {"k1": 0.0}, "points": points,  # real files hold more than anybody listed
+    }  # fmt: skip
 
 
 def _motion(num_points: int, k: int, is_clean: bool) -> tuple[list[dict], list[tuple[float, float, float]]]:

@@ -244,7 +244,7 @@ def test_help_is_instant():
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     cpu_s, *loaded = result.stdout.split("LOADED")[1].split()
     assert float(cpu_s) < 5
-    assert not set(loaded) & {"numpy", "numba", "cv2", "pydantic", "torch", "scipy", "pyarrow"}
+    assert not set(loaded) & {"numpy", "numba", "cv2", "pydantic", "torch", "scipy", "pyarrow", "moderngl"}
 
 
 def test_settings_bring_no_solver_along():

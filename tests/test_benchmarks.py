@@ -44,7 +44,6 @@ bench.TURNS, bench.census_town = 1, lambda name, seed: cosfly.load_map(seed=seed
              "bench.NUM_POINTS, bench.NUM_POOL, bench.FRAMES_RELEASED, bench.SIZES['speed'] = 8, 1, 4, (160, 90)"),
     ("bench_release", "memory 800", r"800 frames: main"),
     ("bench_render", "parts --frames 2", r"CPU ms a frame", SMALL_TOWN),
-    ("bench_render", "disk --workers 1 --frames 2", r"To disk[^|]*\|.*\n.*\n\| town", SMALL_TOWN),
     ("bench_render", "memory --frames 20", r"Memory", SMALL_TOWN),
     ("bench_training", "--batch 1 --steps 1", r'"tokens_per_s": \d'),
     ("bench_training", "--check", r'"relative_difference_of_gradients": \d'),

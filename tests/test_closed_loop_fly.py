@@ -1,6 +1,7 @@
 """`cosfly fly`: students after walkers; what it writes, whatever a student answers, and after a kill."""
 
 import json
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -136,7 +137,12 @@ def test_what_a_model_answers_wrong_is_its_own_failure_and_the_flight_goes_on(to
 
 @pytest.mark.slow
 def test_a_model_is_asked_about_all_flights_at_once_and_nothing_twice(town, tmp_path):
-    with TeacherServer(delay_s=0.2) as server:
+    together = threading.Barrier(3)
+
+    def wait(number, body):  # no answer comes before all three flights have asked
+        together.wait(60)
+
+    with TeacherServer(wait) as server:
         flown = fly(town, tmp_path, f"{SHORT} {ONE} --student {server.url}")
         assert (server.most_at_once, len(server.bodies)) == (3, 3 * 6)
         first = server.bodies[0]

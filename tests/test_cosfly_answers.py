@@ -6,9 +6,9 @@ Each case names the kind of server or model that sends it, as public issue threa
 import json
 import time
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tables import each
 
 from cosfly.formats.captions import Coc
 from cosfly.llm.answer_text import normalize_action, parse_answer
@@ -126,20 +126,8 @@ def test_bodies(subtests):
                 assert outcome[0] in found
 
 
-@pytest.mark.parametrize(
-    "usage",
-    [
-        None,
-        [1],
-        "many",
-        {},
-        {"prompt_tokens": None},
-        {"prompt_tokens": -1, "completion_tokens": 3},
-        {"prompt_tokens": 10**30, "completion_tokens": 3},
-        {"prompt_tokens": True, "completion_tokens": 3},
-    ],
-    ids=range(8),
-)
+@each("usage", [None, [1], "many", {}, {"prompt_tokens": None}, *({"prompt_tokens": count, "completion_tokens": 3}
+    for count in (-1, 10**30, True))])  # fmt: skip
 def test_a_count_that_cannot_be_is_none(usage):
     body = json.dumps({"choices": [{"message": {"content": TEXT}}], "usage": usage}).encode()
     assert completed(body) == Reply(TEXT, None, "plain", None)
@@ -355,9 +343,7 @@ CHINESE_TEXTS: list[tuple[str, str, str | None]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("text", "outcome"), [case[1:] for case in CHINESE_TEXTS], ids=[case[0] for case in CHINESE_TEXTS]
-)
+@each(("text", "outcome"), [case[1:] for case in CHINESE_TEXTS])
 def test_chinese_texts(text, outcome):
     parsed = parse_answer(text, "zh")
     if parsed.coc is None:
@@ -399,22 +385,16 @@ def test_decisions(subtests):
 
 # Why the server says that the text ended; what comes of it.
 CUT = [
-    (TEXT, "length", None),
-    (f"```json\n{TEXT}\n```\n\n\n", "length", None),
-    (HALF, "length", "cut_short"),
-    ("", "length", "cut_short"),
-    (f"So I would say {DRAFT}, but then the", "length", "cut_short"),
+    (TEXT, "length", None), (f"```json\n{TEXT}\n```\n\n\n", "length", None), (HALF, "length", "cut_short"),
+    ("", "length", "cut_short"), (f"So I would say {DRAFT}, but then the", "length", "cut_short"),
     (f"So I would say {DRAFT}, but then the", "MAX_TOKENS", "cut_short"),
     (f"<think>So I would say {DRAFT}", "length", "cut_short"),
-    (changed(reasoning_trace="ok"), "length", "reasoning_trace_too_short"),
-    ("", "content_filter", "content_filter"),
-    (TEXT, "stop", None),
-    (HALF, "stop", "broken_json"),
-    (HALF, "tool_calls", "broken_json"),
-]
+    (changed(reasoning_trace="ok"), "length", "reasoning_trace_too_short"), ("", "content_filter", "content_filter"),
+    (TEXT, "stop", None), (HALF, "stop", "broken_json"), (HALF, "tool_calls", "broken_json"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(("text", "finish_reason", "reason"), CUT, ids=range(len(CUT)))
+@each(("text", "finish_reason", "reason"), CUT)
 def test_an_answer_that_was_cut_off_is_no_draft(text, finish_reason, reason):
     assert parse_answer(text, finish_reason=finish_reason).reason == reason
 
@@ -422,14 +402,8 @@ def test_an_answer_that_was_cut_off_is_no_draft(text, finish_reason, reason):
 BEFORE = ["", "\ufeff", "Sure {or not}: ", "<think>left {or} right?</think>", "hm " + DRAFT + "</think>", "```json\n",
     "assistant\n", DRAFT, HALF + "\n"]  # fmt: skip
 AFTER = [
-    "",
-    "\n```",
-    " I hope this {helps}.",
-    "<|im_end|>",
-    "\n<think>so be it</think>",
-    "\u200b",
-    '\n{"confidence": 1}',
-]
+    "", "\n```", " I hope this {helps}.", "<|im_end|>", "\n<think>so be it</think>", "\u200b", '\n{"confidence": 1}',
+]  # fmt: skip
 WRITERS = [
     lambda value: json.dumps(value),
     lambda value: json.dumps(value, ensure_ascii=False, indent=1),
@@ -452,13 +426,16 @@ def test_the_very_object_comes_back_from_any_noise(first, second, before, after,
     assert json.dumps(found.value) == json.dumps(value)
 
 
-@pytest.mark.parametrize(
-    "text",
-    ['{"a":' * 19_999, '{"' * 49_999, "<think>" * 14_000, '{"a":[{},' * 11_000, "<|" + "a:" * 49_000,
-        '{"a":"' + '\\"{' * 30_000],
-    ids=range(6),
-)  # fmt: skip
+@each("text", [
+    '{"a":' * 19_999, '{"' * 49_999, "<think>" * 14_000, '{"a":[{},' * 11_000, "<|" + "a:" * 49_000,
+    '{"a":"' + '\\"{' * 30_000,
+])  # fmt: skip
 def test_no_text_takes_quadratic_time(text):
-    start_s = time.process_time()
-    find_object(text, GOOD)
-    assert time.process_time() - start_s < 8.0  # they take below 2 s; a quadratic one took 40
+    """A quarter of a text takes a quarter of the time; of a quadratic reader a sixteenth, and so little that it does
+    not count."""
+    seconds = []
+    for part in (text[: len(text) // 4], text):
+        start_s = time.process_time()
+        find_object(part, GOOD)
+        seconds.append(time.process_time() - start_s)
+    assert seconds[1] < 9 * seconds[0] + 0.5

@@ -55,12 +55,7 @@ def test_bad_overrides_and_files(tmp_path):
         with pytest.raises(ConfigError):
             load(Outer, None, [override])
     file = tmp_path / "c.yaml"
-    for text, words in (
-        ("[1, 2]", "not a mapping"),
-        ("a: [", "not valid YAML"),
-        ("a: !!python/object/apply:os.system ['x']", "not valid YAML"),
-        ("plan: {altitude_m: 30}\nseed: 3\nplan: {}\n", "'plan' is given twice"),
-    ):
+    for text, words in (("[1, 2]", "not a mapping"), ("a: [", "not valid YAML")):
         file.write_text(text)
         with pytest.raises(ConfigError, match=words):
             load(Outer, file)

@@ -1,6 +1,7 @@
 """cosfly/pedestrians/crossings.py: what is under the feet, what a crossing is, and that walkers keep to it."""
 
 import numpy as np
+import pytest
 from tables import each
 
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory
@@ -74,7 +75,7 @@ def shares(cfg: RunConfig, name: str, num_others: int = 0) -> tuple[float, float
     return counts[0] / counts[2], counts[1] / counts[2]
 
 
-@each("name", ["old_town", "park", "river"])
+@pytest.mark.parametrize("name", ["park", *(pytest.param(n, marks=pytest.mark.slow) for n in ("old_town", "river"))])
 def test_at_most_a_twentieth_of_the_walked_points_of_shipped_towns_is_on_the_road_away_from_crossings(name):
     away, on_crossings = shares(load(RunConfig, shipped("diverse.yaml")), name)
     assert away <= 0.05

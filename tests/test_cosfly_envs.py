@@ -190,14 +190,14 @@ def ask(follow, tmp_path, monkeypatch):
     follow.reset(seed=0)
     observation = SimpleNamespace(simulation=follow._simulation, moments=[follow._now])
 
-    def answers(name, limit_s=60.0, first_s=None):
-        policy = Policy(f"own:{name}", first_s or limit_s, 0)
-        found = []
+    def answers(name, limit_s=60.0, slow_at=None):
+        policy = Policy(f"own:{name}", limit_s, 0)
+        found, go = [], tmp_path / "go"
         try:
-            for one in ["a", "a", "a", "a", "b"]:
+            for number, one in enumerate("aaaab"):
+                policy._limit_s = limit_s if number != slow_at else 0.5
+                go.touch() if number != slow_at else go.unlink()
                 found.append(policy.decide([SimpleNamespace(**vars(observation), episode=one)])[0])
-                (tmp_path / "go").touch()
-                policy._limit_s = limit_s
             return found
         finally:
             policy.close()
@@ -223,7 +223,7 @@ def test_what_a_policy_started_ends_with_it(ask, tmp_path):
 
 
 def test_a_slow_answer_is_late_once_and_the_next_ones_are_in_time(ask):
-    assert [one.answer for one in ask("Slow", first_s=1.0)][:4] == ["late", "ok", "ok", "ok"]
+    assert [one.answer for one in ask("Slow", slow_at=1)] == ["ok", "late", "ok", "ok", "ok"]
     assert MOST_LATE > 1
 
 

@@ -25,14 +25,11 @@ def names(tree: Path, **choice) -> list[str]:
 
 def test_patterns_are_of_folders_and_those_above_them(tree):
     for choice, count in (
-        ({}, 8),
-        ({"match": ("Town01",)}, 4),
-        ({"match": ("Town0[12]*/trajectory_177708*",)}, 4),
+        ({}, 8), ({"match": ("Town01",)}, 4), ({"match": ("Town0[12]*/trajectory_177708*",)}, 4),
         ({"match": ("*/ORI",)}, 4),
         ({"match": ("Town01/trajectory_1777083733/ORI", "Town02_Opt/trajectory_1777090000/")}, 3),
-        ({"tracks": ("clean",)}, 4),
-        ({"match": ("Town02*",), "tracks": ("perturbed",)}, 2),
-    ):
+        ({"tracks": ("clean",)}, 4), ({"match": ("Town02*",), "tracks": ("perturbed",)}, 2),
+    ):  # fmt: skip
         found = names(tree, **choice)
         assert len(found) == count
         assert set(found) <= set(names(tree))

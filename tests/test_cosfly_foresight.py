@@ -40,27 +40,6 @@ def test_the_wished_places_are_in_the_lattice_and_cost_nothing():
         assert made.radius_max_m == pytest.approx(away_m.max())
 
 
-@each("seed", range(2))
-def test_the_survey_measures_what_the_kernels_measure(seed):
-    obstacles = random_town(seed)
-    scenario = straight_scenario(obstacles)
-    made = foresight.make_lattice(scenario, climbing=seed % 2 == 1)
-    places, targets = made.places_m.reshape(len(made.frames), -1, 3), scenario.targets_m[made.frames]
-    aloft = foresight.boxes_aloft(obstacles, scenario.targets_m, made)
-    gaps, hidden = np.zeros(places.shape[:2]), np.full(places.shape[:2], -1.0)
-    foresight._survey(places, targets, obstacles, aloft.rows, 3.0, foresight.REACH_M, gaps, hidden)
-    flat = places.reshape(-1, 3)
-    expected, _ = kernels.signed_distances(obstacles, flat, foresight.REACH_M)
-    free = expected >= 3.0
-    np.testing.assert_array_equal(gaps.ravel() >= 3.0, free)
-    np.testing.assert_allclose(gaps.ravel()[free], expected[free], atol=1e-9)
-    seen = kernels.visibility(obstacles, flat, np.repeat(targets, places.shape[1], axis=0))
-    np.testing.assert_allclose(hidden.ravel()[free], 1.0 - seen[free])
-    assert (hidden.ravel()[~free] == -1.0).all()
-    assert 0 < free.mean() < 1
-    assert 0 < seen.mean() < 1
-
-
 def cheapest_by_trying_all(places, own, longest_m, index, clearance_m, links, num_azimuths, max_turn, way_cost):
     """The least cost of any sequence of places, each step asked of the kernels."""
     free = kernels.signed_distances(index, places.reshape(-1, 3), 50.0)[0].reshape(own.shape) >= clearance_m

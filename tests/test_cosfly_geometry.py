@@ -5,14 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from cosfly.geometry.axes import (
-    intrinsic_matrix,
-    look_at,
-    mirror_poses,
-    project,
-    rotation_matrix,
-    world_from_camera,
-)
+from cosfly.geometry.axes import intrinsic_matrix, look_at, mirror_poses, project, rotation_matrix, world_from_camera
 
 angles = st.floats(-180, 180)
 

@@ -13,14 +13,7 @@ import pytest
 from tables import each
 
 from cosfly.formats.boxes import make_box_map, read_boxes, write_boxes
-from cosfly.formats.frames import (
-    BystanderMeta,
-    BystandersMeta,
-    depth_file,
-    frame_name,
-    read_depth,
-    read_instance,
-)
+from cosfly.formats.frames import BystanderMeta, BystandersMeta, depth_file, frame_name, read_depth, read_instance
 from cosfly.formats.inspection import read_inspection
 from cosfly.formats.issues import Report
 from cosfly.formats.kinds import KINDS

@@ -15,7 +15,6 @@ from test_cosfly_map_kinds import document, load
 
 from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.formats.kinds import KINDS
-from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.footprints import united
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map, run
@@ -85,14 +84,13 @@ def test_a_wrong_town_is_a_config_error(given, words):
 
 def node(name: str, x: float, y: float, yaw: float = 0.0, z: float = 0.0, scale: float = 1.0) -> dict:
     return {
-        "id": f"GEN_{name}",
-        "instance_name": name,
+        "id": f"GEN_{name}", "instance_name": name,
         "properties": {
             "location": {"x": x, "y": y, "z": z},
             "orientation": {"pitch": 0, "yaw": yaw, "roll": 0},
             "scale": {"x": scale, "y": scale, "z": scale},
         },
-    }
+    }  # fmt: skip
 
 
 def write_world(folder: Path, *nodes: dict, sizes: dict | None = None) -> SimWorldConfig:
@@ -209,14 +207,6 @@ def test_courtyards_stay_open(tmp_path: Path):
     court = Point(20 - boxes.header.offset_m["x"], 20 - boxes.header.offset_m["y"])
     assert union.distance(court) > 7  # 10 m, less what a fill of 0.9 may take
     assert 1319.9 < union.area < 1320 / 0.9
-
-
-@pytest.fixture(scope="module")
-def delft() -> BoxMap:
-    path = Path(__file__).resolve().parents[2] / "shared" / "data" / "delft-bgt-lod1" / "delft.json.gz"
-    if not path.is_file():
-        pytest.skip(f"the real map is not here: {path}")
-    return load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(name="Delft", path=path)))
 
 
 def test_stage_writes_the_same_bytes_and_resumes(tmp_path: Path):

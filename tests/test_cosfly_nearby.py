@@ -1,14 +1,12 @@
-"""Remembered boxes answer as the index, the band solver as a library; a flight does not depend on the memory."""
+"""Remembered boxes answer as the index; a flight does not depend on the memory."""
 
 import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scipy.linalg import solveh_banded
-from tables import each
 
 from cosfly.geometry import kernels
 from cosfly.planners.contract import PlanConfig, Scenario
-from cosfly.planners.muco import loss, muco, nearby, step
+from cosfly.planners.muco import muco, nearby, step
 from cosfly.planners.reference_trajectory import follow
 
 
@@ -46,24 +44,6 @@ def test_memory_answers_as_the_index_does(seed, count, far):
             assert not far
             hits = nearby.hits_among(index.rows, memory.on_view, i, number, *x, *p, 0.8, room)
             assert set(room[:hits].tolist()) == wanted
-
-
-@each("num_points", [3, 4, 30])
-def test_the_band_solver_agrees_with_a_library(num_points):
-    rng = np.random.default_rng(num_points)
-    size = 3 * num_points
-    factor = np.tril(rng.normal(size=(size, size))) * (np.abs(np.subtract.outer(range(size), range(size))) < 10)
-    matrix = factor @ factor.T + 5 * np.eye(size)
-    matrix *= np.abs(np.subtract.outer(range(size), range(size))) < loss.BAND_ROWS
-    matrix += np.diag(np.abs(matrix).sum(axis=1))
-    band = np.zeros((loss.BAND_ROWS, size))
-    for k in range(min(loss.BAND_ROWS, size)):
-        band[k, : size - k] = np.diag(matrix, -k)
-    damping, gradient = rng.uniform(0, 3, num_points), rng.normal(size=(num_points, 3))
-    interior = band[: min(loss.BAND_ROWS, size - 6), 3:-3].copy()
-    interior[0] += np.repeat(damping[1:-1], 3)
-    expected = solveh_banded(interior, -gradient[1:-1].reshape(-1), lower=True).reshape(-1, 3)
-    np.testing.assert_allclose(step.solve_band(band, damping, gradient), expected, rtol=1e-9, atol=1e-12)
 
 
 def test_a_flight_does_not_depend_on_the_memory(monkeypatch):

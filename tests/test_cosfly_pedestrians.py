@@ -14,13 +14,7 @@ from cosfly.geometry.axes import DT_S
 from cosfly.geometry.grid import OccupancyGrid
 from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.crossings import costs_of
-from cosfly.pedestrians.stage import (
-    PedestriansConfig,
-    WalkableGround,
-    make_pedestrian,
-    run,
-    walkable_ground,
-)
+from cosfly.pedestrians.stage import PedestriansConfig, WalkableGround, make_pedestrian, run, walkable_ground
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.seeding import rng_for
 

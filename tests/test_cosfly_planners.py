@@ -102,27 +102,6 @@ def test_gradient_is_the_derivative_of_the_loss():
         assert gradient[i, axis] == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4, abs=1e-3)
 
 
-def test_curvature_is_positive_and_exact_for_the_quadratic_terms():
-    points, problem, obstacles = shaken("empty")
-    quadratic = problem._replace(
-        weights=problem.weights * np.array([0, 1, 1, 0, 0, 0, 0]), pitch_weight=0.0, bearing_weight=0.0,
-        altitude_weights=np.array([0, 0, 8.0, 0]),
-    )  # fmt: skip
-    state, unmasked = loss.make_state(len(points), 0), np.zeros(len(points), dtype=bool)
-
-    def dense(problem):
-        loss.evaluate(points, problem, obstacles, unmasked, state)
-        size = 3 * len(points)
-        matrix = sum(np.diag(state.band[k, : size - k], -k) for k in range(loss.BAND_ROWS))
-        return matrix + np.tril(matrix, -1).T, state.gradient.reshape(-1).copy(), state.terms.sum()
-
-    matrix, gradient, value = dense(quadratic)
-    x = points.reshape(-1)
-    np.testing.assert_allclose(matrix @ x, gradient, atol=1e-8)
-    assert 0.5 * x @ matrix @ x == pytest.approx(value)
-    assert np.linalg.eigvalsh(dense(problem)[0]).min() > -1e-8
-
-
 @each("world", WORLDS)
 def test_the_loss_never_rises_and_the_flight_is_safe(world):
     scenario, obstacles = scenario_of(world)
@@ -208,14 +187,6 @@ def test_the_end_is_within_five_percent_of_a_general_solver(world):
         loss_and_gradient, first[1:-1].reshape(-1), jac=True, method="L-BFGS-B", bounds=bounds, options=settings
     )
     assert solver["loss_end"] <= 1.05 * general.fun
-
-
-def test_a_thin_wall_between_two_waypoints_is_a_collision():
-    wall = kernels.obstacle_index(town_of(((0, 0, 20), (0.01, 50, 40))))
-    points = np.array([[-2.45, 0, 20.0], [2.45, 0, 20.0]])
-    problem = muco.make_problem(scenario_of("empty")[0], CFG)._replace(floor_m=2.0)
-    assert not step.is_feasible(points, problem, wall, nothing_nearby(len(points)))
-    assert step.is_feasible(points - np.array([5.0, 0, 0]), problem, wall, nothing_nearby(len(points)))
 
 
 @each("name", ["five_ray_mean", "accel_rms_mps2", "jerk_rms_mps3"])

@@ -1,7 +1,6 @@
 """The PNG reader and writer against libraries', on pictures of every filter, packing and number of channels."""
 
 import io
-import struct
 import zlib
 
 import cv2
@@ -10,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from specimens_png import png_around
 
 from cosfly.formats.png import areas_png, colours_png, floats_of, floats_png, parse_png
 from cosfly.runtime.errors import InputError
@@ -17,24 +17,12 @@ from cosfly.runtime.errors import InputError
 KIND_OF = {1: 0, 2: 4, 3: 2, 4: 6}
 
 
-def chunk(name: bytes, data: bytes | memoryview) -> bytes:
-    body = name + bytes(data)
-    return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
-
-
 def png_of(lines: np.ndarray, channels: int, level: int, strategy: int, piece: int) -> bytes:
     """A PNG of filtered rows, (h, 1 + w * channels)."""
     packer = zlib.compressobj(level, strategy=strategy)
     packed = packer.compress(lines.tobytes()) + packer.flush()
-    return png_around(packed, lines.shape[0], (lines.shape[1] - 1) // channels, channels, piece)
-
-
-def png_around(packed: bytes, height: int, width: int, channels: int, piece: int = 1 << 20) -> bytes:
-    head = struct.pack(">IIBBBBB", width, height, 8, KIND_OF[channels], 0, 0, 0)
-    parts = [packed[k : k + piece] for k in range(0, len(packed), piece)]
-    return (
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + b"".join(chunk(b"IDAT", p) for p in parts) + chunk(b"IEND", b"")
-    )
+    width = (lines.shape[1] - 1) // channels
+    return png_around(packed, width, len(lines), KIND_OF[channels], piece=piece)
 
 
 def content(rng: np.random.Generator, height: int, stride: int) -> np.ndarray:
@@ -71,7 +59,7 @@ def test_a_picture_that_is_not_what_its_header_says_is_refused():
         zlib.compress(lines.tobytes() + b"\0"), zlib.compress(lines.tobytes()[:-1]), zlib.compress(bytes(50_000_000)),
         zlib.compress(lines.tobytes())[:-1], zlib.compress(wrong.tobytes()), b"",
     ]  # fmt: skip
-    refused = [whole[:cut] for cut in (0, 7, 20, 33, 60, -1, -12, -20)] + [png_around(p, 20, 20, 3) for p in packed]
+    refused = [whole[:cut] for cut in (0, 7, 20, 33, 60, -1, -12, -20)] + [png_around(p, 20, 20) for p in packed]
     for data in refused:
         with pytest.raises(InputError):
             parse_png(data, "x")

@@ -73,12 +73,6 @@ def test_captions_of_another_tree_are_refused(run):
         run_dir.checked_inputs(two | {"0.captions": captions})
 
 
-def test_a_map_that_the_plan_was_not_made_on_is_refused(run):
-    other = make(run / "s2", "simplify", {"map.json": "other boxes"}) / "map.json"
-    with pytest.raises(VerifyError, match=r"traces\.json: it was made of another input 'map'"):
-        run_dir.checked_inputs({"simplified": other, "traces": run / "plan/traces.json"})
-
-
 @pytest.mark.parametrize("name", ["manifest.json", "stage.json"])
 def test_a_stage_without_its_records_is_not_finished(run, name):
     (run / "caption" / name).unlink()

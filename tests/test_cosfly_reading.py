@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 from pydantic import BaseModel
 from shapely.geometry import Polygon
+from specimens_png import png_around
 from tables import each
 from typer.testing import CliRunner
 
@@ -24,7 +25,7 @@ from cosfly.cli import app
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.frames import depth_bytes, read_depth, rgb_bytes
 from cosfly.maps import cityjson
-from cosfly.maps.footprints import check_outline, num_crossings
+from cosfly.maps.footprints import check_outline
 from cosfly.runtime import arrays, json_io, tables
 from cosfly.runtime import io as files
 from cosfly.runtime.config import Config, apply_overrides, build, read_yaml
@@ -61,14 +62,8 @@ def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path, monke
     elif kind != "missing":
         path.symlink_to("/dev/zero" if kind == "device" else path)
     for read in (
-        read_boxes,
-        read_failures,
-        read_yaml,
-        read_text,
-        arrays.read_picture,
-        files.sha256_file,
-        tables.num_rows,
-    ):
+        read_boxes, read_failures, read_yaml, read_text, arrays.read_picture, files.sha256_file, tables.num_rows,
+    ):  # fmt: skip
         with pytest.raises((InputError, ConfigError), match=path.name):
             read(path)
 
@@ -217,19 +212,6 @@ def test_other_arrays_are_refused(data):
         arrays.parse_array(data, "x", dtype=np.float32, ndim=2)
 
 
-def _png(width: int, height: int) -> bytes:
-    """A PNG whose header and checksums are right, with hardly any pixels."""
-    parts = [
-        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)),
-        (b"IDAT", zlib.compress(b"\0" * 9)),
-        (b"IEND", b""),
-    ]
-    chunks = [
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts
-    ]
-    return arrays.PNG_SIGNATURE + b"".join(chunks)
-
-
 def test_a_picture_is_measured_before_it_is_decoded(monkeypatch):
     picture = rgb_bytes(np.zeros((40, 60, 3), np.uint8))
     assert arrays.png_size(picture) == (60, 40)
@@ -237,7 +219,7 @@ def test_a_picture_is_measured_before_it_is_decoded(monkeypatch):
     monkeypatch.setattr(cv2, "imdecode", None)
     for width, height in ((32_000, 32_000), (2**32 - 1, 2**32 - 1), (8192**2 + 1, 1)):
         with pytest.raises(InputError, match=r"got \d+ x \d+ px; expected at most 8192 x 8192 px"):
-            arrays.parse_picture(_png(width, height), "x")
+            arrays.parse_picture(png_around(zlib.compress(b"\0" * 9), width, height), "x")
 
 
 def test_a_chunk_that_goes_on_beyond_the_file_gets_no_memory(monkeypatch):
@@ -373,15 +355,6 @@ def test_hostile_settings_are_one_clear_line(tmp_path, case):
 
 def test_a_date_is_the_text_that_it_looks_like():
     assert build(_Dated, apply_overrides({}, ["name=2026-11-22"]), "x").name == "2026-11-22"
-
-
-def test_crossings_are_counted():
-    square = [(0, 0), (4, 0), (4, 4), (0, 4)]
-    assert num_crossings(Polygon(square)) == 0
-    assert num_crossings(Polygon([(0, 0), (4, 4), (4, 0), (0, 4)])) == 1
-    assert num_crossings(Polygon(square, [[(1, 1), (2, 1), (2, 1), (2, 2)]])) == 0
-    assert num_crossings(Polygon(square, [[(3, 1), (5, 1), (5, 2)]])) == 2
-    assert num_crossings(Polygon([(0, 0), (9, 0), (3, 0), (6, 0), (1, 5)])) > 1  # back and forth
 
 
 def test_an_outline_that_crosses_itself_now_and_then_is_mended():

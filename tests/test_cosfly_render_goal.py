@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from test_cosfly_render import needs_gl
@@ -10,19 +9,15 @@ from test_renderers_contract import circling, pose_towards, write_inputs
 
 from cosfly.formats.boxes import make_box_map
 from cosfly.formats.bystanders import Bystander, Bystanders, write_bystanders
-from cosfly.formats.frames import PERSON_ID, read_depth, read_instance, read_rgb
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.people import Appearance, People
-from cosfly.formats.playback import TARGET_FILE, read_track
-from cosfly.formats.tracks import find_tracks
-from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
-from cosfly.geometry.goals import LANDMARKS, SIDES, SeenFrame, meant, target_picture, words_of
+from cosfly.geometry.axes import intrinsic_matrix
+from cosfly.geometry.goals import LANDMARKS, SIDES, target_picture
 from cosfly.render.contract import Frame, PosedBystander, PosedPerson, other_id
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.track import find_goal
-from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.config import build
 
 LOOKS = Appearance("man", "jacket", "blue", "trousers", "red")
@@ -70,29 +65,6 @@ def make_crowded_tree(folder):
     )
     cfg = build(RenderConfig, {"width_px": 320, "height_px": 180, "fovs_deg": [60.0]}, "test")
     run(cfg, *write_inputs(folder / "in", traces), folder / "out", seed=2, others=folder / "others.json")
-
-
-@pytest.mark.slow
-@needs_gl
-def test_of_all_in_a_crowd_a_goal_means_the_target_alone(crowded_tree):
-    tree = crowded_tree
-    flights = [read_track(folder) for folder in find_tracks(tree)]
-    assert len(flights) == 4
-    for flight in flights:
-        goal, people = flight.goal, flight.people
-        assert goal is not None
-        assert people is not None
-        frame = flight.frame_folder(goal.frame)
-        kinds, ids = read_instance(frame)
-        rotation = world_from_camera(flight.positions_m[goal.frame], flight.rotations_deg[goal.frame])[:3, :3]
-        seen = SeenFrame(kinds, ids, read_depth(frame), flight.camera_at(goal.frame).intrinsic, rotation)
-        assert len({*people.others} & {*np.unique(ids).tolist()}) > 1, "no crowd"
-        assert meant(goal.says, people.target, {PERSON_ID: people.target, **people.others}, seen) == {PERSON_ID}
-        assert {"en": goal.en, "zh": goal.zh} == words_of(goal.says, people.target)
-        assert all(not flight.legibility_at(i)["legible"] for i in range(goal.frame)) or goal.frame == 0
-        shown = read_picture(flight.folder / TARGET_FILE, tree=tree)
-        expected = target_picture(read_rgb(frame), flight.target.mask_bbox[goal.frame].tolist())
-        np.testing.assert_array_equal(cv2.cvtColor(shown, cv2.COLOR_BGR2RGB), expected)
 
 
 def test_a_target_picture_holds_the_person_and_stays_inside():

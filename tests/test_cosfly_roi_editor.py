@@ -130,14 +130,9 @@ def test_only_our_own_page_is_answered(map_file, tmp_path):
         assert server.host.startswith("127.0.0.1:")
         assert asked(server, "GET", ours)[0] == 200
         for path in (
-            "/",
-            "/save",
-            f"/{server.token}x/",
-            f"/{server.token[:-1]}/",
-            "/../../etc/passwd",
-            f"{ours}../../etc/passwd",
-            f"{ours}save",
-        ):
+            "/", "/save", f"/{server.token}x/", f"/{server.token[:-1]}/", "/../../etc/passwd",
+            f"{ours}../../etc/passwd", f"{ours}save",
+        ):  # fmt: skip
             assert asked(server, "GET", path)[0] == 404, path
         assert asked(server, "GET", ours, Host="evil.example")[0] == 404
         assert asked(server, "POST", f"{ours}save", body, Origin="http://evil.example")[0] == 404

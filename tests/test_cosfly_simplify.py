@@ -13,15 +13,7 @@ from tables import each
 from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.formats.kinds import KINDS
 from cosfly.runtime.errors import ResumeError
-from cosfly.simplify.passes import (
-    SimplifyConfig,
-    clusters,
-    crop_below_ground,
-    fill_share,
-    merge,
-    prune_nested,
-    simplify,
-)
+from cosfly.simplify.passes import SimplifyConfig, clusters, crop_below_ground, merge, prune_nested, simplify
 from cosfly.simplify.stage import cross_validate, run
 
 VEGETATION, BUILDINGS, STATIC, ROADS = (KINDS[name] for name in ("Vegetation", "Buildings", "Static", "Roads"))
@@ -60,21 +52,18 @@ def random_map(seed: int, count: int, size_m: float = 30.0) -> BoxMap:
     ("Buildings", (5.0, 0, 0), 1),
     ("Buildings", (5.0, 5.1, 0), 2),
     ("Static", (0.0, 0, 0), 2),  # not merged by default
+    ("Buildings Vegetation", (0.0, 0, 0), 2),  # of two kinds
 ])  # fmt: skip
 def test_merge_follows_the_gap_rule(kind, gap, count):
     shift = np.where(np.array(gap) == 0, 0.0, 1.0 + np.array(gap))
-    pair = box_map((kind, (0, 0, 0), (1, 1, 1)), (kind, shift, shift + 1))
+    kinds = kind.split()
+    pair = box_map((kinds[0], (0, 0, 0), (1, 1, 1)), (kinds[-1], shift, shift + 1))
     merged = simplify(pair, only("merge", min_fill=0.0, min_canopy_fill=0.0)).box_map
     assert len(merged) == count
     if count == 1:
         assert merged.ids.tolist() == [1]
         np.testing.assert_allclose(merged.mins[0], np.minimum(0, shift))
         np.testing.assert_allclose(merged.maxs[0], np.maximum(1, shift + 1))
-
-
-def test_kinds_never_merge_with_each_other():
-    touching = box_map(("Buildings", (0, 0, 0), (4, 4, 5)), ("Vegetation", (4, 0, 0), (8, 4, 5)))
-    assert len(simplify(touching, only("merge", min_fill=0.0, min_canopy_fill=0.0)).box_map) == 2
 
 
 def slow_clusters(mins, maxs, gap_m):
@@ -123,16 +112,6 @@ def test_the_guard_keeps_a_street_between_two_askew_rows_and_the_papers_rule_doe
     walkable = [cross_validate(street, m)["simplified_walkable_m2"] for m in (plain, guarded)]
     assert walkable[0] == 0.0
     assert walkable[1] > 0.9 * cross_validate(street, street)["raw_walkable_m2"]
-
-
-@each(("rectangle", "share"), [
-    ((0.5, 0.5, 1.0, 0.0, 0.5, 0.5), 1.0),
-    ((0.25, 0.5, 1.0, 0.0, 0.25, 0.5), 0.5),
-    ((0.5, 0.5, np.sqrt(0.5), np.sqrt(0.5), np.sqrt(0.125), np.sqrt(0.125)), 0.5),  # a square on its corner
-    ((5.0, 5.0, 1.0, 0.0, 0.5, 0.5), 0.0),
-])  # fmt: skip
-def test_fill_share(rectangle, share):
-    assert fill_share(np.array([rectangle]), np.zeros(2), np.ones(2)) == pytest.approx(share, abs=0.02)
 
 
 def test_full_trunks_are_the_papers_split():

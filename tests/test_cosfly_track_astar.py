@@ -4,36 +4,12 @@ import itertools
 
 import numpy as np
 import pytest
-from specimens_planning import WORLDS, first_points, town_of, walk_along
+from specimens_planning import WORLDS, first_points, walk_along
 
 import cosfly.planners.stage as planners
 from cosfly.geometry import kernels
-from cosfly.planners import line_of_sight as sight
 from cosfly.planners import track_astar
 from cosfly.planners.contract import PlanConfig, TrackAStarConfig
-
-
-def random_town(seed):
-    """Fifty turned boxes round the origin, some above it, some beside it, one of them small."""
-    rng = np.random.default_rng(seed)
-    centers = np.column_stack([rng.uniform(-60, 60, (50, 2)), rng.uniform(0, 40, 50)])
-    halves, turns = rng.uniform(0.2, 9, (50, 3)), rng.uniform(-180, 180, 50)
-    return kernels.obstacle_index(town_of(*zip(centers, halves, turns, strict=True)))
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_a_look_sees_what_the_kernel_sees(seed):
-    obstacles, rng = random_town(seed), np.random.default_rng(seed)
-    target = np.array([*rng.uniform(-30, 30, 2), 1.0])
-    points = target + np.column_stack([rng.uniform(-60, 60, (800, 2)), rng.uniform(19, 90, 800)])
-    points[0] = target + np.array([0, 0, 30])  # straight above
-    away = np.hypot(*(points - target)[:, :2].T)
-    slopes = (points[:, 2] - target[2] - sight.FOOT_LOW_M) / np.maximum(away, 1.0)
-    horizon = sight.make_horizon(obstacles, target, away.max(), slopes.min())
-    seen = [sight.look(obstacles, horizon, target, *point) for point in points]
-    expected = kernels.visibility(obstacles, points, np.repeat(target[None], len(points), axis=0))
-    np.testing.assert_array_equal(seen, expected)
-    assert 0.02 < expected.mean() < 0.98  # the sample holds both
 
 
 def cost_of(places, targets, obstacles, cfg, start):

@@ -3,12 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.pedestrians.speed_model import (
-    PACES,
-    TimedRoute,
-    standing_time_s,
-    take_pace,
-)
+from cosfly.pedestrians.speed_model import PACES, TimedRoute, standing_time_s, take_pace
 
 
 def test_even_speed_gives_even_steps_and_ends_at_the_goal():

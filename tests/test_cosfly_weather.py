@@ -87,13 +87,11 @@ def test_a_bad_pool_is_one_error_with_all_its_problems(tmp_path):
         ("presets: {a: {cloudiness: 1, fog_density: 5, fog_distance: 9}}", ["presets.a.precipitation", "required"]),
         (f"presets: {{a: {{{outside}}}}}", many),
         (f"presets: {{a: {{cloudyness: 1, {rest}}}", ["did you mean 'cloudiness'"]),
-        (f"presets: {{a: {{cloudiness: on, {rest}}}", ["presets.a.cloudiness"]),
-        ("presets: {}", ["presets"]),
-        ("{}", ["presets"]),
-        ("presets: [1]", ["presets"]),
+        (f"presets: {{a: {{cloudiness: on, {rest}}}", ["presets.a.cloudiness"]), ("presets: {}", ["presets"]),
+        ("{}", ["presets"]), ("presets: [1]", ["presets"]),
         (f"presets: {{a b: &x {{cloudiness: 1, {rest}, a_b: *x}}", ["two presets have the same name"]),
         ("!!python/object:os.system {}", ["tag"]),
-    ):
+    ):  # fmt: skip
         sky.write_text(text)
         with pytest.raises(ConfigError) as caught:
             read_pools(config(**RANDOM, weather_pool=str(sky)))

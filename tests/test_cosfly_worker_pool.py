@@ -9,21 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from processes import children_of, is_running, wait_until
-from toy_workers import make_worker, stage_in
+from processes import QUICK, children_of, is_running, wait_until
+from toy_workers import items_of, make_worker, stage_in
 
 from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.events import LOSSES, read_events
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Failed
-from cosfly.runtime.worker import Item
-
-# Stands still after 2 s, and a while before its item has taken too long, or chance would say which of them it was.
-QUICK = Watch(item_limit_s=3.2, heartbeat_s=0.1, check_s=0.4, probe_s=0.3, failed_checks=5)
-
-
-def items_of(*kinds: str) -> list[Item]:
-    return [Item(f"i{k}", (kind, bytes(1_000_000))) for k, kind in enumerate(kinds)]  # more than a pipe holds
 
 
 def work_on(path: Path, kinds: list[str], workers: int, watch: Watch = QUICK):

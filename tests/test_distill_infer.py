@@ -17,7 +17,7 @@ from distill.inference import stage as infer
 from distill.schema import open_split
 from specimens import make_playback_tree
 
-ENDPOINT = {"max_tries": 1, "timeout_s": 5.0, "concurrency": 3}
+ENDPOINT = {"max_tries": 1, "timeout_s": 60.0, "concurrency": 3}
 
 
 @pytest.fixture(scope="module")

@@ -5,10 +5,8 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from commands import invoke
-from specimens_captions import WAY
 from specimens_distill import ADAPTER_PIXELS, make_adapter, make_captions, prepared
 from specimens_students import features_of, inputs_of
 
@@ -17,9 +15,7 @@ pytest.importorskip("peft", reason="needs the extra distill")
 
 from teacher_server import kept_answers  # noqa: E402
 
-from caption.answer_formats.contract import more_fields  # noqa: E402
 from cosfly.formats.predictions import Prediction, read_predictions  # noqa: E402
-from cosfly.llm.answer_text import answer_schema, parse_answer  # noqa: E402
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
@@ -30,6 +26,8 @@ from distill.student.encoding import encode_text  # noqa: E402
 from distill.student.model import load_student  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
 from specimens import make_playback_tree  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 NUM_TOKENS = 12
 
@@ -157,32 +155,6 @@ def test_constrained_answers_all_parse(place, clean, tmp_path):
             assert prediction.raw.startswith('{"critical_components":"')
     again = answer(place, tmp_path / "one", constrained=True, max_new_tokens=900, max_samples=2, batch_size=1)
     assert told(read_predictions(again)) == told(predictions)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
-def test_noise_under_a_teachers_schema_parses_too(place, seed):
-    """Random tokens that a request's grammar allows, claims among them, as a server of random weights sends them."""
-    llguidance = pytest.importorskip("llguidance")
-    from llguidance.hf import from_tokenizer
-
-    schema = answer_schema(more=more_fields(WAY))
-    tokenizer = load_student(place / "student", device="cpu", max_pixels=ADAPTER_PIXELS).tokenizer
-    grammar = llguidance.LLMatcher.grammar_from_json_schema(schema, defaults={"whitespace_flexible": False})
-    matcher, ids = llguidance.LLMatcher(from_tokenizer(tokenizer), grammar), list[int]()
-    rng, quote = np.random.default_rng(seed), tokenizer.convert_tokens_to_ids('"')  # which ends a string
-    while not matcher.is_stopped():
-        allowed = np.flatnonzero(np.unpackbits(np.frombuffer(matcher.compute_bitmask(), np.uint8), bitorder="little"))
-        ids.append(int(quote if quote in allowed and rng.random() < 0.3 else rng.choice(allowed)))
-        assert matcher.consume_token(ids[-1])
-    text = tokenizer.decode(ids, skip_special_tokens=True)
-    parsed = parse_answer(text, "en", (*WAY.optional, "therefore"), optional=WAY.optional)
-    # No schema keeps noise from other alphabets, or from a claim of 1e999.
-    noise = ("wrong_language", "unreadable_character", "not_finite")
-    assert parsed.coc is not None or parsed.reason.endswith(noise), (parsed.reason, text)
-
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_a_merged_student_sees_pictures_as_it_was_taught(place, tmp_path):

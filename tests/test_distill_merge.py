@@ -12,12 +12,11 @@ pytest.importorskip("peft", reason="needs the extra distill")
 
 from safetensors.torch import load_file, save_file  # noqa: E402
 from specimens_distill import make_adapter  # noqa: E402
-from specimens_students import inputs_of, samples_of, trees_of  # noqa: E402
 
 from cosfly.runtime.errors import InputError  # noqa: E402
 from cosfly.runtime.json_io import write_json  # noqa: E402
 from distill.inference import merge  # noqa: E402
-from distill.student.model import Student, load_student  # noqa: E402
+from distill.student.model import load_student  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -25,18 +24,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 PIXELS = 64 * 64
 
 
-def make_calm_student(folder: Path) -> Path:
-    """A random student whose layers change little, as those of a trained one: else a rounding grows from layer to
-    layer."""
-    path = make_tiny_student(folder, seed=2) / "model.safetensors"
-    tensors = {n: t * 0.25 if ".layers." in n and t.ndim == 2 else t for n, t in load_file(path).items()}
-    save_file(tensors, path, {"format": "pt"})
-    return folder
-
-
 @pytest.fixture(scope="module")
 def base(tmp_path_factory) -> Path:
-    folder = make_calm_student(tmp_path_factory.mktemp("base") / "student")
+    folder = make_tiny_student(tmp_path_factory.mktemp("base") / "student", seed=2)
     # Any file that servers need.
     shutil.copy(folder / "generation_config.json", folder / "video_preprocessor_config.json")
     return folder
@@ -47,31 +37,7 @@ def adapter(base, tmp_path_factory) -> Path:
     return make_adapter(base, tmp_path_factory.mktemp("adapter") / "adapter")
 
 
-@pytest.fixture(scope="module")
-def inputs(place, base) -> dict:
-    student = load_student(base, device="cpu", max_pixels=PIXELS)
-    return inputs_of(student, samples_of(place)[:3], trees_of(place))
-
-
-def logits(student: Student, inputs: dict) -> torch.Tensor:
-    student.model.eval()
-    with torch.inference_mode():
-        return student.model(**inputs).logits
-
-
-def test_merged_weights_give_the_logits_of_base_and_adapter(base, adapter, inputs, tmp_path):
-    model = merge.run(base, adapter, tmp_path / "out")
-    alone = logits(load_student(base, device="cpu", max_pixels=PIXELS), inputs)
-    beside = logits(load_student(base, device="cpu", max_pixels=PIXELS, adapter=adapter), inputs)
-    merged = logits(load_student(model, device="cpu", max_pixels=PIXELS), inputs)
-    seen = inputs["attention_mask"].bool()
-    torch.testing.assert_close(merged[seen], beside[seen], rtol=1e-5, atol=1e-5)
-    assert float((merged - alone)[seen].abs().max()) > 0.1
-    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
-    assert manifest["counts"]["kept"] == len(load_file(adapter / "adapter_model.safetensors")) // 2
-
-
-@pytest.mark.parametrize("changes", [{"r": 3, "use_rslora": True}, {"target_modules": ["q_proj", "up_proj"]}])
+@pytest.mark.parametrize("changes", [{}, {"r": 3, "use_rslora": True}, {"target_modules": ["q_proj", "up_proj"]}])
 def test_merged_as_peft_merges(base, tmp_path, changes):
     folder = make_adapter(base, tmp_path / "adapter", **changes)
     expected = load_student(base, device="cpu", max_pixels=PIXELS, adapter=folder).model.merge_and_unload().state_dict()
@@ -82,6 +48,8 @@ def test_merged_as_peft_merges(base, tmp_path, changes):
     assert not any("visual" in name for name in changed)
     for name, tensor in found.items():
         torch.testing.assert_close(tensor, expected[name], rtol=1e-6, atol=1e-6)
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert manifest["counts"]["kept"] == len(load_file(folder / "adapter_model.safetensors")) // 2
 
 
 def test_damaged_adapters_are_refused(base, adapter, tmp_path):

@@ -21,15 +21,13 @@ from distill.training.settings import TrainConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-WORDS = """
+TEMPLATE = """
 {%- macro words(content) -%}
     {%- if content is string -%}{{ content }}
     {%- else -%}
         {%- for part in content -%}
-            {%- if part.type == 'image' or 'image' in part or 'image_url' in part -%}
-                {{- '<|vision_start|><|image_pad|><|vision_end|>' -}}
-            {%- elif 'text' in part -%}{{ part.text }}
-            {%- else -%}{{ raise_exception('Unexpected item type in content.') }}
+            {%- if part.type == 'image' -%}{{- '<|vision_start|><|image_pad|><|vision_end|>' -}}
+            {%- else -%}{{ part.text }}
             {%- endif -%}
         {%- endfor -%}
     {%- endif -%}
@@ -38,62 +36,44 @@ WORDS = """
 {%- for message in messages if message.role == 'user' -%}
     {%- set place.last_question = messages.index(message) -%}
 {%- endfor -%}
-"""
-END = """
-{%- if add_generation_prompt -%}
-    {{- '<|im_start|>assistant\\n' -}}
-    {%- if enable_thinking is defined and enable_thinking is false -%}{{- '<think>\\n\\n</think>\\n\\n' -}}
-    {%- else -%}{{- '<think>\\n' -}}
-    {%- endif -%}
-{%- endif -%}
-"""
-
-
-def turns(keeps_thoughts: str, reads_thoughts: bool) -> str:
-    """The turns of a chat. keeps_thoughts: when thoughts of earlier answers stay. reads_thoughts: also from the
-    text."""
-    from_text = """
-            {%- elif '</think>' in text -%}
-                {%- set thought = text.split('</think>')[0].rstrip('\\n').split('<think>')[-1].lstrip('\\n') -%}
-                {%- set text = text.split('</think>')[-1].lstrip('\\n') -%}"""
-    return (
-        """
+{%- set effort = '' -%}
+EFFORT
 {%- for message in messages -%}
     {%- set text = words(message.content) | trim -%}
-    {%- if message.role == 'system' -%}
-        {%- if not loop.first -%}{{ raise_exception('System message must be at the beginning.') }}{%- endif -%}
-        {%- if effort -%}{%- set text = effort + '\\n\\n' + text -%}{%- endif -%}
-        {{- '<|im_start|>system\\n' + text + '<|im_end|>\\n' -}}
-    {%- elif message.role == 'user' -%}
-        {{- '<|im_start|>user\\n' + text + '<|im_end|>\\n' -}}
-    {%- else -%}
-        {%- set thought = '' -%}
-        {%- if message.reasoning_content is string -%}{%- set thought = message.reasoning_content -%}"""
-        + (from_text if reads_thoughts else "")
-        + """
-        {%- endif -%}
+    {%- if message.role == 'system' and effort -%}{%- set text = effort + '\\n\\n' + text -%}{%- endif -%}
+    {%- if message.role == 'assistant' -%}
+        {%- set thought = message.reasoning_content if message.reasoning_content is string else '' -%}
+        FROM_TEXT
         {%- if KEEPS or loop.index0 > place.last_question -%}
-            {{- '<|im_start|>assistant\\n<think>\\n' + (thought | trim) + '\\n</think>\\n\\n' + text -}}
-        {%- else -%}{{- '<|im_start|>assistant\\n' + text -}}
+            {%- set text = '<think>\\n' + (thought | trim) + '\\n</think>\\n\\n' + text -%}
         {%- endif -%}
-        {{- '<|im_end|>\\n' -}}
     {%- endif -%}
-{%- endfor -%}""".replace("KEEPS", keeps_thoughts)
-    )
-
-
-EFFORT = """
-{%- set effort = '' -%}
-{%- if enable_thinking is undefined or enable_thinking is true -%}
-    {%- set wanted = reasoning_effort | default('xhigh') -%}
-    {%- if wanted not in ('xhigh', 'medium', 'low') -%}{{ raise_exception('Unexpected effort ' ~ wanted) }}{%- endif -%}
-    {%- if wanted != 'medium' -%}{%- set effort = 'Reasoning effort is set to ' ~ wanted ~ '.' -%}{%- endif -%}
+    {{- '<|im_start|>' + message.role + '\\n' + text + '<|im_end|>\\n' -}}
+{%- endfor -%}
+{%- if add_generation_prompt -%}
+    {{- '<|im_start|>assistant\\n<think>\\n' -}}
+    {%- if enable_thinking is defined and enable_thinking is false -%}{{- '\\n</think>\\n\\n' -}}{%- endif -%}
 {%- endif -%}
 """
+FROM_TEXT = """
+        {%- if not thought and '</think>' in text -%}
+            {%- set thought = text.split('</think>')[0].split('<think>')[-1] -%}
+            {%- set text = text.split('</think>')[-1].lstrip('\\n') -%}
+        {%- endif -%}"""
+EFFORT = """
+{%- if enable_thinking is undefined or enable_thinking is true -%}
+    {%- set effort = 'Reasoning effort is set to ' ~ (reasoning_effort | default('xhigh')) ~ '.' -%}
+{%- endif -%}"""
+
+
+def template(keeps_thoughts: str, from_text: str = FROM_TEXT, effort: str = "") -> str:
+    return TEMPLATE.replace("KEEPS", keeps_thoughts).replace("FROM_TEXT", from_text).replace("EFFORT", effort)
+
+
 TEMPLATES = {
-    "3.5": WORDS + turns("false", reads_thoughts=True) + END,
-    "3.6": WORDS + turns("(preserve_thinking is defined and preserve_thinking)", reads_thoughts=True) + END,
-    "3.8": WORDS + EFFORT + turns("(preserve_thinking | default(true))", reads_thoughts=False) + END,
+    "3.5": template("false"),
+    "3.6": template("(preserve_thinking is defined and preserve_thinking)"),
+    "3.8": template("(preserve_thinking | default(true))", "", EFFORT),
 }
 
 

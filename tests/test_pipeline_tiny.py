@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from specimens_release import run_here
 from typer.testing import CliRunner
 
 from cosfly.cli import app
@@ -41,7 +42,7 @@ def base(built_once):
 
 
 def make_tiny_run(root: Path) -> None:
-    pipeline.run(tiny(), root / "run")
+    run_here(TINY, root / "run")
 
 
 def products(folder: Path) -> dict[str, str]:

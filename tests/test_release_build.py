@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import struct
 import zlib
 from itertools import pairwise
 from pathlib import Path
@@ -13,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 from specimens_foreign import write_foreign_tree
+from specimens_png import png_around
 from specimens_release import FREE, all_bytes, make_caption, make_inspection, rewrite_captions, source_of
 
 from caption.schema import CaptionConfig
@@ -160,10 +160,7 @@ def interlaced(pixels: np.ndarray) -> bytes:
     passes = ((0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (0, 1, 2, 2), (1, 0, 2, 1))
     parts = (pixels[y::down, x::across] for y, x, down, across in passes)
     rows = b"".join(b"\0" + row.tobytes() for part in parts if part.size for row in part)
-    head = struct.pack(">IIBBBBB", pixels.shape[1], pixels.shape[0], 8, 2, 0, 0, 1)
-    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
-    packed = (struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in chunks)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+    return png_around(zlib.compress(rows), pixels.shape[1], pixels.shape[0], interlace=1)
 
 
 def other_kind(frame_file: str, kind: str):

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_release import CFG, all_bytes, build, make_inspection, rewrite_captions, source_of
+from specimens_release import CFG, build, make_inspection, rewrite_captions, source_of
 
 from cosfly.formats.boxes import MapHeader
 from cosfly.formats.frames import read_depth, read_instance, read_rgb
@@ -185,11 +185,6 @@ def test_shards_lose_nothing_and_keep_the_order(sizes, target):
     for group in groups[:-1]:
         assert sum(sizes[i] for i in group) >= target
         assert sum(sizes[i] for i in group[:-1]) < target
-
-
-@pytest.mark.slow
-def test_same_bytes_with_two_workers(release_inputs, built, tmp_path):
-    assert all_bytes(build(release_inputs, tmp_path / "two", workers=2)) == all_bytes(built)
 
 
 @pytest.mark.slow

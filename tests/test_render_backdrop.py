@@ -42,6 +42,7 @@ def test_the_ground_lies_where_the_world_has_it(ground_z_m, yaw_deg):
     assert not (wrong & ~edge).any(), "no pixel beyond one from the shore"
 
 
+@pytest.mark.slow
 def test_carla_gives_the_same_picture_by_the_same_way(tmp_path):
     pytest.importorskip("carla")
     from test_render_carla import found_settings

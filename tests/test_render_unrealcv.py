@@ -10,7 +10,7 @@ from simulator_serving import serving
 from simulators.scene import clothes_of
 from simulators.unrealcv_server import UnrealCvServer
 from test_cosfly_maps_unrealcv import beside
-from test_render_carla import FRAMES, files_of, flown, pictures_of
+from test_render_carla import FRAMES, files_of, flown, same_but_for_pictures, schema_of
 from test_renderers_contract import street
 from typer.testing import CliRunner
 
@@ -31,7 +31,7 @@ from cosfly.simulators.unrealcv_client import UnrealCvConfig, connect
 
 pytest.importorskip("unrealcv")
 CLEAN = {**FRAMES, "tracks": ["clean"]}
-QUICK = {"timeout_s": 20.0, "settle_delay_s": 0.02}
+QUICK = {"timeout_s": 60.0, "settle_delay_s": 0.02}
 
 
 def exported() -> BoxMap:
@@ -55,14 +55,6 @@ def opened(port: int, box_map: BoxMap, **own):
     return open_renderer("unrealcv", box_map, 160, 90, settings=settings, num_others=4)
 
 
-def schema_of(value: object) -> object:
-    if isinstance(value, dict):
-        return {name: schema_of(one) for name, one in value.items()}
-    if isinstance(value, list):
-        return [schema_of(value[0])] if value else []
-    return "number" if isinstance(value, int | float) and not isinstance(value, bool) else type(value).__name__
-
-
 @pytest.mark.slow
 def test_a_tree_is_the_embedded_renderers_by_recursive_diff(tmp_path):
     """Step 6's contract: the same folders, files, schemas and frames; poses byte for byte; other pixels of people."""
@@ -78,26 +70,7 @@ def test_a_tree_is_the_embedded_renderers_by_recursive_diff(tmp_path):
             connection.close()
         assert "COSFLY" not in str(objects), "nobody is left"
         assert (str(pose).split()[0], size) == ("0.000000", "640 480"), "the camera is where it was"
-    # target.png shows what the person wears, which nobody knows of an engine's: CARLA's trees have none either.
-    every = [
-        {str(p.relative_to(root)) for p in root.rglob("*") if p.name != "target.png"} for root in (tree, reference)
-    ]
-    assert every[0] == every[1]
-    for folder in find_tracks(tree):
-        ours, theirs = (
-            json.loads((root / folder.relative_to(tree) / "trajectory.json").read_text()) for root in (tree, reference)
-        )
-        for absent in ("people", "goal"):  # nobody knows what the level's people wear
-            ours.pop(absent, None), theirs.pop(absent, None)
-        assert ours.keys() == theirs.keys()
-        assert schema_of(ours["camera"]) == schema_of(theirs["camera"])
-        for one, other in zip(ours["points"], theirs["points"], strict=True):
-            assert schema_of(one).keys() == schema_of(other).keys()
-            for name in ("drone_pose", "nav_waypoint", "timing"):
-                assert json.dumps(one[name]) == json.dumps(other[name])
-            assert json.dumps(one["target"]["world_location"]) == json.dumps(other["target"]["world_location"])
-        assert ours["camera"] == theirs["camera"]
-    for ours, theirs in zip(pictures_of(tree), pictures_of(reference), strict=True):
+    for ours, theirs in same_but_for_pictures(tree, reference):
         _, name, rgb, depth, kinds, ids, meta = ours
         _, _, their_rgb, their_depth, their_kinds, their_ids, their_meta = theirs
         rest = (ids != PERSON_ID) & (their_ids != PERSON_ID)
@@ -171,14 +144,14 @@ def test_lost_late_double_and_broken_pictures_are_asked_again(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("fault", "told"), [("die@6", "refused"), ("hang@6", "no answer in 2 s")])
+@pytest.mark.parametrize(("fault", "told"), [("die@6", "refused"), ("hang@6", "no answer in 8 s")])
 def test_a_server_that_ends_is_named_and_the_run_goes_on_with_the_next(fault, told, tmp_path):
     given = inputs(tmp_path / "in", 2, 4)
     with (
         serving(street(), tmp_path / "town", fault, protocol="unrealcv") as port,
         pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port} \(UnrealCV.*{told}"),
     ):
-        run(config(port, timeout_s=2.0), *given, tmp_path / "tree", workers=1)
+        run(config(port, timeout_s=8.0), *given, tmp_path / "tree", workers=1)
     assert len(find_tracks(tmp_path / "tree")) == 1
     kept = files_of(tmp_path / "tree")
     with serving(street(), tmp_path / "town", protocol="unrealcv") as port:

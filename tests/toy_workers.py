@@ -10,11 +10,15 @@ from cosfly.runtime.config import Config
 from cosfly.runtime.errors import RenderError
 from cosfly.runtime.io import atomic_folder
 from cosfly.runtime.run_dir import StageFolder
-from cosfly.runtime.worker import Item, Outcome, advance
+from cosfly.runtime.worker import Heartbeat, Item, Outcome, advance
 
 
 def stage_in(path: Path) -> StageFolder:
     return StageFolder.open(path / "s", "demo", config=Config(), inputs={}, seed=0)
+
+
+def items_of(*kinds: str) -> list[Item]:
+    return [Item(f"i{k}", (kind, bytes(1_000_000))) for k, kind in enumerate(kinds)]  # more than a pipe holds
 
 
 def make_worker(folder: Path):
@@ -54,7 +58,8 @@ def make_counting_worker(folder: Path):
         mark = folder / item.item_id
         if item.payload == "once-die" and not mark.exists():
             mark.touch()
-            time.sleep(1.5)  # for a heartbeat with the steps that will be lost
+            (sender,) = logging.getLogger().handlers
+            sender.send(Heartbeat(item.item_id, 3))  # with the steps that will be lost
             os.kill(os.getpid(), signal.SIGKILL)
         if item.payload == "fail":
             raise RenderError("a frame that cannot be drawn", where=item.item_id)

@@ -1,8 +1,7 @@
-"""Two workers on a Ray cluster beside two processes of the local engine; memory of the driver; nodes and workers lost.
+"""Two workers on a Ray cluster beside two processes of the local engine; memory of the driver.
 
     python tests/benchmarks/bench_ray.py render --rounds 2        # pairs A B A B of one render stage
     python tests/benchmarks/bench_ray.py memory                   # 1,000, 10,000, 100,000 items that do nothing
-    python tests/benchmarks/bench_ray.py losses --kills 20        # SIGKILL to workers and one node, 2,000 frames
 
 The cluster is one of several processes on this machine. Writes below the folder of --work only.
 """
@@ -12,14 +11,11 @@ import contextlib
 import logging
 import multiprocessing
 import os
-import random
 import shutil
-import signal
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -31,10 +27,9 @@ from toy_workers import make_talking_worker, stage_in
 from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
-from cosfly.runtime.events import LOSSES, Event, Vitals, read_events
+from cosfly.runtime.events import Event, Vitals, read_events
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.ray_engine import RayConfig, connected
-from cosfly.runtime.run_dir import read_manifest
 from cosfly.runtime.worker import Item
 
 WORKERS = 2
@@ -42,14 +37,16 @@ TOWN = ("pedestrians.num_paths=7", "render.width_px=320", "render.height_px=180"
 
 
 @contextlib.contextmanager
-def cluster(num_nodes: int = WORKERS) -> Iterator[tuple[Nodes, list, RayConfig]]:
+def cluster() -> Iterator[RayConfig]:
     """A head without CPUs and nodes of one."""
     begun_s, nodes = time.monotonic(), Nodes()
-    added, cfg = [nodes.add() for _ in range(num_nodes)], RayConfig(address=nodes.address)
+    for _ in range(WORKERS):
+        nodes.add()
+    cfg = RayConfig(address=nodes.address)
     connected(cfg)
-    print(f"cluster of {num_nodes} nodes, and this process connected: {time.monotonic() - begun_s:.1f} s")
+    print(f"cluster of {WORKERS} nodes, and this process connected: {time.monotonic() - begun_s:.1f} s")
     try:
-        yield nodes, added, cfg
+        yield cfg
     finally:
         nodes.end()
 
@@ -85,7 +82,7 @@ def spans(events: list[Event]) -> tuple[float, float, int]:
 
 def measure_render(work: Path, rounds: int) -> None:
     base, rates = begin(work), {"local": list[float](), "ray": list[float]()}
-    with cluster() as (_, _, cfg):
+    with cluster() as cfg:
         for number in range(rounds):
             for name, engine in (("local", None), ("ray", cfg)):
                 start_s, work_s, frames = spans(render(base, work / f"{name}{number}", engine))
@@ -113,7 +110,7 @@ def do_nothing(folder: Path, engine: RayConfig | None, count: int) -> None:
 
 def measure_memory(work: Path, counts: Iterable[int]) -> None:
     spawn = multiprocessing.get_context("spawn")
-    with cluster() as (_, _, cfg):
+    with cluster() as cfg:
         for count in counts:
             for engine in (None, cfg):
                 process = spawn.Process(target=do_nothing, args=(work / f"{count}{engine is None}", engine, count))
@@ -121,51 +118,20 @@ def measure_memory(work: Path, counts: Iterable[int]) -> None:
                 process.join()
 
 
-def measure_losses(work: Path, kills: int) -> None:
-    base = begin(work)
-    render(base, work / "undisturbed", None)
-    with cluster(3) as (nodes, added, cfg):
-        killed = [0]
-
-        def disturb() -> None:
-            folder, chance = work / "disturbed/run/render", random.Random(0)
-            while killed[0] < kills:
-                time.sleep(chance.uniform(1.0, 3.0))
-                alive = {e.worker: e.pid for e in read_events(folder) if e.event in ("worker_started", "restarted")}
-                with contextlib.suppress(ProcessLookupError):
-                    if alive and (pid := chance.choice(sorted(alive.values()))):
-                        os.kill(pid, signal.SIGKILL)
-                        killed[0] += 1
-                if killed[0] == kills // 2 and added:
-                    nodes.kill(added.pop())
-
-        threading.Thread(target=disturb, daemon=True).start()
-        events = render(base, work / "disturbed", cfg)
-        kinds = (*LOSSES, "restarted", "retried", "given_up")
-        counts = {kind: sum(event.event == kind for event in events) for kind in kinds}
-        frames = read_manifest(work / "disturbed/run/render").facts["num_frames"]
-        told = differences(products(work / "disturbed"), products(work / "undisturbed"))
-        lost = f"{killed[0]} workers and {3 - len(added)} node killed"
-        print(f"{frames} frames, {lost}: {counts}; differences: {told}")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("render", "memory", "losses"))
+    parser.add_argument("what", choices=("render", "memory"))
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--counts", type=int, nargs="+", default=(1_000, 10_000, 100_000), help="of items")
-    parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--work", type=Path, help="new folder; without: one that goes again")
     given = parser.parse_args()
     logging.getLogger().setLevel(logging.ERROR)
     with tempfile.TemporaryDirectory() as place:
         work = (given.work or Path(place)).absolute()
-        todo: dict[str, Callable[[], None]] = {
-            "render": lambda: measure_render(work, given.rounds),
-            "memory": lambda: measure_memory(work, given.counts),
-            "losses": lambda: measure_losses(work, given.kills),
-        }
-        todo[given.what]()
+        if given.what == "render":
+            measure_render(work, given.rounds)
+        else:
+            measure_memory(work, given.counts)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ import itertools
 import socket
 import struct
 import threading
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -86,8 +85,7 @@ class CarlaServer(Server):
             result = [[False]] if value is None else [[1, value]]
         except (ValueError, KeyError) as error:
             result = [[0, [f"{method}: {error}"]]]
-        time.sleep(self.due("late"))
-        if not self.due("hang") and not (method == "version" and self.due("unhealthy")):
+        if not self.due("hang"):
             send(connection, msgpack.packb([1, number, None, result]))
 
     def _load(self, town: str, *_: Any) -> None:

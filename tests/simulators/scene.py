@@ -79,8 +79,7 @@ class Server:
 
     def due(self, name: str, sensor: str = "") -> float:
         for planted, its_sensor, tick, plus, seconds in self._faults:
-            goes_on = plus or name in ("hang", "unhealthy")
-            is_now = self.num_ticks == int(tick) or (goes_on and self.num_ticks > int(tick))
+            is_now = self.num_ticks == int(tick) or ((plus or name == "hang") and self.num_ticks > int(tick))
             if planted == name and is_now and its_sensor in (None, sensor):
                 return float(seconds or 1.0)
         return 0.0
