@@ -128,7 +128,7 @@ FAULTS: dict[str, tuple] = {
     "nobody: a body of 20 MB": (page(200, "[" + "1," * 10_000_000 + "1]"), silent("bad_reply",
         "longer than 0.5 MB")),
     "nobody: a bomb of gzip": (lambda body: Sent(200, BOMB, {"Content-Encoding": "gzip"}), silent("connection",
-        "not requested")),
+        "compressed the body")),
     "nobody: a stream without end": (raw(CHUNKED, b"1000\r\n" + b" " * 4096 + b"\r\n", is_endless=True),
         silent("bad_reply", "longer than 0.5 MB")),
     "Langchain-Chatchat: chunks that end early, its 4383": (raw(CHUNKED, b"5\r\n{\"a\":\r\n"), silent("connection",
@@ -188,7 +188,7 @@ LISTS: dict[str, tuple] = {
         {"id": MODEL}]})), None),
     "ten thousand models": (page(200, json.dumps({"data": [{"id": f"m{i}"} for i in range(10_000)]})),
         "has several models; got 10000 models"),
-    "a body of 20 MB": (page(200, " " * 20_000_000), "returns no list of models"),
+    "a body of 20 MB": (page(200, " " * 20_000_000), "does not return a list of models"),
     "headers that never end": (raw(HEAD, b"X: y\r\n", pause_s=0.02, is_endless=True),
         "cannot reach the teacher; got no answer within 0.3 s"),
 }  # fmt: skip

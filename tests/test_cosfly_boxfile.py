@@ -86,7 +86,7 @@ def test_longitude_and_latitude_become_metres(tmp_path):
     """At 52 degrees north a degree of latitude is 111,267 m, one of longitude 68,677 m (tables of WGS 84)."""
     ring = [[4.0, 52.0], [4.001, 52.0], [4.001, 52.001], [4.0, 52.001], [4.0, 52.0]]
     text = collection(feature("Polygon", [ring], type="Buildings", height_m=9))
-    with pytest.raises(InputError, match=r"do not look like m;.*maps\.boxes\.units=degrees"):
+    with pytest.raises(InputError, match=r"do not look like metres;.*maps\.boxes\.units=degrees"):
         loaded(tmp_path, text, ".geojson")
     with pytest.raises(InputError, match="do not look like degrees"):
         loaded(tmp_path, text.replace("52.001", "58.001"), ".geojson", units="degrees")
@@ -99,7 +99,7 @@ def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
     write_boxes(tmp_path / "own.json", town())
     box_map = load(BoxesConfig(path=tmp_path / "own.json", name="Mine", licence="mit"))
     assert (box_map.name, box_map.header.licence, len(box_map)) == ("Mine", "mit", len(town()))
-    with pytest.raises(ConfigError, match="own types and ground"):
+    with pytest.raises(ConfigError, match="types and ground itself"):
         load(BoxesConfig(path=tmp_path / "own.json", ignore=["*"]))
 
 
@@ -110,16 +110,16 @@ def test_all_that_is_wrong_with_a_table_is_told(tmp_path, subtests):
             (PLAIN.replace(",yaw_deg", ",yaw_dge"), r"unknown column 'yaw_dge' \(did you mean 'yaw_deg'\?\)"),
             (PLAIN.replace("type,x_m", "name,x"), r"unknown column 'x'.*no column type.*no column x_m"),
             (PLAIN.replace("height_m,yaw_deg", "height_m,z_m"), "column z_m occurs twice"),
-            (PLAIN.replace(",12,8,8,30", ",12,8,8"), "line 2: 8 cells, but 9 in the first line"),
+            (PLAIN.replace(",12,8,8,30", ",12,8,8"), "line 2: 8 cells, but the first line has 9"),
             (PLAIN.replace("12,8,8,30", '"12,5",8,8,30'), r"length_m is not a finite number: '12,5'"),
             (PLAIN.replace("12,8,8,30", "-12,8,8,30").replace("4,4,6,0", "4,4,nan,0"),
              r"line 2: length_m is not more than 0; line 3: height_m is not a finite number: 'nan'"),
-            (PLAIN.replace("20,4,12", "20,1e18,12"), "line 2: the box is empty"),
-            (PLAIN.replace("7,Buildings", "8,Buildings"), "id is not a whole number, each once"),
-            (PLAIN.replace("7,Buildings", "x,Buildings"), "id is not a whole number, each once"),
+            (PLAIN.replace("20,4,12", "20,1e18,12"), "line 2: the box has no volume"),
+            (PLAIN.replace("7,Buildings", "8,Buildings"), "ids must be different whole numbers"),
+            (PLAIN.replace("7,Buildings", "x,Buildings"), "ids must be different whole numbers"),
             (PLAIN.replace(",", ";"), "no column type.*separated by commas"),
-            ("", "holds no boxes"),
-            (PLAIN + "\"a", "not a table"),
+            ("", "has no boxes"),
+            (PLAIN + "\"a", "not a CSV table"),
         ]:  # fmt: skip
         with subtests.test(text=text), pytest.raises(InputError, match=words):
             loaded(tmp_path, text)
@@ -152,7 +152,7 @@ def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
                 r".*feature 3: unknown type 'house'.*expected columns .*types .*4 to fix",
             ),
             (json.dumps({"type": "Topology"}), "not GeoJSON"),
-            (collection(), "holds no boxes"),
+            (collection(), "has no boxes"),
         ]:  # fmt: skip
         with subtests.test(words), pytest.raises(InputError, match=words):
             loaded(tmp_path, text, ".geojson")

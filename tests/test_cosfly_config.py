@@ -72,7 +72,7 @@ def test_a_setting_that_is_not_there_is_told_its_place_or_its_neighbours():
         ("render.altitude_max_m=40", r"render\.altitude_max_m: .*\(did you mean 'plan\.altitude_max_m'\?\)"),
         ("endpoint.json_schema=false", r"did you mean 'caption\.endpoint' or 'distill\.infer\.endpoint'\?"),
         ("plan.wokers=2", r"plan\.wokers: unknown setting"),
-        ("render.fovs_deg=60", r"render\.fovs_deg: not a list, got 60; write \[60\]"),
+        ("render.fovs_deg=60", r"render\.fovs_deg: the value is not a list, got 60; write \[60\]"),
     ):
         with pytest.raises(ConfigError, match=words):
             load(RunConfig, None, [given])

@@ -87,7 +87,7 @@ def test_a_server_that_is_not_there_silent_old_or_another_is_named(monkeypatch):
         unrealcv_export.load(UnrealCvMapConfig(port=port, timeout_s=1.0), 0)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
-        with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}.*does not greet"):
+        with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}.*is not UnrealCV"):
             unrealcv_export.load(UnrealCvMapConfig(port=port, timeout_s=0.5), 0)
     for version in ("0.3.10", "error Can not find a handler"):
         monkeypatch.setattr(unrealcv_server, "VERSION", version)

@@ -63,7 +63,9 @@ def test_what_belongs_together_is_taken(run):
 
 def test_captions_of_another_tree_are_refused(run):
     other = make_tree(run / "other", "of another seed")
-    with pytest.raises(VerifyError, match=r"captions\.jsonl: it was made of another input 'data'.*given: .*other"):
+    with pytest.raises(
+        VerifyError, match=r"captions\.jsonl: this file was made from another input 'data'.*got .*other"
+    ):
         run_dir.checked_inputs(inputs_of(run) | {"data": other})
     captions = make(run / "c2", "caption", {"captions.jsonl": "c"}, data=other) / "captions.jsonl"
     two = {"0.data": run / "render", "0.captions": run / "caption/captions.jsonl"}
@@ -76,7 +78,7 @@ def test_captions_of_another_tree_are_refused(run):
 @pytest.mark.parametrize("name", ["manifest.json", "stage.json"])
 def test_a_stage_without_its_records_is_not_finished(run, name):
     (run / "caption" / name).unlink()
-    with pytest.raises(VerifyError, match=f"not finished, or its records are gone; got no {name}"):
+    with pytest.raises(VerifyError, match=f"not finished, or its records are missing; got no {name}"):
         run_dir.checked_inputs(inputs_of(run))
     alone = run / "alone/captions.jsonl"
     alone.parent.mkdir()
@@ -87,7 +89,7 @@ def test_a_stage_without_its_records_is_not_finished(run, name):
 def test_a_name_that_no_record_can_hold(tmp_path):
     path = tmp_path / os.fsdecode(b"bad\xff.json")
     write_json(path, [])
-    with pytest.raises(InputError, match=r"bad\\udcff.json: a name that is not UTF-8 text"):
+    with pytest.raises(InputError, match=r"bad\\udcff.json: the path contains a name that is not UTF-8"):
         begin(tmp_path / "out", "simplify", map=path)
     assert not (tmp_path / "out").exists()
 

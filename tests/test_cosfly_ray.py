@@ -162,4 +162,6 @@ def test_where_no_cluster_answers_one_line_says_so(tmp_path, monkeypatch):
         monkeypatch.setenv("RAY_ADDRESS", address)
         refused(tmp_path, f"{address}: no Ray cluster answers", Watch(RayConfig()))
     monkeypatch.setitem(sys.modules, "ray", None)
-    refused(tmp_path, r"the package ray is missing; pip install 'cosfly\[ray\]', on every node", Watch(RayConfig()))
+    refused(
+        tmp_path, r"the package ray is not installed; pip install 'cosfly\[ray\]', on every node", Watch(RayConfig())
+    )

@@ -96,7 +96,7 @@ def test_a_list_of_empty_objects_is_refused_at_the_first(tmp_path, field):
 
 
 def test_more_brackets_than_a_text_of_its_size_has_are_refused_before_they_are_lists():
-    with pytest.raises(ValueError, match="20,000,000 lists and objects"):
+    with pytest.raises(ValueError, match="too many lists and objects: 20,000,000"):
         json_io.parse_json(b"[" + b"{},[]," * 9_999_999 + b"{}]")
 
 
@@ -131,7 +131,7 @@ def test_a_sparse_file_is_refused_before_it_is_read(tmp_path):
 def test_a_long_line_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "LINE_MB", 1)
     (tmp_path / "x.jsonl").write_bytes(b"{}\n" + b" " * 1_200_000)
-    with pytest.raises(InputError, match=r"x\.jsonl:2: over the limit; .* at most 1 MB"):
+    with pytest.raises(InputError, match=r"x\.jsonl:2: the input is over the limit; .* at most 1 MB"):
         list(files.read_lines(tmp_path / "x.jsonl"))
 
 
@@ -147,7 +147,7 @@ def test_a_gzip_bomb_is_refused_while_it_unpacks(tmp_path, monkeypatch):
         tracemalloc.stop()
     monkeypatch.setattr(files, "UNPACK_FACTOR", 1_000)
     assert len(files.read_unpacked(path)) == 70_000_000
-    with pytest.raises(InputError, match=r"got more, unpacked; expected at most 60 MB"):
+    with pytest.raises(InputError, match=r"got more when unpacked; expected at most 60 MB"):
         files.read_unpacked(path, most_mb=60)
 
 
@@ -156,7 +156,7 @@ def test_very_many_equal_rows_are_refused_before_they_are_read(tmp_path, monkeyp
     pq.write_table(pa.table({"name": ["x"] * 10_000}), path)
     assert path.stat().st_size < 10_000
     monkeypatch.setattr(tables, "FILE_MB", 9)
-    with pytest.raises(InputError, match=r"row group 0: over the limit; got 10 MB; .* smaller row groups"):
+    with pytest.raises(InputError, match=r"row group 0: the input is over the limit; got 10 MB; .* smaller row groups"):
         next(tables.rows_of(path))
     monkeypatch.setattr(tables, "FILE_MB", 10)
     assert len(list(tables.rows_of(path))) == 10_000
@@ -228,7 +228,7 @@ def test_a_chunk_that_goes_on_beyond_the_file_gets_no_memory(monkeypatch):
     place = picture.index(b"IDAT") - 4
     picture[place : place + 4] = struct.pack(">I", 2**31 - 1)
     monkeypatch.setattr(cv2, "imdecode", None)  # a decoder would make room for it
-    with pytest.raises(InputError, match="not an image"):
+    with pytest.raises(InputError, match="image cannot be decoded"):
         arrays.parse_picture(bytes(picture), "x")
 
 

@@ -36,7 +36,7 @@ def test_nan_is_never_a_value(tmp_path):
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(tmp_path / "a.json", {"x": float("nan")})
     (tmp_path / "b.json").write_text('{"x": NaN}')
-    with pytest.raises(InputError, match=r"b\.json: not valid JSON"):
+    with pytest.raises(InputError, match=r"b\.json: this is not valid JSON"):
         read_json(tmp_path / "b.json")
 
 
@@ -47,7 +47,7 @@ def test_names_stay_inside(tmp_path):
             inside(tmp_path, name)
     assert inside(tmp_path, "a" * 255)
     for name in ("a" * 256, "b/" + "行" * 86 + "/c", "a\0b", "\ud800"):
-        with pytest.raises(InputError, match="not a name of a file"):
+        with pytest.raises(InputError, match="not a file name|invalid character"):
             inside(tmp_path, name)
 
 
@@ -149,7 +149,7 @@ def test_a_full_disk_under_a_journal_is_one_error():
 def test_foreign_files_are_not_touched(tmp_path):
     for name in ("thesis.txt", ".thesis.txt.1.partial"):
         (tmp_path / name).write_text("x")
-        with pytest.raises(ResumeError, match="not cosfly's"):
+        with pytest.raises(ResumeError, match="cosfly did not write"):
             _open(tmp_path)
         (tmp_path / name).unlink()
 

@@ -49,7 +49,9 @@ def test_an_item_that_never_ends_has_failed_and_the_others_are_done(tmp_path, ca
 
 def test_workers_that_die_all_the_time_end_the_stage(tmp_path):
     kinds = ["nothing"] + ["die"] * 30
-    with pytest.raises(EnvironmentMissing, match=r"die or stall all the time.*3 lost, 1 items done.*item_limit_s"):
+    with pytest.raises(
+        EnvironmentMissing, match=r"die or stall again and again.*3 workers lost, 1 items done.*item_limit_s"
+    ):
         work_on(tmp_path, kinds, workers=1, watch=Watch(restarts=1))
     assert [record.id for record in stage_in(tmp_path).items()] == ["i0"]
     # The machine is fit again.

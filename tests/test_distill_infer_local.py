@@ -106,7 +106,7 @@ def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
     others = {key: raw for key, raw in expected.items() if key not in hit}
     assert {p.key: p.raw for p in found if p.key not in hit} == others
     assert counts_of(tmp_path / "out")["failed"] == {"input": len(hit)}
-    assert (tmp_path / "out" / "failures.jsonl").read_text().count("not an image") == len(hit)
+    assert (tmp_path / "out" / "failures.jsonl").read_text().count("image cannot be decoded") == len(hit)
     (tree / bad).write_bytes(whole)  # mended: those alone are answered
     result = invoke(words)
     assert result.exit_code == 0, result.output

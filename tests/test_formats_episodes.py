@@ -38,7 +38,7 @@ def test_a_record_is_read_as_it_was_written_and_tells_lead_and_decisions_apart(t
 @each(("change", "words"), [
     ({"frames": [{"time_s": 0.5}]}, "missing|required"),
     ({"ended": "tired"}, "finished"),
-    ({"num_walk_frames": 1}, "2 frames of a trajectory of 1"),
+    ({"num_walk_frames": 1}, "2 frames follow the first decision"),
     ({"colour": "red"}, "[Ee]xtra"),
 ])  # fmt: skip
 def test_a_record_that_cannot_be_is_refused(tmp_path, change, words):

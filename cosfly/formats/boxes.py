@@ -40,7 +40,7 @@ Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 def _licence_id(text: str) -> str:
     if not re.fullmatch(r"[a-z0-9][a-z0-9.+-]*", text):
         raise ValueError(
-            "this is not a licence identifier such as cc-by-4.0 or apache-2.0; put other text into the setting credits"
+            "use a licence identifier such as cc-by-4.0 or apache-2.0, and put other text into the setting credits"
         )
     return text
 
@@ -209,16 +209,18 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
         ("extent", box_map.half_extents),
         ("rotation", box_map.rotations_deg),
     ):
-        check(name, rows, np.abs(rows) <= LARGEST, "a box is not finite", "finite numbers")  # NaN fails
+        check(
+            name, rows, np.abs(rows) <= LARGEST, "the box has a number that is not finite", "finite numbers"
+        )  # NaN fails
     half = box_map.half_extents
-    check("extent", half, half >= 0, "a box has a negative extent", "half sizes of at least 0 m")
+    check("extent", half, half >= 0, "the box has a negative extent", "half sizes of at least 0 m")
     unknown = [int(kind) for kind in np.unique(box_map.kinds) if int(kind) not in KIND_NAMES]
     if unknown:
         expected = f"{min(KIND_NAMES)} to {max(KIND_NAMES)}"
-        raise InputError("unknown semantic id", where=where, got=str(unknown[0]), expected=expected)
+        raise InputError("the semantic id is unknown", where=where, got=str(unknown[0]), expected=expected)
     ids, counts = np.unique(box_map.ids, return_counts=True)
     if (counts > 1).any():
-        raise InputError("a box id occurs more than once", where=where, got=str(ids[counts > 1][0]))
+        raise InputError("two boxes have the same id", where=where, got=str(ids[counts > 1][0]))
 
 
 def _first_row(mask: np.ndarray) -> int | None:
@@ -234,8 +236,8 @@ def check_ground(box_map: BoxMap, path: Path) -> None:
         raise InputError(
             "the map has no ground",
             where=path,
-            got="neither ground_z_m nor heights in the header, and no box of the ground",
-            expected="the height at which people stand",
+            got="no ground_z_m and no heights in the header, and no box of a ground type",
+            expected="the height of the ground",
             fix="put ground_z_m into the header, or add boxes of Roads, Sidewalks, Terrain or Ground",
         )
 
@@ -260,7 +262,7 @@ class _Box(BaseModel):
     @classmethod
     def _is_known(cls, name: str) -> str:
         if name not in KINDS:
-            raise ValueError(f"unknown type{nearest(name, KINDS)}, expected a CityObjectLabel name")
+            raise ValueError(f"the type is unknown{nearest(name, KINDS)}; use a CityObjectLabel name")
         return name
 
 
@@ -317,7 +319,7 @@ def read_boxes(path: Path) -> BoxMap:
     """Read `boxes_3d.json`, `step2_simplified.json` or a bare list of boxes, which the paper's exporter writes."""
     if path.suffix.lower() in (".csv", ".geojson"):
         fix = f"convert it to boxes_3d.json: cosfly maps --source boxes --set maps.boxes.path={path} --out DIR"
-        raise InputError("a table of boxes is not a map", where=path, fix=fix)
+        raise InputError("this file is a table of boxes, not a map", where=path, fix=fix)
     value = read_json(path, what=BOXES_FORMAT.what, most_mb=MAP_MB)
     header = MapHeader(name=path.stem)
     records: Any = value
@@ -327,9 +329,14 @@ def read_boxes(path: Path) -> BoxMap:
         if records is None:
             raise InputError(MISSING, where=f"{path}: boxes", expected="a list")
         if not isinstance(records, list):
-            raise InputError("no list of boxes", where=f"{path}: boxes", got=type(records).__name__, expected="a list")
+            raise InputError(
+                "the field is not a list of boxes",
+                where=f"{path}: boxes",
+                got=type(records).__name__,
+                expected="a list",
+            )
     if not records:
-        raise InputError("the map holds no boxes", where=path, fix="check its source, or the stage that wrote it")
+        raise InputError("the map has no boxes", where=path, fix="check its source, or the stage that wrote it")
     boxes = validated(_Boxes, {"boxes": records}, path).boxes
     box_map = make_box_map(
         [box.center for box in boxes],
@@ -357,10 +364,10 @@ def _check_computed(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, 
         number = KINDS[box.type]
         if box.semantic_id not in (None, number):
             raise InputError(
-                "not the number of the box's type",
+                "semantic_id does not match the type of the box",
                 where=f"{path}: box {box.id}: semantic_id",
                 got=box.semantic_id,
-                expected=f"{number}, {box.type}",
+                expected=f"{number} for {box.type}",
             )
     for name, corners in (("min", box_map.mins), ("max", box_map.maxs)):
         # A corner that the file does not hold is NaN, which compares as equal here.
@@ -369,7 +376,7 @@ def _check_computed(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, 
         bad = _first_row(differs)
         if bad is not None:
             raise InputError(
-                "does not follow from center, extent and rotation",
+                "the corner does not follow from center, extent and rotation",
                 where=f"{path}: box {boxes[bad].id}: {name}",
                 got=str(file_corners[bad].tolist()),
                 expected=str(rounded(corners[bad])),

@@ -19,8 +19,8 @@ BYSTANDERS_FORMAT = FileFormat("cosfly.others", "1.0", "others")
 
 @dataclass(frozen=True)
 class Build:
-    """Size of a kind: half_extents_m of its box, x along its heading; discs on the ground that cover it, of one radius,
-    at disc_offsets_m along the heading."""
+    """Size of a kind. half_extents_m: Of its box, x along the heading. disc_offsets_m: Positions along the heading of
+    discs of one radius on the ground that cover the box."""
 
     half_extents_m: tuple[float, float, float]
     disc_radius_m: float
@@ -36,8 +36,8 @@ BUILDS = {
 
 @dataclass(frozen=True)
 class Bystander:
-    """A pedestrian or car next to the target: positions_m (n, 3) on the ground below its middle; headings_rad (n,).
-    is_look_alike: a hard distractor, who differs from the target in one thing."""
+    """A pedestrian or car next to the target. positions_m: (n, 3), on the ground below the middle. headings_rad: (n,).
+    is_look_alike: A hard distractor, which differs from the target in one garment."""
 
     kind: str
     positions_m: np.ndarray
@@ -64,27 +64,30 @@ class Bystander:
         return self.positions_m[:, None, :2] + np.array(self.build.disc_offsets_m)[None, :, None] * ahead[:, None]
 
     def gap_to_person_m(self, person_m: np.ndarray) -> float:
-        """Return the gap between its first discs and a person's at a place, (2+,), negative where they overlap."""
-        apart = np.linalg.norm(self.discs_m[0] - person_m[:2], axis=1).min()
-        return float(apart) - self.build.disc_radius_m - BUILDS["Pedestrians"].disc_radius_m
+        """Return the gap between its discs at the first time and a person at (2 or 3,) m; negative: overlap."""
+        distance_m = np.linalg.norm(self.discs_m[0] - person_m[:2], axis=1).min()
+        return float(distance_m) - self.build.disc_radius_m - BUILDS["Pedestrians"].disc_radius_m
 
     def at(self, i: int) -> Bystander:
-        """Return it at one time."""
+        """Return the bystander at one time."""
         return replace(self, positions_m=self.positions_m[i : i + 1], headings_rad=self.headings_rad[i : i + 1])
 
     def every(self, stride: int) -> Bystander:
-        """Return it at every `stride`-th time."""
+        """Return the bystander at every `stride`-th time."""
         return replace(self, positions_m=self.positions_m[::stride], headings_rad=self.headings_rad[::stride])
 
     def as_json(self) -> dict:
-        flags, yaw = {"look_alike": True} if self.is_look_alike else {}, rounded(np.degrees(self.headings_rad), 3)
+        flags = {"look_alike": True} if self.is_look_alike else {}
+        yaw = rounded(np.degrees(self.headings_rad), 3)
         return {"kind": self.kind, **flags, **as_columns(self.positions_m, "xyz"), "yaw": yaw}
 
     @classmethod
     def from_json(cls, record: dict, where: str) -> Bystander:
         kind = record.get("kind")
         if not isinstance(kind, str) or kind not in BUILDS:
-            raise InputError("no such kind", where=f"{where}.kind", got=repr(kind)[:60], expected=" or ".join(BUILDS))
+            raise InputError(
+                "the kind is unknown", where=f"{where}.kind", got=repr(kind)[:60], expected=" or ".join(BUILDS)
+            )
         positions_m = columns(record, "xyz", where)
         yaw = column(record, "yaw", where, len(positions_m))
         return cls(kind, positions_m, np.radians(yaw), record.get("look_alike") is True)
@@ -102,11 +105,11 @@ class Bystanders:
 
     @classmethod
     def from_json(cls, record: dict, where: str) -> Bystanders:
-        lines = records(record, "others", where)
-        others = [Bystander.from_json(line, f"{where}.others[{i}]") for i, line in enumerate(lines)]
-        if len({len(other.positions_m) for other in others}) > 1:
-            raise InputError("columns of different lengths", where=f"{where}.others")
-        return cls(text_id(record, where), others)
+        entries = records(record, "others", where)
+        bystanders = [Bystander.from_json(entry, f"{where}.others[{i}]") for i, entry in enumerate(entries)]
+        if len({len(bystander.positions_m) for bystander in bystanders}) > 1:
+            raise InputError("the columns differ in length", where=f"{where}.others")
+        return cls(text_id(record, where), bystanders)
 
 
 def write_bystanders(path: Path, companions: list[Bystanders], header: dict) -> None:

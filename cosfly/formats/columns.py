@@ -33,7 +33,7 @@ def records(value: dict, name: str, where: Path | str) -> list[dict]:
     """Read a list of objects; raises InputError for anything else."""
     entries = value.get(name)
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise InputError("not a list of objects", where=f"{where}: {name}")
+        raise InputError("the field is missing or is not a list of objects", where=f"{where}: {name}")
     return entries
 
 
@@ -59,7 +59,7 @@ def text_id(record: dict, where: str) -> str:
     if value is None:
         raise InputError(MISSING, where=f"{where}.id", expected="text")
     if not isinstance(value, str):
-        raise InputError("not an id", where=f"{where}.id", got=repr(value)[:60], expected="text")
+        raise InputError("the id is not text", where=f"{where}.id", got=repr(value)[:60], expected="text")
     return value
 
 
@@ -83,7 +83,8 @@ def column(record: dict, name: str, where: str, *shape: int | None) -> np.ndarra
     sides = " x ".join("any number" if side is None else str(side) for side in shape)
     values = numbers(record.get(name), *shape)
     if values is None or len(values) == 0:
-        what, got = ("not a column", repr(record[name])[:60]) if name in record else (MISSING, None)
+        what = "the column has the wrong form" if name in record else MISSING
+        got = repr(record[name])[:60] if name in record else None
         raise InputError(what, where=f"{where}.{name}", got=got, expected=f"a list of finite numbers, {sides}")
     return values
 

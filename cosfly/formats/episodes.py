@@ -22,9 +22,9 @@ EPISODE_FORMAT = FileFormat("cosfly.episode", "1.0", "episode")
 SCORE, SCORE_FORMAT = "score.json", FileFormat("cosfly.score", "1.0", "score")
 MOST_WORDS = 4000  # characters of an answer that are kept
 
-# lead: a frame of the plan, before the first decision. late: no answer within the limit; unreadable: not in the
-# requested form; invalid: an unknown decision or an invalid command; none: no answer. After an answer that is not ok
-# the drone hovers. end: the last frame, without a decision.
+# lead: a frame of the plan, before the first decision. late: no answer within the limit. unreadable: an answer in
+# another form than requested. invalid: an unknown decision or an invalid command. none: no answer. end: the last frame,
+# without a decision. After late, unreadable, invalid and none the drone hovers.
 Answer = Literal["lead", "ok", "late", "unreadable", "invalid", "none", "end"]
 # finished: flown to the end of the pedestrian trajectory; crashed: an obstacle or the ground came within the drone's
 # radius; lost: the target was not visible for `fly.lost_s`; left: the drone flew out of the map's bounds.
@@ -38,10 +38,10 @@ class EpisodeFrame(Record):
     """One frame. command: as ACTION (cosfly/geometry/motion.py), None in the last. answer_s: time of the decision.
     words: the student's reasons, or its raw answer if unreadable.
 
-    in_view: some of the target's box is in the picture; visible: and enough of it is not hidden, `visibility` its
-    share; num_pixels: of the target. distance_m: drone to hip over ground; height_m: drone over the target's ground;
-    clearance_m: least distance to an obstacle or the ground until the next frame; speed_mps: of the drone. pose:
-    x, y, z, pitch, yaw, roll of the camera. target_m: the hip.
+    in_view: a part of the target's box is in the picture; visible: enough of it is not hidden; visibility: the share
+    that is not hidden; num_pixels: of the target. distance_m: drone to hip over ground; height_m: drone over the
+    target's ground; clearance_m: least distance to an obstacle or the ground until the next frame; speed_mps: of the
+    drone. pose: x, y, z, pitch, yaw, roll of the camera. target_m: the hip.
     """
 
     time_s: FiniteFloat
@@ -96,15 +96,18 @@ class Episode(Record):
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
-        answers, times_s = [frame.answer for frame in self.frames], [frame.time_s for frame in self.frames]
+        answers = [frame.answer for frame in self.frames]
+        times_s = [frame.time_s for frame in self.frames]
         if "end" in answers[:-1] or answers[-1] != "end" or "lead" in answers[self.num_lead :]:
-            raise ValueError("frames are `lead`, then decisions, then one `end`")
+            raise ValueError("the answers of the frames must be `lead`, then decisions, then one `end`")
         if any(later <= earlier for earlier, later in pairwise(times_s)):
-            raise ValueError("times must increase")
+            raise ValueError("the times of the frames must increase")
         if any((frame.command is None) != (frame.answer == "end") for frame in self.frames):
-            raise ValueError(f"all frames but the last have a command, {', '.join(ACTION)}")
+            raise ValueError(f"each frame except the last must have a command ({', '.join(ACTION)})")
         if len(self.flown) > self.num_walk_frames:
-            raise ValueError(f"{len(self.flown)} frames of a trajectory of {self.num_walk_frames}")
+            raise ValueError(
+                f"{len(self.flown)} frames follow the first decision, but num_walk_frames is {self.num_walk_frames}"
+            )
         return self
 
     @property
@@ -179,8 +182,8 @@ class Score(Record):
     @model_validator(mode="after")
     def _has_each_episode_once(self) -> Self:
         counts = Counter((flight.town, flight.episode) for flight in self.flights)
-        if twice := [f"{town}/{episode}" for (town, episode), count in counts.items() if count > 1]:
-            raise ValueError(f"episode {twice[0]} is listed twice")
+        if repeated := [f"{town}/{episode}" for (town, episode), count in counts.items() if count > 1]:
+            raise ValueError(f"the score lists episode {repeated[0]} twice")
         return self
 
 

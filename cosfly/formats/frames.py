@@ -121,7 +121,7 @@ def _read_axes(names: tuple[str, ...], value: Any) -> np.ndarray:
         row = numbers([value.get(name) for name in names], len(names))
         if row is not None:
             return mirror_poses(row)
-    raise ValueError(f"Value should be an object of finite numbers, {', '.join(names)}")
+    raise ValueError(f"Value should be an object with finite numbers {', '.join(names)}")
 
 
 def _write_axes(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:

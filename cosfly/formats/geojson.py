@@ -47,10 +47,10 @@ def features_of(value: Any, path: Path) -> list[Feature]:
     """Return the features of a document; `path` is for messages. Raises InputError if it is not GeoJSON."""
     if not is_geojson(value):
         expected = "FeatureCollection, Feature, Polygon or MultiPolygon"
-        raise InputError("not GeoJSON", where=f"{path}: type", expected=expected)
+        raise InputError("this file is not GeoJSON", where=f"{path}: type", expected=expected)
     items = value.get("features") if value["type"] == "FeatureCollection" else [value]
     if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
-        raise InputError("no list of features", where=f"{path}: features", expected="a list of Feature")
+        raise InputError("the file has no list of features", where=f"{path}: features", expected="a list of Feature")
     return [_feature(item, number) for number, item in enumerate(items, 1)]
 
 

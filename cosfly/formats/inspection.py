@@ -1,5 +1,5 @@
-"""`inspect.json`, the product of step 6: one record per track and the funnel; `review.jsonl` next to it: what people
-decided about tracks that the inspection could not decide (`cosfly inspect review`).
+"""`inspect.json`, the product of step 6: one record per track and the funnel; `review.jsonl` next to it: decisions of
+people on tracks that the inspection left in review (`cosfly inspect review`).
 
 `review.jsonl` only grows: a later decision on the same track replaces an earlier one. Each decision names the
 inspection by the digest of its file and counts for that inspection only.
@@ -47,7 +47,7 @@ class TrackInspection(Record):
     result: Result
     issues: list[Issue]
     metrics: dict[str, FiniteFloat | int | None]
-    # By a person, after the inspection ; `inspect.json` never holds it.
+    # By a person, after the inspection; `inspect.json` never holds it.
     decided: Literal["accepted", "rejected"] | None = Field(None, exclude=True)
 
     @property
@@ -57,7 +57,7 @@ class TrackInspection(Record):
 
     @property
     def reason(self) -> str | None:
-        """Code of the worst finding, None when the flight is accepted; `review` of one that a person rejected."""
+        """Code of the worst finding; None if the track is accepted, `review` if a person rejected it."""
         if self.decided == "rejected":
             return "review"
         return self.issues[0].code if self.result != "accepted" and self.issues else None
@@ -92,7 +92,7 @@ class TrackFunnel(Record):
 
 
 class Funnel(Record):
-    """From planned trajectories to accepted flights (sec:step6); a trajectory is as good as its worst flight."""
+    """From planned trajectories to accepted tracks (sec:step6); a trajectory has the result of its worst track."""
 
     trajectories: TrajectoryFunnel
     flights: TrackFunnel
@@ -111,14 +111,14 @@ def count_trajectories(flights: list[TrackInspection], *, planned: bool) -> dict
     """Count rendered trajectories by the result of their worst track: `rendered`, `accepted`, `review`, `rejected`.
 
     Args:
-        planned: count plans, so that tracks without one are ignored; otherwise count folders.
+        planned: True counts planned trajectories and ignores tracks without one; False counts folders.
     """
-    results: dict[str, set[str]] = {}
+    results: dict[str, set[Result]] = {}
     for flight in flights:
         name = flight.trace_id if planned else str(Path(flight.folder).parent)
         if name is not None:
             results.setdefault(name, set()).add(flight.result)
-    worst = Counter(next(r for r in reversed(RESULTS) if r in found) for found in results.values())
+    worst = Counter(max(of_trajectory, key=RESULTS.index) for of_trajectory in results.values())
     return {"rendered": len(results)} | {result: worst[result] for result in RESULTS}
 
 
@@ -131,9 +131,9 @@ def read_inspection(path: Path) -> Inspection:
     """Read `inspect.json`."""
     inspection = read_model(path, Inspection, INSPECT_FORMAT)
     counts = Counter(flight.folder for flight in inspection.flights)
-    if twice := [folder for folder, count in counts.items() if count > 1]:
-        where, expected = f"{path}: flights", "one record for each folder of a track"
-        raise InputError("a track has two records", where=where, got=twice[0], expected=expected)
+    if repeated := [folder for folder, count in counts.items() if count > 1]:
+        expected = "one record for each folder of a track"
+        raise InputError("a track has two records", where=f"{path}: flights", got=repeated[0], expected=expected)
     return inspection
 
 
@@ -141,7 +141,7 @@ def read_inspection(path: Path) -> Inspection:
 
 
 class Choice(Record):
-    """A person's verdict on a track, named by its folder in the playback tree, or on a trajectory, by the one above."""
+    """A person's verdict. folder: Of a track, or of a trajectory, relative to the playback tree."""
 
     folder: str
     verdict: Literal["accepted", "rejected"]
@@ -160,8 +160,10 @@ class Decision(Choice):
 
 def read_decisions(inspected: Path) -> dict[str, Decision]:
     """Read the last decision on each track, by folder; empty without a file. inspected: path of `inspect.json`."""
-    path, digest = inspected.with_name(REVIEW), sha256_file(inspected)
-    journal, found = Journal(path), dict[str, Decision]()
+    path = inspected.with_name(REVIEW)
+    digest = sha256_file(inspected)
+    journal = Journal(path)
+    decisions: dict[str, Decision] = {}
     for decision in journal.read_as(Decision.model_validate):
         if decision.inspection != digest:
             raise InputError(
@@ -171,13 +173,15 @@ def read_decisions(inspected: Path) -> dict[str, Decision]:
                 expected=f"decisions on {inspected}",
                 fix=f"move {REVIEW} away and decide again with cosfly inspect review, or restore that inspection",
             )
-        found[decision.folder] = decision
+        decisions[decision.folder] = decision
     if journal.is_cut_short:
         log.warning("%s: the last decision was cut short by a kill and does not count; decide it again", path)
     if num_damaged := journal.num_damaged - journal.is_cut_short:
         fix = "restore the file, or move it away and decide again with cosfly inspect review"
-        raise InputError("a decision was changed", where=path, got=f"{num_damaged} damaged lines", fix=fix)
-    return found
+        raise InputError(
+            "decisions in this file were changed", where=path, got=f"{num_damaged} lines with a wrong checksum", fix=fix
+        )
+    return decisions
 
 
 def _queue(inspected: Path) -> tuple[list[str], dict[str, Decision]]:
@@ -207,19 +211,26 @@ def summary(inspected: Path) -> str:
     """Return the state of the review in one line, with the names of open tracks."""
     queue, decisions = _queue(inspected)
     verdicts = [decisions[folder].verdict for folder in queue if folder in decisions]
-    waiting, num_others = [folder for folder in queue if folder not in decisions], len(decisions.keys() - set(queue))
+    waiting = [folder for folder in queue if folder not in decisions]
     counts = f"{verdicts.count('accepted')} accepted, {verdicts.count('rejected')} rejected, {len(waiting)} open"
-    text = f"{len(queue)} flights in review: {counts}" + (f"; {num_others} others rejected" if num_others else "")
-    return text + (f" ({', '.join(waiting[:3])}{', ...' if len(waiting) > 3 else ''})" if waiting else "")
+    text = f"{len(queue)} flights in review: {counts}"
+    if num_others := len(decisions.keys() - set(queue)):
+        text += f"; {num_others} others rejected"
+    if waiting:
+        text += f" ({', '.join(waiting[:3])}{', ...' if len(waiting) > 3 else ''})"
+    return text
 
 
 def read_settled(inspected: Path) -> Inspection:
     """Read `inspect.json` with people's decisions applied to the results and the funnel of trajectories."""
-    inspection, decisions = read_inspection(inspected), read_decisions(inspected)
+    inspection = read_inspection(inspected)
+    decisions = read_decisions(inspected)
     if not decisions:
         return inspection
-    verdicts = {folder: {"result": one.verdict, "decided": one.verdict} for folder, one in decisions.items()}
-    tracks = [track.model_copy(update=verdicts.get(track.folder)) for track in inspection.flights]
+    updates = {
+        folder: {"result": decision.verdict, "decided": decision.verdict} for folder, decision in decisions.items()
+    }
+    tracks = [track.model_copy(update=updates.get(track.folder)) for track in inspection.flights]
     is_planned = any(track.trace_id is not None for track in tracks) or not inspection.funnel.trajectories.rendered
     counts = count_trajectories(tracks, planned=is_planned)
     trajectories = inspection.funnel.trajectories.model_copy(update=counts)
@@ -234,20 +245,25 @@ def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[D
     A trajectory's folder means its tracks in review; a rejection also covers those that were accepted.
     """
     read_decisions(inspected)  # existing ones must be of this inspection
-    about = {"inspection": sha256_file(inspected), "by": by, "at": datetime.now(UTC).isoformat(timespec="seconds")}
-    tracks, decisions = read_inspection(inspected).flights, list[Decision]()
+    digest = sha256_file(inspected)
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    tracks = read_inspection(inspected).flights
+    decisions: list[Decision] = []
     for choice in choices:
         for track in _chosen(choice, tracks, inspected):
             if track.result == "rejected" and choice.verdict == "accepted":
                 raise InputError(
-                    "a flight that breaks a rule cannot be accepted",
+                    "this track breaks a rule, so it cannot be accepted",
                     where=track.folder,
                     got=track.reason or "rejected",
-                    expected="a flight in review",
-                    fix="fix the flight, or change the threshold and inspect again",
+                    expected="a track in review",
+                    fix="fix the track, or change the threshold and inspect again",
                 )
-            named = {"folder": track.folder, "sha256": track.sha256}
-            decisions.append(Decision(**choice.model_dump() | named | about))
+            decision = Decision(
+                folder=track.folder, verdict=choice.verdict, reason=choice.reason, inspection=digest,
+                sha256=track.sha256, by=by, at=now,
+            )  # fmt: skip
+            decisions.append(decision)
     with Journal(inspected.with_name(REVIEW)) as journal:
         for decision in decisions:
             journal.append(decision.model_dump())
@@ -255,13 +271,13 @@ def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[D
 
 
 def _chosen(choice: Choice, tracks: list[TrackInspection], inspected: Path) -> list[TrackInspection]:
-    """Return the tracks that a choice means."""
+    """Return the tracks that a choice decides."""
     name = choice.folder.strip("/")
-    named = [track for track in tracks if track.folder == name]
-    below = [track for track in tracks if track.folder.rpartition("/")[0] == name]
-    meant = ("review",) if choice.verdict == "accepted" else ("review", "accepted")
-    found = named or [track for track in below if track.result in meant] or below
-    if not found:
-        expected = f"the folder of a flight or of its trajectory, as {', '.join(_folders_in_review(tracks)[:3])}"
-        raise InputError("no such flight", where=inspected, got=choice.folder, expected=expected)
-    return found
+    tracks_of_name = [track for track in tracks if track.folder == name]
+    of_trajectory = [track for track in tracks if track.folder.rpartition("/")[0] == name]
+    results = ("review",) if choice.verdict == "accepted" else ("review", "accepted")
+    chosen = tracks_of_name or [track for track in of_trajectory if track.result in results] or of_trajectory
+    if not chosen:
+        expected = f"the folder of a track or of a trajectory, as {', '.join(_folders_in_review(tracks)[:3])}"
+        raise InputError("the inspection has no such track", where=inspected, got=choice.folder, expected=expected)
+    return chosen

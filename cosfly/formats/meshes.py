@@ -1,7 +1,7 @@
 """Meshes: glTF 2.0 (.glb, .gltf) and Wavefront OBJ (.obj) read through trimesh, and `meshes.glb` next to a map.
 
-Triangles and plain colours, no textures. +y is up in glTF and becomes +z; an OBJ is read as it is, z up. trimesh gets
-bytes only: files that a mesh names are read here, from below its folder, and counts are bounded before they are loaded.
+Only triangles and plain colours are read, not textures. +y is up in glTF and becomes +z; in an OBJ +z is up. trimesh
+gets bytes only: this module reads the files that a mesh names, from below its folder, and bounds counts before loading.
 Planners and visibility use boxes only.
 """
 
@@ -25,12 +25,13 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import MB, decoded, over_limit, read_bytes, write_bytes
 from cosfly.runtime.json_io import parse_document
 
-MOST_TRIANGLES = 2_000_000  # of a file, and of all that a map draws
+MOST_TRIANGLES = 2_000_000  # of a file, and of all meshes of a map
 FILE_MB = MOST_TRIANGLES * 256 / MB  # an OBJ takes some 100 bytes for a triangle
 MOST_NUMBERS = 12 * MOST_TRIANGLES  # of vertices, colours and indices; three of each are usual for a triangle
 SUFFIXES = (".glb", ".gltf", ".obj")
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # from glTF's axes
 GLB_MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
+GLB_HEADER_BYTES = 12
 TRIANGLES, STRIP = 4, 5  # modes; points and lines have no surface
 DISPLAY_GAMMA = 2.2  # an OBJ's colours are those of a screen
 LARGEST_M = 1e7
@@ -52,7 +53,7 @@ class Mesh:
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
-    """Return all of some meshes, at least one, as one."""
+    """Return one mesh with the triangles of several, at least one."""
     return Mesh(np.concatenate([m.corners_m for m in meshes]), np.concatenate([m.colors for m in meshes]))
 
 
@@ -63,7 +64,7 @@ def too_many(where: object, num_triangles: int) -> InputError:
 
 @dataclass(frozen=True)
 class _Folder:
-    """The folder of a mesh. As trimesh's resolver, it gives materials without pictures."""
+    """The folder of a mesh. trimesh reads files through it and gets materials without textures."""
 
     path: Path
     tree: Path
@@ -72,52 +73,60 @@ class _Folder:
         inner = PurePosixPath(unquote(name))
         if inner.is_absolute() or ".." in inner.parts or "\\" in name or ":" in name or "\0" in name or not inner.parts:
             what = "the mesh names a file outside of its folder"
-            raise InputError(what, where=self.path, got=name[:80], expected="a name below it")
+            raise InputError(what, where=self.path, got=name[:80], expected="a file below the folder of the mesh")
         where = self.path.parent / inner
         return read_bytes(where, what=f"file that {self.path.name} names", tree=self.tree, most_mb=FILE_MB)
 
     def __getitem__(self, name: str) -> bytes:
-        return re.sub(rb"(?im)^\s*map_kd\b", b"pictured", self.read(name))
+        return re.sub(rb"(?im)^\s*map_kd\b", b"textured", self.read(name))
 
 
 def read_meshes(path: Path, *, tree: Path) -> dict[str, Mesh]:
     """Read a file of meshes, node by node; an OBJ is one node.
 
     Args:
-        tree: the folder that neither the file nor what it names may lie outside of.
+        tree: The folder that must contain the file and all files that it names.
     """
     data = read_bytes(path, what="mesh", tree=tree, most_mb=FILE_MB)
     readers = {".glb": _read_glb, ".gltf": _read_gltf, ".obj": _read_obj}
     if path.suffix.lower() not in readers:
-        raise InputError("unknown kind of mesh", where=path, got=path.suffix, expected=", ".join(SUFFIXES))
+        raise InputError(
+            "the file type of the mesh is unknown", where=path, got=path.suffix, expected=", ".join(SUFFIXES)
+        )
     try:
-        found = readers[path.suffix.lower()](data, _Folder(path, tree))
+        meshes = readers[path.suffix.lower()](data, _Folder(path, tree))
     except NOT_READ as error:
         raise InputError("the mesh is malformed", where=path, got=f"{type(error).__name__}: {error}"[:120]) from None
-    if not any(map(len, found.values())):
+    if not any(map(len, meshes.values())):
         raise InputError("the mesh has no triangles", where=path)
-    if not all((np.abs(mesh.corners_m) <= LARGEST_M).all() for mesh in found.values()):  # NaN is not
-        raise InputError("a vertex is not finite or too far off", where=path, expected=f"within {LARGEST_M:g} m")
-    return found
+    if not all((np.abs(mesh.corners_m) <= LARGEST_M).all() for mesh in meshes.values()):  # NaN fails
+        raise InputError("a vertex is not finite or too far away", where=path, expected=f"within {LARGEST_M:g} m")
+    return meshes
 
 
 def _read_glb(data: bytes, folder: _Folder) -> dict[str, Mesh]:
     if struct.unpack_from("<II", data.ljust(20)) != (GLB_MAGIC, 2):
-        raise InputError("not a binary glTF 2.0", where=folder.path)
-    chunks, at = dict[int, bytes](), 12
-    while at + 8 <= len(data):
-        size, kind = struct.unpack_from("<II", data, at)
-        chunks.setdefault(kind, data[at + 8 : at + 8 + size])
-        at += 8 + size
-    if at > len(data):
-        raise InputError("the mesh is cut short", where=folder.path, got=f"{len(data)} bytes", expected=f"{at}")
+        raise InputError("this file is not a binary glTF 2.0", where=folder.path)
+    chunks: dict[int, bytes] = {}
+    end = GLB_HEADER_BYTES
+    while end + 8 <= len(data):
+        size, kind = struct.unpack_from("<II", data, end)
+        chunks.setdefault(kind, data[end + 8 : end + 8 + size])
+        end += 8 + size
+    if end > len(data):
+        got = f"{len(data)} bytes"
+        raise InputError("the mesh is cut short", where=folder.path, got=got, expected=f"{end} bytes")
     return _read_gltf(chunks[JSON_CHUNK], folder, chunks.get(BINARY_CHUNK, b""))
 
 
 def _read_gltf(data: bytes, folder: _Folder, binary: bytes = b"") -> dict[str, Mesh]:
-    """Let trimesh place the primitives, each a mesh of its own, of a document without what is not drawn."""
+    """Read the meshes of a glTF document by the names of their nodes.
+
+    trimesh gets a flat document with triangles and colours only, in which each primitive is a mesh of its own.
+    """
     document = parse_document(data, folder.path)
-    accessors, views = document.get("accessors", []), document.get("bufferViews", [])
+    accessors = document.get("accessors", [])
+    views = document.get("bufferViews", [])
     if document.get("extensionsRequired") or any("sparse" in a or "bufferView" not in a for a in accessors):
         raise InputError(
             "the mesh requires a glTF extension, a sparse accessor or an accessor without data",
@@ -125,44 +134,65 @@ def _read_gltf(data: bytes, folder: _Folder, binary: bytes = b"") -> dict[str, M
             expected="plain glTF 2.0",
             fix="export it again without compression and other extensions",
         )
-    nodes, owners = [dict(node) for node in document.get("nodes", ())], list[tuple[int, dict]]()
-    inner = [child for node in nodes for child in node.get("children", ())]
-    every = sorted(set(range(len(nodes))) - set(inner))
-    roots = document["scenes"][document.get("scene", 0)].get("nodes", []) if "scenes" in document else every
-    if len({*inner, *roots}) < len(inner) + len(roots):  # also a cycle
-        raise InputError("a node of the mesh has two parents", where=folder.path)
-    for k, node in enumerate(list(nodes)):
-        pieces = document["meshes"][node.pop("mesh")]["primitives"] if "mesh" in node else ()
-        for piece in (one for one in pieces if one.get("mode", TRIANGLES) >= TRIANGLES):
-            node["children"] = [*node.get("children", ()), len(nodes)]
-            nodes.append({"mesh": len(owners)})
-            owners.append((k, piece))
-    drawn = []
-    for _, piece in owners:
-        if piece.get("mode", TRIANGLES) > STRIP:
-            raise InputError("a fan of triangles", where=folder.path, expected="triangles, or strips of them")
-        kept = {name: k for name, k in piece["attributes"].items() if name in ("POSITION", "COLOR_0")}
-        drawn.append({key: piece[key] for key in ("mode", "indices") if key in piece} | {"attributes": kept})
-    used = [k for flat in drawn for k in (*flat["attributes"].values(), flat.get("indices")) if k is not None]
+    nodes = [dict(node) for node in document.get("nodes", ())]
+    roots = _roots(document, nodes, folder)
+    owned = _with_own_nodes(document, nodes)
+    primitives = [_flat_primitive(primitive, folder) for _, primitive in owned]
+    used = [k for flat in primitives for k in (*flat["attributes"].values(), flat.get("indices")) if k is not None]
     counts = [*(accessors[k]["count"] for k in used), *(view["byteLength"] for view in views)]
     if min(counts, default=0) < 0 or sum(counts) > MOST_NUMBERS + FILE_MB * MB:
-        raise InputError("the mesh counts more numbers than it may", where=folder.path, got=f"{sum(counts):,}")
-    read = functools.cache(lambda uri: _buffer(uri, binary, folder))  # each once, however many name it
-    buffers = {str(k): read(b.get("uri")) for k, b in enumerate(document.get("buffers", ()))}
+        raise InputError("the mesh has too many numbers", where=folder.path, got=f"{sum(counts):,}")
+    read_buffer = functools.cache(lambda uri: _buffer(uri, binary, folder))  # several buffers may name one file
+    buffers = {str(k): read_buffer(b.get("uri")) for k, b in enumerate(document.get("buffers", ()))}
     flat_document = {
         "asset": {"version": "2.0"}, "scenes": [{"nodes": roots}], "accessors": accessors, "bufferViews": views,
-        "nodes": [{key: v for key, v in n.items() if key != "name"} | {"name": str(k)} for k, n in enumerate(nodes)],
-        "meshes": [{"name": str(k), "primitives": [flat]} for k, flat in enumerate(drawn)],
+        "nodes": [node | {"name": str(k)} for k, node in enumerate(nodes)],
+        "meshes": [{"name": str(k), "primitives": [flat]} for k, flat in enumerate(primitives)],
         "buffers": [{"uri": name} for name in buffers],
     }  # fmt: skip
     scene = _scene(json.dumps(flat_document).encode(), "gltf", buffers, folder, skip_materials=True)
-    found: dict[str, list[Mesh]] = {}
+    meshes_by_node: dict[str, list[Mesh]] = {}
     placed = [scene.graph[name] for name in scene.graph.nodes_geometry]
     for number, world in sorted((int(str(key)), world) for world, key in placed):
-        k, piece = owners[number]
-        mesh = _placed(scene.geometry[str(number)], world, _color(piece, document))
-        found.setdefault(str(document["nodes"][k].get("name", f"node_{k}")), []).append(mesh)
-    return {name: joined(meshes) for name, meshes in found.items()}
+        node_index, primitive = owned[number]
+        name = str(document["nodes"][node_index].get("name", f"node_{node_index}"))
+        mesh = _placed(scene.geometry[str(number)], world, _color(primitive, document))
+        meshes_by_node.setdefault(name, []).append(mesh)
+    return {name: joined(meshes) for name, meshes in meshes_by_node.items()}
+
+
+def _roots(document: dict, nodes: list[dict], folder: _Folder) -> list[int]:
+    """Return the nodes of the scene, or without scenes those that have no parent."""
+    children = [child for node in nodes for child in node.get("children", ())]
+    if "scenes" in document:
+        roots = document["scenes"][document.get("scene", 0)].get("nodes", [])
+    else:
+        roots = sorted(set(range(len(nodes))) - set(children))
+    if len({*children, *roots}) < len(children) + len(roots):  # also a cycle
+        raise InputError("a node of the mesh has two parents", where=folder.path)
+    return roots
+
+
+def _with_own_nodes(document: dict, nodes: list[dict]) -> list[tuple[int, dict]]:
+    """Replace meshes by a child node for each primitive with triangles, in place; return each with its old node."""
+    owned: list[tuple[int, dict]] = []
+    for k, node in enumerate(list(nodes)):
+        primitives = document["meshes"][node.pop("mesh")]["primitives"] if "mesh" in node else ()
+        for primitive in primitives:
+            if primitive.get("mode", TRIANGLES) >= TRIANGLES:
+                node["children"] = [*node.get("children", ()), len(nodes)]
+                nodes.append({"mesh": len(owned)})
+                owned.append((k, primitive))
+    return owned
+
+
+def _flat_primitive(primitive: dict, folder: _Folder) -> dict:
+    """Return a primitive with its triangles and colours only."""
+    if primitive.get("mode", TRIANGLES) > STRIP:
+        what = "the mesh has a fan of triangles"
+        raise InputError(what, where=folder.path, expected="single triangles or strips of triangles")
+    attributes = {name: k for name, k in primitive["attributes"].items() if name in ("POSITION", "COLOR_0")}
+    return {key: primitive[key] for key in ("mode", "indices") if key in primitive} | {"attributes": attributes}
 
 
 def _buffer(uri: str | None, binary: bytes, folder: _Folder) -> bytes:
@@ -181,16 +211,16 @@ def _scene(data: bytes, file_type: str, resolver: Any, folder: _Folder, **option
     return scene
 
 
-def _color(piece: dict, document: dict) -> np.ndarray:
-    """Return the plain colour of a primitive, linear RGB; NaN where it has none or a picture has it."""
-    material = document["materials"][piece["material"]] if "material" in piece else {}
+def _color(primitive: dict, document: dict) -> np.ndarray:
+    """Return the plain colour of a primitive, linear RGB; NaN if it has none or has a texture."""
+    material = document["materials"][primitive["material"]] if "material" in primitive else {}
     surface = material.get("pbrMetallicRoughness", {})
     is_plain = "baseColorFactor" in surface and "baseColorTexture" not in surface
     return np.array(surface["baseColorFactor"] if is_plain else [np.nan] * 4, np.float64).reshape(4)[:3]
 
 
 def _placed(shape: Any, world: np.ndarray, color: np.ndarray) -> Mesh:
-    """Return a mesh of trimesh's at the place of its node."""
+    """Convert a mesh of trimesh, moved by the transform of its node (4, 4)."""
     corners = (shape.vertices[shape.faces] @ world[:3, :3].T + world[:3, 3]) @ Z_UP.T
     colors = np.tile(color, (len(corners), 1))
     if shape.visual.kind == "vertex":
@@ -201,7 +231,7 @@ def _placed(shape: Any, world: np.ndarray, color: np.ndarray) -> Mesh:
 
 
 def _read_obj(data: bytes, folder: _Folder) -> dict[str, Mesh]:
-    """Read an OBJ; of its materials the diffuse colours (`Kd`) of those without a picture."""
+    """Read an OBJ, with the diffuse colours (`Kd`) of the materials that have no texture."""
     if re.search(r"(?m)^[ \t]*f[ \t].*-", text := decoded(data, folder.path)):
         raise InputError(
             "the OBJ file uses negative vertex indices, which are not supported",
@@ -210,28 +240,28 @@ def _read_obj(data: bytes, folder: _Folder) -> dict[str, Mesh]:
             fix="export the mesh with absolute indices",
         )
     for name in re.findall(r"(?m)^[ \t]*mtllib[ \t]+(.*)$", text):
-        folder.read(name.strip())  # trimesh would pass over what cannot be read
-    scene, found = _scene(text.encode(), "obj", folder, folder, process=False), list[Mesh]()
+        folder.read(name.strip())  # trimesh would ignore a file that cannot be read
+    scene = _scene(text.encode(), "obj", folder, folder, process=False)
+    meshes: list[Mesh] = []
     for shape in scene.geometry.values():
         material = getattr(getattr(shape.visual, "material", None), "kwargs", {})
-        is_plain = "kd" in material and "pictured" not in material
+        is_plain = "kd" in material and "textured" not in material
         color = np.clip(material["kd"], 0.0, 1.0) ** DISPLAY_GAMMA if is_plain else np.full(3, np.nan)
         corners = shape.vertices[getattr(shape, "faces", np.zeros((0, 3), int))]
-        found.append(Mesh(corners, np.tile(np.reshape(color, 3), (len(corners), 1))))
-    return {"mesh": joined(found)} if found else {}
+        meshes.append(Mesh(corners, np.tile(np.reshape(color, 3), (len(corners), 1))))
+    return {"mesh": joined(meshes)} if meshes else {}
 
 
 MESHES_FILE = "meshes.glb"
-FLOAT, ARRAY_BUFFER = 5126, 34962
-NO_COLOR = -1.0  # in the place of a colour that no file told, while they are sorted
+FLOAT, ARRAY_BUFFER = 5126, 34962  # numbers of glTF
+NO_COLOR = -1.0  # replaces NaN while colours are sorted
 
 
 class MeshRef(BaseModel):
-    """What a box is drawn as.
+    """The mesh that is drawn instead of a box.
 
-    fit `box`: what the mesh spans is stretched to the box, axis by axis. fit `world`: its vertices are places of the
-    map, in metres; boxes that name the same one stand for one thing, which is drawn once, with the id of the first of
-    them.
+    fit `box`: The bounds of the mesh are stretched to the box, axis by axis. fit `world`: Its vertices are positions in
+    the map, in metres; if several boxes name the same mesh, it is drawn once, with the id of the first box.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -245,15 +275,15 @@ class MeshRef(BaseModel):
     def _stays_below(cls, name: str) -> str:
         path = PurePosixPath(name)
         if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
-            raise ValueError("not a name of a file below the map's folder")
+            raise ValueError("the name of a mesh must lead to a file below the map's folder")
         if path.suffix.lower() not in SUFFIXES:
-            raise ValueError(f"not a mesh that is known, expected {', '.join(SUFFIXES)}")
+            raise ValueError(f"the name of a mesh must end in one of {', '.join(SUFFIXES)}")
         return name
 
 
 @dataclass(frozen=True)
 class Meshes:
-    """The meshes of a map. refs: box id -> what it is drawn as; folder: that their files are below; made: node -> mesh
+    """The meshes of a map. refs: Box id -> the mesh that is drawn. folder: The folder of the files. made: Node -> mesh,
     of a MESHES_FILE that is not written yet.
     """
 
@@ -267,22 +297,27 @@ class Meshes:
         return {name: self.folder / name for name in names} if self.folder is not None else {}
 
     def resolved(self) -> dict[MeshRef, Mesh]:
-        """Read what the boxes name."""
-        files = self.files().items()
-        read = {name: read_meshes(path, tree=path.parents[len(Path(name).parts) - 1]) for name, path in files}
-        found: dict[MeshRef, Mesh] = {}
+        """Read the meshes that the boxes name."""
+        nodes_by_file = {
+            name: read_meshes(path, tree=path.parents[len(Path(name).parts) - 1]) for name, path in self.files().items()
+        }
+        meshes: dict[MeshRef, Mesh] = {}
         for box_id, ref in self.refs.items():
-            nodes = read.get(ref.file, self.made)
+            nodes = nodes_by_file.get(ref.file, self.made)
             if ref.node is not None and ref.node not in nodes:
-                where, expected = f"{ref.file}, which box {box_id} names", ", ".join(list(nodes)[:8])
-                raise InputError("the mesh has no such node", where=where, got=ref.node[:80], expected=expected)
-            if ref not in found:
-                found[ref] = joined(list(nodes.values())) if ref.node is None else nodes[ref.node]
-        num_drawn = sum(len(found[ref]) for ref in self.refs.values() if ref.fit == "box")
-        num_drawn += sum(len(mesh) for ref, mesh in found.items() if ref.fit == "world")
-        if num_drawn > MOST_TRIANGLES:
-            raise too_many(self.folder or "map", num_drawn)
-        return found
+                raise InputError(
+                    "the mesh has no such node",
+                    where=f"{ref.file}, which box {box_id} names",
+                    got=ref.node[:80],
+                    expected=", ".join(list(nodes)[:8]),
+                )
+            if ref not in meshes:
+                meshes[ref] = joined(list(nodes.values())) if ref.node is None else nodes[ref.node]
+        num_triangles = sum(len(meshes[ref]) for ref in self.refs.values() if ref.fit == "box")
+        num_triangles += sum(len(mesh) for ref, mesh in meshes.items() if ref.fit == "world")
+        if num_triangles > MOST_TRIANGLES:
+            raise too_many(self.folder or "map", num_triangles)
+        return meshes
 
     def relative_to(self, folder: Path) -> Meshes:
         """Return the meshes moved to MESHES_FILE of a folder, writing it where needed."""
@@ -299,37 +334,40 @@ class Meshes:
 
 
 def write_meshes(path: Path, meshes: dict[str, Mesh]) -> None:
-    """Write meshes as binary glTF 2.0, a node each: vertices in single precision about the node's place."""
-    nodes, shapes, views, accessors = (list[dict]() for _ in range(4))
-    parts, material_of, at = list[bytes](), dict[tuple[float, ...], int](), 0
+    """Write binary glTF 2.0 with a node for each mesh: vertices in single precision relative to the node's position."""
+    nodes: list[dict] = []
+    gltf_meshes: list[dict] = []
+    views: list[dict] = []
+    accessors: list[dict] = []
+    material_of: dict[tuple[float, ...], int] = {}
+    binary = bytearray()
     for name, mesh in meshes.items():
-        corners = mesh.corners_m.reshape(-1, 3) @ Z_UP  # the transpose leads back to +y up
+        corners = mesh.corners_m.reshape(-1, 3) @ Z_UP  # by the transpose, back to +y up
         middle = np.round((corners.min(axis=0) + corners.max(axis=0)) / 2)
         primitives = []
         colors = np.round(np.where(np.isnan(mesh.colors), NO_COLOR, mesh.colors), 4)
         for color in np.unique(colors, axis=0):
-            chosen = np.repeat((colors == color).all(axis=1), 3)
-            near = (corners[chosen] - middle).astype("<f4")
+            has_color = np.repeat((colors == color).all(axis=1), 3)
+            offsets = (corners[has_color] - middle).astype("<f4")
             primitive: dict = {"attributes": {"POSITION": len(accessors)}, "mode": TRIANGLES}
             if (color != NO_COLOR).all():
                 primitive["material"] = material_of.setdefault(tuple(color.tolist()), len(material_of))
             primitives.append(primitive)
             accessors.append(
-                {"bufferView": len(views), "componentType": FLOAT, "type": "VEC3", "count": len(near),
-                 "min": near.min(axis=0).tolist(), "max": near.max(axis=0).tolist()}
+                {"bufferView": len(views), "componentType": FLOAT, "type": "VEC3", "count": len(offsets),
+                 "min": offsets.min(axis=0).tolist(), "max": offsets.max(axis=0).tolist()}
             )  # fmt: skip
-            views.append({"buffer": 0, "byteOffset": at, "byteLength": near.nbytes, "target": ARRAY_BUFFER})
-            parts.append(near.tobytes())
-            at += near.nbytes
-        nodes.append({"name": name, "mesh": len(shapes), "translation": middle.tolist()})
-        shapes.append({"primitives": primitives})
+            views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": offsets.nbytes, "target": ARRAY_BUFFER})
+            binary += offsets.tobytes()
+        nodes.append({"name": name, "mesh": len(gltf_meshes), "translation": middle.tolist()})
+        gltf_meshes.append({"primitives": primitives})
     materials = [{"pbrMetallicRoughness": {"baseColorFactor": [*c, 1.0]}, "doubleSided": True} for c in material_of]
     document = {
         "asset": {"version": "2.0", "generator": "cosfly"}, "scene": 0, "scenes": [{"nodes": list(range(len(nodes)))}],
-        "nodes": nodes, "meshes": shapes, "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": at}],
-        **({"materials": materials} if materials else {}),
+        "nodes": nodes, "meshes": gltf_meshes, "accessors": accessors, "bufferViews": views,
+        "buffers": [{"byteLength": len(binary)}], **({"materials": materials} if materials else {}),
     }  # fmt: skip
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<II", len(text), JSON_CHUNK) + text + struct.pack("<II", at, BINARY_CHUNK) + b"".join(parts)
-    write_bytes(path, struct.pack("<III", GLB_MAGIC, 2, 12 + len(chunks)) + chunks)
+    chunks = struct.pack("<II", len(text), JSON_CHUNK) + text + struct.pack("<II", len(binary), BINARY_CHUNK) + binary
+    write_bytes(path, struct.pack("<III", GLB_MAGIC, 2, GLB_HEADER_BYTES + len(chunks)) + chunks)

@@ -77,7 +77,9 @@ def pace_of(record: dict, where: str) -> str:
     """Read the pace of a record, PLAIN_PACE where it names none."""
     pace = record.get("pace", PLAIN_PACE)
     if not isinstance(pace, str):
-        raise InputError("not a pace", where=f"{where}.pace", got=repr(pace)[:60], expected="a name")
+        raise InputError(
+            "the pace is not text", where=f"{where}.pace", got=repr(pace)[:60], expected="the name of a pace"
+        )
     return pace
 
 

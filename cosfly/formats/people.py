@@ -121,15 +121,13 @@ class Goal:
     def __post_init__(self) -> None:
         in_order = tuple(term for term in GOAL_TERMS if term in self.says)
         if self.says != in_order or not {*self.says} & {*GARMENT_TERMS}:
-            raise ValueError(f"says must name some of {', '.join(GOAL_TERMS)} in this order, and a garment")
+            raise ValueError(f"says must be some of {', '.join(GOAL_TERMS)}, in this order, and at least one garment")
 
 
 def read_goal(record: Any, num_frames: int, where: str) -> Goal:
     """Read the goal of a track of `num_frames` frames from a record."""
     goal = validated(Goal, record, where)
     if goal.frame >= num_frames:
-        expected = f"below {num_frames}"
-        raise InputError(
-            "the goal's frame does not exist", where=f"{where}.frame", got=str(goal.frame), expected=expected
-        )
+        expected = f"0 to {num_frames - 1}"
+        raise InputError("the track has no such frame", where=f"{where}.frame", got=str(goal.frame), expected=expected)
     return goal

@@ -99,9 +99,11 @@ def flight_ids(places: Collection[Place]) -> dict[Place, str]:
         fronts = ({place: form.format(place) for place in group} for form in forms)
         front = next((f for f in fronts if len({(f[place], place.variant) for place in group}) == len(group)), None)
         if front is None:
-            expected = "flights that differ in run, town, trajectory or variant"
-            fix = "leave one of them out, or give the folders of their runs different names"
-            raise InputError("two flights have one name", got=f"{len(group)} of {name}", expected=expected, fix=fix)
+            expected = "tracks that differ in run, town, trajectory or variant"
+            fix = "remove all but one of them, or give the folders of their runs different names"
+            raise InputError(
+                "several tracks have the same id", got=f"{len(group)} of {name}", expected=expected, fix=fix
+            )
         ids |= {place: f"{front[place]}{name}_{place.variant}" for place in group}
     return ids
 

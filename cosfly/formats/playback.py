@@ -370,7 +370,7 @@ class _FieldReader:
         self.issues.append(str(error))
 
     def issue(self, where: str, got: object, expected: str) -> None:
-        self.note(self.error("breaks the layout", where, got, expected))
+        self.note(self.error("the field breaks the layout of the playback tree", where, got, expected))
 
     def optional(self, read: Callable[[], Value]) -> Value | None:
         """Return an optional field; record an issue and return None if its content is invalid."""
@@ -387,7 +387,7 @@ class _FieldReader:
     def points(self, raw: dict) -> list[dict]:
         points = raw.get("points", None if self.strict else raw.get("waypoints"))
         if not isinstance(points, list) or not points or not all(isinstance(p, dict) for p in points):
-            raise self.error("no points", "points", type(points).__name__, "a list of objects")
+            raise self.error("the field is not a list of objects", "points", type(points).__name__, "a list of objects")
         for i, point in enumerate(points):
             self.equal(f"points[{i}].index", point.get("index"), i)
         return points
@@ -398,11 +398,13 @@ class _FieldReader:
         steps = np.diff(time_s)
         if (steps <= 0).any():
             where = f"points[{int(np.argmax(steps <= 0)) + 1}].timing.trace_timestamp"
-            raise self.error("time does not increase", where, float(steps.min()), "strictly increasing times")
+            raise self.error(
+                "the times of the points do not increase", where, float(steps.min()), "strictly increasing times"
+            )
         dt_s = step_s(time_s)
         if len(steps) and np.abs(steps - dt_s).max() > STEP_TOLERANCE_S:
             got = f"steps of {steps.min():.3f} to {steps.max():.3f} s"
-            self.issue("points[].timing.trace_timestamp", got, f"even steps, most are {dt_s:g} s")
+            self.issue("points[].timing.trace_timestamp", got, f"equal steps of {dt_s:g} s")
         return time_s
 
     def time(self, i: int, point: dict) -> float:
@@ -417,7 +419,7 @@ class _FieldReader:
         if value is None and name in ("pitch", "roll") and not self.strict:
             return 0.0
         if value is None or not is_number(value):
-            raise self.error("not a number", f"{where}.{name}", repr(value)[:60], "a finite number")
+            raise self.error("the field is not a number", f"{where}.{name}", repr(value)[:60], "a finite number")
         return float(value)
 
     def poses(self, points: list[dict]) -> np.ndarray:
@@ -446,20 +448,22 @@ class _FieldReader:
             return None
         poses = numbers([point.get("between") for point in points[:-1]], None, None, len(POSE))
         if poses is None:
-            self.issue("points[].between", "something else", "equally many poses of 6 finite numbers at each point")
+            self.issue(
+                "points[].between", "other values", "the same number of poses, of 6 finite numbers each, at each point"
+            )
             return None
         return np.concatenate([mirror_poses(poses), np.full((1, *poses.shape[1:]), np.nan)])
 
     def camera(self, group: Any) -> Camera:
         if not isinstance(group, dict):
-            raise InputError("missing", where=f"{self.path}: camera", expected="width, height, intrinsic")
+            raise InputError(MISSING, where=f"{self.path}: camera", expected="width, height, intrinsic")
         width = self.number("camera", group, "width")
         height = self.number("camera", group, "height")
         matrix = numbers(group.get("intrinsic"), 3, 3)
         if matrix is None or matrix[0, 0] <= 0 or width < 1 or height < 1:
             got = repr(group.get("intrinsic"))[:60]
             expected = "a 3x3 matrix with a positive focal length"
-            raise self.error("not a camera", "camera.intrinsic", got, expected)
+            raise self.error("the camera has no usable matrix", "camera.intrinsic", got, expected)
         check_pixels(width * height, f"{self.path}: camera", f"{width:g} x {height:g} px")
         return Camera(int(width), int(height), matrix)
 

@@ -1,9 +1,9 @@
 """PNG of playback trees and releases: 8 bits, grey to RGBA, not interlaced (RFC 2083).
 
-Reading always compares the checksums of chunks and stream and the number of bytes, and never unpacks more than the
-header says. Writing has three kinds. Colours have texture: each row is stored as the difference to the average of its
-left and upper neighbours. Instance masks have areas: bytes stay as they are. Of depth, a pixel's four channels are the
-bytes of a float32, lowest first, each row stored as the difference to the one above.
+Reading checks the checksums of chunks and stream and the number of bytes, and never unpacks more than the header says.
+Writing filters each kind of picture in its own way. Colours: the difference of each byte to the average of its left and
+upper neighbours. Instance masks: no filter. Depth: the four channels of a pixel are the bytes of a float32, lowest
+first, and each row is stored as the difference to the row above.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from cosfly.runtime.arrays import PNG_SIGNATURE, check_pixels
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
 
-CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # by colour type; palettes are no pictures of a data set
-CHUNK, NUMBER = struct.Struct(">I4s"), struct.Struct(">I")
+CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # by colour type; palettes are not supported
+CHUNK = struct.Struct(">I4s")  # length and name
+NUMBER = struct.Struct(">I")
 RGB, RGBA = 3, 4
 NONE, SUB, UP, AVERAGE, PAETH = range(5)  # filters
-LEVEL = 1
-FIRST = 16  # bytes that are packed apart from the rest
-UNPACK_ERROR: Any = zlib.error  # its stub says that it is no class
+LEVEL = 1  # of compression, the fastest
+FIRST = 16  # bytes that are packed first and flushed
+UNPACK_ERROR: Any = zlib.error  # in the stub it is not a class
 
 
 class Png(NamedTuple):
@@ -35,7 +36,7 @@ class Png(NamedTuple):
 
     def pixels(self) -> np.ndarray:
         """Return the picture, (h, w, channels) uint8."""
-        return _undone(self.lines, self.channels).reshape(len(self.lines), -1, self.channels)
+        return _without_filters(self.lines, self.channels).reshape(len(self.lines), -1, self.channels)
 
 
 def parse_png(data: bytes | memoryview, where: object) -> Png:
@@ -44,28 +45,28 @@ def parse_png(data: bytes | memoryview, where: object) -> Png:
     stride = 1 + width * channels
     unpacker = zlib.decompressobj()
     try:
-        found = unpacker.decompress(packed, height * stride + 1)  # one more than there may be, so that more is noticed
+        raw = unpacker.decompress(packed, height * stride + 1)  # one byte more, to notice a longer stream
     except UNPACK_ERROR as error:
-        raise _broken(where, f"a compressed stream that does not unpack: {error}") from None
-    if len(found) != height * stride or not unpacker.eof:
-        raise _broken(where, "a compressed stream that does not unpack to the picture")
-    lines = np.frombuffer(found, np.uint8).reshape(height, stride)
+        raise _broken(where, f"a damaged compressed stream: {error}") from None
+    if len(raw) != height * stride or not unpacker.eof:
+        raise _broken(where, "a compressed stream with another number of bytes than the picture")
+    lines = np.frombuffer(raw, np.uint8).reshape(height, stride)
     if (lines[:, 0] > PAETH).any():
-        raise _broken(where, "a row with a filter that does not exist")
+        raise _broken(where, "a row with an unknown filter")
     return Png(lines, channels)
 
 
 def colours_png(rgb: np.ndarray) -> bytes:
-    """Encode a picture with texture, (h, w, 3) uint8 RGB."""
+    """Encode a picture of colours, (h, w, 3) uint8 RGB."""
     height, width, _ = rgb.shape
     lines = np.empty((height, 1 + RGB * width), np.uint8)
     lines[:, 0] = AVERAGE
-    _filter(np.ascontiguousarray(rgb).reshape(height, -1), lines)
+    _filter_by_average(np.ascontiguousarray(rgb).reshape(height, -1), lines)
     return _png(lines, RGB)
 
 
 def areas_png(red: np.ndarray, green: np.ndarray, blue: np.ndarray) -> bytes:
-    """Encode a picture of areas, its three channels, (h, w) uint8 each."""
+    """Encode a picture with areas of one colour; each channel is (h, w) uint8."""
     height, width = red.shape
     lines = np.zeros((height, 1 + RGB * width), np.uint8)
     for k, channel in enumerate((red, green, blue)):
@@ -118,12 +119,12 @@ def _packed(data: memoryview) -> bytes:
     not. Flushing after FIRST bytes costs about 2 bytes a picture.
     """
     packer = zlib.compressobj(LEVEL)
-    begun = packer.compress(data[:FIRST]) + packer.flush(zlib.Z_SYNC_FLUSH)
-    return begun + packer.compress(data[FIRST:]) + packer.flush()
+    start = packer.compress(data[:FIRST]) + packer.flush(zlib.Z_SYNC_FLUSH)
+    return start + packer.compress(data[FIRST:]) + packer.flush()
 
 
 def _broken(where: object, got: str) -> InputError:
-    return InputError("the image does not decode", where=str(where), got=got, expected="a whole PNG")
+    return InputError("the image cannot be decoded", where=str(where), got=got, expected="a complete PNG")
 
 
 def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, bytes]:
@@ -134,7 +135,9 @@ def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, byt
     check_pixels(width * height, str(where), f"{width} x {height} px")
     if depth != 8 or kind not in CHANNELS or packing or filters or interlace or not width or not height:
         raise _broken(where, f"{depth} bits, colour type {kind}, interlace {interlace}, {width} x {height} px")
-    position, parts, view = len(PNG_SIGNATURE), list[memoryview](), memoryview(data)
+    position = len(PNG_SIGNATURE)
+    parts: list[memoryview] = []
+    view = memoryview(data)
     while position + 12 <= len(data):
         length, name = CHUNK.unpack_from(data, position)
         end = position + 8 + length
@@ -147,26 +150,35 @@ def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, byt
         elif name == b"IEND":
             return width, height, CHANNELS[kind], b"".join(parts)
         position = end + 4
-    raise _broken(where, f"an end at byte {len(data)}, before the image's")
+    raise _broken(where, f"a file that ends at byte {len(data)}, before the end of the image")
 
 
 # --- compiled ---------------------------------------------------------------------------------------------------------
 
 
 @njit(cache=True, nogil=True)
-def _nearest(left, up, corner):  # type: ignore[no-untyped-def]
-    """Return Paeth's guess of a byte."""
-    a, b, c = abs(up - corner), abs(left - corner), abs(left + up - 2 * corner)
-    return left if a <= b and a <= c else up if b <= c else corner
+def _paeth(left, up, corner):  # type: ignore[no-untyped-def]
+    """Return the neighbour that is nearest to left + up - corner, Paeth's prediction."""
+    left_distance = abs(up - corner)
+    up_distance = abs(left - corner)
+    corner_distance = abs(left + up - 2 * corner)
+    if left_distance <= up_distance and left_distance <= corner_distance:
+        return left
+    return up if up_distance <= corner_distance else corner
 
 
 @njit(cache=True, nogil=True)
-def _undone(lines, channels):  # type: ignore[no-untyped-def]
-    """Undo the filters of rows, (h, w * channels); a row leans on the one before it, the first on zeros."""
-    height, size = lines.shape[0], lines.shape[1] - 1
-    found, nothing = np.empty((height, size), np.uint8), np.zeros(size, np.uint8)
+def _without_filters(lines, channels):  # type: ignore[no-untyped-def]
+    """Return the pixels, (h, w * channels); a row depends on the row above, the first row on zeros."""
+    height = lines.shape[0]
+    size = lines.shape[1] - 1
+    pixels = np.empty((height, size), np.uint8)
+    zeros = np.zeros(size, np.uint8)
     for y in range(height):
-        kind, row, target, above = lines[y, 0], lines[y, 1:], found[y], found[y - 1] if y > 0 else nothing
+        kind = lines[y, 0]
+        row = lines[y, 1:]
+        target = pixels[y]
+        above = pixels[y - 1] if y > 0 else zeros
         if kind == NONE:
             for x in range(size):
                 target[x] = row[x]
@@ -185,17 +197,19 @@ def _undone(lines, channels):  # type: ignore[no-untyped-def]
                 elif kind == AVERAGE:
                     target[x] = row[x] + ((left + up) >> 1)
                 else:
-                    target[x] = row[x] + _nearest(left, up, np.int64(above[x - channels]))
-    return found
+                    target[x] = row[x] + _paeth(left, up, np.int64(above[x - channels]))
+    return pixels
 
 
 @njit(cache=True, nogil=True)
-def _filter(pixels, lines):  # type: ignore[no-untyped-def]
-    """Fill rows with what they are more than the average of left and above: pixels (h, 3 w), lines (h, 1 + 3 w)."""
+def _filter_by_average(pixels, lines):  # type: ignore[no-untyped-def]
+    """Fill lines (h, 1 + 3 w) with the differences of pixels (h, 3 w) to the average of left and upper neighbour."""
     height, size = pixels.shape
-    nothing = np.zeros(size, np.uint8)
+    zeros = np.zeros(size, np.uint8)
     for y in range(height):
-        row, line, above = pixels[y], lines[y], pixels[y - 1] if y > 0 else nothing
+        row = pixels[y]
+        line = lines[y]
+        above = pixels[y - 1] if y > 0 else zeros
         for x in range(RGB):
             line[1 + x] = row[x] - (above[x] >> 1)
         for x in range(RGB, size):

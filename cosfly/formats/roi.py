@@ -58,11 +58,11 @@ class Roi(RoiPolygon):
         for name, got, expected in (("map", self.map, box_map.name), ("axes", self.axes, AXES)):
             if got not in ("", expected):
                 raise InputError(
-                    f"the region of interest was drawn with another value of {name}",
+                    f"the region of interest was drawn with another {name}",
                     where=f"{where}: {name}",
                     got=got,
                     expected=expected,
-                    fix="draw it on this map: cosfly roi edit",
+                    fix="draw the region on this map: cosfly roi edit",
                 )
 
 
@@ -85,10 +85,10 @@ def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Ro
         value = {"polygons": _polygons_of(features_of(value, path), path)}
     roi = validated(Roi, value, path)
     if not roi.closed:
-        where, fix = f"{path}: closed", "close it in the editor"
-        raise InputError("the polygon is not closed", where=where, got="false", expected="true", fix=fix)
+        fix = "close the polygon in the editor"
+        raise InputError("the polygon is not closed", where=f"{path}: closed", got="false", expected="true", fix=fix)
     if not roi.rings():
-        raise InputError("no polygon", where=f"{path}: points_world", expected="at least three points")
+        raise InputError("the file has no polygon", where=f"{path}: points_world", expected="at least three points")
     rings = [(k, ring) for k, polygon in enumerate(roi.rings()) for ring in (polygon.points_world, *polygon.holes)]
     num_vertices = sum(len(ring) for _, ring in rings)
     if num_vertices > most_vertices:
@@ -96,11 +96,13 @@ def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Ro
     for number, ring in rings:
         where = f"{path}: polygon {number}"
         if len(ring) < 3 or numbers(ring, None, 2) is None:
-            got, expected = f"{len(ring)} points", "at least three finite points"
-            raise InputError("not a ring", where=where, got=got, expected=expected)
+            what = "a ring has too few points, or one that is not finite"
+            raise InputError(what, where=where, got=f"{len(ring)} points", expected="at least three finite points")
         reason = shapely.is_valid_reason(shapely.Polygon(ring))
         if reason != "Valid Geometry":
-            raise InputError("a ring crosses itself", where=where, got=reason, fix="draw it again without crossings")
+            raise InputError(
+                "a ring crosses itself", where=where, got=reason, fix="draw the ring again without crossings"
+            )
     return roi
 
 
@@ -117,10 +119,10 @@ def _polygons_of(features: list[Feature], path: Path) -> list[dict[str, Any]]:
         for rings in feature.parts:
             spread = np.ptp(rings[0], axis=0).max()
             if len(rings[0]) < 4 or spread < SMALLEST_M:
-                problems.append(f"{feature.where}: not a region in metres, {len(rings[0])} points within {spread:.3g}")
+                problems.append(f"{feature.where}: {len(rings[0])} points within {spread:.3g} m are not a region")
             points, *holes = (ring[:-1].tolist() for ring in rings)
             polygons.append({"points_world": points, "holes": holes})
     if problems:
-        expected = "polygons in the map's world metres, x east and y north, not in longitude and latitude"
+        expected = "polygons in world metres, x east and y north, not in longitude and latitude"
         raise InputError.of_all(problems, where=path, expected=expected)
     return polygons

@@ -24,18 +24,20 @@ from cosfly.formats.columns import (
 from cosfly.formats.pedestrian_paths import PLAIN_PACE, pace_field, pace_of
 from cosfly.formats.segments import Mission, Segment, flown_as_json, read_flown
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.json_io import FileFormat
+from cosfly.runtime.json_io import MISSING, FileFormat
 
 TRACE_FORMAT = FileFormat("cosfly.drone_trace", "1.0", "drone traces")
 ARRAYS = ("time_s", "positions_m", "rotations_deg", "targets_m", "visibility")
-MORE = ("metrics", "solver", "drop_reason", "instead_of", "not_held")  # fields without checks
+UNCHECKED = ("metrics", "solver", "drop_reason", "instead_of", "not_held")
 MOST_TRAJECTORIES = 1_000_000  # of a run
 
 
 @dataclass(frozen=True)
 class Excerpt:
-    """The whole trajectory that a trajectory is a part of; clothes, stride and weather follow it. number: its index in
-    its run. before_m: (m, 3), the tracked points up to the first of the part, m >= 1."""
+    """The whole trajectory from which a part is taken; clothes, stride and weather are drawn for the whole one.
+
+    number: Its index in its run. before_m: (m, 3), its tracked points up to the first of the part, m >= 1.
+    """
 
     path_id: str
     number: int
@@ -49,8 +51,8 @@ class Excerpt:
         if record is None:
             return None
         if not isinstance(record, dict) or record.get("number") not in range(MOST_TRAJECTORIES):
-            expected = f"id, a number below {MOST_TRAJECTORIES} and before"
-            raise InputError("not a part of a flight", where=where, expected=expected)
+            expected = f"an object with id, number (below {MOST_TRAJECTORIES}) and before"
+            raise InputError("the record does not describe an excerpt", where=where, expected=expected)
         return cls(text_id(record, where), int(record["number"]), column(record, "before", where, None, 3))
 
 
@@ -61,9 +63,9 @@ class DroneTrace:
     time_s: (n,). positions_m: (n, 3) drone. rotations_deg: (n, 3) pitch, yaw, roll of the camera, which looks at the
     target. targets_m: (n, 3) the pedestrian's tracked point (hip height). visibility: (n,) five-ray fraction in [0, 1].
     clearances_m: (n,) signed distance to the nearest obstacle, the least on the straight way to the next point. metrics
-    and solver: JSON-able facts. segments: styles of its parts, none where it follows from end to end. instead_of: the
-    style that the map did not permit, and why; not_held: what was requested and what was flown. drop_reason: why the
-    prefilter (sec:step6) drops it, None if it passes; only those are rendered. pace: of the pedestrian trajectory.
+    and solver: JSON-able facts. segments: Styles of its parts; empty if the drone follows throughout. instead_of: The
+    style that the map did not permit, with the reason; not_held: The requested and the flown value. drop_reason: Why
+    the prefilter (sec:step6) drops it; None if it passes and is rendered. pace: Of the pedestrian trajectory.
     """
 
     path_id: str
@@ -85,7 +87,7 @@ class DroneTrace:
     part_of: Excerpt | None = None
 
     def drawn_as(self, number: int) -> Excerpt:
-        """Return the excerpt that decides its looks, for trajectory `number`."""
+        """Return the excerpt that determines its appearance as trajectory `number` of a run."""
         return self.part_of or Excerpt(self.path_id, number, self.targets_m[:1])
 
     def until(self, end: int) -> DroneTrace:
@@ -94,23 +96,29 @@ class DroneTrace:
         return replace(self, **cut, segments=(), mission=None)
 
     def every(self, stride: int) -> DroneTrace:
-        """Return every `stride`-th point; clearances are the least until the next of them."""
+        """Return every `stride`-th point; each clearance is the least one up to the next point."""
         if stride == 1:
             return self
-        points, order = np.arange(0, len(self.time_s), stride), self.mission
-        parts = [replace(part, begin=-(-part.begin // stride), end=-(-part.end // stride)) for part in self.segments]
-        if order is not None:
-            order = replace(order, at_frame=-(-order.at_frame // stride), home_frame=-(-order.home_frame // stride))
+
+        def new_index(frame: int) -> int:
+            return -(-frame // stride)  # rounded up
+
+        points = np.arange(0, len(self.time_s), stride)
+        parts = [replace(part, begin=new_index(part.begin), end=new_index(part.end)) for part in self.segments]
+        mission = self.mission
+        if mission is not None:
+            home_frame = new_index(mission.home_frame)
+            mission = replace(mission, at_frame=new_index(mission.at_frame), home_frame=home_frame)
         return replace(
             self,
             **{name: getattr(self, name)[points] for name in ARRAYS},
             clearances_m=np.minimum.reduceat(self.clearances_m, points),
             segments=tuple(part for part in parts if part.begin < part.end),
-            mission=order,
+            mission=mission,
         )
 
     def between(self, stride: int) -> np.ndarray | None:
-        """Return the poses that `every` skips, (n, stride - 1, 6), NaN after the last; None where it skips none."""
+        """Return the poses that `every` skips, (n, stride - 1, 6), NaN after the last point; None if stride is 1."""
         if stride == 1:
             return None
         points = np.arange(0, len(self.time_s), stride)
@@ -137,19 +145,29 @@ class DroneTrace:
 
     @classmethod
     def from_json(cls, record: dict, where: str) -> DroneTrace:
-        time_s, groups = column(record, "t", where, None), list[np.ndarray]()
+        time_s = column(record, "t", where, None)
+        groups: list[np.ndarray] = []
         for group, names in (("drone", XYZ), ("drone", ANGLES), ("target", XYZ)):
             if not isinstance(record.get(group), dict):
-                raise InputError("missing", where=f"{where}.{group}", expected="an object of columns")
+                raise InputError(MISSING, where=f"{where}.{group}", expected="an object of columns")
             groups.append(columns(record[group], names, f"{where}.{group}", len(time_s)))
         visibility, clearances_m = (column(record, name, where, len(time_s)) for name in ("visibility", "clearance"))
         segments, mission = read_flown(record, len(time_s), where)
-        more: dict[str, Any] = {name: record[name] for name in MORE if name in record}
-        more |= {"segments": segments, "mission": mission, "pace": pace_of(record, where)}
-        more["part_of"] = Excerpt.from_json(record.get("part_of"), f"{where}.part_of")
-        name, path_id = str(record.get("planner", "")), text_id(record, where)
-        poses = groups[0], groups[1], groups[2]
-        return cls(path_id, name, time_s, *poses, visibility, clearances_m, **more)
+        return cls(
+            path_id=text_id(record, where),
+            planner=str(record.get("planner", "")),
+            time_s=time_s,
+            positions_m=groups[0],
+            rotations_deg=groups[1],
+            targets_m=groups[2],
+            visibility=visibility,
+            clearances_m=clearances_m,
+            segments=segments,
+            mission=mission,
+            pace=pace_of(record, where),
+            part_of=Excerpt.from_json(record.get("part_of"), f"{where}.part_of"),
+            **{name: record[name] for name in UNCHECKED if name in record},
+        )
 
 
 def write_traces(path: Path, traces: list[DroneTrace], header: dict) -> None:

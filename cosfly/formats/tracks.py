@@ -23,9 +23,9 @@ def find_tracks(root: Path, choice: TrackChoice = ALL_TRACKS) -> list[Path]:
     folders = [path.parent for path in files_named(root, "trajectory.json")]
     if not folders:
         raise InputError(
-            "not a playback tree",
+            "this folder is not a playback tree",
             where=root,
-            got="no trajectory.json below it",
+            got="no trajectory.json below the folder",
             expected="Town*/trajectory_*/ORI/trajectory.json",
             fix="check --data",
         )
@@ -76,7 +76,7 @@ def read_twin(track: Track) -> Track | None:
     has_same_times = len(twin) == len(track) and np.abs(twin.time_s - track.time_s).max() < TWIN_TOLERANCE_S
     if not twin.is_original:
         raise VerifyError(
-            "the track in the clean track's folder is not clean", where=twin.folder, got="is_original false"
+            "the folder of the clean track holds a perturbed track", where=twin.folder, got="is_original false"
         )
     if not has_same_times:
         raise VerifyError(

@@ -1,4 +1,4 @@
-"""Weather and time of day: the paper's presets, their six knobs, and the record in a track's files (app:weather)."""
+"""Weather and time of day: the paper's presets, six parameters, and the record in a track's files (app:weather)."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ WeatherMode = Literal["fixed", "random_per_path", "by_weight"]
 SkyKind = Literal[
     "day_dry", "day_rain", "day_fog", "dusk_dry", "dusk_rain", "dusk_fog", "night_dry", "night_rain", "night_fog"
 ]  # fmt: skip
-SUN_IS_DOWN_DEG = -3.0  # of its altitude; a sun on the horizon still lights walls
-DAY_FROM_DEG = 10.0  # of the sun's altitude; below it is dusk, or dawn
+SUN_IS_DOWN_DEG = -3.0  # altitude of the sun; on the horizon it still lights walls
+DAY_FROM_DEG = 10.0  # altitude of the sun; below is dusk or dawn
 Percent = Annotated[float, Field(strict=True, ge=0, le=100)]
 Metres = Annotated[float, Field(strict=True, gt=0)]
 Altitude = Annotated[float, Field(strict=True, ge=-90, le=90)]
@@ -22,7 +22,7 @@ Azimuth = Annotated[float, Field(strict=True, ge=0, lt=360)]
 
 
 class WeatherPreset(Config):
-    """The four knobs of the air."""
+    """The four parameters of the air."""
 
     cloudiness: Percent = Field(description="share of the sky that clouds cover, percent")
     precipitation: Percent = Field(description="strength of the rain, percent")
@@ -31,14 +31,14 @@ class WeatherPreset(Config):
 
 
 class TimePreset(Config):
-    """The two knobs of the sun."""
+    """The two parameters of the sun."""
 
     sun_altitude_angle: Altitude = Field(description="height of the sun over the horizon, degrees; negative is night")
     sun_azimuth_angle: Azimuth = Field(description="compass direction of the sun, degrees clockwise from north")
 
 
 class WeatherParams(TimePreset, WeatherPreset):  # in this order, so that the air comes first
-    """The six resolved knobs (tab:weather_params_fields)."""
+    """All six parameters (tab:weather_params_fields)."""
 
 
 class WeatherRecord(Record):
@@ -50,8 +50,8 @@ class WeatherRecord(Record):
     params: WeatherParams
 
 
-# tab:weather_presets, of sky, rain, fog and haze: cloudiness, precipitation, fog_density, fog_distance
-_KNOBS = {
+# tab:weather_presets: cloudiness, precipitation, fog_density, fog_distance
+_PARAMETERS = {
     "clear": (5, 0, 0, 60), "fair": (20, 0, 0, 60), "partly_cloudy": (40, 0, 0, 60), "cloudy": (70, 0, 0, 60),
     "overcast": (95, 0, 0, 60),
     "drizzle": (50, 15, 10, 50), "light_rain": (60, 30, 5, 50), "medium_rain": (80, 60, 15, 30),
@@ -60,7 +60,8 @@ _KNOBS = {
     "smog": (60, 0, 60, 15), "dust_haze": (70, 0, 70, 12), "snow_haze": (90, 0, 40, 20),
 }  # fmt: skip
 WEATHERS = {
-    name: WeatherPreset(**dict(zip(WeatherPreset.model_fields, knobs, strict=True))) for name, knobs in _KNOBS.items()
+    name: WeatherPreset(**dict(zip(WeatherPreset.model_fields, values, strict=True)))
+    for name, values in _PARAMETERS.items()
 }
 # tab:tod_presets
 TIMES = {
@@ -75,12 +76,16 @@ def preset_token(text: str) -> str:
 
 
 def resolved(weather: WeatherPreset, time: TimePreset) -> WeatherParams:
-    """Put the knobs of the air and of the sun together."""
+    """Return the parameters of a weather and a time of day as one record."""
     return WeatherParams(**weather.model_dump(), **time.model_dump())
 
 
-def sky_kind(knobs: WeatherParams) -> str:
-    """Return the kind of a sky, one of SkyKind, by its knobs: presets of one's own have one too."""
-    sun_deg = knobs.sun_altitude_angle
-    light = "night" if sun_deg <= SUN_IS_DOWN_DEG else "dusk" if sun_deg < DAY_FROM_DEG else "day"
-    return f"{light}_{'rain' if knobs.precipitation else 'fog' if knobs.fog_density else 'dry'}"
+def sky_kind(params: WeatherParams) -> str:
+    """Return the SkyKind of parameters, also for presets of a user."""
+    if params.sun_altitude_angle <= SUN_IS_DOWN_DEG:
+        light = "night"
+    else:
+        light = "dusk" if params.sun_altitude_angle < DAY_FROM_DEG else "day"
+    if params.precipitation:
+        return f"{light}_rain"
+    return f"{light}_fog" if params.fog_density else f"{light}_dry"

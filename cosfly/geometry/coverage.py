@@ -82,7 +82,7 @@ class Coverage(Record):
         nums_bins = {name: len(counts) for name, counts in bins.items()}
         expected = {name: axis.num_bins for name, axis in AXES.items()}
         if bins and nums_bins != expected:
-            raise ValueError(f"bins must be {expected}, or none; got {nums_bins}")
+            raise ValueError(f"bins must be empty or {expected}; got {nums_bins}")
         return bins
 
     @classmethod

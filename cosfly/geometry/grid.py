@@ -77,7 +77,7 @@ def empty_grid(box_map: BoxMap, resolution_m: float = RESOLUTION_M) -> Occupancy
             where=box_map.name,
             got=f"{num_x:.0f} x {num_y:.0f} cells of {resolution_m} m",
             expected=f"at most {MAX_CELLS} cells",
-            fix="remove the box that lies far out, or take a coarser resolution_m",
+            fix="remove boxes that lie far outside, or set a larger resolution_m",
         )
     return OccupancyGrid(float(low[0]), float(low[1]), resolution_m, np.zeros((int(num_y), int(num_x)), dtype=bool))
 
@@ -254,7 +254,7 @@ def compare(left: OccupancyGrid, right: OccupancyGrid) -> tuple[float, float]:
     """
     same_frame = (left.x_min_m, left.y_min_m, left.resolution_m) == (right.x_min_m, right.y_min_m, right.resolution_m)
     if not same_frame or left.occupied.shape != right.occupied.shape:
-        raise ValueError("the grids do not cover the same cells; make one of them with `like`")
+        raise ValueError("the grids do not cover the same cells; pass one of them as `like` to make the other")
     union = int(np.count_nonzero(left.occupied | right.occupied))
     intersection = int(np.count_nonzero(left.occupied & right.occupied))
     agreement = 1.0 - (union - intersection) / left.occupied.size

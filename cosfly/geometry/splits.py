@@ -157,7 +157,7 @@ def assign_splits(
     if len(ranked) < len(requested):
         if too_few == "refuse" or not ranked:
             raise InputError(
-                f"too few {what} to split without a leak",
+                f"there are too few {what}, because each belongs to one split only",
                 got=str(len(ranked)),
                 expected=f"{len(requested)} or more, one for each of {', '.join(requested)}",
                 fix=fix,

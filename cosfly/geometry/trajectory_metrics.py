@@ -93,7 +93,7 @@ def trajectory_metrics(
 def _differences(positions_m: np.ndarray, order: int) -> np.ndarray:
     positions = np.asarray(positions_m, dtype=np.float64)
     if positions.ndim != 2 or positions.shape[1] != 3:
-        raise ValueError(f"positions must be (n, 3), not {positions.shape}")
+        raise ValueError(f"positions must have the shape (n, 3), not {positions.shape}")
     return np.diff(positions, n=order, axis=0)
 
 

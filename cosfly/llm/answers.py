@@ -182,7 +182,7 @@ class BudgetConfig(Config):
     @model_validator(mode="after")
     def _priced(self) -> Self:
         if self.max_cost is not None and self.price_prompt == self.price_completion == 0:
-            raise ValueError("max_cost needs price_prompt or price_completion; without a price it is never reached")
+            raise ValueError("max_cost needs price_prompt or price_completion: without a price the cost is always 0")
         return self
 
     def cost(self, prompt_tokens: float, completion_tokens: float) -> float:
@@ -264,7 +264,7 @@ class Budget:
             self._largest[num_pictures] = (max(prompt, usage.prompt_tokens), max(completion, usage.completion_tokens))
         elif self.cfg.max_cost is not None or self.cfg.max_tokens is not None:
             raise TeacherError(
-                "the endpoint reports no token usage, so a limit of tokens or cost cannot be kept",
+                "the endpoint does not report token usage, so a limit on tokens or cost cannot be applied",
                 where=where,
                 fix="remove --max-cost and --max-tokens, and use --limit",
             )

@@ -129,7 +129,7 @@ class ChatClient:
         self._key = os.environ.get(KEY_VARIABLE, "")
         if not (self._key.isascii() and self._key.isprintable()):  # an error of httpx would quote it
             raise TeacherError(
-                "the API key contains a character that no header can contain, perhaps a line break",
+                "the API key contains a character that an HTTP header must not contain, such as a line break",
                 where=KEY_VARIABLE,
                 fix="check the environment variable",
             )
@@ -283,7 +283,7 @@ class ChatClient:
         elif entries is None and wanted:
             self.model = wanted  # some hosts list no models; the first request shows whether it exists
         elif entries is None:
-            what = "the server returns no list of models, so it may not be an OpenAI-compatible endpoint"
+            what = "the server does not return a list of models, so it may not be an OpenAI-compatible endpoint"
             raise self._error(what, got=self._refusal(response).summary, fix="check the URL, or set --model")
         elif not names:
             raise self._error("the endpoint lists no model with a usable name", fix="set --model")
@@ -302,7 +302,7 @@ class ChatClient:
         if response.status != 200:
             raise RefusedRequest(self._refusal(response), response.retry_after_s)
         if response.is_cut:
-            raise BadReply(f"longer than {MOST_REPLY_MB:g} MB")
+            raise BadReply(f"the body is longer than {MOST_REPLY_MB:g} MB")
         try:
             return protocol.read_completion(response, "json_schema" if is_structured else "plain")
         except BadReply as error:
@@ -355,7 +355,9 @@ class ChatClient:
             ):
                 encoding = response.headers.get("content-encoding", "identity")
                 if encoding.strip().lower() not in ("", "identity"):
-                    raise httpx.DecodingError(f"compressed with {encoding[:40]!r}, which was not requested")
+                    raise httpx.DecodingError(
+                        f"the server compressed the body ({encoding[:40]!r}) without a request to do so"
+                    )
                 async for piece in response.aiter_raw():
                     body += piece
                     if len(body) > most_bytes:  # the rest stays unread, and the connection is closed
@@ -376,6 +378,7 @@ class ChatClient:
         except (httpx.InvalidURL, ValueError, ImportError, OSError) as error:
             raise TeacherError(
                 "the proxy or the certificates cannot be used",
-                where="HTTPS_PROXY, ALL_PROXY, SSL_CERT_FILE, ...",
+                where="HTTPS_PROXY, ALL_PROXY, SSL_CERT_FILE",
                 got=type(error).__name__,
+                fix="check these environment variables",
             ) from None

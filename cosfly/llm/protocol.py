@@ -31,7 +31,7 @@ def check_url(url: str) -> None:
     """
     got = "" if "@" in url else f", got {re.split('[?#]', url)[0][:200]!r}"
     if re.search("[@?#]", url):
-        problem = "a URL must not contain a user, password, query or fragment, since it is recorded"
+        problem = "the URL must not contain a user, password, query or fragment, because it is recorded"
         raise ValueError(f"{problem}{got}; set the key in the environment variable {KEY_VARIABLE}")
     try:
         parts = httpx.URL(url)
@@ -41,7 +41,7 @@ def check_url(url: str) -> None:
     is_host = parts.scheme in ("http", "https") and parts.host and "%" not in parts.host
     is_port = parts.port is None or 0 < parts.port < 65_536
     if not (is_host and is_port) or re.search(r"[\s\x00-\x1f\x7f]", url):
-        problem = "a URL must begin with http:// or https:// and a host name, with a port below 65536 and no blanks"
+        problem = "the URL must have http:// or https://, a host name, a port below 65536 if any, and no spaces"
         raise ValueError(f"{problem}{got}")
 
 
@@ -114,12 +114,12 @@ def read_body(content: bytes) -> Any:
     """
 
     def reject(constant: str) -> float:
-        raise ValueError(f"{constant} is not JSON")
+        raise ValueError(f"{constant} is not a JSON value")
 
     try:
         return _writable(json.loads(content, parse_constant=reject))
     except RecursionError:
-        raise ValueError("nested too deeply") from None
+        raise ValueError("the JSON is nested too deeply") from None
 
 
 def _writable(value: Any) -> Any:
@@ -159,7 +159,7 @@ def read_completion(response: Response, structured: str) -> Reply:
     if not isinstance(choices, list) or not choices or not isinstance(choices[0], dict):
         if value.get("error"):
             raise _error_instead(error_words(value))
-        raise BadReply("no choices")
+        raise BadReply("the body has no choices")
     choice = choices[0]
     finish_reason = choice.get("finish_reason")
     if choice.get("error"):
@@ -168,12 +168,12 @@ def read_completion(response: Response, structured: str) -> Reply:
         raise _error_instead(finish_reason)
     text = _final_text(choice["message"] if isinstance(choice.get("message"), dict) else {})
     if text is None:
-        raise BadReply("no text in the message")
+        raise BadReply("the message has no text")
     return Reply(text, _usage(value.get("usage")), structured, _name(finish_reason))
 
 
 def _error_instead(words: str) -> BadReply:
-    return BadReply(f"an error in place of an answer: {words}", is_error=True)
+    return BadReply(f"the server sent an error instead of an answer: {words}", is_error=True)
 
 
 def _name(value: Any) -> str | None:

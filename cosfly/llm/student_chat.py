@@ -134,8 +134,8 @@ def _student_folder(folder: Path) -> Path:
         if (candidate / CHAT_FORMAT_FILE).is_file():
             return candidate
     raise InputError(
-        f"the folder contains no {CHAT_FORMAT_FILE}, which describes the student's training",
+        f"the folder has no {CHAT_FORMAT_FILE}, the record of the student's prompts",
         where=folder,
-        expected="the file in the folder, in adapter/ or in model/",
+        expected="the file in this folder, or in adapter/ or model/ below it",
         fix="pass the output of cosfly distill train or merge",
     )

@@ -51,7 +51,9 @@ class VllmEngine:
         """
         if not (folder / "config.json").is_file():
             expected = "a folder with config.json"
-            raise InputError("this is not a model folder", where=folder, expected=expected, fix="check --teacher")
+            raise InputError(
+                "this folder does not hold a model", where=folder, expected=expected, fix="check --teacher"
+            )
         self.folder = folder
         self.model = folder.name
         self.where = f"vllm:{folder}"
@@ -102,7 +104,7 @@ class VllmEngine:
             got = _one_line(error)
             if isinstance(error, TypeError) or (section == "endpoint" and isinstance(error, ValueError)):
                 where = f"{self.settings}.{section}"
-                raise ConfigError(f"vLLM refuses a setting of {section}", where=where, got=got) from None
+                raise ConfigError(f"vLLM does not accept a setting of {section}", where=where, got=got) from None
             raise EnvironmentMissing("the vLLM engine does not start", where=self.where, got=got) from None
 
     def arguments(self) -> dict[str, Any]:

@@ -88,10 +88,12 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     path = cfg.inputs()["boxes"]
     suffix = path.suffix.lower()
     if suffix not in (".json", ".csv", ".geojson"):
-        raise InputError("the kind of map is unknown", where=path, got=path.suffix, expected=".json, .csv, .geojson")
+        raise InputError(
+            "the file type of the map is unknown", where=path, got=path.suffix, expected=".json, .csv, .geojson"
+        )
     if suffix == ".json" and (cfg.types or cfg.ignore or cfg.ground_z_m):
         raise ConfigError(
-            "boxes_3d.json has its own types and ground",
+            "boxes_3d.json stores types and ground itself, so settings for them have no effect",
             where="maps.boxes",
             fix="remove the settings types, ignore and ground_z_m",
         )
@@ -134,7 +136,7 @@ def plausibility(box_map: BoxMap) -> str:
 def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
     rows = list(_table_rows(cfg, path) if suffix == ".csv" else _feature_rows(cfg, path))
     if not rows:
-        raise InputError("the map holds no boxes", where=path, expected="a box in each row or feature")
+        raise InputError("the map has no boxes", where=path, expected="a box in each row or feature")
     boxes = BoxList()
     rows_by_problem = dict[str, list[str]]()  # so that each problem is listed once
     for row in rows:
@@ -142,7 +144,7 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
             rows_by_problem.setdefault(problem, []).append(row.where)
     ids = _ids_of(rows)
     if len(set(ids)) < len(ids) or not all(0 <= number < 2**63 for number in ids):
-        rows_by_problem["id is not a whole number, each once"] = [""]
+        rows_by_problem["ids must be different whole numbers"] = [""]
     if rows_by_problem:
         problems = []
         for problem, places in rows_by_problem.items():
@@ -182,11 +184,13 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
                         problems, where=path, expected=f"columns {', '.join(COLUMNS)}, separated by commas"
                     )
                 continue
-            problem = "" if len(cells) == len(names) else f"{len(cells)} cells, but {len(names)} in the first line"
+            problem = "" if len(cells) == len(names) else f"{len(cells)} cells, but the first line has {len(names)}"
             values = {name: cell for name, cell in zip(names, cells, strict=False) if cell and name in COLUMNS}
             yield _Row(f"line {lines.line_num}", values, problem=problem)
     except csv.Error as error:
-        raise InputError("the file is not a table", where=f"{path}: line {lines.line_num}", got=str(error)) from None
+        raise InputError(
+            "the file is not a CSV table", where=f"{path}: line {lines.line_num}", got=str(error)
+        ) from None
 
 
 def _feature_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
@@ -221,11 +225,11 @@ def _to_metres(cfg: BoxesConfig, places: np.ndarray, path: Path) -> Callable[[np
     if (cfg.units == "degrees" and not may_be_degrees) or (cfg.units == "m" and may_be_degrees and size > 0):
         other_unit = "degrees" if cfg.units == "m" else "m"
         raise InputError(
-            f"the coordinates do not look like {cfg.units}",
+            f"the coordinates do not look like {'metres' if cfg.units == 'm' else cfg.units}",
             where=path,
             got=f"{low.tolist()} to {high.tolist()}",
-            expected="wider than 2 m" if cfg.units == "m" else "longitude and latitude of one town",
-            fix=f"--set maps.boxes.units={other_unit}, if that is their unit",
+            expected="a map wider than 2 m" if cfg.units == "m" else "longitude and latitude of one town",
+            fix=f"if their unit is {other_unit}, pass --set maps.boxes.units={other_unit}",
         )
     if cfg.units == "m":
         return lambda ring: ring

@@ -29,7 +29,7 @@ class BoxList:
     def add(self, kind: str, center_xy: Pair, size_xy: Pair, low_m: float, high_m: float, yaw_deg: float = 0.0) -> None:
         """Add a box by its footprint (full sizes before turning, m) and its height interval."""
         if size_xy[0] <= 0 or size_xy[1] <= 0 or high_m <= low_m:
-            raise ValueError(f"the box is empty: {kind}, {size_xy}, {low_m} to {high_m} m")
+            raise ValueError(f"the box has no volume: {kind}, footprint {size_xy} m, height {low_m} to {high_m} m")
         center = (float(center_xy[0]), float(center_xy[1]), (low_m + high_m) / 2)
         self.rows.append((*center, size_xy[0] / 2, size_xy[1] / 2, (high_m - low_m) / 2, float(yaw_deg)))
         self.kinds.append(KINDS[kind])
@@ -51,7 +51,7 @@ def origin_m(low: np.ndarray, high: np.ndarray, where: str | Path, ground_z_m: f
     """Return the place that becomes a map's origin, (3,) m: the middle of its bounds, at the height of its ground."""
     if not (high - low <= WIDEST_M).all():
         got = " x ".join(f"{size:.6g}" for size in high - low) + " m"
-        fix = "cut a part out, or remove stray vertices"
+        fix = "cut out a part, or remove vertices that lie far outside"
         raise InputError("the map is too wide or too high", where=where, got=got, expected="at most 20 km", fix=fix)
     return np.array([*np.round((low + high)[:2] / 2), round(float(ground_z_m), 3)])
 
@@ -59,5 +59,7 @@ def origin_m(low: np.ndarray, high: np.ndarray, where: str | Path, ground_z_m: f
 def required(path: Path | None, setting: str) -> Path:
     """Return the path of a setting; raise ConfigError if it is not set."""
     if path is None:
-        raise ConfigError("no file is set", where=setting, expected="a path", fix=f"--set {setting}=FILE")
+        raise ConfigError(
+            "the setting has no value", where=setting, expected="a path", fix=f"pass --set {setting}=FILE"
+        )
     return path

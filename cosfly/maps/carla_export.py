@@ -110,7 +110,7 @@ def box_map_of(answers: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
             "no object of the town can be used",
             where=where,
             got=f"{len(answers.rows)} objects, dropped: {dict(dropped)}",
-            expected="an object of get_environment_objects with a box of its own",
+            expected="at least one object of get_environment_objects with a usable box",
             fix="check the loaded town",
         )
     header = MapHeader(

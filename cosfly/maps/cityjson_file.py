@@ -204,7 +204,7 @@ def _read_parts(path: Path) -> tuple[str, _Document, list[tuple[str, _Part]]]:
         expected = "CityJSONFeature" if parts else "CityJSON"
         if object_type != expected:
             raise InputError(
-                "the object is not of the expected type",
+                "the object has an unexpected type",
                 where=f"{where}: type",
                 got=repr(object_type)[:80],
                 expected=repr(expected),
@@ -296,10 +296,10 @@ def _resolve_instance(geometry: _Geometry, vertices: _Vertices, where: str) -> _
     anchor = geometry.boundaries[0] if len(geometry.boundaries) == 1 else None
     if not 0 <= geometry.template < len(vertices.templates):
         raise InputError(
-            "the template does not exist",
+            "the geometry refers to a template that does not exist",
             where=f"{where}.template",
             got=str(geometry.template)[:40],
-            expected=f"below {len(vertices.templates)}",
+            expected=f"an index below {len(vertices.templates)}",
         )
     if type(anchor) is not int or not 0 <= anchor < len(vertices.part_vertices):
         raise InputError(
@@ -310,7 +310,9 @@ def _resolve_instance(geometry: _Geometry, vertices: _Vertices, where: str) -> _
         )
     if len(geometry.transformationMatrix) != 16:
         expected = "16 finite numbers, row by row"
-        raise InputError("the instance has no matrix", where=f"{where}.transformationMatrix", expected=expected)
+        raise InputError(
+            "the matrix of the instance has the wrong length", where=f"{where}.transformationMatrix", expected=expected
+        )
     matrix = np.array(geometry.transformationMatrix).reshape(4, 4)
     corners = vertices.template_vertices @ matrix[:3, :3].T + matrix[:3, 3] + vertices.part_vertices[anchor]
     return _Candidate(vertices.templates[geometry.template], corners, where)
@@ -333,7 +335,7 @@ def _rings(surface: Any, vertices: np.ndarray, where: str) -> Surface:
         low, high = min(ring), max(ring)
         if low < 0 or high >= len(vertices):
             raise InputError(
-                "the vertex does not exist",
+                "the ring refers to a vertex that does not exist",
                 where=where,
                 got=str(low if low < 0 else high)[:60],
                 expected=f"0 to {len(vertices) - 1}",

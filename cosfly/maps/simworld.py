@@ -66,12 +66,14 @@ class SimWorldConfig(Config):
     def inputs(self) -> dict[str, Path]:
         world = required(self.world, "maps.simworld.world")
         if world.is_dir():  # its size table would be looked for next to the folder
-            raise InputError("the world is a folder", where=world, expected="a world file of SimWorld, JSON")
+            raise InputError("the world file is a folder", where=world, expected="a JSON file of SimWorld")
         tables = self.sizes or [world.parent / "Bbox.json"]
         for path in tables:
             if not path.is_file():
-                what, fix = "the asset size table is missing", "set it with --set maps.simworld.sizes=FILE"
-                raise InputError(what, where=path, expected="SimWorld's Bbox.json", fix=fix)
+                fix = "pass --set maps.simworld.sizes=FILE"
+                raise InputError(
+                    "the asset size table does not exist", where=path, expected="SimWorld's Bbox.json", fix=fix
+                )
         return {"world": world, **{f"sizes_{k}": path for k, path in enumerate(tables)}}
 
 
@@ -187,10 +189,11 @@ def read_sizes(paths: list[Path]) -> dict[str, np.ndarray]:
 def _check_unknown(cfg: SimWorldConfig, node: _Node, what: str) -> None:
     """Report an asset that cannot be placed, as an error or in the log."""
     if cfg.unknown == "error":
-        fix = "add a size table with it to maps.simworld.sizes"
-        fix = "add it to ASSETS in cosfly/simulators/assets.py" if what == "kind" else fix
+        fix = "add a table with its size to maps.simworld.sizes"
+        if what == "kind":
+            fix = "add the asset to ASSETS in cosfly/simulators/assets.py"
         raise InputError(
-            f"an asset has no {what}", where=f"{cfg.world}: {node.id}.instance_name", got=node.instance_name,
+            f"the asset has no {what}", where=f"{cfg.world}: {node.id}.instance_name", got=node.instance_name,
             fix=f"{fix}, or drop such assets with --set maps.simworld.unknown=drop",
         )  # fmt: skip
     log.warning("%s: %s has no %s and is dropped", node.id, node.instance_name, what)
@@ -203,8 +206,8 @@ def _add_node(boxes: BoxList, node: _Node, asset: Asset, size_cm: np.ndarray, st
     size = size * node.scale.array()
     if not LEAST_M <= size.min() <= size.max() <= LARGEST:
         raise InputError(
-            "the size of an object is out of range", where=f"{world}: {node.id}", got=f"{size.tolist()} m",
-            expected=f"{LEAST_M:g} m or more", fix="correct its scale, or its asset's size in the table",
+            "the size of the object is out of range", where=f"{world}: {node.id}", got=f"{size.tolist()} m",
+            expected=f"{LEAST_M:g} m or more", fix="correct the scale of the object or the size of its asset",
         )  # fmt: skip
     foot = node.location.z * M_PER_CM
     low = 0.0 if 0 < foot <= stand_m else foot

@@ -118,10 +118,10 @@ class SyntheticConfig(Config):
     def _is_possible(self) -> SyntheticConfig:
         if self.preset not in PRESETS:
             hint = nearest(self.preset, list(PRESETS))
-            raise ValueError(f"there is no preset {self.preset!r}{hint}; there are {', '.join(PRESETS)}")
+            raise ValueError(f"there is no preset {self.preset!r}{hint}; choose one of {', '.join(PRESETS)}")
         if (side := self.plan.narrowest_block_m) < MIN_BLOCK_M:
-            problem = f"a block would be {side:.1f} m wide, less than {MIN_BLOCK_M:.0f} m"
-            raise ValueError(f"{problem}: raise size_m or lower num_blocks")
+            problem = f"the blocks are {side:.1f} m wide, but must be at least {MIN_BLOCK_M:.0f} m"
+            raise ValueError(f"{problem}; raise size_m or lower num_blocks")
         return self
 
     @property

@@ -119,10 +119,10 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
     if cfg.most_default is not None and share > cfg.most_default:
         classes = Counter(row[1] for row in kept if row[2] == "default").most_common(5)
         raise InputError(
-            "too many boxes have a default size, because the server knows no bounds of them", where=where,
+            "too many boxes have a default size, because the server does not return their bounds", where=where,
             got=f"{share:.1%}: {', '.join(f'{name} ({num})' for name, num in classes)}",
             expected=f"at most {cfg.most_default:.1%} (maps.unrealcv.most_default)",
-            fix="add a table with their sizes to maps.unrealcv.sizes, or correct the assets' bounds",
+            fix="add a table of their sizes to maps.unrealcv.sizes, or correct the bounds of these assets",
         )  # fmt: skip
     boxes = np.array(rows)
     is_road = np.array([row[2] == "road" for row in kept])

@@ -43,9 +43,9 @@ def find_route(
     num_y, num_x = free.shape
     for name, (x, y) in (("start", start), ("goal", goal)):
         if not (0 <= x < num_x and 0 <= y < num_y):
-            raise ValueError(f"{name} {(int(x), int(y))} is outside the grid of {num_x} x {num_y} cells")
+            raise ValueError(f"the {name} {(int(x), int(y))} is outside the grid of {num_x} x {num_y} cells")
         if not free[y, x]:
-            raise ValueError(f"{name} {(int(x), int(y))} is not a free cell")
+            raise ValueError(f"the {name} {(int(x), int(y))} is not a free cell")
     # Zeroed pages are allocated on access, so a search pays for the cells it visits and not for the grid.
     state = np.zeros(free.size, dtype=np.uint8)
     steps = np.empty((free.size, 2), dtype=np.int32)

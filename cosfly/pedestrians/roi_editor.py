@@ -74,9 +74,9 @@ def _is_large(ring: shapely.LinearRing) -> bool:
 def run_propose(map_: Path, cfg: PedestriansConfig, out: Path) -> str:
     """Read a map, write a first `roi_polygon.json` and report what it holds."""
     if out.is_dir():
-        raise InputError("a folder, not a file", where=out, fix="name another file")
+        raise InputError("the output is a folder, not a file", where=out, fix="choose another --out")
     if out.exists():
-        raise InputError("there is a region already", where=out, fix="name another file, or remove this one")
+        raise InputError("the output file already exists", where=out, fix="choose another --out, or remove this file")
     box_map = _read_map(map_)
     roi = propose(walkable_ground(box_map, cfg, where=map_), box_map.name)
     ground = walkable_ground(box_map, cfg, roi, where=map_, roi_where=out)
@@ -115,7 +115,7 @@ class Editor:
                 where=self.where,
                 got=f"{num_x} x {num_y} cells",
                 expected=f"at most {MOST_SIDE} cells a side and {MOST_CELLS:,} cells in all",
-                fix="set a larger pedestrians.resolution_m while you draw: the region is saved in metres",
+                fix="set a larger pedestrians.resolution_m while you draw; the region stays in metres",
             )
         self.bare = walkable_ground(self.box_map, self.cfg, where=self.where)
         self.opened = None
@@ -172,7 +172,7 @@ class Editor:
             digest = sha256_bytes(read_bytes(self.path)) if self.path.exists() else None
             if digest != self.digest:
                 raise InputError(
-                    "the file was changed by somebody else; nothing is written",
+                    "the file was changed by somebody else, so nothing is written",
                     where=self.path,
                     fix="start the editor again",
                 )
@@ -218,7 +218,7 @@ def open_editor(map_: Path, cfg: PedestriansConfig, roi: Path, port: int, backdr
     picture = None if backdrop is None else Backdrop.read(backdrop)
     if picture is not None and not picture.covers(box_map):
         raise InputError(
-            "the picture shows no part of the map",
+            "the picture does not show any part of the map",
             where=backdrop,
             got=str(picture.frame()),
             expected=f"a picture of {box_map.name}",

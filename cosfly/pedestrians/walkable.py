@@ -98,12 +98,14 @@ class PedestriansConfig(Config):
     def _ranges_are_ordered(self) -> PedestriansConfig:
         problems = []
         if self.min_distance_m >= self.max_distance_m:
-            problems.append(f"min_distance_m {self.min_distance_m} is not below max_distance_m {self.max_distance_m}")
+            problems.append(f"min_distance_m {self.min_distance_m} must be below max_distance_m {self.max_distance_m}")
         if self.look_alikes > self.others:
-            problems.append(f"look_alikes {self.look_alikes} is above others {self.others}, which include them")
+            problems.append(
+                f"look_alikes {self.look_alikes} is above others {self.others}, although others include them"
+            )
         if 0 < self.max_detour < 1:
             problems.append(
-                f"max_detour {self.max_detour} is below 1, but no route is shorter than straight; 0: no limit"
+                f"max_detour {self.max_detour} is between 0 and 1, but must be at least 1, or 0 for no limit"
             )
         if problems:
             raise ValueError("; ".join(problems))
@@ -235,7 +237,7 @@ def walkable_ground(
     ground = WalkableGround(grid, inflated, parts, footing, box_map.ground, costs, is_in_roi, counts)
     if not ground.row_ends[-1]:
         raise NoPathError(
-            "all walkable ground is carriageway, where no trajectory may start or end", where=where,
+            "all walkable ground is carriageway, where trajectories must not start or end", where=where,
             got=f"{counts['cells_used']} walkable cells, all Roads", fix="set road_cost to 1",
             expected="pavements, squares or paths (Sidewalks, Ground)",
         )  # fmt: skip
@@ -290,7 +292,7 @@ def _parts_of_large_components(
     if not is_large.any():
         raise NoPathError(
             "no connected walkable area is large enough", where=where,
-            got=f"{int(sizes.max())} cells in the largest of {len(sizes) - 1}",
+            got=f"{int(sizes.max())} cells in the largest of {len(sizes) - 1} areas",
             expected=f"at least {min_component_cells} cells (min_component_cells)",
             fix="lower min_component_cells or safety_radius_m, or widen the region of interest",
         )  # fmt: skip
@@ -311,9 +313,9 @@ def check_roi(roi: Roi, box_map: BoxMap, where: str | Path, *, refuse: bool = Fa
         raise InputError(
             "most of the region of interest lies outside the map",
             where=where,
-            got=f"{inside:.0%} of it on the map",
-            expected=f"at least {ROI_SHARE_MIN:.0%}",
-            fix="draw it on this map, in its world metres: x is east, y is north",
+            got=f"{inside:.0%} of the region on the map",
+            expected=f"at least {ROI_SHARE_MIN:.0%} on the map",
+            fix="draw the region on this map, in world metres: x is east, y is north",
         )
     if 0.0 < inside < ROI_SHARE_MIN:
         log.warning("%s: %.0f %% of the region of interest lies outside the map", where, 100 * (1 - inside))
@@ -336,13 +338,13 @@ def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | 
             "no free cell lies on the requested ground",
             where=where,
             got=f"{counts['cells_free']} free cells",
-            expected="a free cell on such ground",
+            expected="a free cell on ground of that kind",
             fix="set ground to surfaces or anywhere",
         )
     raise NoPathError(
         "the region of interest has no walkable cell",
         where=roi_where,
-        got=f"{counts['cells_in_roi']} of the map's {counts['cells']} cells inside, none of them free ground",
+        got=f"{counts['cells_in_roi']} of {counts['cells']} cells in the region, and none of them is free ground",
         expected="a region in the map's world metres",
-        fix="draw it over free ground of this map",
+        fix="draw the region over free ground of this map",
     )

@@ -68,8 +68,8 @@ def parse_array(
     """
     header = parse_array_header(memoryview(data), where, what=what)
     if header.dtype != dtype or len(header.shape) != ndim:
-        expected = f"{np.dtype(dtype)} of {ndim} dimensions"
-        raise InputError(f"not a {what}", where=where, got=str(header), expected=expected)
+        expected = f"{np.dtype(dtype)} with {ndim} dimensions"
+        raise InputError(f"the {what} has the wrong type or shape", where=where, got=str(header), expected=expected)
     check_pixels(math.prod(header.shape), where, str(header.shape))
     values: np.ndarray = np.ndarray(header.shape, dtype, data, header.offset, order="F" if header.is_fortran else "C")
     return values.copy("K") if copy else values
@@ -79,7 +79,9 @@ def _header(start: bytes, size: int, where: str | Path, what: str) -> ArrayHeade
     """Return the header of a `.npy` file of `size` bytes from its first bytes."""
 
     def not_an_array(got: str) -> InputError:
-        return InputError(f"not a {what}", where=where, got=got, expected="a complete .npy file of numbers")
+        return InputError(
+            f"the {what} cannot be read", where=where, got=got, expected="a complete .npy file of numbers"
+        )
 
     if len(start) < LONG_PREFIX_BYTES or not start.startswith(NPY_MAGIC) or start[VERSION_BYTE] not in (1, 2, 3):
         raise not_an_array(f"{size} bytes that do not begin as a NumPy array")
@@ -146,7 +148,7 @@ def parse_picture(data: bytes, where: str | Path, *, flags: int = cv2.IMREAD_COL
         except cv2.error as error:
             got = str(error)
     if image is None:
-        raise InputError("not an image", where=where, got=got, expected="a PNG")
+        raise InputError("the image cannot be decoded", where=where, got=got, expected="a complete PNG")
     return image
 
 

@@ -107,8 +107,8 @@ def read_yaml(path: Path) -> dict:
         raise ConfigError(error.what, where=path, got=error.got, fix=error.fix) from None
     value = parse_yaml(text, path)
     if not isinstance(value, dict | None):
-        what, expected = "the configuration is not a mapping", "key: value lines"
-        raise ConfigError(what, where=path, got=type(value).__name__, expected=expected)
+        what = "the configuration is not a mapping"
+        raise ConfigError(what, where=path, got=type(value).__name__, expected="lines of the form key: value")
     return value or {}
 
 
@@ -122,14 +122,14 @@ def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
         key, equals, text = override.partition("=")
         if not equals or not all(key.split(".")) or key.count(".") > MOST_PARTS:
             expected = "key=value, for instance pedestrians.num_paths=3"
-            raise ConfigError("not an assignment", where="--set", got=override[:80], expected=expected)
+            raise ConfigError("the value of --set is not an assignment", got=override[:80], expected=expected)
         value = parse_yaml(text, f"--set {key}", what="value")
         node = data
         *parents, last = key.split(".")
         for parent in parents:
             node = node.setdefault(parent, {})
             if not isinstance(node, dict):
-                raise ConfigError("not a group of settings", where=f"--set {key}", got=parent)
+                raise ConfigError(f"{parent!r} is not a group of settings", where=f"--set {key}")
         node[last] = value
     return data
 
@@ -161,7 +161,7 @@ def _problem(model: type[BaseModel], detail: Any) -> str:
         hint = nearest(str(last), known) or (f" (there are {', '.join(known)})" if len(known) <= MOST_LISTED else "")
         return f"{field}: unknown setting{hint}"
     if kind in ("list_type", "tuple_type"):
-        return f"{field}: not a list, got {detail['input']!r}; write [{detail['input']}]"
+        return f"{field}: the value is not a list, got {detail['input']!r}; write [{detail['input']}]"
     got = "" if isinstance(detail["input"], dict) else f", got {detail['input']!r}"
     return f"{field}: {'not a group of settings' if kind == 'model_type' else plain(detail['msg'])}{got}"
 
@@ -202,10 +202,14 @@ def config_file(config: Path | None) -> Path | None:
     if is_bare and (packaged := shipped(f"{config}.yaml")).exists():
         return packaged  # even where a folder has this name
     names = sorted(path.stem for path in shipped(".").glob("*.yaml") if path.stem != "glossary")
-    expected = f"a YAML file, a run directory, or one that ships: {', '.join(names)}"
+    expected = f"a YAML file, a run directory, or one of {', '.join(names)}"
     if config.is_dir():
-        what, fix = "this folder is not a run directory", f"cosfly list {config} names the runs in it"
-        raise ConfigError(what, where=config, got="no run.yaml", expected=expected, fix=fix)
+        fix = f"cosfly list {config} shows the runs in it"
+        raise ConfigError(
+            "this folder is not a run directory", where=config, got="no run.yaml", expected=expected, fix=fix
+        )
     if is_bare:
-        raise ConfigError(f"no such configuration{nearest(str(config), names)}", where=config, expected=expected)
+        raise ConfigError(
+            f"there is no such configuration{nearest(str(config), names)}", where=config, expected=expected
+        )
     return config

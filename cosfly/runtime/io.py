@@ -49,7 +49,7 @@ class LinkedPath(PosixPath):
 
 def over_limit(where: object, got: str, expected: str, fix: str) -> InputError:
     """Return the error of an input that is larger than its reader accepts."""
-    return InputError("over the limit", where=str(where), got=got, expected=f"at most {expected}", fix=fix)
+    return InputError("the input is over the limit", where=str(where), got=got, expected=f"at most {expected}", fix=fix)
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
@@ -104,7 +104,7 @@ def read_bytes(
         file.seek(first)
         data = file.read(size)
     if span is not None and len(data) != size:
-        raise InputError(f"the {what} became shorter while it was read", where=path, got=f"{first + len(data)} bytes")
+        raise InputError(f"the {what} became shorter during reading", where=path, got=f"{first + len(data)} bytes")
     return data
 
 
@@ -120,7 +120,8 @@ def decoded(data: bytes, where: object) -> str:
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         got = f"the byte 0x{data[error.start]:02x} in line {line}"
-        raise InputError("not UTF-8 text", where=str(where), got=got, fix="if it is text, save it as UTF-8") from None
+        fix = "if the file is text, save it as UTF-8"
+        raise InputError("the file is not UTF-8 text", where=str(where), got=got, fix=fix) from None
 
 
 def read_lines(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> Iterator[bytes]:
@@ -130,7 +131,7 @@ def read_lines(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: P
             with disk_errors(path, what, fix):
                 line = file.readline(LINE_MB * MB + 1)
             if len(line) > LINE_MB * MB:
-                fix = "check that it is JSON lines, one record a line"
+                fix = "check that the file is JSON lines, with one record in each line"
                 raise over_limit(f"{path}:{number}", "a longer line", f"{LINE_MB} MB", fix)
             if not line:
                 return
@@ -149,10 +150,11 @@ def read_unpacked(path: Path, *, what: str = "file", most_mb: float = FILE_MB) -
     except (OSError, EOFError, zlib.error) as error:
         raise InputError("the gzip data is damaged", where=path, got=str(error)) from None
     if len(unpacked) > most_mb * MB:
-        raise over_limit(path, "more, unpacked", f"{most_mb:,g} MB in one piece", SPLIT)
+        raise over_limit(path, "more when unpacked", f"{most_mb:,g} MB in one piece", SPLIT)
     if len(unpacked) > by_factor:
         got = f"{len(data):,} bytes that unpack to more"
-        raise over_limit(path, got, f"{UNPACK_FACTOR} times the file", "if you trust it, gunzip it first")
+        fix = "if you trust the file, run gunzip on it first"
+        raise over_limit(path, got, f"{UNPACK_FACTOR} times the file", fix)
     return unpacked
 
 
@@ -210,7 +212,7 @@ def check_stays_below(path: Path, tree: Path, *, in_parent: bool = False) -> Non
     try:
         real, root = real_path(path), real_path(tree)
     except ValueError as error:  # a NUL in a name
-        raise InputError("not a name of a file", where=tree, got=str(error)) from None
+        raise InputError("a path has an invalid character", where=tree, got=str(error)) from None
     blobs = [str(folder.parent / "blobs") for folder in Path(root).parents if folder.name == "snapshots"][:1]
     if not any(is_below(real, allowed) for allowed in (os.path.dirname(root) if in_parent else root, *blobs)):
         raise InputError(
@@ -218,7 +220,7 @@ def check_stays_below(path: Path, tree: Path, *, in_parent: bool = False) -> Non
             where=path,
             got=real,
             expected=f"a file below {tree}",
-            fix="if you trust it, --set follow_links=true",
+            fix="if you trust the link, pass --set follow_links=true",
         )
 
 
@@ -252,8 +254,8 @@ def _plain_name(root: Path, name: str) -> str:
     """Return a normalized name without `..`; a link may still lead out."""
     plain = os.path.normpath(name)
     if "\0" in name or max(len(part.encode("utf-8", "surrogatepass")) for part in plain.split(os.sep)) > LONGEST_NAME:
-        expected = f"parts of at most {LONGEST_NAME} bytes"
-        raise InputError("not a name of a file", where=root, got=name, expected=expected)
+        expected = f"no null character, and at most {LONGEST_NAME} bytes between two slashes"
+        raise InputError("the text is not a file name", where=root, got=name, expected=expected)
     if os.path.isabs(plain) or plain.split(os.sep)[0] == os.pardir:
         raise InputError("a name leads out of its folder", where=root, got=name, expected="a path inside the folder")
     return plain
@@ -266,7 +268,7 @@ def refuse_link(path: Path) -> None:
             "this path is a link, and cosfly does not write through links",
             where=path,
             got=f"a link to {os.readlink(path)}",
-            fix="remove it, or replace it by its target; only the folder that --out names may be a link",
+            fix="remove the link, or replace it by its target; only the folder of --out itself may be a link",
         )
 
 
@@ -292,19 +294,19 @@ def storage_errors(path: Path) -> Iterator[None]:
         name = os.fsdecode(error.filename) if error.filename is not None else None
         is_about_path = name is not None and path.absolute().is_relative_to(Path(name).absolute())
         if error.errno in DISK_FULL:
-            fix = "free some space or choose another --out, then run the same command again: finished work is kept"
+            fix = "free some space or choose another --out, then run the same command again; finished work is kept"
         elif error.errno in NOT_WRITABLE or (error.errno in NO_SUCH_PLACE and is_about_path):
-            fix = "choose another --out, or fix the folder and run the same command again: finished work is kept"
+            fix = "choose another --out, or fix the folder and run the same command again; finished work is kept"
         else:
             raise
-        raise StorageError("cannot write", where=path, got=error.strerror, fix=fix) from error
+        raise StorageError("cannot write the file", where=path, got=error.strerror, fix=fix) from error
 
 
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[IO[bytes]]:
     """Open a file under a temporary name that is renamed at the end: a kill leaves either the old file or the new."""
     if path.is_dir():
-        raise StorageError("cannot write a file where a folder is", where=path, fix="name a file in it")
+        raise StorageError("cannot write the file: it is a folder", where=path, fix="name a file in this folder")
     with _renamed(path) as partial, open(partial, "xb") as file:
         yield file
         file.flush()
@@ -392,7 +394,8 @@ def read_checksums(folder: Path) -> dict[str, str]:
     for number, line in enumerate(read_text(path, what="checksums", tree=folder).splitlines(), 1):
         digest, _, name = line.partition("  ")
         if len(digest) != 64 or not name:
-            raise InputError("a broken checksum line", where=f"{path}:{number}", got=line[:80])
+            expected = "64 hex digits, two spaces and a name"
+            raise InputError("the checksum line is damaged", where=f"{path}:{number}", got=line[:80], expected=expected)
         plain = _plain_name(folder, name)
         parent = os.path.dirname(plain)
         if parent not in checked or os.path.islink(f"{folder}{os.sep}{plain}"):

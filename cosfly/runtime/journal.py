@@ -58,9 +58,12 @@ class Journal:
             except ValidationError as error:
                 detail = error.errors(include_url=False, include_input=False)[0]
                 field = ".".join(str(part)[:40] for part in detail["loc"]) or "top level"
-                where, got = f"{self.path}:{self.line_num}", f"{field}: {plain(detail['msg'])[:200]}"
-                fix = "delete this line from the file and run the same command: the item of the line is done again"
-                raise InputError("a line that cannot be used", where=where, got=got, fix=fix) from None
+                raise InputError(
+                    "the line of the journal cannot be used",
+                    where=f"{self.path}:{self.line_num}",
+                    got=f"{field}: {plain(detail['msg'])[:200]}",
+                    fix="delete this line and run the same command again, which repeats the item of the line",
+                ) from None
             yield found
 
     def read_at(self, line_bytes: Iterable[int]) -> Iterator[dict]:
@@ -73,11 +76,10 @@ class Journal:
                     file.seek(line_byte)
                     record = _record_of(file.readline())
                 if record is None:
-                    fix = "run the same command again: the item of this line is done again"
                     raise InputError(
                         "a line of the journal changed while the command was running",
                         where=f"{self.path}: byte {line_byte}",
-                        fix=fix,
+                        fix="run the same command again, which repeats the item of this line",
                     )
                 yield record
 

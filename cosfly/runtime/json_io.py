@@ -53,7 +53,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     members = dict(pairs)
     if len(members) < len(pairs):
         names = [name for name, _ in pairs]
-        raise ValueError(f"{next(name for name in names if names.count(name) > 1)!r} is given twice")
+        raise ValueError(f"the key {next(name for name in names if names.count(name) > 1)!r} is given twice")
     return members
 
 
@@ -65,10 +65,10 @@ def parse_json(text: str | bytes, *, unique_keys: bool = False) -> Any:
     data = text.encode() if isinstance(text, str) else text.removeprefix(b"\xef\xbb\xbf")
     num_groups = data.count(b"[") + data.count(b"{")
     if num_groups > max(MOST_GROUPS, len(data) / LEAST_GROUP_BYTES):
-        raise ValueError(f"{num_groups:,} lists and objects in {len(data):,} characters")
+        raise ValueError(f"the text has too many lists and objects: {num_groups:,} in {len(data):,} bytes")
     value = from_json(data, allow_inf_nan=False)
     if num_groups > DEPTH and is_deep(value):
-        raise ValueError(f"nested deeper than {DEPTH}")
+        raise ValueError(f"lists and objects are nested deeper than {DEPTH} levels")
     if unique_keys or _SUSPECT.search(data):
         json.loads(data, parse_float=_finite, parse_int=_integer, object_pairs_hook=_unique if unique_keys else None)
     return value
@@ -90,7 +90,7 @@ def parse_document(data: bytes | str, where: str | Path, *, unique_keys: bool = 
     try:
         return parse_json(data, unique_keys=unique_keys)
     except ValueError as error:
-        raise InputError(f"not valid JSON: {error}", where=where) from None
+        raise InputError(f"this is not valid JSON: {error}", where=where) from None
 
 
 def read_json(
@@ -104,7 +104,7 @@ def read_object(path: Path, *, what: str = "file", tree: Path | None = None) -> 
     """Read a JSON file that holds an object."""
     value = read_json(path, what=what, tree=tree)
     if not isinstance(value, dict):
-        raise InputError(f"not the {what}", where=path, got=type(value).__name__, expected="an object")
+        raise InputError(f"the {what} is not a JSON object", where=path, got=type(value).__name__, expected="an object")
     return value
 
 
@@ -142,7 +142,8 @@ def validated(kind: type[Kind], value: Any, where: str | Path) -> Kind:
         detail = error.errors(include_url=False, include_context=False)[0]
         places = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in detail["loc"])
         field, found = "".join(places).removeprefix(".") or "top level", detail["input"]
-        what = "not an object" if detail["type"] in ("model_type", "dataclass_type") else plain(detail["msg"])
+        is_object_error = detail["type"] in ("model_type", "dataclass_type")
+        what = "the value is not an object" if is_object_error else plain(detail["msg"])
         got = (reprlib if isinstance(found, dict | list) else builtins).repr(found)[:80]
         raise InputError(what, where=f"{where}: {field}", got=got) from None
 
@@ -196,16 +197,16 @@ class FileFormat(NamedTuple):
 def check_schema(value: Any, form: FileFormat, path: Path | str) -> dict:
     """Return a JSON value that is an object of the wanted schema and major version."""
     if not isinstance(value, dict):
-        expected = f"an object, schema {form.schema}"
-        raise InputError("not a cosfly file", where=path, got=type(value).__name__, expected=expected)
+        expected = f"an object with schema {form.schema}"
+        raise InputError("this is not a file of cosfly", where=path, got=type(value).__name__, expected=expected)
     for key, wanted in form.header.items():
         found, where = value.get(key), f"{path}: {key}"
         if found is None:
-            fix = "check that this is the file that was meant"
+            fix = f"check that this file is the {form.what}"
             raise InputError(MISSING, where=where, expected=repr(wanted), fix=fix)
         is_schema = key == "schema"
         if found != wanted if is_schema else str(found).split(".")[0] != wanted.split(".")[0]:
-            what = "not the expected kind of file" if is_schema else "unknown version"
+            what = "this is another kind of file" if is_schema else "the version of the file is not supported"
             raise InputError(what, where=where, got=repr(found)[:80], expected=repr(wanted))
     return value
 

@@ -76,10 +76,10 @@ class Cluster:
         if not self.room:
             got = ", ".join(f"{node.get('CPU', 0):g} CPUs and {node.get('GPU', 0):g} GPUs" for node in nodes)
             raise EnvironmentMissing(
-                "no node has room for a worker",
-                got=f"nodes of {got}",
+                "no node is large enough for a worker",
+                got=f"nodes with {got}",
                 expected=self.needs,
-                fix="lower ray.worker_cpus or ray.worker_gpus, or add a node that has as many",
+                fix="lower ray.worker_cpus or ray.worker_gpus, or add a larger node",
             )
         self._actor = self._ray.remote(_host())
 
@@ -182,12 +182,17 @@ def _host() -> type:
             try:
                 import cosfly
             except ImportError as error:
-                fix = f"install cosfly {version} there, or start the node with the Python that has it"
-                return node, None, {"what": "cosfly is not there", "got": f"{error} ({python})", "fix": fix}
+                fix = f"install cosfly {version} on the node, or start the node with the Python that has it"
+                return (
+                    node,
+                    None,
+                    {"what": "cosfly is not installed on the node", "got": f"{error} ({python})", "fix": fix},
+                )
             if cosfly.__version__ != version:
-                fix = "install the same version on every node, then start Ray there again"
+                fix = "install the same version on every node, then start Ray again on the nodes"
                 got = f"{cosfly.__version__} ({python})"
-                return node, None, {"what": "another version of cosfly", "got": got, "expected": version, "fix": fix}
+                what = "the node has another version of cosfly"
+                return node, None, {"what": what, "got": got, "expected": version, "fix": fix}
             from cosfly.runtime.io import sha256_file
             from cosfly.runtime.local_transport import LocalTransport
 
@@ -198,8 +203,8 @@ def _host() -> type:
                 is_same = False
             if not is_same:
                 got = f"no {Path(cwd) / folder}, or another folder of that name"
-                fix = "have run folder and inputs on storage that all nodes share, at the same path"
-                return node, None, {"what": "the stage's folder is not there", "got": got, "fix": fix}
+                fix = "put run folder and inputs on storage that all nodes share, at the same path"
+                return node, None, {"what": "the node does not see the folder of the stage", "got": got, "fix": fix}
             if devices := ray.get_gpu_ids():
                 os.environ.setdefault("GLCONTEXT_DEVICE_INDEX", str(devices[0]))  # EGL lists NVIDIA devices first
             sys.path.extend(entry for entry in path if entry not in sys.path)  # a spawned process inherits it
@@ -249,7 +254,7 @@ def connected(cfg: RayConfig) -> Any:
         from ray._private import worker as ray_worker
     except ImportError:
         fix = "pip install 'cosfly[ray]', on every node"
-        raise EnvironmentMissing("the package ray is missing", where="--engine ray", fix=fix) from None
+        raise EnvironmentMissing("the package ray is not installed", where="--engine ray", fix=fix) from None
     if ray.is_initialized():
         return ray
     address = cfg.address or os.environ.get("RAY_ADDRESS") or "local"
@@ -280,12 +285,12 @@ def _check_reachable(address: str) -> None:
     try:
         grpc.channel_ready_future(channel).result(ANSWER_S)
     except grpc.FutureTimeoutError:
-        raise _refused(address, f"no gRPC server within {ANSWER_S:g} s") from None
+        raise _refused(address, f"no answer of a gRPC server within {ANSWER_S:g} s") from None
     finally:
         channel.close()
 
 
 def _refused(address: str, error: Exception | str) -> EnvironmentMissing:
-    fix = "start one there (ray start --head), or leave out --address for a cluster of this machine"
+    fix = "start a cluster at this address (ray start --head), or omit --address to use this machine"
     got = " ".join(str(error).split())
     return EnvironmentMissing("no Ray cluster answers", where=address, got=got, fix=fix)

@@ -94,11 +94,11 @@ def hold_folder(folder: Path) -> FolderLock:
         try:
             lock.acquire()
         except Timeout:
-            fix = "wait for it or stop it, then run the same command again; or choose another --out"
+            fix = "wait for that process or stop it, then run the same command again; or choose another --out"
             raise ResumeError("another process is at work in this folder", where=path.parent, fix=fix) from None
         except NotImplementedError:
-            fix = "choose another --out"
-            raise StorageError("the file system has no locks", where=path.parent, fix=fix) from None
+            fix = "choose an --out on another file system"
+            raise StorageError("the file system does not support file locks", where=path.parent, fix=fix) from None
     return lock
 
 
@@ -387,7 +387,7 @@ class StageFolder:
         failures = read_failures(path) if path.exists() else []
         if failures:
             got += f"; the first failure: {failures[0].message}"
-        fix = fix or "fix what failures.jsonl and items.jsonl there name, or change settings and choose another --out"
+        fix = fix or "fix the causes in failures.jsonl and items.jsonl, or change settings and choose another --out"
         what = f"{self.stage} kept nothing, so the next stage has no input"
         return NothingKept(what, where=where or self.path, got=got, expected=expected, fix=fix)
 
@@ -397,7 +397,7 @@ def _prepare_resume(out: Path, record: StageRecord, resume: Resume, begun: Colle
     if not (out / "stage.json").exists():
         # A kill during the write of the record leaves its partial file.
         if any(entry.name != LOCK and not entry.match(".stage.json.*.partial") for entry in out.iterdir()):
-            problem = "the output folder holds files that are not cosfly's"
+            problem = "the output folder holds files that cosfly did not write"
             raise ResumeError(problem, where=out, fix="choose an empty --out")
     elif _holds_work(out, begun):
         _check_same(out, record, resume)
@@ -439,13 +439,13 @@ def _check_same(out: Path, record: StageRecord, resume: Resume) -> None:
             differences.append(f"the input {name} ({new.path if new else 'none'}) has changed")
     for name, digest in previous.package_files.items():
         if record.package_files.get(name, digest) != digest:
-            differences.append(f"the {name} changed")
+            differences.append(f"the {name} has changed")
     if differences:
         raise ResumeError(
             "the folder holds work made with other settings or inputs",
             where=out,
             got="; ".join(differences),
-            fix="choose another --out, or restore them",
+            fix="choose another --out, or restore the previous settings and inputs",
         )
     if previous.code_version != record.code_version:
         log.warning("%s: resumed by version %s, started by %s", out, record.code_version, previous.code_version)
@@ -470,7 +470,7 @@ def _check_outputs_exist(out: Path, manifest: Manifest) -> None:
         path = inside(out, entry.path)
         if not path.is_file() or path.stat().st_size != entry.bytes:
             raise VerifyError(
-                "the manifest calls this stage complete, but a product is missing or has another size",
+                "the manifest says that this stage is complete, but a product is missing or has another size",
                 where=path,
                 expected=f"{entry.bytes} bytes",
                 fix=f"remove {out} and run the stage again",
@@ -531,8 +531,8 @@ def checked_inputs(inputs: Mapping[str, Path], audited: Collection[str] = ()) ->
         try:
             str(path).encode()
         except UnicodeEncodeError:
-            problem = "a name that is not UTF-8 text cannot be recorded"
-            raise InputError(problem, where=path, fix="rename it") from None
+            problem = "the path contains a name that is not UTF-8 text"
+            raise InputError(problem, where=path, fix="rename the file or folder") from None
         if name not in audited:
             _check_finished(path)
     records = {name: StageInput(path=str(path), sha256=fingerprint(path)) for name, path in sorted(inputs.items())}
@@ -567,11 +567,11 @@ def _check_finished(path: Path) -> None:
     for name in RECORDS:
         if not _record(folder, name):
             raise VerifyError(
-                "the stage that makes this is not finished, or its records are gone",
+                "the stage that makes this input is not finished, or its records are missing",
                 where=path,
                 got=f"no {name} in {folder}",
                 expected=f"{name} of that stage",
-                fix="run that stage again; to use its files as they are, copy them to a folder of their own",
+                fix="run that stage again; to use its files as they are, copy them to an empty folder",
             )
     name = os.path.relpath(path, folder)
     problems = list[str]()
@@ -585,11 +585,11 @@ def _check_finished(path: Path) -> None:
     if problems:
         more = f" and {len(problems) - NUM_NAMED} more" if len(problems) > NUM_NAMED else ""
         raise VerifyError(
-            "the files of this stage are not those that it finished",
+            "files of this stage were changed after it finished",
             where=folder,
             got="; ".join(problems[:NUM_NAMED]) + more,
             expected="the files whose digests are in its records",
-            fix="restore the files or make them again; to use a file that you changed, copy it to a folder of its own",
+            fix="restore the files or run the stage again; to use a file that you changed, copy it to an empty folder",
         )
 
 
@@ -604,11 +604,11 @@ def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], records: M
         if sources and peer != name and all(entry.sha256 != records[peer].sha256 for _, entry in sources):
             source, entry = sources[0]
             raise VerifyError(
-                f"it was made of another input {source!r} than the one given with it",
+                f"this file was made from another input {source!r} than the one that is passed with it",
                 where=path,
-                got=f"given: {inputs[peer]}",
-                expected=f"{entry.path}, as it was then",
-                fix=f"give the two that belong together, or make {path.name} again",
+                got=str(inputs[peer]),
+                expected=f"{entry.path} with unchanged content",
+                fix=f"pass the two that belong together, or make {path.name} again",
             )
 
 

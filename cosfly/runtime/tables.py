@@ -33,7 +33,7 @@ def arrow_errors(path: Path | str) -> Iterator[None]:
     try:
         yield
     except (pa.ArrowException, OSError, ValueError) as error:  # which one depends on the damaged byte
-        raise InputError("not a whole parquet file", where=path, got=str(error)) from None
+        raise InputError("the parquet file is damaged", where=path, got=str(error)) from None
 
 
 class _Table(pq.ParquetFile):
@@ -150,7 +150,7 @@ class TableRows(Sequence[dict[str, Any]]):
         if self._process != os.getpid():  # a fork shares the place in the open file with its parent
             table = self._stack.enter_context(open_table(self._path))
             if missing := sorted(set(self._columns) - set(table.schema_arrow.names)):
-                raise InputError("columns are missing", where=self._path, got=", ".join(missing)[:200])
+                raise InputError("the table lacks columns", where=self._path, got=", ".join(missing)[:200])
             counts = (table.metadata.row_group(k).num_rows for k in range(table.num_row_groups))
             self._firsts = list(accumulate(counts, initial=0))
             self._group = lru_cache(GROUPS_HELD)(lambda k: read_row_group(self._path, table, k, self._columns))

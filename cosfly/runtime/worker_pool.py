@@ -307,9 +307,9 @@ class WorkerPool:
         self.events.write(loss, **fields)
         if self.num_lost > self.watch.restarts + self._num_done:
             raise EnvironmentMissing(
-                "workers die or stall all the time",
+                "workers die or stall again and again",
                 where=None if attempt is None else attempt.item.item_id,
-                got=f"{self.num_lost} lost, {self._num_done} items done; the last: {LOSSES[loss]}",
+                got=f"{self.num_lost} workers lost, {self._num_done} items done; the last loss: {LOSSES[loss]}",
                 fix=f"see events.jsonl; free some memory, use fewer --workers or raise item_limit_s, {RUN_AGAIN}",
             )
         if attempt is not None:

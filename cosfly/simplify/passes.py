@@ -81,7 +81,7 @@ def clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:
     """Return the lowest row of each box's cluster, (n,) int64: boxes, (n, 3) m, with gaps of at most `gap_m` on every
     axis."""
     if mins.shape != maxs.shape or mins.ndim != 2 or mins.shape[1] != 3:
-        raise ValueError(f"mins and maxs must be (n, 3), got {mins.shape} and {maxs.shape}")
+        raise ValueError(f"mins and maxs must have the shape (n, 3), got {mins.shape} and {maxs.shape}")
     if not gap_m >= 0:
         raise ValueError(f"gap_m must not be negative, got {gap_m}")
     if len(mins) == 0:

@@ -82,7 +82,10 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same
     result = simplify(raw, cfg)
     if len(result.box_map) == 0:
         raise InputError(
-            "every box lies below the ground", where=maps, expected="boxes above it", fix="check the map's ground_z_m"
+            "every box lies below the ground",
+            where=maps,
+            expected="boxes above the ground",
+            fix="check the map's ground_z_m",
         )
     write_boxes(product, result.box_map)
     facts = report(raw, result, cfg)

@@ -62,11 +62,11 @@ def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:
         client_version = client.get_client_version()
     if version != client_version:
         raise EnvironmentMissing(
-            "the CARLA server has another version than the client",
+            "the CARLA server and the CARLA client have different versions",
             where=endpoint,
             got=version,
             expected=client_version,
-            fix=f"run a server of {client_version}: streams of other versions crash this client",
+            fix=f"run a server of version {client_version}, because other versions crash this client",
         )
     with _server_errors("CARLA did not return its world", endpoint, version):
         world = client.get_world()
@@ -74,7 +74,7 @@ def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:
         towns = sorted({_short(name) for name in client.get_available_maps()})
         if cfg.town is not None and cfg.town != loaded:
             if cfg.town not in towns:
-                what = f"the server has no such town{nearest(cfg.town, towns)}"
+                what = f"the server has no town of this name{nearest(cfg.town, towns)}"
                 where = f"{endpoint} (CARLA {version})"
                 raise ConfigError(what, where=where, got=cfg.town, expected=", ".join(towns))
             world = client.load_world(cfg.town)

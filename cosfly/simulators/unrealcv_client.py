@@ -76,8 +76,8 @@ class UnrealCvConnection:
         for command, answer in zip(commands, self.ask(*commands), strict=True):
             if is_refusal(answer):
                 got = f"{command}: {answer!r}"
-                fix = "use a build of UnrealCV that has it"
-                raise EnvironmentMissing("the server refuses a command", where=self.where, got=got, fix=fix)
+                fix = "use a build of UnrealCV that has this command"
+                raise EnvironmentMissing("the server does not accept a command", where=self.where, got=got, fix=fix)
 
     def numbers(self, answer: str | bytes, num: int) -> tuple[float, ...] | None:
         """Return the numbers of an answer; None if it does not hold `num` finite numbers."""
@@ -123,7 +123,7 @@ def connect(cfg: UnrealCvConfig, port: int) -> UnrealCvConnection:
             where=connection.endpoint,
             got=repr(version)[:80],
             expected=f"{'.'.join(map(str, LEAST_VERSION))} or newer",
-            fix="run a newer build, as SimWorld ships",
+            fix="run a newer build, such as the one in SimWorld",
         )
     connection.version = match[0]
     connection.level = "" if is_refusal(level) else for_terminal(str(level).strip())
@@ -149,7 +149,7 @@ def _opened(cfg: UnrealCvConfig, port: int, connection: UnrealCvConnection) -> U
             break
         time.sleep(0.5)
     connection.close()
-    fix = "open the level by hand and set the name that `vget /level/name` answers, or leave the level unset"
+    fix = "open the level by hand and set the answer to `vget /level/name`, or remove the setting"
     raise ConfigError("the server did not open the level", where=before, got=cfg.level, fix=fix)
 
 
@@ -198,7 +198,7 @@ def _why_not(host: str, port: int) -> str:
         socket.create_connection((host, port), PROBE_S).close()
     except OSError as error:
         return str(error)
-    return "it does not greet as UnrealCV does, or has another client"
+    return "the server is not UnrealCV, or already has another client"
 
 
 @contextlib.contextmanager

@@ -106,9 +106,13 @@ class WorldPlan(BaseModel):
         for name, (least, most) in (limits | {"trees_per_ha": (0.0, 400.0)}).items():
             low, high = getattr(self, name)
             if not least <= low <= high <= most:
-                raise ValueError(f"{name} is {low:g} to {high:g}, but must be a range within {least:g} to {most:g}")
+                raise ValueError(
+                    f"{name} is {low:g} to {high:g}, but must be lowest to highest, within {least:g} to {most:g}"
+                )
         if self.plazas + self.greens >= self.blocks_along**2:
-            raise ValueError(f"{self.plazas} plazas and {self.greens} greens leave no block of {self.blocks_along**2}")
+            raise ValueError(
+                f"{self.plazas} plazas and {self.greens} greens leave none of {self.blocks_along**2} blocks to build on"
+            )
         narrowest_m = self.block_m * (1.0 - self.unevenness) / (1.0 + self.unevenness)
         if narrowest_m < MIN_BLOCK_M + 1.0 or self.setback_m > narrowest_m / 5:
             expected = f"at least {MIN_BLOCK_M + 1.0:g} m and at least five times setback_m"

@@ -51,7 +51,7 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
     not_in_table = _find_unknown(rest)
     if not (objects or not_in_table or without or set(words) & KNOWN):
         raise InputError(
-            "the prompt has no word that the rules know", where="PROMPT", got=repr(prompt[:60]),
+            "the rules know none of the words of the prompt", where="PROMPT", got=repr(prompt[:60]),
             expected="English, as in 'a small village with a church'",
             fix="name a kind of place, or let a language model plan with --planner URL",
         )  # fmt: skip
@@ -69,7 +69,7 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
     if heights := _HEIGHTS.search(prompt.lower()):
         plan["heights_m"] = float(heights[1]), float(heights[2])
         if not 3 <= plan["heights_m"][0] <= plan["heights_m"][1] <= 450:
-            what = "the heights of buildings are contradictory"
+            what = "the heights of buildings are not a possible range"
             raise InputError(what, where="PROMPT", got=heights[0], expected="lowest to highest, within 3 to 450 m")
     plan |= _open_and_water(words, objects, plan)
     if without:
@@ -120,7 +120,7 @@ def _choices(rest: str) -> dict[str, str]:
         found = {choice: word for word in spoken for choice, entry in choices.items() if word in entry["words"].split()}
         if len(found) > 1:
             got = " and ".join(repr(word) for word in found.values())
-            raise InputError(f"the words about {group} contradict each other", where="PROMPT", got=got)
+            raise InputError(f"two words about {group} contradict each other", where="PROMPT", got=got)
         if found:
             chosen[group] = next(iter(found))
     return chosen

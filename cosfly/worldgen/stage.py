@@ -160,9 +160,9 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
     found = find_object(reply.text, WorldPlan.model_fields.keys(), reply.finish_reason)
     if found.value is None:
         raise TeacherError(
-            "the planner's answer holds no plan", where=where,
+            "the answer of the planner has no plan", where=where,
             got=f"{found.reason}: {' '.join(reply.text.split())[:80]!r}", expected="a JSON object",
-            fix="try another --seed, prompt or model, or omit --planner: the rules need no model",
+            fix="try another --seed, prompt or model, or omit --planner to plan by rules without a model",
         )  # fmt: skip
     return validated(WorldPlan, found.value, where), trace
 
