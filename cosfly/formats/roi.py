@@ -107,12 +107,9 @@ def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Ro
 
 
 def _polygons_of(features: list[Feature], path: Path) -> list[dict[str, Any]]:
-    """Convert the polygons of GeoJSON, whose rings repeat their first point, to records of `RoiPolygon`.
-
-    Raises:
-        InputError: Lists the problems of all features.
-    """
-    problems, polygons = [], []
+    """Convert GeoJSON, whose rings repeat their first point, to `RoiPolygon` records; InputError lists all problems."""
+    problems: list[str] = []
+    polygons: list[dict[str, Any]] = []
     for feature in features:
         if feature.problem:
             problems.append(f"{feature.where}: {feature.problem}")

@@ -148,9 +148,6 @@ def assign_splits(
         fractions: shares of `val` and `test`, together below 1; 0 or none: no such split.
         too_few: with fewer groups than splits, refuse, or fill train, then val, and leave the others empty.
         what, fix: for the message.
-
-    Raises:
-        InputError: If there are too few groups.
     """
     ranked = sorted(set(groups), key=lambda group: hashlib.sha256(f"{seed}/distill.split/{group}".encode()).digest())
     requested = [split for split in SPLITS if split == "train" or fractions.get(split, 0.0) > 0]

@@ -181,12 +181,7 @@ class ChatClient:
             await asyncio.sleep(pause_s)
 
     async def _try(self, request: Request, sent_s: float) -> Reply:
-        """Try to get the answer of a request.
-
-        Raises:
-            NoAnswer: This try is not answered, or with `is_final` the request never will be.
-            TeacherError: No request will be answered.
-        """
+        """Try once to get the answer of a request; NoAnswer fails this try, TeacherError all requests."""
         try:
             reply = await self._ask(request)
         except (TimeoutError, httpx.RequestError) as error:  # also a compressed body

@@ -26,8 +26,10 @@ from cosfly.simulators.conventions import world_pose
 
 log = logging.getLogger(__name__)
 
-HUGE_KINDS, SLAB_M = ("Terrain", "Vegetation"), 2.0  # lower ones are ground
-ROAD_STEP_M, ALONG_M = 25.0, 60.0  # between points on roads; how near a box must be to count as along one
+HUGE_KINDS = ("Terrain", "Vegetation")
+SLAB_M = 2.0  # huge boxes that are lower are ground
+ROAD_STEP_M = 25.0  # between the points on roads
+ALONG_M = 60.0  # largest distance of a point on a road from the nearest box
 SLOPE_M = 1.0  # roads with a larger range of heights are not on flat ground
 
 
@@ -61,20 +63,22 @@ def ask(cfg: CarlaConfig) -> CarlaTown:
     connection = connect(cfg, cfg.port)
     answers = CarlaTown(connection.town, connection.version)
     labels = connection.carla.CityObjectLabel.names.items()
-    with connection.asking("the objects were not given"):
+    with connection.asking("CARLA did not return the objects of the town"):
         for name, label in sorted(labels, key=lambda pair: int(pair[1])):
             if name == "Any":
                 continue
             objects = connection.world.get_environment_objects(label)
             if not objects:
                 answers.empty_labels.append(name)
-            for one in objects:
-                place, half, turn = one.bounding_box.location, one.bounding_box.extent, one.bounding_box.rotation
-                box = (place.x, place.y, place.z, half.x, half.y, half.z, turn.pitch, turn.yaw, turn.roll)
-                answers.rows.append((name, one.id, one.name, box))
+            for item in objects:
+                center = item.bounding_box.location
+                half = item.bounding_box.extent
+                turn = item.bounding_box.rotation
+                box = (center.x, center.y, center.z, half.x, half.y, half.z, turn.pitch, turn.yaw, turn.roll)
+                answers.rows.append((name, item.id, item.name, box))
         for waypoint in connection.world.get_map().generate_waypoints(ROAD_STEP_M):
-            place = waypoint.transform.location
-            answers.road_points_m.append((place.x, place.y, place.z))
+            location = waypoint.transform.location
+            answers.road_points_m.append((location.x, location.y, location.z))
     return answers
 
 
@@ -84,15 +88,17 @@ def load(cfg: CarlaMapConfig, seed: int) -> BoxMap:
         try:
             answers = pool.submit(ask, cfg).result()
         except BrokenProcessPool:
-            what, fix = "the client of CARLA crashed", "check that the server is CARLA 0.9.16, then try again"
-            raise EnvironmentMissing(what, where=f"{cfg.host}:{cfg.port}", fix=fix) from None
+            fix = "check that the server is CARLA 0.9.16, then try again"
+            raise EnvironmentMissing("the client of CARLA crashed", where=f"{cfg.host}:{cfg.port}", fix=fix) from None
     return box_map_of(answers, cfg)
 
 
 def box_map_of(answers: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
     """Return a map of a server's answers; the header counts dropped objects."""
     where = f"{cfg.host}:{cfg.port} (CARLA {answers.version}), {answers.town}"
-    dropped, seen, num_repeated = Counter[str](), set(), 0
+    dropped = Counter[str]()
+    seen = set[tuple]()
+    num_repeated = 0
     rows = dict[int, tuple]()  # by id: centre, half sizes, rotation, kind
     for label, number, name, box in answers.rows:
         key = (label, *np.round(box, 3).tolist())
@@ -121,14 +127,16 @@ def box_map_of(answers: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
     centers, halves, turns, kinds = zip(*rows.values(), strict=True)
     box_map = make_box_map(centers, halves, turns, kinds, list(rows), header)
     tops_m = box_map.maxs[box_map.kinds == KINDS["Roads"], 2]
-    ground_z_m = cfg.ground_z_m if cfg.ground_z_m is not None else float(np.median(tops_m)) if len(tops_m) else 0.0
+    ground_z_m = cfg.ground_z_m
+    if ground_z_m is None:
+        ground_z_m = float(np.median(tops_m)) if len(tops_m) else 0.0
     box_map = replace(box_map, header=header.model_copy(update={"ground_z_m": ground_z_m}))
     _report(answers, box_map, where, tops_m)
     return box_map
 
 
 def _unfit(label: str, box: np.ndarray, cfg: CarlaMapConfig) -> str:
-    """Return why a box is dropped; "" if it is kept."""
+    """Return why a box is dropped; an empty text if it is kept."""
     if not np.isfinite(box).all():
         return "not finite"
     if (box[3:6] <= 0).sum() > 1 or (box[3:6] < 0).any():
@@ -147,13 +155,15 @@ def _report(answers: CarlaTown, box_map: BoxMap, where: str, tops_m: np.ndarray)
     if num := header.model_extra and header.model_extra["repeated_ids"]:
         log.warning("%s: %d objects repeated an id and got a new one", where, num)
     if len(tops_m) and np.ptp(tops_m) > SLOPE_M:
-        what = "%s: roads are %.1f to %.1f m high, and the map's ground is flat at %.1f m: pedestrians leave the roads"
-        log.warning(what, where, tops_m.min(), tops_m.max(), header.ground_z_m)
-    roads_m = [world_pose((*place, 0.0, 0.0, 0.0))[0][:2] for place in answers.road_points_m]
+        log.warning(
+            "%s: roads are %.1f to %.1f m high, but the ground is flat at %.1f m: pedestrians leave the roads",
+            where, tops_m.min(), tops_m.max(), header.ground_z_m,
+        )  # fmt: skip
+    points_m = [world_pose((*point, 0.0, 0.0, 0.0))[0][:2] for point in answers.road_points_m]
     low_m, high_m = box_map.mins[:, :2], box_map.maxs[:, :2]
-    gaps_m = [np.maximum(low_m - place, place - high_m).max(axis=1).min() for place in roads_m]
+    gaps_m = [np.maximum(low_m - point, point - high_m).max(axis=1).min() for point in points_m]
     if num := sum(gap > ALONG_M for gap in gaps_m):
-        what = (
-            "%s: %d of %d places on roads have no object within %.0f m: large maps load only tiles near the spectator"
-        )
-        log.warning(what, where, num, len(roads_m), ALONG_M)
+        log.warning(
+            "%s: %d of %d points on roads have no object within %.0f m: large maps load only tiles near the spectator",
+            where, num, len(points_m), ALONG_M,
+        )  # fmt: skip

@@ -15,9 +15,10 @@ from cosfly.geometry.axes import box_corners
 from cosfly.runtime.io import over_limit
 
 MIN_AREA_M2 = 0.02  # smaller pieces are rounding errors of a cut
+THINNEST_M = 1e-3  # thinner rectangles are rounding errors too
 MOST_CROSSINGS = 500  # of an outline with itself; 1,000 take a second to resolve
-PAIRS_AT_ONCE = 1_000_000  # of edges that are compared between two looks at the count
-MAX_DEPTH = 16  # 65,536 pieces of one polygon: more than any real object has
+PAIRS_AT_ONCE = 1_000_000  # pairs of edges that are compared before the count is checked
+MAX_DEPTH = 16  # of cuts: up to 65,536 pieces of a polygon
 
 CUT_SHARES = (0.25, 0.4, 0.5, 0.6, 0.75)  # where houses may be cut
 
@@ -45,12 +46,14 @@ def oriented_rectangle(polygon: Polygon) -> Rectangle:
     edges = np.diff(hull, axis=0)
     angles = np.unique(np.round(np.mod(np.arctan2(edges[:, 1], edges[:, 0]), np.pi / 2), 9))
     cos, sin = np.cos(angles)[:, None], np.sin(angles)[:, None]
-    along, across = cos * hull[:, 0] + sin * hull[:, 1], cos * hull[:, 1] - sin * hull[:, 0]
+    along = cos * hull[:, 0] + sin * hull[:, 1]
+    across = cos * hull[:, 1] - sin * hull[:, 0]
     sizes = np.stack([np.ptp(along, axis=1), np.ptp(across, axis=1)], axis=1)
     best = int(np.argmin(sizes.prod(axis=1)))
-    middle = np.array([along[best].min() + along[best].max(), across[best].min() + across[best].max()]) / 2
+    middle_along = (along[best].min() + along[best].max()) / 2
+    middle_across = (across[best].min() + across[best].max()) / 2
     c, s = float(cos[best, 0]), float(sin[best, 0])
-    center = (c * middle[0] - s * middle[1], s * middle[0] + c * middle[1])
+    center = (c * middle_along - s * middle_across, s * middle_along + c * middle_across)
     return Rectangle(center, (float(sizes[best, 0]), float(sizes[best, 1])), float(np.degrees(angles[best])))
 
 
@@ -61,7 +64,7 @@ def footprints(box_map: BoxMap) -> np.ndarray:
 
 
 def rectangle_polygon(rectangle: Rectangle, along: Share = (-0.5, 0.5), across: Share = (-0.5, 0.5)) -> Polygon:
-    """Return a rectangle, or a part of it in shares of its sizes from the middle, as a polygon."""
+    """Return a rectangle as a polygon, or its part within shares of its sizes, counted from the middle."""
     yaw = np.radians(rectangle.yaw_deg)
     x = np.array([np.cos(yaw), np.sin(yaw)]) * rectangle.size[0]
     y = np.array([-np.sin(yaw), np.cos(yaw)]) * rectangle.size[1]
@@ -91,28 +94,34 @@ def cover(
     while waiting:
         piece, depth = waiting.pop()
         rectangle = oriented_rectangle(piece)
-        area, longest = rectangle.size[0] * rectangle.size[1], max(rectangle.size)
+        area = rectangle.size[0] * rectangle.size[1]
+        longest = max(rectangle.size)
         is_full = piece.area >= min_fill * area and longest <= max_size_m
         if not (is_full or area <= MIN_AREA_M2 or longest <= min_size_m or depth == MAX_DEPTH):
             waiting += [(part, depth + 1) for part in _cut(piece, rectangle, shares)]
-        elif min(rectangle.size) > 1e-3:
+        elif min(rectangle.size) > THINNEST_M:
             done.append(rectangle)
     return done
 
 
 def _cut(piece: Polygon, rectangle: Rectangle, shares: Sequence[float]) -> list[Polygon]:
-    longer, least_m2, best = int(rectangle.size[0] < rectangle.size[1]), np.inf, list[Polygon]()
+    """Cut a piece at one of the shares of its rectangle; see `cover`."""
+    longer = 0 if rectangle.size[0] >= rectangle.size[1] else 1
+    whole = (-0.6, 0.6)  # a little more than the rectangle
+    least_m2 = np.inf
+    best: list[Polygon] = []
     for axis in (longer, 1 - longer) if len(shares) > 1 else (longer,):
         for share in shares:
             parts: list[Polygon] = []
-            for cut in ((-0.6, share - 0.5), (share - 0.5, 0.6)):
-                window = rectangle_polygon(rectangle, *((cut, (-0.6, 0.6)) if axis == 0 else ((-0.6, 0.6), cut)))
-                parts += polygons_of(shapely.intersection(piece, window))
+            for window in ((whole[0], share - 0.5), (share - 0.5, whole[1])):
+                along, across = (window, whole) if axis == 0 else (whole, window)
+                parts += polygons_of(shapely.intersection(piece, rectangle_polygon(rectangle, along, across)))
             if len(shares) == 1:
                 return parts
             empty_m2 = sum(float(np.prod(oriented_rectangle(part).size)) for part in parts) - piece.area
             if empty_m2 < least_m2 - 1e-9:
-                least_m2, best = empty_m2, parts
+                least_m2 = empty_m2
+                best = parts
     return best
 
 
@@ -124,21 +133,25 @@ def check_outline(polygon: Polygon, where: str) -> None:
 
 
 def num_crossings(polygon: Polygon) -> int:
-    """Count the pairs of edges, not neighbours in a ring, that meet; stop soon after MOST_CROSSINGS."""
-    edges, before, first = [], [], 0
+    """Count the pairs of edges that meet and are not neighbours in a ring; stop soon after MOST_CROSSINGS."""
+    edges: list[np.ndarray] = []
+    neighbours: list[np.ndarray] = []  # the number of the edge before each
+    num_edges = 0
     for ring in (polygon.exterior, *polygon.interiors):
         corners = np.asarray(ring.coords)[:, :2]
         corners = corners[np.r_[True, (np.diff(corners, axis=0) != 0).any(axis=1)]]
         edges.append(np.stack([corners[:-1], corners[1:]], axis=1))
-        before.append(first + np.roll(np.arange(len(corners) - 1), 1))  # the edge before each
-        first += len(corners) - 1
-    lines, previous = shapely.linestrings(np.concatenate(edges)), np.concatenate(before)
-    tree, count = shapely.STRtree(lines), 0
+        neighbours.append(num_edges + np.roll(np.arange(len(corners) - 1), 1))
+        num_edges += len(corners) - 1
+    lines = shapely.linestrings(np.concatenate(edges))
+    previous = np.concatenate(neighbours)
+    tree = shapely.STRtree(lines)
+    count = 0
     step = max(1, PAIRS_AT_ONCE // len(lines))
     for start in range(0, len(lines), step):
-        one, other = tree.query(lines[start : start + step], predicate="intersects")
-        one = one + start
-        count += int(((one < other) & (previous[one] != other) & (previous[other] != one)).sum())
+        first, second = tree.query(lines[start : start + step], predicate="intersects")
+        first = first + start
+        count += int(((first < second) & (previous[first] != second) & (previous[second] != first)).sum())
         if count > MOST_CROSSINGS:
             break
     return count

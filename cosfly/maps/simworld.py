@@ -1,9 +1,9 @@
 """A SimWorld city: the world file of its generator, with the table of asset sizes.
 
-The source is Unreal's: centimetres, left-handed, yaw clockwise. A box has its foot at the node's location; its size is
-the table's full size times the node's scale. The source lacks sizes of street furniture (`default`: those of ASSETS)
-and widths of roads (`road`: from the objects along them). A world that names its own surfaces, as `cosfly world` writes
-it, is read as it is. `header.extent_sources` holds the counts.
+The file has Unreal's axes: centimetres, left-handed, yaw clockwise. A box stands on the node's location; its size is
+the full size in the table times the node's scale. The table lacks sizes of street furniture (source `default`: ASSETS),
+and the world lacks widths of roads (source `road`: from the objects along them). A world that holds its own surfaces,
+such as those of `cosfly world`, gets none added. `header.extent_sources` counts the sources of sizes.
 """
 
 from __future__ import annotations
@@ -29,16 +29,19 @@ from cosfly.simulators.assets import Asset, asset_of, kind_of
 
 log = logging.getLogger(__name__)
 
-LEAST_M = 1e-3  # no object is smaller
+LEAST_M = 1e-3  # smallest side of an object
 M_PER_CM = 0.01
-ROAD_LENGTH_M = 200.0  # of a road piece: the generator's default
-STAND_M = 0.3  # boxes with their foot at most this high reach down to the ground
+ROAD_LENGTH_M = 200.0  # of a road piece, the default of the generator
+STAND_M = 0.3  # boxes that begin at most this high are extended down to the ground
 PLACEHOLDER_CM = 256.0  # side of the cube that the size table has for assets without a measured size
 PAVEMENT_TOP_M, ROAD_TOP_M, PAINT_TOP_M, BASE_TOP_M, SLAB_M = 0.0, -0.06, -0.03, -0.12, 0.3
-BESIDE_ROAD_M = 60.0  # objects farther from every centre line do not count for the width of roads
-KERB_M = 0.5  # from the kerb to the middle of the row of street furniture
-ROAD_SHARE_OF_FRONT = 0.43  # carriageway half width / distance of the fronts, where no furniture marks the kerb
-DEFAULT_FRONT_M = 27.0  # the generator's usual distance, for roads without buildings
+BESIDE_ROAD_M = 60.0  # largest distance of objects that count for the width of roads from a centre line
+KERB_M = 0.5  # from the kerb to the middle of street furniture
+LEAST_FURNITURE = 4  # objects that locate the kerb
+LEAST_KERB_M = 2.0  # from the centre line to the kerb
+ROAD_SHARE_OF_FRONT = 0.43  # half width of the carriageway / distance of the fronts, if too little furniture is there
+DEFAULT_FRONT_M = 27.0  # usual distance of fronts in the generator, for roads without buildings
+DASH_M, DASH_STEP_M, DASH_WIDTH_M = 3.0, 9.0, 0.16  # of the paint on a centre line
 MAP_MARGIN_M = 10.0
 ROAD_PIECES = "BP_Road*"  # of ASSETS: pieces without a size
 SURFACE_NODE = "Sidewalks_C"  # only worlds with their own surfaces have it
@@ -145,10 +148,13 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
     sizes = read_sizes(tables)
     has_surfaces = any(node.instance_name == SURFACE_NODE for node in nodes)
     stand_m = 0.0 if has_surfaces else STAND_M
-    boxes, sources, dropped, road_nodes = BoxList(), {"road": 0, "bbox": 0, "engine": 0, "default": 0}, 0, []
+    boxes = BoxList()
+    sources = {"road": 0, "bbox": 0, "engine": 0, "default": 0}
+    num_dropped = 0
+    road_nodes: list[_Node] = []
     for node in nodes:
         asset = asset_of(node.instance_name)
-        if asset is None and (kind := kind_of(node.instance_name)):  # a world of ours names nodes after kinds
+        if asset is None and (kind := kind_of(node.instance_name)):  # `cosfly world` names nodes after kinds
             asset = Asset(node.instance_name, kind)
         if asset is not None and asset.pattern == ROAD_PIECES:
             road_nodes.append(node)
@@ -156,10 +162,11 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
         size = sizes.get(node.instance_name)
         if asset is None or size is None:
             _check_unknown(cfg, node, "kind" if asset is None else "size")
-            dropped += 1
+            num_dropped += 1
             continue
         sources[_add_node(boxes, node, asset, size, stand_m, world)] += 1
-    widths, num_asset_boxes = {}, len(boxes)
+    widths: dict[str, float] = {}
+    num_asset_boxes = len(boxes)
     if not has_surfaces:
         lines = [_centerline(node) for node in road_nodes]
         widths = _add_roads(boxes, lines)
@@ -171,7 +178,7 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
         name=cfg.name, source=MapSource(tool=tool, version="world file", file=world.name), licence=cfg.licence,
         credits=cfg.credits, ground_z_m=0.0, extent_sources=sources, roads=widths,
         added_boxes=len(boxes) - num_asset_boxes, num_objects=len(nodes),
-        dropped_objects={"unknown_asset": dropped} if dropped else {},
+        dropped_objects={"unknown_asset": num_dropped} if num_dropped else {},
     )  # fmt: skip
     return boxes.box_map(header)
 
@@ -216,10 +223,10 @@ def _add_node(boxes: BoxList, node: _Node, asset: Asset, size_cm: np.ndarray, st
 
 
 def _centerline(node: _Node) -> Centerline:
-    """Return a road piece's centre line, world metres: its location is the piece's middle, x its direction.
+    """Return the centre line of a road piece, world metres: the location is its middle, x its direction.
 
-    The roads.json of a world is not read: in the city that SimWorld ships it holds 7 roads, two of them nowhere in the
-    world, and the world holds 10.
+    The roads.json of a world is not read: in SimWorld's city it has 7 roads, two of which the world lacks, but the
+    world has 10.
     """
     turn = -np.radians(node.yaw)
     half = np.array([np.cos(turn), np.sin(turn)]) * ROAD_LENGTH_M / 2
@@ -228,18 +235,18 @@ def _centerline(node: _Node) -> Centerline:
 
 def _distances_m(points: np.ndarray, lines: list[Centerline]) -> np.ndarray:
     """Return the distances of points, (n, 2), to the nearest centre line."""
-    best = np.full(len(points), np.inf)
+    distances = np.full(len(points), np.inf)
     for line in lines:
         along = np.clip((points - line.start) @ line.direction, 0.0, line.length_m)
-        best = np.minimum(best, np.linalg.norm(points - line.start - along[:, None] * line.direction, axis=1))
-    return best
+        offsets = points - line.start - along[:, None] * line.direction
+        distances = np.minimum(distances, np.linalg.norm(offsets, axis=1))
+    return distances
 
 
 def _half_widths(boxes: BoxList, lines: list[Centerline]) -> tuple[float, float]:
-    """Return half the carriageway's width, and the distance of the fronts from the centre line, m.
+    """Return the distances of the kerb and of the fronts from the centre line, m.
 
-    Both are distances that nearly all objects keep (tenth percentile): fronts from the nearest points of buildings, the
-    kerb from the middles of street furniture.
+    Both are tenth percentiles: fronts of the nearest points of buildings, the kerb of the middles of street furniture.
     """
     box_map = boxes.box_map()
     kinds = np.array([KIND_NAMES[int(kind)] for kind in box_map.kinds])
@@ -254,8 +261,12 @@ def _half_widths(boxes: BoxList, lines: list[Centerline]) -> tuple[float, float]
     front = float(np.percentile(fronts, 10))
     furniture = _distances_m(box_map.centers[(kinds == "Static") | (kinds == "Motorcycle"), :2], lines)
     furniture = furniture[furniture < front]
-    kerb = float(np.percentile(furniture, 10)) - KERB_M if len(furniture) >= 4 else ROAD_SHARE_OF_FRONT * front
-    kerb = max(kerb, 2.0)
+    kerb = (
+        float(np.percentile(furniture, 10)) - KERB_M
+        if len(furniture) >= LEAST_FURNITURE
+        else ROAD_SHARE_OF_FRONT * front
+    )
+    kerb = max(kerb, LEAST_KERB_M)
     return round(kerb, 2), round(max(front, kerb + 1.0), 2)
 
 
@@ -264,41 +275,44 @@ def _add_roads(boxes: BoxList, lines: list[Centerline]) -> dict[str, float]:
     if not lines:
         return {}
     kerb, front = _half_widths(boxes, lines)
-    middle, width = (front + kerb) / 2, front - kerb  # of the pavement, from the centre line
+    middle = (front + kerb) / 2  # of the pavement, from the centre line
+    width = front - kerb  # of the pavement
 
-    def add_slab(kind: str, place: np.ndarray, size: tuple[float, float], x: np.ndarray) -> None:
+    def add_slab(kind: str, position: np.ndarray, size: tuple[float, float], x: np.ndarray) -> None:
         top = ROAD_TOP_M if kind == "Roads" else PAVEMENT_TOP_M
-        boxes.add(kind, place, size, top - SLAB_M, top, float(np.degrees(np.arctan2(x[1], x[0]))))
+        boxes.add(kind, position, size, top - SLAB_M, top, float(np.degrees(np.arctan2(x[1], x[0]))))
 
     junctions: dict[tuple[int, int], list[np.ndarray]] = {}
     for line in lines:
-        x, free_m = line.direction, line.length_m - 2 * front  # a junction's slabs reach as far as the fronts
+        x = line.direction
+        free_m = line.length_m - 2 * front  # the slabs of a junction reach as far as the fronts
         for end, away in ((line.start, x), (line.end, -x)):
             junctions.setdefault(tuple(np.round(end).astype(int)), []).append(away)
         if free_m > 0:
             add_slab("Roads", (line.start + line.end) / 2, (free_m, 2 * kerb), x)
             for side in (-1, 1):
-                place = (line.start + line.end) / 2 + side * middle * np.array([-x[1], x[0]])
-                add_slab("Sidewalks", place, (free_m, width), x)
+                position = (line.start + line.end) / 2 + side * middle * np.array([-x[1], x[0]])
+                add_slab("Sidewalks", position, (free_m, width), x)
     for key, arms in junctions.items():  # pavement at the four corners, and across the sides without a road
-        place, x = np.array(key, dtype=np.float64), arms[0]
+        junction = np.array(key, dtype=np.float64)
+        x = arms[0]
         y = np.array([-x[1], x[0]])
-        add_slab("Roads", place, (2 * kerb, 2 * kerb), x)
+        add_slab("Roads", junction, (2 * kerb, 2 * kerb), x)
         for a, b in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-            add_slab("Sidewalks", place + middle * (a * x + b * y), (width, width), x)
+            add_slab("Sidewalks", junction + middle * (a * x + b * y), (width, width), x)
         along, across = (width, 2 * kerb), (2 * kerb, width)
         for away, size in ((x, along), (-x, along), (y, across), (-y, across)):
             is_road = any(arm @ away > 0.7 for arm in arms)
-            add_slab("Roads" if is_road else "Sidewalks", place + middle * away, size, x)
+            add_slab("Roads" if is_road else "Sidewalks", junction + middle * away, size, x)
     return {"carriageway_m": 2 * kerb, "front_to_front_m": 2 * front}
 
 
 def _add_ground_and_paint(boxes: BoxList, lines: list[Centerline], widths: dict) -> None:
-    """Add the ground below everything, and centre dashes: neither is in the source."""
+    """Add the ground below everything and dashes on the centre lines, which the source lacks."""
     low, high = boxes.box_map().bounds()
     boxes.span("Terrain", low[:2] - MAP_MARGIN_M, high[:2] + MAP_MARGIN_M, BASE_TOP_M - SLAB_M, BASE_TOP_M)
     for line in lines:
         yaw_deg = float(np.degrees(np.arctan2(*line.direction[::-1])))
-        for at in np.arange(widths["carriageway_m"], line.length_m - widths["carriageway_m"], 9.0):
-            place = line.start + (at + 1.5) * line.direction
-            boxes.add("RoadLines", place, (3.0, 0.16), ROAD_TOP_M - 0.04, PAINT_TOP_M, yaw_deg)
+        for start_m in np.arange(widths["carriageway_m"], line.length_m - widths["carriageway_m"], DASH_STEP_M):
+            middle = line.start + (start_m + DASH_M / 2) * line.direction
+            boxes.add("RoadLines", middle, (DASH_M, DASH_WIDTH_M), ROAD_TOP_M - 0.04, PAINT_TOP_M, yaw_deg)

@@ -1,4 +1,4 @@
-"""What the synthetic town is made of: trees, benches, and the kinds of building blocks."""
+"""The parts of the synthetic town: trees, benches, and the kinds of building blocks."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ PAVED_TOP_M, LAWN_TOP_M, ROAD_TOP_M = 0.0, -0.02, -0.06
 TOPS_M = {"Sidewalks": PAVED_TOP_M, "Terrain": LAWN_TOP_M, "Roads": ROAD_TOP_M}
 WATER_TOP_M = 0.05  # over the ground, so that water is an obstacle to pedestrians
 SLAB_M = 0.3
-PASSAGE_M, ARCADE_M = 3.2, 3.0  # clear height of passages and arcades; depth of an arcade
-LEAST_FRONT_M = 7.0  # a longer rest of a row of lots is built on
+PASSAGE_M = 3.2  # clear height of passages and arcades
+ARCADE_M = 3.0  # depth of an arcade
+LEAST_FRONT_M = 7.0  # of a building; a shorter rest of a row of lots stays empty
 
 Range = tuple[float, float]
 
@@ -27,7 +28,7 @@ class Lots:
 
     footprints_m: tuple[Range, ...] = ((12.0, 10.0), (18.0, 13.0), (26.0, 15.0))  # front and depth to choose from
     heights_m: Range = (8.0, 20.0)  # of the lowest and the highest building
-    fall_m: float = 0.0  # distance from the middle of the town from which on all are the lowest; 0: they are mixed
+    fall_m: float = 0.0  # heights fall to the lowest at this distance from the middle of the town; 0: they are mixed
     gap_m: float = 2.0  # least gap between two buildings
     setback_m: float = 1.0  # from the pavement to the fronts; from 2.5 on there are gardens
 
@@ -41,27 +42,33 @@ def point(axis: int, along: float, across: float) -> tuple[float, float]:
 
 
 class Plot(BoxList):
-    """A rectangle of the town from its low to its high corner, (2,) m, that adds to the town's boxes and draws from
-    its own random generator."""
+    """A rectangle of the town, from its low to its high corner, (2,) m. It adds boxes to the town's list and has a
+    random generator of its own."""
 
     def __init__(self, town: BoxList, low: Pair, high: Pair, rng: np.random.Generator, lots: Lots) -> None:
         super().__init__(town.rows, town.kinds)
-        self.low, self.high, self.rng, self.lots = np.asarray(low), np.asarray(high), rng, lots
-        self.size, self.middle = self.high - self.low, (self.low + self.high) / 2
+        self.low = np.asarray(low)
+        self.high = np.asarray(high)
+        self.rng = rng
+        self.lots = lots
+        self.size = self.high - self.low
+        self.middle = (self.low + self.high) / 2
 
     def at(self, x: float, y: float) -> np.ndarray:
-        """Return the point at shares of the plot's sides."""
+        """Return the point at x and y, shares of the plot's sides from its low corner."""
         return self.low + self.size * (x, y)
 
     def lay(self, kind: str, a: Pair | None = None, b: Pair | None = None) -> None:
-        """Add ground at the height of its kind, by two opposite corners; without them over the whole plot."""
-        a, b = (self.low, self.high) if a is None or b is None else (a, b)
+        """Add ground at the height of its kind between two opposite corners; None: the corners of the plot."""
+        a = self.low if a is None else a
+        b = self.high if b is None else b
         self.span(kind, a, b, TOPS_M[kind] - SLAB_M, TOPS_M[kind])
 
     def ring(self, kind: str, outer: Any, inner: Any, heights_m: Range | None = None) -> None:
         """Add four slabs between two rectangles, each by its low and high corner; without heights they are ground."""
         heights = heights_m or (TOPS_M[kind] - SLAB_M, TOPS_M[kind])
-        (low, high), (inner_low, inner_high) = outer, inner
+        low, high = outer
+        inner_low, inner_high = inner
         self.span(kind, low, (high[0], inner_low[1]), *heights)
         self.span(kind, (low[0], inner_high[1]), high, *heights)
         self.span(kind, (low[0], inner_low[1]), (inner_low[0], inner_high[1]), *heights)
@@ -76,24 +83,28 @@ class Plot(BoxList):
         """Add a bench of 1.8 m along a street, and a bin next to it."""
         self.add("Static", point(axis, along, across), point(axis, 1.8, 0.55), 0.0, 0.48)
         self.add("Static", point(axis, along + 1.5, across), (0.5, 0.5), 0.0, 0.95)
-        if self.rng.random() < 0.5:  # the bin's liner: a box inside a box of the same kind
+        if self.rng.random() < 0.5:  # the inner bin, a box inside a box of the same kind
             self.add("Static", point(axis, along + 1.5, across), (0.4, 0.4), 0.05, 0.9)
 
-    def tree(self, place: Pair, crowns_m: Range, heights_m: Range, parts: float = 0.0) -> None:
+    def tree(self, position: Pair, crowns_m: Range, heights_m: Range, parts: float = 0.0) -> None:
         """Add a tree: one box, or a stem and overlapping parts of a crown, as simulators export trees.
 
         Args:
             crowns_m, heights_m: ranges of the crown's width and the tree's height.
             parts: probability of a tree in parts.
         """
-        rng, (x, y) = self.rng, place
-        crown, height = rng.uniform(*crowns_m), rng.uniform(*heights_m)
-        if not (rng.random() < parts if 0 < parts < 1 else parts):
-            self.add("Vegetation", place, (crown, crown * rng.uniform(0.9, 1.1)), 0.0, height)
+        rng = self.rng
+        x, y = position
+        crown = rng.uniform(*crowns_m)
+        height = rng.uniform(*heights_m)
+        has_parts = rng.random() < parts if 0 < parts < 1 else bool(parts)
+        if not has_parts:
+            self.add("Vegetation", position, (crown, crown * rng.uniform(0.9, 1.1)), 0.0, height)
             return
-        self.add("Vegetation", place, (0.45, 0.45), 0.0, height * 0.5)
+        self.add("Vegetation", position, (0.45, 0.45), 0.0, height * 0.5)
         for dx, dy in ((-1, -1), (1, -1), (-1, 1), (1, 1), (0, 0)):
-            is_top, size = dx == 0, crown * rng.uniform(0.5, 0.65)
+            is_top = dx == 0
+            size = crown * rng.uniform(0.5, 0.65)
             shift = (crown - size) / 2
             low = 2.3 + rng.uniform(0.0, 0.8) + (height * 0.25 if is_top else 0.0)
             top = height * (1.0 if is_top else rng.uniform(0.75, 0.9))
@@ -101,29 +112,32 @@ class Plot(BoxList):
 
     def crossing_paths(self, half_m: float) -> None:
         """Lay two crossing paths, and lawn in the quarters between them."""
-        low, high, (x, y) = self.low, self.high, self.middle
+        low, high = self.low, self.high
+        x, y = self.middle
         self.lay("Sidewalks", (low[0], y - half_m), (high[0], y + half_m))
-        for a, b in ((low[1], y - half_m), (y + half_m, high[1])):
-            self.lay("Sidewalks", (x - half_m, a), (x + half_m, b))
-            for c, d in ((low[0], x - half_m), (x + half_m, high[0])):
-                self.lay("Terrain", (c, a), (d, b))
+        for south, north in ((low[1], y - half_m), (y + half_m, high[1])):
+            self.lay("Sidewalks", (x - half_m, south), (x + half_m, north))
+            for west, east in ((low[0], x - half_m), (x + half_m, high[0])):
+                self.lay("Terrain", (west, south), (east, north))
 
 
 def _park(plot: Plot) -> None:
     """Build lawns between two crossing paths, a pond with a stone rim, groves, a hedge with openings."""
-    low, high, middle = plot.low, plot.high, plot.middle
+    low, high = plot.low, plot.high
+    middle = plot.middle
     plot.crossing_paths(2.0)
     pond = np.array([middle + 3.5, high - 3.5])
     water = pond[0] + 0.5, pond[1] - 0.5
     plot.span("Water", *water, -0.8, WATER_TOP_M)
     plot.ring("Static", pond, water, (-0.5, 0.3))
     for x, y in ((0, 0), (1, 0), (0, 1)):  # the quarters without the pond
-        a, b = np.where((x, y), middle, low) + 4.5, np.where((x, y), high, middle) - 4.5
+        quarter_low = np.where((x, y), middle, low) + 4.5
+        quarter_high = np.where((x, y), high, middle) - 4.5
         for _ in range(5):
-            plot.tree(plot.rng.uniform(a, b), (4.0, 6.5), (8.0, 14.0), 0.5)
+            plot.tree(plot.rng.uniform(quarter_low, quarter_high), (4.0, 6.5), (8.0, 14.0), 0.5)
     for y in (low[1] + 0.5, high[1] - 0.5):
-        for a, b in ((low[0], middle[0] - 4.0), (middle[0] + 4.0, high[0])):
-            plot.span("Vegetation", (a, y - 0.4), (b, y + 0.4), 0.0, 1.1)
+        for west, east in ((low[0], middle[0] - 4.0), (middle[0] + 4.0, high[0])):
+            plot.span("Vegetation", (west, y - 0.4), (east, y + 0.4), 0.0, 1.1)
     for step in (-11.0, -7.0, 7.0, 11.0):
         plot.bench(0, middle[0] + step, middle[1] - 2.0 + 0.4)
 
@@ -131,7 +145,8 @@ def _park(plot: Plot) -> None:
 def _square(plot: Plot) -> None:
     """Build a paved square with a hall, a fountain, kiosks and trees in rows."""
     plot.lay("Sidewalks")
-    low, high, middle, size = plot.low, plot.high, plot.middle, plot.size
+    low, high = plot.low, plot.high
+    middle, size = plot.middle, plot.size
     hall = np.array([size[0] * 0.5, min(14.0, size[1] * 0.3)])
     center = np.array([middle[0], high[1] - hall[1] / 2 - 2.0])
     plot.stack("Buildings", center, 0.0, (hall, -1.5, 9.0), ((6.0, 6.0), 9.0, 17.0))  # a clock tower on the roof
@@ -149,12 +164,15 @@ def _square(plot: Plot) -> None:
 def _courtyard(plot: Plot) -> None:
     """Build four L-shaped houses around a green yard, with a passage on every side."""
     plot.lay("Terrain")
-    rng, low, high = plot.rng, plot.low + 1.5, plot.high - 1.5
-    middle, depth = (low + high) / 2, min(12.0, 0.24 * (high - low).min())
+    rng = plot.rng
+    low, high = plot.low + 1.5, plot.high - 1.5
+    middle = (low + high) / 2
+    depth = min(12.0, 0.24 * (high - low).min())
     gap = rng.uniform(5.5, 7.0) / 2
     for sx, sy in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
         corner = np.array([low[0] if sx < 0 else high[0], low[1] if sy < 0 else high[1]])
-        height, back = rng.uniform(10.0, 19.0), corner[1] - sy * depth
+        height = rng.uniform(10.0, 19.0)
+        back = corner[1] - sy * depth
         plot.span("Buildings", corner, (middle[0] + sx * gap, back), -2.0, height)
         lower = height - rng.choice([0.0, 3.0, 6.0])
         plot.span("Buildings", (corner[0], back), (corner[0] - sx * depth, middle[1] + sy * gap), -2.0, lower)
@@ -170,28 +188,33 @@ def _courtyard(plot: Plot) -> None:
 def _houses(plot: Plot) -> None:
     """Build two rows of slightly turned houses, back to back, with gardens, hedges and garden walls between them."""
     plot.lay("Terrain")
-    rng, low, high, middle = plot.rng, plot.low, plot.high, plot.middle
+    rng, middle = plot.rng, plot.middle
+    low, high = plot.low, plot.high
     columns = max(2, int((high[0] - low[0]) // 18.0))
     pitch = (high[0] - low[0]) / columns
     for row, side in ((low[1], 1), (high[1], -1)):
         for column in range(columns):
             center = np.array([low[0] + (column + 0.5) * pitch, row + side * 8.5]) + rng.uniform(-0.6, 0.6, 2)
-            width, depth, height = rng.uniform(9.0, 11.0), rng.uniform(8.0, 10.0), rng.uniform(5.6, 7.6)
+            width = rng.uniform(9.0, 11.0)
+            depth = rng.uniform(8.0, 10.0)
+            height = rng.uniform(5.6, 7.6)
             yaw = rng.uniform(-7.0, 7.0)
-            ridge, rooms = (width * 0.92, depth * 0.5), (width * 0.5, depth * 0.5)
-            parts = ((width, depth), -0.5, height), (ridge, height, height + 1.8), (rooms, 0.2, height - 0.5)
-            plot.stack("Buildings", center, yaw, *parts)
+            walls = (width, depth), -0.5, height
+            ridge = (width * 0.92, depth * 0.5), height, height + 1.8
+            rooms = (width * 0.5, depth * 0.5), 0.2, height - 0.5
+            plot.stack("Buildings", center, yaw, walls, ridge, rooms)
             garden = np.array([center[0] + rng.uniform(-3.0, 3.0), (center[1] + side * 5.0 + middle[1]) / 2])
             plot.tree(garden, (2.8, 4.2), (4.0, 7.0), 0.3)
             if column:
                 edge = low[0] + column * pitch
-                front, back = (edge - 0.12, center[1] + side * 1.0), (edge + 0.12, middle[1] - side * 3.5)
+                front = edge - 0.12, center[1] + side * 1.0
+                back = edge + 0.12, middle[1] - side * 3.5
                 plot.span("Walls", front, back, -0.2, 1.7)
     edges = low[0] + pitch * np.arange(columns)
-    for a in edges + 3.5:
-        plot.span("Fences", (a, middle[1] - 0.06), (a + pitch - 5.5, middle[1] + 0.06), -0.1, 1.2)
-    for a in edges:
-        plot.span("Vegetation", (a + 0.6, low[1] + 0.4), (a + pitch * 0.55, low[1] + 1.2), 0.0, 1.0)
+    for x in edges + 3.5:
+        plot.span("Fences", (x, middle[1] - 0.06), (x + pitch - 5.5, middle[1] + 0.06), -0.1, 1.2)
+    for x in edges:
+        plot.span("Vegetation", (x + 0.6, low[1] + 0.4), (x + pitch * 0.55, low[1] + 1.2), 0.0, 1.0)
 
 
 def _towers(plot: Plot) -> None:
@@ -211,26 +234,30 @@ def _towers(plot: Plot) -> None:
 
 
 def _lanes(plot: Plot) -> None:
-    """Build terraces of narrow old houses with lanes between them; one way through is built over."""
+    """Build terraces of narrow old houses with lanes between them; one passage has a building over it."""
     plot.lay("Sidewalks")
-    rng, low, high, lane = plot.rng, plot.low, plot.high, 5.6
+    rng = plot.rng
+    low, high = plot.low, plot.high
+    lane = 5.6
     rows = max(2, int((high[1] - low[1] + lane) // (8.5 + lane)))
     depth = (high[1] - low[1] - (rows - 1) * lane) / rows
     gap_row = rng.integers(rows)
     for row in range(rows):
-        base, at = low[1] + row * (depth + lane), low[0]
-        passage = rng.uniform(0.35, 0.65) * (high[0] - low[0]) + low[0]  # a way through the terrace
-        while at < high[0] - 4.0:
-            width = min(rng.uniform(5.5, 9.0), high[0] - at)
-            height, ridge = rng.uniform(6.5, 13.0), rng.uniform(1.6, 2.6)
-            is_passage = at <= passage < at + width
+        base = low[1] + row * (depth + lane)
+        x = low[0]
+        passage = rng.uniform(0.35, 0.65) * (high[0] - low[0]) + low[0]  # a gap in the terrace
+        while x < high[0] - 4.0:
+            width = min(rng.uniform(5.5, 9.0), high[0] - x)
+            height = rng.uniform(6.5, 13.0)
+            ridge = rng.uniform(1.6, 2.6)
+            is_passage = x <= passage < x + width
             if is_passage and row == gap_row:
-                plot.span("Buildings", (at, base), (at + lane, base + depth), PASSAGE_M, height)
+                plot.span("Buildings", (x, base), (x + lane, base + depth), PASSAGE_M, height)
             elif not is_passage:
-                plot.span("Buildings", (at, base), (at + width, base + depth), -1.0, height)
+                plot.span("Buildings", (x, base), (x + width, base + depth), -1.0, height)
                 low_y, high_y = base + depth * 0.28, base + depth * 0.72
-                plot.span("Buildings", (at + 0.2, low_y), (at + width - 0.2, high_y), height, height + ridge)
-            at += width if not is_passage else lane
+                plot.span("Buildings", (x + 0.2, low_y), (x + width - 0.2, high_y), height, height + ridge)
+            x += lane if is_passage else width
         if row == gap_row:
             plot.bench(0, passage, base - lane / 2 if row else base + depth + lane / 2)
 
@@ -238,29 +265,32 @@ def _lanes(plot: Plot) -> None:
 def _skyscrapers(plot: Plot) -> None:
     """Build three towers of different heights on a plaza, with a colonnade of trees."""
     plot.lay("Sidewalks")
-    rng, low, high, size = plot.rng, plot.low, plot.high, plot.size
-    for place in ((0.25, 0.27), (0.74, 0.34), (0.42, 0.76)):
-        center, foot = plot.at(*place), size * rng.uniform(0.24, 0.32, 2)
-        height, yaw = rng.uniform(40.0, 110.0), float(rng.choice([0.0, 0.0, 20.0, -30.0]))
+    rng = plot.rng
+    for center in (plot.at(0.25, 0.27), plot.at(0.74, 0.34), plot.at(0.42, 0.76)):
+        foot = plot.size * rng.uniform(0.24, 0.32, 2)
+        height = rng.uniform(40.0, 110.0)
+        yaw = float(rng.choice([0.0, 0.0, 20.0, -30.0]))
         plot.add("Buildings", center, foot, -2.0, height * 0.6, yaw)
         plot.add("Buildings", center, foot * 0.75, height * 0.6, height, yaw)
         plot.add("Poles", center, (0.6, 0.6), height, height + 9.0)
         plot.add("Buildings", center, (4.0, 4.0), 0.5, height * 0.55, yaw)  # the lift shaft, inside
-    for along in np.arange(low[0] + 5.0, high[0] - 4.0, 9.0):
-        plot.tree((along, high[1] - 3.5), (3.0, 4.0), (6.0, 9.0))
+    for x in np.arange(plot.low[0] + 5.0, plot.high[0] - 4.0, 9.0):
+        plot.tree((x, plot.high[1] - 3.5), (3.0, 4.0), (6.0, 9.0))
     plot.bench(0, *plot.at(0.75, 0.75))
 
 
 def _campus(plot: Plot) -> None:
     """Build two long halls and a library around a lawn, with paths from door to door."""
     plot.lay("Terrain")
-    rng, low, high, size, middle = plot.rng, plot.low, plot.high, plot.size, plot.middle
+    rng = plot.rng
+    low, high = plot.low, plot.high
+    middle, size = plot.middle, plot.size
     for y in (low[1] + size[1] * 0.14, high[1] - size[1] * 0.14):
-        long = np.array([size[0] * rng.uniform(0.62, 0.8), size[1] * 0.17])
+        hall = np.array([size[0] * rng.uniform(0.62, 0.8), size[1] * 0.17])
         height = rng.uniform(8.0, 15.0)
-        lecture_rooms = long * (0.9, 0.5), 0.2, height - 1.0
-        parts = (long, -1.0, height), (long * (0.3, 0.6), height, height + 2.8), lecture_rooms
-        plot.stack("Buildings", (middle[0], y), 0.0, *parts)
+        skylight = hall * (0.3, 0.6), height, height + 2.8
+        lecture_rooms = hall * (0.9, 0.5), 0.2, height - 1.0
+        plot.stack("Buildings", (middle[0], y), 0.0, (hall, -1.0, height), skylight, lecture_rooms)
     library = (high[0] - size[0] * 0.14, middle[1])
     plot.add("Buildings", library, size * (0.2, 0.26), -1.0, rng.uniform(14.0, 22.0), rng.uniform(-12.0, 12.0))
     for y in (middle[1] - size[1] * 0.16, middle[1] + size[1] * 0.16):
@@ -273,11 +303,11 @@ def _campus(plot: Plot) -> None:
 def _farm(plot: Plot) -> None:
     """Build a farmhouse and a barn at a yard, an orchard in rows, a field behind a dry wall."""
     plot.lay("Terrain")
-    rng, low, high, size = plot.rng, plot.low, plot.high, plot.size
+    rng, size = plot.rng, plot.size
+    low, high = plot.low, plot.high
     yaw = rng.uniform(-10.0, 10.0)
-    house, barn = plot.at(0.24, 0.2), plot.at(0.3, 0.62)
-    plot.stack("Buildings", house, yaw, ((12.0, 8.5), -0.5, 5.6), ((11.0, 4.4), 5.6, 7.8))
-    plot.stack("Buildings", barn, yaw + 90.0, ((17.0, 10.0), -0.3, 6.2), ((16.0, 5.0), 6.2, 8.6))
+    plot.stack("Buildings", plot.at(0.24, 0.2), yaw, ((12.0, 8.5), -0.5, 5.6), ((11.0, 4.4), 5.6, 7.8))  # the house
+    plot.stack("Buildings", plot.at(0.3, 0.62), yaw + 90.0, ((17.0, 10.0), -0.3, 6.2), ((16.0, 5.0), 6.2, 8.6))
     plot.add("Static", plot.at(0.44, 0.4), (2.6, 1.6), 0.0, 1.2, yaw)  # a cart
     for x in np.arange(low[0] + size[0] * 0.56, high[0] - 3.0, 6.5):
         for y in np.arange(low[1] + 4.0, low[1] + size[1] * 0.55, 6.5):
@@ -292,7 +322,8 @@ def _farm(plot: Plot) -> None:
 def _market(plot: Plot) -> None:
     """Build rows of stalls with awnings around a market hall that has arcades on its long sides."""
     plot.lay("Sidewalks")
-    rng, low, high, middle = plot.rng, plot.low, plot.high, plot.middle
+    rng, middle = plot.rng, plot.middle
+    low, high = plot.low, plot.high
     hall = plot.size * (0.34, 0.26)
     arcades = hall - (0.0, 2 * ARCADE_M), -0.5, PASSAGE_M
     plot.stack("Buildings", middle, 0.0, arcades, (hall, PASSAGE_M, 7.0), (hall * (0.9, 0.4), 7.0, 9.5))
@@ -312,10 +343,10 @@ def _market(plot: Plot) -> None:
 
 
 def _meadow(plot: Plot) -> None:
-    """Leave open grass with a path along it, two groves and a pavilion: room for a drone to circle."""
+    """Lay grass with a path along it, two groves and a pavilion: room for a drone to circle."""
     plot.lay("Terrain")
-    low, high, middle = plot.low, plot.high, plot.middle
-    plot.lay("Sidewalks", (low[0], middle[1] - 1.5), (high[0], middle[1] + 1.5))
+    middle = plot.middle
+    plot.lay("Sidewalks", (plot.low[0], middle[1] - 1.5), (plot.high[0], middle[1] + 1.5))
     for corner in (plot.at(0.18, 0.2), plot.at(0.8, 0.8)):
         for _ in range(4):
             plot.tree(corner + plot.rng.uniform(-5.0, 5.0, 2), (4.0, 6.0), (7.0, 12.0))
@@ -331,22 +362,25 @@ def _lots(plot: Plot) -> None:
     style = plot.lots
     has_gardens = style.setback_m >= 2.5
     plot.lay("Terrain" if has_gardens else "Sidewalks")
-    rng, low, high, (lowest, highest) = plot.rng, plot.low, plot.high, style.heights_m
+    rng = plot.rng
+    low, high = plot.low, plot.high
+    lowest, highest = style.heights_m
     depth = plot.size[1] / 2 - max(2.5, 0.08 * plot.size[1]) - style.setback_m
     fall = min(1.0, float(np.linalg.norm(plot.middle)) / style.fall_m) if style.fall_m else 0.0
     for row, side in ((low[1], 1), (high[1], -1)):
-        at = low[0] + style.gap_m / 2
-        while (room := high[0] - style.gap_m / 2 - at) >= LEAST_FRONT_M:
+        x = low[0] + style.gap_m / 2
+        while (room := high[0] - style.gap_m / 2 - x) >= LEAST_FRONT_M:
             front, deep = style.footprints_m[rng.integers(len(style.footprints_m))]
             share = min(1.0, depth / deep)
             front, deep = front * share, deep * share
-            front = room if room < front + LEAST_FRONT_M + style.gap_m else front
+            if room < front + LEAST_FRONT_M + style.gap_m:
+                front = room
             height = lowest + (highest - lowest) * rng.beta(1.3, 1.7) * (1.0 - 0.9 * fall)
-            middle = np.array([at + front / 2, row + side * (style.setback_m + deep / 2)])
+            middle = np.array([x + front / 2, row + side * (style.setback_m + deep / 2)])
             plot.add("Buildings", middle, (front, deep), 0.0, height)
             if has_gardens:
                 plot.lay("Sidewalks", (middle[0] - 0.8, row), (middle[0] + 0.8, row + side * style.setback_m))
-            at += front + style.gap_m * rng.uniform(1.0, 1.6)
+            x += front + style.gap_m * rng.uniform(1.0, 1.6)
 
 
 def _plaza(plot: Plot) -> None:

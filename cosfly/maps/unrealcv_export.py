@@ -1,8 +1,9 @@
 """The objects of a running UnrealCV server's level as boxes (app:simworld, step 2).
 
 The sources of sizes are counted, as in the paper: `road`, bounds of a road; `bbox`, a table of asset sizes; `engine`,
-bounds of any other object; `default`, no answer: the plausible size of its asset or a cube of 1 m. Bounds are along the
-world's axes; of a turned object the box with these bounds is computed. Ids are derived from names (`id_of`).
+bounds of any other object; `default`, without an answer: the plausible size of the asset or a cube of 1 m. Bounds are
+aligned with the world's axes; for a turned object the turned box with these bounds is computed. Ids are derived from
+names (`id_of`).
 """
 
 from __future__ import annotations
@@ -30,10 +31,11 @@ log = logging.getLogger(__name__)
 
 QUESTIONS = {"uclass_name": 0, "location": 3, "rotation": 3, "bounds": 6, "scale": 3}  # number of values of each answer
 SOURCES = ("road", "bbox", "engine", "default")
-LEAST_M = 0.01  # smaller bounds are none
+LEAST_M = 0.01  # smaller bounds count as missing
 CUBE_M = 1.0
 SKEWED = 0.2  # cosine of twice a yaw, below which the sides of a turned box do not follow from its bounds
-OBJECTS_FILE, VIEWER = "boxes_meta.json", "boxes.html"
+OBJECTS_FILE = "boxes_meta.json"
+VIEWER = "boxes.html"
 MOST_PAGE_MB = 200.0
 
 
@@ -64,7 +66,7 @@ class LevelMap(BoxMap):
 
 @dataclass(frozen=True)
 class _Object:
-    """Answers about one object; numbers in the server's units and axes, None where it has none."""
+    """Answers about one object; numbers in the server's units and axes, None without an answer."""
 
     name: str
     class_name: str
@@ -78,7 +80,7 @@ def load(cfg: UnrealCvMapConfig, seed: int) -> BoxMap:
     """Return the level's boxes; the seed changes nothing."""
     connection = connect(cfg, cfg.port)
     try:
-        with connection.asking("the objects were not given"):
+        with connection.asking("the server did not return the objects of the level"):
             objects = list(_asked(connection))
     finally:
         connection.close()
@@ -96,18 +98,25 @@ def _asked(connection: UnrealCvConnection) -> Iterator[_Object]:
 def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, version: str, level: str) -> LevelMap:
     """Return a map of a server's answers; the header counts dropped objects."""
     sizes = read_sizes(cfg.sizes) if cfg.sizes else {}
-    dropped, rows, kinds, kept = Counter[str](), [], [], []
-    for one in objects:
-        kind = kind_of(one.class_name)
-        box, source = _box(one, kind, sizes, cfg)
-        if reason := _unfit(one, kind, box, source, cfg):
+    dropped = Counter[str]()
+    rows: list[np.ndarray] = []
+    kinds: list[int] = []
+    names: list[str] = []
+    class_names: list[str] = []
+    sources: list[str] = []
+    for item in objects:
+        kind = kind_of(item.class_name)
+        box, source = _box(item, kind, sizes, cfg)
+        if reason := _unfit(item, kind, box, source, cfg):
             dropped[reason] += 1
             continue
         assert box is not None
         rows.append(box)
         kinds.append(KINDS[kind or "Other"])
-        kept.append((one.name, one.class_name, source))
-    counts = {source: sum(row[2] == source for row in kept) for source in SOURCES}
+        names.append(item.name)
+        class_names.append(item.class_name)
+        sources.append(source)
+    counts = {source: sources.count(source) for source in SOURCES}
     if not rows:
         raise InputError(
             "no object of the level can be used",
@@ -117,17 +126,18 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
         )
     share = counts["default"] / len(rows)
     if cfg.most_default is not None and share > cfg.most_default:
-        classes = Counter(row[1] for row in kept if row[2] == "default").most_common(5)
+        without_size = Counter(name for name, source in zip(class_names, sources, strict=True) if source == "default")
         raise InputError(
             "too many boxes have a default size, because the server does not return their bounds", where=where,
-            got=f"{share:.1%}: {', '.join(f'{name} ({num})' for name, num in classes)}",
+            got=f"{share:.1%}: {', '.join(f'{name} ({num})' for name, num in without_size.most_common(5))}",
             expected=f"at most {cfg.most_default:.1%} (maps.unrealcv.most_default)",
             fix="add a table of their sizes to maps.unrealcv.sizes, or correct the bounds of these assets",
         )  # fmt: skip
     boxes = np.array(rows)
-    is_road = np.array([row[2] == "road" for row in kept])
-    tops_m = boxes[is_road, 2] + boxes[is_road, 5]
-    ground_z_m = cfg.ground_z_m if cfg.ground_z_m is not None else float(np.median(tops_m)) if len(tops_m) else 0.0
+    roads = boxes[np.array(sources) == "road"]
+    ground_z_m = cfg.ground_z_m
+    if ground_z_m is None:
+        ground_z_m = float(np.median(roads[:, 2] + roads[:, 5])) if len(roads) else 0.0
     header = MapHeader(
         name=cfg.name or level or "Unreal", source=MapSource(tool="UnrealCV", version=version, file=level),
         licence=cfg.licence, credits=cfg.credits, ground_z_m=ground_z_m, extent_sources=counts,
@@ -136,13 +146,13 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
     log.info("%s: sizes from %s", where, counts)
     if dropped:
         log.warning("%s: dropped: %s", where, dict(dropped))
-    plain = make_box_map(boxes[:, :3], boxes[:, 3:6], boxes[:, 6:], kinds, [id_of(row[0]) for row in kept], header)
-    return LevelMap(**vars(plain), objects=tuple(kept))
+    box_map = make_box_map(boxes[:, :3], boxes[:, 3:6], boxes[:, 6:], kinds, [id_of(name) for name in names], header)
+    return LevelMap(**vars(box_map), objects=tuple(zip(names, class_names, sources, strict=True)))
 
 
-def _unfit(one: _Object, kind: str | None, box: np.ndarray | None, source: str, cfg: UnrealCvMapConfig) -> str:
-    """Why an object is no box of the map; "" if it is."""
-    if kind is None and is_no_part_of_town(one.class_name):
+def _unfit(item: _Object, kind: str | None, box: np.ndarray | None, source: str, cfg: UnrealCvMapConfig) -> str:
+    """Return why an object is dropped; an empty text if it is kept."""
+    if kind is None and is_no_part_of_town(item.class_name):
         return "not of the town"
     if box is None or (kind is None and source == "default"):
         return "no body"
@@ -151,36 +161,38 @@ def _unfit(one: _Object, kind: str | None, box: np.ndarray | None, source: str, 
 
 
 def _box(
-    one: _Object, kind: str | None, sizes: dict[str, np.ndarray], cfg: UnrealCvMapConfig
+    item: _Object, kind: str | None, sizes: dict[str, np.ndarray], cfg: UnrealCvMapConfig
 ) -> tuple[np.ndarray | None, str]:
     """Return centre, half sizes and rotation, (9,) in world axes, of an object, and the source of its size."""
-    turn = one.rotation or (0.0, 0.0, 0.0)
-    if one.bounds is not None and one.class_name not in sizes:
-        low, high = np.reshape(one.bounds, (2, 3)) / cfg.coord_scale
+    turn = item.rotation or (0.0, 0.0, 0.0)
+    if item.bounds is not None and item.class_name not in sizes:
+        low, high = np.reshape(item.bounds, (2, 3)) / cfg.coord_scale
         if (high - low >= 0).all() and (high - low >= LEAST_M).sum() >= 2:
-            half, upright = _unturned((high - low) / 2, turn)
-            center, rotation_deg = world_pose([*(low + high) / 2, *((0.0, turn[1], 0.0) if upright else (0.0,) * 3)])
+            half, yaw_deg = _unturned((high - low) / 2, turn)
+            center, rotation_deg = world_pose([*(low + high) / 2, 0.0, yaw_deg, 0.0])
             return np.concatenate([center, half, rotation_deg]), "road" if kind == "Roads" else "engine"
-    if one.location is None:
+    if item.location is None:
         return None, "default"
-    asset = asset_of(one.class_name)
-    size_cm = sizes.get(one.class_name)
+    asset = asset_of(item.class_name)
+    size_cm = sizes.get(item.class_name)
     plausible_m = (asset and asset.default_size_m) or (CUBE_M,) * 3
     size_m = np.array(plausible_m) if size_cm is None else size_cm / CM_PER_M
-    half = size_m * (one.scale or (1.0,) * 3) / 2
-    foot, rotation_deg = world_pose([*(part / cfg.coord_scale for part in one.location), *turn])
+    half = size_m * (item.scale or (1.0,) * 3) / 2
+    foot, rotation_deg = world_pose([*(part / cfg.coord_scale for part in item.location), *turn])
     center = foot + np.array([0.0, 0.0, half[2]])
     return np.concatenate([center, half, rotation_deg]), "default" if size_cm is None else "bbox"
 
 
-def _unturned(half_m: np.ndarray, rotation_deg: tuple[float, ...]) -> tuple[np.ndarray, bool]:
-    """Return half sizes of the turned box with these bounds and True; if there is none, the bounds' own and False."""
+def _unturned(half_m: np.ndarray, rotation_deg: tuple[float, ...]) -> tuple[np.ndarray, float]:
+    """Return half sizes and yaw of the upright box with these bounds; without one, the bounds themselves and 0."""
     pitch, yaw, roll = rotation_deg
     c, s = abs(np.cos(np.radians(yaw))), abs(np.sin(np.radians(yaw)))
     if max(abs(pitch), abs(roll)) > 1e-3 or abs(c * c - s * s) < SKEWED:
-        return half_m, False
+        return half_m, 0.0
     x, y = np.linalg.solve([[c, s], [s, c]], half_m[:2])
-    return (np.array([x, y, half_m[2]]), True) if min(x, y) > LEAST_M / 2 else (half_m, False)
+    if min(x, y) <= LEAST_M / 2:
+        return half_m, 0.0
+    return np.array([x, y, half_m[2]]), yaw
 
 
 def write_objects(box_map: BoxMap, out: Path) -> list[Path]:

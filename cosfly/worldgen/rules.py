@@ -37,9 +37,6 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
     """Read a prompt; return the plan, and the trace: which words were read as which property.
 
     The seed varies unspecified sizes, by up to a tenth.
-
-    Raises:
-        InputError: If no word of the prompt is known, or its heights are contradictory.
     """
     text = prompt.lower().replace("’", "'")
     trees = r"\b(no|without(?: any)?|few|many|hardly any|lots of) (trees|vegetation|greenery)"

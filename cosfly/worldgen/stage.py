@@ -170,10 +170,6 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
 def run(cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
     """Read a prompt; write trace.json, plan.json, layout.json, placement.json, combined_world.json with Bbox.json,
     checks.json, map.png, and loop.yaml: settings for `cosfly run` on the world.
-
-    Raises:
-        InputError: If the prompt cannot be planned.
-        TeacherError: If the language model returns no plan.
     """
     prompt = " ".join(cfg.prompt.split())
     if not re.search(r"\w", prompt) or len(prompt) > MOST_CHARACTERS:
