@@ -1,11 +1,11 @@
-"""Frames, poses and projection: the project's conventions for space.
+"""Axes, poses and projection: the project's conventions for space.
 
-World: right-handed, metres, +x East, +y North, +z up. Files carry degrees, kernels take radians and say so in the name.
+World: right-handed, metres, +x East, +y North, +z up. Files store degrees; kernels take radians (suffix `_rad`).
 `yaw` is counter-clockwise from +x, `pitch` positive nose-up, `roll` positive right-side-down;
-rotation = Rz(yaw) @ Ry(-pitch) @ Rx(roll) on a body frame x forward, y left, z up.
+rotation = Rz(yaw) @ Ry(-pitch) @ Rx(roll) in a body frame with x forward, y left, z up.
 Cameras are OpenCV cameras (x right, y down, z forward) and depth is z-depth.
 
-CARLA and Unreal are left-handed (y to the right, yaw clockwise): `mirror_poses` is that change, its own inverse.
+CARLA and Unreal are left-handed (y to the right, yaw clockwise): `mirror_poses` converts in both directions.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ def rotation_matrix(pitch_rad: float, yaw_rad: float, roll_rad: float) -> np.nda
 def rotation_matrices(rotations_rad: np.ndarray) -> np.ndarray:
     """Return world_from_body, (n, 3, 3) float64, for rotations (n, 3) of pitch, yaw, roll."""
     pitch, yaw, roll = np.asarray(rotations_rad, dtype=np.float64).T
-    cp, sp, cy, sy, cr, sr = np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw), np.cos(roll), np.sin(roll)
+    cp, sp = np.cos(pitch), np.sin(pitch)
+    cy, sy = np.cos(yaw), np.sin(yaw)
+    cr, sr = np.cos(roll), np.sin(roll)
     # Rz(yaw) @ Ry(-pitch) @ Rx(roll), written out.
     rows = (
         [cy * cp, -sy * cr - cy * sp * sr, sy * sr - cy * sp * cr],
@@ -53,8 +55,8 @@ def axis_aligned_half_extents(half_extents: np.ndarray, rotations_deg: np.ndarra
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (pitch_rad, yaw_rad) that point the body's x axis from eye to target; works on (..., 3) arrays."""
-    d = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
-    return np.arctan2(d[..., 2], np.hypot(d[..., 0], d[..., 1])), np.arctan2(d[..., 1], d[..., 0])
+    x, y, z = np.moveaxis(np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64), -1, 0)
+    return np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)
 
 
 def focal_px(width_px: int, fov_deg: float) -> float:
@@ -89,7 +91,8 @@ def project(points_m: np.ndarray, camera_pose: np.ndarray, intrinsic: np.ndarray
         uv (n, 2) px and z (n,) m. Points with z <= 0 lie behind the camera: their uv is NaN.
     """
     in_camera = (np.asarray(points_m, dtype=np.float64) - camera_pose[:3, 3]) @ camera_pose[:3, :3]
-    z, uv = in_camera[:, 2], np.full((len(in_camera), 2), np.nan)
+    z = in_camera[:, 2]
+    uv = np.full((len(in_camera), 2), np.nan)
     front = z > 0
     homogeneous = in_camera[front] @ intrinsic.T
     uv[front] = homogeneous[:, :2] / homogeneous[:, 2:]
@@ -102,18 +105,19 @@ def box_corners(center: np.ndarray, half_extents: np.ndarray, yaw_rad: float = 0
 
 
 def mask_box(mask: np.ndarray) -> np.ndarray:
-    """Return the box around a mask (h, w) bool: (4,) xmin, ymin, xmax, ymax px at pixel borders, or NaN."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    """Return the box around a mask (h, w) bool: (4,) xmin, ymin, xmax, ymax px at pixel borders; NaN if it is empty."""
+    rows = np.flatnonzero(mask.any(axis=1))
+    columns = np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return np.full(4, np.nan)
     return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], dtype=np.float64)
 
 
-def box_iou(one: np.ndarray, two: np.ndarray) -> float:
+def box_iou(first: np.ndarray, second: np.ndarray) -> float:
     """Return the intersection over union of two boxes, (4,) xmin, ymin, xmax, ymax; 0 when both are empty."""
-    sides = np.minimum(one[2:], two[2:]) - np.maximum(one[:2], two[:2])
+    sides = np.minimum(first[2:], second[2:]) - np.maximum(first[:2], second[:2])
     shared = float(np.prod(np.clip(sides, 0, None)))
-    union = float(np.prod(one[2:] - one[:2]) + np.prod(two[2:] - two[:2])) - shared
+    union = float(np.prod(first[2:] - first[:2]) + np.prod(second[2:] - second[:2])) - shared
     return shared / union if union > 0 else 0.0
 
 
@@ -123,7 +127,7 @@ def wrap_deg(angle_deg: np.ndarray | float) -> np.ndarray | float:
 
 
 def mirror_poses(poses: np.ndarray) -> np.ndarray:
-    """Convert positions or rotations (..., 3), or one after the other (..., 6), between right-handed and CARLA axes."""
+    """Convert positions or rotations (..., 3), or both in a row (..., 6), between right-handed and CARLA axes."""
     return np.asarray(poses, dtype=np.float64) * np.tile([1.0, -1.0, 1.0], np.shape(poses)[-1] // 3)
 
 
@@ -141,7 +145,7 @@ def headings_of(positions_m: np.ndarray, time_s: np.ndarray) -> np.ndarray:
     Args:
         positions_m: (n, 2 or more), n >= 2; time_s: (n,), increasing.
     Returns:
-        Central differences. Below STANDS_MPS the last heading is kept, at the start the first one; without any, east.
+        Headings of central differences. Below STANDS_MPS the last heading stays, at the start the first; else east.
     """
     velocity = np.gradient(positions_m[:, :2], time_s, axis=0)
     moves = np.linalg.norm(velocity, axis=1) > STANDS_MPS

@@ -1,6 +1,6 @@
-"""How high the ground lies: one height for a map, or a grid of heights with a flat triangle on each half of a cell.
+"""The height of the ground: one height for a map, or a grid of heights with two flat triangles for each cell.
 
-Triangles, not a bilinear surface: they are what renderers draw, so that feet, rays and pictures agree to the rounding.
+The surface is made of triangles because renderers draw triangles: feet, rays and pictures agree up to rounding.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 class Ground:
     """Heights of the ground, world m.
 
-    heights_m: (ny, nx), the node [y, x] at (west_m + x cell_m, south_m + y cell_m); (1, 1) is flat ground without an
-    end. Each cell has two triangles, cut from its south-west to its north-east corner. Beyond the grid the height of
-    its border goes on.
+    heights_m: (ny, nx), the node [y, x] at (west_m + x cell_m, south_m + y cell_m); (1, 1) is flat ground of any
+    extent. The diagonal from its south-west to its north-east corner cuts each cell into two triangles. Beyond the grid
+    the ground continues at the height of the border.
     """
 
     heights_m: np.ndarray
@@ -30,7 +30,7 @@ class Ground:
 
     @property
     def is_flat(self) -> bool:
-        """Whether it has one height everywhere."""
+        """Whether the height is the same everywhere."""
         return self.heights_m.size == 1
 
     def height_at(self, points_m: np.ndarray) -> np.ndarray:
@@ -42,16 +42,17 @@ class Ground:
         return np.where(u >= v, low + u * (east - low) + v * (far - east), low + v * (north - low) + u * (far - north))
 
     def slope_at(self, points_m: np.ndarray) -> np.ndarray:
-        """Return rise over run under each of (n, 2 or 3) points, (n,); beyond the grid only along its border."""
+        """Return the slope (rise over run) under (n, 2 or 3) points, (n,); beyond the grid that along the border."""
         points = np.asarray(points_m, dtype=np.float64)
         if self.is_flat:
             return np.zeros(len(points))
         u, v, (low, east, north, far) = self._cells(points)
-        rise_x, rise_y = np.where(u >= v, east - low, far - north), np.where(u >= v, far - east, north - low)
+        rise_x = np.where(u >= v, east - low, far - north)
+        rise_y = np.where(u >= v, far - east, north - low)
         num_y, num_x = self.heights_m.shape
-        places = (points[:, :2] - [self.west_m, self.south_m]) / self.cell_m
-        goes_on = (places >= 0.0) & (places <= [num_x - 1, num_y - 1])
-        return np.hypot(rise_x * goes_on[:, 0], rise_y * goes_on[:, 1]) / self.cell_m
+        grid_points = (points[:, :2] - [self.west_m, self.south_m]) / self.cell_m
+        is_inside = (grid_points >= 0.0) & (grid_points <= [num_x - 1, num_y - 1])
+        return np.hypot(rise_x * is_inside[:, 0], rise_y * is_inside[:, 1]) / self.cell_m
 
     def range_under(self, mins: np.ndarray, maxs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and highest ground under upright boxes (n, 3), at centers and corners, (n,) each."""
@@ -61,11 +62,12 @@ class Ground:
         return heights.min(axis=0), heights.max(axis=0)
 
     def _cells(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
-        """Return places within cells, 0 to 1, and the heights of corners: south-west, -east, north-west, -east."""
+        """Return x and y within cells, 0 to 1, and heights at the south-west, -east, north-west, -east corners."""
         num_y, num_x = self.heights_m.shape
         x = np.clip((points[:, 0] - self.west_m) / self.cell_m, 0.0, num_x - 1.0)
         y = np.clip((points[:, 1] - self.south_m) / self.cell_m, 0.0, num_y - 1.0)
-        ix, iy = np.minimum(x.astype(int), num_x - 2), np.minimum(y.astype(int), num_y - 2)
+        ix = np.minimum(x.astype(int), num_x - 2)
+        iy = np.minimum(y.astype(int), num_y - 2)
         corners = tuple(self.heights_m[iy + dy, ix + dx] for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)))
         return x - ix, y - iy, corners
 
@@ -73,10 +75,11 @@ class Ground:
         """Return the triangles, (2 cells, 3, 3) m, counter-clockwise from above.
 
         Args:
-            reach_m: how far the border's heights go on beyond the grid, in cells of their own; 0 for not at all.
+            reach_m: Width of further cells around the grid, at the heights of its border; 0: none.
         """
         num_y, num_x = self.heights_m.shape
-        x, y = self.west_m + self.cell_m * np.arange(num_x), self.south_m + self.cell_m * np.arange(num_y)
+        x = self.west_m + self.cell_m * np.arange(num_x)
+        y = self.south_m + self.cell_m * np.arange(num_y)
         z = self.heights_m
         if reach_m > 0:
             x, y = (np.concatenate([[line[0] - reach_m], line, [line[-1] + reach_m]]) for line in (x, y))
@@ -87,20 +90,21 @@ class Ground:
         return pairs.reshape(-1, 3, 3)
 
     def slabs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return boxes that fill the ground from below, one to a cell: centers, half_extents (k, 3), turns (k, 3, 3).
+        """Return boxes that fill the ground from below, one per cell: centers, half_extents (k, 3), turns (k, 3, 3).
 
-        A box follows the plane through its cell's corners; where they lie in none it is lower, by a quarter of the
-        twist. turns: world_from_box.
+        The top of a box is the plane through its cell's corners; if they are not in one plane, it lies lower by a
+        quarter of the twist. turns: world_from_box.
         """
         heights = self.heights_m
-        low, east, north, far = (heights[:-1, :-1], heights[:-1, 1:], heights[1:, :-1], heights[1:, 1:])
+        low, east, north, far = heights[:-1, :-1], heights[:-1, 1:], heights[1:, :-1], heights[1:, 1:]
         rises = np.stack([east - low + far - north, north - low + far - east], axis=-1)
         gradient = rises.reshape(-1, 2) / (2 * self.cell_m)
         num_y, num_x = self.heights_m.shape
         x, y = np.meshgrid(np.arange(num_x - 1) + 0.5, np.arange(num_y - 1) + 0.5)
         middle_z = ((low + east + north + far) - np.abs(low - east - north + far)).ravel() / 4
-        x, y = self.west_m + self.cell_m * x.ravel(), self.south_m + self.cell_m * y.ravel()
-        tops = np.column_stack([x, y, middle_z])
+        tops = np.column_stack(
+            [self.west_m + self.cell_m * x.ravel(), self.south_m + self.cell_m * y.ravel(), middle_z]
+        )
         along = np.column_stack([np.ones(len(tops)), np.zeros(len(tops)), gradient[:, 0]])
         up = np.column_stack([-gradient, np.ones(len(tops))])
         along, up = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True) for vectors in (along, up))
@@ -108,5 +112,5 @@ class Ground:
         reach = self.cell_m / 2 * np.array([[sx, sy] for sx in (-1, 1) for sy in (-1, 1)])
         offsets = np.concatenate([np.broadcast_to(reach, (len(tops), 4, 2)), (gradient @ reach.T)[:, :, None]], axis=2)
         half = np.abs(np.einsum("nij,nki->nkj", turns, offsets)).max(axis=1)
-        half[:, 2] = (middle_z - self.heights_m.min() + 2.0) / 2  # down to the lowest ground: nobody flies under a hill
+        half[:, 2] = (middle_z - self.heights_m.min() + 2.0) / 2  # down to below the lowest ground
         return tops - turns[:, :, 2] * half[:, 2:], half, turns

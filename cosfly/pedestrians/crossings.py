@@ -1,9 +1,9 @@
 """The footing of each cell: pavement, open ground, carriageway or crossing.
 
-In a map that marks crossings, a crossing is carriageway under stripes: paint that is MARKED_M wide in every direction
-once gaps below GAP_M are closed, unlike dashes and edge lines. In other maps it is carriageway straight across, from
-pavement to pavement along the grid axis (of four, with the diagonals) along which they are nearest, at most
-ACROSS_SHARE as wide as the carriageway at right angles to it. So routes cross a street and do not run along it.
+In a map that marks crossings, a crossing is carriageway under stripes: after gaps below GAP_M are closed, its paint is
+MARKED_M wide in every direction, unlike dashes and edge lines. In other maps, carriageway may be crossed from pavement
+to pavement along the grid axis (of four, with the diagonals) with the least distance, if this is at most ACROSS_SHARE
+of the distance at right angles to it. So routes cross a street and do not run along it.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.geometry.grid import OccupancyGrid, surface, surface_kinds
 from cosfly.runtime.compiled import njit
 
-MARKED_M, GAP_M = 2.0, 2.0
+MARKED_M = 2.0
+GAP_M = 2.0
 ACROSS_SHARE = 0.5
 
-# Footings of a cell; ROAD + 1 + axis: carriageway that may be crossed along an axis.
+# Footings of a cell; ROAD + 1 + axis is carriageway that may be crossed along that axis.
 PAVED, OPEN, CROSSING, ROAD = range(4)
-AXES = np.array([[1, 0], [0, 1], [1, 1], [-1, 1]])  # cells; the order of astar.py's directions
+AXES = np.array([[1, 0], [0, 1], [1, 1], [-1, 1]])  # in cells, in the order of the directions in astar.py
 NUM_FOOTINGS = ROAD + 1 + len(AXES)
 OF_KIND = np.full(256, OPEN, dtype=np.uint8)
 OF_KIND[[KINDS["Sidewalks"], KINDS["Ground"]]] = PAVED
@@ -56,9 +57,9 @@ def _morphed(mask: np.ndarray, operation: int, width_m: float, grid: OccupancyGr
 
 @njit(cache=True)
 def _mark_ways_across(is_road, is_paved, footing):  # pragma: no cover (compiled)
-    """Mark the carriageway that is crossed along an axis, in place; all arrays are (ny, nx)."""
+    """Mark carriageway that may be crossed along an axis in `footing`; all arrays are (ny, nx)."""
     num_y, num_x = is_road.shape
-    widths = np.full((len(AXES), num_y, num_x), np.inf, dtype=np.float32)  # in cells, between what is no carriageway
+    widths = np.full((len(AXES), num_y, num_x), np.inf, dtype=np.float32)  # of the carriageway, in cells
     is_way = np.zeros((len(AXES), num_y, num_x), dtype=np.bool_)  # from pavement to pavement
     for axis in range(len(AXES)):
         dx, dy = AXES[axis]

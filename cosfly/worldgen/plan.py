@@ -1,4 +1,4 @@
-"""The plan of a world: what a language model or the rules make of a prompt, and all that the layout is made from.
+"""The plan of a world: the answer of a language model or of the rules to a prompt, and the only input of the layout.
 
 Source: app:simworld:step1, the structured high-level plan.
 """
@@ -19,9 +19,10 @@ from cosfly.runtime.json_io import FileFormat, Record
 
 PLAN_FORMAT = FileFormat("cosfly.world_plan", "1", "plan of a world")
 
-OPEN_SHARE = 0.45  # of an open block that objects may fill
-SPACE_M = 4.0  # around each object
-EDGE_M = 14.0  # of an open block, both sides together, that belongs to its trees
+OPEN_SHARE = 0.45  # share of an open block that objects may fill
+SPACE_M = 4.0  # free ground around each object
+EDGE_M = 14.0  # width of both edges of an open block together, which hold its trees
+LOW_PART_M = 3.0  # parts of a quay that begin above this height are over the water
 
 
 class Object(Record):
@@ -40,7 +41,7 @@ class Object(Record):
     @property
     def size_m(self) -> tuple[float, float]:
         """Full size of the footprint, centred at its middle; on a quay without the parts over the water."""
-        parts = [part for part in self.parts if self.where == "open" or part[5] < 3.0]
+        parts = [part for part in self.parts if self.where == "open" or part[5] < LOW_PART_M]
         return (
             2 * max(abs(x) + wide / 2 for _, x, _, wide, _, _, _ in parts),
             2 * max(abs(y) + deep / 2 for _, _, y, _, deep, _, _ in parts),
@@ -74,7 +75,7 @@ class NamedObject(Record):
 
 
 class WorldPlan(BaseModel):
-    """Properties of a world. Lengths in m; what is measured afterwards has a range, from low to high."""
+    """Properties of a world. Lengths are in m; properties that are measured afterwards have a range, low to high."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -121,38 +122,45 @@ class WorldPlan(BaseModel):
         return self
 
     def known_objects(self) -> list[tuple[Object, int]]:
-        """Return the named objects of the table with their counts; of a name that occurs twice, the sum."""
+        """Return the named objects of the table with their counts, summed over equal names."""
         counts: dict[str, int] = {}
         for named in self.objects:
             counts[named.name] = counts.get(named.name, 0) + named.count
         return [(OBJECTS[name], count) for name, count in counts.items() if name in OBJECTS]
 
     def unknown_objects(self) -> list[str]:
-        """Return the named objects that the table lacks, an entry for each."""
-        return [o.name for o in self.objects if o.name not in OBJECTS for _ in range(o.count)] + self.not_in_table
+        """Return the names of objects that the table lacks, as often as they are counted."""
+        unknown = [named for named in self.objects if named.name not in OBJECTS]
+        return [named.name for named in unknown for _ in range(named.count)] + self.not_in_table
 
 
 def town_plan(plan: WorldPlan) -> TownPlan:
-    """Return the town generator's plan: with open blocks enough, and large enough, for the objects."""
-    block_m, along = plan.block_m, plan.blocks_along
+    """Return the plan for the town generator, with enough open blocks, and large enough ones, for the objects."""
+    block_m = plan.block_m
+    along = plan.blocks_along
     placed = [(thing, count) for thing, count in plan.known_objects() if thing.where == "open"]
     for thing, _ in placed:
         block_m = max(block_m, min(max(thing.size_m) * thing.least_scale + EDGE_M + 4.0, 150.0))
     narrowest = block_m * (1.0 - plan.unevenness) / (1.0 + plan.unevenness)
     room = OPEN_SHARE * (narrowest - EDGE_M) ** 2
-    needed = sum(n * math.prod(side * thing.least_scale + SPACE_M for side in thing.size_m) for thing, n in placed)
+    needed = sum(
+        count * math.prod(side * thing.least_scale + SPACE_M for side in thing.size_m) for thing, count in placed
+    )
     num_open = max(plan.plazas + plan.greens, int(-(-needed // room)))
     while num_open > along**2 // 2 and along < 9:
         along += 1
     plazas = max(plan.plazas, num_open - plan.greens)
     shares = {"lanes" if plan.lanes else "lots": along**2 - plazas - plan.greens, "plaza": plazas, "green": plan.greens}
     streets_m = along * plan.street_m + max(plan.avenue_m, plan.river_m)
+    tree_share = 0.4 if plan.trees_per_ha[1] < 25 else 0.9
+    if plan.trees_per_ha[1] < 3:
+        tree_share = 0.0
     return TownPlan(
         size_m=block_m * along + streets_m + 2 * VERGE_M, num_blocks=along, street_m=plan.street_m,
         boulevard_m=plan.avenue_m, unevenness=plan.unevenness, center="plaza" if plazas else None,
         blocks={block: float(share) for block, share in shares.items() if share > 0}, river_m=plan.river_m,
         bridges=plan.bridges, shore_m=plan.shore_m, parked_share=plan.parked_share, tree_parts=False,
-        tree_share=0.0 if plan.trees_per_ha[1] < 3 else 0.4 if plan.trees_per_ha[1] < 25 else 0.9,
+        tree_share=tree_share,
         lots=Lots(
             footprints_m=_footprints(plan), heights_m=plan.heights_m, gap_m=plan.gap_m, setback_m=plan.setback_m,
             fall_m=0.5 * (block_m + plan.street_m) * along if plan.high_center else 0.0,
@@ -161,7 +169,7 @@ def town_plan(plan: WorldPlan) -> TownPlan:
 
 
 def _footprints(plan: WorldPlan) -> tuple[Range, ...]:
-    """Return SimWorld's own footprints within a plan's range; if fewer than four, all of them scaled into it."""
+    """Return the footprints of SimWorld's buildings in a plan's range; if fewer than four fit, scale all into it."""
     low, high = plan.footprint_m
     sizes = [(size[0], size[1]) for name, size in assets().items() if name.startswith("BP_Building")]
     fitting = [size for size in sizes if low <= min(size) and max(size) <= high]

@@ -30,11 +30,11 @@ _STOPS = re.compile(
 _PHRASE = rf"(?:(?!{_STOPS.pattern}|\b(?:but|no)\b).)+"
 _WITHOUT = re.compile(rf"\b(?:no|without(?: any)?)\s+({_PHRASE}(?:\b(?:or|nor)\b{_PHRASE})*)")  # "no fountain or well"
 _HEIGHTS = re.compile(r"\b(?:between|from)\s+(\d+)\s*(?:m\b)?\s*(?:and|to)\s+(\d+)\s*(?:m|metres?|meters?)\b")
-SEVERAL = 4  # of a plural without a number
+SEVERAL = 4  # objects of a plural without a number
 
 
 def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
-    """Read a prompt; return the plan, and the trace: which words were read as which property.
+    """Read a prompt; return the plan, and the trace: the choice for each property.
 
     The seed varies unspecified sizes, by up to a tenth.
     """
@@ -42,10 +42,11 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
     trees = r"\b(no|without(?: any)?|few|many|hardly any|lots of) (trees|vegetation|greenery)"
     text = re.sub(trees, lambda m: f"{re.sub('^without.*', 'no', m[1])}-trees".replace(" ", "-"), text)
     text = re.sub(r"\bgarden city\b", "garden-city", text)
-    without, text = " ".join(_WITHOUT.findall(text)), _WITHOUT.sub(" , ", text)
-    objects, rest = _find_objects(text)
-    words = re.findall(r"[a-z][a-z'-]*", rest)
-    not_in_table = _find_unknown(rest)
+    without = " ".join(_WITHOUT.findall(text))
+    text = _WITHOUT.sub(" , ", text)
+    objects, remaining_text = _find_objects(text)
+    words = re.findall(r"[a-z][a-z'-]*", remaining_text)
+    not_in_table = _find_unknown(remaining_text)
     if not (objects or not_in_table or without or set(words) & KNOWN):
         raise InputError(
             "the rules know none of the words of the prompt", where="PROMPT", got=repr(prompt[:60]),
@@ -56,7 +57,7 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
     kind = next((name for name, entry in settlements.items() if set(entry["words"].split()) & set(words)), "town")
     trace: dict[str, Any] = {"planner": "rules", "settlement": kind, "objects": {w.name: w.count for w in objects}}
     plan = WorldPlan().model_dump() | {name: value for name, value in settlements[kind].items() if name != "words"}
-    for group, choice in _choices(rest).items():
+    for group, choice in _choices(remaining_text).items():
         trace[group] = choice
         for name, factor in WORDS["groups"][group][choice].items():
             if name != "words":
@@ -66,16 +67,20 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
     if heights := _HEIGHTS.search(prompt.lower()):
         plan["heights_m"] = float(heights[1]), float(heights[2])
         if not 3 <= plan["heights_m"][0] <= plan["heights_m"][1] <= 450:
-            what = "the heights of buildings are not a possible range"
-            raise InputError(what, where="PROMPT", got=heights[0], expected="lowest to highest, within 3 to 450 m")
+            expected = "lowest to highest, within 3 to 450 m"
+            raise InputError(
+                "the heights of buildings are not a possible range", where="PROMPT", got=heights[0], expected=expected
+            )
     plan |= _open_and_water(words, objects, plan)
     if without:
         trace["without"] = without
-        plan["parked_share"] *= not re.search(r"\b(?:cars?|vehicles?|traffic)\b", without)
+        if re.search(r"\b(?:cars?|vehicles?|traffic)\b", without):
+            plan["parked_share"] = 0.0
     if "tower" in " ".join(words) and kind not in ("downtown", "high-rise city"):
         plan["heights_m"] = (plan["heights_m"][0], max(plan["heights_m"][1], 48.0))
     if re.search(r"\b(?:towers|high-rises|skyscrapers) in the (?:cent|middle)", text):
-        plan["high_center"], plan["heights_m"] = True, (min(plan["heights_m"][0], 8.0), plan["heights_m"][1])
+        plan["high_center"] = True
+        plan["heights_m"] = (min(plan["heights_m"][0], 8.0), plan["heights_m"][1])
     least = math.ceil(math.sqrt(2 * (plan["plazas"] + plan["greens"])))  # half of the blocks are built on
     plan["blocks_along"] = int(min(9, max(2, least, round(plan["blocks_along"]))))
     plan["gap_m"] = max(0.5, plan["gap_m"])
@@ -89,32 +94,35 @@ def _scaled(value: Any, factor: float) -> Any:
 
 def _find_objects(text: str) -> tuple[list[NamedObject], str]:
     """Find the objects of the table, the longest names first; return also the rest of the text."""
-    found: dict[str, NamedObject] = {}
+    objects: dict[str, NamedObject] = {}
     names = {word: thing.name for thing in OBJECTS.values() for word in (thing.name, *thing.words)}
     numbers = "|".join([*NUMBERS, *ARTICLES, r"\d+"])
     for word in sorted(names, key=len, reverse=True):
         plural = f"{word[:-1]}ies" if word.endswith("y") else f"{word}(?:e?s)?"
         pattern = re.compile(rf"\b(?:({numbers})\s+(?:[a-z-]+\s+)??)?({word}|{plural})\b(?!-)")
         while match := pattern.search(text):
-            number, is_plural = match[1] or "", match[2] != word
+            number = match[1] or ""
+            is_plural = match[2] != word
             if names[word] == "hotel" and is_plural and not number:
                 break  # hotels are ordinary buildings
             count = SEVERAL if is_plural else 1
             if number in NUMBERS or number.isdigit():
                 count = min(60, max(1, NUMBERS.get(number, 0) or int(number)))
-            found[names[word]] = NamedObject(name=names[word], count=count)
+            objects[names[word]] = NamedObject(name=names[word], count=count)
             text = f"{text[: match.start()]} , {text[match.end() :]}"
-    return [found[name] for name in sorted(found)], text
+    return [objects[name] for name in sorted(objects)], text
 
 
-def _choices(rest: str) -> dict[str, str]:
-    """Return the choice of each group that the text makes; words of size count where they describe the settlement."""
+def _choices(text: str) -> dict[str, str]:
+    """Return the choice of the text in each group; words of size count only in phrases about the settlement."""
     chosen: dict[str, str] = {}
-    chunks = [re.findall(r"[a-z][a-z'-]*", chunk) for chunk in _STOPS.split(rest)]
-    sized = [own for own in chunks if set(WORDS["sized"]) & set(own) or any(w.endswith("-scale") for w in own)]
+    phrases = [re.findall(r"[a-z][a-z'-]*", phrase) for phrase in _STOPS.split(text)]
+    of_settlement = [
+        words for words in phrases if set(WORDS["sized"]) & set(words) or any(w.endswith("-scale") for w in words)
+    ]
     for group, choices in WORDS["groups"].items():
-        spoken = [word for own in (sized if group == "size" else chunks) for word in own]
-        found = {choice: word for word in spoken for choice, entry in choices.items() if word in entry["words"].split()}
+        words = [word for phrase in (of_settlement if group == "size" else phrases) for word in phrase]
+        found = {choice: word for word in words for choice, entry in choices.items() if word in entry["words"].split()}
         if len(found) > 1:
             got = " and ".join(repr(word) for word in found.values())
             raise InputError(f"two words about {group} contradict each other", where="PROMPT", got=got)
@@ -124,7 +132,7 @@ def _choices(rest: str) -> dict[str, str]:
 
 
 def _open_and_water(words: list[str], objects: list[NamedObject], plan: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of a plan that words of open blocks and water, and the objects, change."""
+    """Return the fields of a plan that change by the objects and by words for open blocks and water."""
     changes: dict[str, Any] = {}
     for word in words:
         singular = word.removesuffix("s")
@@ -144,12 +152,12 @@ def _open_and_water(words: list[str], objects: list[NamedObject], plan: dict[str
     return changes
 
 
-def _find_unknown(rest: str) -> list[str]:
+def _find_unknown(text: str) -> list[str]:
     """Return the phrases that begin with an article or a number, and of which no table has a word."""
-    found = []
-    for chunk in _STOPS.split(rest):
-        first, *words = re.findall(r"[a-z0-9][a-z0-9'-]*", chunk) or [""]
-        counts = first in ARTICLES or first in NUMBERS or first.isdigit()
-        if counts and words and len(words[-1]) > 2 and not {*words, words[-1].removesuffix("s")} & KNOWN:
-            found.append(" ".join(words))
-    return found
+    unknown = []
+    for phrase in _STOPS.split(text):
+        first, *words = re.findall(r"[a-z0-9][a-z0-9'-]*", phrase) or [""]
+        is_counted = first in ARTICLES or first in NUMBERS or first.isdigit()
+        if is_counted and words and len(words[-1]) > 2 and not {*words, words[-1].removesuffix("s")} & KNOWN:
+            unknown.append(" ".join(words))
+    return unknown

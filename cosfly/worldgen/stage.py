@@ -34,14 +34,17 @@ from cosfly.worldgen.town import CM_PER_M, Town, build, footprints, layout_nodes
 
 log = logging.getLogger(__name__)
 
-WORLD_FILE, SIZES_FILE, LOOP_FILE = "combined_world.json", "Bbox.json", "loop.yaml"
+WORLD_FILE = "combined_world.json"
+SIZES_FILE = "Bbox.json"
+LOOP_FILE = "loop.yaml"
 CHECKS_FORMAT = FileFormat("cosfly.world_checks", "1.0", "checks of a world")
 CREDITS = "cosfly; sizes of assets by SimWorld, maitrix-org and contributors"
 MOST_CHARACTERS = 2000  # of a prompt
 
 AT_THE_DOOR_M = 2.0  # from a building to the pavement that leads to it
-WALK_M = 100.0  # the longest pedestrian trajectory that must find room: app:simworld:step4 samples 50 to 100 m
-OVERLAP_M = 0.05
+WALK_M = 100.0  # the longest pedestrian trajectory that must fit: app:simworld:step4 samples 50 to 100 m
+OVERLAP_M = 0.05  # buildings that share less only touch
+RIDGE_M = 3.0  # highest ridge of an old house above its walls
 
 
 class WorldConfig(Config):
@@ -66,19 +69,21 @@ def _buildings_of(box_map: BoxMap) -> tuple[np.ndarray, np.ndarray]:
 
 def check_world(town: Town, plan: WorldPlan) -> list[dict[str, Any]]:
     """Return each check of a world: its name, the measured value, the accepted range, and whether it is met."""
-    world, (outlines, tops_m) = town.boxes, _buildings_of(town.layout)
+    world = town.boxes
+    outlines, tops_m = _buildings_of(town.layout)
     buildings, _ = _buildings_of(world)
-    reached, component_m, share = _reach(world, buildings)
+    num_reached, component_m, component_share = _reach(world, buildings)
     low, high = plan.heights_m
-    heights_m, extra = (tops_m if len(tops_m) else [low]), (3.0 if plan.lanes else 0.0)  # ridges of old houses
+    heights_m = tops_m if len(tops_m) else [low]
+    ridge_m = RIDGE_M if plan.lanes else 0.0
     checks = [
         ("overlapping buildings", _num_overlaps(world), 0, 0),
-        ("buildings without a pavement", len(buildings) - reached, 0, 0),
+        ("buildings without a pavement", len(buildings) - num_reached, 0, 0),
         ("length of the largest walkable component, m", component_m, WALK_M, 1e5),
-        ("walkable ground in it", share, 0.8, 1.0),
+        ("walkable ground in it", component_share, 0.8, 1.0),
         ("building share", shapely.area(outlines).sum() / town.land_m2, *plan.building_share),
-        ("lowest building, m", min(heights_m), low, high + extra),
-        ("highest building, m", max(heights_m), low, high + extra),
+        ("lowest building, m", min(heights_m), low, high + ridge_m),
+        ("highest building, m", max(heights_m), low, high + ridge_m),
         ("trees per hectare", trees_of(world).sum() / town.land_m2 * 1e4, *plan.trees_per_ha),
     ]
     return [
@@ -92,9 +97,9 @@ def _num_overlaps(box_map: BoxMap) -> int:
     """Count pairs of boxes of buildings that share more than a sliver of space."""
     boxes = box_map.select(np.flatnonzero(of_kinds(box_map, "Buildings")))
     outlines = shapely.buffer(footprints(boxes), -OVERLAP_M / 2, join_style="mitre")
-    one, other = shapely.STRtree(outlines).query(outlines, predicate="intersects")
-    above = np.minimum(boxes.maxs[one, 2], boxes.maxs[other, 2]) - np.maximum(boxes.mins[one, 2], boxes.mins[other, 2])
-    return int(((one < other) & (above > OVERLAP_M)).sum())
+    first, second = shapely.STRtree(outlines).query(outlines, predicate="intersects")
+    shared_m = np.minimum(*boxes.maxs[[first, second], 2]) - np.maximum(*boxes.mins[[first, second], 2])
+    return int(((first < second) & (shared_m > OVERLAP_M)).sum())
 
 
 def _reach(box_map: BoxMap, buildings: np.ndarray) -> tuple[int, float, float]:
@@ -126,10 +131,7 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
     """Ask a model for the plan of a prompt, or take its earlier answer to the same prompt and seed.
 
     Returns:
-        The plan, and the trace: the question and the answer, to the letter.
-
-    Raises:
-        TeacherError: If there is no answer, or none with a plan. InputError: If the plan is impossible.
+        The plan, and the trace: the question and the answer, word for word.
     """
     endpoint = EndpointConfig(model=cfg.model, max_tokens=2048)
     fields = "\n".join(
@@ -149,22 +151,22 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
     try:
         reply = asyncio.run(ask())
     except NoAnswer as error:
-        what, fix = "the planner gave no answer", error.fix or None
-        raise TeacherError(what, where=client.url, got=str(error), fix=fix) from None
+        fix = error.fix or None
+        raise TeacherError("the planner gave no answer", where=client.url, got=str(error), fix=fix) from None
     trace = {
         "planner": "model", "url": cfg.planner, "model": client.model, "seed": seed, "messages": messages,
         "answer": reply.text, "finish_reason": reply.finish_reason,
         "usage": reply.usage.model_dump() if reply.usage else None,
     }  # fmt: skip
     where = f"{cfg.planner}: plan"
-    found = find_object(reply.text, WorldPlan.model_fields.keys(), reply.finish_reason)
-    if found.value is None:
+    answer = find_object(reply.text, WorldPlan.model_fields.keys(), reply.finish_reason)
+    if answer.value is None:
         raise TeacherError(
             "the answer of the planner has no plan", where=where,
-            got=f"{found.reason}: {' '.join(reply.text.split())[:80]!r}", expected="a JSON object",
+            got=f"{answer.reason}: {' '.join(reply.text.split())[:80]!r}", expected="a JSON object",
             fix="try another --seed, prompt or model, or omit --planner to plan by rules without a model",
         )  # fmt: skip
-    return validated(WorldPlan, found.value, where), trace
+    return validated(WorldPlan, answer.value, where), trace
 
 
 def run(cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
@@ -190,7 +192,7 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same
     write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks})
     view = TopView.around(np.stack(town.boxes.bounds()), 1000)
     write_bytes(out / "map.png", png_bytes(draw_map(town.boxes, view)))
-    settings = read_yaml(shipped("simworld.yaml")) | {"name": "world"}  # of the appendix, with this world
+    settings = read_yaml(shipped("simworld.yaml")) | {"name": "world"}  # those of the appendix, for this world
     world = {"name": cfg.name, "world": str(product.resolve()), "licence": OUR_LICENCE, "credits": CREDITS}
     settings["maps"] = {"source": "simworld", "simworld": world}
     loop = "# cosfly run THIS_FILE --out DIR\n" + yaml.safe_dump(settings, sort_keys=False)
@@ -211,7 +213,8 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same
 
 def _write_world(town: Town, out: Path) -> None:
     """Write layout, placement, both merged, and the sizes of the assets that they use."""
-    layout, placed = layout_nodes(town), placement_nodes(town)
+    layout = layout_nodes(town)
+    placed = placement_nodes(town)
     write_json(out / "layout.json", {"nodes": layout}, indent=None)
     missing = [{"name": name, "reason": reason} for name, reason in town.not_placed]
     placement = {"nodes": placed, "placed": [thing._asdict() for thing in town.placed], "not_placed": missing}
