@@ -1,12 +1,12 @@
 """Numba's `njit` with a cache that never serves stale code.
 
-Numba keeps a compiled function until its own file changes, whatever becomes of those that it calls. Here every version
+Numba caches a compiled function until its own file changes, even if functions that it calls change. Here each version
 of all compiled sources together has its own cache folder, $XDG_CACHE_HOME/cosfly/<digest>, unless NUMBA_CACHE_DIR is
-set. Of several processes that need a function, one compiles it and the others wait for its lock and load it.
+set. If several processes need a function, one compiles it and the others wait for its lock and load it.
 
-Two habits keep compiling short: a literal argument is a type of its own to numba, which compiles the function once
-more, so it is passed as `int64(0)`; and whole arrays are set by `fill` or a loop, because numba's `array[:] = ...`
-compiles the formatting of its error message too.
+Two rules keep compiling short. Pass literals as `int64(0)`, because numba treats a literal argument as a type of its
+own and compiles the function once more. Set whole arrays by `fill` or a loop, because `array[:] = ...` also compiles
+the formatting of its error message.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ PACKAGE = Path(__file__).parents[1]
 
 
 class _SharedCache(caching.FunctionCache):
-    """The cache of a function. A process that finds nothing holds the function's lock until it has saved its own."""
+    """The cache of a function. A process that compiles it holds the function's lock until it has saved the result."""
 
     _lock: Any = None
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        found = super().load_overload(sig, target_context)
-        if found is None:
-            if self._lock is None:  # a function may need itself, or another overload of itself
-                with contextlib.suppress(OSError):  # no place for a lock: each compiles for itself
+        overload = super().load_overload(sig, target_context)
+        if overload is None:
+            if self._lock is None:  # recursion and overloads reuse the lock
+                with contextlib.suppress(OSError):  # without a folder for locks each process compiles
                     os.makedirs(self.cache_path, exist_ok=True)
                     path = os.path.join(self.cache_path, f"{self._py_func.__qualname__}.lock")
                     self._lock = open(path, "w")  # noqa: SIM115
                     fcntl.flock(self._lock, fcntl.LOCK_EX)
-            found = super().load_overload(sig, target_context)  # another process may have compiled it meanwhile
-            if found is None:
+            overload = super().load_overload(sig, target_context)  # another process may have compiled it meanwhile
+            if overload is None:
                 log.info("compiling kernels, once on this machine (planning: about 30 s); kept in %s", self.cache_path)
             else:
                 self._release_lock()
-        return found
+        return overload
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:
@@ -81,7 +81,7 @@ def njit(**options: Any) -> Callable[[Callable], Callable]:
 
 
 def _use_own_cache(caches: Path) -> None:
-    """Let numba cache in a folder of the sources' own, if it can be made."""
+    """Let numba cache in a folder named after the digest of the sources, if it can be created."""
     digest = hashlib.sha256()
     for path in sorted(PACKAGE.rglob("*.py")):
         if b"@njit" in (text := read_bytes(path)):
@@ -92,7 +92,7 @@ def _use_own_cache(caches: Path) -> None:
         numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
 
 
-# One line: a process compiles several functions, and so does each of its workers, whose records come here too.
+# Only the first record is logged: a process and its workers, whose records come here too, compile many functions.
 _num_records = itertools.count()
 log.addFilter(lambda record: next(_num_records) == 0)
 

@@ -1,7 +1,7 @@
 """Settings: YAML and `--set a.b=c` into strict pydantic models, with all problems reported at once.
 
-Settings are YAML limited to the values of JSON, with comments and anchors: a tag, a key that is given twice and a key
-that is no plain word are errors; a date is text.
+Settings are YAML with the values of JSON, comments and anchors. A tag, a repeated key and a key that is not text or a
+number are errors; a date is text.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from pydantic_core import to_jsonable_python
 from cosfly.runtime.errors import ConfigError, InputError, nearest, plain
 from cosfly.runtime.io import read_text
 
-MOST_BYTES = 1_000_000  # a run's settings are some 10 kB; the longest word list that ships has 100
+MOST_BYTES = 1_000_000  # the settings of a run take some 10 kB, the longest shipped word list 100 kB
 MOST_LISTED = 15  # names of settings in a message
-MOST_ELSEWHERE = 3  # places of an unknown name, as in "did you mean plan.x or render.x"
-MOST_PARTS = 32  # of a setting's name
+MOST_ELSEWHERE = 3  # settings in other groups in a message, as in "did you mean plan.x or render.x"
+MOST_PARTS = 32  # of the name of a setting
 
 T = TypeVar("T")
 C = TypeVar("C", bound=BaseModel)
 
-# MayDiffer[int] is a setting that changes how a stage works and not what it makes: it is not recorded in `stage.json`,
+# MayDiffer[int] is a setting that changes how a stage works but not its products: it is not recorded in `stage.json`,
 # and a stage may be resumed with another value.
 _MAY_DIFFER = "may differ on resume"
 MayDiffer = Annotated[T, _MAY_DIFFER]
@@ -40,7 +40,7 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     def recorded(self) -> dict[str, Any]:
-        """Return the settings and constants that decide what a stage makes, JSON-able: all but those of MayDiffer."""
+        """Return the settings and constants that determine the products, JSON-able: all but those of MayDiffer."""
         may_differ = {name for name, field in type(self).model_fields.items() if _MAY_DIFFER in field.metadata}
         return self._values("recorded", [name for name in self._names() if name not in may_differ])
 
@@ -48,9 +48,10 @@ class Config(BaseModel):
         """Return all settings and constants, JSON-able."""
         return self._values("all_values", self._names())
 
-    def _values(self, of_group: str, names: list[str]) -> dict[str, Any]:
+    def _values(self, method: str, names: list[str]) -> dict[str, Any]:
+        """Return settings by name; `method` is applied to groups."""
         values = {name: getattr(self, name) for name in names}
-        groups = {name: getattr(one, of_group)() for name, one in values.items() if isinstance(one, Config)}
+        groups = {name: getattr(value, method)() for name, value in values.items() if isinstance(value, Config)}
         return to_jsonable_python(values) | groups
 
     @classmethod
@@ -64,7 +65,7 @@ class Config(BaseModel):
 
 
 class _Loader(yaml.SafeLoader):
-    """The safe loader, with each key given once."""
+    """The safe loader; it refuses a key that occurs twice."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict:
         seen = set[str]()
@@ -77,7 +78,7 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-# Only what JSON has: without the resolver a date stays text, which is what its users mean.
+# Only the types of JSON; without the resolver a date stays text.
 _KINDS = {f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float", "str", "seq", "map", "merge")}
 _Loader.yaml_constructors = {
     tag: constructor for tag, constructor in yaml.SafeLoader.yaml_constructors.items() if tag is None or tag in _KINDS
@@ -89,7 +90,7 @@ _Loader.yaml_implicit_resolvers = {
 
 
 def parse_yaml(text: str, where: str | Path, *, what: str = "configuration") -> Any:
-    """Return the value of YAML text; ConfigError where it is not valid or too long."""
+    """Return the value of YAML text; ConfigError if it is invalid or too long."""
     if len(text) > MOST_BYTES:
         expected = f"at most {MOST_BYTES / 1e6:g} MB"
         raise ConfigError(f"the {what} is too long", where=where, got=f"{len(text) / 1e6:.1f} MB", expected=expected)
@@ -100,7 +101,7 @@ def parse_yaml(text: str, where: str | Path, *, what: str = "configuration") -> 
 
 
 def read_yaml(path: Path) -> dict:
-    """Read a YAML mapping; ConfigError where the file holds none."""
+    """Read a YAML mapping; ConfigError if the file holds something else."""
     try:
         text = read_text(path, what="configuration")
     except InputError as error:
@@ -135,7 +136,7 @@ def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
 
 
 def build(model: type[C], data: dict, source: str | Path) -> C:
-    """Return a model of plain data; ConfigError names every problem, and the nearest known key of an unknown one."""
+    """Return a model of plain data; ConfigError lists all problems, and the nearest name for each unknown key."""
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -154,11 +155,13 @@ def _problem(model: type[BaseModel], detail: Any) -> str:
     kind = detail["type"]
     if kind == "extra_forbidden":
         *parents, last = detail["loc"]
-        known = list(getattr(_group(model, parents), "model_fields", {}))
+        names = list(getattr(_group(model, parents), "model_fields", {}))
         elsewhere = [name for name in _names(model) if f".{name}".endswith(f".{last}")]
         if 0 < len(elsewhere) <= MOST_ELSEWHERE:
             return f"{field}: unknown setting (did you mean {' or '.join(map(repr, elsewhere))}?)"
-        hint = nearest(str(last), known) or (f" (there are {', '.join(known)})" if len(known) <= MOST_LISTED else "")
+        hint = nearest(str(last), names)
+        if not hint and len(names) <= MOST_LISTED:
+            hint = f" (there are {', '.join(names)})"
         return f"{field}: unknown setting{hint}"
     if kind in ("list_type", "tuple_type"):
         return f"{field}: the value is not a list, got {detail['input']!r}; write [{detail['input']}]"
@@ -174,7 +177,7 @@ def _names(model: Any, above: str = "") -> Iterator[str]:
 
 
 def _group(model: Any, parents: Iterable[Any]) -> Any:
-    """Return the model of the group of settings at `parents`, None where there is none."""
+    """Return the model of the group of settings at `parents`; None if there is none."""
     for parent in parents:
         field = getattr(model, "model_fields", {}).get(parent)
         if field is None:
@@ -193,7 +196,7 @@ def shipped(name: str) -> Path:
 
 
 def config_file(config: Path | None) -> Path | None:
-    """Return the file of a configuration, given as a path, a run directory, or the bare name of one that ships."""
+    """Return the file of a configuration: a path, a run directory, or the name of a shipped one."""
     if config is None or config.is_file():
         return config
     if (config / "run.yaml").is_file():

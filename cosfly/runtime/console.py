@@ -19,7 +19,7 @@ from cosfly.runtime.escaping import LONGEST_LOG, for_terminal
 
 
 class _Console(Console):
-    """Prints plain text: no markup, and no control character, whatever the source of a text."""
+    """Prints plain text: no markup and no control characters, because a text may come from a server."""
 
     def __init__(self, *, stderr: bool) -> None:
         super().__init__(stderr=stderr, markup=False, highlight=False, emoji=False)
@@ -37,17 +37,17 @@ SECONDS_BETWEEN_LINES = 10.0  # progress as log lines where there is no terminal
 
 
 class _Lines(logging.Handler):
-    """Writes a record as one line, however long: a pipe has no width."""
+    """Writes a record as one line of any length, because a pipe has no width."""
 
     def emit(self, record: logging.LogRecord) -> None:
         console.print(self.format(record), soft_wrap=True)
 
 
 class _File(logging.FileHandler):
-    """Writes records to a file. A file that cannot be written any more is reported once, and the command continues."""
+    """Writes records to a file. If writing fails, it is reported once, and the command continues without the file."""
 
     def format(self, record: logging.LogRecord) -> str:
-        return for_terminal(super().format(record), LONGEST_LOG)  # its words may be a server's
+        return for_terminal(super().format(record), LONGEST_LOG)  # the text may come from a server
 
     def handleError(self, record: logging.LogRecord) -> None:  # the name of the library
         logging.getLogger().removeHandler(self)
@@ -55,7 +55,7 @@ class _File(logging.FileHandler):
 
 
 def set_up_logging(level: int, file: Path | None = None) -> None:
-    """Send log lines of a level to the shared console and all of them to a file, where each has its time."""
+    """Send log lines of a level to the shared console, and all of them to a file, with times."""
     with_time = logging.Formatter("%(asctime)s %(levelname)-8s %(message)s", "%Y-%m-%dT%H:%M:%S%z")
     handlers: list[logging.Handler] = [_Lines(level)]
     handlers[0].setFormatter(logging.Formatter("%(levelname)-8s %(message)s") if console.is_terminal else with_time)
@@ -74,9 +74,9 @@ def set_levels(level: int) -> None:
     """Set the level of our own log lines; libraries log warnings only."""
     logging.getLogger().setLevel(level)
     # Some HTTP clients log whole requests, with the key in them.
-    noisy_ones = "httpx httpcore httpx2 httpcore2 huggingface_hub urllib3"
-    for noisy in (*noisy_ones.split(), "numba", "PIL", "asyncio"):
-        logging.getLogger(noisy).setLevel(logging.WARNING)
+    libraries = "httpx httpcore httpx2 httpcore2 huggingface_hub urllib3 numba PIL asyncio"
+    for library in libraries.split():
+        logging.getLogger(library).setLevel(logging.WARNING)
 
 
 Advance = Callable[..., None]  # advance(count, words=""): moves a bar and sets the words next to it
@@ -84,12 +84,15 @@ Advance = Callable[..., None]  # advance(count, words=""): moves a bar and sets 
 
 @contextlib.contextmanager
 def progress_bar(label: str, total: int | None, done: int = 0) -> Iterator[Advance]:
-    """Show progress: a bar on a terminal, else a log line every few seconds; total None: unknown. Yields
-    advance(count)."""
+    """Show progress as a bar on a terminal, else as a log line every few seconds; total None: unknown.
+
+    Yields:
+        advance(count, words): Moves the bar.
+    """
     if console.is_terminal:
-        name, bar, number = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn()
-        times = TimeElapsedColumn(), TimeRemainingColumn()
-        with Progress(name, bar, number, *times, console=console, transient=True) as progress:
+        name = TextColumn("{task.description}", markup=False)
+        columns = (name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=console, transient=True) as progress:
             task = progress.add_task(label, total=total, completed=done)
 
             def move(count: int, words: str = "") -> None:
@@ -97,7 +100,8 @@ def progress_bar(label: str, total: int | None, done: int = 0) -> Iterator[Advan
 
             yield move
         return
-    position, last_s = done, time.monotonic()
+    position = done
+    last_s = time.monotonic()
 
     def advance(count: int, words: str = "") -> None:
         nonlocal position, last_s

@@ -22,28 +22,33 @@ T = TypeVar("T")
 class Journal:
     """An append-only JSON-lines file whose every line carries its own checksum.
 
-    A line is on the disk before `append` returns, or with `sync=False` held by the system, which survives a kill of
-    this process; `sync` then waits for the disk. A line that a kill cut short, or that was damaged, is skipped by
-    `read` and counted in `num_damaged`; its item is done again. `is_cut_short`: the last of these has no end, as after
-    a kill. `line_num`, `line_byte`: number and first byte of the line that was read last.
+    `append` returns when the line is on the disk, or with `sync=False` when the system holds it, which survives a kill
+    of this process; `sync` then waits for the disk. `read` skips lines that a kill cut short or that were damaged and
+    counts them in `num_damaged`; their items are done again. `is_cut_short`: The last damaged line has no end, as after
+    a kill. `line_num`, `line_byte`: Number and first byte of the line that was read last.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.num_damaged = self.line_num = self.line_byte = 0
+        self.num_damaged = 0
+        self.line_num = 0
+        self.line_byte = 0
         self.is_cut_short = False
         self._file: Any = None
         self._lock = threading.Lock()
 
     def read(self) -> Iterator[dict]:
         """Yield the records in order; damaged lines are skipped."""
-        self.num_damaged, self.is_cut_short = 0, False
+        self.num_damaged = 0
+        self.is_cut_short = False
         if not self.path.exists():
             return
         end = 0
         for number, line in enumerate(read_lines(self.path, what="journal"), 1):
-            self.line_num, self.line_byte, record = number, end, _record_of(line)
+            self.line_num = number
+            self.line_byte = end
             end += len(line)
+            record = _record_of(line)
             if record is None:
                 self.num_damaged += 1
                 self.is_cut_short = not line.endswith(b"\n")
@@ -54,7 +59,7 @@ class Journal:
         """Yield `read_record` of each record; its ValidationError becomes an InputError that names the line."""
         for record in self.read():
             try:
-                found = read_record(record)
+                value = read_record(record)
             except ValidationError as error:
                 detail = error.errors(include_url=False, include_input=False)[0]
                 field = ".".join(str(part)[:40] for part in detail["loc"]) or "top level"
@@ -64,10 +69,10 @@ class Journal:
                     got=f"{field}: {plain(detail['msg'])[:200]}",
                     fix="delete this line and run the same command again, which repeats the item of the line",
                 ) from None
-            yield found
+            yield value
 
     def read_at(self, line_bytes: Iterable[int]) -> Iterator[dict]:
-        """Yield the records of the lines that begin at these bytes; InputError where one is not there any more."""
+        """Yield the records of the lines that begin at these bytes; InputError if one is damaged."""
         if not self.path.exists():
             return
         with open_file(self.path, what="journal") as file:
@@ -100,7 +105,7 @@ class Journal:
         return line_byte
 
     def sync(self) -> None:
-        """Wait until all that was appended is on the disk."""
+        """Wait until all appended lines are on the disk."""
         with storage_errors(self.path):
             if self._file is not None:
                 os.fsync(self._file.fileno())
@@ -119,7 +124,7 @@ class Journal:
 
 
 def _record_of(line: bytes) -> dict | None:
-    """Return the record of a line; None where it was cut short or damaged."""
+    """Return the record of a line; None if the line is cut short or damaged."""
     digest, _, body = line.removesuffix(b"\n").partition(b" ")
     if not line.endswith(b"\n") or digest != sha256_bytes(body)[:16].encode():
         return None
@@ -131,8 +136,8 @@ def _record_of(line: bytes) -> dict | None:
 
 
 def _cut_torn_line(path: Path) -> None:
-    """Remove a line that a kill cut short, which would become valid when more is written."""
-    if not path.exists() or not path.stat().st_size:  # nothing can be mapped of an empty file
+    """Remove a last line without an end, to which the next line would be appended."""
+    if not path.exists() or not path.stat().st_size:  # an empty file cannot be mapped
         return
     with open(path, "r+b") as file:
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:

@@ -1,13 +1,11 @@
 """JSON files: read into plain values and into pydantic models, and written.
 
-Refused beyond what JSON forbids: numbers that are not finite (NaN, 1e999) or are integers of more than DIGITS digits,
-nesting deeper than DEPTH, half a surrogate pair, which no file could hold again, and more brackets than a text of its
-size has.
+Reading refuses more than JSON forbids: numbers that are not finite (NaN, 1e999), integers of more than DIGITS digits,
+nesting deeper than DEPTH, half a surrogate pair, which cannot be written again, and too many lists and objects.
 """
 
 from __future__ import annotations
 
-import builtins
 import functools
 import json
 import math
@@ -26,13 +24,14 @@ from cosfly.runtime.io import CHECK_PATH, FILE_MB, decoded, read_bytes, read_lin
 Model = TypeVar("Model", bound=BaseModel)
 Kind = TypeVar("Kind")
 
-DEPTH = 64  # the deepest honest file, a CityJSON CompositeSolid, has 10
-DIGITS = 40  # ids have up to 20; a float holds no number of 309
-# An empty list or object takes 80 bytes of memory: 0.8 GB, or ten times the file.
-MOST_GROUPS, LEAST_GROUP_BYTES = 10_000_000, 8
+DEPTH = 64  # a CityJSON CompositeSolid, the deepest usual file, has 10
+DIGITS = 40  # ids have up to 20; a float cannot store a number of 309
+# An empty list or object takes 80 bytes of memory, so these are limits of 0.8 GB, or of ten times the file.
+MOST_GROUPS = 10_000_000
+LEAST_GROUP_BYTES = 8  # of text for each list or object
 MISSING = "the field is missing or null"
 
-# What may be a number that overflows or has too many digits; harmless text that looks so is parsed twice.
+# A possible number that overflows or has too many digits. Harmless text that looks like one is parsed twice.
 _SUSPECT = re.compile(rb"[0-9]{%d}|[0-9][eE]\+?[0-9]{3}" % (DIGITS + 1))
 _COMPACT = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":"))
 
@@ -58,9 +57,9 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes, *, unique_keys: bool = False) -> Any:
-    """Return the value of JSON text in UTF-8; ValueError where it is none or holds what this module refuses.
+    """Return the value of JSON text in UTF-8; ValueError if it is invalid or this module refuses it.
 
-    unique_keys: Refuse a key that is given twice in one object, of which readers in other languages may take either.
+    unique_keys: Refuse an object with the same key twice, because other readers may take either value.
     """
     data = text.encode() if isinstance(text, str) else text.removeprefix(b"\xef\xbb\xbf")
     num_groups = data.count(b"[") + data.count(b"{")
@@ -78,8 +77,8 @@ def is_deep(value: Any) -> bool:
     """Return whether lists and objects are nested deeper than DEPTH."""
     level = [value]
     for _ in range(DEPTH + 1):
-        members = (one for group in level for one in (group.values() if type(group) is dict else group))
-        level = [one for one in members if type(one) is dict or type(one) is list]
+        members = (member for group in level for member in (group.values() if type(group) is dict else group))
+        level = [member for member in members if type(member) is dict or type(member) is list]
         if not level:
             return False
     return True
@@ -134,33 +133,34 @@ class Record(BaseModel):
 def validated(kind: type[Kind], value: Any, where: str | Path) -> Kind:
     """Return a JSON value as a model or a dataclass; InputError names the file and the first wrong field.
 
-    Validation ends at the first wrong member of a list or object: each error takes kilobytes.
+    Validation ends at the first wrong member of a list or object, because each error takes kilobytes.
     """
     try:
         return _validator(kind).validate_python(value)  # type: ignore[arg-type]
     except ValidationError as error:
         detail = error.errors(include_url=False, include_context=False)[0]
-        places = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in detail["loc"])
-        field, found = "".join(places).removeprefix(".") or "top level", detail["input"]
+        parts = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in detail["loc"])
+        field = "".join(parts).removeprefix(".") or "top level"
+        value = detail["input"]
         is_object_error = detail["type"] in ("model_type", "dataclass_type")
         what = "the value is not an object" if is_object_error else plain(detail["msg"])
-        got = (reprlib if isinstance(found, dict | list) else builtins).repr(found)[:80]
+        got = (reprlib.repr(value) if isinstance(value, dict | list) else repr(value))[:80]
         raise InputError(what, where=f"{where}: {field}", got=got) from None
 
 
 @functools.cache
 def _validator(kind: type) -> SchemaValidator:
-    # The models inside would bring validators of their own, which collect all errors.
+    # Prebuilt validators of inner models would collect all errors.
     return SchemaValidator(_ending_early(TypeAdapter(kind).core_schema), _use_prebuilt=False)  # type: ignore[call-arg]
 
 
 def _ending_early(schema: Any) -> Any:
-    """Return a schema of pydantic's with `fail_fast` in each kind of collection."""
+    """Return a schema of pydantic with `fail_fast` in all collections."""
     if isinstance(schema, list):
-        return [_ending_early(one) for one in schema]
+        return [_ending_early(part) for part in schema]
     if not isinstance(schema, dict):
         return schema
-    copied = {key: one if key in ("default", "metadata") else _ending_early(one) for key, one in schema.items()}
+    copied = {key: part if key in ("default", "metadata") else _ending_early(part) for key, part in schema.items()}
     is_collection = copied.get("type") in ("list", "tuple", "set", "frozenset", "dict")
     return copied | {"fail_fast": True} if is_collection else copied
 
@@ -171,13 +171,19 @@ def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Itera
     Args:
         what, fix: Words for the message where the file is missing or its `schema_version` is not the model's.
     """
-    version = field.default if (field := model.model_fields.get("schema_version")) else None
+    field = model.model_fields.get("schema_version")
+    version = field.default if field else None
     for number, data in enumerate(read_lines(path, what=what, fix=fix), 1):
         where = f"{path}:{number}"
         value = parse_document(data, where)
         if isinstance(value, dict) and (found := value.get("schema_version", version)) != version:
-            what, where, fix = f"{what} of another version", f"{where}: schema_version", f"make it again: {fix}"
-            raise InputError(what, where=where, got=repr(found)[:80], expected=repr(version), fix=fix)
+            raise InputError(
+                f"a line of the {what} has another version",
+                where=f"{where}: schema_version",
+                got=repr(found)[:80],
+                expected=repr(version),
+                fix=f"make it again: {fix}",
+            )
         yield decoded(data, where), validated(model, value, where)
 
 
@@ -200,12 +206,14 @@ def check_schema(value: Any, form: FileFormat, path: Path | str) -> dict:
         expected = f"an object with schema {form.schema}"
         raise InputError("this is not a file of cosfly", where=path, got=type(value).__name__, expected=expected)
     for key, wanted in form.header.items():
-        found, where = value.get(key), f"{path}: {key}"
+        found = value.get(key)
+        where = f"{path}: {key}"
         if found is None:
             fix = f"check that this file is the {form.what}"
             raise InputError(MISSING, where=where, expected=repr(wanted), fix=fix)
         is_schema = key == "schema"
-        if found != wanted if is_schema else str(found).split(".")[0] != wanted.split(".")[0]:
+        is_right = found == wanted if is_schema else str(found).split(".")[0] == wanted.split(".")[0]
+        if not is_right:
             what = "this is another kind of file" if is_schema else "the version of the file is not supported"
             raise InputError(what, where=where, got=repr(found)[:80], expected=repr(wanted))
     return value

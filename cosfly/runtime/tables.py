@@ -20,9 +20,9 @@ import pyarrow.parquet as pq
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import FILE_MB, MB, SMALL_UNPACKED_MB, UNPACK_FACTOR, open_file, over_limit
 
-MOST_FOOTER_BYTES = 100 * MB  # of the footer's strings and lists; ours have some 10 kB
-WORTH_THREADS_BYTES = 8 * MB  # of a row group: below, one thread takes less time, and each keeps memory of its own
-LEAST_ROW_BYTES = 1_000  # of a row as Python values: packed, a million equal ones are a few kB
+MOST_FOOTER_BYTES = 100 * MB  # of the strings and lists of a footer; ours have some 10 kB
+WORTH_THREADS_BYTES = 8 * MB  # of a row group; for smaller ones a single thread is faster and needs less memory
+LEAST_ROW_BYTES = 1_000  # of a row as Python values; a million equal rows take only a few kB in the file
 GROUPS_HELD = 4  # row groups that reading single rows keeps in memory
 SMALLER_GROUPS = "write it again with smaller row groups, as pyarrow's row_group_size does"
 
@@ -37,19 +37,21 @@ def arrow_errors(path: Path | str) -> Iterator[None]:
 
 
 class _Table(pq.ParquetFile):
-    """A parquet file. packed: the same file, read with texts as dictionaries and indices."""
+    """A parquet file. packed: The same file, read with texts as dictionaries and indices."""
 
-    def __init__(self, file: io.IOBase, **how: Any) -> None:
-        how |= {"thrift_string_size_limit": MOST_FOOTER_BYTES, "thrift_container_size_limit": MOST_FOOTER_BYTES}
-        super().__init__(file, **how)
+    def __init__(self, file: io.IOBase) -> None:
+        limits = {"thrift_string_size_limit": MOST_FOOTER_BYTES, "thrift_container_size_limit": MOST_FOOTER_BYTES}
+        super().__init__(file, **limits)
         leaves = [self.schema.column(j) for j in range(len(self.schema))]
-        texts = [leaf.path for j, leaf in enumerate(leaves) if leaf.logical_type.type == "STRING" or self._repeats(j)]
-        self.packed = pq.ParquetFile(file, metadata=self.metadata, read_dictionary=texts, **how)
+        texts = [
+            leaf.path for j, leaf in enumerate(leaves) if leaf.logical_type.type == "STRING" or self._has_dictionary(j)
+        ]
+        self.packed = pq.ParquetFile(file, metadata=self.metadata, read_dictionary=texts, **limits)
 
-    def _repeats(self, j: int) -> bool:
-        """Return whether a column stores bytes by a dictionary; pictures are stored plainly, which is faster."""
-        groups = (self.metadata.row_group(k).column(j) for k in range(self.num_row_groups))
-        return any(one.physical_type == "BYTE_ARRAY" and one.has_dictionary_page for one in groups)
+    def _has_dictionary(self, j: int) -> bool:
+        """Return whether a column stores bytes by a dictionary; pictures are stored without, which is faster."""
+        chunks = (self.metadata.row_group(k).column(j) for k in range(self.num_row_groups))
+        return any(chunk.physical_type == "BYTE_ARRAY" and chunk.has_dictionary_page for chunk in chunks)
 
 
 @contextlib.contextmanager
@@ -71,7 +73,7 @@ def num_rows(path: Path) -> int:
 def row_groups(
     path: Path, columns: list[str] | None = None, *, tree: Path | None = None, wanted: Collection[int] | None = None
 ) -> Iterator[pa.Table]:
-    """Yield the row groups of a parquet file, the wanted ones or all, one at a time; InputError over the limit."""
+    """Yield row groups of a parquet file one at a time, all or those in `wanted`; InputError over the limit."""
     with open_table(path, tree=tree) as table:
         for k in range(table.num_row_groups):
             if wanted is None or k in wanted:
@@ -81,21 +83,22 @@ def row_groups(
 def read_row_group(path: Path | str, table: _Table, k: int, columns: list[str] | None) -> pa.Table:
     """Read one row group of an open table; texts are unpacked once their total size is known."""
     _check_size(path, table, k)
-    about = table.metadata.row_group(k)
+    metadata = table.metadata.row_group(k)
+    use_threads = metadata.total_byte_size > WORTH_THREADS_BYTES
     with arrow_errors(path):
-        group = table.packed.read_row_group(k, columns=columns, use_threads=about.total_byte_size > WORTH_THREADS_BYTES)
+        group = table.packed.read_row_group(k, columns=columns, use_threads=use_threads)
         size = sum(_text_bytes(chunk) for column in group.columns for chunk in column.chunks)
-    stored = sum(about.column(j).total_compressed_size for j in range(about.num_columns))
+    stored = sum(metadata.column(j).total_compressed_size for j in range(metadata.num_columns))
     if size > max(SMALL_UNPACKED_MB * MB, UNPACK_FACTOR * stored):
-        got = f"{stored:,} bytes with texts of {size:,}"
+        got = f"{stored:,} bytes with texts of {size:,} bytes"
         raise over_limit(f"{path}: row group {k}", got, f"{UNPACK_FACTOR} times the row group", SMALLER_GROUPS)
     with arrow_errors(path):
-        plain = [member.with_type(_plain(member.type)) for member in group.schema]
-        return group.cast(pa.schema(plain, group.schema.metadata))
+        fields = [field.with_type(_unpacked_type(field.type)) for field in group.schema]
+        return group.cast(pa.schema(fields, group.schema.metadata))
 
 
 def _text_bytes(values: pa.Array) -> int:
-    """Return the bytes of packed texts, also inside of lists and structs."""
+    """Return the number of bytes of packed texts after unpacking, also inside lists and structs."""
     if pa.types.is_dictionary(values.type):
         lengths = pc.binary_length(values.dictionary).cast(pa.int64())
         return pc.sum(lengths.take(values.indices)).as_py() or 0
@@ -104,12 +107,12 @@ def _text_bytes(values: pa.Array) -> int:
     return _text_bytes(values.flatten()) if pa.types.is_list(values.type) else 0
 
 
-def _plain(kind: pa.DataType) -> pa.DataType:
+def _unpacked_type(kind: pa.DataType) -> pa.DataType:
     """Return the type with its texts unpacked."""
     if pa.types.is_struct(kind):
-        return pa.struct([member.with_type(_plain(member.type)) for member in kind])
+        return pa.struct([field.with_type(_unpacked_type(field.type)) for field in kind])
     if pa.types.is_list(kind):
-        return pa.list_(kind.value_field.with_type(_plain(kind.value_type)))
+        return pa.list_(kind.value_field.with_type(_unpacked_type(kind.value_type)))
     return kind.value_type if pa.types.is_dictionary(kind) else kind
 
 
@@ -121,8 +124,8 @@ def row_batches(path: Path | str, table: _Table, k: int, columns: list[str], num
 
 
 def _check_size(path: Path | str, table: _Table, k: int) -> None:
-    about = table.metadata.row_group(k)
-    size = max(about.total_byte_size, about.num_rows * LEAST_ROW_BYTES)
+    metadata = table.metadata.row_group(k)
+    size = max(metadata.total_byte_size, metadata.num_rows * LEAST_ROW_BYTES)
     if size > FILE_MB * MB:
         raise over_limit(f"{path}: row group {k}", f"{size / MB:,.0f} MB", f"{FILE_MB:,} MB", SMALLER_GROUPS)
 
@@ -135,26 +138,30 @@ def rows_of(path: Path, columns: list[str] | None = None, *, tree: Path | None =
 
 
 class TableRows(Sequence[dict[str, Any]]):
-    """The rows of a parquet file by number. It stays open with a few row groups in memory; each process has its own."""
+    """The rows of a parquet file by number. Each process opens the file once and keeps a few row groups in memory."""
 
     def __init__(self, path: Path, columns: list[str]) -> None:
-        self._path, self._columns, self._stack = path, columns, contextlib.ExitStack()
-        self._process, self._lock = -1, threading.Lock()
-        self._firsts: list[int] = []  # number of the first row of each group, and of all rows
+        self._path = path
+        self._columns = columns
+        self._stack = contextlib.ExitStack()
+        self._process = -1
+        self._lock = threading.Lock()
+        self._firsts: list[int] = []  # number of the first row of each group, then the number of rows
         self._group: Callable[[int], pa.Table]
 
     def __reduce__(self) -> tuple:
         return type(self), (self._path, self._columns)
 
     def _open(self) -> None:
-        if self._process != os.getpid():  # a fork shares the place in the open file with its parent
+        if self._process != os.getpid():  # a fork shares the position in the open file with its parent
             table = self._stack.enter_context(open_table(self._path))
             if missing := sorted(set(self._columns) - set(table.schema_arrow.names)):
                 raise InputError("the table lacks columns", where=self._path, got=", ".join(missing)[:200])
             counts = (table.metadata.row_group(k).num_rows for k in range(table.num_row_groups))
             self._firsts = list(accumulate(counts, initial=0))
             self._group = lru_cache(GROUPS_HELD)(lambda k: read_row_group(self._path, table, k, self._columns))
-            self._process, self._lock = os.getpid(), threading.Lock()
+            self._process = os.getpid()
+            self._lock = threading.Lock()
 
     def __len__(self) -> int:
         self._open()
