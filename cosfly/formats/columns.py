@@ -66,8 +66,7 @@ def text_id(record: dict, where: str) -> str:
 def numbers(value: Any, *shape: int | None) -> np.ndarray | None:
     """Return nested lists of numbers as float64 of a shape, in which None is any length.
 
-    Returns:
-        None for another shape or content, or if a number is not finite or exceeds LARGEST.
+    Return None for another shape or content, or if a number is not finite or exceeds LARGEST.
     """
     try:
         array = np.array(value, dtype=np.float64)

@@ -299,8 +299,6 @@ def read_track(folder: Path, *, strict: bool = True) -> Track:
     Args:
         strict: True requires every rule of the layout. False accepts older names and missing optional fields and lists
             them in `Track.issues`. Poses and times must be finite in both cases.
-    Raises:
-        InputError: The message names the file, the point and the field.
     """
     path = folder / "trajectory.json"
     raw = read_object(path, what="trajectory", tree=tree_of_track(folder))

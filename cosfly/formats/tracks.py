@@ -60,14 +60,7 @@ def track_of(folder: Path) -> TrackName:
 
 
 def read_twin(track: Track) -> Track | None:
-    """Read the clean twin of a perturbed track.
-
-    Returns:
-        None if the track is clean or has no twin.
-
-    Raises:
-        VerifyError: If the twin has other frames, or the folder named as the clean track holds another one.
-    """
+    """Read the clean twin of a perturbed track; None without one, VerifyError if the two do not belong together."""
     if track.is_original or track.folder is None:
         return None
     twin = _clean_sibling(track, type(track.folder)(os.path.abspath(track.folder)))

@@ -247,11 +247,7 @@ def _fill_hull(points, count, touch, mark, cells):  # pragma: no cover (compiled
 
 
 def compare(left: OccupancyGrid, right: OccupancyGrid) -> tuple[float, float]:
-    """Return the share of cells that are equal in two grids, and the IoU of their occupied cells, 1 if there are none.
-
-    Raises:
-        ValueError: If the grids do not cover the same cells.
-    """
+    """Return the share of equal cells of two grids of one frame, and the IoU of their occupied cells, 1 without any."""
     same_frame = (left.x_min_m, left.y_min_m, left.resolution_m) == (right.x_min_m, right.y_min_m, right.resolution_m)
     if not same_frame or left.occupied.shape != right.occupied.shape:
         raise ValueError("the grids do not cover the same cells; pass one of them as `like` to make the other")

@@ -285,13 +285,7 @@ class KeptAnswers:
         self._asking: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()  # by key, held during a request
 
     async def ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
-        """Return the recorded answer, or ask the engine.
-
-        Raises:
-            NoAnswer: This request gets no answer.
-            BudgetSpent: The request might exceed a limit.
-            TeacherError: No request will be answered.
-        """
+        """Return the recorded answer, or ask the engine; NoAnswer fails this request, TeacherError all requests."""
         engine = self.engine
         key = answer_key(engine.model, request)
         num_pictures = len(request.digests)

@@ -110,10 +110,7 @@ class ChatClient:
     kind: Literal["endpoint"] = "endpoint"
 
     def __init__(self, url: str, cfg: EndpointConfig, troubles: Troubles | None = None) -> None:
-        """
-        Raises:
-            TeacherError: The URL is invalid or contains a secret, or the key or the proxy cannot be used.
-        """
+        """Raise TeacherError if the URL is invalid or contains a secret, or the key or the proxy cannot be used."""
         try:
             protocol.check_url(url)
         except ValueError as error:
@@ -146,9 +143,7 @@ class ChatClient:
     async def answer(self, request: Request) -> Reply:
         """Send a request until it is answered.
 
-        Raises:
-            NoAnswer: The number of tries or the time limit is exceeded, or the server refuses this request.
-            TeacherError: No request will be answered.
+        NoAnswer: The tries or the time are used up, or the server refuses it. TeacherError: All requests will fail.
         """
         num_tries = 0
         deadline_s = math.inf
@@ -256,11 +251,7 @@ class ChatClient:
         return replace(reply, finish_reason=CONTEXT_FULL)
 
     async def start(self) -> None:
-        """Read the server's list of models and choose the one of the settings.
-
-        Raises:
-            TeacherError: The server does not answer, refuses the key, is no chat endpoint, or lacks the model.
-        """
+        """Read the server's list of models and choose the one of the settings; TeacherError if that fails."""
         wanted = self.cfg.model
         try:
             response = await self._exchange("models")

@@ -130,11 +130,8 @@ async def started(engine: Engine) -> AsyncIterator[None]:
 def run_until_interrupted(main: Coroutine[Any, Any, Result]) -> Result:
     """Run a coroutine as `asyncio.run` does: the first Ctrl-C cancels its tasks in order, a second ends the process.
 
-    asyncio's second Ctrl-C interrupts the cancelled tasks and prints a traceback of each; journals survive an end at
-    any time.
-
-    Raises:
-        KeyboardInterrupt: After the first Ctrl-C, once all tasks have ended.
+    After the first Ctrl-C it raises KeyboardInterrupt when all tasks have ended. asyncio's second Ctrl-C would end
+    the cancelled tasks and print a traceback of each; journals survive an end at any time.
     """
     if threading.current_thread() is not threading.main_thread():
         return asyncio.run(main)

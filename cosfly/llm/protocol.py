@@ -26,8 +26,7 @@ MOST_NAME = 256  # characters of a name, such as a model or a finish reason; lon
 def check_url(url: str) -> None:
     """Check that a URL is usable and contains no secret, since it is written to `run.yaml` and shown in messages.
 
-    Raises:
-        ValueError: The message names the problem without the parts of the URL that may be secret.
+    The message of the ValueError omits the parts of the URL that may be secret.
     """
     got = "" if "@" in url else f", got {re.split('[?#]', url)[0][:200]!r}"
     if re.search("[@?#]", url):
@@ -107,11 +106,7 @@ class BadReply(Exception):
 
 
 def read_body(content: bytes) -> Any:
-    """Read JSON of a server: long numbers and duplicate keys are accepted, half a surrogate pair becomes U+FFFD.
-
-    Raises:
-        ValueError: The content is not JSON, or is nested too deeply.
-    """
+    """Read JSON of a server: long numbers and duplicate keys are accepted, half a surrogate pair becomes U+FFFD."""
 
     def reject(constant: str) -> float:
         raise ValueError(f"{constant} is not a JSON value")
@@ -147,11 +142,7 @@ def error_words(value: Any) -> str:
 
 
 def read_completion(response: Response, structured: str) -> Reply:
-    """Return the reply in a response, after checks of all types and sizes. structured: As in `Reply`.
-
-    Raises:
-        BadReply: The response holds no reply.
-    """
+    """Return the reply in a response; BadReply if a type or a size is wrong. structured: As in `Reply`."""
     value = _object(response)
     if value is None:
         raise BadReply("the body is not JSON")

@@ -214,10 +214,7 @@ def _feature_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
 def _to_metres(cfg: BoxesConfig, places: np.ndarray, path: Path) -> Callable[[np.ndarray], np.ndarray]:
     """Return the function that converts coordinates of the file, (n, 2), to metres east and north.
 
-    Degrees are projected on the plane that touches the Earth in the middle of the map.
-
-    Args:
-        places: All coordinates of the file, (n, 2).
+    Degrees are projected on the plane that touches the Earth in the middle of all coordinates of the file, `places`.
     """
     low, high = places.min(axis=0), places.max(axis=0)
     size = float((high - low).max())

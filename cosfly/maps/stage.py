@@ -72,11 +72,7 @@ def load_map(cfg: MapsConfig, *, seed: int = 0, follow_links: bool = False) -> B
 
 
 def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same", follow_links: bool = False) -> Path:
-    """Read the source's files, if it has any; write `boxes_3d.json` and the overview `map.png`.
-
-    Raises:
-        InputError: If a file is malformed, or does not contain the height of the ground.
-    """
+    """Read the source's files, if it has any; write `boxes_3d.json` and the overview `map.png`."""
     inputs = getattr(cfg, cfg.source).inputs()
     stage = StageFolder.open(out, "maps", config=cfg, inputs=inputs, seed=seed, resume=resume)
     product = out / "boxes_3d.json"

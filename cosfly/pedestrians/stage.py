@@ -56,11 +56,7 @@ class PedestrianResult(NamedTuple):
 def make_pedestrian(
     path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, pace: str | None = None
 ) -> PedestrianResult:
-    """Make one trajectory: draw its ends, find the route, apply a pace (None: drawn by its share), sample it.
-
-    Raises:
-        NoPathError: If every pair of ends is rejected.
-    """
+    """Make one trajectory: draw its ends, find the route, apply a pace (None: drawn by its share), sample it."""
     seconds = Counter[str]()
     pace_rng = rng.spawn(1)[0]  # a child takes no draw from its parent: shares of paces change no route
     route_m, retries = _draw_route(path_id, ground, cfg, rng, seconds)
@@ -180,11 +176,7 @@ def run(
     watch: Watch = Watch(), resume: Resume = "if-same", roi: Path | None = None,
 ) -> Path:  # fmt: skip
     """Read `step2_simplified.json` (and `roi`, a region of interest); write `path.json`, a report and `paths.png`, and
-    `others.json` where there are bystanders or cars; return the path of `path.json`.
-
-    Raises:
-        NoPathError: If nothing is walkable.
-        NothingKept: If no trajectory can be made; single failures are counted.
+    `others.json` if there are bystanders or cars; return the path of `path.json`. Failed trajectories are counted.
     """
     inputs = {"map": simplified_map} | ({"roi": roi} if roi else {})
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)

@@ -108,9 +108,9 @@ def read_bytes(
     return data
 
 
-def read_text(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> str:
+def read_text(path: Path, *, what: str = "file", tree: Path | None = None) -> str:
     """Read a whole file of UTF-8 text."""
-    return decoded(read_bytes(path, what=what, fix=fix, tree=tree), path)
+    return decoded(read_bytes(path, what=what, tree=tree), path)
 
 
 def decoded(data: bytes, where: object) -> str:
@@ -124,9 +124,9 @@ def decoded(data: bytes, where: object) -> str:
         raise InputError("the file is not UTF-8 text", where=str(where), got=got, fix=fix) from None
 
 
-def read_lines(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> Iterator[bytes]:
+def read_lines(path: Path, *, what: str = "file", fix: str = CHECK_PATH) -> Iterator[bytes]:
     """Yield the lines of a file, each with its line end; a line has at most LINE_MB."""
-    with open_file(path, what=what, fix=fix, tree=tree) as file:
+    with open_file(path, what=what, fix=fix) as file:
         for number in itertools.count(1):
             with disk_errors(path, what, fix):
                 line = file.readline(LINE_MB * MB + 1)

@@ -42,12 +42,7 @@ class CarlaConnection:
 
 
 def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:
-    """Connect to the server at a port and have it load the town.
-
-    Raises:
-        EnvironmentMissing: If the package is missing, no server answers, or its version differs.
-        ConfigError: If the server has no such town.
-    """
+    """Connect to the server at a port, check its version, and have it load the town."""
     try:
         import carla
     except ModuleNotFoundError as error:

@@ -107,12 +107,7 @@ def is_refusal(answer: str | bytes | None) -> bool:
 
 
 def connect(cfg: UnrealCvConfig, port: int) -> UnrealCvConnection:
-    """Connect to the server at a port and have it open the level.
-
-    Raises:
-        EnvironmentMissing: If the package is missing, no server answers, or it is too old.
-        ConfigError: If the server has no such level.
-    """
+    """Connect to the server at a port, check its version, and have it open the level."""
     with _server_errors("no UnrealCV server answers", f"{cfg.host}:{port} (UnrealCV unknown)"):
         connection = UnrealCvConnection(cfg, port)
         version, level = connection.ask("vget /unrealcv/version", "vget /level/name")

@@ -128,11 +128,7 @@ Choose ranges wide enough that a random town meets them, and as narrow as the us
 
 
 def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tuple[WorldPlan, dict[str, Any]]:
-    """Ask a model for the plan of a prompt, or take its earlier answer to the same prompt and seed.
-
-    Returns:
-        The plan, and the trace: the question and the answer, word for word.
-    """
+    """Return a model's plan of a prompt, asked for or recorded, and the trace: the question and the answer."""
     endpoint = EndpointConfig(model=cfg.model, max_tokens=2048)
     fields = "\n".join(
         f"- {name}: {field.description}; else {field.default!r}" for name, field in WorldPlan.model_fields.items()
