@@ -6,14 +6,18 @@ Each case names the kind of server or model that sends it, as public issue threa
 import json
 import time
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
+from specimens_distill import make_caption
 from tables import each
 
-from cosfly.formats.captions import Coc
-from cosfly.llm.answer_text import normalize_action, parse_answer
+from cosfly.formats.captions import TOKENS, Coc, read_captions, write_captions
+from cosfly.llm.answer_text import answer_schema, normalize_action, parse_answer
 from cosfly.llm.contract import Reply
 from cosfly.llm.protocol import BadReply, Response, error_words, read_body, read_completion, read_models
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.model_json import find_object
 
 GOOD = {
@@ -439,3 +443,52 @@ def test_no_text_takes_quadratic_time(text):
         find_object(part, GOOD)
         seconds.append(time.process_time() - start_s)
     assert seconds[1] < 9 * seconds[0] + 0.5
+
+
+@given(st.text(max_size=30))
+def test_nothing_else_is_an_action(text):
+    assert normalize_action(text) in (None, *TOKENS)
+    assert normalize_action(text + " quickly") is None
+
+
+def test_what_the_reasoning_leads_to_stands_before_the_decision():
+    schema = answer_schema("hover", more={"therefore": {"enum": list(TOKENS)}})
+    assert list(schema["properties"]) == schema["required"] == [*list(GOOD)[:2], "therefore", "flight_decision"]
+    assert schema["properties"]["flight_decision"]["enum"] == ["hover"]
+    assert len(schema["properties"]["therefore"]["enum"]) == 17
+
+
+@each(("fields", "outcome"), [
+    ({"therefore": "Track straight"}, "track_straight"),
+    ({}, "missing_field"),
+    ({"therefore": "go on"}, "therefore_not_in_closed_set"),
+    ({"therefore": ["hover"]}, "therefore_not_in_closed_set"),
+    ({"therefore": "hover", "claims": []}, "extra_field"),
+])  # fmt: skip
+def test_further_fields_are_those_that_were_asked_for(fields, outcome):
+    parsed = parse_answer(changed(**fields), more=("therefore",))
+    assert outcome == (parsed.therefore if parsed.coc else parsed.reason)
+    assert parse_answer(changed(**fields)).coc is None or not fields
+
+
+def test_captions_round_trip_and_errors_name_the_line(tmp_path):
+    path = tmp_path / "captions.jsonl"
+    captions = [make_caption("Town01", "trajectory_1", "ORI", frame) for frame in (4, 5)]
+    assert write_captions(path, captions) == 2
+    assert list(read_captions(path)) == captions
+    path.write_text(path.read_text().replace('"status":"accepted"', '"status":"maybe"'))
+    with pytest.raises(InputError, match=r"captions\.jsonl:1: status"):
+        list(read_captions(path))
+    path.write_text("{")
+    with pytest.raises(InputError, match=":1: this is not valid JSON"):
+        list(read_captions(path))
+    with pytest.raises(InputError, match="run cosfly caption"):
+        list(read_captions(tmp_path / "nowhere.jsonl"))
+
+
+@each(
+    ("name", "value"), [("depth_range_m", float("nan")), ("depth_range_m", float("inf")), ("picture_px", (2**64, 36))]
+)
+def test_no_caption_holds_what_is_no_number(name, value):
+    with pytest.raises(ValidationError, match=name):
+        make_caption("Town01", "trajectory_1", "ORI", 4, **{name: value})

@@ -1,22 +1,38 @@
-"""cosfly/maps/derived_ground.py: ground for maps that have buildings and no streets."""
+"""Ground: derived where a map has buildings and no streets, ground that slopes, and the rim beyond a map."""
 
 import json
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from specimens_slopes import on_ground, sampled, sloped_city
+from numpy.testing import assert_allclose
+from specimens_slopes import SHAPES, TILT, flat_town, on_ground, plane_m, sampled, sloped_city, sloped_town
+from test_renderers_contract import NAMES
 
-from cosfly.formats.boxes import BoxMap, read_boxes
+from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
-from cosfly.geometry.grid import empty_grid, lies_off_ground, surface_kinds
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory
+from cosfly.formats.traces import DroneTrace
+from cosfly.geometry.axes import DT_S, intrinsic_matrix, world_from_camera
+from cosfly.geometry.grid import blocks_walking, empty_grid, lies_off_ground, surface_kinds
+from cosfly.geometry.kernels import index_boxes, obstacle_index, signed_distances
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.derived_ground import CREDITS, NEAR_M, PAVEMENT_M, with_derived_ground
 from cosfly.maps.stage import MapsConfig, load_map, run
+from cosfly.maps.stage import load_map as load_source
 from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
+from cosfly.planners.contract import PLANNERS, PlanConfig
+from cosfly.planners.stage import plan_trajectory
+from cosfly.render.contract import NO_INSTANCE, instance_ids
+from cosfly.render.rim import FLIGHTS_TO_M, REACH_M, SOLIDS_FROM_M, check_outside_rim, rim_of
+from cosfly.render.stage import open_renderer
 from cosfly.render.surfaces import drape, is_draped
+from cosfly.runtime.config import build
+from cosfly.runtime.errors import EnvironmentMissing, RenderError
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig, simplify
 
@@ -86,3 +102,189 @@ def test_people_of_a_foreign_city_of_buildings_alone_walk_on_its_pavements(share
     places = np.concatenate([walk.positions_m for walk in walks])
     x, y = ground.grid.cells_at(places).T
     assert np.isin(ground.footing[y, x], [0, 1]).mean() > 0.95
+
+
+@pytest.fixture(scope="module", params=SHAPES)
+def town(request) -> BoxMap:
+    return sloped_town(request.param)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_slabs_fill_the_ground_and_hide_nothing_over_it(shape):
+    ground, rng = sampled(shape), np.random.default_rng(2)
+    index = index_boxes(*ground.slabs())
+    places = rng.uniform(-150.0, 150.0, (2000, 2))
+    feet = np.column_stack([places, ground.height_at(places)])
+    assert_allclose(signed_distances(index, feet)[0], 0.0, atol=0.04)
+    buried = feet - [0.0, 0.0, 2.0]
+    # Between slabs in a hollow are wedges of a few centimetres.
+    assert (signed_distances(index, buried)[0] < 0.05).all()
+    over = signed_distances(index, feet + np.array([0.0, 0.0, 3.0]))[0]
+    assert (over > 2.8).all()
+    assert (over <= 3.04).all()
+
+
+def test_a_sloped_map_survives_its_file_and_a_flat_one_says_nothing_of_it(tmp_path: Path):
+    town = sloped_town("hill")
+    write_boxes(tmp_path / "hill.json", town)
+    back = read_boxes(tmp_path / "hill.json")
+    assert (back.ground.heights_m == town.ground.heights_m).all()
+    assert back.header == town.header
+    write_boxes(tmp_path / "flat.json", flat_town())
+    assert "ground" not in json.loads((tmp_path / "flat.json").read_text())
+
+
+def test_what_stands_on_a_slope_is_in_the_way_and_what_hangs_over_it_is_not(town: BoxMap):
+    flat = flat_town()
+    is_small = flat.half_extents[:, :2].max(axis=1) < 3.0
+    assert (blocks_walking(town) == blocks_walking(flat))[is_small].mean() > 0.99
+    # A wide box that hangs 2.5 m over its middle reaches down to where somebody walks uphill.
+    awning = make_box_map([[0, 0, 30 + 2.6]], [[30, 30, 0.1]], np.zeros((1, 3)), [KINDS["Static"]])
+    tilted = sampled("plane")
+    lifted = make_box_map(
+        awning.centers, awning.half_extents, awning.rotations_deg, awning.kinds, header=sloped_town("plane").header
+    )
+    assert blocks_walking(lifted).all()
+    assert tilted.height_at(np.zeros((1, 2)))[0] == pytest.approx(30.0)
+
+
+def bare(shape: str) -> BoxMap:
+    block = make_box_map([[140, 140, 1]], np.ones((1, 3)), np.zeros((1, 3)), [KINDS["Static"]])
+    return on_ground(block, sampled(shape))
+
+
+def walk_over(box_map: BoxMap, start: tuple[float, float], goal: tuple[float, float]) -> PedestrianTrajectory:
+    ends = np.array([start, goal], dtype=np.float64)
+    time_s = np.arange(0.0, np.linalg.norm(ends[1] - ends[0]) / 1.2, DT_S)
+    xy = ends[0] + (ends[1] - ends[0]) * (1.2 * time_s / np.linalg.norm(ends[1] - ends[0]))[:, None]
+    feet = np.column_stack([xy, box_map.ground.height_at(xy)])
+    return PedestrianTrajectory("slope", ends, time_s, feet, np.full(len(xy), 1.2))
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_flights_count_their_altitude_from_the_ground_under_the_walker(shape: str, planner: str):
+    box_map, cfg = bare(shape), PlanConfig(planner=planner)
+    walk = walk_over(box_map, (-60.0, 5.0), (60.0, 5.0))
+    assert np.ptp(walk.positions_m[:, 2]) > 4.0
+    obstacles = obstacle_index(box_map)
+    trace = plan_trajectory(walk, obstacles, cfg, 0)
+    over_walker = trace.positions_m[:, 2] - walk.positions_m[:, 2]
+    assert over_walker.min() >= cfg.altitude_min_m - 1e-3
+    assert over_walker.max() <= cfg.altitude_min_m + 12.0
+    assert trace.metrics["altitude_min_m"] == pytest.approx(over_walker.min(), abs=1e-3)
+    over_ground = trace.positions_m[:, 2] - box_map.ground.height_at(trace.positions_m)
+    assert over_ground.min() >= cfg.relaxed_safety_m
+    assert (trace.clearances_m <= over_ground + 0.1).all()  # the ground is what is nearest
+    assert (trace.visibility == 1.0).all()
+
+
+def rays(camera_pose: np.ndarray, intrinsic: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Origin (3,) and directions (h, w, 3) of unit z-depth through the middles of pixels."""
+    x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    across, down = (x - intrinsic[0, 2]) / intrinsic[0, 0], (y - intrinsic[1, 2]) / intrinsic[1, 1]
+    return camera_pose[:3, 3], np.stack([across, down, np.ones_like(x)], axis=-1) @ camera_pose[:3, :3].T
+
+
+@pytest.fixture(params=NAMES)
+def renderer_name(request) -> str:
+    if request.param == "pyrender":
+        pytest.importorskip("pyrender")
+    return request.param
+
+
+def test_the_depth_of_a_tilted_plane_is_that_of_the_analytic_ray(renderer_name: str):
+    box_map, size = bare("plane"), (96, 54)
+    renderer = open_renderer(renderer_name, box_map, *size)
+    eye = np.array([-40.0, 20.0, 30.0 + 22.0])
+    pose, intrinsic = world_from_camera(eye, np.array([-35.0, 25.0, 0.0])), intrinsic_matrix(*size, 70.0)
+    frame = renderer.render(pose, intrinsic, None)
+    renderer.close()
+    origin, directions = rays(pose, intrinsic, size)
+    # eye + t d meets z = 30 + tilt (x, y): t is the z-depth, since d has a unit part along the view.
+    fall = directions[..., 2] - directions[..., :2] @ TILT
+    depth = (plane_m(origin[None])[0] - origin[2]) / fall
+    hit = origin + depth[..., None] * directions
+    on_grid = (np.abs(hit[..., :2]) < 130.0).all(axis=-1) & (fall < 0)
+    assert on_grid.mean() > 0.6
+    assert np.abs(frame.depth - depth)[on_grid].max() < 0.02
+    assert (frame.kinds[on_grid] == KINDS["Terrain"]).all()
+    assert (frame.ids[on_grid] == 0).all()
+
+
+FLAT = [KINDS["Terrain"], KINDS["Roads"]]
+
+
+@cache
+def delft(path: Path) -> BoxMap:
+    return load_source(build(MapsConfig, {"source": "cityjson", "cityjson": {"path": path}}, "maps"), seed=0)
+
+
+@cache
+def town_of(preset: str = "grid") -> BoxMap:
+    return load_source(build(MapsConfig, {"synthetic": {"preset": preset}}, "maps"), seed=0)
+
+
+@pytest.fixture(params=["grid", "village", "delft", "hill"])
+def box_map(request) -> BoxMap:
+    if request.param == "hill":
+        return sloped_town("hill")
+    if request.param != "delft":
+        return town_of(request.param)
+    path = request.getfixturevalue("shared_data") / "delft-bgt-lod1" / "delft.json.gz"
+    return delft(path)
+
+
+@pytest.mark.slow
+def test_what_stands_begins_where_no_flight_comes_and_fields_cover_the_ground(box_map: BoxMap):
+    rim, (low, high) = rim_of(box_map, 0), box_map.bounds()
+    flat = np.isin(rim.kinds, FLAT)
+    assert set(np.unique(rim.kinds)) == {KINDS[name] for name in ("Terrain", "Roads", "Buildings", "Vegetation")}
+    gaps = np.maximum(low - rim.maxs, rim.mins - high)[~flat, :2].max(axis=1)  # along the axis that parts them
+    corner = np.linalg.norm(np.maximum(np.maximum(low - rim.maxs, rim.mins - high), 0.0)[~flat, :2], axis=1)
+    assert (gaps > 0.0).all()
+    assert corner.min() > SOLIDS_FROM_M
+    assert SOLIDS_FROM_M > FLIGHTS_TO_M
+    fields = rim.select(rim.kinds == KINDS["Terrain"])
+    area = (4.0 * fields.half_extents[:, 0] * fields.half_extents[:, 1]).sum()
+    assert area == pytest.approx(((high - low)[:2] + 2 * REACH_M).prod(), rel=1e-3)  # no field lies on another
+    roads = rim.select(rim.kinds == KINDS["Roads"])
+    assert not ((roads.mins < high) & (roads.maxs > low))[:, :2].all(axis=1).any()  # none on the map
+
+
+def test_a_flight_that_comes_there_is_refused():
+    box_map = town_of("village")
+    east = box_map.bounds()[1][0]
+    places = np.column_stack([east + np.array([0.0, FLIGHTS_TO_M - 1.0]), np.zeros(2), np.full(2, 20.0)])
+    ones = np.ones(2)
+    trace = DroneTrace("path_004", "hand", 0.5 * np.arange(2), places, 0 * places, places, ones, ones)
+    check_outside_rim(trace, box_map)
+    with pytest.raises(RenderError, match=r"path_004.*72 m") as error:
+        check_outside_rim(replace(trace, positions_m=places + np.array([3.0, 0.0, 0.0])), box_map)
+    assert "render.rim" in str(error.value.fix)
+
+
+@pytest.mark.parametrize("name", ["gl", pytest.param("pyrender", marks=pytest.mark.slow)])
+def test_pixels_of_the_map_stay_what_they_are_and_those_of_the_rim_are_nobodys(name: str):
+    box_map = town_of("village")
+    pose = world_from_camera(np.array([100.0, 30.0, 25.0]), np.array([-12.0, 20.0, 0.0]))
+    frames = []
+    for rim in (None, rim_of(box_map, 0)):
+        try:
+            renderer = open_renderer(name, box_map, 320, 180, rim=rim)
+        except EnvironmentMissing as error:
+            pytest.skip(str(error))
+        frames.append(renderer.render(pose, intrinsic_matrix(320, 180, 75.0), None))
+        renderer.close()
+    bare, frame = frames
+    own = bare.ids != NO_INSTANCE
+    assert np.isin(np.unique(frame.ids), np.append(instance_ids(box_map), NO_INSTANCE)).all()
+    assert 0.1 < own.mean() < 0.9
+    for image in ("ids", "kinds"):
+        assert (getattr(frame, image) == getattr(bare, image))[own].mean() > 0.999
+    assert np.abs(frame.depth - bare.depth)[own & (frame.ids == bare.ids)].max() < 1e-3
+    nobodys = frame.ids == NO_INSTANCE
+    seen = {KINDS[kind] for kind in ("Terrain", "Roads", "Buildings", "Vegetation", "Sky")}
+    assert set(np.unique(frame.kinds[nobodys])) == seen
+    on_ground = (frame.kinds == KINDS["Terrain"]) & nobodys & (bare.depth < 300.0)
+    assert np.abs(frame.depth - bare.depth)[on_ground].max() < 1e-3 * 300.0

@@ -1,19 +1,28 @@
-"""Products of stages 1-4: round trips, and every error names file and field."""
+"""Products on disk: round trips, every error names file and field; episodes, the wardrobe, goals in words."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
+from itertools import chain, combinations
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from tables import each
 
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
+from cosfly.formats.episodes import Episode, EpisodeFrame, PathDifficulty, episode_file, read_episode, write_episode
+from cosfly.formats.frames import PERSON_ID
+from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths, write_paths
+from cosfly.formats.people import COLORS, FIGURES, GARMENTS, GOAL_TERMS, HAIR, Appearance, Goal, People, read_goal
 from cosfly.formats.roi import read_roi
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
+from cosfly.geometry.goals import LANDMARKS, SIDES, SLOTS, SeenFrame, find_says, meant, words_of
+from cosfly.render.person import draw_appearance, look_alike
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.json_io import validated
 
 
 def some_boxes(n=3, seed=0):
@@ -87,3 +96,195 @@ def test_path_and_trace_round_trip(tmp_path, subtests):
             path.write_text(json.dumps(value))
             with pytest.raises(InputError, match=rf"{group}\[0\]\.t"):
                 read(path)
+
+
+def test_a_drawn_person_is_read_back_as_written():
+    rng = np.random.default_rng(1)
+    for _ in range(200):
+        person = draw_appearance(rng)
+        assert validated(Appearance, asdict(person), "here") == person
+        assert person.hat_color not in HAIR
+
+
+def test_a_look_alike_differs_in_one_thing():
+    rng = np.random.default_rng(2)
+    for _ in range(200):
+        person = draw_appearance(rng)
+        other = look_alike(person, rng)
+        assert len(person.differences(other)) == 1
+        assert person.is_all_seen
+        assert other.is_all_seen
+
+
+def test_the_most_alike_differs_least_the_greatest_id_of_several():
+    target = Appearance("man", "jacket", "red", "shorts", "blue")
+    one, two = (Appearance("man", "jacket", color, "shorts", color) for color in ("red", "green"))
+    people = People(
+        target, {9: two, 8: one, 7: one, 6: Appearance("woman", "coat", "pink", "trousers", "pink", "cap", "red")}
+    )
+    assert people.most_alike([9, 8, 7, 6]) == (8, 1)
+    assert people.most_alike([6, 9]) == (9, 2)
+    assert people.most_alike([6]) == (6, 4)
+    assert people.most_alike([]) == (None, None)
+
+
+@each(("field", "value"), [("top", "toga"), ("hat_color", "red"), ("figure", 3), ("bag", None)])
+def test_what_the_wardrobe_lacks_is_refused(field, value):
+    bare = asdict(Appearance("man", "jacket", "red", "shorts", "blue"))
+    with pytest.raises(InputError, match=field):
+        validated(Appearance, bare | {field: value}, "here")
+
+
+def test_colours_are_far_apart():
+    srgb = np.array([color for _, color in COLORS.values()]) ** (1 / 2.2)
+    apart = np.linalg.norm(srgb[:, None] - srgb[None], axis=2)[np.triu_indices(len(srgb), 1)]
+    assert apart.min() > 0.2
+
+
+def frame(time_s: float, answer: str, **more) -> EpisodeFrame:
+    told = {"answer": answer, "in_view": True, "visible": True, "visibility": 0.9, "num_pixels": 40}
+    told |= {"distance_m": 20.0, "height_m": 20.0, "clearance_m": 12.0, "speed_mps": 1.2}
+    told |= {"pose": (0, 0, 20, -43, 0, 0), "target_m": (20, 0, 0.9)}
+    told["command"] = None if answer == "end" else (1.2, 0.0, 0.0, 0.0, -43.0)
+    return EpisodeFrame(time_s=time_s, **told | more)
+
+
+def record(answers=("lead", "lead", "ok", "late", "end"), **more) -> Episode:
+    frames = tuple(frame(0.5 * i, answer) for i, answer in enumerate(answers))
+    told = {"student": "rules-7", "engine": "rules", "town": "Town_7", "map_sha256": "ab" * 32, "walk": "path_00000"}
+    told |= {"seed": 7, "dt_s": 0.5, "camera_px": (640, 360), "fov_deg": 90.0, "drone_radius_m": 0.5}
+    style = PathDifficulty(pace="walk", turn_degps=2.0, hidden_share=0.1)
+    told |= {"episode": "path_00000", "style": style, "ended": "lost", "num_walk_frames": 9, "frames": frames}
+    return Episode(**told | more)
+
+
+def test_a_record_is_read_as_it_was_written_and_tells_lead_and_decisions_apart(tmp_path):
+    path = episode_file(tmp_path, "path_00000")
+    write_episode(path, record())
+    found = read_episode(path)
+    assert found == record()
+    assert (found.num_lead, [f.answer for f in found.decisions]) == (2, ["ok", "late"])
+    assert [f.time_s for f in found.flown] == [1.5, 2.0]  # what came of the two decisions
+
+
+@each(("change", "words"), [
+    ({"frames": [{"time_s": 0.5}]}, "missing|required"),
+    ({"ended": "tired"}, "finished"),
+    ({"num_walk_frames": 1}, "2 frames follow the first decision"),
+    ({"colour": "red"}, "[Ee]xtra"),
+])  # fmt: skip
+def test_a_record_that_cannot_be_is_refused(tmp_path, change, words):
+    path = tmp_path / "one.json"
+    write_episode(path, record())
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(InputError, match=words):
+        read_episode(path)
+
+
+def test_answers_come_in_order_and_only_the_last_frame_has_no_command():
+    for answers in (("ok", "lead", "end"), ("ok", "end", "end"), ("lead", "ok"), ("lead", "lead")):
+        with pytest.raises(ValueError, match="lead"):
+            record(answers)
+    with pytest.raises(ValueError, match="command"):
+        record(frames=(frame(0, "ok", command=None), frame(0.5, "end")))
+
+
+RELATIONS = {*SIDES, *LANDMARKS}
+TREE_M, POST_M = 20, 40  # columns of the picture below, a metre each
+
+
+def picture_of(columns: dict[int, int]) -> SeenFrame:
+    """Look north from a height at people on a line, a metre to a pixel, 20 m away; trees and posts stand far above."""
+    ids, kinds = np.zeros((40, 60), np.uint16), np.full((40, 60), KINDS["Roads"], np.uint8)
+    for number, column in columns.items():
+        ids[20, column], kinds[20, column] = number, KINDS["Pedestrians"]
+    kinds[15, TREE_M], kinds[19, POST_M] = KINDS["Vegetation"], KINDS["Poles"]
+    kinds[21, 30] = KINDS["Vegetation"]  # a lawn
+    intrinsic = np.array([[20.0, 0.0, 30.0], [0.0, 20.0, 20.0], [0.0, 0.0, 1.0]])
+    rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    return SeenFrame(kinds, ids, np.full((40, 60), 20.0, np.float32), intrinsic, rotation)
+
+
+def crowd(rng: np.random.Generator) -> tuple[dict[int, Appearance], SeenFrame]:
+    """Draw a target, look-alikes, strangers, and one that is out of view and looks just as the target."""
+    target = draw_appearance(rng)
+    others = [look_alike(target, rng) if rng.random() < 0.5 else draw_appearance(rng) for _ in range(rng.integers(12))]
+    people = {PERSON_ID: target, 1: target} | {65533 - i: one for i, one in enumerate(others)}
+    seen = [number for number in people if number != 1]
+    return people, picture_of(dict(zip(seen, rng.permutation(np.arange(1, 59))[: len(seen)].tolist(), strict=True)))
+
+
+def stands_apart(relation: str, picture: SeenFrame, number: int, rivals: list[int]) -> bool:
+    where = {n: int(np.nonzero(picture.ids == n)[1][0]) for n in (number, *rivals)}
+    if relation in ("left", "right"):
+        sign = 1 if relation == "left" else -1
+        return all(sign * where[number] < sign * where[n] for n in rivals)
+    at = {"Vegetation": TREE_M, "Poles": POST_M}[relation]
+    return abs(where[number] - at) <= 4.001 and all(abs(where[n] - at) > 4.001 for n in rivals)
+
+
+def test_a_goal_is_true_of_the_target_alone_and_says_what_is_seen():
+    rng = np.random.default_rng(3)
+    relations = set()
+    for _ in range(250):
+        people, picture = crowd(rng)
+        target, hidden = people[PERSON_ID], {slot for slot in ("figure", *SLOTS) if rng.random() < 0.4}
+        says = find_says(people, picture, lambda slot, other, hidden=hidden: slot not in hidden)
+        if says is None:
+            continue
+        assert [*says] == [one for one in GOAL_TERMS if one in says]
+        assert not hidden & {*says}
+        assert meant(says, target, people, picture) == {PERSON_ID}
+        slots, relation = [s for s in says if s not in RELATIONS], [s for s in says if s in RELATIONS]
+        rivals = [n for n in people if n not in (PERSON_ID, 1) and not {*slots} & {*target.differences(people[n])}]
+        assert len(relation) == bool(rivals)  # a place is said where garments do not do
+        assert all(stands_apart(relation[0], picture, PERSON_ID, rivals) for _ in relation)
+        relations |= {*relation}
+    assert {"left", "right", "Vegetation", "Poles"} <= relations
+
+
+def test_what_the_picture_does_not_tell_apart_is_not_said_apart():
+    red = Appearance("man", "jacket", "red", "shorts", "blue")
+    shirt = Appearance("man", "t_shirt", "red", "shorts", "blue")
+    people = {PERSON_ID: red, 5: shirt}
+
+    def tells(slot, other):
+        return other.top_color != "red" or slot != "top"
+
+    assert find_says(people, picture_of({PERSON_ID: 20, 5: 21}), tells) is None
+    assert find_says(people, picture_of({PERSON_ID: 20, 5: 30}), tells) == ("figure", "top", "left")
+    assert find_says(people, picture_of({PERSON_ID: 20}), tells) == ("figure", "top")
+    assert find_says(people, picture_of({PERSON_ID: 20}), lambda slot, other: False) is None
+
+
+def test_both_languages_say_the_same_slots():
+    looks = Appearance("woman", "jacket", "red", "skirt", "green", "cap", "white", "shoulder", "yellow")
+    bare = Appearance("man", "coat", "red", "shorts", "green")
+    words = {
+        slot: GARMENTS[slot][getattr(looks, slot)] | {f"{k}_color": v for k, v in COLORS[color][0].items()}
+        for slot in SLOTS if (color := getattr(looks, f"{slot}_color"))
+    }  # fmt: skip
+    for says in chain.from_iterable(combinations(("figure", *SLOTS, "left", "Poles"), n) for n in range(1, 8)):
+        if not {*SLOTS} & {*says}:
+            continue
+        for language, text in words_of(says, looks).items():
+            for slot, told in words.items():
+                assert (told[language] in text) == (told[f"{language}_color"] in text) == (slot in says), text
+            assert (FIGURES["woman"][language] in text) == ("figure" in says)
+    assert words_of(("figure", "top", "bag", "hat", "Poles"), looks) == {
+        "en": "the woman in the red jacket with the yellow shoulder bag and the white cap, by a post",
+        "zh": "在杆子旁边、穿红色夹克、背黄色挎包、戴白色鸭舌帽的女子",
+    }
+    assert words_of(("legs", "bag", "hat", "right"), bare) == {
+        "en": "the rightmost person in the green shorts with no bag and no hat",
+        "zh": "最右边的穿绿色短裤、不带包、不戴帽子的行人",
+    }
+
+
+def test_a_goal_is_read_back_and_nothing_else_is():
+    goal = Goal(3, "the man in the red coat", "穿红色长大衣的男子", ("figure", "top"))
+    record = asdict(goal) | {"says": list(goal.says)}
+    assert read_goal(record, 4, "here") == goal
+    for broken in ({"frame": 4}, {"zh": None}, {"says": ["figure"]}, {"says": ["top", "figure"]}):
+        with pytest.raises(InputError):
+            read_goal(record | broken, 4, "here")

@@ -1,4 +1,7 @@
+"""Stage 3: pedestrian trajectories and crossings, lanes of a map, and bystanders and cars about a pedestrian."""
+
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -6,17 +9,26 @@ import numpy as np
 import pytest
 from tables import each
 
-from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
+from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
+from cosfly.formats.bystanders import Bystander, Bystanders, read_bystanders, write_bystanders
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.pedestrian_paths import read_paths
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths
 from cosfly.formats.roi import Roi
 from cosfly.geometry.axes import DT_S
 from cosfly.geometry.grid import OccupancyGrid
 from cosfly.geometry.ground import Ground
-from cosfly.pedestrians.crossings import costs_of
+from cosfly.maps.boxlist import BoxList
+from cosfly.maps.stage import load_map
+from cosfly.pedestrians.bystanders import bystanders_of, gaps_m
+from cosfly.pedestrians.crossings import costs_of, count_on_road
+from cosfly.pedestrians.lanes import lanes_of
 from cosfly.pedestrians.stage import PedestriansConfig, WalkableGround, make_pedestrian, run, walkable_ground
+from cosfly.pipeline.settings import RunConfig
+from cosfly.runtime.config import load, shipped
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.seeding import rng_for
+from cosfly.simplify.passes import simplify
 
 BUILDINGS, ROADS = KINDS["Buildings"], KINDS["Roads"]
 
@@ -197,3 +209,222 @@ def test_simworld_gives_twenty_of_twenty(shared_data, tmp_path):
     ground = json.loads((tmp_path / "out" / "pedestrians_report.json").read_text())["ground"]
     assert ground["component_sizes_used"][0] > 0.9 * ground["cells_walkable"]  # one large walkable component
     assert len(read_boxes(tmp_path / "map.json")) == ground["boxes"]
+
+
+PERSON, CAR = "Pedestrians", "Car"
+
+
+def crossing_town(*more: tuple[str, tuple, tuple]) -> BoxMap:
+    """Two carriageways of 8 m that cross at the origin, pavement all about; more: (kind, center, half_extents)."""
+    rows = [
+        ("Sidewalks", (0, 0, -0.2), (80, 80, 0.15)), ("Roads", (0, 0, -0.1), (80, 4, 0.1)),
+        ("Roads", (0, 42, -0.1), (4, 38, 0.1)), ("Roads", (0, -42, -0.1), (4, 38, 0.1)), *more,
+    ]  # fmt: skip
+    kinds = [KINDS[row[0]] for row in rows]
+    header = MapHeader(name="Crossing")
+    return make_box_map(
+        [row[1] for row in rows], [row[2] for row in rows], np.zeros((len(rows), 3)), kinds, header=header
+    )
+
+
+def standing(kind: str, x: float, y: float, heading_rad: float = 0.0, n: int = 2) -> Bystander:
+    return Bystander(kind, np.tile([x, y, 0.0], (n, 1)), np.full(n, heading_rad))
+
+
+def going(kind: str, start, end, n: int = 2) -> Bystander:
+    start, end = np.array([*start, 0.0]), np.array([*end, 0.0])
+    places = start + np.linspace(0.0, 1.0, n)[:, None] * (end - start)
+    return Bystander(kind, places, np.full(n, np.arctan2(*(end - start)[1::-1])))
+
+
+def test_others_round_trip_and_bad_files(tmp_path):
+    path = tmp_path / "others.json"
+    write_bystanders(
+        path,
+        [
+            Bystanders("p", [going(CAR, (0, 0), (4, 3)), replace(standing(PERSON, 1, 1), is_look_alike=True)]),
+            Bystanders("q", []),
+        ],
+        {"map": "T"},
+    )
+    first, second = read_bystanders(path)
+    assert (first.path_id, second.path_id, second.others) == ("p", "q", [])
+    assert [other.kind for other in first.others] == [CAR, PERSON]
+    assert [other.is_look_alike for other in first.others] == [False, True]
+    np.testing.assert_allclose(first.others[0].positions_m, [[0, 0, 0], [4, 3, 0]])
+    np.testing.assert_allclose(first.others[0].headings_rad, np.arctan2(3, 4), atol=1e-5)
+    for old, new, words in (
+        ('"Car"', '"Tank"', r"paths\[0\]\.others\[0\]\.kind: .*'Tank'.*Pedestrians or Car"),
+        ('"Car"', '["Car"]', r"paths\[0\]\.others\[0\]\.kind"),
+        ('"x":[0.0,4.0]', '"x":[0.0]', r"paths\[0\]\.others\[0\]\.y"),
+        ('"x":[0.0,4.0]', '"x":[0.0,null]', r"paths\[0\]\.others\[0\]\.x"),
+        ('"id":"q"', '"id":7', r"paths\[1\]\.id"),
+    ):
+        text = path.read_text()
+        assert old in text
+        (tmp_path / "bad.json").write_text(text.replace(old, new, 1))
+        with pytest.raises(InputError, match=words):
+            read_bystanders(tmp_path / "bad.json")
+    value = json.loads(path.read_text())
+    for axis in ("x", "y", "z", "yaw"):
+        value["paths"][0]["others"][1][axis].append(1.0)
+    path.write_text(json.dumps(value))
+    with pytest.raises(InputError, match=r"paths\[0\]\.others.*|different lengths"):
+        read_bystanders(path)
+
+
+CFG = PedestriansConfig(others=6, look_alikes=2, traffic=6, pace={"walk": 1, "stop_and_look": 1, "turn_back": 1})
+
+
+@pytest.fixture(scope="module")
+def placed():
+    box_map = crossing_town(("Buildings", (40, 40, 5), (20, 20, 5)), ("Buildings", (-40, 40, 5), (20, 20, 5)))
+    ground, lanes = walkable_ground(box_map, CFG), lanes_of(box_map)
+    made = []
+    for k in range(4):
+        walk = make_pedestrian(f"p{k}", ground, CFG, rng_for(0, "pedestrians", str(k))).trajectory
+        made.append((walk, bystanders_of(walk, ground, lanes, CFG, rng_for(0, "others", str(k)))))
+    return box_map, ground, lanes, made
+
+
+def test_nobody_meets_anybody(placed):
+    for walk, bystanders in placed[3]:
+        everybody = [Bystander(PERSON, walk.positions_m, np.zeros(len(walk.time_s))), *bystanders.others]
+        for k, one in enumerate(everybody):
+            assert len(one.positions_m) == len(walk.time_s)
+            for two in everybody[:k]:
+                assert gaps_m(one, two).min() >= 0.0
+                apart = np.linalg.norm(one.positions_m - two.positions_m, axis=1).min()
+                assert apart >= 0.6
+
+
+def test_people_walk_where_people_walk_and_cars_drive_on_the_road(placed):
+    _, ground, _, made = placed
+    kinds = [other.kind for _, bystanders in made for other in bystanders.others]
+    assert kinds.count(PERSON) >= 20
+    assert kinds.count(CAR) >= 12
+    for walk, bystanders in made:
+        for other in bystanders.others:
+            step_mps = np.linalg.norm(np.diff(other.positions_m, axis=0), axis=1) / np.diff(walk.time_s)
+            assert step_mps.max() <= (10.0 if other.kind == CAR else 2.0)
+            assert step_mps.max() > 0.5, "somebody who moves"
+            if other.kind == PERSON:
+                x, y = ground.grid.cells_at(other.positions_m).T
+                assert not ground.grid.occupied[y, x].any()
+            else:
+                x, y = np.abs(other.positions_m[:, :2]).T
+                assert (np.minimum(x, y) < 4.0 + 1e-6).all()
+                turn = np.abs(np.degrees(np.diff(np.unwrap(other.headings_rad))))
+                assert turn.max() < 60.0, "a car turns along its way"
+                moving = step_mps > 1.0
+                along = np.diff(other.positions_m[:, :2], axis=0)[moving]
+                heading = other.headings_rad[:-1][moving]
+                ahead = (along * np.column_stack([np.cos(heading), np.sin(heading)])).sum(axis=1)
+                assert (ahead > 0.5 * np.linalg.norm(along, axis=1)).all(), "forwards"
+
+
+def test_the_same_numbers_give_the_same_company_and_more_keep_the_first(placed):
+    _, ground, lanes, made = placed
+    walk, bystanders = made[0]
+    again = bystanders_of(walk, ground, lanes, CFG, rng_for(0, "others", "0"))
+    assert dump_json(again.as_json()) == dump_json(bystanders.as_json())
+    other = bystanders_of(walk, ground, lanes, CFG, rng_for(1, "others", "0"))
+    assert dump_json(other.as_json()) != dump_json(bystanders.as_json())
+    fewer = bystanders_of(
+        walk, ground, lanes, CFG.model_copy(update={"others": 2, "traffic": 0}), rng_for(0, "others", "0")
+    )
+    assert [o.as_json() for o in fewer.others] == [o.as_json() for o in bystanders.others[:2]]
+    assert {o.kind for o in bystanders_of(walk, ground, [], CFG, np.random.default_rng(0)).others} == {PERSON}, (
+        "no road"
+    )
+
+
+@pytest.mark.slow
+def test_the_stage_writes_others_only_where_they_are_wanted(tmp_path: Path, caplog):
+    write_boxes(tmp_path / "map.json", crossing_town(("Terrain", (0, 0, -1.0), (90, 90, 0.5))))
+    plain = PedestriansConfig(num_paths=3)
+    run(plain, tmp_path / "map.json", tmp_path / "none")
+    assert not (tmp_path / "none/others.json").exists()
+    assert "others" not in json.loads((tmp_path / "none/pedestrians_report.json").read_text())
+    cfg = plain.model_copy(update={"others": 3, "traffic": 2})
+    for folder, workers in (("one", 1), ("two", 2)):
+        run(cfg, tmp_path / "map.json", tmp_path / folder, workers=workers)
+    one, two = ((tmp_path / folder / "others.json").read_bytes() for folder in ("one", "two"))
+    assert one == two
+    walks, companions = read_paths(tmp_path / "one/path.json"), read_bystanders(tmp_path / "one/others.json")
+    assert [walk.path_id for walk in walks] == [bystanders.path_id for bystanders in companions]
+    for before, walk in zip(read_paths(tmp_path / "none/path.json"), walks, strict=True):
+        np.testing.assert_array_equal(before.positions_m, walk.positions_m)
+    counts = json.loads((tmp_path / "one/pedestrians_report.json").read_text())["others"]
+    placed = [
+        sum(other.kind == kind for bystanders in companions for other in bystanders.others) for kind in (PERSON, CAR)
+    ]
+    assert counts == {PERSON: {"wanted": 9, "placed": placed[0]}, CAR: {"wanted": 6, "placed": placed[1]}}
+
+
+KERB_CFG = PedestriansConfig(road_cost=20, open_cost=3, min_component_cells=100, min_distance_m=20)
+
+
+def street(*, marked: bool = False) -> BoxList:
+    """Two streets of 8 m that cross at the origin, between pavements of 4 m, on a lawn of 80 m; one has dashes."""
+    boxes = BoxList()
+    boxes.span("Terrain", (-40, -40), (40, 40), -0.4, -0.1)
+    for size in (80, 8), (8, 80):
+        boxes.add("Roads", (0, 0), size, -0.36, -0.06)
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            boxes.add("Sidewalks", (sx * 22, sy * 6), (36, 4), -0.3, 0.0)
+            boxes.add("Sidewalks", (sx * 6, sy * 22), (4, 36), -0.3, 0.0)
+    for x in (16, 22, 28):
+        boxes.add("RoadLines", (x, 0), (3.0, 0.16), -0.1, -0.03)
+    for y in np.arange(-3.2, 3.4, 1.2) if marked else ():
+        boxes.add("RoadLines", (10, y), (3.0, 0.55), -0.1, -0.03)
+    return boxes
+
+
+@each(("way", "marked", "counts"), [
+    ([[20.25, -6.25], [20.25, 6.25]], False, (0, 16)),  # straight across, 8 m at two points a metre
+    ([[20.25, -6.25], [20.25, 6.25]], True, (16, 0)),  # beside the stripes
+    ([[10.25, -6.25], [10.25, 6.25]], True, (0, 16)),
+    ([[14.25, 0.25], [34.25, 0.25]], False, (41, 0)),  # along the street
+    ([[14.25, 6.25], [34.25, 6.25]], False, (0, 0)),
+    ([[-6.25, -6.25], [6.25, 6.25]], False, (16, 0)),  # over the junction from corner to corner
+])  # fmt: skip
+def test_points_are_counted_by_where_they_are_and_which_way_they_go(way, marked, counts):
+    start, goal = np.array(way)
+    length = np.abs(goal - start).max()
+    places = start + np.linspace(0, 1, int(2 * length) + 1)[:, None] * (goal - start)
+    walk = PedestrianTrajectory(
+        "p", places, np.arange(len(places)) * 0.5, np.pad(places, ((0, 0), (0, 1))), np.ones(len(places))
+    )
+    ground = walkable_ground(street(marked=marked).box_map(), KERB_CFG)
+    assert count_on_road(walk, ground.footing, ground.grid) == counts
+
+
+def shares(cfg: RunConfig, name: str, num_others: int = 0) -> tuple[float, float]:
+    """Shares of the walked points of a town, on carriageway away from crossings and on crossings; the others' too."""
+    town = cfg.of_town(name)
+    walking = town.pedestrians.model_copy(update={"others": num_others})
+    ground = walkable_ground(simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map, walking)
+    counts = np.zeros(3)
+    for k in range(walking.num_paths):
+        rng = rng_for(town.seed, "pedestrians", f"path_{k:05d}")
+        walk = make_pedestrian(f"path_{k:05d}", ground, walking, rng).trajectory
+        everybody = [walk.positions_m]
+        if num_others:
+            everybody += [other.positions_m for other in bystanders_of(walk, ground, [], walking, rng).others]
+        for places in everybody:
+            moves = np.r_[True, np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1) > 1e-6]
+            line = walk.polyline_m if places is walk.positions_m else places[moves, :2]
+            one = PedestrianTrajectory("p", line, walk.time_s, places, walk.speeds_mps)
+            counts += *count_on_road(one, ground.footing, ground.grid), len(places)
+    return counts[0] / counts[2], counts[1] / counts[2]
+
+
+@pytest.mark.parametrize("name", ["park", *(pytest.param(n, marks=pytest.mark.slow) for n in ("old_town", "river"))])
+def test_at_most_a_twentieth_of_the_walked_points_of_shipped_towns_is_on_the_road_away_from_crossings(name):
+    away, on_crossings = shares(load(RunConfig, shipped("diverse.yaml")), name)
+    assert away <= 0.05
+    assert on_crossings > 0.05  # people do cross
+    paper, _ = shares(load(RunConfig, shipped("diverse.yaml"), ["pedestrians.road_cost=1"]), name)
+    assert paper > 0.1

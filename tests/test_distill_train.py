@@ -1,24 +1,44 @@
-"""distill: student, encoding, training and inference on a tiny random Qwen3.5 model."""
+"""distill: student, encoding and training on a tiny random Qwen3.5 model; what training can be, and what goes wrong."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import is_running, wait_until
 from specimens_distill import write_set
 
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
-from specimens_students import FAST, MAX_PIXELS, begun, inputs_of, load, log_of, run, samples_of, trees_of  # noqa: E402
+from safetensors.torch import load_file  # noqa: E402
+from specimens_students import (  # noqa: E402
+    FAST,
+    MAX_PIXELS,
+    TWELVE,
+    begun,
+    inputs_of,
+    load,
+    log_of,
+    losses_of,
+    run,
+    samples_of,
+    trees_of,
+)
 
 from cosfly.formats.predictions import read_predictions  # noqa: E402
+from cosfly.runtime.errors import ConfigError, InputError  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
 from distill.student import model as student  # noqa: E402
-from distill.student.checkpoint import load_checkpoint  # noqa: E402
+from distill.student.checkpoint import Progress, load_checkpoint, newest_checkpoint  # noqa: E402
 from distill.student.encoding import IGNORED, encode_text, load_pictures, padded  # noqa: E402
+from distill.training import fit  # noqa: E402
 from distill.training import stage as train  # noqa: E402
+from distill.training.fit import Validation, judged  # noqa: E402
 from distill.training.settings import Steps, TrainConfig  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -157,3 +177,161 @@ def test_a_student_that_overfits_answers_right(place, tmp_path):
     predictions = read_predictions(out)
     assert [p.raw for p in predictions] == [sample.answer for sample in learnt]
     assert all(p.coc is not None and p.is_finished for p in predictions)
+
+
+@pytest.mark.slow
+def test_a_model_trained_in_full_is_a_whole_folder(place, tmp_path):
+    from transformers import AutoModelForImageTextToText, AutoTokenizer, GenerationConfig
+
+    folder = run(place, tmp_path / "out", method="full", max_steps=4, learning_rate=1e-3)
+    assert folder.name == "model"
+    model = AutoModelForImageTextToText.from_pretrained(folder, dtype=torch.float32)
+    assert AutoTokenizer.from_pretrained(folder).chat_template == load(place).tokenizer.chat_template
+    assert GenerationConfig.from_pretrained(folder) is not None
+    own = student.load_student(folder, device="cpu", max_pixels=10**9)
+    assert own.image_processor.size["longest_edge"] == MAX_PIXELS  # what it was taught with stays its own bound
+    inputs = inputs_of(own, samples_of(place)[:1], trees_of(place))
+    with torch.inference_mode():
+        assert torch.equal(own.model.eval()(**inputs).logits, model.eval()(**inputs).logits)
+    before, after = load(place).core.state_dict(), own.core.state_dict()
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert any("language_model" in name for name in changed)
+    assert not any("visual" in name for name in changed)
+    assert (folder / "cosfly_student.json").exists()
+
+
+@pytest.mark.slow
+def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path, monkeypatch):
+    losses = iter([4.0, 3.0, 1.0, 2.0, 1.5, 0.5])  # before the first step, then after each: the best is step 2
+    monkeypatch.setattr(fit, "validate", lambda *_: Validation(samples=4, loss=next(losses)))
+    settings = {"validate_every_steps": 1, "patience": 2, "keep_checkpoints": 1}
+    out = tmp_path / "out"
+    run(place, out, **settings)
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert (manifest["best_step"], manifest["steps"]) == (2, 4)
+    assert [r["validation"]["loss"] for r in log_of(out, "validation")] == [4.0, 3.0, 1.0, 2.0, 1.5]
+    best, last = (out / "checkpoints" / f"step_{step:08d}" / "weights.safetensors" for step in (2, 4))
+    kept, newest = load_file(best), load_file(last)
+    product = load_file(out / "adapter" / "adapter_model.safetensors")
+    product = {name.replace(".weight", ".default.weight"): tensor for name, tensor in product.items()}
+    assert product.keys() == kept.keys()
+    assert all(torch.equal(tensor, kept[name]) for name, tensor in product.items())
+    assert not all(torch.equal(tensor, newest[name]) for name, tensor in product.items())
+    (out / "manifest.json").unlink()
+    run(place, out, **settings)  # it has ended: nothing is done again
+    assert json.loads((out / "manifest.json").read_text())["steps"] == 4
+    assert next(losses) == 0.5
+    (out / "manifest.json").unlink()
+    best.write_bytes(best.read_bytes()[:-7])
+    with pytest.raises(InputError, match=r"best validation is damaged.*weights\.safetensors"):
+        run(place, out, **settings)
+
+
+@pytest.mark.slow
+def test_bfloat16_computes_with_float32_weights_that_learn(place, tmp_path):
+    settings = {"method": "full", "max_steps": 4, "learning_rate": 1e-3, "validation_answers": True}
+    for dtype in ("float32", "bfloat16"):
+        run(place, tmp_path / dtype, dtype=dtype, max_new_tokens=4, **settings)
+    found, wanted = losses_of(tmp_path / "bfloat16"), losses_of(tmp_path / "float32")
+    assert found == pytest.approx(wanted, rel=0.05)
+    assert found != wanted
+    newest = sorted((tmp_path / "bfloat16" / "checkpoints").iterdir())[-1]
+    assert {tensor.dtype for tensor in load_file(newest / "weights.safetensors").values()} == {torch.float32}
+
+
+def test_the_best_is_who_decides_best_and_patience_ends():
+    progress, cfg, found = Progress(), TrainConfig(patience=2), []
+    for step, (share, loss) in enumerate([(0.2, 3.0), (0.5, 2.0), (0.5, 1.0), (0.4, 0.5), (0.5, 1.5)], 1):
+        validation = Validation(samples=4, loss=loss, accuracy=share, consistent=0.1 * step)  # the latter only grows
+        progress = judged(progress.model_copy(update={"step": step}), validation, cfg)
+        found.append((progress.best_step, progress.stale, progress.has_ended))
+    assert found == [(1, 0, False), (2, 0, False), (3, 0, False), (3, 1, False), (3, 2, True)]
+    patient = TrainConfig(patience=0)
+    assert not judged(Progress(step=9, best_score=(1.0, 0.0)), Validation(samples=1, loss=1.0), patient).has_ended
+
+
+@pytest.mark.slow
+def test_a_picture_that_does_not_decode_costs_its_samples(place, tmp_path):
+    """Its header is right, so only the step that needs it finds out; the others are learnt from, and once more the
+    same."""
+    tree = shutil.copytree(place / "tree", tmp_path / "tree")
+    sample = samples_of(place)[0]
+    path = tree / sample.images[0]
+    path.write_bytes(path.read_bytes()[:60])
+    users = [s.key for s in samples_of(place) if sample.images[0] in s.images]
+    cfg = TrainConfig(**{**TWELVE, "epochs": 1, "samples_per_step": 3})
+    for name in ("one", "two"):
+        train.run(cfg, place / "set", [tree], place / "student", tmp_path / name)
+    counts = json.loads((tmp_path / "one" / "manifest.json").read_text())["counts"]
+    assert counts["dropped"] == {"unreadable_picture": len(users)}
+    assert counts["kept"] + len(users) == counts["input"] == 12
+    log = log_of(tmp_path / "one")
+    assert sum(record["samples"] for record in log) == counts["kept"]
+    assert log == log_of(tmp_path / "two")
+
+
+@pytest.mark.slow
+def test_a_checkpoint_of_another_student_is_refused(place, tmp_path):
+    begun(place, tmp_path / "out")
+    newest = newest_checkpoint(tmp_path / "out" / "checkpoints")
+    assert newest is not None
+    other = train.add_adapter(load(place), TrainConfig(**{**FAST, "lora_rank": 8}), 0)
+    with pytest.raises(InputError, match="checkpoint is of another student"):
+        load_checkpoint(newest, other)
+
+
+def test_a_loss_that_is_no_number_leaves_the_last_good_checkpoint(place, tmp_path, monkeypatch):
+    real, calls = fit.answer_loss, []
+
+    def broken(*args):
+        total, nats = real(*args)
+        calls.extend([1] * torch.is_grad_enabled())  # of steps, not of validations
+        return (total * float("nan"), nats) if len(calls) > 13 else (total, nats)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fit, "answer_loss", broken)
+        with pytest.raises(ConfigError, match="not finite"):
+            run(place, tmp_path / "out")
+    newest = newest_checkpoint(tmp_path / "out" / "checkpoints")
+    assert newest is not None
+    assert newest.name == "step_00000006"
+
+
+WORKERS = """
+import os, time
+from distill.training.loading import in_order
+for pid, _ in in_order(lambda order: (os.getpid(), bytes(10_000_000)), range(100), 2):
+    print(pid, flush=True)
+    time.sleep(0.5)
+"""
+
+
+@pytest.mark.slow
+def test_workers_end_with_a_training_that_was_killed(tmp_path):
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(
+        [sys.executable, "-c", WORKERS], stdout=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stdout is not None
+        workers = {int(process.stdout.readline()) for _ in range(2)}
+        assert len(workers) == 2
+        process.kill()
+    wait_until(lambda: not any(map(is_running, workers)))
+
+
+def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path):
+    good = samples_of(place)
+    long = good[0].model_copy(update={"sample_id": "long", "answer": "tree " * 5000})
+    spoken = good[1].model_copy(update={"sample_id": "spoken", "answer": f"{good[1].answer}<|im_end|>"})
+    shown = good[2].prompt.model_copy(update={"user": "an <|image_pad|> stands here"})
+    pictured = good[2].model_copy(update={"sample_id": "pictured", "prompt": shown})
+    sized = good[3].model_copy(update={"sample_id": "sized", "picture_px": (32, 32)})
+    splits = {"train": [*good, long, spoken, pictured, sized], "val": samples_of(place, "val")}
+    dataset = write_set(tmp_path / "set", splits, [place / "tree"])
+    run(place, tmp_path / "out", dataset=dataset, max_steps=1)
+    counts = json.loads((tmp_path / "out" / "manifest.json").read_text())["counts"]
+    assert counts["dropped"] == {"special_token": 2, "too_long": 1, "unfit_picture": 1}
+    assert (counts["kept"], counts["input"]) == (len(good), len(good) + 4)
+    told = (tmp_path / "out" / "preflight.json").read_text()
+    assert "long/en" in told or "long/zh" in told
+    assert "at most 4096" in told

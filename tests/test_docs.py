@@ -5,6 +5,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,7 @@ def anchors_of(page: Path) -> set[str]:
 
 def test_links_and_pictures_exist():
     num_anchors = 0
-    for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]:
+    for page in PAGES:
         for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", page.read_text(encoding="utf-8")):
             if "://" in target:
                 continue
@@ -156,3 +157,81 @@ def test_one_version_is_named_everywhere_and_every_tag_has_its_heading():
         ["git", "tag", "--list", "v*"], cwd=ROOT, capture_output=True, text=True, check=False
     ).stdout.split()
     assert set(tags) <= {f"v{number}" for number, day in found if day != "unreleased"}
+
+
+TOWNS = [f"runs/learning/{name}" for name in ("grid", "old_town", "city_a", "city_b")]
+VARIABLES = {
+    "trees": " ".join(f"--data {town}/render" for town in TOWNS),
+    "towns": " ".join(TOWNS),
+    "name": "both",
+    "size": "2B",
+    "DATA": "data",
+    "flights": "--map work/town10/maps/boxes_3d.json --simplified work/town10/simplify/step2_simplified.json "
+    "--traces work/town10/plan/drone_trace.json",
+}  # of loops in a page
+COMMAND = re.compile(r"^(?:\$ )?(?:.*; )?(?:[A-Z_]+=\S+ )*(?:.* -m )?cosfly (.*)$")
+
+
+def blocks(text: str) -> Iterator[str]:
+    """The code blocks of a page that are no program: fenced ones of a shell, and indented ones."""
+    fence, lines = None, list[str]()
+    for line in [*text.splitlines(), ""]:
+        mark = re.fullmatch(r"\s*```(\w*)", line)
+        if mark:
+            if fence in ("", "bash", "sh", "console"):
+                yield "\n".join(lines)
+            fence, lines = (mark[1], []) if fence is None else (None, [])
+        elif fence is not None or line.startswith("    "):
+            lines.append(line)
+        else:
+            if lines:
+                yield "\n".join(lines)
+            lines = []
+
+
+def typed_commands(page: Path) -> list[str]:
+    """Every `cosfly ...` of a page's blocks, without the word itself, with variables filled in."""
+    found = []
+    for block in blocks(page.read_text(encoding="utf-8")):
+        for line in block.replace("\\\n", " ").splitlines():
+            if match := COMMAND.match(line.strip()):
+                text = re.sub(r"\$(\w+)", lambda name: VARIABLES[name[1]], match[1].replace('"$@" ', ""))
+                found.append(re.sub(r";? *(?:}|done)$", "", text.partition("  #")[0].strip()))
+    return found
+
+
+COMMAND_LINE = typer.main.get_command(app)
+ALL = [(page.name, text) for page in PAGES for text in typed_commands(page)]
+
+
+def parsed(text: str) -> tuple[Any, list[str]]:
+    """The command that a line names, and its words after that."""
+    words = shlex.split(text, comments=True)
+    command: Any = COMMAND_LINE
+    while words and words[0] in getattr(command, "commands", {}):
+        command, words = command.commands[words[0]], words[1:]
+    return command, words
+
+
+def test_the_commands_are_found():
+    pages = {name for name, _ in ALL}
+    assert {"commands.md", "distillation.md", "releases.md", "teachers.md", "files.md", "first-runs.md"} <= pages
+    assert len(ALL) > 90
+    assert any(text.startswith("distill train --dataset work/dataset") for _, text in ALL)
+
+
+def test_every_command_parses(subtests):
+    for page, text in ALL:
+        with subtests.test(page=page, text=text):
+            command, words = parsed(text)
+            command.make_context("cosfly", list(words))
+
+
+def test_no_option_in_running_text_is_unknown():
+    unknown = []
+    for page in PAGES:
+        for text in re.findall(r"`cosfly ([^`]+)`", page.read_text(encoding="utf-8")):
+            command, words = parsed(re.sub(r"[\[\]\\<>]", "", text).replace("...", "").partition(" > ")[0])
+            known = {option for parameter in command.params for option in parameter.opts} | {"--help", "--version"}
+            unknown += [f"{page.name}: cosfly {text}" for word in words if word.startswith("-") and word not in known]
+    assert not unknown

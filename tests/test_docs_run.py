@@ -20,9 +20,9 @@ from specimens_foreign import write_foreign_tree
 from specimens_slopes import sloped_city
 from teacher_server import TeacherServer
 from test_caption_doctor import patient
-from test_cosfly_maps import node, write_world
+from test_cosfly_map_kinds import node, write_world
 from test_distill_evaluate import make_encoder
-from test_docs_commands import ALL, PAGES, blocks
+from test_docs import ALL, PAGES, blocks
 from typer.testing import CliRunner
 
 from cosfly.cli import app

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from specimens_release import build, make_inputs
+from test_cosfly_answers import TEXT
 
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.captions import read_captions
@@ -59,11 +60,6 @@ WORLD = {"base_map": "x", "nodes": [{
     "id": "a", "instance_name": "BP_Tree1_C", "properties": {"location": {"x": 100, "y": 200, "z": 0},
         "orientation": {"pitch": 0, "yaw": 0, "roll": 0}, "scale": {"x": 1, "y": 1, "z": 1}},
 }]}  # fmt: skip
-ANSWER = {
-    "critical_components": "A pedestrian walks ahead on the pavement.",
-    "reasoning_trace": "The person keeps to the middle of the image, so nothing has to change.",
-    "flight_decision": "track_straight",
-}
 READERS = {
     "boxes": Reader("boxes_3d.json", read_boxes),
     "region": Reader("roi.geojson", read_roi),
@@ -103,7 +99,7 @@ def specimens(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_json(root / name, value)
     write_json(root / "Bbox.json", {"all": {"BP_Tree1_C": {"bbox": {"x": 800, "y": 600, "z": 1200}}}})
     (root / "own.csv").write_text("id,type,x_m,y_m,z_m,length_m,width_m,height_m,yaw_deg\n1,Buildings,0,0,4,9,9,8,30\n")
-    (root / "answer.txt").write_text(f"<think>hm</think>\n```json\n{json.dumps(ANSWER)}\n```")
+    (root / "answer.txt").write_text(f"<think>hm</think>\n```json\n{TEXT}\n```")
     return root
 
 

@@ -7,8 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from test_cosfly_render import needs_gl
-from test_cosfly_render_goal import crowded_tree  # noqa: F401
+from test_cosfly_render import (
+    crowded_tree,  # noqa: F401
+    needs_gl,
+)
 
 from cosfly.formats.frames import FILE_NAMES, PERSON_ID, frame_path
 from cosfly.formats.people import People
