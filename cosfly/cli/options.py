@@ -41,17 +41,13 @@ def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> Parame
 
 
 class SettingOption(NamedTuple):
-    """An option that sets a setting.
-
-    values: text of the option -> value of the setting; other texts are the value themselves. default: shown in the
-    help.
-    """
+    """An option that sets a setting."""
 
     setting: str
     help: str
-    kind: Any = str
-    values: Mapping[str, Any] = {}
-    default: str | bool = False
+    kind: Any = str  # type of the option
+    values: Mapping[str, Any] = {}  # text of the option: value of the setting; other texts are the value themselves
+    default: str | bool = False  # shown in the help
     metavar: str | None = None
 
     def parameter(self, name: str) -> Parameter:
@@ -94,15 +90,12 @@ def track_options(
 
 @dataclass(frozen=True)
 class Job:
-    """The resolved settings of a command, and how to work.
-
-    overrides: the values of --set. set_by_options: names of the settings that an option of the command set.
-    """
+    """The resolved settings of a command."""
 
     cfg: RunConfig
-    overrides: Sequence[str] = ()
+    overrides: Sequence[str] = ()  # values of --set
     resume: Resume = "if-same"
-    set_by_options: Collection[str] = ()
+    set_by_options: Collection[str] = ()  # names of the settings that the user set by options of the command
 
     def call(self, target: str, *arguments: Any, **keywords: Any) -> Any:
         """Import a function and call it with the arguments, and with the common arguments that it takes.

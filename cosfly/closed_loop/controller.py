@@ -52,12 +52,8 @@ def read_controls(path: Path, tokens: tuple[str, ...]) -> dict[str, Control]:
     """Read a table and check that it has a row for each token."""
     controls = build(ControlTable, read_yaml(path), path).actions
     if missing := [token for token in tokens if token not in controls]:
-        raise ConfigError(
-            "the controller table has no command for some decisions",
-            where=path,
-            got=f"no {', no '.join(missing)}",
-            fix="add an entry for each of them under actions",
-        )
+        problem = f"the controller table has no command for {', '.join(missing)}"
+        raise ConfigError(problem, where=path, fix="add an entry for each of them under actions")
     return controls
 
 

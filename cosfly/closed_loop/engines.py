@@ -47,29 +47,29 @@ NO_SET = "decision_not_in_closed_set"  # of readable answers with an unknown dec
 
 @dataclass(frozen=True)
 class EngineDecision:
-    """A student's decision. command: (5,) as ACTION, of a student that returns commands."""
+    """A student's decision."""
 
     answer: Answer
     action: str | None = None
-    words: str | None = None
-    answer_s: float | None = None
-    command: np.ndarray | None = None
+    words: str | None = None  # reasons of the student, or the failure
+    answer_s: float | None = None  # time that the student needed
+    command: np.ndarray | None = None  # (5,) as ACTION, of a student that returns commands
 
 
 @dataclass(frozen=True)
 class Observation:
-    """The last frames of an episode, oldest first."""
+    """What an engine decides on."""
 
     episode: str
     simulation: ClosedLoopTrajectory
-    moments: Sequence[Moment]
+    moments: Sequence[Moment]  # the last frames, oldest first
 
 
 class DecisionEngine(Protocol):
-    """An engine. name: in records. num_frames: most frames of an observation."""
+    """A student as an engine of decisions."""
 
-    name: str
-    num_frames: int
+    name: str  # in records
+    num_frames: int  # most frames of an observation
 
     def decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:
         """Return one decision for each observation."""

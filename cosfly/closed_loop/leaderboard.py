@@ -26,6 +26,8 @@ from cosfly.viz.frame_views import thumbnail
 from cosfly.viz.page import page
 from distill.evaluation.pages import COLORS, STYLE, bars, shown_as
 
+Role = Literal["student", "floor", "ceiling"]
+RANKED_BY = ("success", "in_view")
 HEADLINE = ("success", "in_view", "tracked_frames", "kept_s", "lost", "crashed")
 STRIP_FRAMES = 8  # pictures of an episode
 STRIP_PX = 200  # their width
@@ -42,7 +44,7 @@ class Standing(Record):
     """One student of a table."""
 
     name: str
-    role: Literal["student", "floor", "ceiling"]
+    role: Role
     score: Score
     gain: dict[str, Figure] | None = None  # of a round: the change of its figures since the previous round
 
@@ -112,10 +114,13 @@ def tables_of(students: Mapping[str, StudentFolders], cfg: LeaderboardConfig, se
         gain = None
         if cfg.rounds and group:
             gain = figures_of(merged.flights, rng_for(seed, "leaderboard", "gains"), group[-1].score.flights)
-        group.append(Standing(name=name, role=_role_of(merged.engine), score=merged, gain=gain))
+        role: Role = "ceiling" if merged.engine == "planner" else "student"
+        if merged.engine in BASELINES:
+            role = "floor"
+        group.append(Standing(name=name, role=role, score=merged, gain=gain))
     if not cfg.rounds:
         for group in groups.values():
-            group.sort(key=_rank)
+            group.sort(key=lambda row: [row.score.figures[name].value or 0.0 for name in RANKED_BY], reverse=True)
     return [StudentTable(episodes=digests, standings=tuple(group)) for digests, group in groups.items()]
 
 
@@ -136,23 +141,12 @@ def _merged_score(scores: list[Score], digests: tuple[str, ...], seed: int) -> S
     )
 
 
-def _role_of(engine: str) -> Literal["student", "floor", "ceiling"]:
-    if engine in BASELINES:
-        return "floor"
-    return "ceiling" if engine == "planner" else "student"
-
-
-def _rank(standing: Standing) -> list[float]:
-    return [-(standing.score.figures[name].value or 0.0) for name in ("success", "in_view")]
-
-
 # --- the page ---------------------------------------------------------------------------------------------------------
 
 
 def _shown(name: str, figure: Figure, *, signed: bool = False) -> str:
-    sign = "+" if signed else ""
     digits = ".1%" if name in SHARES else ".2f"
-    return shown_as(f"{{:{sign}{digits}}}", figure)
+    return shown_as(f"{{:+{digits}}}" if signed else f"{{:{digits}}}", figure)
 
 
 def page_of(board: Leaderboard, students: Mapping[str, StudentFolders]) -> str:

@@ -160,7 +160,9 @@ class ClosedLoopTrajectory:
         if problem := self.drone.problem_of(command):
             raise ValueError(problem)
         path_m, yaw_deg, pitch_deg = self._path(np.asarray(command, dtype=np.float64))
-        gaps_m = self._clearances(path_m)
+        gaps_m, _, _ = swept_distances(self.airspace.surroundings.obstacles, path_m, CLEARANCE_CAP_M)
+        over_ground_m = path_m[:, 2] - self.airspace.ground.height_at(path_m)
+        gaps_m = np.minimum(gaps_m[:-1], np.minimum(over_ground_m[:-1], over_ground_m[1:]))  # of each part of the path
         hits = np.flatnonzero(gaps_m < self.drone.radius_m)
         end = int(hits[0]) if len(hits) else len(path_m) - 1  # the drone stops before the part that touches
         i = self.index + 1
@@ -181,12 +183,6 @@ class ClosedLoopTrajectory:
         elif self.lost_s and self._unseen_s >= self.lost_s:
             self.ended = "lost"
         return moment
-
-    def _clearances(self, path_m: np.ndarray) -> np.ndarray:
-        """Return the distance of each part of a path, (k + 1, 3), to obstacles and ground, (k,)."""
-        gaps_m, _, _ = swept_distances(self.airspace.surroundings.obstacles, path_m, CLEARANCE_CAP_M)
-        over_ground_m = path_m[:, 2] - self.airspace.ground.height_at(path_m)
-        return np.minimum(gaps_m[:-1], np.minimum(over_ground_m[:-1], over_ground_m[1:]))
 
     def _path(self, command: np.ndarray) -> tuple[np.ndarray, float, float]:
         """Return the positions within one step, (k + 1, 3), and yaw and pitch at its end, degrees."""

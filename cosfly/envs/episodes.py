@@ -37,7 +37,8 @@ from cosfly.simplify.passes import SimplifyConfig, simplify
 
 EPISODES_FILE = Path(__file__).with_name("episodes.json")
 EPISODES_FORMAT = FileFormat("cosfly.episodes", "1.0", "episodes")
-SIZE_PX, FOV_DEG = (640, 360), 60.0  # of the camera of the lists
+SIZE_PX = (640, 360)  # width and height of the pictures of the lists
+FOV_DEG = 60.0
 NUM_DECISIONS = 80  # 40 s
 LEAD_FRAMES = 21  # of the plan, as in `fly.lead_frames`
 AFTER_LOSS = 3  # frames without visibility before a policy takes over
@@ -53,6 +54,7 @@ TASKS = {
     "cosfly/Reacquire-v0": _ALONE,
 }
 REACQUIRES = "cosfly/Reacquire-v0"
+UNSUITABLE = "the trajectory gives no episode, because its drone trajectory is missing or too short"
 
 
 class BenchmarkTown(NamedTuple):
@@ -102,10 +104,10 @@ def episode_id(town: str, number: int) -> str:
 
 @dataclass(frozen=True)
 class BenchmarkWorld:
-    """A town: boxes that are drawn, obstacles, walkable ground and lanes."""
+    """A town with all that its episodes need."""
 
     town: BenchmarkTown
-    boxes: BoxMap
+    boxes: BoxMap  # that are drawn
     simplified: BoxMap
     ground: WalkableGround
     lanes: list[Lane]
@@ -143,13 +145,13 @@ def world_of(town: BenchmarkTown) -> BenchmarkWorld:
 
 @dataclass(frozen=True)
 class BenchmarkEpisode:
-    """A plan and the bystanders. num_lead: frames that follow the plan before a policy takes over."""
+    """One episode: the plan of a drone trajectory, and the bystanders."""
 
     task: str
     world: BenchmarkWorld
     number: int
     plan: DroneTrace
-    num_lead: int
+    num_lead: int  # frames that follow the plan before a policy takes over
     others: tuple[Bystander, ...]
 
     def simulation(self, airspace: Airspace) -> ClosedLoopTrajectory:

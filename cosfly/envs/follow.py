@@ -90,28 +90,20 @@ class FollowEnv(gymnasium.Env):
             if index is None:
                 index = int(self.np_random.integers(len(self.listed)))
             if not isinstance(index, int) or not 0 <= index < len(self.listed):
-                raise InputError(
-                    "the list has no episode with this index",
-                    where=f"{self.task}: options['episode']",
-                    got=repr(index)[:40],
-                    expected=f"a whole number from 0 to {len(self.listed) - 1}",
-                )
+                where = f"{self.task}: options['episode']"
+                expected = f"a whole number from 0 to {len(self.listed) - 1}"
+                raise InputError("the list has no such episode", where=where, got=repr(index)[:40], expected=expected)
             town, number = self.listed[index]
             if not self._begin(benchmark.episode_of(self.task, world_of(benchmark.HELD_OUT[town]), number)):
-                raise InputError(
-                    "the trajectory gives no episode, because its drone trajectory is missing or too short",
-                    where=f"{self.task}: {town}, trajectory {number}",
-                    fix="choose another options['episode']",
-                )
+                where = f"{self.task}: {town}, trajectory {number}"
+                raise InputError(benchmark.UNSUITABLE, where=where, fix="choose another options['episode']")
         else:
             world = world_of(benchmark.TRAINING[int(self.np_random.integers(len(benchmark.TRAINING)))])
             numbers = self.np_random.integers(100_000, size=benchmark.TRIES).tolist()
             if not any(self._begin(benchmark.episode_of(self.task, world, number)) for number in numbers):
-                raise InputError(
-                    f"none of {benchmark.TRIES} random trajectories gives an episode",
-                    where=f"{self.task}: {world.town.name}",
-                    fix="call reset with another seed",
-                )
+                problem = f"none of {benchmark.TRIES} random trajectories gives an episode"
+                where = f"{self.task}: {world.town.name}"
+                raise InputError(problem, where=where, fix="call reset with another seed")
         return self._observation(), self._info()
 
     def _begin(self, episode: BenchmarkEpisode | None) -> bool:
@@ -166,9 +158,7 @@ class FollowEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:
         """Return the present frame, (h, w, 3) uint8."""
-        if self.render_mode != "rgb_array" or self._simulation is None:
-            return None
-        return self._now.frame.rgb.copy()
+        return self._now.frame.rgb.copy() if self.render_mode == "rgb_array" and self._simulation else None
 
     def close(self) -> None:
         """Close the renderer."""

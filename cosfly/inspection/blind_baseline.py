@@ -56,19 +56,10 @@ def past_of(track: Track, window: Sequence[int], is_ordered: bool) -> np.ndarray
     bearing = np.arctan2(offsets_m[-1, 1], offsets_m[-1, 0])
     aspect = bearing - np.arctan2(target_mps[-1, 1], target_mps[-1, 0])  # between the view and the target's heading
     moves = target_speeds[-1] > STANDS_MPS
-    parts = [
-        drone_mps,
-        np.linalg.norm(drone_mps, axis=1),
-        target_mps,
-        target_speeds,
-        offsets_m[-1],
-        distances_m,
-        np.diff(distances_m),
-        np.asarray(wrap_deg(poses[:-1, 4] - yaw_deg)),
-        poses[:, 3],
-        track.target.visible[frames],
-        np.array([bearing, moves * np.cos(aspect), moves * np.sin(aspect), is_ordered], dtype=float),
-    ]
+    parts = [drone_mps, np.linalg.norm(drone_mps, axis=1), target_mps, target_speeds]
+    parts += [offsets_m[-1], distances_m, np.diff(distances_m)]
+    parts += [np.asarray(wrap_deg(poses[:-1, 4] - yaw_deg)), poses[:, 3], track.target.visible[frames]]
+    parts.append(np.array([bearing, moves * np.cos(aspect), moves * np.sin(aspect), is_ordered], dtype=float))
     return np.nan_to_num(np.concatenate([part.ravel() for part in parts]))
 
 

@@ -61,20 +61,13 @@ JPEG = Annotated[str, Field(pattern=r"^[A-Za-z0-9+/=]*$")]
 
 
 class TrackView(BaseModel):
-    """The pictures and curves of one track; JPEGs are in base64.
-
-    Attributes:
-        curves: By their names in PLOTS; None is a gap.
-        pictures: Three frames; None if one cannot be read.
-        plan: The map from above.
-        frames: The indices of the three frames: those of issues first, then the first, the middle and the last.
-    """
+    """The pictures and curves of one track; JPEGs are in base64."""
 
     time_s: list[FiniteFloat] = []
-    curves: dict[str, list[FiniteFloat | None]] = {}
-    pictures: list[JPEG | None] = Field([None, None, None], min_length=3, max_length=3)
-    plan: JPEG | None = None
-    frames: list[int] = []
+    curves: dict[str, list[FiniteFloat | None]] = {}  # by their names in PLOTS; None is a gap
+    pictures: list[JPEG | None] = Field([None, None, None], min_length=3, max_length=3)  # None: the file is unreadable
+    plan: JPEG | None = None  # the map from above
+    frames: list[int] = []  # of the pictures: those of issues first, then the first, the middle and the last
 
 
 def draw_track(

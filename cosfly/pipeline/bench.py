@@ -29,20 +29,16 @@ STAGES = ("pedestrians", "plan", "render", "inspect", "caption", "release")  # t
 
 
 class BenchRun(BaseModel):
-    """Figures of one run of the stage.
-
-    attempted: the frames of render, or the items of another stage, that were done or lost with a worker. gpu_percent,
-    gpu_gib: mean load and peak memory of the probes; None without a GPU.
-    """
+    """Figures of one run of the stage, which count frames of render and items of other stages."""
 
     workers: int
     seconds: float
-    attempted: int
+    attempted: int  # done, or lost with a worker
     successful: int
     cores_used: float
     peak_memory_mib: float
-    gpu_percent: float | None = None
-    gpu_gib: float | None = None
+    gpu_percent: float | None = None  # mean load; None without a GPU
+    gpu_gib: float | None = None  # peak memory
     restarts: int
     failed: int
 

@@ -48,13 +48,10 @@ class MissingFile(Exception):
 
 @dataclass
 class FigureReader:
-    """Reads figures by their places.
+    """Reads figures by their places."""
 
-    roots: folders that files are searched in, the run directory first. derived: the figures of the file `work`.
-    """
-
-    roots: Sequence[Path]
-    derived: dict[str, Any]
+    roots: Sequence[Path]  # folders that files are searched in, the run directory first
+    derived: dict[str, Any]  # the figures of the file `work`
     _documents: dict[str, Any] = field(default_factory=dict)
 
     def file(self, name: str) -> Path:

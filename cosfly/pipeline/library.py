@@ -63,12 +63,8 @@ def load_map(path: str | Path | None = None, *, source: str | None = None, seed:
         raise ConfigError("there is no map source of this name", where="load_map", got=source, expected=expected)
     if path is not None:
         if source not in FILE_SETTING:
-            raise ConfigError(
-                f"the map source {source} reads no file, but a path is given",
-                where="load_map",
-                got=str(path),
-                fix="omit the path, or choose another source",
-            )
+            problem = f"the map source {source} reads no file, but a path is given"
+            raise ConfigError(problem, where="load_map", got=str(path), fix="omit the path, or use another source")
         _check_taken(settings, settings.keys() - {FILE_SETTING[source]}, "load_map")
         settings[FILE_SETTING[source]] = path
     return load_source(build(MapsConfig, {"source": source, source: settings}, "load_map"), seed=seed)

@@ -65,27 +65,22 @@ OF_RELEASE = ("release", "decisions", "confusion", "repairs", "text_lengths", "f
 
 
 class Part(Table):
-    """A table of the paper with this run's figures. picture: JPEG in base64, on the page only."""
+    """A table of the paper with this run's figures."""
 
     source: Literal["recorded", "measured again"] = "recorded"
-    picture: str | None = Field(None, exclude=True)
+    picture: str | None = Field(None, exclude=True)  # JPEG in base64, on the page only
 
 
 class PaperTable(BaseModel):
-    """A table of `paper.yaml`.
-
-    head: names of the columns, separated by `|`. places: row -> place of our figures, or the text that replaces `{}`
-    in `template`. reason: why our figures differ. paper_rows: row -> the paper's figures. more_labels: further labels
-    of the paper that the table covers.
-    """
+    """A table of `paper.yaml`."""
 
     title: str
-    head: str
-    places: dict[str, str] = Field(alias="here")
+    head: str  # names of the columns, separated by `|`
+    places: dict[str, str] = Field(alias="here")  # row: place of our figures, or the text for `{}` in template
     template: str = Field("{}", alias="from")
-    reason: str = Field("", alias="why")
-    paper_rows: dict[str, Any] = Field({}, alias="paper")
-    more_labels: str = Field("", alias="also")
+    reason: str = Field("", alias="why")  # why our figures differ
+    paper_rows: dict[str, Any] = Field({}, alias="paper")  # row: the paper's figures
+    more_labels: str = Field("", alias="also")  # further labels of the paper that the table covers
     picture: str | None = None
 
     def labels(self, label: str) -> str:
@@ -94,11 +89,11 @@ class PaperTable(BaseModel):
 
 
 class Paper(BaseModel):
-    """`paper.yaml`. settings: label -> setting -> value; left_out: labels -> why."""
+    """`paper.yaml`."""
 
-    settings: dict[str, dict[str, Any]]
+    settings: dict[str, dict[str, Any]]  # label: setting: value
     tables: dict[str, PaperTable]
-    left_out: dict[str, str]
+    left_out: dict[str, str]  # labels: reason why they are not compared
 
 
 def read_paper() -> Paper:

@@ -16,15 +16,11 @@ BOUNDS |= {"multipleOf": "a multiple of"}
 
 
 class Setting(NamedTuple):
-    """One setting, or a group of settings.
+    """One setting, or a group of settings."""
 
-    name: with its sections, such as `plan.altitude_max_m`. value: JSON-able, None for a group. kind: a text about the
-    values that it takes, empty for a group. meaning: its description.
-    """
-
-    name: str
-    value: Any
-    kind: str
+    name: str  # with its sections, such as `plan.altitude_max_m`
+    value: Any  # can be written as JSON; None for a group
+    kind: str  # the allowed values in words; empty for a group
     meaning: str
 
 

@@ -61,14 +61,13 @@ INSTALL = 'pip install "cosfly[ompl]"'
 
 
 class PaperRow(NamedTuple):
-    """The paper's figures of a planner: mean of the four axes (seven planners only), weighted score, visibility,
-    clearance, and the number of 20 scenarios without collision."""
+    """The paper's figures of a planner."""
 
-    axes_mean: float | None
-    weighted: float
+    axes_mean: float | None  # mean of the four axes, printed for seven planners only
+    weighted: float  # weighted score
     visibility: float
     clearance_m: float
-    num_free: int
+    num_free: int  # scenarios of 20 without collision
 
 
 _PRINTED = {

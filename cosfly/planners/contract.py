@@ -5,8 +5,8 @@ A planner is one function, named in PLANNERS or, if it is a generic one, in REFE
     plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan
 
 It returns one drone position for each target position, keeps the shared limits (tab:drone_params), draws random numbers
-from `rng` only, and raises NoPathError where it finds no trajectory. `tests/test_planners_contract.py` checks that for
-every entry of PLANNERS. Only planners import compiled code, so that settings are read without it.
+from `rng` only, and raises NoPathError if it finds no trajectory. `tests/test_planners_contract.py` checks this for
+every planner. Only planners import compiled code, so this module and the settings load without it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from cosfly.runtime.errors import NoPathError, nearest
 if TYPE_CHECKING:
     from cosfly.geometry.kernels import BoxIndex
 
-# In the order of comparisons: the first is compared with each of the others.
+# In the order of comparisons: the first planner is compared with each of the others.
 PLANNERS = {
     "foresight": "cosfly.planners.foresight:plan",
     "track_astar": "cosfly.planners.track_astar:plan",
@@ -44,7 +44,7 @@ _REFERENCE_MODULES = {
 }  # fmt: skip
 REFERENCES = {name: f"cosfly.planners.reference.{module}:plan_{name}" for name, module in _REFERENCE_MODULES.items()}
 ALL_PLANNERS = PLANNERS | REFERENCES
-# Titles for tables and pictures, where they are not the names.
+# Titles for tables and pictures; other planners are shown by their names.
 TITLES = {
     "track_astar": "TA* + Smooth", "muco": "MuCO", "rrt_star": "RRT*", "prm": "PRM", "bspline_prm": "B-spline PRM",
     "astar": "3D A*", "weighted_astar": "weighted A*", "theta_star": "Theta*", "visibility_astar": "visibility-A*",
@@ -60,13 +60,15 @@ def title_of(name: str) -> str:
 
 
 def planner_notes(names: Iterable[str], cfg: PlanConfig) -> dict[str, str]:
-    """Return how planners named after the paper's differ from them with these settings."""
-    notes = {"track_astar": SMOOTHING_NOTE} | ({"muco": STEP_NOTE} if cfg.muco.step == "newton" else {})
+    """Return, for planners with the names of the paper's planners, how they differ from those."""
+    notes = {"track_astar": SMOOTHING_NOTE}
+    if cfg.muco.step == "newton":
+        notes["muco"] = STEP_NOTE
     return {name: notes[name] for name in names if name in notes}
 
 
 def known_planner(name: str) -> str:
-    """Return the name; raise ValueError where it is not in ALL_PLANNERS."""
+    """Return the name of a planner; raise ValueError if there is no such planner."""
     if name not in ALL_PLANNERS:
         raise ValueError(
             f"there is no planner {name!r}{nearest(name, ALL_PLANNERS)}; choose one of {', '.join(ALL_PLANNERS)}"
@@ -78,7 +80,7 @@ def known_planner(name: str) -> str:
 
 
 class MucoConfig(Config):
-    """Settings of the MuCO optimiser (subsec:appendix_planner_muco): the paper's loss; `step` chooses its optimiser."""
+    """Settings of MuCO (subsec:appendix_planner_muco), which minimizes the paper's loss in one of two ways (`step`)."""
 
     track_distance_m: ClassVar[float] = 28.0  # preferred slant distance to the target, m
     weight_tracking: ClassVar[float] = 2.0  # weight of (distance - track_distance_m)^2
@@ -208,11 +210,12 @@ class PlanConfig(Config):
         return self
 
     def style(self, name: str) -> Style:
-        """Return a row of the table of styles with the ranges of the settings."""
-        plain = name.removeprefix(OTHER_SIDE)
-        row = with_ranges(ROWS[plain], self.style_ranges.get(plain, {}))
+        """Return a row of the table of styles with the ranges of the settings, mirrored if the name asks for it."""
+        style_name = name.removeprefix(OTHER_SIDE)
+        row = with_ranges(ROWS[style_name], self.style_ranges.get(style_name, {}))
         if name.startswith(OTHER_SIDE) and row.bearing_deg is not None:
-            row = replace(row, bearing_deg=(-row.bearing_deg[1], -row.bearing_deg[0]))
+            low_deg, high_deg = row.bearing_deg
+            row = replace(row, bearing_deg=(-high_deg, -low_deg))
         return row
 
     def _rows(self) -> dict[str, Style]:
@@ -244,27 +247,21 @@ class PlanConfig(Config):
 
 @dataclass(frozen=True)
 class TrackingReference:
-    """The trajectory that a planner tracks, (n,) each, as closely as boxes, speed and visibility allow.
+    """The trajectory that a planner tracks as closely as boxes, speed and visibility allow; arrays are (n,).
 
-    heading_rad: smoothed direction of the target, continuous. bearing_rad: direction from the target to the drone,
-    counter-clockwise from the heading: 0 in front, pi behind. distance_m: slant distance to the hip point.
-    ground_distance_m: distance in the plane. pitch_rad: downward pitch of the view; it does not follow from the
-    distances, because the paper's three values do not agree. altitude_m: above the ground under the target;
-    altitude_min_m and altitude_max_m are hard bounds. keeps_sight: bool, whether the target must be visible; elsewhere
-    a planner ignores visibility. any_bearing: True for the paper's reference, whose bearing is a start and a weak
-    preference; for others bearing and altitude are the purpose.
+    The paper's three values of pitch and distances do not agree, so none of them follows from the others.
     """
 
-    heading_rad: np.ndarray
-    bearing_rad: np.ndarray
-    distance_m: np.ndarray
-    ground_distance_m: np.ndarray
-    pitch_rad: np.ndarray
-    altitude_m: np.ndarray
-    altitude_min_m: np.ndarray
-    altitude_max_m: np.ndarray
-    keeps_sight: np.ndarray
-    any_bearing: bool = False
+    heading_rad: np.ndarray  # smoothed direction of the target, continuous
+    bearing_rad: np.ndarray  # from the target to the drone, counter-clockwise from the heading: 0 in front, pi behind
+    distance_m: np.ndarray  # slant distance to the hip point
+    ground_distance_m: np.ndarray  # distance in the plane
+    pitch_rad: np.ndarray  # downward pitch of the view
+    altitude_m: np.ndarray  # above the ground under the target
+    altitude_min_m: np.ndarray  # hard bound
+    altitude_max_m: np.ndarray  # hard bound
+    keeps_sight: np.ndarray  # bool: whether the target must be visible; elsewhere a planner ignores visibility
+    any_bearing: bool = False  # the paper's reference: bearing is a weak preference; else bearing and altitude count
 
     @property
     def view_rad(self) -> np.ndarray:
@@ -279,20 +276,15 @@ class TrackingReference:
 
 @dataclass(frozen=True)
 class Scenario:
-    """The input of a planner; n >= 2 waypoints, dt_s apart.
-
-    targets_m: (n, 3) hip points. ground_m: (n,) height of the ground below each. past_m: (k, 3) positions of the drone
-    at the first k waypoints of a trajectory to continue; k is 0, or 3 and more, and only foresight continues one.
-    turns_back: such a drone first has to brake and turn back.
-    """
+    """The input of a planner: n >= 2 waypoints. Only foresight continues a trajectory from past positions."""
 
     path_id: str
-    targets_m: np.ndarray
-    ground_m: np.ndarray
+    targets_m: np.ndarray  # (n, 3) hip points
+    ground_m: np.ndarray  # (n,) height of the ground below each
     reference: TrackingReference
-    dt_s: float = DT_S
-    past_m: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
-    turns_back: bool = False
+    dt_s: float = DT_S  # time between waypoints
+    past_m: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))  # (k, 3) of the drone; k is 0, or at least 3
+    turns_back: bool = False  # the drone of `past_m` first has to brake and turn back
 
     @property
     def start(self) -> int:
@@ -306,41 +298,39 @@ class Scenario:
     def key_frames(self, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return every stride-th frame and the last, with the least, preferred and greatest z at each, all (m,).
 
-        The heights respect the bounds of all frames around a key frame, because a trajectory is straight between key
-        frames and the ground is not.
+        A trajectory is straight between key frames and the ground is not, so a height respects the bounds of all frames
+        around its key frame.
         """
         from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-        frames = np.unique(np.append(np.arange(self.start, len(self.targets_m), stride), len(self.targets_m) - 1))
-        least, preferred = (
-            maximum_filter1d(self.ground_m + altitudes_m, 2 * stride + 1, mode="nearest")[frames]
-            for altitudes_m in (self.reference.altitude_min_m, self.reference.altitude_m)
-        )
-        highest_m = self.ground_m + self.reference.altitude_max_m
-        return frames, least, preferred, minimum_filter1d(highest_m, 2 * stride + 1, mode="nearest")[frames]
+        last = len(self.targets_m) - 1
+        frames = np.unique(np.append(np.arange(self.start, last + 1, stride), last))
+        width = 2 * stride + 1
+        least_z = maximum_filter1d(self.ground_m + self.reference.altitude_min_m, width, mode="nearest")
+        preferred_z = maximum_filter1d(self.ground_m + self.reference.altitude_m, width, mode="nearest")
+        greatest_z = minimum_filter1d(self.ground_m + self.reference.altitude_max_m, width, mode="nearest")
+        return frames, least_z[frames], preferred_z[frames], greatest_z[frames]
 
-    def between(self, frames: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Return positions, (n, 3), that are straight between those at key frames, (m, 3)."""
+    def between(self, frames: np.ndarray, positions_m: np.ndarray) -> np.ndarray:
+        """Return positions, (n, 3), interpolated linearly between those at key frames, (m, 3)."""
         every = np.arange(len(self.targets_m))
-        return self.with_past(np.stack([np.interp(every, frames, places[:, axis]) for axis in range(3)], axis=1))
+        return self.with_past(np.stack([np.interp(every, frames, positions_m[:, axis]) for axis in range(3)], axis=1))
 
-    def no_path_error(self, what: str, floor_m: float) -> NoPathError:
-        """Return the error of a planner that finds no trajectory with a clearance of `floor_m`."""
-        low_m, high_m = self.reference.altitude_min_m.min(), self.reference.altitude_max_m.max()
-        expected = f"positions {low_m:g} to {high_m:g} m above ground, {floor_m:g} m from all boxes"
+    def no_path_error(self, what: str, clearance_m: float) -> NoPathError:
+        """Return the error of a planner that finds no trajectory with a clearance."""
+        low_m = self.reference.altitude_min_m.min()
+        high_m = self.reference.altitude_max_m.max()
+        expected = f"positions {low_m:g} to {high_m:g} m above ground and {clearance_m:g} m from all boxes"
         fix = "raise plan.altitude_max_m, or remove the pedestrian trajectory if a roof covers it"
         return NoPathError(what, where=self.path_id, expected=expected, fix=fix)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The result of a planner. positions_m: (n, 3), one per target. solver: JSON facts that do not vary between runs.
+    """The result of a planner. The filter drops a trajectory whose optimiser did not converge."""
 
-    is_converged: False where an optimiser stopped before it converged; the filter drops such a trajectory.
-    """
-
-    positions_m: np.ndarray
-    solver: dict = field(default_factory=dict)
+    positions_m: np.ndarray  # (n, 3), one per target
+    solver: dict = field(default_factory=dict)  # JSON facts about the search that do not vary between runs
     is_converged: bool = True
 
 

@@ -46,18 +46,14 @@ NEAR_COST, FAR_COST = 0.1, 0.03  # nearer and farther than the reference distanc
 
 @dataclass(frozen=True)
 class Lattice:
-    """Candidate places at m key frames; r rings, `NUM_AZIMUTHS` places on each.
+    """Candidate positions at m key frames: r rings with NUM_AZIMUTHS (a) positions on each."""
 
-    frames: (m,). places_m: (m, r, azimuths, 3). costs: (m, r, azimuths) without visibility. links: (r, r) rings that
-    can be reached from each, itself first, then -1. radius_max_m: of the largest ring. max_turn: azimuths between one
-    key frame and the next."""
-
-    frames: np.ndarray
-    places_m: np.ndarray
-    costs: np.ndarray
-    links: np.ndarray
-    radius_max_m: float
-    max_turn: int
+    frames: np.ndarray  # (m,)
+    places_m: np.ndarray  # (m, r, a, 3)
+    costs: np.ndarray  # (m, r, a), without visibility
+    links: np.ndarray  # (r, r) rings that can be reached from each, itself first, then -1
+    radius_max_m: float  # of the largest ring
+    max_turn: int  # most azimuths between one key frame and the next
 
 
 def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:

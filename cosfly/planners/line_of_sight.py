@@ -19,18 +19,14 @@ ROUNDING = 1e-6
 
 
 class Horizon(NamedTuple):
-    """The boxes that can hide one target, by direction; m boxes near it.
+    """The m boxes near one target that can hide it, and by sector of directions (s = NUM_SECTORS)."""
 
-    counts: (NUM_SECTORS,), lists: (NUM_SECTORS, m) boxes that reach into each sector; steepest: (NUM_SECTORS,). near:
-    (m,) m in the plane, less the rays' spread. slopes: (m,) a ray that rises more per horizontal metre passes above.
-    """
-
-    boxes: np.ndarray
-    near: np.ndarray
-    slopes: np.ndarray
-    counts: np.ndarray
-    lists: np.ndarray
-    steepest: np.ndarray
+    boxes: np.ndarray  # (m,)
+    near: np.ndarray  # (m,) distance in the plane, less the spread of the rays, m
+    slopes: np.ndarray  # (m,) a ray that rises more per horizontal metre passes above the box
+    counts: np.ndarray  # (s,) number of boxes that reach into the sector
+    lists: np.ndarray  # (s, m) those boxes
+    steepest: np.ndarray  # (s,) largest of their slopes
 
 
 @njit(cache=True)

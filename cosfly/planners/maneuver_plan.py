@@ -35,16 +35,13 @@ NOT_HELD = "style_not_held"
 
 @dataclass(frozen=True)
 class ManeuverPlan:
-    """The styles of one trajectory. segments: empty for the paper's `follow` from end to end.
-
-    order: of the mission that ends the pursuit. impossible: why the map cannot hold the style; the reference is the
-    paper's then."""
+    """The styles of one trajectory."""
 
     reference: TrackingReference
-    segments: tuple[Segment, ...] = ()
+    segments: tuple[Segment, ...] = ()  # empty for the paper's `follow` from end to end
     mission: Mission | None = None
-    order: MissionKind | None = None
-    impossible: str | None = None
+    order: MissionKind | None = None  # of the mission that ends the pursuit
+    impossible: str | None = None  # why the map cannot hold the style; the reference is then the paper's
 
     @property
     def searches(self) -> bool:

@@ -22,29 +22,24 @@ Range = tuple[float, float]  # a value is drawn uniformly from it for each segme
 
 @dataclass(frozen=True)
 class Style:
-    """One row. Distances are in the plane, altitudes above the ground under the target.
+    """One row of the table. Distances are in the plane, altitudes above the ground under the target.
 
-    purpose: labels of the decisions that the style is for. bearing_deg: of the drone as seen from the target,
-    counter-clockwise from its heading: 0 in front, 180 behind; None: as at the end of the previous segment.
-    either_side: half of the segments are mirrored. Values with `end` are reached at the end of the segment; None: as at
-    its start. climb_m: during a search. round_mps: speed around the target, positive counter-clockwise. hop_s: the
-    drone hovers this long before it takes a new position, at the bearing of the start of the halt. pace_mps: rate of
-    change of the distance between segments. suits: "uneven", a pedestrian who stops and hurries; "straight", one who
-    goes straight on; "": any.
+    Values with `end` are reached at the end of the segment; None: as at its start.
     """
 
-    purpose: tuple[str, ...]
+    purpose: tuple[str, ...]  # labels of the decisions that the style is for
     ground_distance_m: Range
     altitude_m: Range
+    # From the target to the drone, counter-clockwise from the heading: 0 in front, 180 behind; None: as before.
     bearing_deg: Range | None = None
-    either_side: bool = False
+    either_side: bool = False  # half of the segments are mirrored
     ground_distance_end_m: Range | None = None
     altitude_end_m: Range | None = None
-    climb_m: Range = (0.0, 0.0)
-    round_mps: Range = (0.0, 0.0)
-    hop_s: Range | None = None
-    pace_mps: Range = (4.0, 4.0)
-    suits: str = ""
+    climb_m: Range = (0.0, 0.0)  # during a search
+    round_mps: Range = (0.0, 0.0)  # speed around the target, positive counter-clockwise
+    hop_s: Range | None = None  # time that the drone hovers between its moves to new positions
+    pace_mps: Range = (4.0, 4.0)  # rate of change of the distance between segments
+    suits: str = ""  # pedestrian: uneven (stops and hurries), straight (goes straight on); empty: any
 
     @property
     def altitude_range_m(self) -> Range:

@@ -45,38 +45,30 @@ TRACKING, VISIBILITY, PATH, SAFETY, SMOOTHNESS = range(5)
 
 
 class Voxels(NamedTuple):
-    """The grid of one search. low: (3,) m, centre of voxel (0, 0, 0). shape: (3,). size: (3,) m. lengths: of moves, m.
+    """The grid of one search, with caches of clearances and edges."""
 
-    columns: (nx, ny) bool, inside the corridor. Caches: clearances (cells,) m, NaN is unknown; edges (cells, 27):
-    UNKNOWN, FREE or BLOCKED.
-    """
-
-    low: np.ndarray
-    shape: np.ndarray
-    size: np.ndarray
-    lengths: np.ndarray
-    columns: np.ndarray
-    clearances: np.ndarray
-    edges: np.ndarray
+    low: np.ndarray  # (3,) centre of voxel (0, 0, 0), m
+    shape: np.ndarray  # (3,) number of voxels
+    size: np.ndarray  # (3,) of a voxel, m
+    lengths: np.ndarray  # of moves, m
+    columns: np.ndarray  # (nx, ny) bool, inside the corridor
+    clearances: np.ndarray  # (cells,) m; NaN if not computed yet
+    edges: np.ndarray  # (cells, 27): UNKNOWN, FREE or BLOCKED
 
 
 class Costs(NamedTuple):
-    """Weights and lengths of the search; weights: (5,), places below.
+    """Weights and lengths of the search; m time layers."""
 
-    ring_m, least_z, preferred_z, greatest_z: (m,) of each layer. requested: (m, 2) reference position in the plane, NaN
-    if every position on the ring is allowed. sight: (m,) weight of the blocked part of the rays. start: (3,).
-    """
-
-    weights: np.ndarray
-    ring_m: np.ndarray
-    requested: np.ndarray
-    sight: np.ndarray
-    least_z: np.ndarray
-    preferred_z: np.ndarray
-    greatest_z: np.ndarray
+    weights: np.ndarray  # (5,), indices below
+    ring_m: np.ndarray  # (m,) preferred distance in the plane
+    requested: np.ndarray  # (m, 2) reference position in the plane; NaN if every position on the ring is allowed
+    sight: np.ndarray  # (m,) weight of the blocked part of the rays
+    least_z: np.ndarray  # (m,)
+    preferred_z: np.ndarray  # (m,)
+    greatest_z: np.ndarray  # (m,)
     influence_m: float
     safety_m: float
-    start: np.ndarray
+    start: np.ndarray  # (3,)
 
 
 @njit(cache=True)

@@ -26,17 +26,12 @@ MOST_SAMPLES = 40_000  # rays through the target's box; more are thinned evenly
 
 @dataclass(frozen=True)
 class TargetView:
-    """The projected target in one frame.
+    """The projected target in one frame; boxes are xmin, ymin, xmax, ymax."""
 
-    uv: (2,) px of the hip point, NaN behind the camera. depth_m: z-depth of the hip point. box_px: (4,) xmin, ymin,
-    xmax, ymax of the projected box, not clipped, NaN where all of it is behind the camera. bbox_px: (4,) the same
-    clipped to the image, NaN where none of it is inside.
-    """
-
-    uv: np.ndarray
-    depth_m: float
-    box_px: np.ndarray
-    bbox_px: np.ndarray
+    uv: np.ndarray  # (2,) px of the hip point; NaN behind the camera
+    depth_m: float  # z-depth of the hip point
+    box_px: np.ndarray  # (4,) projected box, not clipped; NaN if all of it is behind the camera
+    bbox_px: np.ndarray  # (4,) projected box, clipped to the image; NaN if none of it is inside
 
     @property
     def in_view(self) -> bool:

@@ -51,26 +51,22 @@ CONIFER_LOW = -0.78  # of a conifer's half height
 
 @dataclass(frozen=True)
 class Frame:
-    """One synchronous set of images, row 0 at the top, pixel (i, j) sampled at its centre (j + 0.5, i + 0.5).
+    """One synchronous set of images, row 0 at the top, pixel (i, j) sampled at its centre (j + 0.5, i + 0.5)."""
 
-    rgb (h, w, 3) uint8; depth (h, w) float32 z-depth in m, sky 1000.0, invalid 0.0; kinds (h, w) uint8 KINDS;
-    ids (h, w) uint16 instance ids.
-    """
-
-    rgb: np.ndarray
-    depth: np.ndarray
-    kinds: np.ndarray
-    ids: np.ndarray
+    rgb: np.ndarray  # (h, w, 3) uint8
+    depth: np.ndarray  # (h, w) float32 z-depth, m; sky 1000.0, invalid 0.0
+    kinds: np.ndarray  # (h, w) uint8, of KINDS
+    ids: np.ndarray  # (h, w) uint16 instance ids
 
 
 @dataclass(frozen=True)
 class Clothes:
-    """The appearance of a person, and linear RGB, (3,) each, of what it does not contain."""
+    """The appearance of a person, and the colours that it does not contain."""
 
     looks: Appearance
-    hair: np.ndarray
-    skin: np.ndarray
-    shoes: np.ndarray
+    hair: np.ndarray  # (3,) linear RGB
+    skin: np.ndarray  # (3,) linear RGB
+    shoes: np.ndarray  # (3,) linear RGB
 
     def color(self, slot: str) -> np.ndarray:
         """Return the linear RGB of a garment, (3,)."""
@@ -79,26 +75,23 @@ class Clothes:
 
 @dataclass(frozen=True)
 class PosedPerson:
-    """One person of 1.8 m at one time. hip_m (3,) world, the middle of the person's box, with the feet on its bottom;
-    phase_rad of the stride, two steps to a turn; swing from 0, standing, to 1, walking.
-    """
+    """One person of 1.8 m at one time."""
 
-    hip_m: np.ndarray
+    hip_m: np.ndarray  # (3,) world, the middle of the person's box; the feet are on its bottom
     heading_rad: float
-    phase_rad: float
-    swing: float
+    phase_rad: float  # of the stride: two steps are 2 pi
+    swing: float  # of arms and legs, from 0 (standing) to 1 (walking)
     clothes: Clothes
 
 
 @dataclass(frozen=True)
 class PosedCar:
-    """One car at one time: its box's middle (3,) world, half sizes, x along the heading; seed in [0, 1) of its
-    paint."""
+    """One car at one time."""
 
-    center_m: np.ndarray
+    center_m: np.ndarray  # (3,) world, the middle of its box
     heading_rad: float
-    half_extents_m: tuple[float, float, float]
-    seed: float
+    half_extents_m: tuple[float, float, float]  # x along the heading
+    seed: float  # of its paint, in [0, 1)
 
 
 @dataclass(frozen=True)
@@ -120,14 +113,12 @@ Others = Sequence[PosedBystander]
 class Renderer(Protocol):
     """A renderer of one map, for one thread: `RENDERERS[name](box_map, width_px, height_px, look, num_others, rim)`.
 
-    num_others: ids of `other_id` that no box may have. rim: boxes beyond the map (rim.py), without ids.
-
-    dresses: whether people wear the given clothes; otherwise tracks do not record appearances. device: hardware and
-    driver, one line. Opening raises EnvironmentMissing if a package or driver is missing.
+    num_others: ids of `other_id` that no box may have. rim: boxes beyond the map (rim.py), without ids. Opening raises
+    EnvironmentMissing if a package or driver is missing.
     """
 
-    dresses: bool
-    device: str
+    dresses: bool  # whether people wear the given clothes; otherwise tracks do not record appearances
+    device: str  # hardware and driver, one line
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
         """Compute shadows and the like for a trajectory within these corners, (3,) each, in this weather or in the

@@ -61,19 +61,12 @@ class PerturbationConfig(Config):
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of n frames.
+    """Poses of n frames."""
 
-    Attributes:
-        positions_m: (n, 3), the drone.
-        rotations_deg: (n, 3), pitch, yaw, roll.
-        targets_m: (n, 3), the person's hip point.
-        clearances_m: (n,), from the drone to the nearest obstacle, CLEARANCE_CAP_M at most.
-    """
-
-    positions_m: np.ndarray
-    rotations_deg: np.ndarray
-    targets_m: np.ndarray
-    clearances_m: np.ndarray
+    positions_m: np.ndarray  # (n, 3), the drone
+    rotations_deg: np.ndarray  # (n, 3), pitch, yaw, roll
+    targets_m: np.ndarray  # (n, 3), hip of the target
+    clearances_m: np.ndarray  # (n,), from the drone to the nearest obstacle, CLEARANCE_CAP_M at most
 
     def copy_frame(self, i: int, source: Poses) -> None:
         """Copy frame i from other poses, in place."""
@@ -85,22 +78,14 @@ class Poses:
 
 @dataclass(frozen=True)
 class PerturbedTrack:
-    """The perturbed poses and the events of each frame.
-
-    Attributes:
-        drone_offsets_m, target_offsets_m: (n, 3), zero without an applied position event.
-        rotation_offsets_deg: (n, 3), zero without an applied rotation event; the turn away from the person, after the
-            camera was aimed at the shifted person.
-        states: n times {"position", "rotation"}; each value is NONE, APPLIED or the reason for the fallback.
-        unshifted: The same frames with their rotation events only, for frames whose shift is dropped.
-    """
+    """The perturbed poses and the events of n frames."""
 
     poses: Poses
-    drone_offsets_m: np.ndarray
-    target_offsets_m: np.ndarray
-    rotation_offsets_deg: np.ndarray
-    states: list[dict[str, str]]
-    unshifted: PerturbedTrack | None = None
+    drone_offsets_m: np.ndarray  # (n, 3), zero without an applied position event
+    target_offsets_m: np.ndarray  # (n, 3), zero without an applied position event
+    rotation_offsets_deg: np.ndarray  # (n, 3), turn away from the shifted target; zero without a rotation event
+    states: list[dict[str, str]]  # n of {"position", "rotation"}: NONE, APPLIED or the reason for the fallback
+    unshifted: PerturbedTrack | None = None  # only the rotation events, for frames whose shift is dropped
 
     @classmethod
     def unperturbed(cls, planned: Poses) -> PerturbedTrack:
@@ -168,10 +153,10 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class _Scene:
-    """The inputs of a perturbation that no event changes; `cameras` holds one per frame."""
+    """The inputs of a perturbation that no event changes."""
 
     planned: Poses
-    cameras: Sequence[Camera]
+    cameras: Sequence[Camera]  # one per frame
     surroundings: Surroundings
     cfg: PerturbationConfig
     bystanders: DressedBystanders

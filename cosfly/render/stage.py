@@ -172,9 +172,9 @@ def run(
     box_map = read_boxes(boxes)
     inputs |= {f"mesh {name}": path for name, path in box_map.meshes.files().items()}
     if cfg.path_index is not None and cfg.path_index >= (num := len(read_traces(traces))):
+        problem = "no trajectory has this index"
         expected = f"an index below {num}"
-        where = "render.path_index"
-        raise ConfigError("no trajectory has this index", where=where, got=cfg.path_index, expected=expected)
+        raise ConfigError(problem, where="render.path_index", got=cfg.path_index, expected=expected)
     stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return out
@@ -199,10 +199,7 @@ def run(
         if fog_hides(weathers[trace.drawn_as(number).number], nearest_m):
             hidden.append(trace.path_id)
     if hidden:
-        log.warning(
-            "render: fog hides the target in all frames of %s; plan nearer, or choose other weather",
-            hidden,
-        )
+        log.warning("render: fog hides the target in all frames of %s; plan nearer, or change the weather", hidden)
     items = [
         Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track), len(trace.time_s[:: cfg.frame_stride]))
         for number, trace in passed.items()

@@ -50,27 +50,20 @@ DIFFERENT_CONTRAST = 10.0  # least difference of a pixel (CIE76)
 
 @dataclass(frozen=True)
 class TrackScript:
-    """All that one track shows.
-
-    Attributes:
-        trace: The drawn poses of trajectory `number` of a file.
-        between: Planned poses that are not drawn (`Track.between`).
-        cameras: One per frame.
-        weather: Replaces `look`, which is then None.
-    """
+    """All that one track shows."""
 
     town: str
     trajectory: str
     variant: str
-    number: int
-    trace: DroneTrace
-    between: np.ndarray | None
-    cameras: tuple[Camera, ...]
+    number: int  # index of the trajectory in its file
+    trace: DroneTrace  # its drawn poses
+    between: np.ndarray | None  # planned poses that are not drawn (`Track.between`)
+    cameras: tuple[Camera, ...]  # one per frame
     perturbed: PerturbedTrack
     gait: Gait
     clothes: Clothes
     others: DressedBystanders
-    look: Look | None
+    look: Look | None  # None with a weather
     weather: WeatherRecord | None
 
 

@@ -49,17 +49,11 @@ class BeamConfig(PlanConfig):
 
 
 class Planned(BaseModel):
-    """The outcome for one pedestrian at one beam.
+    """The outcome for one pedestrian at one beam."""
 
-    Attributes:
-        figures: Values of FIGURES; None if no trajectory was found.
-        reason: The reason of a dropped trajectory; None if it was kept.
-        times_ms: Times of `search` and `smooth`, from a second run of each.
-    """
-
-    figures: dict[str, float] | None = None
-    reason: str | None = None
-    times_ms: dict[str, float] = {}
+    figures: dict[str, float] | None = None  # values of FIGURES; None if no trajectory was found
+    reason: str | None = None  # of a dropped trajectory; None if it was accepted
+    times_ms: dict[str, float] = {}  # of `search` and `smooth`, from a second run of each
 
 
 class _Result(BaseModel):

@@ -29,7 +29,8 @@ FIGURE = (  # fig:weather_gallery
     ("overcast", "night"), ("snow_haze", "noon"), ("dust_haze", "morning"),
 )  # fmt: skip
 FIGURE_COLUMNS = 3
-FIGURE_TILE_PX, SHEET_TILE_PX = (640, 360), (320, 180)  # width, height
+FIGURE_TILE_PX = (640, 360)  # width, height
+SHEET_TILE_PX = (320, 180)
 STRIP_PX = 26  # height of the names below a picture
 JPEG_QUALITY = 88
 FIGURE_NAME, SHEET_NAME = "weather_gallery.jpg", "weather_sheet.jpg"
@@ -37,24 +38,22 @@ FOV_DEG = 67.38  # 90 degrees at a zoom of 1.5
 
 
 def run(
-    cfg: RenderConfig, boxes: Path, traces: Path, out: Path, *, trajectory: int = 0, frame: int | None = None,
+    cfg: RenderConfig, boxes: Path, traces: Path, out: Path, *, frame: int | None = None,
     fov_deg: float = FOV_DEG, seed: int = 0, advance: Callable[[], object] = lambda: None,
 ) -> tuple[Path, Path]:  # fmt: skip
     """Read `boxes_3d.json` and `drone_trace.json`; write the figure and the sheet and return their paths.
 
     Args:
-        trajectory: Index of a trajectory of the traces.
-        frame: Index of a frame of its clean track; None takes the frame that looks down least.
+        frame: Index of a frame of the first clean track, as in the paper; None takes the frame that looks down least.
         advance: Called for each picture that is drawn.
 
     Raises:
-        InputError: There is no such trajectory or frame, or an input is malformed.
+        InputError: There is no trajectory, no such frame, or an input is malformed.
     """
     all_traces = read_traces(traces)
-    if not 0 <= trajectory < len(all_traces):
-        expected = f"an index from 0 to {len(all_traces) - 1}"
-        raise InputError("the file has no trajectory with this index", where=traces, got=trajectory, expected=expected)
-    trace = all_traces[trajectory]
+    if not all_traces:
+        raise InputError("the file contains no drone trajectory", where=traces)
+    trace = all_traces[0]
     index = int(np.argmax(trace.rotations_deg[:, 0])) if frame is None else frame
     if not 0 <= index < len(trace.time_s):
         expected = f"an index from 0 to {len(trace.time_s) - 1}"
@@ -65,14 +64,15 @@ def run(
     pose = world_from_camera(trace.positions_m[index], trace.rotations_deg[index])
     clothes = choose_clothes(rng_for(seed, "weather_gallery", trace.path_id))
     person = gait_of(trace.targets_m, trace.time_s).posed(index, trace.targets_m[index], clothes)
-    places = np.concatenate([trace.positions_m, trace.targets_m])
-    corners = places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M
+    points_m = np.concatenate([trace.positions_m, trace.targets_m])
+    low_m = points_m.min(axis=0) - MARGIN_M
+    high_m = points_m.max(axis=0) + MARGIN_M
     intrinsic = intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg)
     pictures = {}
     renderer = renderer_of(cfg, box_map, seed)
     try:
         for weather, time_of_day in product(WEATHERS, TIMES):
-            renderer.prepare(*corners, resolved(WEATHERS[weather], TIMES[time_of_day]))
+            renderer.prepare(low_m, high_m, resolved(WEATHERS[weather], TIMES[time_of_day]))
             rgb = renderer.render(pose, intrinsic, person).rgb
             pictures[weather, time_of_day] = cv2.resize(rgb, FIGURE_TILE_PX, interpolation=cv2.INTER_AREA)
             advance()

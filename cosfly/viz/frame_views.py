@@ -34,17 +34,11 @@ PAGE_JPEG_QUALITY = 72
 
 @dataclass(frozen=True)
 class Pictures:
-    """The pictures of each frame in a prompt.
+    """The pictures of each frame in a prompt."""
 
-    Attributes:
-        views: In this order; empty if no picture is sent.
-        size_px: (width, height) of one view's picture. Pixel values of the prompt and of the answer refer to it.
-        layout: separate: one picture per view; tiled: one per frame, with the views from left to right.
-    """
-
-    views: tuple[View, ...]
-    size_px: tuple[int, int]
-    layout: Layout = "separate"
+    views: tuple[View, ...]  # in this order; empty if no picture is sent
+    size_px: tuple[int, int]  # width, height of one view; pixel values of the prompt and of the answer refer to it
+    layout: Layout = "separate"  # one picture per view; tiled: one per frame, with the views from left to right
     depth_range_m: float = DEPTH_RANGE_M
 
     def read(self, frame: Path) -> list[np.ndarray]:

@@ -27,10 +27,10 @@ EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("
 
 
 class _Box(NamedTuple):
-    """One box to draw: corners (8, 3) and middle (3,), world m."""
+    """One box to draw."""
 
-    corners_m: np.ndarray
-    center_m: np.ndarray
+    corners_m: np.ndarray  # (8, 3) world
+    center_m: np.ndarray  # (3,) world
     color: Color
     label: str
 

@@ -42,14 +42,14 @@ MOST_PATHS = 100
 
 @dataclass
 class PageTrack:
-    """A drone trajectory of a planner or a tree. path: id of its pedestrian trajectory; kind: text of the legend.
+    """A drone trajectory of a planner or a tree.
 
-    rows: (n, 10) s, drone x, y, z, m, pitch, yaw, degrees, target x, y, z, m (NaN if unknown), visibility.
+    Columns of `rows`: time s; drone x, y, z m; pitch, yaw degrees; target x, y, z m (NaN if unknown); visibility.
     """
 
-    path: str
-    kind: str
-    rows: np.ndarray
+    path: str  # id of its pedestrian trajectory
+    kind: str  # text of the legend
+    rows: np.ndarray  # (n, 10)
     figures: dict[str, float] = field(default_factory=dict)
     drawn: Track | None = None
     pictures: dict[int, str] = field(default_factory=dict)

@@ -34,12 +34,12 @@ Color = Sequence[float]  # RGB, 0..255
 
 @dataclass(frozen=True)
 class TopView:
-    """A window of the world, north up. west_m, north_m: the place of pixel (0, 0). size_px: width, height."""
+    """A window of the world, north up."""
 
-    west_m: float
-    north_m: float
+    west_m: float  # x of pixel (0, 0)
+    north_m: float  # y of pixel (0, 0)
     pixels_per_m: float
-    size_px: tuple[int, int]
+    size_px: tuple[int, int]  # width, height
 
     @classmethod
     def around(cls, points_m: np.ndarray, longer_side_px: int, margin_m: float = 2.0) -> Self:

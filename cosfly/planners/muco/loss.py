@@ -68,24 +68,17 @@ THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
 
 
 class Problem(NamedTuple):
-    """The constants of one optimisation; n waypoints.
+    """The constants of one optimisation; n waypoints."""
 
-    targets: (n, 3) m, hip points. views_rad: (n,) preferred azimuth of the view. distances: (n,) m, preferred. weights:
-    (7,) in the order of TERM_NAMES. altitudes: (n, 3) least, preferred, greatest z of each waypoint in the world, m.
-    pitches_rad: (n, 3) lower edge of the band, preferred, upper edge. keeps_sight: (n,) bool, whether a waypoint has a
-    visibility term. bearing_weight: of the view's azimuth.
-    altitude_weights: (4,) below the least, above the preferred, oscillation, beneath the preferred.
-    """
-
-    targets: np.ndarray
-    views_rad: np.ndarray
-    distances: np.ndarray
-    weights: np.ndarray
-    altitudes: np.ndarray
-    keeps_sight: np.ndarray
-    bearing_weight: float
-    altitude_weights: np.ndarray
-    pitches_rad: np.ndarray
+    targets: np.ndarray  # (n, 3) hip points, m
+    views_rad: np.ndarray  # (n,) preferred azimuth of the view
+    distances: np.ndarray  # (n,) preferred distance, m
+    weights: np.ndarray  # (7,) in the order of TERM_NAMES
+    altitudes: np.ndarray  # (n, 3) least, preferred, greatest z of each waypoint in the world, m
+    keeps_sight: np.ndarray  # (n,) bool, whether a waypoint has a visibility term
+    bearing_weight: float  # of the azimuth of the view
+    altitude_weights: np.ndarray  # (4,) below the least, above the preferred, oscillation, beneath the preferred
+    pitches_rad: np.ndarray  # (n, 3) lower edge of the band, preferred, upper edge
     influence_m: float
     difference_m: float
     pitch_weight: float
@@ -97,24 +90,17 @@ class Problem(NamedTuple):
 
 
 class State(NamedTuple):
-    """The buffers that an evaluation writes; reused.
+    """The buffers that each evaluation overwrites; n waypoints."""
 
-    terms: (9,) the loss by term. gradient, visibility_gradient: (n, 3), the first without the second.
-    band: (BAND_ROWS, 3 n) the lower band of the curvature. visibility: (n,) five-ray visibility. rough: (n,) share of
-    each waypoint in the terms that are not smooth, visibility and safety. blockers: (k,) buffer of box numbers.
-    contacts: (n, 3) unit normal of the obstacle that a waypoint touches, or zero. nearby: cached boxes from earlier
-    evaluations; states may share them.
-    """
-
-    terms: np.ndarray
-    gradient: np.ndarray
-    visibility_gradient: np.ndarray
-    band: np.ndarray
-    visibility: np.ndarray
-    rough: np.ndarray
-    blockers: np.ndarray
-    contacts: np.ndarray
-    nearby: Nearby
+    terms: np.ndarray  # (9,) the loss by term
+    gradient: np.ndarray  # (n, 3), without the gradient of visibility
+    visibility_gradient: np.ndarray  # (n, 3)
+    band: np.ndarray  # (BAND_ROWS, 3 n) the lower band of the curvature
+    visibility: np.ndarray  # (n,) five-ray visibility
+    rough: np.ndarray  # (n,) share of each waypoint in the terms that are not smooth: visibility and safety
+    blockers: np.ndarray  # (k,) buffer of box numbers
+    contacts: np.ndarray  # (n, 3) unit normal of the obstacle that a waypoint touches, or zero
+    nearby: Nearby  # cached boxes from earlier evaluations; states may share them
 
 
 def make_state(num_points: int, num_boxes: int) -> State:

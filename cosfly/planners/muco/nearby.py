@@ -20,18 +20,13 @@ ROOM = 32  # boxes in one entry; a longer list is not cached
 
 
 class Nearby(NamedTuple):
-    """Cached boxes of n waypoints.
+    """Cached boxes of n waypoints."""
 
-    anchors: (n, 3) m, waypoints when their boxes were queried; infinite where nothing is cached. around: (n, ROOM)
-    boxes within reach of the waypoint. on_view: (n, ROOM) boxes on the view of its target. num_around, num_on_view:
-    (n,) their numbers, -1 for more than ROOM.
-    """
-
-    anchors: np.ndarray
-    around: np.ndarray
-    num_around: np.ndarray
-    on_view: np.ndarray
-    num_on_view: np.ndarray
+    anchors: np.ndarray  # (n, 3) the waypoint when its boxes were queried, m; infinite if nothing is cached
+    around: np.ndarray  # (n, ROOM) boxes within reach of the waypoint
+    num_around: np.ndarray  # (n,) their number, -1 for more than ROOM
+    on_view: np.ndarray  # (n, ROOM) boxes between the waypoint and its target
+    num_on_view: np.ndarray  # (n,) their number, -1 for more than ROOM
 
 
 @njit(cache=True)

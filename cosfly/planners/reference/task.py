@@ -21,18 +21,15 @@ FREE_STEP_M, FREE_REACH_M = 2.0, 40.0  # of the search for a free place near a b
 
 @dataclass(frozen=True)
 class Task:
-    """A path to find from `start` to `goal`, (3,) m, between the corners `low` and `high` of a volume, (3,) m.
+    """A path to find from a start to a goal in a volume."""
 
-    clearance_m: growth of boxes on every side. num: points of the trajectory.
-    """
-
-    start: np.ndarray
-    goal: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    start: np.ndarray  # (3,) m
+    goal: np.ndarray  # (3,) m
+    low: np.ndarray  # (3,) m, corner of the volume
+    high: np.ndarray  # (3,) m, corner of the volume
     obstacles: BoxIndex
-    clearance_m: float
-    num: int
+    clearance_m: float  # by which boxes are enlarged on every side
+    num: int  # points of the trajectory
     dt_s: float
     rng: np.random.Generator
 

@@ -109,19 +109,12 @@ LONGEST_M = 60.0  # length of the longest shadow
 
 
 class ShadowRegion(NamedTuple):
-    """One rectangle of pixels and the movers whose shadows or headlights may change it.
+    """One rectangle of pixels and the movers whose shadows or headlights may change it."""
 
-    Attributes:
-        rectangle_px: x0, y0, x1, y1.
-        points: (k, 3) m, relative to the scene's origin; their hull holds all shadows and lights of the movers.
-        capsules: (c, 2, 4) of `capsules_of`.
-        has_person: Whether the person is one of the movers.
-    """
-
-    rectangle_px: tuple[int, int, int, int]
-    points: np.ndarray
-    capsules: np.ndarray
-    has_person: bool
+    rectangle_px: tuple[int, int, int, int]  # x0, y0, x1, y1
+    points: np.ndarray  # (k, 3) m, relative to the scene's origin; their hull holds the shadows and lights
+    capsules: np.ndarray  # (c, 2, 4) of `capsules_of`
+    has_person: bool  # whether the target is one of the movers
 
     def overlaps(self, other: ShadowRegion) -> bool:
         a, b = self.rectangle_px, other.rectangle_px

@@ -45,17 +45,12 @@ def sources(vertex: tuple[str, ...], fragment: tuple[str, ...], define: str = ""
 
 @dataclass(frozen=True)
 class Programs:
-    """The programs of one kind of weather.
+    """The programs of one kind of weather."""
 
-    Attributes:
-        materials, near_movers: One for each material; those of near_movers also draw the shadows of movers.
-        rain: None in fair weather.
-    """
-
-    materials: list[Any]
-    near_movers: list[Any]
+    materials: list[Any]  # one for each material
+    near_movers: list[Any]  # one for each material; they also draw the shadows of movers
     sky: Any
-    rain: Any
+    rain: Any  # None in fair weather
 
 
 def programs_of(context: Any, define: str | None, *, snaps: bool) -> Programs:

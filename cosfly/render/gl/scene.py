@@ -162,18 +162,14 @@ HAS_PAINT = 2.0  # seed of a road on a map with its own lane markings; the shade
 
 @dataclass(frozen=True)
 class Scene:
-    """A map ready to be drawn. origin_m: (3,) world position of the parts' zero; plane_z_m: the ground plane, world.
-
-    loose: surfaces on sloping `ground`, and the meshes of boxes. lamps: (n, 3) relative to the parts' zero, of a map
-    without any among its parts.
-    """
+    """A map ready to be drawn."""
 
     parts: Parts
-    origin_m: np.ndarray
-    plane_z_m: float
+    origin_m: np.ndarray  # (3,) world position of the origin of the parts
+    plane_z_m: float  # height of the ground plane, world
     ground: Ground
-    loose: Loose
-    lamps: np.ndarray
+    loose: Loose  # surfaces on sloping ground, and the meshes of boxes
+    lamps: np.ndarray  # (n, 3) relative to the origin; only for a map without lamps among its parts
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and highest place of things on the ground plane, (3,) each, world."""
