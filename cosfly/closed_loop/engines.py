@@ -263,7 +263,8 @@ class LocalEngine(PromptedEngine):
 
     @staticmethod
     def _sample(question: Question) -> Sample:
-        window, pictures = question.window, question.pictures
+        window = question.window
+        pictures = question.pictures
         return Sample(
             sample_id=window.sample_id, window_id=window.sample_id, run="", town=window.town,
             trajectory=window.trajectory, variant=window.variant, walk="", window=window.indices, language="en",

@@ -155,7 +155,7 @@ def score_episodes(records: Iterable[Episode], *, trained_on: Sequence[str] | No
         students.add((episode.student, episode.engine, episode.list_sha256 or ""))
     if len(students) != 1:
         got = "; ".join(" ".join(filter(None, words)) for words in sorted(students)[:3]) or "no episode"
-        raise InputError("a score needs episodes of one student on one list", where="episodes", got=got)
+        raise InputError("a score needs episodes of a single student on a single list", where="episodes", got=got)
     measured.sort(key=lambda score: (score.town, score.episode))
     student, engine, list_sha256 = students.pop()
     return score_measured(

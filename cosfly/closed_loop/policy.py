@@ -132,7 +132,8 @@ class Policy:
         if isinstance(value, str) and value in TOKENS:
             return EngineDecision("ok", value, answer_s=answer_s)
         if isinstance(value, list):
-            command, drone = np.array(value), observation.simulation.drone
+            command = np.array(value)
+            drone = observation.simulation.drone
             low, high = drone.bounds
             if command.shape == low.shape and (command >= low).all() and (command <= high).all():
                 return EngineDecision("ok", answer_s=answer_s, command=drone.within_speed(command))
@@ -140,7 +141,8 @@ class Policy:
 
     def _ask(self, call: tuple | None, limit_s: float) -> tuple[Answer, Any]:
         """Return the reply to a call, or, with call None, the first message of the process."""
-        until_s, reply = time.monotonic() + limit_s, None
+        until_s = time.monotonic() + limit_s
+        reply = None
         try:
             if self._awaits_reply:  # it may still work on the previous call
                 reply = self._receive(until_s)

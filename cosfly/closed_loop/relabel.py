@@ -87,7 +87,8 @@ def _seed_of(flown: Path, cfg: ClosedLoopConfig) -> int:
     begun = read_stage_record(flown)
     if begun.stage != "fly":
         what = "the folder is not the output of `cosfly fly --map --paths`"
-        raise InputError(what, where=flown, got=f"output of the stage {begun.stage}")
+        fix = "pass the output directory of that command"
+        raise InputError(what, where=flown, got=f"output of the stage {begun.stage}", fix=fix)
     if "others" in begun.inputs:
         raise InputError(
             "these episodes have bystanders, which --relabel cannot render",
@@ -110,7 +111,8 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
     """Open a map in this process; return the function that relabels one decision of a student."""
     plans = {plan.path_id: (n, plan) for n, plan in enumerate(read_traces(flown / PLAN / TRACES))}
     space = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed)
-    relabel, num = cfg.fly.relabel, cfg.caption.window
+    relabel = cfg.fly.relabel
+    num = cfg.caption.window
 
     def work(item: Item) -> Outcome:
         episode, i = item.payload
@@ -148,7 +150,8 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
         reasons = _reasons(record, i, future)
         if relabel.mistakes_only and not reasons:
             return Outcome(drop_reason="no_mistake")
-        poses, about = simulation.poses, {"student": record.student, "round": relabel.round}
+        poses = simulation.poses
+        about = {"student": record.student, "round": relabel.round}
         trace = flown_trace(
             space.surroundings.obstacles, np.array([moment.time_s for moment in moments]),
             np.hstack([poses.positions_m, poses.rotations_deg]), poses.targets_m, poses.clearances_m,

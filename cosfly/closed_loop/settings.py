@@ -65,7 +65,8 @@ class RelabelConfig(Config):
 
 
 CONTROLLER_FILE = Path(__file__).with_name("controller.yaml")
-BASELINES, MODELS = ("track_straight", "random"), ("endpoint", "vllm", "transformers")
+BASELINES = ("track_straight", "random")
+MODELS = ("endpoint", "vllm", "transformers")
 ENGINES = ("rules", *MODELS, "policy", *BASELINES, "planner")
 KINDS = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR, policy:MODULE:CLASS, track_straight, random or planner"
 
@@ -112,7 +113,7 @@ class FlyConfig(Config):
         if self.engine not in ENGINES:
             raise ValueError(f"student {self.student!r} does not exist{nearest(self.student, ENGINES)}; use {KINDS}")
         if self.adapter is not None and self.engine != "transformers":
-            raise ValueError(f"an adapter needs a student transformers:MODEL_DIR, but the student is {self.student!r}")
+            raise ValueError(f"adapter needs student transformers:MODEL_DIR, but the student is {self.student!r}")
         return self
 
     def recorded(self) -> dict[str, Any]:

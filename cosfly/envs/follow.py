@@ -113,7 +113,8 @@ class FollowEnv(gymnasium.Env):
         if self._airspace is None or self._episode is None or self._episode.world is not episode.world:
             self.close()
             self._airspace = episode.world.airspace(self.task, self.size_px)
-        self._episode, self._simulation = episode, episode.simulation(self._airspace)
+        self._episode = episode
+        self._simulation = episode.simulation(self._airspace)
         self._now = self._simulation.reset()[-1]
         self._controller = Controller(self._controls, self.drone, self._now)
         return self._now.target.visible != (self.task == benchmark.REACQUIRES)

@@ -97,7 +97,8 @@ def _lists(folder: Path, names: list[str]) -> bool:
 def _check_header(path: Path, track: Track, where: str, report: Report) -> None:
     """Check type and size of a picture or a depth image by its header."""
     assert track.folder is not None
-    tree, (width, height) = tree_of_track(track.folder), (track.camera.width_px, track.camera.height_px)
+    tree = tree_of_track(track.folder)
+    width, height = (track.camera.width_px, track.camera.height_px)
     is_depth = path.suffix == ".npy"
     expected = f"float32 ({height}, {width})" if is_depth else f"a PNG of {width} x {height} px"
     try:

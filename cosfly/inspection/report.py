@@ -49,7 +49,8 @@ PLOTS: dict[str, tuple[str, str, tuple[float | None, float | None]]] = {
 }
 OF_FRAME = re.compile(r"(?:frame_|points\[|frame )(\d+)")  # the frame's index in `where` of an issue
 BETWEEN_FRAMES = ("temporal_jump", "frozen_frame", "teleport")
-PLAN_PX, MARGIN_M = 300, 12.0
+PLAN_PX = 300
+MARGIN_M = 12.0
 # RGB
 DRONE = (35, 100, 220)
 TARGET = (235, 120, 20)
@@ -174,7 +175,8 @@ def report_html(name: str, inspection: Inspection, views: Mapping[str, TrackView
         name: Name of the run.
         views: By track folder. Pages larger than `page_mb` leave out the pictures of the last tracks.
     """
-    tracks, coverage = inspection.flights, inspection.coverage
+    tracks = inspection.flights
+    coverage = inspection.coverage
     accepted = [track for track in tracks if track.result == "accepted"] or tracks
     accepted = [track for track in sorted(accepted, key=lambda track: track.track) if track.folder in views]
     counts = {

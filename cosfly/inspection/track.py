@@ -277,7 +277,8 @@ def check_projection(track: Track, report: Report) -> None:
             continue
         pose = world_from_camera(track.positions_m[i], track.rotations_deg[i])
         uv, depth_m = project(track.targets_m[i : i + 1], pose, track.camera_at(i).intrinsic)
-        box, pixels = target_box(track, i), limits.REPROJECTION_TOLERANCE_PX
+        box = target_box(track, i)
+        pixels = limits.REPROJECTION_TOLERANCE_PX
         recorded = (
             ("image_uv", target.uv[i], uv[0], pixels, "px"),
             # The target of another program has another size.
@@ -298,7 +299,8 @@ def check_projection(track: Track, report: Report) -> None:
 def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Metrics) -> None:
     """Check files and pixels; the visibility of rendered frames is measured but never rejects (sec:dataset_stats)."""
     assert track.folder is not None
-    metas, target = check_files(track, report), track.target
+    metas = check_files(track, report)
+    target = track.target
     # Other programs count others in another way.
     bystanders = {i: meta.others for i, meta in metas.items() if track.is_ours and meta and meta.others}
     check_bystanders(track, bystanders, cfg.clearance_min_m, report, metrics)

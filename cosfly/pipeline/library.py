@@ -148,7 +148,7 @@ def render_frames(
         pitch, yaw = look_at(positions, targets)
         rotations = np.degrees(np.column_stack([pitch, yaw, np.zeros(len(positions))]))
     else:
-        fix = "pass rotation_deg, or the target_m that it looks at"
+        fix = "pass rotation_deg, or pass target_m to look at the target"
         raise InputError("the camera has no direction", where="render_frames", fix=fix)
     camera = {"width_px": size_px[0], "height_px": size_px[1], "fovs_deg": [fov_deg]}
     cfg = build(RenderConfig, settings | camera, "render_frames")

@@ -116,12 +116,11 @@ def run(
     """
     done = [stage.name for stage in summarize(folder).stages if stage.state == "complete"]
     if missing := [name for name in STAGES if name not in done]:
-        raise InputError(
-            "the run directory has no complete drone trajectories",
-            where=folder,
-            got=f"incomplete stages: {', '.join(missing)}",
-            fix=f"one town at a time: {folder}/{next(iter(cfg.towns))}" if cfg.towns else f"cosfly run {folder}",
-        )
+        fix = f"complete the run: cosfly run {folder}"
+        if cfg.towns:
+            fix = f"pass the directory of one town: {folder}/{next(iter(cfg.towns))}"
+        got = f"incomplete stages: {', '.join(missing)}"
+        raise InputError("the run directory has no complete drone trajectories", where=folder, got=got, fix=fix)
     sample = measure(cfg, folder, out, pedestrians, done, pool | {"seed": seed, "resume": resume})
     reader = FigureReader([folder, out], {} if sample is None else {"sample": sample})
     reader.derived |= derived_figures(cfg, folder, reader, done)

@@ -35,7 +35,7 @@ def explain(cfg: BaseModel, section: str | None = None) -> list[Setting]:
         raise ConfigError(
             f"there is no section or setting of this name{nearest(section, [setting.name for setting in settings])}",
             got=section,
-            expected="a name such as plan or plan.muco, after that of the configuration",
+            expected="a section or setting such as plan.muco, or a configuration",
         )
     return selected
 

@@ -58,7 +58,8 @@ class Lattice:
 
 def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
     """Return the rings around the target. climbing: add places far above the reference, at fewer key frames."""
-    reference, targets = scenario.reference, scenario.targets_m
+    reference = scenario.reference
+    targets = scenario.targets_m
     stride = max(1, round((BETWEEN_KEYS_CLIMBING_S if climbing else BETWEEN_KEYS_S) / scenario.dt_s))
     frames, least_z, _, greatest_z = scenario.key_frames(stride)
     least_z, greatest_z = least_z[:, None], greatest_z[:, None]
@@ -78,14 +79,16 @@ def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
     aside = np.where(off > 0, FAR_COST, NEAR_COST) * off**2 + high * (STEP_UP_M * rings[:, 1] / distances_m) ** 2
     costs = aside[:, :, None] + turned * np.minimum(turns, 2.0 * np.pi - turns) ** 2
     if len(scenario.past_m):  # all places of the first key frame are the drone's position
-        places_m[0], costs[0] = scenario.past_m[-1], 0.0
+        places_m[0] = scenario.past_m[-1]
+        costs[0] = 0.0
     max_turn = MAX_TURN_CLIMBING if climbing else MAX_TURN
     return Lattice(frames, places_m, costs, _links(rings), float(radii_m.max()), max_turn)
 
 
 def _links(rings: np.ndarray) -> np.ndarray:
     """Return the numbers of the rings next to each, outwards and up, (r, r): itself first, then -1."""
-    outwards, levels = rings[:, 0], np.searchsorted(np.unique(rings[:, 1]), rings[:, 1])
+    outwards = rings[:, 0]
+    levels = np.searchsorted(np.unique(rings[:, 1]), rings[:, 1])
     near = (abs(outwards[:, None] - outwards) <= 1) & (abs(levels[:, None] - levels) <= 1)
     np.fill_diagonal(near, False)
     links = np.full(near.shape, -1)
@@ -115,7 +118,8 @@ def search_trajectory(
         obstacles: at least the boxes of the map that can be near the lattice or hide the target.
         clearance_m: least distance of points and of the lines between them to boxes.
     """
-    frames, num_azimuths = lattice.frames, lattice.places_m.shape[2]
+    frames = lattice.frames
+    num_azimuths = lattice.places_m.shape[2]
     places = lattice.places_m.reshape(len(frames), -1, 3)
     aloft = boxes_aloft(obstacles, scenario.targets_m, lattice)
     gaps, hidden = np.zeros(places.shape[:2]), np.ones(places.shape[:2])
@@ -126,7 +130,8 @@ def search_trajectory(
     place_costs[~scenario.reference.keeps_sight[frames]] = 0.0
     place_costs += lattice.costs.reshape(place_costs.shape)
     longest_m = SPEED_SHARE * cfg.speed_max_mps * scenario.dt_s * np.diff(frames, prepend=frames[0])
-    links, max_turn = lattice.links, lattice.max_turn
+    links = lattice.links
+    max_turn = lattice.max_turn
     chosen = _cheapest(
         places, place_costs, gaps, longest_m, aloft, clearance_m, links, num_azimuths, max_turn, WAY_COST
     )

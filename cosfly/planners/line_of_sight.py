@@ -61,7 +61,9 @@ def _boxes_round(index, target, reach_m, least_slope):
     num = 0
     if len(index.rows) == 0:
         return boxes, near, slopes, spans
-    cell, num_x, num_y = index.grid[kernels.CELL], index.shape[0], index.shape[1]
+    cell = index.grid[kernels.CELL]
+    num_x = index.shape[0]
+    num_y = index.shape[1]
     first_x = min(max(int(np.floor((target[0] - reach_m - index.grid[kernels.ORIGIN_X]) / cell)), 0), num_x)
     last_x = min(int(np.floor((target[0] + reach_m - index.grid[kernels.ORIGIN_X]) / cell)), num_x - 1)
     first_y = min(max(int(np.floor((target[1] - reach_m - index.grid[kernels.ORIGIN_Y]) / cell)), 0), num_y)

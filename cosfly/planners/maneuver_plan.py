@@ -218,7 +218,8 @@ def end_with_order(
     from cosfly.planners.smoothing import repair_to_limits
 
     assert maneuvers.order is not None
-    num, dt_s = len(positions_m), scenario.dt_s
+    num = len(positions_m)
+    dt_s = scenario.dt_s
     order_frame = num - 1
     first_frame = max(1, int(num * PURSUIT_LEAST))
     last_arrival = num - round(HOLDS_S / dt_s)

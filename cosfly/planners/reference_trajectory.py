@@ -62,7 +62,9 @@ def without_jumps(
     course: np.ndarray, scenario: Scenario, cfg: PlanConfig, paces_mps: np.ndarray | float = APART_MPS
 ) -> TrackingReference:
     """Return the reference of a course, (n, 3): jumps become motion at the speeds above and `paces_mps`, smoothed."""
-    num, dt_s, paper = len(course), scenario.dt_s, scenario.reference
+    num = len(course)
+    dt_s = scenario.dt_s
+    paper = scenario.reference
 
     def followed(values: np.ndarray, speeds_mps: np.ndarray | float) -> np.ndarray:
         slewed = _slew(values, np.broadcast_to(np.asarray(speeds_mps) * dt_s, num))
@@ -90,7 +92,8 @@ def continued_reference(scenario: Scenario, cfg: PlanConfig) -> TrackingReferenc
 
     The altitudes at its start are within the bounds.
     """
-    paper, num_past = scenario.reference, len(scenario.past_m)
+    paper = scenario.reference
+    num_past = len(scenario.past_m)
     away = scenario.past_m[-1] - scenario.targets_m[num_past - 1]
     altitude_m = scenario.past_m[-1, 2] - scenario.ground_m[num_past - 1]
     course = np.column_stack([paper.heading_rad + paper.bearing_rad, paper.ground_distance_m, paper.altitude_m])
@@ -205,7 +208,9 @@ def reacquire_reference(
     """Return a reference that loses the target and finds it again; None where the map does not hide the target."""
     from cosfly.geometry.kernels import signed_distances, visibility
 
-    targets, ground, dt_s = scenario.targets_m, scenario.ground_m, scenario.dt_s
+    targets = scenario.targets_m
+    ground = scenario.ground_m
+    dt_s = scenario.dt_s
     style = cfg.style(REACQUIRE)
     for _ in range(HIDING_TRIES):
         course = _watching(style, scenario, rng)
@@ -229,7 +234,8 @@ def reacquire_reference(
 
 def _watching(style: Style, scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
     """Draw a course, (n, 3), before the loss: at a bearing from the target, or behind it along its path."""
-    targets, heading_rad = scenario.targets_m, scenario.reference.heading_rad
+    targets = scenario.targets_m
+    heading_rad = scenario.reference.heading_rad
     apart_m = rng.uniform(*style.ground_distance_m)
     altitude_m = rng.uniform(*style.altitude_m)
     bearing = rng.uniform(-np.pi, np.pi)
@@ -277,7 +283,8 @@ def follow(targets_m: np.ndarray, cfg: PlanConfig, dt_s: float = DT_S) -> Tracki
     Args:
         targets_m: (n, 3), n >= 2. dt_s: between points.
     """
-    num, muco = len(targets_m), cfg.muco
+    num = len(targets_m)
+    muco = cfg.muco
     constants = {
         "bearing_rad": np.pi, "distance_m": muco.track_distance_m, "ground_distance_m": cfg.behind_distance_m,
         "pitch_rad": np.radians(muco.pitch_deg), "altitude_m": cfg.altitude_preferred_m,

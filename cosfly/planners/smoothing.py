@@ -50,7 +50,8 @@ def smooth_trajectory(
     Returns:
         (n, 3), and facts: visibility of the raw trajectory, rounds, whether a smooth trajectory was found.
     """
-    reference, dt_s = scenario.reference, scenario.dt_s
+    reference = scenario.reference
+    dt_s = scenario.dt_s
     ahead = slice(scenario.start, None)
     settled = 0
     if scenario.turns_back:  # until `settled` the drone can neither follow the raw trajectory nor see as much

@@ -53,7 +53,7 @@ def make_scenario(pedestrian: PedestrianTrajectory, obstacles: BoxIndex, cfg: Pl
     targets = pedestrian.positions_m + np.array([0.0, 0.0, TARGET_HEIGHT_M])
     if len(targets) < 2:
         problem = "the pedestrian trajectory has too few points"
-        raise NoPathError(problem, where=path_id, got=str(len(targets)), expected="at least 2")
+        raise NoPathError(problem, where=path_id, got=f"{len(targets)} points", expected="at least 2")
     dt_s = step_s(pedestrian.time_s)
     steps_s = np.diff(pedestrian.time_s)
     is_uneven = np.abs(steps_s - max(dt_s, 0.0)) > 1e-3

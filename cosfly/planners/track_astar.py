@@ -283,7 +283,9 @@ def search_trajectory(
     Returns:
         (n, 3) one position per target, and facts of the search; None if there is no path.
     """
-    settings, targets, reference = cfg.track_astar, scenario.targets_m, scenario.reference
+    settings = cfg.track_astar
+    targets = scenario.targets_m
+    reference = scenario.reference
     voxels = make_voxels(scenario, cfg)
     frames, least_z, preferred_z, greatest_z = scenario.key_frames(frames_per_layer(cfg, scenario.dt_s))
     places = reference.places_m(targets, scenario.ground_m)[frames, :2]
@@ -296,7 +298,8 @@ def search_trajectory(
         influence_m=settings.influence_m, safety_m=safety_m, start=np.array([*places[0], preferred_z[0]]),
     )  # fmt: skip
     reaches_m = np.diff(frames, prepend=frames[0]) * scenario.dt_s * cfg.speed_max_mps
-    beam, corridor_m = settings.beam, settings.corridor_m
+    beam = settings.beam
+    corridor_m = settings.corridor_m
     cells, cost, num_seen = search_layers(targets[frames], reaches_m, voxels, costs, obstacles, beam, corridor_m)
     if cells[0] < 0:
         return None
@@ -314,7 +317,9 @@ def frames_per_layer(cfg: PlanConfig, dt_s: float = DT_S) -> int:
 
 def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
     """Return the grid around a pedestrian trajectory: the corridor in the plane, between the altitude bounds."""
-    settings, flat, reference = cfg.track_astar, scenario.targets_m[:, :2], scenario.reference
+    settings = cfg.track_astar
+    flat = scenario.targets_m[:, :2]
+    reference = scenario.reference
     low_xy = flat.min(axis=0) - settings.corridor_m
     num_xy = np.floor((np.ptp(flat, axis=0) + 2.0 * settings.corridor_m) / settings.voxel_m) + 1
     least_z, greatest_z = (scenario.ground_m + bound for bound in (reference.altitude_min_m, reference.altitude_max_m))
@@ -325,7 +330,7 @@ def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
             where=scenario.path_id,
             got=f"{num_xy.prod() * num_z:.0f} voxels",
             expected=f"at most {MAX_CELLS}",
-            fix="use another planner, or a larger plan.track_astar.voxel_m",
+            fix="use another planner, or shorter pedestrian trajectories",
         )
     shape = np.array([*num_xy, num_z], dtype=np.int64)
     size = np.array([settings.voxel_m, settings.voxel_m, settings.voxel_height_m])

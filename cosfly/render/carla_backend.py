@@ -83,7 +83,8 @@ class CarlaRenderer(SimulatorRenderer):
                 self._library = world.get_blueprint_library()
                 self._cameras: dict[str, tuple[Any, queue.SimpleQueue]] = {}
                 self._movers: dict[int, Any] = {}
-                self._fov_deg, self._sizes_m = 0.0, dict[str, np.ndarray]()
+                self._fov_deg = 0.0
+                self._sizes_m = dict[str, np.ndarray]()
                 self._ids = _ids_in_pictures(self._server, self._map, self._num_others)
         except Exception:
             self._guard.close()
@@ -161,7 +162,8 @@ class CarlaRenderer(SimulatorRenderer):
     def _pictures(self, frame: int) -> dict[str, np.ndarray]:
         """Wait for the picture of a tick from every camera, (h, w, 4) BGRA; earlier ones and doubles are ignored."""
         picture_s = PICTURE_SHARE * self._cfg.timeout_s
-        pictures, until_s = {}, time.monotonic() + picture_s
+        pictures = {}
+        until_s = time.monotonic() + picture_s
         for name, (_, inbox) in self._cameras.items():
             while name not in pictures:
                 try:

@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 TRIES = 3  # to draw a frame
 WALK_MPS = 1.4  # walking speed at full swing
-FIX = "read the server's log, then run the same command again: finished trajectories are kept"
+FIX = "read the server's log, then run the same command again; finished trajectories are kept"
 Body = PosedPerson | PosedCar
 
 

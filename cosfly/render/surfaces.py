@@ -62,7 +62,8 @@ def drape(box_map: BoxMap) -> Triangles:
     yaws = np.radians(box_map.rotations_deg[rows, 1])
     frames = np.column_stack([box_map.centers[rows, :2], np.cos(yaws), np.sin(yaws)])
     halves = np.maximum(box_map.half_extents[rows, :2], MIN_HALF_EXTENT_M)
-    pieces, owners = [bare], [np.full(len(bare), BARE_GROUND)]
+    pieces = [bare]
+    owners = [np.full(len(bare), BARE_GROUND)]
     for k, row in enumerate(rows):
         x, y = (np.arange(first[k, axis], last[k, axis] + 1) for axis in (0, 1))
         cells = np.add.outer(y * cells_x, x).ravel()

@@ -79,7 +79,7 @@ def check_track(trace: DroneTrace, surroundings: Surroundings) -> None:
         is_too_deep = deep_m > most_m
         if is_too_deep.any():
             i = int(np.argmax(is_too_deep))
-            got = f"a depth of {deep_m[i]:.2f} m; {np.count_nonzero(is_too_deep)} of {len(is_too_deep)} frames"
+            got = f"{deep_m[i]:.2f} m deep; this occurs in {np.count_nonzero(is_too_deep)} of {len(is_too_deep)} frames"
             raise RenderError(what, where=f"{trace.path_id}: frame {i}", got=got, expected=expected, fix=fix)
 
 
@@ -249,7 +249,9 @@ def _write_frame(
 
 
 def _track(script: TrackScript, targets: list[TargetMeta], visibility: np.ndarray, bystanders: list[dict]) -> Track:
-    perturbed, trace, cameras = script.perturbed, script.trace, script.cameras
+    perturbed = script.perturbed
+    trace = script.trace
+    cameras = script.cameras
     zooms = any(camera is not cameras[0] for camera in cameras)
 
     def column(name: str, num: int = 1) -> np.ndarray:

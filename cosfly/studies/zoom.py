@@ -169,7 +169,8 @@ def _draw_fidelity(wide: Track, longer: Track) -> bytes:
 def _enlarged(rgb: np.ndarray, method: int) -> np.ndarray:
     """Enlarge the middle of a picture, (h, w, 3) uint8, to its full size by MAGNIFICATION."""
     # Pixel (u, v) of the result samples the same ray in the wide picture; pixel centres are at + 0.5.
-    size, share = rgb.shape[1::-1], 1.0 / MAGNIFICATION
+    size = rgb.shape[1::-1]
+    share = 1.0 / MAGNIFICATION
     matrix = np.column_stack([share * np.eye(2), (np.array(size) - 1) / 2.0 * (1.0 - share)])
     return cv2.warpAffine(rgb, matrix, size, flags=method | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE)
 

@@ -61,7 +61,7 @@ class Pictures:
                 "the picture does not fit the size that the prompt states",
                 where=file,
                 got="{} x {} px".format(*found_px),
-                expected="at least {} x {} px, with this ratio of the sides".format(*self.size_px),
+                expected="at least {} x {} px, with this aspect ratio".format(*self.size_px),
                 fix="pass the playback tree that was captioned",
             )
 

@@ -150,7 +150,8 @@ def _add_square(terms, gradient, band, term, i, weight, residual, ax, ay, az, in
     """Add weight * residual^2 of waypoint i, where (ax, ay, az) is the residual's derivative."""
     terms[term] += weight * residual * residual
     if in_model:
-        slope, k = 2.0 * weight * residual, 3 * i
+        slope = 2.0 * weight * residual
+        k = 3 * i
         gradient[i, 0] += slope * ax
         gradient[i, 1] += slope * ay
         gradient[i, 2] += slope * az
@@ -200,7 +201,8 @@ def point_terms(points, begin, end, problem, index, masked, state):
         flat = max(np.sqrt(dx * dx + dy * dy), 1.0)
         pitch, square = np.arctan2(dz, flat), flat * flat + dz * dz
         px, py, pz = -dz * dx / flat / square, -dz * dy / flat / square, flat / square
-        off, is_free = pitch - pitches[i, PREFERRED_PITCH], not masked[i]
+        off = pitch - pitches[i, PREFERRED_PITCH]
+        is_free = not masked[i]
         _add_square(terms, gradient, band, VIEW_ANGLE, i, weights[VIEW_ANGLE], off, px, py, pz, is_free)
         turn = np.arctan2(-dy, -dx) - views[i]
         turn -= 2.0 * np.pi * np.floor((turn + np.pi) / (2.0 * np.pi))
@@ -226,7 +228,9 @@ def visibility_terms(points, problem, index, masked, state):
     slope.
     """
     spread = max(RAY_SPREAD_M, problem.difference_m)  # of any ray of the window from the middle one, at both ends
-    weight, step, free = problem.weights[VISIBILITY], problem.difference_m, np.empty(7)
+    weight = problem.weights[VISIBILITY]
+    step = problem.difference_m
+    free = np.empty(7)
     visible, blockers, band, rough, rows = state.visibility, state.blockers, state.band, state.rough, index.rows
     anchors, on_view, num_on_view = state.nearby.anchors, state.nearby.on_view, state.nearby.num_on_view
     slope, slopes, targets = np.empty(3), state.visibility_gradient, problem.targets
@@ -264,7 +268,9 @@ def visibility_terms(points, problem, index, masked, state):
 @njit(cache=True)
 def chain_curvature(problem, state):
     """Set the curvature to that of smoothness, jerk and altitude oscillation, which is the same for all positions."""
-    band, num_points, weights = state.band, len(problem.targets), problem.weights
+    band = state.band
+    num_points = len(problem.targets)
+    weights = problem.weights
     band.fill(0.0)
     for coefficients, weight in ((SECOND_DIFFERENCE, weights[SMOOTHNESS]), (THIRD_DIFFERENCE, weights[JERK])):
         for first in range(num_points - len(coefficients) + 1):
@@ -321,7 +327,8 @@ def chain_terms(points, begin, end, problem, state):
 def _add_lengths(points, begin, end, weight, state):
     """Add weight * |p_{i+1} - p_i|; its curvature is (1 - u u^T) / length, with a floor under the length."""
     gradient, band = state.gradient, state.band
-    unit, total = np.empty(3), 0.0
+    unit = np.empty(3)
+    total = 0.0
     for i in range(begin, end):
         for a in range(3):
             unit[a] = points[i + 1, a] - points[i, a]

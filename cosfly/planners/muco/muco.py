@@ -52,12 +52,14 @@ def search_start(
     Returns:
         (n, 3), straight between key frames, all of it `clearance_m` from all boxes; None if there is none.
     """
-    targets_m, reference = problem.targets, scenario.reference
+    targets_m = problem.targets
+    reference = scenario.reference
     keys, _, preferred_m, greatest_m = scenario.key_frames(max(1, round(BETWEEN_KEYS_S / problem.dt_s)))
     rings = _rings(reference.ground_distance_m[keys], preferred_m, greatest_m, climbing)
     azimuths = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
     angles = problem.views_rad[keys, None, None] + np.pi + azimuths[None, None, :]
-    offsets, middles = rings[:, :, 0, None], targets_m[keys, :2, None, None]
+    offsets = rings[:, :, 0, None]
+    middles = targets_m[keys, :2, None, None]
     x, y = middles[:, 0] + offsets * np.cos(angles), middles[:, 1] + offsets * np.sin(angles)
     places = np.stack([x, y, np.broadcast_to(rings[:, :, 1, None], x.shape)], axis=-1).reshape(len(keys), -1, 3)
     turns = np.minimum(azimuths, 2.0 * np.pi - azimuths) / np.pi
@@ -95,7 +97,8 @@ def _search(places, targets, times, extra, keeps_sight, index, clearance_m, spee
     place_cost, guesses = np.empty(num_places), np.empty(num_places)
     for key in range(num_keys):
         for c in range(num_places):
-            p, hip = places[key, c], targets[key]
+            p = places[key, c]
+            hip = targets[key]
             gap, _ = nearest_box(index, p[0], p[1], p[2], clearance_m)
             place_cost[c] = np.inf
             if gap >= clearance_m:
@@ -152,7 +155,8 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
 
 def make_problem(scenario: Scenario, cfg: PlanConfig) -> Problem:
     """Convert settings and scenario to the form of the compiled loss."""
-    muco, reference = cfg.muco, scenario.reference
+    muco = cfg.muco
+    reference = scenario.reference
     weights = np.array([getattr(muco, f"weight_{name}") for name in TERM_NAMES[:7]])
     # The band is relative to the settings' pitch and moves with the reference.
     shift = reference.pitch_rad - np.radians(muco.pitch_deg)

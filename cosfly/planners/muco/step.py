@@ -69,7 +69,8 @@ def solve_band(band, damping, gradient):
     Returns:
         (n - 2, 3) m. If rounding has made H indefinite, its diagonal replaces it.
     """
-    size, rows = 3 * len(gradient) - 6, BAND_ROWS
+    size = 3 * len(gradient) - 6
+    rows = BAND_ROWS
     factor = np.empty((size + rows, rows))  # factor[j, k]: row j + k, column j
     step = np.empty(size)
     factor[size:].fill(0.0)

@@ -61,7 +61,8 @@ def elastic_band(task: Task) -> np.ndarray | None:
     if band is None:
         return None
     for _ in range(BAND_ITERATIONS):
-        inner, reach_m = band[1:-1], task.clearance_m + INFLUENCE_M
+        inner = band[1:-1]
+        reach_m = task.clearance_m + INFLUENCE_M
         gaps_m, away = task.near(inner, reach_m)
         drawn = CONTRACTION * (0.5 * (band[:-2] + band[2:]) - inner)
         band[1:-1] = np.clip(inner + drawn + REPULSION * (reach_m - gaps_m)[:, None] * away, task.low, task.high)
@@ -120,7 +121,8 @@ def trajopt(task: Task) -> np.ndarray:
 def _loss(inner: np.ndarray, task: Task, weight: float) -> tuple[float, np.ndarray]:
     """Return the loss of the points between both ends, (3 n,), and its gradient."""
     points = np.vstack([task.start, inner.reshape(-1, 3), task.goal])
-    loss, slopes = 0.0, np.zeros_like(points)
+    loss = 0.0
+    slopes = np.zeros_like(points)
     for share, order in DIFFERENCES:
         changes = np.diff(points, n=order, axis=0)
         loss += share * float((changes**2).sum())

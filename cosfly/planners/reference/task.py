@@ -64,7 +64,9 @@ def make_task(
     scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator, clearance_m: float
 ) -> Task | None:
     """Return the task of a scenario; None where no free place is near its first or last reference position."""
-    reference, targets, margin_m = scenario.reference, scenario.targets_m, cfg.track_astar.corridor_m
+    reference = scenario.reference
+    targets = scenario.targets_m
+    margin_m = cfg.track_astar.corridor_m
     low_z = (scenario.ground_m + reference.altitude_min_m).max()
     high_z = (scenario.ground_m + reference.altitude_max_m).min()
     low = np.array([*(targets[:, :2].min(axis=0) - margin_m), low_z])

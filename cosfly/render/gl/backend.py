@@ -60,7 +60,8 @@ class GlRenderer:
         self.look = look
         self.num_others = num_others
         self.width_px, self.height_px = width_px, height_px
-        context, size = self.context, (width_px, height_px)
+        context = self.context
+        size = (width_px, height_px)
         with context:
             self._color = context.texture(size, 4)
             self._depth = context.texture(size, 1, dtype="f4")
@@ -121,7 +122,8 @@ class GlRenderer:
         parts that a camera within the corners can see are selected, and the origin is moved near them.
         """
         low_m, high_m = np.asarray(low_m), np.asarray(high_m)
-        parts, zero = self.scene.parts, self.scene.origin_m
+        parts = self.scene.parts
+        zero = self.scene.origin_m
         outside = np.maximum(low_m - zero - parts.object_centers, parts.object_centers - (high_m - zero))
         away_m = np.linalg.norm(np.maximum(outside, 0.0), axis=1) - parts.object_radii
         shift_m = np.round(((low_m + high_m) / 2.0 - zero) / ORIGIN_STEP_M) * [1.0, 1.0, 0.0] * ORIGIN_STEP_M

@@ -95,7 +95,8 @@ class LooseTriangles:
     """Loose triangles in buffers of one GL context; every vertex holds its part."""
 
     def __init__(self, context: Any, loose: Loose) -> None:
-        self._context, self._loose = context, loose
+        self._context = context
+        self._loose = loose
         self._buffers = {material: context.buffer(reserve=rows.nbytes) for material, rows in loose.vertices.items()}
         self._indices = {m: context.buffer(reserve=4 * len(rows), dynamic=True) for m, rows in loose.vertices.items()}
         numbers = np.arange(len(loose.centers) + 1)

@@ -95,7 +95,9 @@ def _planes(
     A wall: x along it, y out, z up. A slope: x along its eaves, y out, z up the slope. A flat roof: turned like its
     house's largest wall, z up. Other things: the axes of the box.
     """
-    normals, things, zero = solids.normals, solids.things, np.zeros(len(solids))
+    normals = solids.normals
+    things = solids.things
+    zero = np.zeros(len(solids))
     around = np.round(np.arctan2(normals[:, 1], normals[:, 0]) / SAME_ANGLE_RAD).astype(np.int64)
     slope = np.round(np.arcsin(np.clip(normals[:, 2], -1.0, 1.0)) / SAME_ANGLE_RAD)
     tilt = np.where(is_wall, 0, slope).astype(np.int64)
@@ -189,7 +191,8 @@ def build_scene(town: BoxMap, num_others: int = 0, rim: BoxMap | None = None) ->
     centers = box_map.centers - origin
     centers[lies, 2] -= box_map.ground.height_at(box_map.centers[lies])
     lying = np.zeros(len(box_map) + 1, PART)  # the last is the ground plane
-    tiers, seeds = layers_of(box_map) % 1.0, seeds_of(box_map.ids)
+    tiers = layers_of(box_map) % 1.0
+    seeds = seeds_of(box_map.ids)
     turns = rotation_matrices(np.radians(box_map.rotations_deg))
     half = np.maximum(box_map.half_extents, 1e-3)
     if (town.kinds == KINDS["RoadLines"]).any():

@@ -165,7 +165,8 @@ def _crowns(boxes: Boxes, leaf: np.ndarray, crown_low: np.ndarray) -> list[Parts
 
 
 def _conifers(boxes: Boxes, leaf: np.ndarray) -> list[Parts]:
-    h, dark = boxes.half, leaf * [0.6, 0.75, 0.85]
+    h = boxes.half
+    dark = leaf * [0.6, 0.75, 0.85]
     far = boxes.part(meshes.CONE, h * [1, 1, 0.92], parts.LEAVES, dark, offset=h * [0, 0, 0.08], max_px=FAR_PX)
     tree = [far, _stems(boxes, np.full(len(h), -0.5))]
     for low, top, radius in ((contract.CONIFER_LOW, 0.1, 1.0), (-0.35, 0.55, 0.78), (0.1, 1.0, 0.55)):
@@ -202,7 +203,8 @@ def _wheels(boxes: Boxes, high: float, long: float, along: float) -> list[Parts]
 
 
 def _cars(boxes: Boxes) -> list[Parts]:
-    h, paint = boxes.half, boxes.pick(CAR_COLORS)
+    h = boxes.half
+    paint = boxes.pick(CAR_COLORS)
     return [
         boxes.part(meshes.ROUNDED, h * [1, 0.97, 0.36], parts.CAR_PAINT, paint, offset=h * [0, 0, -0.36]),
         boxes.part(meshes.CABIN, h * [0.56, 0.84, 0.37], parts.CABIN, paint, offset=h * [-0.08, 0, 0.3]),
@@ -212,7 +214,8 @@ def _cars(boxes: Boxes) -> list[Parts]:
 
 
 def _trucks(boxes: Boxes) -> list[Parts]:
-    h, paint = boxes.half, boxes.pick(CAR_COLORS)
+    h = boxes.half
+    paint = boxes.pick(CAR_COLORS)
     return [
         boxes.part(meshes.BOX, h * [0.7, 1, 0.83], parts.PLAIN, paint * 0.6 + 0.3, offset=h * [-0.3, 0, 0.17]),
         boxes.part(meshes.ROUNDED, h * [0.27, 0.94, 0.46], parts.CAR_PAINT, paint, offset=h * [0.72, 0, -0.3]),
@@ -222,13 +225,16 @@ def _trucks(boxes: Boxes) -> list[Parts]:
 
 
 def _buses(boxes: Boxes) -> list[Parts]:
-    h, paint = boxes.half, boxes.pick(CAR_COLORS[3:6])
+    h = boxes.half
+    paint = boxes.pick(CAR_COLORS[3:6])
     body = boxes.part(meshes.BOX, h * [1, 1, 0.9], parts.BUS, paint, offset=h * [0, 0, 0.1])
     return [body, *_wheels(boxes, 0.28, 0.14, 0.62)]
 
 
 def _two_wheelers(boxes: Boxes) -> list[Parts]:
-    h, rubber, paint = boxes.half, (0.03, 0.03, 0.03), boxes.pick(CAR_COLORS)
+    h = boxes.half
+    rubber = (0.03, 0.03, 0.03)
+    paint = boxes.pick(CAR_COLORS)
     radius = np.minimum(0.4 * h[:, 0], 0.62 * h[:, 2])
     size = np.column_stack([radius, radius, np.minimum(0.05, h[:, 1])])
     places = (np.column_stack([side * (h[:, 0] - radius), 0 * radius, radius - h[:, 2]]) for side in (-1.0, 1.0))
@@ -284,7 +290,8 @@ def _signs(boxes: Boxes) -> list[Parts]:
 
 def _people(boxes: Boxes) -> list[Parts]:
     """Return standing people of the map: trousers, coat, head."""
-    h, coats = boxes.half, boxes.pick(COAT_COLORS)
+    h = boxes.half
+    coats = boxes.pick(COAT_COLORS)
     return [
         boxes.part(meshes.LIMB, h * [0.5, 0.6, 0.46], parts.CLOTH, (0.05, 0.06, 0.09), offset=h * [0, 0, -0.54]),
         boxes.part(meshes.ROUNDED, h * [0.55, 0.85, 0.36], parts.CLOTH, coats, offset=h * [0, 0, 0.28]),
