@@ -231,9 +231,9 @@ def render(
     from cosfly.runtime.io import inside
     from cosfly.viz.gallery import preview_gif
 
-    wanted = {"rgb": require_rgb, "depth": require_depth}
-    modalities: list[str] = [name for name in job.cfg.render.modalities if wanted.get(name) is not False]
-    modalities += [name for name, is_wanted in wanted.items() if is_wanted and name not in modalities]
+    required = {"rgb": require_rgb, "depth": require_depth}
+    modalities: list[str] = [name for name in job.cfg.render.modalities if required.get(name) is not False]
+    modalities += [name for name, is_required in required.items() if is_required and name not in modalities]
     cfg = build(RenderConfig, job.cfg.render.model_dump() | {"modalities": modalities}, "render")
     product = job.call("cosfly.render.stage", cfg, map_, simplified, traces, out, others=others)
     if gif:

@@ -171,7 +171,7 @@ class Policy:
         self._awaits_reply = False
         answer, value = json.loads(self._connection.recv_bytes(MOST_REPLY_BYTES))
         numbers = value if isinstance(value, list) else []
-        if answer not in ("ok", "unreadable", "none") or not all(isinstance(one, int | float) for one in numbers):
+        if answer not in ("ok", "unreadable", "none") or not all(isinstance(number, int | float) for number in numbers):
             raise ValueError(f"the policy process sent an unknown reply: {answer!r}")
         return answer, value
 

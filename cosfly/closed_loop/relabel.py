@@ -110,38 +110,38 @@ def _seed_of(flown: Path, cfg: ClosedLoopConfig) -> int:
 def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Path, seed: int) -> Work:
     """Open a map in this process; return the function that relabels one decision of a student."""
     plans = {plan.path_id: (n, plan) for n, plan in enumerate(read_traces(flown / PLAN / TRACES))}
-    space = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed)
+    airspace = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed)
     relabel = cfg.fly.relabel
-    num = cfg.caption.window
+    window = cfg.caption.window
 
     def work(item: Item) -> Outcome:
         episode, i = item.payload
         record = read_episode(episode_file(flown, episode))
         number, plan = plans[record.walk]
-        begin, end = i - num.num_frames + 1, i + relabel.future_frames + 1
+        begin, end = i - window.num_frames + 1, i + relabel.future_frames + 1
         if begin < 0 or end > len(plan.time_s):
             return Outcome(drop_reason="walk_ends")
-        own = record.frames[: i + 1]
-        if not any(frame.visible for frame in own[begin:]):
+        flown_frames = record.frames[: i + 1]
+        if not any(frame.visible for frame in flown_frames[begin:]):
             return Outcome(drop_reason="long_lost")  # no picture shows where the target is
-        here_m = np.array([own[-1].pose[:3]])
-        if signed_distances(space.surroundings.obstacles, here_m)[0][0] < cfg.plan.relaxed_safety_m:
+        position_m = np.array([flown_frames[-1].pose[:3]])
+        if signed_distances(airspace.surroundings.obstacles, position_m)[0][0] < cfg.plan.relaxed_safety_m:
             return Outcome(drop_reason="too_near")  # no plan begins there
         try:
-            planned = _planned_on(plan, own, space, cfg.plan)
+            planned = _planned_on(plan, flown_frames, airspace, cfg.plan)
         except NoPathError:
             return Outcome(drop_reason="no_path")
         cut: Any = {name: getattr(planned, name)[begin:end] for name in (*ARRAYS, "clearances_m")}
         part_of = Excerpt(plan.path_id, number, plan.targets_m[: begin + 1])
         planned = replace(planned, **cut, part_of=part_of)
-        simulation = ClosedLoopTrajectory(space, planned, number=number, num_lead=num.num_frames)
+        simulation = ClosedLoopTrajectory(airspace, planned, number=number, num_lead=window.num_frames)
         moments = [*simulation.reset()]
         while simulation.ended is None:
             moments.append(simulation.step(PlannerEngine.to_next(simulation, moments[-1])))
             advance()
         if simulation.ended != "finished":
             return Outcome(drop_reason="crashes")
-        before, *after = moments[num.num_frames - 2 :][: num.future_frames + 2]
+        before, *after = moments[window.num_frames - 2 :][: window.future_frames + 2]
         rows = [(m.time_s, m.position_m, m.rotation_deg[1], m.target_m, m.target.visible) for m in after]
         speed_mps = float(np.linalg.norm(after[0].position_m - before.position_m)) / simulation.dt_s
         time_s, positions_m, yaw_deg, targets_m, visible = map(np.array, zip(*rows, strict=True))
@@ -151,13 +151,13 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
         if relabel.mistakes_only and not reasons:
             return Outcome(drop_reason="no_mistake")
         poses = simulation.poses
-        about = {"student": record.student, "round": relabel.round}
+        source = {"student": record.student, "round": relabel.round}
         trace = flown_trace(
-            space.surroundings.obstacles, np.array([moment.time_s for moment in moments]),
+            airspace.surroundings.obstacles, np.array([moment.time_s for moment in moments]),
             np.hstack([poses.positions_m, poses.rotations_deg]), poses.targets_m, poses.clearances_m,
             np.array([moment.position_m[2] - moment.height_m for moment in moments]), path_id=item.item_id,
             planner=f"replanned from frame {i} of {record.student}, round {relabel.round}", pace=record.style.pace,
-            solver={"source": episode, "frame": i, **about, "decision": record.frames[i].action, "reasons": reasons},
+            solver={"source": episode, "frame": i, **source, "decision": record.frames[i].action, "reasons": reasons},
             part_of=part_of,
         )  # fmt: skip
         return Outcome({"trace": trace.as_json(), "reasons": reasons})
@@ -165,10 +165,10 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
     return work
 
 
-def _planned_on(plan: DroneTrace, flown: Sequence[EpisodeFrame], space: Airspace, cfg: PlanConfig) -> DroneTrace:
+def _planned_on(plan: DroneTrace, flown: Sequence[EpisodeFrame], airspace: Airspace, cfg: PlanConfig) -> DroneTrace:
     """Return a plan that begins with the flown frames of a student; raises as `plan_on`."""
     poses = np.array([frame.pose for frame in flown])
-    obstacles = space.surroundings.obstacles
+    obstacles = airspace.surroundings.obstacles
     positions_m = plan_on(plan.path_id, plan.targets_m, step_s(plan.time_s), poses[:, :3], obstacles, cfg)
     pitch_rad, yaw_rad = look_at(positions_m, plan.targets_m)
     rotations_deg = np.degrees(np.stack([pitch_rad, yaw_rad, 0.0 * yaw_rad], axis=1))

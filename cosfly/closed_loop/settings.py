@@ -117,6 +117,6 @@ class FlyConfig(Config):
         return self
 
     def recorded(self) -> dict[str, Any]:
-        """Return the settings on record: a model's address and the paths of own files do not decide the result."""
-        own = {name: "own" if getattr(self, name) else None for name in ("controller", "as_student", "adapter")}
-        return super().recorded() | {"student": self.engine if self.asks_model else self.student} | own
+        """Return the settings on record, without a model's address and the paths of files, which change no result."""
+        paths = {name: "own" if getattr(self, name) else None for name in ("controller", "as_student", "adapter")}
+        return super().recorded() | {"student": self.engine if self.asks_model else self.student} | paths

@@ -79,9 +79,9 @@ def check_files(track: Track, report: Report) -> dict[int, FrameMeta | None]:
         if len(report.issues) == num_issues:
             complete[i] = meta
     frames = track.folder / FRAMES_DIR
-    known = {folder.name for folder in folders}
-    for stray in sorted(p.name for p in frames.iterdir() if p.name not in known) if frames.is_dir() else []:
-        report.warn("stray_frame", f"{FRAMES_DIR}/{stray}", "no point of this index", f"{len(known)} frames")
+    frame_names = {folder.name for folder in folders}
+    for stray in sorted(p.name for p in frames.iterdir() if p.name not in frame_names) if frames.is_dir() else []:
+        report.warn("stray_frame", f"{FRAMES_DIR}/{stray}", "no point of this index", f"{len(frame_names)} frames")
     return complete
 
 

@@ -285,10 +285,10 @@ def check_projection(track: Track, report: Report) -> None:
             ("bbox_2d", target.bbox[i] if track.is_ours else box, box, 2 * pixels, "px"),
             ("depth", target.depth_m[i : i + 1], depth_m, 0.01, "m"),
         )
-        for name, found, expected, tolerance, unit in recorded:
-            if np.isnan(found).any() or np.isnan(expected).any():
+        for name, value, expected, tolerance, unit in recorded:
+            if np.isnan(value).any() or np.isnan(expected).any():
                 continue
-            distance = float(np.abs(found - expected).max())
+            distance = float(np.abs(value - expected).max())
             if distance > tolerance:
                 limit = f"the projection of the target within {tolerance:g} {unit}"
                 report.error("projection_differs", f"{point}.{name}", f"{distance:.2f} {unit} from it", limit)

@@ -327,8 +327,8 @@ def _turned_home(
     pitch, yaw = look_at(positions_m, targets_m)
     for i in range(order_frame + 1, len(yaw)):
         moves = np.hypot(*velocity[i]) >= STANDING_MPS
-        wanted = np.arctan2(velocity[i, 1], velocity[i, 0]) if moves else yaw[i - 1]
-        yaw[i] = yaw[i - 1] + np.clip(_wrapped(wanted - yaw[i - 1]), -step, step)
+        course = np.arctan2(velocity[i, 1], velocity[i, 0]) if moves else yaw[i - 1]
+        yaw[i] = yaw[i - 1] + np.clip(_wrapped(course - yaw[i - 1]), -step, step)
         pitch[i] = pitch[i - 1] + np.clip(np.radians(HOME_PITCH_DEG) - pitch[i - 1], -step, step)
     return pitch, _wrapped(yaw)
 

@@ -289,12 +289,13 @@ def _ids_in_pictures(server: CarlaConnection, box_map: BoxMap, num_others: int) 
         boxes = server.world.get_level_bbs(server.carla.CityObjectLabel.values[kind])
         if not boxes:
             continue
-        places = [conventions.world_pose((b.location.x, b.location.y, b.location.z, 0.0, 0.0, 0.0))[0] for b in boxes]
-        gaps_m, nearest = cKDTree(np.array(places)).query(box_map.centers[rows])
+        centers = [conventions.world_pose((b.location.x, b.location.y, b.location.z, 0.0, 0.0, 0.0))[0] for b in boxes]
+        gaps_m, nearest = cKDTree(np.array(centers)).query(box_map.centers[rows])
         actor_of_key: dict[int, int] = {}
-        for row, place in zip(rows[gaps_m <= SAME_BOX_M].tolist(), nearest[gaps_m <= SAME_BOX_M].tolist(), strict=True):
+        is_same = gaps_m <= SAME_BOX_M
+        for row, box in zip(rows[is_same].tolist(), nearest[is_same].tolist(), strict=True):
             num_found += 1
-            actor = boxes[place].actor_id
+            actor = boxes[box].actor_id
             key = kind << 16 | actor & ACTOR_BITS
             if key not in actor_of_key:
                 actor_of_key[key] = actor

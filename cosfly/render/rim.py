@@ -117,17 +117,17 @@ def _roads(box_map: BoxMap, town: np.ndarray, rng: np.random.Generator) -> np.nd
         reach = np.where(lies, sign * streets.centers[:, axis] + half[:, axis], -np.inf)
         leads = np.flatnonzero(reach > reach.max(initial=-np.inf) - OUTERMOST_M)
         order = np.lexsort((rng.random(len(leads)), -half[leads, across].round()))
-        places = streets.centers[leads[order], across] if len(leads) else rng.uniform(town[0], town[1])[[across]]
-        taken: list[float] = []
-        for place in places.tolist():
-            if len(taken) < STREETS and all(abs(place - other) > APART_M for other in taken):
-                taken.append(place)
+        offsets_m = streets.centers[leads[order], across] if len(leads) else rng.uniform(town[0], town[1])[[across]]
+        chosen_m: list[float] = []
+        for offset_m in offsets_m.tolist():
+            if len(chosen_m) < STREETS and all(abs(offset_m - other) > APART_M for other in chosen_m):
+                chosen_m.append(offset_m)
         ends = town[side, axis] + sign * np.array([LANES_M[0], REACH_M])
-        strips = [(axis, *ends, place) for place in taken]
+        strips = [(axis, *ends, offset_m) for offset_m in chosen_m]
         strips += [(across, town[0, across] - m, town[1, across] + m, town[side, axis] + sign * m) for m in LANES_M]
-        for along, begin, end, place in strips:
+        for along, begin, end, offset_m in strips:
             turn = 1 if along == 0 else -1
-            middle = ((begin + end) / 2.0, place)[::turn]
+            middle = ((begin + end) / 2.0, offset_m)[::turn]
             size = (abs(end - begin) / 2.0 + ROAD_HALF_M, ROAD_HALF_M)
             roads.append([*middle, *size[::turn], FLAT_HALF_M])
     return np.array(roads)

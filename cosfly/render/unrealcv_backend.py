@@ -81,8 +81,8 @@ class UnrealCvRenderer(SimulatorRenderer):
         self._spawned: dict[int, str] = {}
         self._fov_deg = 0.0
         if is_first and self._guard is not None:
-            asked = [f"{self._camera}/{what}" for what in ("size", "fov", "pose")]
-            state = zip(asked, self._server.ask(*(f"vget {name}" for name in asked)), strict=True)
+            properties = [f"{self._camera}/{what}" for what in ("size", "fov", "pose")]
+            state = zip(properties, self._server.ask(*(f"vget {name}" for name in properties)), strict=True)
             self._guard.note([f"vset {name} {text!s}" for name, text in state if not is_refusal(text)])
         names = str(*self._server.ask("vget /objects"))
         leftover = spawned_by_cosfly(names)  # by a connection that broke
@@ -100,8 +100,8 @@ class UnrealCvRenderer(SimulatorRenderer):
         rows = {int(k): row for row, k in enumerate(self._map.ids)}
         self._ids = np.full(COLORS, NO_INSTANCE, dtype=np.uint16)
         self._kinds = np.full(COLORS, KINDS["NONE"], dtype=np.uint8)
-        asked = (f"vget /object/{name}/{what}" for name in names for what in ("color", "uclass_name"))
-        answers = iter(self._server.ask(*asked))
+        queries = (f"vget /object/{name}/{what}" for name in names for what in ("color", "uclass_name"))
+        answers = iter(self._server.ask(*queries))
         linked = dict[str, int]()
         self._used = set[int]()
         num_doubtful = 0
@@ -182,7 +182,7 @@ class UnrealCvRenderer(SimulatorRenderer):
                 self._server.run(self._removal(number))
 
     def _frame(self, camera_pose: np.ndarray, fov_deg: float, bodies: dict[int, Body]) -> Frame:
-        place, turn = self._there(camera_pose[:3, 3], camera_rotation_deg(camera_pose))
+        place, turn = self._in_level(camera_pose[:3, 3], camera_rotation_deg(camera_pose))
         try:
             commands = ["vset /action/game/resume", *(self._removal(n) for n in self._spawned.keys() - bodies.keys())]
             for number, body in bodies.items():
@@ -192,31 +192,32 @@ class UnrealCvRenderer(SimulatorRenderer):
             self._server.run(*commands, f"vset {self._camera}/pose {place} {turn}")
             self._fov_deg = fov_deg
             time.sleep(self._cfg.settle_delay_s)
-            asked = ("location", "lit png", "object_mask png", "depth npy")
-            commands = ["vset /action/game/pause", *(f"vget {self._camera}/{what}" for what in asked)]
-            _, found, lit, mask, depth = self._server.ask(*commands)
-            self._check_place(camera_pose[:3, 3], found)
+            replies = ("location", "lit png", "object_mask png", "depth npy")
+            commands = ["vset /action/game/pause", *(f"vget {self._camera}/{what}" for what in replies)]
+            _, location, lit, mask, depth = self._server.ask(*commands)
+            self._check_place(camera_pose[:3, 3], location)
             return self._decoded(lit, mask, depth)
         except (NoAnswerError, InputError) as error:
             raise NoPictureError(f"camera {self._cfg.camera}: {error}") from None
 
-    def _there(self, position_m: np.ndarray, rotation_deg: np.ndarray) -> tuple[str, str]:
+    def _in_level(self, position_m: np.ndarray, rotation_deg: np.ndarray) -> tuple[str, str]:
         """Return a position in the level's units and its rotation, as words of commands."""
         x, y, z, *turn = unreal_pose(position_m + np.array([0.0, 0.0, self._cfg.coord_z_offset]), rotation_deg)
         place = (f"{part * self._cfg.coord_scale:.6f}" for part in (x, y, z))
         return " ".join(place), " ".join(f"{part:.6f}" for part in turn)
 
-    def _check_place(self, position_m: np.ndarray, found: str | bytes) -> None:
-        numbers = self._server.numbers(found, 3)
+    def _check_place(self, position_m: np.ndarray, location: str | bytes) -> None:
+        """Check that the location in a reply is the position that the camera was set to, (3,) world."""
+        numbers = self._server.numbers(location, 3)
         if numbers is None:
-            raise NoAnswerError(f"the server sent {found!r} instead of the three numbers of the camera's position")
-        place_m = world_pose([*(part / self._cfg.coord_scale for part in numbers), 0.0, 0.0, 0.0])[0]
-        place_m[2] -= self._cfg.coord_z_offset
-        if np.linalg.norm(place_m - position_m) > SAME_PLACE_M:
-            both = np.stack([place_m, position_m])
+            raise NoAnswerError(f"the server sent {location!r} instead of the three numbers of the camera's position")
+        found_m = world_pose([*(part / self._cfg.coord_scale for part in numbers), 0.0, 0.0, 0.0])[0]
+        found_m[2] -= self._cfg.coord_z_offset
+        if np.linalg.norm(found_m - position_m) > SAME_PLACE_M:
+            both = np.stack([found_m, position_m])
             over_m = both[:, 2] - self._map.ground.height_at(both)
-            places = zip(both.round(2).tolist(), over_m, strict=True)
-            got, expected = (f"{place}, {over:.1f} m over the ground" for place, over in places)
+            heights = zip(both.round(2).tolist(), over_m, strict=True)
+            got, expected = (f"{point}, {over:.1f} m over the ground" for point, over in heights)
             what = "the camera is not at the requested position"
             fix = "stop the level from moving it (for example by gravity), or choose another render.unrealcv.camera"
             raise RenderError(what, where=self.device, got=got, expected=expected, fix=fix)
@@ -252,7 +253,7 @@ class UnrealCvRenderer(SimulatorRenderer):
         name = self._spawned.get(number) or self._spawn(number, body)
         animate = self._cfg.animate
         position_m, turn_deg, _, speed_mps = placement_of(body, self._cfg.settle_delay_s if animate else 0.0)
-        place, turn = self._there(position_m, turn_deg)
+        place, turn = self._in_level(position_m, turn_deg)
         commands = [f"vset /object/{name}/location {place}", f"vset /object/{name}/rotation {turn}"]
         if animate and isinstance(body, PosedPerson):
             speed = f"vbp {name} SetMaxSpeed {speed_mps * self._cfg.coord_scale:.3f}"

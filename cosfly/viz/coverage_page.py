@@ -14,9 +14,10 @@ TEMPLATE = "cosfly/viz/templates/coverage.html"
 
 def coverage_html(coverage: Coverage) -> str:
     """Return a histogram for each axis, with the range of 90 % of the frames, and a table for each kind of name."""
+    default = default_coverage()
     histograms = []
     for (name, axis), (title, span, default_span) in zip(AXES.items(), ranges(coverage), strict=True):
-        bars = _histogram(axis, coverage.bins.get(name, []), default_coverage().bins[name])
+        bars = _histogram(axis, coverage.bins.get(name, []), default.bins[name])
         histograms.append(bars | {"title": title, "range": span, "range_of_plain": default_span})
     names = {kind: shares(coverage, kind) for kind in NAMED}
     return fragment(TEMPLATE, histograms=histograms, names=names, skies=_skies(coverage.skies))
@@ -31,39 +32,44 @@ def _skies(frames: dict[str, int]) -> dict[str, Any] | None:
     times = [*TIMES, *sorted({time for _, time in counts} - set(TIMES))]
     rows = [(weather, [counts.get((weather, time)) for time in times]) for weather in weathers]
     shipped = [pair for pair in counts if pair[0] in WEATHERS and pair[1] in TIMES]
-    day_dry = [counts[a, b] for a, b in shipped if sky_kind(resolved(WEATHERS[a], TIMES[b])) == "day_dry"]
-    by_day = f"{sum(day_dry) / sum(counts.values()):.0%} of the frames by day and dry"
+    num_day_dry = 0
+    for weather, time in shipped:
+        if sky_kind(resolved(WEATHERS[weather], TIMES[time])) == "day_dry":
+            num_day_dry += counts[weather, time]
+    by_day = f"{num_day_dry / sum(counts.values()):.0%} of the frames by day and dry"
     note = f"{len(counts)} of {len(weathers) * len(times)} pairs; {by_day}"
     return {"times": times, "rows": rows, "note": note}
 
 
 def ranges(coverage: Coverage) -> list[tuple[str, str, str]]:
-    """Return a row for each axis: title, 5 % to 95 % of the frames, the same for the default run."""
-    plain = default_coverage()
+    """Return a row for each axis: title, range of 5 % to 95 % of the frames, that range for the default run."""
+    default = default_coverage()
     titles = [f"{axis.title}, {axis.unit}".rstrip(", ") for axis in AXES.values()]
-    return [(title, _range(coverage, name), _range(plain, name)) for title, name in zip(titles, AXES, strict=True)]
+    return [(title, _range(coverage, name), _range(default, name)) for title, name in zip(titles, AXES, strict=True)]
 
 
 def shares(coverage: Coverage, kind: str) -> list[tuple[str, int, str, str]]:
     """Return a row for each name of a kind of NAMED: name, frames, share, share in the default run."""
     counts = getattr(coverage, kind)
-    plain = getattr(default_coverage(), kind)
+    default_counts = getattr(default_coverage(), kind)
     if not counts:
         return []
-    names = sorted({*counts, *plain}, key=lambda name: (-counts.get(name, 0), name))
+    names = sorted({*counts, *default_counts}, key=lambda name: (-counts.get(name, 0), name))
 
     def share(table: dict[str, int], name: str) -> str:
         total = sum(table.values())
         return f"{100.0 * table.get(name, 0) / total:.1f} %" if total else "-"
 
-    return [(name, counts.get(name, 0), share(counts, name), share(plain, name)) for name in names]
+    return [(name, counts.get(name, 0), share(counts, name), share(default_counts, name)) for name in names]
 
 
 def _range(coverage: Coverage, name: str) -> str:
     """Return the range of 5 % to 95 % of the frames; for a circle, the shares of its sides."""
     axis = AXES[name]
     if name == "azimuth_deg":
-        if not (total := sum(counts := coverage.bins.get(name, []))):
+        counts = coverage.bins.get(name, [])
+        total = sum(counts)
+        if not total:
             return "-"
         middles = [abs(axis.low + (k + 0.5) * axis.step) for k in range(axis.num_bins)]
         behind = sum(count for count, middle in zip(counts, middles, strict=True) if middle > 135.0) / total

@@ -93,9 +93,9 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
 
 def frame_in(tree: Path, frame: str | Path) -> Path:
     """Return the folder of a frame, which is named relative to the tree, or by a path into it."""
-    place = Path(frame).resolve()
-    if place.is_dir() and place.is_relative_to(tree.resolve()):
-        return tree / place.relative_to(tree.resolve())
+    path = Path(frame).resolve()
+    if path.is_dir() and path.is_relative_to(tree.resolve()):
+        return tree / path.relative_to(tree.resolve())
     return inside(tree, str(frame))
 
 

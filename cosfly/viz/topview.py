@@ -77,23 +77,23 @@ def draw_map(box_map: BoxMap, view: TopView) -> np.ndarray:
     return picture
 
 
-def draw_area(picture: np.ndarray, places: np.ndarray, color: Color) -> None:
-    cv2.fillPoly(picture, [_fixed(places)], color, cv2.LINE_AA, shift=FRACTION_BITS)
+def draw_area(picture: np.ndarray, points: np.ndarray, color: Color) -> None:
+    cv2.fillPoly(picture, [_fixed(points)], color, cv2.LINE_AA, shift=FRACTION_BITS)
 
 
 def draw_line(
-    picture: np.ndarray, places: np.ndarray, color: Color, width: int = 1, *, closed: bool = False, halo: int = 0
+    picture: np.ndarray, points: np.ndarray, color: Color, width: int = 1, *, closed: bool = False, halo: int = 0
 ) -> None:
-    """Draw a line through (n, 2) places; halo: width of the white line under it, 0 for none."""
-    points = _fixed(places)
+    """Draw a line through points, (n, 2) px; halo: width of the white line under it, 0 for none."""
+    fixed = _fixed(points)
     if halo:
-        cv2.polylines(picture, [points], closed, HALO, halo, cv2.LINE_AA, shift=FRACTION_BITS)
-    cv2.polylines(picture, [points], closed, color, width, cv2.LINE_AA, shift=FRACTION_BITS)
+        cv2.polylines(picture, [fixed], closed, HALO, halo, cv2.LINE_AA, shift=FRACTION_BITS)
+    cv2.polylines(picture, [fixed], closed, color, width, cv2.LINE_AA, shift=FRACTION_BITS)
 
 
-def draw_dot(picture: np.ndarray, place: np.ndarray, radius_px: int, color: Color, width: int = -1) -> None:
-    """Draw a disc round a place, or a ring of some width."""
-    center = _fixed(place).tolist()
+def draw_dot(picture: np.ndarray, point: np.ndarray, radius_px: int, color: Color, width: int = -1) -> None:
+    """Draw a disc round a point, or a ring of some width."""
+    center = _fixed(point).tolist()
     cv2.circle(picture, center, radius_px << FRACTION_BITS, color, width, cv2.LINE_AA, shift=FRACTION_BITS)
 
 
@@ -110,7 +110,8 @@ def draw_text(
 ) -> int:
     """Write text with its baseline at y; return the x of its end. align: 0 begins at x, 0.5 is centred, 1 ends at x."""
     width = cv2.getTextSize(text, FONT, scale, 1)[0][0]
-    left, base = round(x - align * width), round(y)
+    left = round(x - align * width)
+    base = round(y)
     if halo is not None:  # of shifted letters: thicker ones are wider in OpenCV 5
         for dx, dy in product((-1, 0, 1), repeat=2):
             cv2.putText(picture, text, (left + dx, base + dy), FONT, scale, halo, 1, cv2.LINE_AA)
@@ -132,6 +133,6 @@ def png_bytes(picture: np.ndarray) -> bytes:
     return data.tobytes()
 
 
-def _fixed(places: np.ndarray) -> np.ndarray:
-    """Return places as whole sixteenths, int32."""
-    return np.round(np.asarray(places, dtype=np.float64) * 2**FRACTION_BITS).astype(np.int32)
+def _fixed(points: np.ndarray) -> np.ndarray:
+    """Return points in whole sixteenths of a pixel, int32."""
+    return np.round(np.asarray(points, dtype=np.float64) * 2**FRACTION_BITS).astype(np.int32)
