@@ -1,4 +1,4 @@
-"""What the commands share: `command` adds a command with its common options and resolves its settings; tables."""
+"""The common parts of the commands: `command` adds a command and resolves its settings; a Job runs it; tables."""
 
 from __future__ import annotations
 

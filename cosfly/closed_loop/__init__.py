@@ -1,1 +1,1 @@
-"""The closed loop: a student flies, and what it sees next is what it flew to."""
+"""The closed loop: the decisions of a student move the drone, and it decides again on the new view."""

@@ -58,7 +58,7 @@ class EngineDecision:
 
 @dataclass(frozen=True)
 class Observation:
-    """What an engine decides on."""
+    """The input of one decision."""
 
     episode: str
     simulation: ClosedLoopTrajectory
@@ -66,7 +66,7 @@ class Observation:
 
 
 class DecisionEngine(Protocol):
-    """A student as an engine of decisions."""
+    """A student that decides."""
 
     name: str  # in records
     num_frames: int  # most frames of an observation

@@ -100,7 +100,7 @@ class FlyConfig(Config):
 
     @property
     def batch(self) -> int:
-        """Episodes that a worker flies at once: one of a policy, which has a state."""
+        """Number of episodes that a worker flies at once; one with a policy, because a policy has a state."""
         return 1 if self.engine == "policy" else self.side_by_side
 
     @property

@@ -58,7 +58,7 @@ UNSUITABLE = "the trajectory gives no episode, because its drone trajectory is m
 
 
 class BenchmarkTown(NamedTuple):
-    """A town by name and seed."""
+    """A generated town."""
 
     name: str
     preset: str

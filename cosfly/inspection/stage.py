@@ -69,8 +69,8 @@ def run(
     watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
-    """Read the simplified map, the plans and the playback tree; write `inspect.json` and `report.html`. Return the
-    former's path.
+    """Read the simplified map, the plans and the playback tree; write `inspect.json` and `report.html`. Return the path
+    of `inspect.json`.
 
     Args:
         simplified, traces: `step2_simplified.json`, `drone_trace.json`; None for a tree of another program.

@@ -99,7 +99,7 @@ def files_of(place: str) -> set[str]:
 
 
 def follow(value: Any, keys: Sequence[str]) -> Any:
-    """Return what the keys lead to, or None if it does not exist."""
+    """Return the value that the keys lead to, or None if it does not exist."""
     for k, key in enumerate(keys):
         if key == "*":
             elements = value.values() if isinstance(value, dict) else value

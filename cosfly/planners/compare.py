@@ -197,7 +197,7 @@ class PlannedItem(BaseModel):
     times_ms: dict[str, float]
 
     def read_traces(self, path_id: str) -> dict[str, DroneTrace]:
-        """Return the traces by planner; raise InputError where one is invalid."""
+        """Return the traces by planner; raise InputError if one is invalid."""
         return {name: DroneTrace.from_json(t, f"items.jsonl: {path_id}: {name}") for name, t in self.traces.items()}
 
 

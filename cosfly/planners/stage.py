@@ -262,7 +262,7 @@ def warm_up(cfg: PlanConfig) -> None:
 
 
 def read_inputs(simplified_map: Path, paths: Path) -> tuple[BoxMap, list[PedestrianTrajectory]]:
-    """Read a map and its pedestrian trajectories; raise InputError where there are none, or two with one id."""
+    """Read a map and its pedestrian trajectories; raise InputError if there are none, or two have one id."""
     box_map, pedestrians = read_boxes(simplified_map), read_paths(paths)
     where = f"{paths}: paths"
     if not pedestrians:

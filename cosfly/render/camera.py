@@ -1,4 +1,4 @@
-"""Cameras of a trajectory, and what they see of the target: box, depth, visibility, legibility (sec:step6)."""
+"""Cameras of a trajectory, and the target in their view: box, depth, visibility, legibility (sec:step6)."""
 
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ class CarlaRenderer(SimulatorRenderer):
     # --- one trajectory --------------------------------------------------------------------------------------
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
-        """Set the weather, or the one that was found where None is given, and remove everybody."""
+        """Set the weather, or restore that of the server for None, and remove all people and cars."""
         self._weather = weather
         for number in list(self._movers):
             self._remove(number)
@@ -211,7 +211,7 @@ class CarlaRenderer(SimulatorRenderer):
     # --- people and cars ----------------------------------------------------------------------------------------------
 
     def _place(self, number: int, body: Body) -> None:
-        """Put somebody in their place; a walker starts where this tick's step leads there."""
+        """Put a person or a car in place; a walker starts one step before it, because the tick moves it there."""
         carla = self._server.carla
         actor = self._movers.get(number) or self._add(number, body)
         position_m, turn_deg, ahead, speed_mps = placement_of(body, SIMULATED_STEP_S)
@@ -221,7 +221,7 @@ class CarlaRenderer(SimulatorRenderer):
         actor.set_transform(self._transform(position_m, turn_deg))
 
     def _add(self, number: int, body: Body) -> Any:
-        """Spawn somebody, by clothes or size, and note the actor's number in pictures."""
+        """Spawn a person or a car, by clothes or size, and note the number of the actor in pictures."""
         if isinstance(body, PosedPerson):
             names = sorted(blueprint.id for blueprint in self._library.filter("walker.pedestrian.*"))
             worn = dump_json(asdict(body.clothes.looks))

@@ -121,8 +121,7 @@ class Renderer(Protocol):
     device: str  # hardware and driver, one line
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
-        """Compute shadows and the like for a trajectory within these corners, (3,) each, in this weather or in the
-        look.
+        """Compute shadows for a trajectory between two corners, (3,) each, in a weather, or in the look for None.
 
         Weather changes colours only, never depth, kinds and ids.
 

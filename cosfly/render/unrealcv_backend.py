@@ -173,7 +173,7 @@ class UnrealCvRenderer(SimulatorRenderer):
     # --- one frame ----------------------------------------------------------------------------------------------------
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
-        """Remove everybody; the level's own weather stays."""
+        """Remove all people and cars; the weather of the level stays."""
         if weather is not None:
             fix = "set render.backend to gl or carla, or render.weather_mode to off"
             raise RenderError("the renderer unrealcv cannot draw weather", where=self.device, fix=fix)
@@ -223,7 +223,7 @@ class UnrealCvRenderer(SimulatorRenderer):
             raise RenderError(what, where=self.device, got=got, expected=expected, fix=fix)
 
     def _decoded(self, lit: str | bytes, mask: str | bytes, depth: str | bytes) -> Frame:
-        """Convert a server's pictures to a frame; raise InputError where one is damaged."""
+        """Convert a server's pictures to a frame; raise InputError if one is damaged."""
         shape = self._size_px[::-1]
         pictures = []
         for name, data in (("lit", lit), ("object_mask", mask)):

@@ -92,7 +92,7 @@ def draw_line(
 
 
 def draw_dot(picture: np.ndarray, point: np.ndarray, radius_px: int, color: Color, width: int = -1) -> None:
-    """Draw a disc round a point, or a ring of some width."""
+    """Draw a disc around a point, (2,) px, or a ring of a width."""
     center = _fixed(point).tolist()
     cv2.circle(picture, center, radius_px << FRACTION_BITS, color, width, cv2.LINE_AA, shift=FRACTION_BITS)
 

@@ -1,4 +1,4 @@
-"""The task of the generic planners: start, goal, free space, and the repair of what they find.
+"""The task of the generic planners: start, goal, free space, and the repair of their trajectories.
 
 A generic planner knows no target: it goes from the first reference position to the last one in the duration of the
 pedestrian trajectory, free of boxes. The repair is `repair_to_limits` of smoothing.py for all planners.
