@@ -41,7 +41,7 @@ def test_a_served_town_comes_back_as_it_is(tmp_path):
         done = CliRunner().invoke(app, words, catch_exceptions=False)
         wrong = CarlaMapConfig(port=port, town="Town99")
         with pytest.raises(
-            ConfigError, match=rf"127\.0\.0\.1:{port} \(CARLA 0\.9\.16\).*no such town.*Town99.*{town.name}"
+            ConfigError, match=rf"127\.0\.0\.1:{port} \(CARLA 0\.9\.16\).*no town of this name.*Town99.*{town.name}"
         ):
             carla_export.load(wrong, 0)
     assert done.exit_code == 0, done.output
