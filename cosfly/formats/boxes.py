@@ -220,7 +220,8 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
         raise InputError("the semantic id is unknown", where=where, got=str(unknown[0]), expected=expected)
     ids, counts = np.unique(box_map.ids, return_counts=True)
     if (counts > 1).any():
-        raise InputError("two boxes have the same id", where=where, got=str(ids[counts > 1][0]))
+        got = str(ids[counts > 1][0])
+        raise InputError("two boxes have the same id", where=where, got=got, expected="a different id for each box")
 
 
 def _first_row(mask: np.ndarray) -> int | None:
@@ -359,7 +360,9 @@ def _check_computed(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, 
     for name, value in computed.items():
         if header.get(name, value) != value:
             got, expected = str(header[name])[:200], str(value)[:200]
-            raise InputError("the field contradicts the boxes", where=f"{path}: {name}", got=got, expected=expected)
+            raise InputError(
+                "the field disagrees with the boxes of the file", where=f"{path}: {name}", got=got, expected=expected
+            )
     for box in boxes:
         number = KINDS[box.type]
         if box.semantic_id not in (None, number):

@@ -140,8 +140,10 @@ def _read_gltf(data: bytes, folder: _Folder, binary: bytes = b"") -> dict[str, M
     primitives = [_flat_primitive(primitive, folder) for _, primitive in owned]
     used = [k for flat in primitives for k in (*flat["attributes"].values(), flat.get("indices")) if k is not None]
     counts = [*(accessors[k]["count"] for k in used), *(view["byteLength"] for view in views)]
-    if min(counts, default=0) < 0 or sum(counts) > MOST_NUMBERS + FILE_MB * MB:
-        raise InputError("the mesh has too many numbers", where=folder.path, got=f"{sum(counts):,}")
+    most = int(MOST_NUMBERS + FILE_MB * MB)
+    if min(counts, default=0) < 0 or sum(counts) > most:
+        expected = f"counts from 0 to {most:,} in all"
+        raise InputError("the mesh has too many numbers", where=folder.path, got=f"{sum(counts):,}", expected=expected)
     read_buffer = functools.cache(lambda uri: _buffer(uri, binary, folder))  # several buffers may name one file
     buffers = {str(k): read_buffer(b.get("uri")) for k, b in enumerate(document.get("buffers", ()))}
     flat_document = {

@@ -102,7 +102,7 @@ def flight_ids(places: Collection[Place]) -> dict[Place, str]:
             expected = "tracks that differ in run, town, trajectory or variant"
             fix = "remove all but one of them, or give the folders of their runs different names"
             raise InputError(
-                "several tracks have the same id", got=f"{len(group)} of {name}", expected=expected, fix=fix
+                "several tracks have the same id", got=f"{len(group)} tracks in {name}", expected=expected, fix=fix
             )
         ids |= {place: f"{front[place]}{name}_{place.variant}" for place in group}
     return ids

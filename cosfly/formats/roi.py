@@ -96,7 +96,7 @@ def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Ro
     for number, ring in rings:
         where = f"{path}: polygon {number}"
         if len(ring) < 3 or numbers(ring, None, 2) is None:
-            what = "a ring has too few points, or one that is not finite"
+            what = "a ring has too few points, or a point that is not finite"
             raise InputError(what, where=where, got=f"{len(ring)} points", expected="at least three finite points")
         reason = shapely.is_valid_reason(shapely.Polygon(ring))
         if reason != "Valid Geometry":

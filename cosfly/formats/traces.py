@@ -52,7 +52,7 @@ class Excerpt:
             return None
         if not isinstance(record, dict) or record.get("number") not in range(MOST_TRAJECTORIES):
             expected = f"an object with id, number (below {MOST_TRAJECTORIES}) and before"
-            raise InputError("the record does not describe an excerpt", where=where, expected=expected)
+            raise InputError("the field does not describe a part of a trajectory", where=where, expected=expected)
         return cls(text_id(record, where), int(record["number"]), column(record, "before", where, None, 3))
 
 

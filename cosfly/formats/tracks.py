@@ -32,7 +32,7 @@ def find_tracks(root: Path, choice: TrackChoice = ALL_TRACKS) -> list[Path]:
     named = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
     if not named:
         raise InputError(
-            "no track of the tree has such a name",
+            "no track of the tree matches the patterns",
             where=root,
             got=", ".join(choice.match),
             expected=f"a pattern for folders such as {folders[0].relative_to(root).as_posix()}",
@@ -43,7 +43,7 @@ def find_tracks(root: Path, choice: TrackChoice = ALL_TRACKS) -> list[Path]:
     chosen = [folder for folder in named if track_of(folder) in choice.tracks]
     if not chosen:
         got = ", ".join(choice.tracks)
-        raise InputError("no track of the tree is of this kind", where=root, got=got, fix="check --tracks")
+        raise InputError("no track of the tree is of the chosen kind", where=root, got=got, fix="check --tracks")
     return chosen
 
 

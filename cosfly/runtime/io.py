@@ -104,7 +104,9 @@ def read_bytes(
         file.seek(first)
         data = file.read(size)
     if span is not None and len(data) != size:
-        raise InputError(f"the {what} became shorter during reading", where=path, got=f"{first + len(data)} bytes")
+        got = f"{first + len(data)} bytes"
+        fix = "try again when no other process writes the file"
+        raise InputError(f"the {what} became shorter during reading", where=path, got=got, fix=fix)
     return data
 
 
@@ -255,7 +257,7 @@ def _plain_name(root: Path, name: str) -> str:
     plain = os.path.normpath(name)
     if "\0" in name or max(len(part.encode("utf-8", "surrogatepass")) for part in plain.split(os.sep)) > LONGEST_NAME:
         expected = f"no null character, and at most {LONGEST_NAME} bytes between two slashes"
-        raise InputError("the text is not a file name", where=root, got=name, expected=expected)
+        raise InputError("the name is not a valid file name", where=root, got=name, expected=expected)
     if os.path.isabs(plain) or plain.split(os.sep)[0] == os.pardir:
         raise InputError("a name leads out of its folder", where=root, got=name, expected="a path inside the folder")
     return plain

@@ -424,7 +424,11 @@ def _check_same(out: Path, record: StageRecord, resume: Resume) -> None:
     """Raise ResumeError if `record` does not agree with the record of the work in a folder."""
     previous = read_stage_record(out)
     if resume == "never":
-        raise ResumeError("the folder already holds work", where=out, fix="choose another --out, or --resume if-same")
+        raise ResumeError(
+            "the folder already holds work of an earlier command",
+            where=out,
+            fix="choose another --out, or --resume if-same",
+        )
     before = flattened(previous.config) | {"seed": previous.seed}
     after = flattened(record.config) | {"seed": record.seed}
     differences = [
