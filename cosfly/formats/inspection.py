@@ -110,8 +110,7 @@ class Inspection(Record):
 def count_trajectories(flights: list[TrackInspection], *, planned: bool) -> dict[str, int]:
     """Count rendered trajectories by the result of their worst track: `rendered`, `accepted`, `review`, `rejected`.
 
-    Args:
-        planned: True counts planned trajectories and ignores tracks without one; False counts folders.
+    planned: True counts planned trajectories and ignores tracks without one; False counts folders.
     """
     results: dict[str, set[Result]] = {}
     for flight in flights:
@@ -227,9 +226,8 @@ def read_settled(inspected: Path) -> Inspection:
     decisions = read_decisions(inspected)
     if not decisions:
         return inspection
-    updates = {
-        folder: {"result": decision.verdict, "decided": decision.verdict} for folder, decision in decisions.items()
-    }
+    verdicts = {folder: decision.verdict for folder, decision in decisions.items()}
+    updates = {folder: {"result": verdict, "decided": verdict} for folder, verdict in verdicts.items()}
     tracks = [track.model_copy(update=updates.get(track.folder)) for track in inspection.flights]
     is_planned = any(track.trace_id is not None for track in tracks) or not inspection.funnel.trajectories.rendered
     counts = count_trajectories(tracks, planned=is_planned)
@@ -259,11 +257,8 @@ def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[D
                     expected="a track in review",
                     fix="fix the track, or change the threshold and inspect again",
                 )
-            decision = Decision(
-                folder=track.folder, verdict=choice.verdict, reason=choice.reason, inspection=digest,
-                sha256=track.sha256, by=by, at=now,
-            )  # fmt: skip
-            decisions.append(decision)
+            file = {"folder": track.folder, "sha256": track.sha256, "inspection": digest}
+            decisions.append(Decision(**file, verdict=choice.verdict, reason=choice.reason, by=by, at=now))
     with Journal(inspected.with_name(REVIEW)) as journal:
         for decision in decisions:
             journal.append(decision.model_dump())

@@ -42,8 +42,9 @@ class Report:
 
     def add(self, severity: Severity, code: str, where: object, got: object, expected: str) -> None:
         """Add a finding."""
-        place, value = cut(str(where)), cut(str(got))
-        self.issues.append(Issue(severity=severity, code=code, where=place, got=value, expected=expected))
+        self.issues.append(
+            Issue(severity=severity, code=code, where=cut(str(where)), got=cut(str(got)), expected=expected)
+        )
 
     def error(self, code: str, where: object, got: object, expected: str) -> None:
         self.add("error", code, where, got, expected)
@@ -60,11 +61,12 @@ class Report:
         return sum(issue.count for issue in self.issues if issue.severity == severity)
 
     def merged(self) -> list[Issue]:
-        """Return one issue per severity and code, the first occurrence's, with the number of occurrences; sorted."""
+        """Return the first issue of each severity and code, with the number of occurrences, sorted."""
         first: dict[tuple[str, str], Issue] = {}
         for issue in self.issues:
-            known = first.get(key := (issue.severity, issue.code))
-            first[key] = issue if known is None else known.model_copy(update={"count": known.count + issue.count})
+            key = (issue.severity, issue.code)
+            num_before = first[key].count if key in first else 0
+            first[key] = first.get(key, issue).model_copy(update={"count": num_before + issue.count})
         return sorted(first.values(), key=sort_key)
 
     def __str__(self) -> str:

@@ -84,8 +84,7 @@ class _Folder:
 def read_meshes(path: Path, *, tree: Path) -> dict[str, Mesh]:
     """Read a file of meshes, node by node; an OBJ is one node.
 
-    Args:
-        tree: The folder that must contain the file and all files that it names.
+    tree: The folder that must contain the file and all files that it names.
     """
     data = read_bytes(path, what="mesh", tree=tree, most_mb=FILE_MB)
     readers = {".glb": _read_glb, ".gltf": _read_gltf, ".obj": _read_obj}

@@ -53,8 +53,10 @@ class PedestrianTrajectory:
 
     @classmethod
     def from_json(cls, record: dict, where: str) -> PedestrianTrajectory:
-        time_s, polyline = column(record, "t", where, None), column(record, "polyline", where, None, 2)
-        positions, speeds = columns(record, "xyz", where, len(time_s)), column(record, "speed", where, len(time_s))
+        time_s = column(record, "t", where, None)
+        polyline = column(record, "polyline", where, None, 2)
+        positions = columns(record, "xyz", where, len(time_s))
+        speeds = column(record, "speed", where, len(time_s))
         return cls(text_id(record, where), polyline, time_s, positions, speeds, pace_of(record, where))
 
 

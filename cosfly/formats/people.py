@@ -66,8 +66,9 @@ class Appearance:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if value not in (rows := _rows(name, vars(self))):
-                raise ValueError(f"{name} must be one of {', '.join(map(repr, rows))}")
+            allowed = _rows(name, vars(self))
+            if value not in allowed:
+                raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}")
 
     def differences(self, other: Appearance) -> tuple[str, ...]:
         """Return the fields in which two people differ; a garment counts once."""

@@ -17,15 +17,14 @@ from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import is_below, real_path
 
-TOWN = "Town"  # what the name of a town's folder begins with
-
+TOWN = "Town"  # prefix of the name of a town's folder
 
 TrackName = Literal["clean", "perturbed"]
 TRACKS: tuple[TrackName, ...] = get_args(TrackName)
 
 
 class TrackChoice(Config):
-    """Which flights of a tree a stage takes."""
+    """Selects tracks of a tree."""
 
     match: tuple[str, ...] = Field(
         (), description="patterns for their folders in the tree, as Town01/trajectory_17*/ORI or Town0[12]; empty: all"
@@ -33,7 +32,7 @@ class TrackChoice(Config):
     tracks: tuple[TrackName, ...] = Field(TRACKS, min_length=1, description="clean, perturbed, or both")
 
     def names(self, folder: str) -> bool:
-        """Return whether a pattern names a flight by its folder in the tree, or by a folder above it."""
+        """Return whether a pattern matches the folder of a track in the tree, or a folder above it."""
         parts = folder.split("/")
         heads = ["/".join(parts[:count]) for count in range(1, len(parts) + 1)]
         return not self.match or any(fnmatchcase(head, pattern.strip("/")) for pattern in self.match for head in heads)
@@ -44,7 +43,7 @@ ALL_TRACKS = TrackChoice()
 
 @dataclass(frozen=True, order=True)
 class Place:
-    """A flight among those of several runs. `run` is empty where there is one tree alone."""
+    """The position of a track in the tree of a run; `run` is empty if there is only one tree."""
 
     run: str
     town: str
@@ -53,12 +52,12 @@ class Place:
 
 
 def folder_name(text: str) -> str:
-    """Make a name for a folder of any text."""
+    """Return a text as the name of a folder."""
     return re.sub(r"[^\w.-]+", "_", text, flags=re.ASCII).lstrip(".") or "map"
 
 
 def town_folder(name: str) -> str:
-    """Make the name of a town's folder of a map's name: `Town03` stays, `delft` is `Town_delft`."""
+    """Return the name of a map as the name of a town's folder: `Town03` stays, `delft` becomes `Town_delft`."""
     name = folder_name(name)
     return name if name.startswith(TOWN) else f"{TOWN}_{name}"
 
@@ -90,21 +89,21 @@ def flight_ids(places: Collection[Place]) -> dict[Place, str]:
     Trajectories that share a name get the town as a prefix, and if necessary the run and the town; all tracks of a
     trajectory get the same prefix. Raises InputError if two tracks agree in all of these.
     """
-    named: dict[str, list[Place]] = defaultdict(list)
+    groups: dict[str, list[Place]] = defaultdict(list)
     for place in places:
-        named[place.trajectory].append(place)
+        groups[place.trajectory].append(place)
     ids: dict[Place, str] = {}
-    for name, group in named.items():
-        forms = ("", "{0.town}_", "{0.run}_{0.town}_")
-        fronts = ({place: form.format(place) for place in group} for form in forms)
-        front = next((f for f in fronts if len({(f[place], place.variant) for place in group}) == len(group)), None)
-        if front is None:
+    for name, group in groups.items():
+        for form in ("", "{0.town}_", "{0.run}_{0.town}_"):
+            prefixes = [form.format(place) for place in group]
+            if len({(prefix, place.variant) for prefix, place in zip(prefixes, group, strict=True)}) == len(group):
+                break
+        else:
             expected = "tracks that differ in run, town, trajectory or variant"
             fix = "remove all but one of them, or give the folders of their runs different names"
-            raise InputError(
-                "several tracks have the same id", got=f"{len(group)} tracks in {name}", expected=expected, fix=fix
-            )
-        ids |= {place: f"{front[place]}{name}_{place.variant}" for place in group}
+            got = f"{len(group)} tracks in {name}"
+            raise InputError("several tracks have the same id", got=got, expected=expected, fix=fix)
+        ids |= {place: f"{prefix}{name}_{place.variant}" for prefix, place in zip(prefixes, group, strict=True)}
     return ids
 
 

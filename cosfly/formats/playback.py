@@ -5,8 +5,8 @@
         trajectory.json
         frames_playback/frame_00000/{rgb.png, depth_float32.png or depth.npy, instance.png, meta.json}
 
-Axes inside the tree are CARLA's (left-handed). This module converts them, and frames.py those of `meta.json`; all other
-code uses right-handed axes. Unknown keys are kept in `Track.raw` and survive a read-write round trip.
+The files use CARLA's left-handed axes. This module converts those of `trajectory.json`, and frames.py those of
+`meta.json`; all other code uses right-handed axes. Unknown keys are kept in `Track.raw` and are written again.
 """
 
 from __future__ import annotations
@@ -52,20 +52,20 @@ BBOX = ("xmin", "ymin", "xmax", "ymax")
 ORIGINAL = "ORI"  # the folder of a clean track
 TARGET_FILE = "target.png"  # in a track's folder: the target, cut out of the frame of the goal
 TREE_ACTION = ("forward_mps", "right_mps", "up_mps", "yaw_rate_degps", "gimbal_pitch_deg")  # motion.ACTION, mirrored
-TREE_ACTION_SIGNS = np.array([1.0, -1.0, 1.0, -1.0, 1.0])  # left to right, counter-clockwise to clockwise
+TREE_ACTION_SIGNS = np.array([1.0, -1.0, 1.0, -1.0, 1.0])  # left becomes right, counter-clockwise clockwise
 LEGIBILITY = ("height_px", "contrast", "legible")  # fields of a point's target, measured in cosfly/render/camera.py
 EVENTS = ("position", "rotation")  # events of a perturbed frame; docs/files.md lists their outcomes
 # States of the frames of a perturbed track, and the shares of the paper. Each event has a probability of 0.6
 # (tab:augmentation_states). Index: 1 if the position is perturbed, plus 2 if the rotation is.
 STATES = {"unperturbed": 0.16, "position only": 0.24, "rotation only": 0.24, "full": 0.36}
 DATASET_FORMAT = "cosfly_playback"  # marks tracks that cosfly made
-# Keys under which a file may store the names of weather presets: the paper names none, and no public file has any.
+# Keys under which a file may store the names of weather presets; neither the paper nor a public file defines one.
 WEATHER_KEYS = {
     "weather": ("weather_name", "weather", "preset", "name"),
     "time_of_day": ("tod_name", "time_of_day", "tod"),
 }
 HEADING_FRAMES = 2  # a heading points from the position this many frames before to that as many frames after
-STANDS_M = 0.1  # a target that moves less between these two stands
+STANDS_M = 0.1  # a target that moves less between these two frames is standing
 
 
 @dataclass(frozen=True)
@@ -307,12 +307,13 @@ def read_track(folder: Path, *, strict: bool = True) -> Track:
     for name, expected in (("schema", SCHEMA), ("schema_version", SCHEMA_VERSION), ("trace_dir", variant)):
         reader.equal(name, raw.get(name), expected)
     points = reader.points(raw)
-    time_s, poses = reader.times(points), mirror_poses(reader.poses(points))
+    time_s = reader.times(points)
+    poses = mirror_poses(reader.poses(points))
     targets = [object_of(point, "target") for point in points]
-    others = [object_of(point, "others") for point in points]
+    bystander_groups = [object_of(point, "others") for point in points]
     if not all(target or point.get("target", "missing") is None for target, point in zip(targets, points, strict=True)):
         reader.issue("points[].target", "missing", "an object, or null without a target")
-    bystanders = np.column_stack([_numbers_of(others, name) for name in BYSTANDER_COLUMNS])
+    bystanders = np.column_stack([_numbers_of(bystander_groups, name) for name in BYSTANDER_COLUMNS])
     segments, mission = reader.optional(lambda: read_flown(raw, len(points), str(path))) or ((), None)
     people = goal = None
     if "people" in raw:
@@ -556,7 +557,8 @@ def write_track(folder: Path, track: Track) -> None:
         "dataset_format": raw.get("dataset_format", DATASET_FORMAT), "frames_dir": raw.get("frames_dir", FRAMES_DIR),
         "coordinates": raw.get("coordinates", COORDINATES), "source": track.source,
         **flown_as_json(track.segments, mirrored(track.mission)),
-        **{name: asdict(one) for name, one in (("people", track.people), ("goal", track.goal)) if one is not None},
+        **({} if track.people is None else {"people": asdict(track.people)}),
+        **({} if track.goal is None else {"goal": asdict(track.goal)}),
         "camera": object_of(raw, "camera")
         | {"width": camera.width_px, "height": camera.height_px, **camera.focal_record()},
         "augmentation": {"enabled": not track.is_original, "aug_index": 0 if track.is_original else 1}

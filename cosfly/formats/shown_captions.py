@@ -1,6 +1,6 @@
-"""A caption as a release shows it, and what a checker of captions finds: what `release verify` and `caption` exchange.
+"""The interface between `release verify` and `caption`: captions as released, and the findings of their checker.
 
-Release knows rows and pictures, caption knows labels and verdicts; the command line brings the two together.
+`release` reads rows and pictures, `caption` checks labels and verdicts; the command line passes one to the other.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class ShownCaption:
 
 @dataclass(frozen=True)
 class ReleasedTrack:
-    """The released part of a track. flight: of the frames `frame_indices`, (n,), ascending, possibly with gaps. twin:
-    the clean track of a perturbed one with the same frames, None if not released. settings: of the captions as
-    recorded; empty means the defaults."""
+    """The released part of a track. flight: The frames `frame_indices`, (n,), ascending, possibly with gaps. twin: The
+    clean track of a perturbed one with the same frames; None if not released. settings: Those recorded for the
+    captions; empty means the defaults."""
 
     flight: Track
     frame_indices: np.ndarray

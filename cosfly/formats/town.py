@@ -1,5 +1,5 @@
-"""Files of a town's folder in the playback tree: `map.json` (name and licence of the map) and `instance_ids.json`
-(which box an id of `instance.png` means)."""
+"""Files in a town's folder of the playback tree: `map.json` (name and licence of the map) and `instance_ids.json` (the
+box of each id in `instance.png`)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from pydantic import Field
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader
 from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
-IDS_FILE, IDS_FORMAT = "instance_ids.json", FileFormat("cosfly.instance_ids", "1.0", "record of ids")
-TOWN_FILE, TOWN_FORMAT = "map.json", FileFormat("cosfly.town_map", "1.0", "town's map")
+IDS_FILE = "instance_ids.json"
+IDS_FORMAT = FileFormat("cosfly.instance_ids", "1.0", "record of ids")
+TOWN_FILE = "map.json"
+TOWN_FORMAT = FileFormat("cosfly.town_map", "1.0", "record of the town's map")
 
 
 class TownMap(Record):
-    """The map below a town's flights: its name and licence, and who must be named (one sentence or more)."""
+    """The map of a town: its name, licence and attribution (one sentence or more)."""
 
     name: str
     licence: LicenceId
@@ -38,7 +40,7 @@ def read_town_map(town: Path) -> TownMap:
 
 
 class InstanceIds(Record):
-    """person: the target's id; shared: of boxes without their own; others: of who else moves; boxes: (id, box id)."""
+    """person: The target's id. shared: Of boxes without an id. others: Of bystanders. boxes: (id, box id)."""
 
     person: int
     shared: int
@@ -49,8 +51,8 @@ class InstanceIds(Record):
 
     def of_boxes(self, box_map: BoxMap) -> np.ndarray:
         """Return the ids of a map's boxes, (n,); `shared` for a box that is not listed."""
-        own = {box_id: instance_id for instance_id, box_id in self.boxes}
-        return np.array([own.get(int(box_id), self.shared) for box_id in box_map.ids.tolist()])
+        id_of = {box_id: instance_id for instance_id, box_id in self.boxes}
+        return np.array([id_of.get(int(box_id), self.shared) for box_id in box_map.ids.tolist()])
 
 
 def read_instance_ids(town: Path) -> InstanceIds:

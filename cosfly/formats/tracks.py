@@ -69,7 +69,7 @@ def read_twin(track: Track) -> Track | None:
     has_same_times = len(twin) == len(track) and np.abs(twin.time_s - track.time_s).max() < TWIN_TOLERANCE_S
     if not twin.is_original:
         raise VerifyError(
-            "the folder of the clean track holds a perturbed track", where=twin.folder, got="is_original false"
+            "the clean track's folder holds a perturbed track", where=twin.folder, got="is_original false"
         )
     if not has_same_times:
         raise VerifyError(

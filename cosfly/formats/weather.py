@@ -60,8 +60,7 @@ _PARAMETERS = {
     "smog": (60, 0, 60, 15), "dust_haze": (70, 0, 70, 12), "snow_haze": (90, 0, 40, 20),
 }  # fmt: skip
 WEATHERS = {
-    name: WeatherPreset(**dict(zip(WeatherPreset.model_fields, values, strict=True)))
-    for name, values in _PARAMETERS.items()
+    name: WeatherPreset(**dict(zip(WeatherPreset.model_fields, row, strict=True))) for name, row in _PARAMETERS.items()
 }
 # tab:tod_presets
 TIMES = {
@@ -82,10 +81,9 @@ def resolved(weather: WeatherPreset, time: TimePreset) -> WeatherParams:
 
 def sky_kind(params: WeatherParams) -> str:
     """Return the SkyKind of parameters, also for presets of a user."""
+    light = "dusk" if params.sun_altitude_angle < DAY_FROM_DEG else "day"
     if params.sun_altitude_angle <= SUN_IS_DOWN_DEG:
         light = "night"
-    else:
-        light = "dusk" if params.sun_altitude_angle < DAY_FROM_DEG else "day"
     if params.precipitation:
         return f"{light}_rain"
     return f"{light}_fog" if params.fog_density else f"{light}_dry"

@@ -41,12 +41,9 @@ def rotation_matrices(rotations_rad: np.ndarray) -> np.ndarray:
 
 
 def axis_aligned_half_extents(half_extents: np.ndarray, rotations_deg: np.ndarray) -> np.ndarray:
-    """Return the half sizes of the axis-aligned boxes around rotated boxes.
+    """Return the half sizes of the axis-aligned boxes around rotated boxes, (n, 3) m.
 
-    Args:
-        half_extents: (n, 3) m; rotations_deg: (n, 3) pitch, yaw, roll.
-    Returns:
-        (n, 3) m. Exact for unrotated boxes and quarter turns up to rounding.
+    half_extents: (n, 3) m; rotations_deg: (n, 3) pitch, yaw, roll.
     """
     turns = np.abs(rotation_matrices(np.radians(rotations_deg)))
     turns[turns < 1e-12] = 0.0  # cos(90 deg) is 6e-17: do not let it widen a box
@@ -73,8 +70,7 @@ def intrinsic_matrix(width_px: int, height_px: int, fov_deg: float) -> np.ndarra
 def world_from_camera(position_m: np.ndarray, rotation_deg: np.ndarray) -> np.ndarray:
     """Return the (4, 4) transform of a camera at a body pose.
 
-    Args:
-        position_m: (3,); rotation_deg: (3,) pitch, yaw, roll.
+    position_m: (3,); rotation_deg: (3,) pitch, yaw, roll.
     """
     transform = np.eye(4)
     transform[:3, :3] = rotation_matrix(*np.radians(rotation_deg)) @ BODY_FROM_CAMERA

@@ -98,7 +98,8 @@ class Coverage(Record):
             styles, paces: one per frame. labels: one per frame with a label. skies: weather and time of day per
                 frame, None where unknown.
         """
-        offsets_m, heading_deg, height_px, visibility = seen[:, :3], *seen[:, 3:].T
+        offsets_m = seen[:, :3]
+        heading_deg, height_px, visibility = seen[:, 3:].T
         azimuth_deg = azimuths_deg(offsets_m, heading_deg)
         distance_m = np.linalg.norm(offsets_m, axis=1)
         values = (offsets_m[:, 2] + hip_height_m, distance_m, azimuth_deg, height_px, visibility)
@@ -107,8 +108,8 @@ class Coverage(Record):
         weathers = [weather for weather, _ in pairs if weather is not None]
         times = [time for _, time in pairs if time is not None]
         both = [PAIR.join((weather, time)) for weather, time in pairs if weather is not None and time is not None]
-        named = [dict(sorted(Counter(names).items())) for names in (styles, paces, labels, weathers, times, both)]
-        return cls(frames=sum(named[0].values()), bins=bins, **dict(zip(COUNTED, named, strict=True)))
+        counts = [dict(sorted(Counter(names).items())) for names in (styles, paces, labels, weathers, times, both)]
+        return cls(frames=sum(counts[0].values()), bins=bins, **dict(zip(COUNTED, counts, strict=True)))
 
     @classmethod
     def total(cls, parts: Iterable[Coverage]) -> Coverage:
@@ -122,15 +123,15 @@ class Coverage(Record):
 
     def range_of(self, name: str) -> tuple[float | None, float | None]:
         """Return the 5th and the 95th percentile of an axis."""
-        axis, counts = AXES[name], self.bins.get(name, [])
+        axis = AXES[name]
+        counts = self.bins.get(name, [])
         return axis.percentile(counts, 0.05), axis.percentile(counts, 0.95)
 
 
 def azimuths_deg(offsets_m: np.ndarray, headings_deg: np.ndarray) -> np.ndarray:
     """Return the azimuth of the drone relative to the target's heading, (n,) degrees, -180 to 180, left positive.
 
-    Args:
-        offsets_m: (n, 3) from the target to the drone. headings_deg: (n,) of the target.
+    offsets_m: (n, 3) from the target to the drone. headings_deg: (n,) of the target.
     """
     bearing = np.degrees(np.arctan2(offsets_m[:, 1], offsets_m[:, 0]))
     return (bearing - headings_deg + 180.0) % 360.0 - 180.0

@@ -107,8 +107,7 @@ def find_says(
 ) -> tuple[str, ...] | None:
     """Find the shortest description that only the target (PERSON_ID) fits in a picture; None if there is none.
 
-    Args:
-        tells: (slot, appearance) -> whether the picture shows that the target does not look like that in the slot.
+    tells: (slot, appearance) -> whether the picture shows that the target does not look like that in the slot.
     """
     looks = people[PERSON_ID]
     rivals = {
@@ -128,7 +127,8 @@ def find_says(
                 number for number, slots in differing.items() if not any(tells(slot, rivals[number]) for slot in slots)
             }
             if best_says is None or len(confused) < len(best_rivals):
-                best_says, best_rivals = says, confused
+                best_says = says
+                best_rivals = confused
     if best_says is None or not best_rivals:
         return best_says
     for relation in (*SIDES, *LANDMARKS):
@@ -181,8 +181,7 @@ def words_of(says: Sequence[str], looks: Appearance) -> Words:
 def target_picture(rgb: np.ndarray, box: list[float]) -> np.ndarray:
     """Cut a person out of a frame, (h, w, 3) uint8, with room around, and enlarge it where it is small.
 
-    Args:
-        box: xmin, ymin, xmax, ymax px.
+    box: xmin, ymin, xmax, ymax px.
     """
     center = np.array([box[1] + box[3], box[0] + box[2]]) / 2.0
     side = max(box[2] - box[0], box[3] - box[1])

@@ -144,8 +144,7 @@ def surface(box_map: BoxMap, kinds: Collection[int] = GROUND_KINDS, *, like: Occ
 def surface_kinds(box_map: BoxMap, kinds: Collection[int], *, like: OccupancyGrid) -> np.ndarray:
     """Return the kind of the topmost ground in the middle of each cell, (ny, nx) uint8; 0 where there is none.
 
-    Args:
-        kinds: as for `surface`; of kinds in one plane, to a centimetre, the higher layer counts.
+    kinds: as for `surface`; of kinds in one plane, to a centimetre, the higher layer counts.
     """
     boxes = _surfaces(box_map, kinds)
     tops_m = np.round(boxes.maxs[:, 2] - boxes.ground.height_at(boxes.centers), 2)

@@ -74,8 +74,7 @@ class Ground:
     def triangles(self, reach_m: float = 0.0) -> np.ndarray:
         """Return the triangles, (2 cells, 3, 3) m, counter-clockwise from above.
 
-        Args:
-            reach_m: Width of further cells around the grid, at the heights of its border; 0: none.
+        reach_m: Width of further cells around the grid, at the heights of its border; 0: none.
         """
         num_y, num_x = self.heights_m.shape
         x = self.west_m + self.cell_m * np.arange(num_x)

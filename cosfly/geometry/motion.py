@@ -23,16 +23,15 @@ NUM_WAYPOINTS = 10
 def without_perturbation(
     poses: np.ndarray, targets_m: np.ndarray, offsets: np.ndarray, target_offsets_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Subtract a perturbation (cosfly/render/perturbation.py).
-
-    It consists of the shifts of drone and target, the turn of the view, and the new aim after the shifts.
+    """Subtract a perturbation: the shifts of drone and target, the turn of the view, and the new aim after the shifts.
 
     Args:
         poses, offsets: (n, 6) x, y, z in m, pitch, yaw, roll in degrees. targets_m, target_offsets_m: (n, 3).
     Returns:
         poses (n, 6) and targets (n, 3); NaN where the perturbation of a frame is not recorded.
     """
-    planned, targets = poses - offsets, targets_m - target_offsets_m
+    planned = poses - offsets
+    targets = targets_m - target_offsets_m
     # A frame without a shift was not aimed again, whether or not its target is known. An unknown shift (NaN) counts
     # as a shift.
     is_shifted = (offsets[:, :3] != 0).any(axis=1) | (target_offsets_m != 0).any(axis=1)

@@ -79,8 +79,7 @@ def compare_views(
 ) -> Agreement:
     """Reproject the grid's points of one frame into another and back.
 
-    Args:
-        intrinsics: (4,) fx, fy, cx, cy of both. others_intrinsics: of the other, where the camera zoomed in between.
+    intrinsics: (4,) fx, fy, cx, cy of both. others_intrinsics: of the other, where the camera zoomed in between.
     """
     intrinsics = intrinsics.astype(np.float64)
     others = intrinsics if others_intrinsics is None else others_intrinsics.astype(np.float64)

@@ -19,12 +19,9 @@ CLEARANCE_TOLERANCE_M = 1e-3  # files keep a tenth of a millimetre
 
 
 def derivative_rms(positions_m: np.ndarray, order: int, dt_s: float = DT_S) -> float:
-    """Return the root mean square of the length of a discrete derivative of a path.
+    """Return the root mean square of the length of a discrete derivative of a path, (n, 3) m; 0 for a shorter path.
 
-    Args:
-        positions_m: (n, 3). order: 1 speed (m/s), 2 acceleration (m/s^2), 3 jerk (m/s^3).
-    Returns:
-        0 for a path of at most `order` points, which has no such difference.
+    order: 1 speed (m/s), 2 acceleration (m/s^2), 3 jerk (m/s^3); it needs more than `order` points.
     """
     differences = _differences(positions_m, order)
     if dt_s <= 0:

@@ -281,7 +281,10 @@ class KeptAnswers:
             book: None records nothing. budget: None sets no limit.
             only: Ids of the samples for which the engine may be asked; None: all. Others get recorded answers only.
         """
-        self.engine, self.book, self.budget, self.only = engine, book, budget, only
+        self.engine = engine
+        self.book = book
+        self.budget = budget
+        self.only = only
         self._asking: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()  # by key, held during a request
 
     async def ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:

@@ -75,22 +75,26 @@ SECONDS_BETWEEN_WARNINGS = 10.0
 
 
 class Troubles:
-    """Failed tries, for the progress display. last: the last error; None after an answer."""
+    """Failed tries, for the progress display. last: The last error; None after an answer."""
 
     def __init__(self) -> None:
         self.num = 0
         self.last: str | None = None
-        self._answered_s, self._warned_s = time.monotonic(), float("-inf")
+        self._answered_s = time.monotonic()
+        self._warned_s = float("-inf")
 
     def answered(self) -> None:
         """Record an answer."""
-        self.last, self._answered_s = None, time.monotonic()
+        self.last = None
+        self._answered_s = time.monotonic()
 
     def failed(self, detail: str) -> bool:
         """Record a failed try; return whether it is time for a line in the log."""
-        self.num, self.last, now_s = self.num + 1, detail, time.monotonic()
-        if is_time := now_s - self._warned_s >= SECONDS_BETWEEN_WARNINGS:
-            self._warned_s = now_s
+        self.num += 1
+        self.last = detail
+        is_time = time.monotonic() - self._warned_s >= SECONDS_BETWEEN_WARNINGS
+        if is_time:
+            self._warned_s = time.monotonic()
         return is_time
 
     @property
@@ -138,7 +142,8 @@ def run_until_interrupted(main: Coroutine[Any, Any, Result]) -> Result:
     is_interrupted = False
 
     async def guarded() -> Result:
-        task, loop = asyncio.current_task(), asyncio.get_running_loop()
+        task = asyncio.current_task()
+        loop = asyncio.get_running_loop()
 
         def interrupt() -> None:
             nonlocal is_interrupted

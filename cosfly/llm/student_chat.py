@@ -40,8 +40,7 @@ class StudentEndpointConfig(EndpointConfig):
 def chat_messages(prompt: Prompt, frames: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
     """Return the chat of a sample: system text, each frame's pictures after its name, question.
 
-    Args:
-        frames: Picture parts of each frame, oldest first; a frame without pictures gets no label.
+    frames: Picture parts of each frame, oldest first; a frame without pictures gets no label.
     """
     content: list[dict[str, Any]] = []
     for number, pictures in enumerate(frames):

@@ -188,10 +188,8 @@ def _add_solid(
 ) -> tuple[Any, Mesh | None]:
     """Add a building as upright boxes from its lowest ground (or below it) to its top.
 
-    A box is as high as the mesh in it, so that planners know its spires.
-
-    Returns:
-        The union of the outlines of the boxes; the mesh to draw, if it has one.
+    A box is as high as the mesh in it, so that planners know its spires. Return the union of the outlines of the boxes,
+    and the mesh to draw, if there is one.
     """
     z = item.corners()[:, 2]
     low = min(float(z.min()), float(ground.height_at(item.corners()).min()))
@@ -295,10 +293,9 @@ def _add_trees(boxes: BoxList, item: CityObject, facets: list[Facet]) -> None:
 
 
 def _canopy_heights(item: CityObject, facets: list[Facet]) -> tuple[np.ndarray, np.ndarray]:
-    """Rasterise the heights of a surface: the highest corner in each cell, and the surface over the cell's middle.
+    """Rasterise a surface: the highest corner in each cell, and the height over the cell's middle.
 
-    Returns:
-        Heights (nx, ny) m, 0 off the surface; indices (2,) of the first cell: its low corner over CANOPY_CELL_M.
+    Return heights (nx, ny) m, 0 off the surface, and the indices (2,) of the first cell: low corner / CANOPY_CELL_M.
     """
     cell_m = CANOPY_CELL_M
     bounds = np.array([polygon.bounds for polygon, _ in facets])
@@ -321,13 +318,9 @@ def _canopy_heights(item: CityObject, facets: list[Facet]) -> tuple[np.ndarray, 
 
 
 def _crowns(heights: np.ndarray) -> list[tuple[int, int, int, int, float]]:
-    """Gather the cells of a canopy into trees, the highest first; every cell over CANOPY_M lies in exactly one.
+    """Gather the cells of a canopy, heights (nx, ny) m, into trees, the highest first.
 
-    Args:
-        heights: (nx, ny) m.
-
-    Returns:
-        (x0, y0, x1, y1, height) of each tree: indices of cells with the ends excluded, and m.
+    Every cell over CANOPY_M is in exactly one tree: (x0, y0, x1, y1, height), indices with the ends excluded, and m.
     """
     free = heights > CANOPY_M
     trees = []
@@ -337,7 +330,8 @@ def _crowns(heights: np.ndarray) -> list[tuple[int, int, int, int, float]]:
             break
         if not free[x, y]:
             continue
-        tree, grown = (x, y, x + 1, y + 1), (0, 0, 0, 0)
+        tree = (x, y, x + 1, y + 1)
+        grown = (0, 0, 0, 0)
         while tree != grown:
             grown = tree
             for step in ((-1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1)):

@@ -74,9 +74,7 @@ class SimWorldConfig(Config):
         for path in tables:
             if not path.is_file():
                 fix = "pass --set maps.simworld.sizes=FILE"
-                raise InputError(
-                    "the asset size table does not exist", where=path, expected="SimWorld's Bbox.json", fix=fix
-                )
+                raise InputError("the size table does not exist", where=path, expected="SimWorld's Bbox.json", fix=fix)
         return {"world": world, **{f"sizes_{k}": path for k, path in enumerate(tables)}}
 
 

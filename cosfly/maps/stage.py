@@ -62,8 +62,7 @@ class MapsConfig(Config):
 def load_map(cfg: MapsConfig, *, seed: int = 0, follow_links: bool = False) -> BoxMap:
     """Read or build the map of the chosen source; its meshes are read when they are drawn.
 
-    Args:
-        follow_links: also read meshes through links that lead out of the map's folder.
+    follow_links: also read meshes through links that lead out of the map's folder.
     """
     box_map = SOURCES[cfg.source](getattr(cfg, cfg.source), seed)
     if not follow_links or box_map.meshes.folder is None:

@@ -386,9 +386,8 @@ def _lots(plot: Plot) -> None:
 def _plaza(plot: Plot) -> None:
     """Pave a square, free in the middle, with trees and benches along its edges."""
     plot.lay("Sidewalks")
-    low, high = plot.low, plot.high
-    for x in np.arange(low[0] + 6.0, high[0] - 5.0, 11.0):
-        for y, inwards in ((low[1] + 2.5, 1), (high[1] - 2.5, -1)):
+    for x in np.arange(plot.low[0] + 6.0, plot.high[0] - 5.0, 11.0):
+        for y, inwards in ((plot.low[1] + 2.5, 1), (plot.high[1] - 2.5, -1)):
             plot.tree((x, y), (2.8, 3.8), (5.5, 8.0))
             if plot.rng.random() < 0.4:
                 plot.bench(0, x + 4.0, y + inwards * 1.2)
@@ -396,11 +395,10 @@ def _plaza(plot: Plot) -> None:
 
 def _green(plot: Plot) -> None:
     """Lay a lawn between two crossing paths, free in the middle of each quarter, with trees along its edges."""
-    low, high = plot.low, plot.high
     plot.crossing_paths(1.5)
     for axis in (0, 1):
-        for along in np.arange(low[axis] + 6.0, high[axis] - 5.0, 9.0):
-            for across in (low[1 - axis] + 4.0, high[1 - axis] - 4.0):
+        for along in np.arange(plot.low[axis] + 6.0, plot.high[axis] - 5.0, 9.0):
+            for across in (plot.low[1 - axis] + 4.0, plot.high[1 - axis] - 4.0):
                 if abs(along - plot.middle[axis]) > 4.0:
                     plot.tree(point(axis, along, across), (3.5, 5.5), (7.0, 12.0))
 

@@ -101,9 +101,7 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
     dropped = Counter[str]()
     rows: list[np.ndarray] = []
     kinds: list[int] = []
-    names: list[str] = []
-    class_names: list[str] = []
-    sources: list[str] = []
+    used: list[tuple[str, str, str]] = []  # name, class, and source of the size
     for item in objects:
         kind = kind_of(item.class_name)
         box, source = _box(item, kind, sizes, cfg)
@@ -113,9 +111,8 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
         assert box is not None
         rows.append(box)
         kinds.append(KINDS[kind or "Other"])
-        names.append(item.name)
-        class_names.append(item.class_name)
-        sources.append(source)
+        used.append((item.name, item.class_name, source))
+    sources = [source for _, _, source in used]
     counts = {source: sources.count(source) for source in SOURCES}
     if not rows:
         raise InputError(
@@ -126,7 +123,7 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
         )
     share = counts["default"] / len(rows)
     if cfg.most_default is not None and share > cfg.most_default:
-        without_size = Counter(name for name, source in zip(class_names, sources, strict=True) if source == "default")
+        without_size = Counter(class_name for _, class_name, source in used if source == "default")
         raise InputError(
             "too many boxes have a default size, because the server does not return their bounds", where=where,
             got=f"{share:.1%}: {', '.join(f'{name} ({num})' for name, num in without_size.most_common(5))}",
@@ -146,8 +143,9 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
     log.info("%s: sizes from %s", where, counts)
     if dropped:
         log.warning("%s: dropped: %s", where, dict(dropped))
-    box_map = make_box_map(boxes[:, :3], boxes[:, 3:6], boxes[:, 6:], kinds, [id_of(name) for name in names], header)
-    return LevelMap(**vars(box_map), objects=tuple(zip(names, class_names, sources, strict=True)))
+    ids = [id_of(name) for name, _, _ in used]
+    box_map = make_box_map(boxes[:, :3], boxes[:, 3:6], boxes[:, 6:], kinds, ids, header)
+    return LevelMap(**vars(box_map), objects=tuple(used))
 
 
 def _unfit(item: _Object, kind: str | None, box: np.ndarray | None, source: str, cfg: UnrealCvMapConfig) -> str:

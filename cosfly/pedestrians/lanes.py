@@ -129,7 +129,8 @@ def _on_road(roads: BoxMap, points_m: np.ndarray) -> np.ndarray:
 
 def _junctions(streets: list[Street]) -> tuple[list[float], list[list[Station]]]:
     """Return the width of the widest street of each junction, m, and the stations of each street in order."""
-    places_m, widths_m = list[np.ndarray](), list[float]()
+    places_m: list[np.ndarray] = []
+    widths_m: list[float] = []
     stations: list[dict[int, float]] = [{} for _ in streets]
     for (i, one), (j, two) in combinations(enumerate(streets), 2):
         meeting = _meeting(one, two)

@@ -37,12 +37,9 @@ FROM_ABOVE_PX = 2400
 
 
 def propose(ground: WalkableGround, name: str) -> Roi:
-    """Compute the outline of the ground that pedestrians use, without holes below SMALLEST_HOLE_M2, to TOLERANCE_M.
-
-    Args:
-        name: of the map.
-    """
-    grid, half_m = ground.grid, 0.5 * ground.grid.resolution_m  # outlines run through the middles of cells
+    """Return the outline of the ground that pedestrians use, without holes below SMALLEST_HOLE_M2, to TOLERANCE_M."""
+    grid = ground.grid
+    half_m = 0.5 * grid.resolution_m  # outlines run through the middles of cells
     outlines, tree = cv2.findContours(ground.walkable.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     shapes: dict[bool, list[BaseGeometry]] = {False: [], True: []}
     for outline, parent in zip(outlines, tree[0, :, 3], strict=True):
@@ -126,7 +123,9 @@ class Editor:
 
     def page_html(self) -> str:
         """Return the page."""
-        folder, grid, ground = Path(__file__).parent, self.bare.grid, self.bare
+        folder = Path(__file__).parent
+        ground = self.bare
+        grid = ground.grid
         levels = np.full(ground.walkable.shape, FREE, dtype=np.uint8)
         for mask, level in ((~ground.walkable, UNUSED), (ground.inflated.occupied, MARGIN), (grid.occupied, OCCUPIED)):
             levels[mask] = level
@@ -171,11 +170,8 @@ class Editor:
         with self.lock:
             digest = sha256_bytes(read_bytes(self.path)) if self.path.exists() else None
             if digest != self.digest:
-                raise InputError(
-                    "the file was changed by somebody else, so nothing is written",
-                    where=self.path,
-                    fix="start the editor again",
-                )
+                what = "the file was changed by somebody else, so nothing is written"
+                raise InputError(what, where=self.path, fix="start the editor again")
             write_roi(self.path, roi)
             self.digest = sha256_bytes(read_bytes(self.path))
         return {"figures": figures, "saved": str(self.path)}
@@ -217,10 +213,8 @@ def open_editor(map_: Path, cfg: PedestriansConfig, roi: Path, port: int, backdr
     box_map = _read_map(map_)
     picture = None if backdrop is None else Backdrop.read(backdrop)
     if picture is not None and not picture.covers(box_map):
+        expected = f"a picture of {box_map.name}"
         raise InputError(
-            "the picture does not show any part of the map",
-            where=backdrop,
-            got=str(picture.frame()),
-            expected=f"a picture of {box_map.name}",
+            "the picture does not show the map", where=backdrop, got=str(picture.frame()), expected=expected
         )
     return PageServer(Editor(box_map, cfg, roi, map_, picture), port)

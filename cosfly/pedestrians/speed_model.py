@@ -62,11 +62,7 @@ class TimedRoute:
         return np.concatenate([[0.0], np.cumsum(lengths_m / means_mps)])
 
     def resample(self, step_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Sample the route at equal steps; the last sample is the goal, reached within the last step.
-
-        Returns:
-            time_s (n,) = 0, step, 2 step ...; positions_m (n, 2); speeds_mps (n,).
-        """
+        """Return times (n,) s at equal steps from 0, positions (n, 2) m and speeds (n,) m/s; the last is the goal."""
         num_samples = int(np.ceil((self.times_s[-1] + self.stops_s.sum()) / step_s - 1e-9)) + 1
         time_s = np.arange(num_samples) * step_s
         return time_s, *self.sample(time_s)

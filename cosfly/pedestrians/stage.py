@@ -228,7 +228,8 @@ CAPTION = "dark: obstacles, grey: margin, blue: walkable, violet: carriageway, y
 
 def draw_overview(ground: WalkableGround, paths: list[PedestrianTrajectory]) -> bytes:
     """Draw the ground and the trajectories, north up; a ring is a start, a dot a goal; return PNG bytes."""
-    grid, (num_x, num_y) = ground.grid, ground.grid.size
+    grid = ground.grid
+    num_x, num_y = grid.size
     colors = np.full((num_y, num_x, 3), UNUSED, dtype=np.uint8)
     for mask, color in (
         (ground.walkable, USED), (ground.walkable & (ground.footing >= ROAD), ON_ROAD),
@@ -238,8 +239,8 @@ def draw_overview(ground: WalkableGround, paths: list[PedestrianTrajectory]) -> 
         colors[mask] = color
     scale = LONGER_SIDE_PX / max(num_x, num_y)
     width, height = max(1, round(num_x * scale)), max(1, round(num_y * scale))
-    how = cv2.INTER_NEAREST if scale >= 1 else cv2.INTER_AREA
-    picture = cv2.resize(np.ascontiguousarray(colors[::-1]), (width, height), interpolation=how)
+    method = cv2.INTER_NEAREST if scale >= 1 else cv2.INTER_AREA
+    picture = cv2.resize(np.ascontiguousarray(colors[::-1]), (width, height), interpolation=method)
     per_m = scale / grid.resolution_m
     # A cell's colour fills its pixels; coordinates are 0 in the middle of the first pixel.
     view = TopView(grid.x_min_m + 0.5 / per_m, grid.y_min_m + (height - 0.5) / per_m, per_m, (width, height))

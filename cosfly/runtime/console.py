@@ -84,11 +84,7 @@ Advance = Callable[..., None]  # advance(count, words=""): moves a bar and sets 
 
 @contextlib.contextmanager
 def progress_bar(label: str, total: int | None, done: int = 0) -> Iterator[Advance]:
-    """Show progress as a bar on a terminal, else as a log line every few seconds; total None: unknown.
-
-    Yields:
-        advance(count, words): Moves the bar.
-    """
+    """Yield a function that shows progress: as a bar on a terminal, else as a log line every few seconds."""
     if console.is_terminal:
         name = TextColumn("{task.description}", markup=False)
         columns = (name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())

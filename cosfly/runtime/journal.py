@@ -30,9 +30,7 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.num_damaged = 0
-        self.line_num = 0
-        self.line_byte = 0
+        self.num_damaged = self.line_num = self.line_byte = 0
         self.is_cut_short = False
         self._file: Any = None
         self._lock = threading.Lock()

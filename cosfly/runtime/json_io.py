@@ -168,8 +168,7 @@ def _ending_early(schema: Any) -> Any:
 def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Iterator[tuple[str, Model]]:
     """Yield each line of a JSON-lines file, its end included, and the model it holds.
 
-    Args:
-        what, fix: Words for the message where the file is missing or its `schema_version` is not the model's.
+    what, fix: Words for the message where the file is missing or its `schema_version` is not the model's.
     """
     field = model.model_fields.get("schema_version")
     version = field.default if field else None

@@ -68,9 +68,8 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
         plan["heights_m"] = float(heights[1]), float(heights[2])
         if not 3 <= plan["heights_m"][0] <= plan["heights_m"][1] <= 450:
             expected = "lowest to highest, within 3 to 450 m"
-            raise InputError(
-                "the heights of buildings are not a possible range", where="PROMPT", got=heights[0], expected=expected
-            )
+            what = "the heights of buildings are not a possible range"
+            raise InputError(what, where="PROMPT", got=heights[0], expected=expected)
     plan |= _open_and_water(words, objects, plan)
     if without:
         trace["without"] = without

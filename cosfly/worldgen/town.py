@@ -28,7 +28,8 @@ from cosfly.simulators.assets import ASSETS
 from cosfly.worldgen.plan import OBJECTS, SPACE_M, Object, WorldPlan, assets, town_plan
 
 CM_PER_M = 100.0
-ROAD_PIECE_M, ROAD_SCALE = 200.0, (0.95, 0.9, 1.0)  # length of SimWorld's piece of road, and its scale at that length
+ROAD_PIECE_M = 200.0  # length of SimWorld's piece of road
+ROAD_SCALE = (0.95, 0.9, 1.0)  # scale of the piece at that length
 STRETCH = 6.0  # most that an asset's box may be stretched along one side relative to another
 STEP_M = 2.0  # between places that are tried
 SCALES = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4)
@@ -293,12 +294,13 @@ def layout_nodes(town: Town) -> list[dict[str, Any]]:
 
 def placement_nodes(town: Town) -> list[dict[str, Any]]:
     """Return SimWorld's nodes of the placed objects and of the ways to them."""
-    ids, named = ["way"] * len(town.placement), list[str | None]([None]) * len(town.placement)
+    names = ["way"] * len(town.placement)
+    asset_names: list[str | None] = [None] * len(names)
     for thing in town.placed:
         for row in range(*thing.rows):
-            ids[row] = f"OBJ_{thing.name.replace(' ', '_')}_{thing.number}"
-            named[row] = OBJECTS[thing.name].asset
-    return [_box_node(town.placement, row, ids[row], named[row]) for row in range(len(ids))]
+            names[row] = f"OBJ_{thing.name.replace(' ', '_')}_{thing.number}"
+            asset_names[row] = OBJECTS[thing.name].asset
+    return [_box_node(town.placement, row, names[row], asset_names[row]) for row in range(len(names))]
 
 
 def _box_node(box_map: BoxMap, row: int, name: str, asset: str | None = None) -> dict[str, Any]:
