@@ -11,10 +11,8 @@ from pydantic import Field
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader
 from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
-IDS_FILE = "instance_ids.json"
-IDS_FORMAT = FileFormat("cosfly.instance_ids", "1.0", "record of ids")
-TOWN_FILE = "map.json"
-TOWN_FORMAT = FileFormat("cosfly.town_map", "1.0", "record of the town's map")
+IDS_FILE, IDS_FORMAT = "instance_ids.json", FileFormat("cosfly.instance_ids", "1.0", "record of ids")
+TOWN_FILE, TOWN_FORMAT = "map.json", FileFormat("cosfly.town_map", "1.0", "record of the town's map")
 
 
 class TownMap(Record):

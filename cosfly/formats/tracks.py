@@ -29,8 +29,8 @@ def find_tracks(root: Path, choice: TrackChoice = ALL_TRACKS) -> list[Path]:
             expected="Town*/trajectory_*/ORI/trajectory.json",
             fix="check --data",
         )
-    named = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
-    if not named:
+    matching = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
+    if not matching:
         raise InputError(
             "no track of the tree matches the patterns",
             where=root,
@@ -39,8 +39,8 @@ def find_tracks(root: Path, choice: TrackChoice = ALL_TRACKS) -> list[Path]:
             fix="check --flights",
         )
     if len(choice.tracks) == len(TRACKS):
-        return named
-    chosen = [folder for folder in named if track_of(folder) in choice.tracks]
+        return matching
+    chosen = [folder for folder in matching if track_of(folder) in choice.tracks]
     if not chosen:
         got = ", ".join(choice.tracks)
         raise InputError("no track of the tree is of the chosen kind", where=root, got=got, fix="check --tracks")

@@ -70,8 +70,8 @@ class Agreement:
 
         In a static world it is 0 for any two frames: a point that is not visible there is hidden by something nearer.
         """
-        both = ((self.through, self.seen), (self.through_back, self.seen_back))
-        return max((through / seen for through, seen in both if seen >= LEAST_SEEN), default=0.0)
+        counts = ((self.through, self.seen), (self.through_back, self.seen_back))
+        return max((through / seen for through, seen in counts if seen >= LEAST_SEEN), default=0.0)
 
 
 def compare_views(
@@ -79,11 +79,12 @@ def compare_views(
 ) -> Agreement:
     """Reproject the grid's points of one frame into another and back.
 
-    intrinsics: (4,) fx, fy, cx, cy of both. others_intrinsics: of the other, where the camera zoomed in between.
+    intrinsics: (4,) fx, fy, cx, cy of both frames. others_intrinsics: Of the other frame, if the camera has zoomed.
     """
     intrinsics = intrinsics.astype(np.float64)
     others = intrinsics if others_intrinsics is None else others_intrinsics.astype(np.float64)
-    turn, shift = other.rotation.T @ one.rotation, other.rotation.T @ (one.position_m - other.position_m)
+    turn = other.rotation.T @ one.rotation
+    shift = other.rotation.T @ (one.position_m - other.position_m)
     counts, errors, standing, ids, states = _reproject(
         one.depth, one.instance, other.depth, other.instance, intrinsics, others, turn, shift, MOVING, FLAT
     )
@@ -105,18 +106,18 @@ def _error_of(errors: np.ndarray) -> float:
 def median_of(values: np.ndarray) -> float:
     """Return the median; for few numbers it takes a quarter of the time of `np.median`."""
     middle = len(values) // 2
-    found = np.partition(values, (middle - 1, middle))
-    return float(found[middle] if len(values) % 2 else (found[middle - 1] + found[middle]) / 2.0)
+    ordered = np.partition(values, (middle - 1, middle))
+    return float(ordered[middle] if len(values) % 2 else (ordered[middle - 1] + ordered[middle]) / 2.0)
 
 
 def _most_of_one(ids: np.ndarray, states: np.ndarray, state: int) -> int:
-    """Return the number of points in a state, of the instance most of whose points are in it rather than FIRM."""
-    odd = ids[states == state]
-    if len(odd) < LEAST_SHIFTED:
+    """Return the largest number of points in a state among instances with more points in that state than FIRM."""
+    ids_in_state = ids[states == state]
+    if len(ids_in_state) < LEAST_SHIFTED:
         return 0
-    counts = np.bincount(odd, minlength=SHARED_ID + 1)
+    counts = np.bincount(ids_in_state, minlength=SHARED_ID + 1)
     counts[counts <= np.bincount(ids[states == FIRM], minlength=len(counts))[: len(counts)]] = 0
-    counts[[0, SHARED_ID]] = 0  # ids of nothing and of many things
+    counts[[0, SHARED_ID]] = 0  # the ids of no instance and of several instances
     most = int(counts.max())
     return most if most >= LEAST_SHIFTED else 0
 

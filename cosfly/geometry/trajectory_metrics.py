@@ -106,14 +106,14 @@ def figure_of_draws(value: float, drawn: np.ndarray, count: int, num_walks: int,
     """Return a figure whose value on each draw is `drawn`, (draws,); NaN: of nothing."""
     if count == 0 or np.isnan(value):
         return Figure(value=None, low=None, high=None, count=count)
-    low, high = interval_of(drawn, confidence) if num_walks > 1 else (None, None)  # one walk tells nothing of others
+    low, high = interval_of(drawn, confidence) if num_walks > 1 else (None, None)  # one trajectory has no spread
     return Figure(value=value, low=low, high=high, count=count)
 
 
 def interval_of(drawn: np.ndarray, confidence: float) -> tuple[float | None, float | None]:
     """Return the percentiles between which `confidence` of the samples lies, NaN ignored."""
-    drawn = drawn[~np.isnan(drawn)]  # draws in which nothing of the kind occurs
-    if not len(drawn):
+    known = drawn[~np.isnan(drawn)]  # NaN: nothing of the kind occurs in the draw
+    if not len(known):
         return None, None
-    low, high = np.quantile(drawn, [(1 - confidence) / 2, (1 + confidence) / 2])
+    low, high = np.quantile(known, [(1 - confidence) / 2, (1 + confidence) / 2])
     return float(low), float(high)

@@ -103,17 +103,17 @@ def parse_answer(
         optional: Fields of `more` that an answer may omit.
     """
     names = (*FIELDS, *more)
-    found = find_object(text, names, finish_reason)
-    if (value := found.value) is None:
-        return Parsed(None, found.reason, found.recovered)
+    answer = find_object(text, names, finish_reason)
+    if (value := answer.value) is None:
+        return Parsed(None, answer.reason, answer.recovered)
     names = tuple(name for name in names if name in value or name not in optional)
     if len(value) != len(names) or not all(map(value.__contains__, names)):
-        return Parsed(None, "missing_field" if set(names) - value.keys() else "extra_field", found.recovered)
+        return Parsed(None, "missing_field" if set(names) - value.keys() else "extra_field", answer.recovered)
     texts = [value[name] for name in FIELDS]
     if not all(isinstance(text, str) for text in texts):
-        return Parsed(None, "field_not_text", found.recovered)
+        return Parsed(None, "field_not_text", answer.recovered)
     plain = [_CONTROL.sub("", text) for text in texts]
-    recovered = found.recovered if plain == texts else (*found.recovered, "control_characters")
+    recovered = answer.recovered if plain == texts else (*answer.recovered, "control_characters")
     cleaned = {name: text.strip() for name, text in zip(FIELDS, plain, strict=True)}
     if (reason := _problem_of(cleaned, language)) is not None:
         return Parsed(None, reason, recovered)

@@ -99,9 +99,10 @@ AWAY = frozenset({408, 409, 424, 425, 429, 502, 503, 504, *range(520, 531)})
 
 def kind_of(status: int, text: str) -> Kind:
     """Return the cause of a refusal with this body; `unknown` if no pattern matches."""
-    text, flags = text[:MOST_CHARACTERS], re.IGNORECASE | re.DOTALL
-    found = (kind for kind, meaning in MEANINGS.items() if re.search(meaning.pattern, text, flags))
-    kind: Kind = "account" if status == 402 else next(found, "unknown")
+    start = text[:MOST_CHARACTERS]
+    flags = re.IGNORECASE | re.DOTALL
+    matching = (kind for kind, meaning in MEANINGS.items() if re.search(meaning.pattern, start, flags))
+    kind: Kind = "account" if status == 402 else next(matching, "unknown")
     # In the text of a failed server these words are not about a window or a schema.
     is_other = status >= 500 and kind in ("content", "schema")
     return "unknown" if is_other or (status in AWAY and kind != "account") else kind

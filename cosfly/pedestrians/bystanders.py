@@ -150,8 +150,8 @@ def _draw_pedestrian(
     if place is None:
         return None
     reach_cells = cfg.others_reach_m / cfg.resolution_m
-    drawn = [ground.sample_goal(place, 0.5 * reach_cells, reach_cells, rng) for _ in range(1 + OPPOSITE_TRIES)]
-    goals = [goal for goal in drawn if goal is not None]
+    samples = [ground.sample_goal(place, 0.5 * reach_cells, reach_cells, rng) for _ in range(1 + OPPOSITE_TRIES)]
+    goals = [goal for goal in samples if goal is not None]
     if len(goals) < 2:
         return None
     first = np.subtract(goals[0], place)

@@ -17,8 +17,7 @@ from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.geometry.grid import OccupancyGrid, surface, surface_kinds
 from cosfly.runtime.compiled import njit
 
-MARKED_M = 2.0
-GAP_M = 2.0
+MARKED_M = GAP_M = 2.0
 ACROSS_SHARE = 0.5
 
 # Footings of a cell; ROAD + 1 + axis is carriageway that may be crossed along that axis.

@@ -173,14 +173,14 @@ def _lane(street: Street, first: Station, last: Station, widths_m: list[float], 
 
 
 def _meeting(one: Street, two: Street) -> tuple[float, float] | None:
-    """Return where two streets meet, m along each; None where they do not reach each other."""
+    """Return where two streets meet, m along each; None if they do not meet."""
     sine = _cross(one.direction, two.direction)
     apart = two.start_m - one.start_m
     if abs(sine) > 0.2:
-        place = _cross(apart, two.direction) / sine, _cross(apart, one.direction) / sine
+        meeting = _cross(apart, two.direction) / sine, _cross(apart, one.direction) / sine
     else:
-        place = _in_line(one, two)
-    return place if one.reaches(place[0]) and two.reaches(place[1]) else None
+        meeting = _in_line(one, two)
+    return meeting if one.reaches(meeting[0]) and two.reaches(meeting[1]) else None
 
 
 def _in_line(one: Street, two: Street) -> tuple[float, float]:

@@ -48,15 +48,15 @@ class CosflyError(Exception):
 
     def __str__(self) -> str:
         got = self.got if self.got is None or isinstance(self.got, str) else repr(self.got)
-        named = (("got ", got), ("expected ", self.expected), ("", self.fix))
+        details = (("got ", got), ("expected ", self.expected), ("", self.fix))
         parts = [self.what if self.where is None else f"{self.where}: {self.what}"]
-        parts += [word + text for word, text in named if text is not None]
-        # One line that a terminal prints, whatever the parts held.
+        parts += [word + text for word, text in details if text is not None]
+        # One line of printable characters.
         return " ".join("; ".join(map(for_terminal, parts)).split())
 
     @classmethod
     def of_all(cls, problems: Sequence[str], *, where: str | Path, expected: str | None = None) -> Self:
-        """Return one error for several problems of a file: the first of them, and how many there are."""
+        """Return one error for several problems of a file: the first MOST_NAMED of them, and their number."""
         more = f"; and {len(problems) - MOST_NAMED} more" if len(problems) > MOST_NAMED else ""
         count = f"{len(problems)} to fix" if len(problems) > 1 else None
         return cls("; ".join(problems[:MOST_NAMED]) + more, where=where, expected=expected, fix=count)
@@ -109,8 +109,8 @@ class VerifyError(CosflyError, code="verify"):
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return ' (did you mean X?)' for the nearest known name, or the empty string."""
-    found = get_close_matches(name, list(known), 1)
-    return f" (did you mean {found[0]!r}?)" if found else ""
+    matches = get_close_matches(name, list(known), 1)
+    return f" (did you mean {matches[0]!r}?)" if matches else ""
 
 
 def plain(message: str) -> str:

@@ -34,9 +34,7 @@ from cosfly.worldgen.town import CM_PER_M, Town, build, footprints, layout_nodes
 
 log = logging.getLogger(__name__)
 
-WORLD_FILE = "combined_world.json"
-SIZES_FILE = "Bbox.json"
-LOOP_FILE = "loop.yaml"
+WORLD_FILE, SIZES_FILE, LOOP_FILE = "combined_world.json", "Bbox.json", "loop.yaml"
 CHECKS_FORMAT = FileFormat("cosfly.world_checks", "1.0", "checks of a world")
 CREDITS = "cosfly; sizes of assets by SimWorld, maitrix-org and contributors"
 MOST_CHARACTERS = 2000  # of a prompt
