@@ -193,7 +193,7 @@ def _folders_in_review(tracks: Iterable[TrackInspection]) -> list[str]:
 
 
 def undecided(inspected: Path) -> list[str]:
-    """Return the folders of the tracks in review that nobody has decided."""
+    """Return the folders of the tracks in review without a decision."""
     queue, decisions = _queue(inspected)
     return [folder for folder in queue if folder not in decisions]
 

@@ -19,7 +19,7 @@ KIND_COLORS: dict[str, str] = {
     "RoadLines": "#9dea32", "Ground": "#510051", "Bridge": "#966464", "RailTrack": "#e6968c", "GuardRail": "#b4a5b4",
 }  # fmt: skip
 
-# Surfaces that people and cars stand on: never an obstacle, whatever their thickness.
+# Surfaces on which people and cars stand: never an obstacle, even if they are thick.
 GROUND_KINDS = frozenset(KINDS[name] for name in ("Roads", "Sidewalks", "Terrain", "RoadLines", "Ground", "RailTrack"))
 PAVED_KINDS = frozenset(KINDS[name] for name in ("Roads", "Sidewalks", "Ground"))
 # Of surfaces in one plane the one of the higher layer is seen, and walked on; bare ground is layer 0.

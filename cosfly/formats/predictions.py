@@ -11,7 +11,7 @@ from cosfly.runtime.json_io import Record, model_lines
 
 Split = Literal["train", "val", "test"]
 PREDICTIONS = "predictions.jsonl"
-FAILED = "failed_"  # what the reason of a prediction begins with that could not be made
+FAILED = "failed_"  # prefix of the reason of a failed prediction
 
 
 class Prediction(Record):

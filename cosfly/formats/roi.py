@@ -19,7 +19,7 @@ from cosfly.runtime.json_io import parse_document, validated, write_json
 
 WHAT = "region of interest"
 MOST_VERTICES = 100_000  # of a region; to see that a spiky ring does not cross itself takes 8 s then
-SMALLEST_M = 1.0  # nobody walks in less; a region drawn in degrees is smaller
+SMALLEST_M = 1.0  # of a region; one that was drawn in degrees is smaller
 
 
 class RoiPolygon(BaseModel):

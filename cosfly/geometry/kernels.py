@@ -438,7 +438,7 @@ def visibility(index: BoxIndex, drones: np.ndarray, targets: np.ndarray) -> np.n
     """Return the five-ray visibility of each target from each drone.
 
     A box that contains an end of a ray blocks it: a person inside a solid box is hidden, as in the renderer. Flat
-    ground is no obstacle (`obstacle_index`), so standing on it hides nobody.
+    ground is not in the index (`obstacle_index`), so it does not hide people who stand on it.
 
     Args:
         drones, targets: (n, 3) m; a target is a hip point.

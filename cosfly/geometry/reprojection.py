@@ -1,4 +1,4 @@
-"""Reprojection of one frame into another: points of a depth image, moved through both poses, and what is found there.
+"""Reprojection of one frame into another: points of a depth image are moved by both poses and compared there.
 
 A static surface has the depth that the poses imply from both positions, and the same instance. So depth, masks, poses,
 intrinsics and times check each other. Colours are not used: light, weather, zoom and renderers change them.
@@ -20,7 +20,7 @@ LEAST_SHIFTED = 12  # points of a thing
 FIRM, MOVED, RENAMED = 1, 2, 3
 SHARED_ID = 65534  # of several things: docs/files.md
 MOVING = np.zeros(256, np.bool_)  # kinds of pixels that may be elsewhere in the next frame
-MOVING[[12, 13, 14, 15, 16, 17, 18, 19, 21]] = True  # people, riders, vehicles, what is dynamic (CARLA 0.9.16)
+MOVING[[12, 13, 14, 15, 16, 17, 18, 19, 21]] = True  # people, riders, vehicles, dynamic objects (CARLA 0.9.16)
 # Kinds of surfaces that people and cars stand on, and water. Maps have several in one plane (two roads at their
 # crossing), where a renderer's rounding decides the id pixel by pixel, so only their kind is compared.
 FLAT = np.zeros(256, np.bool_)
@@ -66,7 +66,7 @@ class Agreement:
 
     @property
     def gone(self) -> float:
-        """Return the share of points of one frame that the other frame looks through, 0 to 1.
+        """Return the share of points of one frame that are missing in the other frame, 0 to 1.
 
         In a static world it is 0 for any two frames: a point that is not visible there is hidden by something nearer.
         """
@@ -162,7 +162,7 @@ def _reproject(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift
                 state = FIRM
             elif is_there and is_one and not is_flat:
                 state = RENAMED
-            # Farther all round: what is nearer may be another side of the thing, that hides this one.
+            # Farther on all sides: a nearer point may be another side of the same instance, which hides this one.
             elif not is_there and has_ids and (is_through or (is_whole and least > 0.0)):
                 state = MOVED
             if state > 0:

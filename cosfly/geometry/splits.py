@@ -1,8 +1,8 @@
 """Groups of tracks of the same pedestrian trajectory, and splits that do not share such a group.
 
-Two tracks of one pedestrian trajectory show the same places at the same times, whatever their names, planners, runs and
-builds of the town are: a student that was trained on one of them has seen the answers to the other. So training sets
-and releases assign whole groups, called walks here. This module handles positions and names only, no files.
+Two tracks of one pedestrian trajectory show the same places at the same times, even with other names, planners, runs or
+builds of the town: a student that was trained on one of them has seen the answers to the other. So training sets and
+releases assign whole groups, called walks here. This module handles positions and names only, no files.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ NEAR_SHARE = 0.5  # least share of common seconds in which two tracks are near; 
 FEW_S = 5  # least number of near seconds, unless all are near: two who begin at one place are near for some seconds
 MOST_GAP_S = 2.0  # longest gap between points that a position is interpolated over
 ON_TIME_S = 1e-3  # a point this close to a full second counts as at that second
-SAME_M = 1e-3  # of tracks that differ by less, only one is compared with the others
+SAME_M = 1e-3  # tracks that differ by less are compared with the others only once
 
 
 @dataclass(frozen=True)
 class Course:
     """The target's positions in a track, without any perturbation.
 
-    name: `run/town/trajectory`; courses with the same name are one walk, whatever their positions. time_s: (n,) s,
+    name: `run/town/trajectory`; courses with the same name always belong to one walk. time_s: (n,) s,
     increasing. target_m: (n, 3) m, right-handed, NaN where unknown.
     """
 

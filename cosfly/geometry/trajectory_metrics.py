@@ -103,7 +103,7 @@ def draw_pedestrians(num_walks: int, resamples: int, rng: np.random.Generator) -
 
 
 def figure_of_draws(value: float, drawn: np.ndarray, count: int, num_walks: int, confidence: float) -> Figure:
-    """Return a figure whose value on each draw is `drawn`, (draws,); NaN: of nothing."""
+    """Return a figure with its interval from the values on the draws, (draws,); NaN: nothing of the kind occurs."""
     if count == 0 or np.isnan(value):
         return Figure(value=None, low=None, high=None, count=count)
     low, high = interval_of(drawn, confidence) if num_walks > 1 else (None, None)  # one trajectory has no spread

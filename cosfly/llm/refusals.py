@@ -87,9 +87,9 @@ MEANINGS: dict[Kind, Meaning] = {
     ),
     "unknown": Meaning("the server refuses the request", "check the server", False),
 }
-STATUSES = {  # what a status means for which no pattern matches
+STATUSES = {  # meaning of a status if no pattern matches the text
     **dict.fromkeys((401, 403), Meaning("the teacher refuses the key", f"set {KEY_VARIABLE}", True)),
-    404: Meaning("no such model or not a chat endpoint", "check URL and model", True),
+    404: Meaning("the server has no such model or is no chat endpoint", "check URL and model", True),
     **dict.fromkeys((*range(300, 400), 405), Meaning("not a chat endpoint", "check the URL", True)),
 }
 # Statuses of a server that is busy or away (above 511: Cloudflare's, 424: TGI's of a failed generation); only an empty

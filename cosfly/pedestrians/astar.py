@@ -35,8 +35,8 @@ def find_route(
 
     Args:
         free: (ny, nx) bool, contiguous; start, goal: (x index, y index).
-        classes: (ny, nx) uint8, rows of `costs`; None: all 0. costs: (classes, 4) int64, at least 1, what a cell costs
-            along x, along y, and along the diagonals of equal and of opposite signs.
+        classes: (ny, nx) uint8, rows of `costs`; None: all 0. costs: (classes, 4) int64, at least 1, the cost of a
+            cell along x, along y, and along the diagonals of equal and of opposite signs.
     """
     if free.ndim != 2 or free.dtype != np.bool_ or not free.flags.c_contiguous:
         raise ValueError("free must be a contiguous two-dimensional array of bool")

@@ -1,6 +1,6 @@
 """`cosfly roi`: the region of interest of a map, proposed, and drawn on a local page (subsec:appendix_g_editor).
 
-The page draws; what it shows of a region is computed here, by the code that the stage walks with.
+The page only draws: this module computes the walkable ground of a region with the code of the pedestrian stage.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from cosfly.viz.topview import TopView, draw_map, png_bytes
 MOST_SIDE, MOST_CELLS = 16_000, 64_000_000  # what browsers draw on one canvas
 OCCUPIED, MARGIN, UNUSED, FREE = 128, 190, 228, 255  # grey levels of the backdrop
 IN_REGION, WALKABLE = (90, 160, 230, 60), (60, 150, 240, 110)  # RGBA over the backdrop
-TOLERANCE_M, SMALLEST_HOLE_M2 = 1.0, 100.0  # of a proposal, which a person goes on with
+TOLERANCE_M, SMALLEST_HOLE_M2 = 1.0, 100.0  # of a proposed region, which a person edits
 FROM_ABOVE_PX = 2400
 
 
@@ -69,7 +69,7 @@ def _is_large(ring: shapely.LinearRing) -> bool:
 
 
 def run_propose(map_: Path, cfg: PedestriansConfig, out: Path) -> str:
-    """Read a map, write a first `roi_polygon.json` and report what it holds."""
+    """Read a map, write a first `roi_polygon.json` and return a report of its content."""
     if out.is_dir():
         raise InputError("the output is a folder, not a file", where=out, fix="choose another --out")
     if out.exists():
@@ -177,7 +177,7 @@ class Editor:
         return {"figures": figures, "saved": str(self.path)}
 
     def answer(self, name: str, data: bytes) -> bytes:
-        """Answer what the page asks for; errors are messages for the page."""
+        """Answer a request of the page; errors become messages of the page."""
         if name == "above":
             grid = self.bare.grid
             size_m = np.array(grid.size) * grid.resolution_m

@@ -116,9 +116,9 @@ class PedestriansConfig(Config):
 class WalkableGround:
     """The walkable ground of a map.
 
-    grid: the obstacles before inflation. inflated: after it. parts: (ny, nx) int32, equal numbers where a route from
-    one cell to the other exists, 0 where nobody walks: obstacles, outside the region of interest, steep ground, small
-    components. footing: (ny, nx) uint8, crossings.py. heights: of the ground. costs: of footings, for routes.
+    grid: The obstacles before inflation. inflated: After it. parts: (ny, nx) int32, one number for cells with a route
+    between them, 0 for cells that are not walkable: obstacles, outside the region of interest, steep ground, small
+    components. footing: (ny, nx) uint8, crossings.py. heights: Of the ground. costs: Of footings, for routes.
     """
 
     grid: grids.OccupancyGrid

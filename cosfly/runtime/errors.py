@@ -96,7 +96,7 @@ class NothingKept(CosflyError, code="nothing_kept"):
 
 
 class RenderError(CosflyError, code="render"):
-    """A frame cannot be made or is not what it must be."""
+    """A frame cannot be rendered or is wrong."""
 
 
 class TeacherError(CosflyError, code="teacher", fatal=True):

@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 class Journal:
-    """An append-only JSON-lines file whose every line carries its own checksum.
+    """An append-only JSON-lines file in which each line has a checksum.
 
     `append` returns when the line is on the disk, or with `sync=False` when the system holds it, which survives a kill
     of this process; `sync` then waits for the disk. `read` skips lines that a kill cut short or that were damaged and

@@ -125,7 +125,7 @@ def write_json(path: Path, value: Any, *, indent: int | None = 1) -> None:
 
 
 class Record(BaseModel):
-    """Base of what a file holds: frozen, and an unknown key is an error."""
+    """Base of the records in files: frozen, and an unknown key is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

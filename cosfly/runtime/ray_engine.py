@@ -41,7 +41,7 @@ WAITING_S = 30.0  # interval of warnings that no node has free resources
 
 
 class RayConfig(Config):
-    """Where a Ray cluster is, and what a worker takes of it."""
+    """The address of a Ray cluster, and the resources of a worker."""
 
     address: str = Field(
         "", pattern=r"^(auto|[^/\s]+:\d+)?$",

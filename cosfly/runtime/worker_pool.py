@@ -38,7 +38,7 @@ Transport = LocalTransport | RayTransport
 
 @dataclass(frozen=True)
 class Watch:
-    """Where the workers run, and when one counts as stalled. The default times are the paper's (sec:dataset_watchdog).
+    """The place of the workers, and the time limits after which one has stalled: the paper's (sec:dataset_watchdog).
 
     ray: The Ray cluster; None runs the workers on this machine.
     item_limit_s: The longest time in which an item may report no step; 0 disables the limit. None sets it to ten

@@ -33,8 +33,8 @@ def merge(
 ) -> BoxMap:
     """Replace clusters of neighbours of one kind by enclosing axis-aligned boxes; single boxes keep their rotation.
 
-    A cluster whose members, gaps of CLOSED_GAP_M between them closed, cover less than the least share of the enclosing
-    footprint is halved at the median of its longer side, again and again; a share of 0 never halves.
+    If its members, with gaps of CLOSED_GAP_M closed, cover less than the least share of the enclosing footprint, a
+    cluster is halved at the median of its longer side, repeatedly; a share of 0 never halves.
 
     Args:
         rules: kind -> largest gap on every axis, m, and least share; other kinds stay.

@@ -1,4 +1,4 @@
-"""Stage `simplify`: the passes over one map, a report of what they cost in walkable ground, and a picture."""
+"""Stage `simplify`: the passes over one map, a report of the walkable ground that they cost, and a picture."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Worlds from text: a plan, a layout that follows it, what the prompt names placed in it, SimWorld's world file."""
+"""Worlds from text: a plan, its layout, the named objects placed in it, and SimWorld's world file."""
