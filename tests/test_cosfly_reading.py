@@ -171,7 +171,7 @@ def test_texts_that_a_dictionary_repeats_are_counted_before_they_are_unpacked(tm
     texts = pa.DictionaryArray.from_arrays(pa.array([0] * 3_000, pa.int32()), pa.array(["x" * 30_000], kind))
     pq.write_table(pa.table({"text": within(texts)}), path, store_schema=False)
     assert path.stat().st_size < 50_000
-    with pytest.raises(InputError, match=r"got .* texts of 90,000,000; expected at most 100 times the row group"):
+    with pytest.raises(InputError, match=r"got .* texts of 90,000,000 bytes; expected at most 100 times the row group"):
         next(tables.rows_of(path))
     monkeypatch.setattr(tables, "UNPACK_FACTOR", 10_000_000)
     row = next(tables.rows_of(path))
