@@ -100,7 +100,9 @@ BY_LETTERS = {token.replace("_", ""): token for token in TOKENS}  # tokens by th
 def not_in_set(token: object, where: object) -> InputError:
     """Return the error of a decision that is not in the set."""
     expected = f"one of {', '.join(TOKENS)}"
-    return InputError("not an action of the closed set", where=str(where), got=str(token), expected=expected)
+    return InputError(
+        "the decision is not in the closed set of actions", where=str(where), got=str(token), expected=expected
+    )
 
 
 # --- captions.jsonl ---------------------------------------------------------------------------------------------------
@@ -135,17 +137,17 @@ class Prompt(Record):
 
 
 _Value = TypeVar("_Value")
-_Given = Annotated[_Value | None, Field(exclude_if=partial(is_, None))]  # a key that is not written without a value
+_Omitted = Annotated[_Value | None, Field(exclude_if=partial(is_, None))]  # a key that is omitted without a value
 
 
 class TeacherSettings(Record):
     """The sampling settings of a teacher; the rule teacher has only a seed."""
 
-    temperature: _Given[float] = None
-    top_p: _Given[float] = None
-    max_tokens: _Given[int] = None
+    temperature: _Omitted[float] = None
+    top_p: _Omitted[float] = None
+    max_tokens: _Omitted[int] = None
     seed: int
-    extra_body: _Given[dict[str, Any]] = None
+    extra_body: _Omitted[dict[str, Any]] = None
 
 
 class TeacherRecord(Record):
@@ -158,8 +160,8 @@ class TeacherRecord(Record):
     kind: TeacherKind
     model: str
     settings: TeacherSettings
-    structured: _Given[str] = None
-    run: _Given[str] = None
+    structured: _Omitted[str] = None
+    run: _Omitted[str] = None
 
 
 class JudgeRecord(Record, frozen=False):
@@ -168,7 +170,7 @@ class JudgeRecord(Record, frozen=False):
     verdict: str
     reason: str
     model: str
-    overruled_by: _Given[str] = None
+    overruled_by: _Omitted[str] = None
 
 
 class RepairRecord(Record, frozen=False):
@@ -215,7 +217,7 @@ class Claim(BaseModel):
     value: Annotated[float, Field(strict=True)] | str  # strict: true is not 1.0
     unit: str | None = None
     modality: Modality = "observed"
-    quote: _Given[str] = None
+    quote: _Omitted[str] = None
 
 
 class Template(Record):
@@ -223,7 +225,7 @@ class Template(Record):
 
     critical_components: str
     reasoning_trace: str
-    claims: _Given[list[Claim]] = None
+    claims: _Omitted[list[Claim]] = None
 
 
 class Evidence(Record):
@@ -232,7 +234,7 @@ class Evidence(Record):
     slots: Templates of the texts. problems: Contradictions. contradicted: Decisions that the track contradicts.
     """
 
-    slots: _Given[dict[Language, Template]] = None
+    slots: _Omitted[dict[Language, Template]] = None
     problems: list[str] = Field([])
     contradicted: list[str] = Field([])
 
@@ -246,16 +248,16 @@ class Checks(Record, frozen=False):
     refusal: The message of a server that refused the window, or the reason why it cut the answer.
     """
 
-    keyframe: _Given[KeyframeRecord] = None
-    structure: _Given[str] = None
-    refused: _Given[list[str]] = None
-    bilingual: _Given[str] = None
-    evidence: _Given[Literal["ok"] | list[str]] = None
-    sentences: _Given[dict[Language, list[SentenceState]]] = None
-    contradicted: _Given[list[str]] = None
-    recovered: _Given[list[str]] = None
-    frame: _Given[str] = None
-    refusal: _Given[str] = None
+    keyframe: _Omitted[KeyframeRecord] = None
+    structure: _Omitted[str] = None
+    refused: _Omitted[list[str]] = None
+    bilingual: _Omitted[str] = None
+    evidence: _Omitted[Literal["ok"] | list[str]] = None
+    sentences: _Omitted[dict[Language, list[SentenceState]]] = None
+    contradicted: _Omitted[list[str]] = None
+    recovered: _Omitted[list[str]] = None
+    frame: _Omitted[str] = None
+    refusal: _Omitted[str] = None
 
 
 class Caption(BaseModel):
