@@ -108,16 +108,16 @@ def test_all_that_is_wrong_with_a_table_is_told(tmp_path, subtests):
             (PLAIN.replace("Vegetation", "vegetable").replace("Roads", "roads"),
              r"line 3: unknown type 'vegetable'.*line 4: unknown type 'roads' \(did you mean 'Roads'\?\); expected"),
             (PLAIN.replace(",yaw_deg", ",yaw_dge"), r"unknown column 'yaw_dge' \(did you mean 'yaw_deg'\?\)"),
-            (PLAIN.replace("type,x_m", "name,x"), r"unknown column 'x'.*no column type.*no column x_m"),
+            (PLAIN.replace("type,x_m", "name,x"), r"unknown column 'x'.*column type is missing.*column x_m is missing"),
             (PLAIN.replace("height_m,yaw_deg", "height_m,z_m"), "column z_m occurs twice"),
             (PLAIN.replace(",12,8,8,30", ",12,8,8"), "line 2: 8 cells, but the first line has 9"),
             (PLAIN.replace("12,8,8,30", '"12,5",8,8,30'), r"length_m is not a finite number: '12,5'"),
             (PLAIN.replace("12,8,8,30", "-12,8,8,30").replace("4,4,6,0", "4,4,nan,0"),
-             r"line 2: length_m is not more than 0; line 3: height_m is not a finite number: 'nan'"),
+             r"line 2: length_m must be above 0; line 3: height_m is not a finite number: 'nan'"),
             (PLAIN.replace("20,4,12", "20,1e18,12"), "line 2: the box has no volume"),
             (PLAIN.replace("7,Buildings", "8,Buildings"), "ids must be different whole numbers"),
             (PLAIN.replace("7,Buildings", "x,Buildings"), "ids must be different whole numbers"),
-            (PLAIN.replace(",", ";"), "no column type.*separated by commas"),
+            (PLAIN.replace(",", ";"), "column type is missing.*separated by commas"),
             ("", "has no boxes"),
             (PLAIN + "\"a", "not a CSV table"),
         ]:  # fmt: skip
@@ -138,7 +138,7 @@ def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
             (collection(feature("Point", [5, 5], type="Vegetation", height_m=3)),
              "feature 1: no length_m, no width_m"),
             (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 0]]], type="Buildings")),
-             "feature 1: no height_m"),
+             "feature 1: height_m is missing"),
             (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 9]]], type="Buildings", height_m=3)),
              "the last equal to the first"),
             (
@@ -148,7 +148,7 @@ def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
                     feature("Point", [5, 5], type="house", levels=3, length_m=4, width_m=4, height_m=6),
                 ),
                 r"unknown column 'levels'.*feature 1 \(way/7\): unsupported geometry.*feature 2 \(old oak\): "
-                r"no length_m, no width_m, height_m is not a finite number: 'tall'"
+                r"length_m is missing, width_m is missing, height_m is not a finite number: 'tall'"
                 r".*feature 3: unknown type 'house'.*expected columns .*types .*4 to fix",
             ),
             (json.dumps({"type": "Topology"}), "not GeoJSON"),

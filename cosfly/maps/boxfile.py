@@ -177,8 +177,8 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
             if not names:
                 names = cells
                 problems = _unknown(names, cfg)
-                problems += [f"no column {name}" for name in ("type", *PLACE) if name not in names]
-                problems += [f"column {name} occurs twice" for name, count in Counter(names).items() if count > 1]
+                problems += [f"the column {name} is missing" for name in ("type", *PLACE) if name not in names]
+                problems += [f"the column {name} occurs twice" for name, count in Counter(names).items() if count > 1]
                 if problems:
                     raise InputError.of_all(
                         problems, where=path, expected=f"columns {', '.join(COLUMNS)}, separated by commas"
@@ -257,10 +257,10 @@ def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> str:
         needed.append("height_m")
     sizes = [name for name in needed if name not in ("x_m", "y_m")]
     problems = [] if kind in TYPES else [f"unknown type {type_name[:40]!r}{nearest(type_name, [*TYPES, *cfg.types])}"]
-    problems += [f"no {name}" for name in needed if name not in numbers]
+    problems += [f"{name} is missing" for name in needed if name not in numbers]
     not_finite = [name for name, number in numbers.items() if math.isnan(number)]
     problems += [f"{name} is not a finite number: {str(row.values[name])[:40]!r}" for name in not_finite]
-    problems += [f"{name} is not more than 0" for name in sizes if numbers.get(name, 1.0) <= 0]
+    problems += [f"{name} must be above 0" for name in sizes if numbers.get(name, 1.0) <= 0]
     if row.outline is not None and not row.outline.is_valid:
         problems.append(f"the outline crosses itself: {shapely.is_valid_reason(row.outline)}")
     if problems:
