@@ -14,7 +14,6 @@ from cosfly.runtime.json_io import validated
 
 Words = dict[Language, str]
 
-
 # Words and linear RGB for a renderer. The colours are far enough apart to be recognized in any daylight.
 COLORS: dict[str, tuple[Words, tuple[float, float, float]]] = {
     "red": ({"en": "red", "zh": "红色"}, (0.55, 0.02, 0.02)),

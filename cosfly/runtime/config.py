@@ -49,7 +49,6 @@ class Config(BaseModel):
         return self._values("all_values", self._names())
 
     def _values(self, method: str, names: list[str]) -> dict[str, Any]:
-        """Return settings by name; `method` is applied to groups."""
         values = {name: getattr(self, name) for name in names}
         groups = {name: getattr(value, method)() for name, value in values.items() if isinstance(value, Config)}
         return to_jsonable_python(values) | groups
