@@ -136,5 +136,5 @@ def test_captions_of_another_prompt_are_refused_by_name(tree, tmp_path, monkeypa
     changed = tmp_path / "changed"
     changed.write_text("otherwise")
     monkeypatch.setitem(stage.PACKAGE_FILES, name, changed)
-    with pytest.raises(ResumeError, match=f"the {name} changed"):
+    with pytest.raises(ResumeError, match=f"the {name} has changed"):
         run(CaptionConfig(), tree, tmp_path / "out")

@@ -15,7 +15,7 @@ import pytest
 from crashes import contents, differences
 from processes import QUICK
 from teacher_server import TeacherServer
-from toy_workers import items_of, make_talking_worker, make_worker, stage_in
+from toy_workers import items_of, make_faulty, make_talking_worker, stage_in
 
 from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.settings import RunConfig
@@ -71,7 +71,7 @@ def test_workers_that_die_and_stall_once_cost_nothing_but_time(tmp_path, nodes, 
     nodes.add(num_cpus=2)
     kinds = ["once-stop", "once-die", "once-sleep", "nothing", "nothing"]
     watch = quick(nodes)
-    finished = run_items(stage_in(tmp_path), items_of(*kinds), make_worker, (tmp_path / "s",), workers=2, watch=watch)
+    finished = run_items(stage_in(tmp_path), items_of(*kinds), make_faulty, (tmp_path / "s",), workers=2, watch=watch)
     assert [record.id for record in finished.kept] == [f"i{k}" for k in range(len(kinds))]
     events = read_events(tmp_path / "s")
     found = {event.item: event.event for event in events if event.event in LOSSES}
@@ -145,7 +145,7 @@ def test_a_run_has_the_bytes_of_the_local_engine_though_workers_and_nodes_are_lo
 
 def refused(tmp_path: Path, words: str, watch: Watch) -> None:
     with pytest.raises(EnvironmentMissing, match=words) as caught:
-        run_items(stage_in(tmp_path), items_of("nothing"), make_worker, (tmp_path / "s",), workers=1, watch=watch)
+        run_items(stage_in(tmp_path), items_of("nothing"), make_faulty, (tmp_path / "s",), workers=1, watch=watch)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "s/manifest.json").exists()
 

@@ -1,15 +1,24 @@
-"""Items to work: resume, tally, failures, dying workers."""
+"""Items to work: resume, tally, failures; workers that die, stall or never end; Ctrl-C while requests are in flight."""
 
+import asyncio
 import os
 import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from processes import QUICK, children_of, is_running, wait_until
+from toy_workers import items_of, make_faulty, stage_in
 
+from cosfly.llm.contract import run_until_interrupted
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import EnvironmentMissing, InputError, StorageError
+from cosfly.runtime.events import LOSSES, read_events
 from cosfly.runtime.json_io import dump_json
-from cosfly.runtime.pool import run_items
+from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Failed, Kept, StageFolder
 from cosfly.runtime.seeding import random_bytes, rng_for
 from cosfly.runtime.worker import Item, Outcome
@@ -128,3 +137,179 @@ def test_rng_depends_on_all_three_and_zero_is_a_seed():
     assert len(draws) == 4
     assert rng_for(0, "a", "x").random() == rng_for(0, "a", "x").random()
     assert len({random_bytes(*key) for key in ((0, "a", "x"), (1, "a", "x"), (0, "b", "x"), (0, "a", "y"))}) == 4
+
+
+def work_on(path: Path, kinds: list[str], workers: int, watch: Watch = QUICK):
+    return run_items(stage_in(path), items_of(*kinds), make_faulty, (path / "s",), workers=workers, watch=watch)
+
+
+@pytest.mark.parametrize(
+    ("workers", "lost"),
+    [(1, {"i0": "heartbeat_lost"}), (2, {"i0": "heartbeat_lost", "i1": "worker_died", "i2": "timed_out"})],
+)
+def test_workers_that_die_and_stall_once_cost_nothing_but_time(tmp_path, workers, lost):
+    kinds = ["once-stop", "once-die", "once-sleep"][: len(lost)] + ["nothing"] * 2
+    finished = work_on(tmp_path, kinds, workers)
+    assert [record.id for record in finished.kept] == [f"i{k}" for k in range(len(kinds))]
+    found = {event.item: event.event for event in read_events(tmp_path / "s") if event.event in LOSSES}
+    assert found == found | lost
+    assert not list((tmp_path / "s").glob(".*.partial"))
+    assert all((tmp_path / "s" / record.id / "frame").read_text() == record.id for record in finished.kept)
+
+
+@pytest.mark.slow
+def test_an_item_that_never_ends_has_failed_and_the_others_are_done(tmp_path, caplog):
+    finished = work_on(tmp_path, ["loop", "slow", "nothing"], workers=2)
+    assert [record.id for record in finished.kept] == ["i1", "i2"]
+    assert finished.tally.model_dump()["failed"] == {"timed_out": 1}
+    failure = next(record for record in finished.records if isinstance(record, Failed))
+    assert "finished no step within its time limit, 3 times" in failure.message
+    assert caplog.text.count("it is tried again") >= 2
+    assert not list((tmp_path / "s").glob(".*.partial"))
+
+
+def test_workers_that_die_all_the_time_end_the_stage(tmp_path):
+    kinds = ["nothing"] + ["die"] * 30
+    with pytest.raises(
+        EnvironmentMissing, match=r"die or stall again and again.*3 workers lost, 1 items done.*item_limit_s"
+    ):
+        work_on(tmp_path, kinds, workers=1, watch=Watch(restarts=1))
+    assert [record.id for record in stage_in(tmp_path).items()] == ["i0"]
+    # The machine is fit again.
+    assert work_on(tmp_path, ["nothing"] * 31, workers=1).tally.kept == 31
+
+
+PROGRAM = """
+import sys; sys.path.insert(0, {tests!r})
+from pathlib import Path
+from toy_workers import make_idle_worker, stage_in
+from cosfly import cli
+from cosfly.runtime.worker import Item
+from cosfly.runtime.pool import run_items
+
+if __name__ == "__main__":
+    @cli.app.command()
+    def work(folder: Path) -> None:
+        run_items(stage_in(folder), [Item(str(k)) for k in range(4)], make_idle_worker, (folder,), workers=2)
+    sys.argv = ["cosfly", "work", {folder!r}]
+    cli.main()
+"""
+
+
+def start_program(folder: Path, until: Sequence[str] = ("0.pid", "1.pid"), **options) -> subprocess.Popen:
+    program = folder / "program.py"
+    program.write_text(PROGRAM.format(tests=str(Path(__file__).parent), folder=str(folder)))
+    parent = subprocess.Popen([sys.executable, str(program)], **options)
+    wait_until(lambda: all((folder / name).exists() and (folder / name).read_text() for name in until))
+    return parent
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+def test_workers_end_when_their_parent_is_killed(tmp_path):
+    parent = start_program(tmp_path)
+    pids = [int((tmp_path / name).read_text()) for name in ("0.pid", "1.pid")]
+    assert all(map(is_running, pids))
+    parent.kill()
+    parent.wait()
+    wait_until(lambda: not any(map(is_running, pids)))
+    assert not stage_in(tmp_path).is_complete  # and nobody holds the folder
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+@pytest.mark.parametrize(
+    ("number", "word", "until"),
+    [(signal.SIGINT, "interrupted", ("s/stage.json",)), (signal.SIGTERM, "terminated", ("0.pid", "1.pid"))],
+    ids=["while workers start", "while they work"],
+)
+def test_a_signal_ends_a_command_and_its_workers_in_one_line(tmp_path, until, number, word):
+    options: dict = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "start_new_session": True}
+    process = start_program(tmp_path, until, **options)
+    wait_until(lambda: children_of(process.pid))
+    os.killpg(process.pid, number)  # what a terminal and a service manager do
+    text, _ = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    assert text.splitlines() == [f"error: {word}; finished work is kept; run the same command again to resume"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+@pytest.mark.parametrize("gap_s", [0.0, 0.002, 0.01])
+def test_a_second_signal_that_breaks_off_the_ending_ends_the_workers_too(tmp_path, gap_s):
+    process = start_program(tmp_path, ("0.pid", "1.pid"), stderr=subprocess.DEVNULL)
+    pids = [int((tmp_path / name).read_text()) for name in ("0.pid", "1.pid")]
+    process.send_signal(signal.SIGINT)
+    time.sleep(gap_s)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=60) in (130, 143, -signal.SIGTERM)
+    wait_until(lambda: not any(map(is_running, pids)))
+
+
+CHILD = """
+import asyncio, sys
+from cosfly.llm.contract import run_until_interrupted
+
+async def ask():
+    await asyncio.sleep(3600)
+
+async def main():
+    tasks = [asyncio.create_task(ask()) for _ in range(20)]
+    print("asking", flush=True)
+    try:
+        await asyncio.gather(*tasks)
+    finally:
+        print("ending", flush=True)
+        if "hang" in sys.argv:
+            await asyncio.sleep(3600)
+
+try:
+    run_until_interrupted(main())
+except KeyboardInterrupt:
+    print("ended", flush=True)
+    sys.exit(7)
+"""
+
+
+def interrupted(*words: str) -> tuple[int, list[str], str]:
+    """Interrupt a process when it asks, and if it hangs again when it ends: its status, what it said and complained
+    of."""
+    with subprocess.Popen(
+        [sys.executable, "-X", "dev", "-c", CHILD, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        said = []
+        for line in process.stdout:
+            said.append(line.strip())
+            if said[-1] == "asking" or (said[-1] == "ending" and "hang" in words):
+                process.send_signal(signal.SIGINT)
+        _, complained = process.communicate(timeout=60)
+        return process.returncode, said, complained
+
+
+def test_once_ends_everything_in_order():
+    assert interrupted() == (7, ["asking", "ending", "ended"], "")
+
+
+def test_twice_ends_the_process_in_one_line():
+    status, said, complained = interrupted("hang")
+    assert (status, said) == (130, ["asking", "ending"])
+    assert (
+        complained == "error: interrupted at once; what was answered is kept: run the same command again to continue\n"
+    )
+
+
+def test_without_it_all_is_as_ever():
+    async def answer() -> int:
+        return 3
+
+    async def fail() -> None:
+        raise ValueError("as it is")
+
+    async def give_up() -> None:
+        raise asyncio.CancelledError
+
+    assert run_until_interrupted(answer()) == 3
+    with pytest.raises(ValueError, match="as it is"):
+        run_until_interrupted(fail())
+    with pytest.raises(asyncio.CancelledError):
+        run_until_interrupted(give_up())
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -21,7 +21,7 @@ def items_of(*kinds: str) -> list[Item]:
     return [Item(f"i{k}", (kind, bytes(1_000_000))) for k, kind in enumerate(kinds)]  # more than a pipe holds
 
 
-def make_worker(folder: Path):
+def make_faulty(folder: Path):
     def work(item: Item) -> Outcome:
         what = item.payload[0]
         mark = folder / f"{item.item_id}.begun"
