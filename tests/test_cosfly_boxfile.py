@@ -136,7 +136,7 @@ def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
             (collection(feature("Polygon", [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]], type="Buildings", height_m=3)),
              r"feature 1: the outline crosses itself: Self-intersection\[4\.5 4\.5\]"),
             (collection(feature("Point", [5, 5], type="Vegetation", height_m=3)),
-             "feature 1: no length_m, no width_m"),
+             "feature 1: length_m is missing, width_m is missing"),
             (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 0]]], type="Buildings")),
              "feature 1: height_m is missing"),
             (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 9]]], type="Buildings", height_m=3)),

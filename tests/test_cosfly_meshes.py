@@ -129,7 +129,7 @@ FLAT = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 ONE_ACCESSOR = {"bufferView": 0, "componentType": 5126, "type": "VEC3"}
 HOSTILE = {
     "no_numbers.glb": (one_triangle([float("nan"), *FLAT[1:]]), "not finite"),
-    "far.glb": (one_triangle([1e30, *FLAT[1:]]), "not finite or too far"),
+    "far.glb": (one_triangle([1e30, *FLAT[1:]]), "not finite or is more than 10,000,000 m"),
     "count.glb": (one_triangle(FLAT, accessors=[{**ONE_ACCESSOR, "count": 2_000_000_000}]), "too many numbers"),
     "below_nothing.glb": (
         one_triangle(FLAT, bufferViews=[{"buffer": 0, "byteLength": n} for n in (36, -9, 36, 36)]),

@@ -1,4 +1,4 @@
-"""The whole way on a tiny town: every stage, one and two workers, kill -9 in the middle of every stage."""
+"""The whole way on a tiny town: every stage, one and two workers. `test_crashes.py` has the kills."""
 
 import contextlib
 import itertools

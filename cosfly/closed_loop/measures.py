@@ -153,9 +153,18 @@ def score_episodes(records: Iterable[Episode], *, trained_on: Sequence[str] | No
         measured.append(measure(episode, trained_on))
         digests.append(episode_digest(episode))
         students.add((episode.student, episode.engine, episode.list_sha256 or ""))
-    if len(students) != 1:
-        got = "; ".join(" ".join(filter(None, words)) for words in sorted(students)[:3]) or "no episode"
-        raise InputError("a score needs episodes of a single student on a single list", where="episodes", got=got)
+    if not students:
+        raise InputError("there is no episode to score", where="episodes", expected="at least one episode")
+    if len(students) > 1:
+        raise InputError(
+            f"the episodes come from {len(students)} different combinations of student, engine and episode list",
+            where="episodes",
+            got="; ".join(
+                f"student {student or 'unknown'}, engine {engine or 'unknown'}, list {digest[:12] or 'none'}"
+                for student, engine, digest in sorted(students)[:3]
+            ),
+            fix="score the episodes of each combination separately",
+        )
     measured.sort(key=lambda score: (score.town, score.episode))
     student, engine, list_sha256 = students.pop()
     return score_measured(

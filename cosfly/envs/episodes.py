@@ -54,7 +54,7 @@ TASKS = {
     "cosfly/Reacquire-v0": _ALONE,
 }
 REACQUIRES = "cosfly/Reacquire-v0"
-UNSUITABLE = "the trajectory gives no episode, because its drone trajectory is missing or too short"
+UNSUITABLE = "this pedestrian trajectory cannot be an episode: no drone trajectory was found, or it is too short"
 
 
 class BenchmarkTown(NamedTuple):

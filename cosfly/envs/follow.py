@@ -94,14 +94,23 @@ class FollowEnv(gymnasium.Env):
                 expected = f"a whole number from 0 to {len(self.listed) - 1}"
                 raise InputError("the list has no such episode", where=where, got=repr(index)[:40], expected=expected)
             town, number = self.listed[index]
-            if not self._begin(benchmark.episode_of(self.task, world_of(benchmark.HELD_OUT[town]), number)):
-                where = f"{self.task}: {town}, trajectory {number}"
-                raise InputError(benchmark.UNSUITABLE, where=where, fix="choose another options['episode']")
+            episode = benchmark.episode_of(self.task, world_of(benchmark.HELD_OUT[town]), number)
+            if not self._begin(episode):
+                found, expected = ("visible", "hidden") if self.task == benchmark.REACQUIRES else ("hidden", "visible")
+                problem = (
+                    f"this pedestrian trajectory cannot be an episode: the target is {found} at first, but must be "
+                    f"{expected} in this environment"
+                )
+                raise InputError(
+                    benchmark.UNSUITABLE if episode is None else problem,
+                    where=f"{self.task}: {town}, pedestrian trajectory {number}",
+                    fix="choose another options['episode']",
+                )
         else:
             world = world_of(benchmark.TRAINING[int(self.np_random.integers(len(benchmark.TRAINING)))])
             numbers = self.np_random.integers(100_000, size=benchmark.TRIES).tolist()
             if not any(self._begin(benchmark.episode_of(self.task, world, number)) for number in numbers):
-                problem = f"none of {benchmark.TRIES} random trajectories gives an episode"
+                problem = f"none of {benchmark.TRIES} random pedestrian trajectories can be an episode"
                 where = f"{self.task}: {world.town.name}"
                 raise InputError(problem, where=where, fix="call reset with another seed")
         return self._observation(), self._info()

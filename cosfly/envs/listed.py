@@ -62,7 +62,7 @@ def make_worker(cfg: ListConfig, out: Path, seed: int, num_workers: int) -> Work
         world, airspace = airspace_of(town)
         episode = benchmark.episode_of(task, world, number)
         if episode is None:
-            raise InputError(benchmark.UNSUITABLE, where=f"{cfg.env}: {town}, trajectory {number}")
+            raise InputError(benchmark.UNSUITABLE, where=f"{cfg.env}: {town}, pedestrian trajectory {number}")
         return episode.simulation(airspace)
 
     def work(item: Item) -> Outcome:

@@ -79,12 +79,13 @@ def numbers(value: Any, *shape: int | None) -> np.ndarray | None:
 
 def column(record: dict, name: str, where: str, *shape: int | None) -> np.ndarray:
     """Read numbers of a shape, in which None is any length but 0; raises InputError for anything else."""
-    sides = " x ".join("any number" if side is None else str(side) for side in shape)
+    shape_text = str(tuple("n" if side is None else side for side in shape)).replace("'", "")
+    expected = f"finite numbers of shape {shape_text}" + (", n at least 1" if None in shape else "")
     values = numbers(record.get(name), *shape)
     if values is None or len(values) == 0:
         what = "the column has the wrong form" if name in record else MISSING
         got = repr(record[name])[:60] if name in record else None
-        raise InputError(what, where=f"{where}.{name}", got=got, expected=f"a list of finite numbers, {sides}")
+        raise InputError(what, where=f"{where}.{name}", got=got, expected=expected)
     return values
 
 

@@ -98,8 +98,13 @@ class Episode(Record):
     def _is_consistent(self) -> Self:
         answers = [frame.answer for frame in self.frames]
         times_s = [frame.time_s for frame in self.frames]
-        if "end" in answers[:-1] or answers[-1] != "end" or "lead" in answers[self.num_lead :]:
-            raise ValueError("the answers of the frames must be `lead`, then decisions, then one `end`")
+        last = len(answers) - 1
+        for i, answer in enumerate(answers):
+            if (answer == "end") != (i == last) or (answer == "lead" and i >= self.num_lead):
+                raise ValueError(
+                    f"frame {i} has the answer `{answer}`, but only frames before the first decision have `lead`, "
+                    "only the last frame has `end`, and all others have a decision"
+                )
         if any(later <= earlier for earlier, later in pairwise(times_s)):
             raise ValueError("the times of the frames must increase")
         if any((frame.command is None) != (frame.answer == "end") for frame in self.frames):

@@ -165,12 +165,14 @@ def read_decisions(inspected: Path) -> dict[str, Decision]:
     decisions: dict[str, Decision] = {}
     for decision in journal.read_as(Decision.model_validate):
         if decision.inspection != digest:
+            found = f"sha256 {decision.inspection[:12]}"
+            fix = f"decide again with cosfly inspect review, or restore the `{inspected.name}` that was reviewed"
             raise InputError(
-                "the decision belongs to another inspection",
+                f"this decision was made on a different version of `{inspected.name}`",
                 where=f"{path}:{journal.line_num}",
-                got=f"{decision.folder}, {decision.verdict} by {decision.by} at {decision.at}",
-                expected=f"decisions on {inspected}",
-                fix=f"move {REVIEW} away and decide again with cosfly inspect review, or restore that inspection",
+                got=f"{decision.folder}, {decision.verdict} by {decision.by} at {decision.at}, {found}",
+                expected=f"sha256 {digest[:12]}, as of {inspected}",
+                fix=f"move {REVIEW} away and {fix}",
             )
         decisions[decision.folder] = decision
     if journal.is_cut_short:

@@ -98,8 +98,15 @@ def read_meshes(path: Path, *, tree: Path) -> dict[str, Mesh]:
         raise InputError("the mesh is malformed", where=path, got=f"{type(error).__name__}: {error}"[:120]) from None
     if not any(map(len, meshes.values())):
         raise InputError("the mesh has no triangles", where=path)
-    if not all((np.abs(mesh.corners_m) <= LARGEST_M).all() for mesh in meshes.values()):  # NaN fails
-        raise InputError("a vertex is not finite or too far away", where=path, expected=f"within {LARGEST_M:g} m")
+    for name, mesh in meshes.items():
+        is_valid = (np.abs(mesh.corners_m) <= LARGEST_M).all(axis=2)  # NaN fails
+        if not is_valid.all():
+            problem = (
+                f"mesh {name!r} has a vertex that is not finite or is more than {LARGEST_M:,.0f} m from the origin"
+            )
+            vertex = ", ".join(f"{value:g}" for value in mesh.corners_m[~is_valid][0])
+            fix = "move or remove the vertex, and export the mesh in metres"
+            raise InputError(problem, where=path, got=f"the vertex ({vertex}) m", fix=fix)
     return meshes
 
 

@@ -397,9 +397,8 @@ class _FieldReader:
         steps = np.diff(time_s)
         if (steps <= 0).any():
             where = f"points[{int(np.argmax(steps <= 0)) + 1}].timing.trace_timestamp"
-            raise self.error(
-                "the times of the points do not increase", where, float(steps.min()), "strictly increasing times"
-            )
+            got = f"a step of {steps.min():g} s"
+            raise self.error("the times of the points do not increase", where, got, "strictly increasing times")
         dt_s = step_s(time_s)
         if len(steps) and np.abs(steps - dt_s).max() > STEP_TOLERANCE_S:
             got = f"steps of {steps.min():.3f} to {steps.max():.3f} s"
@@ -459,7 +458,10 @@ class _FieldReader:
         width = self.number("camera", group, "width")
         height = self.number("camera", group, "height")
         matrix = numbers(group.get("intrinsic"), 3, 3)
-        if matrix is None or matrix[0, 0] <= 0 or width < 1 or height < 1:
+        if width < 1 or height < 1:
+            got, expected = f"{width:g} x {height:g} px", "at least 1 x 1 px"
+            raise self.error("the pictures of the camera have no size", "camera", got, expected)
+        if matrix is None or matrix[0, 0] <= 0:
             got = repr(group.get("intrinsic"))[:60]
             expected = "a 3x3 matrix with a positive focal length"
             raise self.error("the camera has no usable matrix", "camera.intrinsic", got, expected)

@@ -79,10 +79,11 @@ class Coverage(Record):
     @field_validator("bins")
     @classmethod
     def _are_those_of_the_axes(cls, bins: dict[str, list[int]]) -> dict[str, list[int]]:
-        nums_bins = {name: len(counts) for name, counts in bins.items()}
-        expected = {name: axis.num_bins for name, axis in AXES.items()}
-        if bins and nums_bins != expected:
-            raise ValueError(f"bins must be empty or {expected}; got {nums_bins}")
+        if unknown := [name for name in bins if name not in AXES]:
+            raise ValueError(f"axis {unknown[0]} is unknown; expected {', '.join(AXES)}")
+        for name, axis in AXES.items() if bins else ():
+            if (num := len(bins.get(name, ()))) != axis.num_bins:
+                raise ValueError(f"axis {name} has {num} bins, expected {axis.num_bins}")
         return bins
 
     @classmethod

@@ -155,7 +155,7 @@ def assign_splits(
         if too_few == "refuse" or not ranked:
             raise InputError(
                 f"there are too few {what}, because each belongs to one split only",
-                got=str(len(ranked)),
+                got=f"{len(ranked)} {what}",
                 expected=f"{len(requested)} or more, one for each of {', '.join(requested)}",
                 fix=fix,
             )

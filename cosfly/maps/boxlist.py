@@ -29,7 +29,8 @@ class BoxList:
     def add(self, kind: str, center_xy: Pair, size_xy: Pair, low_m: float, high_m: float, yaw_deg: float = 0.0) -> None:
         """Add a box by its footprint (full sizes before turning, m) and its height interval."""
         if size_xy[0] <= 0 or size_xy[1] <= 0 or high_m <= low_m:
-            raise ValueError(f"the box has no volume: {kind}, footprint {size_xy} m, height {low_m} to {high_m} m")
+            footprint = f"footprint {size_xy[0]:g} x {size_xy[1]:g}"
+            raise ValueError(f"the box has no volume: {kind}, {footprint} m, height {low_m:g} to {high_m:g} m")
         center = (float(center_xy[0]), float(center_xy[1]), (low_m + high_m) / 2)
         self.rows.append((*center, size_xy[0] / 2, size_xy[1] / 2, (high_m - low_m) / 2, float(yaw_deg)))
         self.kinds.append(KINDS[kind])

@@ -208,13 +208,24 @@ def _encoded(picture: np.ndarray) -> str:
     return base64.b64encode(data.tobytes()).decode()
 
 
+def _area_text(x_min_m: float, x_max_m: float, y_min_m: float, y_max_m: float) -> str:
+    return f"x {x_min_m:.1f} to {x_max_m:.1f} m, y {y_min_m:.1f} to {y_max_m:.1f} m"
+
+
 def open_editor(map_: Path, cfg: PedestriansConfig, roi: Path, port: int, backdrop: Path | None) -> PageServer:
     """Read all that the page shows, and listen; `PageServer.serve` answers until it is interrupted."""
     box_map = _read_map(map_)
     picture = None if backdrop is None else Backdrop.read(backdrop)
     if picture is not None and not picture.covers(box_map):
-        expected = f"a picture of {box_map.name}"
+        frame = picture.frame()
+        west_m, north_m = frame["west"], frame["north"]
+        shown = _area_text(west_m, west_m + frame["width"], north_m - frame["height"], north_m)
+        low_m, high_m = box_map.bounds()
         raise InputError(
-            "the picture does not show the map", where=backdrop, got=str(picture.frame()), expected=expected
+            "the backdrop lies outside the map",
+            where=backdrop,
+            got=f"a picture of {shown}",
+            expected=f"a picture of some of {_area_text(low_m[0], high_m[0], low_m[1], high_m[1])}",
+            fix="correct the JSON file next to the picture",
         )
     return PageServer(Editor(box_map, cfg, roi, map_, picture), port)

@@ -344,7 +344,7 @@ def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | 
     raise NoPathError(
         "the region of interest has no walkable cell",
         where=roi_where,
-        got=f"{counts['cells_in_roi']} of {counts['cells']} cells in the region, and none of them is free ground",
-        expected="a region in the map's world metres",
+        got=f"{counts['cells_in_roi']} of {counts['cells']} map cells lie in the region, 0 of them free",
+        expected="a polygon in world metres of this map, over free ground",
         fix="draw the region over free ground of this map",
     )

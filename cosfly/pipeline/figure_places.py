@@ -28,7 +28,7 @@ from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import read_object
 
 DERIVED = "work"
-UNEXPECTED = "the file does not have the structure that its stage writes"
+MAKE_AGAIN = "run the stage that writes the file again"
 FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "mean": lambda values: float(np.mean(values)),
     "std": lambda values: float(np.std(values)),
@@ -79,7 +79,16 @@ class FigureReader:
                     names = functions.split(",")
                     values = [FUNCTIONS[name](value) if value else None for value in values for name in names]
             except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
-                raise InputError(UNEXPECTED, where=f"{file}: {keys}", got=str(error)) from None
+                expected = (
+                    f"a value that {functions} can be applied to" if functions else "an object or a list at each `*`"
+                )
+                raise InputError(
+                    "cannot read this value from the file",
+                    where=f"{file}: {keys}",
+                    got=str(error),
+                    expected=expected,
+                    fix=MAKE_AGAIN,
+                ) from None
             figures += values
         return figures
 

@@ -24,7 +24,7 @@ from cosfly.formats.boxes import read_boxes
 from cosfly.formats.captions import FIELDS, Caption, read_captions
 from cosfly.formats.segments import FOLLOW
 from cosfly.pipeline import bench as benchmark
-from cosfly.pipeline.figure_places import UNEXPECTED, FigureReader, MissingFile, files_of, follow
+from cosfly.pipeline.figure_places import MAKE_AGAIN, FigureReader, MissingFile, files_of, follow
 from cosfly.pipeline.runs import summarize
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners import compare
@@ -186,7 +186,13 @@ def our_figures(table: PaperTable, reader: FigureReader) -> tuple[dict[str, list
             continue
         named_rows = figures[0] or {}
         if not isinstance(named_rows, dict):
-            raise InputError(UNEXPECTED, where=place, got=str(named_rows)[:80], expected="figures by name")
+            raise InputError(
+                "the value at this place is not a table",
+                where=place,
+                got=type(named_rows).__name__,
+                expected="an object with one entry for each row name",
+                fix=MAKE_AGAIN,
+            )
         rows |= {key: _as_list(row) for key, row in named_rows.items()}
     return rows, sources
 

@@ -206,8 +206,10 @@ def check_with_files(cfg: RunConfig) -> None:
 def _check_files(cfg: RunConfig) -> None:
     files = getattr(cfg.maps, cfg.maps.source).inputs()
     if missing := {name: str(path) for name, path in files.items() if not path.exists()}:
+        noun = "this input file" if len(missing) == 1 else "these input files"
         where = f"maps.{cfg.maps.source}: {', '.join(missing)}"
-        raise InputError("an input file of the map does not exist", where=where, got=", ".join(missing.values()))
+        problem = f"the map needs {noun}, but no such file exists: {', '.join(missing.values())}"
+        raise InputError(problem, where=where, fix="correct the paths in these settings")
 
 
 def _run_town(cfg: RunConfig, out: Path, town_stages: list[Stage]) -> list[StageResult]:

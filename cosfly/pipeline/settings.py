@@ -76,7 +76,7 @@ class RunConfig(CommandConfig):
         """
         changes = self.towns[name]
         if "towns" in changes:
-            fix = "move its towns to the outer section towns"
+            fix = "move these towns to the section `towns` at the top of the file"
             raise ConfigError("a town cannot contain towns", where=f"towns.{name}.towns", fix=fix)
         seed = int(rng_for(self.seed, "run", name).integers(2**31))
         shared = self.model_dump(mode="json", exclude={"towns", "maps"}) | {"name": name, "seed": seed}

@@ -84,8 +84,10 @@ class SimulatorRenderer(ABC):
         f = focal_px(width, fov_deg)
         if not np.allclose(intrinsic, [[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]], atol=1e-3):
             what = "the simulator cannot draw with this intrinsic matrix"
+            (fx, skew, cx), (_, fy, cy) = intrinsic[:2]
+            got = f"fx {fx:g}, fy {fy:g}, skew {skew:g}, principal point {cx:g}, {cy:g} px"
             expected = "square pixels, and the principal point in the middle of the picture"
-            raise RenderError(what, where=self.device, got=str(intrinsic.tolist()), expected=expected)
+            raise RenderError(what, where=self.device, got=got, expected=expected)
         bodies: dict[int, Body] = {} if person is None else {PERSON_ID: person}
         bodies |= {other.instance_id: other.body for other in others}
         problem: Exception | None = None

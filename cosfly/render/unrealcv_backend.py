@@ -224,17 +224,22 @@ class UnrealCvRenderer(SimulatorRenderer):
 
     def _decoded(self, lit: str | bytes, mask: str | bytes, depth: str | bytes) -> Frame:
         """Convert a server's pictures to a frame; raise InputError if one is damaged."""
-        shape = self._size_px[::-1]
+        width_px, height_px = self._size_px
         pictures = []
         for name, data in (("lit", lit), ("object_mask", mask)):
             if isinstance(data, str):
                 raise InputError("the server sent a text instead of a picture", where=name, got=repr(data)[:80])
             pictures.append(parse_picture(data, name, flags=cv2.IMREAD_COLOR))
         raw = parse_array(depth if isinstance(depth, bytes) else depth.encode(), "depth", dtype=np.float32, ndim=2)
-        for picture in (*pictures, raw):
-            if (got := picture.shape[:2]) != shape:
-                problem = "a picture of the server has the wrong height or width"
-                raise InputError(problem, where=self.device, got=f"{got} px", expected=f"{shape} px")
+        for name, picture in zip(("lit", "object_mask", "depth"), (*pictures, raw), strict=True):
+            if picture.shape[:2] != (height_px, width_px):
+                raise InputError(
+                    f"the server sent {name} in the wrong size",
+                    where=self.device,
+                    got="{1} x {0} px".format(*picture.shape),
+                    expected=f"{width_px} x {height_px} px",
+                    fix="set render.width_px and render.height_px to the size that the server sends",
+                )
         colors = pictures[1].astype(np.int64) @ [1, 1 << 8, 1 << 16]  # blue, green, red
         kinds = self._kinds[colors]
         ids = self._ids[colors]

@@ -144,9 +144,8 @@ def read_pools(cfg: WeatherConfig) -> Pools:
         kinds = pools.pairs_by_kind()
         if missing := [kind for kind, share in cfg.sky_shares.items() if share and kind not in kinds]:
             raise ConfigError(
-                "a kind of sky has a share, but no preset belongs to it",
+                f"the pools have no preset for these kinds of sky, which have a share: {', '.join(missing)}",
                 where="render.sky_shares",
-                got=", ".join(missing),
                 fix="remove the share, or add presets of this kind to the pools",
             )
     return pools

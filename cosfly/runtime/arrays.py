@@ -69,8 +69,9 @@ def parse_array(
     header = parse_array_header(memoryview(data), where, what=what)
     if header.dtype != dtype or len(header.shape) != ndim:
         expected = f"{np.dtype(dtype)} with {ndim} dimensions"
-        raise InputError(f"the {what} has the wrong type or shape", where=where, got=str(header), expected=expected)
-    check_pixels(math.prod(header.shape), where, str(header.shape))
+        got = f"{header.dtype} of shape {header.shape}"
+        raise InputError(f"the {what} has the wrong type or shape", where=where, got=got, expected=expected)
+    check_pixels(math.prod(header.shape), where, f"shape {header.shape}")
     values: np.ndarray = np.ndarray(header.shape, dtype, data, header.offset, order="F" if header.is_fortran else "C")
     return values.copy("K") if copy else values
 

@@ -177,11 +177,11 @@ def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Itera
         value = parse_document(data, where)
         if isinstance(value, dict) and (found := value.get("schema_version", version)) != version:
             raise InputError(
-                f"a line of the {what} has another version",
+                f"a line of the {what} has a version that is not supported",
                 where=f"{where}: schema_version",
                 got=repr(found)[:80],
                 expected=repr(version),
-                fix=f"make it again: {fix}",
+                fix=f"make the file again: {fix}",
             )
         yield decoded(data, where), validated(model, value, where)
 

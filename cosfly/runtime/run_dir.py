@@ -604,15 +604,14 @@ def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], records: M
     run = name.rpartition(".")[0]
     peers = {_role(other): other for other in inputs if other.rpartition(".")[0] == run}
     for role, peer in peers.items():
-        sources = [(source, entry) for source, entry in record.inputs.items() if _role(source) == role]
-        if sources and peer != name and all(entry.sha256 != records[peer].sha256 for _, entry in sources):
-            source, entry = sources[0]
+        sources = [entry for source, entry in record.inputs.items() if _role(source) == role]
+        if sources and peer != name and all(entry.sha256 != records[peer].sha256 for entry in sources):
             raise VerifyError(
-                f"this file was made from another input {source!r} than the one that is passed with it",
+                f"{path.name} was not made from the {role} that you passed",
                 where=path,
                 got=str(inputs[peer]),
-                expected=f"{entry.path} with unchanged content",
-                fix=f"pass the two that belong together, or make {path.name} again",
+                expected=f"{sources[0].path}, unchanged",
+                fix=f"pass the expected {role}, or run the stage that writes {path.name} again",
             )
 
 

@@ -156,7 +156,8 @@ class TableRows(Sequence[dict[str, Any]]):
         if self._process != os.getpid():  # a fork shares the position in the open file with its parent
             table = self._stack.enter_context(open_table(self._path))
             if missing := sorted(set(self._columns) - set(table.schema_arrow.names)):
-                raise InputError("the table lacks columns", where=self._path, got=", ".join(missing)[:200])
+                noun = "column" if len(missing) == 1 else "columns"
+                raise InputError(f"the table lacks the {noun} {', '.join(missing)[:200]}", where=self._path)
             counts = (table.metadata.row_group(k).num_rows for k in range(table.num_row_groups))
             self._firsts = list(accumulate(counts, initial=0))
             self._group = lru_cache(GROUPS_HELD)(lambda k: read_row_group(self._path, table, k, self._columns))
@@ -172,7 +173,7 @@ class TableRows(Sequence[dict[str, Any]]):
 
     def __getitem__(self, number: int) -> dict[str, Any]:  # type: ignore[override]  # one row at a time
         if not 0 <= number < len(self):
-            raise IndexError(number)
+            raise IndexError(f"row {number} does not exist: the table has {len(self)} rows")
         k = bisect.bisect_right(self._firsts, number) - 1
         with self._lock:
             group = self._group(k)

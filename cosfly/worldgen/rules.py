@@ -49,7 +49,7 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
     not_in_table = _find_unknown(remaining_text)
     if not (objects or not_in_table or without or set(words) & KNOWN):
         raise InputError(
-            "the rules know none of the words of the prompt", where="PROMPT", got=repr(prompt[:60]),
+            "the planner without a model knows no word of this prompt", where="PROMPT", got=repr(prompt[:60]),
             expected="English, as in 'a small village with a church'",
             fix="name a kind of place, or let a language model plan with --planner URL",
         )  # fmt: skip
