@@ -206,9 +206,8 @@ def check_with_files(cfg: RunConfig) -> None:
 def _check_files(cfg: RunConfig) -> None:
     files = getattr(cfg.maps, cfg.maps.source).inputs()
     if missing := {name: str(path) for name, path in files.items() if not path.exists()}:
-        noun = "this input file" if len(missing) == 1 else "these input files"
         where = f"maps.{cfg.maps.source}: {', '.join(missing)}"
-        problem = f"the map needs {noun}, but no such file exists: {', '.join(missing.values())}"
+        problem = f"an input file of the map does not exist: {', '.join(missing.values())}"
         raise InputError(problem, where=where, fix="correct the paths in these settings")
 
 
