@@ -10,12 +10,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from cosfly.formats.captions import KeyframeRecord, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
+from cosfly.formats.captions import KeyframeRecord, LabelFrom, Language, TeacherKind, Verdict, Writing
 from cosfly.formats.places import TrackChoice
 from cosfly.formats.predictions import PREDICTIONS
 from cosfly.llm.answers import BudgetConfig
@@ -29,6 +29,7 @@ from cosfly.viz.frame_views import DEPTH_RANGE_M, Layout, View
 Strategy = Literal["anchored", "hint", "multi_sample", "cascade"]
 Treatment = Literal["keep", "repair", "drop"]
 Judgement = Literal["ACCEPT_ALTERNATIVE", "FIX_LABEL", "REJECT_REGEN"]
+TextState = Literal["relative", "paper"]
 
 
 # --- windows ----------------------------------------------------------------------------------------------------------
@@ -119,22 +120,6 @@ class Window:
     keyframe: KeyframeRecord | None = None  # why it was taken, and how many windows after it were not
 
 
-# --- texts ------------------------------------------------------------------------------------------------------------
-
-
-class Judged(NamedTuple):
-    """A sentence and what was found out about it. problems: "kind: what", empty unless it is contradicted.
-
-    proved: something in it was compared with the facts, all of that holds, and no numeral or opposite was left out.
-    unread: the rest.
-    """
-
-    name: str  # C1 is the first sentence of critical_components, R1 of reasoning_trace
-    text: str
-    state: SentenceState
-    problems: tuple[str, ...] = ()
-
-
 # --- settings ---------------------------------------------------------------------------------------------------------
 
 
@@ -163,13 +148,6 @@ class ImageConfig(Config):
     )
     depth_range_m: float = Field(DEPTH_RANGE_M, gt=0, description="depth at the dark end of the pseudo-colour")
     encoding: ClassVar[Literal["jpeg", "png"]] = "jpeg"  # of the pictures in a request; a student's are PNG
-
-
-class EvidenceConfig(Config):
-    drop: bool | None = Field(
-        None,
-        description="drop a sample whose text contradicts a measured value; empty: where slots say what it states",
-    )
 
 
 class JudgeConfig(Config):
@@ -244,7 +222,12 @@ class CaptionConfig(Config):
     )
     writing: Writing = Field(
         "slots",
-        description="how a teacher writes. slots: it names facts, their values are filled in; prose: plain text",
+        description="how a teacher writes. slots: it names facts, and cosfly fills in their values; prose: plain text",
+    )
+    text_state: TextState = Field(
+        "relative",
+        description="flight data in a prompt. relative: place and motion in the axes of the drone, with their changes; "
+        "paper: velocity, altitude, yaw, target speed, visibility, world poses",
     )
     prompts: Path | None = Field(
         None,
@@ -254,7 +237,9 @@ class CaptionConfig(Config):
     flights: TrackChoice = Field(TrackChoice(), description="which flights of the tree")
     window: WindowConfig = Field(WindowConfig(), description="windows")
     image: ImageConfig = Field(ImageConfig(), description="pictures in a request")
-    evidence: EvidenceConfig = Field(EvidenceConfig(), description="check of numbers against the flight")
+    contradicted_values: Literal["drop", "keep"] = Field(
+        "drop", description="what becomes of a caption with a number that contradicts the measured facts"
+    )
     endpoint: EndpointConfig = Field(EndpointConfig(), description="how an endpoint is asked")
     student: StudentConfig = Field(StudentConfig(), description="a teacher that is a student, asked as it was taught")
     vllm: MayDiffer[VllmConfig] = Field(VllmConfig(), description="the engine of teacher vllm:MODEL_DIR")

@@ -64,7 +64,7 @@ class Sample(SplitMember):
     decision: str  # the answer's flight_decision
     label: str | None  # the decision that the future geometry calls for; None: it cannot tell
     contradicted: tuple[str, ...] | None  # decisions that the future geometry rules out; None: not known
-    proved: float | None  # share of the answer's sentences that the geometry proves; None: none was judged
+    values_contradicted: int | None  # values of the answer that match no fact; None: nobody compared them
     repair: str | None  # strategy of the repair that made the answer; None: as the teacher gave it
     weight: float
     past: tuple[float, ...] = ()  # see cosfly/inspection/blind_baseline.py; () where not known

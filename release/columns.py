@@ -18,7 +18,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import pyarrow as pa
 
-from cosfly.formats.captions import FIELDS, Caption, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
+from cosfly.formats.captions import FIELDS, Caption, LabelFrom, Language, TeacherKind, ValueCounts, Verdict, Writing
 from cosfly.formats.frames import (
     INVALID_DEPTH_M,
     LEAST_FOV_DEG,
@@ -46,7 +46,8 @@ WEATHER_PARAMS = tuple(WeatherParams.model_fields)
 BOX = ("xmin_px", "ymin_px", "xmax_px", "ymax_px")
 LANGUAGES: tuple[Language, ...] = get_args(Language)
 LANGUAGE_NAMES: dict[Language, str] = {"en": "English", "zh": "Chinese"}
-STATES: tuple[SentenceState, ...] = get_args(SentenceState)
+VALUES = tuple(ValueCounts.model_fields)  # values_filled, values_matched, values_contradicted
+VALUE_COLUMNS = tuple(f"{name}_{language}" for language in LANGUAGES for name in VALUES)
 CAPTION_FIELDS = tuple(f"caption_{language}_{name}" for language in LANGUAGES for name in FIELDS)
 TARGET_PICTURE = "target_picture"
 COMPANY_COLUMNS = ("others_in_view", "other_distance_m", "other_id", "alike_id", "alike_differences")  # frames.COMPANY
@@ -205,8 +206,12 @@ def _decision(caption: Caption) -> str | None:
     return None if coc is None else coc.flight_decision
 
 
-def _states(language: Language, caption: Caption) -> list[SentenceState] | None:
-    return (caption.checks.sentences or {}).get(language)
+def _values(column: str, caption: Caption) -> int | None:
+    name, _, language = column.rpartition("_")
+    for counted, counts in (caption.checks.values or {}).items():
+        if counted == language:
+            return getattr(counts, name)
+    return None
 
 
 def _text(language: Language, name: str, caption: Caption) -> str | None:
@@ -356,6 +361,7 @@ CAPTION = (  # what a row holds of an accepted caption, and nulls where there is
         title="verdict against the geometry", counted=True,
     ),
     Column("repair_strategy", "string", of_caption=_repair, title="repair", counted=True, shown=True),
+    Column("repair_rung", "string", of_caption=lambda c: c.repair and c.repair.rung, title="repaired by", shown=True),
     Column(
         "teacher_kind", "string", of_caption=lambda c: c.teacher.kind, words=get_args(TeacherKind), required=True,
         title="kind of teacher", counted=True, shown=True,
@@ -368,9 +374,8 @@ CAPTION = (  # what a row holds of an accepted caption, and nulls where there is
         "writing", "string", of_caption=lambda c: c.writing, words=get_args(Writing), required=True,
         title="written as", counted=True, shown=True,
     ),
-    *(  # of each sentence, whether the geometry proves it, contradicts it, or leaves it unread
-        Column(f"sentence_states_{language}", "texts", of_caption=partial(_states, language))
-        for language in LANGUAGES
+    *(  # numbers with a unit, and relations that fill slots; nothing else of a text is checked
+        Column(name, "int32", of_caption=partial(_values, name)) for name in VALUE_COLUMNS
     ),
     *(
         Column(
@@ -383,7 +388,7 @@ CAPTION = (  # what a row holds of an accepted caption, and nulls where there is
         Column(f"{name}_{language}", "string", of_caption=partial(_prompt, language, part))
         for language in LANGUAGES for name, part in (("system", "system"), ("prompt", "user"))
     ),
-    Column("evidence", "string", of_caption=_evidence, required=True, title="evidence of its sentences"),
+    Column("evidence", "string", of_caption=_evidence, required=True, title="evidence of its values"),
     Column(WINDOW, "indices", of_caption=lambda c: c.window, required=True, title="window", shown=True),
     Column(PICTURE_PX, "indices", of_caption=lambda c: list(c.picture_px), required=True),
 )  # fmt: skip

@@ -190,15 +190,15 @@ class Spread(Strict):
 
 
 class CaptionNumbers(Strict):
-    """frames_by: column -> frames by what their captions say there; mean_proved: of their sentences the share that the
-    geometry proves, where any was judged; `example` is the first one's sample_id and texts, empty without any."""
+    """frames_by: column -> frames by what their captions say there; values: numbers of values by column; `example` is
+    the first one's sample_id and texts, empty without any."""
 
     frames_with: int
     frames_without: int
     with_label: int
     decision_equals_label: int
     frames_by: dict[str, Counts]
-    mean_proved: dict[str, float | None]
+    values: dict[str, int]
     mean_characters: dict[str, float | None]
     example: dict[str, str]
 

@@ -23,5 +23,5 @@ def make_row(i: int, variant: str = "ORI", trajectory: str = "trajectory_1", **c
         "target_visible": True, "has_caption": i % 2 == 0,
     }  # fmt: skip
     if row["has_caption"]:
-        row |= dict.fromkeys((*COUNTED, *CAPTION_FIELDS), "word") | WORDS | {"sentence_states_en": ["proved", "unread"]}
+        row |= dict.fromkeys((*COUNTED, *CAPTION_FIELDS), "word") | WORDS | {"values_filled_en": 2}
     return row | change

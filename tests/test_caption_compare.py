@@ -8,8 +8,8 @@ from specimens_captions import VOCABULARY
 from tables import each
 
 from caption.schema import CaptionConfig, RepairConfig, WindowConfig
-from caption.stage.compare import compare
-from caption.stage.window_loop import Trial, caption_window
+from caption.stage.compare import compare, comparison_table
+from caption.stage.window_loop import Trial, caption_window, try_strategy
 from caption.stage.windows import cut_windows
 from caption.teachers.teacher import RuleTeacher
 from cosfly.formats.captions import Caption, Coc
@@ -34,9 +34,48 @@ def test_what_becomes_of_a_soft_conflict(treatment):
         if treatment == "keep":
             assert (caption.status, caption.verdict, caption.repair) == ("accepted", "SOFT_CONFLICT", None)
         elif treatment == "drop":
-            assert caption.drop_reason == "soft_conflict"
+            assert caption.drop_reason == "conflict"
         else:
-            assert (caption.verdict, caption.repair.first_verdict) == ("CONSISTENT", "SOFT_CONFLICT")
+            assert caption.repair is not None
+            assert caption.repair.first_verdict == "SOFT_CONFLICT"
+            if caption.status == "accepted":
+                assert caption.verdict == "CONSISTENT"
+            else:
+                assert caption.drop_reason == "no_reason"
+
+
+@each("strategy", ["anchored", "cascade"])
+def test_a_record_says_that_a_caption_is_anchored_and_by_which_strategy(strategy):
+    track = dataclasses.replace(make_flight(60)[0], folder=Path("nowhere"))
+    cfg = CFG.model_copy(update={"repair": RepairConfig(soft_conflict="repair", strategy=strategy)})
+    captions = [
+        asyncio.run(caption_window(window, RuleTeacher(0), cfg, VOCABULARY))
+        for window in cut_windows(track, cfg.window)
+    ]
+    rejected = [caption for caption in captions if caption.repair is not None]
+    assert any(caption.status == "accepted" for caption in rejected)
+    # The rule teacher gives the same answer to a hint and to another seed.
+    asks = 3 if strategy == "cascade" else 1
+    for caption in rejected:
+        repair = caption.repair
+        assert repair is not None
+        assert (repair.strategy, repair.asks) == (strategy, asks)
+        if caption.status == "accepted":
+            assert (repair.rung, repair.outcome) == ("anchored", "repaired")
+        else:
+            assert (repair.rung, repair.outcome, caption.drop_reason) == (None, "failed", "no_reason")
+
+
+@each("strategy", ["anchored", "cascade"])
+def test_a_conflict_without_a_reason_for_its_label_counts_as_not_repaired(strategy):
+    cfg = CFG.model_copy(update={"repair": RepairConfig(hard_conflict="repair", soft_conflict="repair")})
+    track = dataclasses.replace(make_flight(60)[0], folder=Path("nowhere"))
+    windows = list(cut_windows(track, cfg.window))
+    found = [asyncio.run(try_strategy(window, RuleTeacher(0), cfg, VOCABULARY, strategy)) for window in windows]
+    trials = [trial for trial in found if trial is not None]
+    repaired = [trial for trial in trials if trial.last is not None]
+    assert 0 < len(repaired) < len(trials)
+    assert compare(strategy, trials).consistency == round(len(repaired) / len(trials), 3)
 
 
 def coc(text: str) -> Coc:
@@ -50,5 +89,9 @@ def test_a_comparison_by_hand():
         Trial(coc("a b c"), None, "HARD_CONFLICT", 3, 300),
     ]
     found = compare("hint", trials)
-    assert (found.num_conflicts, found.repaired, found.consistent) == (3, 2, 1)
-    assert (found.asks_per_conflict, found.tokens_per_conflict, found.text_distance) == (2.0, 200.0, 0.375)
+    assert (found.num_conflicts, found.repaired, found.consistency) == (3, 2, 0.333)
+    assert (found.asks_per_conflict, found.tokens_per_conflict, found.naturalness) == (2.0, 200.0, 0.625)
+    nothing = compare("hint", trials[2:])
+    assert (nothing.repaired, nothing.consistency, nothing.naturalness) == (0, 0.0, None)
+    cells = [list(column.cells) for column in comparison_table([found, nothing]).columns]
+    assert cells[:4] == [["hint", "hint"], ["2", "0"], ["33.3 %", "0.0 %"], ["62.5 %", "-"]]

@@ -122,13 +122,13 @@ def test_what_is_a_windows_fault_costs_that_window_and_is_kept_in_the_servers_wo
     out = tmp_path / "out"
     with deciding(respond=lambda body: refusal(status, text) if body["seed"] == whole[1][0] else None) as server:
         path = run(settings(server.url), tree, out)
-        assert report_of(out)["windows"] == {"input": 10, "kept": 9, "dropped": {reason: 1}, "failed": {}}
+        assert report_of(out)["windows"] == {"input": 10, "kept": 9, "dropped": {"refused": 1}, "failed": {}}
         assert report_of(out)["structured"] == {"json_schema": 9, "none": 1}  # nobody else lost the schema
         [dropped] = [caption for caption in read_captions(path) if caption.status == "dropped"]
         [held] = quarantine(out).values()
         words = report_of(out)["refusals"][reason]
         assert held == {"id": dropped.sample_id, "code": reason, "message": words}
-        assert dropped.checks.refusal == words
+        assert dropped.checks.refusal == f"{reason}: {words}"
         assert words.startswith(f"HTTP {status} ")
         assert words.isprintable()
         assert text.split("\n")[0].replace("\x1b", "?")[:60] in words

@@ -67,7 +67,7 @@ def test_a_file_is_judged_as_answers_are(tree, rules, tmp_path):
     assert (found[0].therefore, found[1].therefore) == (None, lines[1]["therefore"])
     assert (found[0].teacher.kind, found[0].teacher.model) == ("file", "theirs.jsonl")
     assert found[0].verdict == "CONSISTENT"
-    assert (found[0].checks.sentences or {}).keys() == {"en", "zh"}
+    assert (found[0].checks.values or {}).keys() == {"en", "zh"}
     record = json.loads((tmp_path / "a/out/stage.json").read_text())
     assert record["inputs"].keys() == {"data", "captions"}
     report = json.loads((tmp_path / "a/out/caption_report.json").read_text())
@@ -76,30 +76,29 @@ def test_a_file_is_judged_as_answers_are(tree, rules, tmp_path):
     assert (report["refusals"], found[-1].checks.refusal) == ({}, None)
 
 
-def test_a_contradiction_is_on_record_and_drops_its_window_where_the_settings_say_so(tree, rules, tmp_path):
+def test_a_contradicted_value_is_recorded_and_drops_its_window_unless_the_settings_keep_it(tree, rules, tmp_path):
     said = EN | {"critical_components": "The person can be made out from 777 m up.", "flight_decision": rules[0].label}
     lines = [line(rules[0], en=said, zh=None), line(rules[1])]
-    found = captions_of(lines, tree, tmp_path / "a")
+    found = captions_of(lines, tree, tmp_path / "a", contradicted_values="keep")
     assert found[0].status == "accepted"
-    assert [problem.partition(":")[0] for problem in found[0].checks.evidence] == ["en number"]
-    assert (found[0].checks.sentences or {})["en"][0] == "contradicted"
-    dropped = captions_of(lines, tree, tmp_path / "b", evidence={"drop": True})
-    assert [caption.drop_reason for caption in dropped[:2]] == ["evidence", None]
+    assert [problem.partition(":")[0] for problem in found[0].checks.contradictions] == ["en number"]
+    assert found[0].checks.values["en"].values_contradicted == 1
+    dropped = captions_of(lines, tree, tmp_path / "b")
+    assert [caption.drop_reason for caption in dropped[:2]] == ["contradicted_value", None]
 
 
-@each(("changes", "reason"), [
-    ({"therefore": "return_to_home"}, "decision_against_reasoning"),
-    ({"decision": "do a barrel roll"}, "structure_decision_not_in_closed_set"),
-    ({"zh": ZH | {"flight_decision": "return_to_home"}}, "bilingual_decision"),
-    ({"zh": EN | {"flight_decision": "hover"}}, "bilingual_structure_"),
-    ({"en": EN | {"reasoning_trace": "So.", "flight_decision": "hover"}}, "structure_reasoning_trace_too_short"),
+@each(("changes", "reason", "detail"), [
+    ({"therefore": "return_to_home"}, "decision_mismatch", None),
+    ({"decision": "do a barrel roll"}, "structure", "decision_not_in_closed_set"),
+    ({"zh": ZH | {"flight_decision": "return_to_home"}}, "bilingual", "decision"),
+    ({"zh": {"critical_components": "短", "reasoning_trace": "短", "flight_decision": "hover"}}, "bilingual", "structure_"),
+    ({"en": EN | {"reasoning_trace": "So.", "flight_decision": "hover"}}, "structure", "reasoning_trace_too_short"),
 ])  # fmt: skip
-def test_what_is_wrong_with_a_caption_drops_its_window(tree, rules, tmp_path, changes, reason):
-    if reason.startswith("bilingual_structure"):
-        changes = {"zh": {"critical_components": "短", "reasoning_trace": "短", "flight_decision": "hover"}}
+def test_what_is_wrong_with_a_caption_drops_its_window(tree, rules, tmp_path, changes, reason, detail):
     found = captions_of([line(rules[0], **changes), *(line(caption) for caption in rules[1:])], tree, tmp_path / "a")
     assert found[0].status == "dropped"
-    assert (found[0].drop_reason or "").startswith(reason)
+    assert found[0].drop_reason == reason
+    assert detail is None or getattr(found[0].checks, reason).startswith(detail)
     assert {caption.status for caption in found[1:]} == {"accepted"}
 
 

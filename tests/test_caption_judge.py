@@ -6,7 +6,7 @@ import json
 import pytest
 from specimens_captions import VOCABULARY
 from tables import each
-from teacher_server import TeacherServer
+from teacher_server import TeacherServer, is_mirror, obedient_answer
 
 from caption.schema import CaptionConfig, JudgeConfig
 from caption.stage.stage import run
@@ -46,10 +46,27 @@ def test_reading_a_judgement(text, verdict):
     assert parse_judgement(text)[0] == verdict
 
 
+def teacher_in_conflict(**options) -> TeacherServer:
+    """A teacher whose free decisions differ from the label in part of the windows; its text names its decision."""
+    server = TeacherServer(decision=lambda body: ("hover", "track_straight", "speed_up")[body["seed"] % 3], **options)
+
+    def text(body: dict) -> str:
+        answer = obedient_answer(server, body)
+        named = (
+            "因此应{decision}，使目标留在画面中。"
+            if is_mirror(body)
+            else "So the drone should {decision} in this case."
+        )
+        return json.dumps(answer | {"reasoning_trace": named})
+
+    server.text = text
+    return server
+
+
 def judged(tree, out, answer, **settings):
-    with judging_server(answer) as server:
-        cfg = CaptionConfig.model_validate({"judge": {"url": server.url, **settings}})
-        path = run(cfg, tree, out)
+    with judging_server(answer) as server, teacher_in_conflict() as teacher:
+        cfg = {"teacher": teacher.url, "judge": {"url": server.url, **settings}, "image": {"max_side_px": 32}}
+        path = run(CaptionConfig.model_validate(cfg), tree, out)
         return list(read_captions(path)), json.loads((out / "caption_report.json").read_text()), server
 
 
@@ -88,8 +105,10 @@ def test_a_label_is_not_put_under_a_text_that_states_another_decision(tree, tmp_
 
 def test_a_judges_tokens_count_in_the_budget_and_are_shown(tree, tmp_path):
     out, reject = tmp_path / "out", '{"verdict": "REJECT_REGEN", "reason": "no"}'
-    with judging_server(lambda body: reject) as server:  # each judgement: 1,000 tokens in, 100 out
+    # Each judgement: 1,000 tokens in, 100 out.
+    with judging_server(lambda body: reject) as server, teacher_in_conflict() as teacher:
         settings = {
+            "teacher": teacher.url,
             "judge": {"url": server.url, "concurrency": 1},
             "endpoint": {"max_tokens": 64},
             "image": {"max_side_px": 32},  # pictures count in the guess of the first request
@@ -103,7 +122,6 @@ def test_a_judges_tokens_count_in_the_budget_and_are_shown(tree, tmp_path):
         assert run(CaptionConfig.model_validate(settings), tree, tmp_path / "other").read_bytes() == whole
         assert len(server.bodies) == 2 * num_asked  # what was judged before the budget stopped was not asked again
     assert report["judge_tokens"] == {"prompt_tokens": 1000 * num_asked, "completion_tokens": 100 * num_asked}
-    assert report["tokens"] == {"completion_tokens": 0, "prompt_tokens": 0}  # the rule teacher's
     assert f"{1000 * num_asked:,} in, {100 * num_asked:,} out" in (out / "report.html").read_text(encoding="utf-8")
 
 

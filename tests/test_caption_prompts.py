@@ -1,17 +1,171 @@
-"""Prompts of somebody's own."""
+"""Prompts: the state of a window in both languages, and prompts of the user's own."""
 
+import dataclasses
 import json
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commands import invoke
 
-from caption.schema import CaptionConfig
+from caption.answer_formats.contract import Draft, way_of
+from caption.schema import CaptionConfig, ObservedWindow, observed_frames
 from caption.stage.stage import run
-from caption.teachers.prompt_files import PROMPTS, export_prompts, own_prompts, shipped_prompts
-from cosfly.formats.captions import OWN_PROMPTS, read_captions
+from caption.teachers.prompt_files import (
+    PROMPTS,
+    export_prompts,
+    own_prompts,
+    shipped_prompts,
+    slots_of,
+    vocabulary_of,
+)
+from caption.teachers.prompts import user_prompts
+from caption.verification.facts import measure_facts
+from caption.verification.references import Fact, find_fact, parse_reference
+from cosfly.formats.captions import OWN_PROMPTS, PICTURES_MARK, Prompt, read_captions
+from cosfly.llm.answer_text import parse_answer
 from cosfly.runtime.errors import ConfigError, ResumeError
 from specimens import make_playback_tree
+
+RELATIVE, PAPER = vocabulary_of(CaptionConfig()), vocabulary_of(CaptionConfig(text_state="paper"))
+
+
+def make_window(hidden: tuple[bool, ...] = (False,) * 5, turn_deg: float = 0.0) -> ObservedWindow:
+    """A drone that flies along +y at 1 m/s, 19.1 m above the hip of a pedestrian who walks along -x at 2 m/s."""
+    x = np.arange(5.0)
+    flags = np.array(hidden)
+    frames = observed_frames(
+        0.5 * x,
+        np.stack([0 * x + 100.0, 0.5 * x, 0 * x + 20.0], axis=1),
+        np.stack([0 * x - 45.0, 90.0 + turn_deg * x, 0 * x], axis=1),
+        np.stack([102.0 - x, 0 * x + 20.0, 0 * x + 0.9], axis=1),
+        np.full((5, 2), np.nan),
+        np.stack([650.0 + 10 * x, 320.0 - 2.5 * x, 670.0 + 10 * x, 380.0 + 2.5 * x], axis=1),
+        np.ones(5, bool),
+        ~flags,
+        np.where(flags, 0.0, 1.0),
+    )
+    folders = (Path("frame"),) * 5
+    place = ("track_ORI_frame_00004", "Town", "track", "ORI", tuple(range(5)), 1280, 720)
+    return ObservedWindow(*place, frames, folders, (frozenset[str](),) * 5)
+
+
+def lines_of(window: ObservedWindow, vocabulary=RELATIVE, language="en") -> list[str]:
+    return user_prompts(window, measure_facts(window), vocabulary)[language].splitlines()
+
+
+def test_the_relative_state_by_hand():
+    assert lines_of(make_window()) == [
+        f"5 observed frames, 0.5 s apart, from the oldest to the one now. {PICTURES_MARK}",
+        "Forward, left and up are the directions of the drone now. A change is since the first frame that has a value. "
+        '"-": not known, the target is hidden.',
+        "Target visibility: visible, visible, visible, visible, now visible.",
+        "Target forward of the drone: 20.0, 19.5, 19.0, 18.5, now 18.0 m; change -2.0 m.",
+        "Target left of the drone (minus: right): -2.0, -1.0, 0.0, 1.0, now 2.0 m; change +4.0 m.",
+        "Target above the drone (minus: below): -19.1, -19.1, -19.1, -19.1, now -19.1 m; change 0 m.",
+        "Horizontal distance to the target: 20.1, 19.5, 19.0, 18.5, now 18.1 m; change -2.0 m.",
+        "Target bearing, to the left (minus: right): -5.7, -2.9, 0.0, 3.1, now 6.3 deg; change +12.0 deg.",
+        "Target in the image, right of the centre (minus: left): 20, 30, 40, 50, now 60 px; change +40 px.",
+        "Target in the image, below the centre (minus: above): -10, -10, -10, -10, now -10 px; change 0 px.",
+        "Target box height in the image: change +33 %.",
+        "Target speed: 2.00, 2.00, 2.00, 2.00, now 2.00 m/s; change 0 m/s.",
+        "Target velocity over all frames: forward 0.00, left 2.00 m/s.",
+        "Drone speed: 1.00, 1.00, 1.00, 1.00, now 1.00 m/s; change 0 m/s.",
+        "Drone velocity over all frames: forward 1.00, left 0.00, up 0.00 m/s.",
+        "Drone yaw since the first frame, to the left (minus: right): 0.0, 0.0, 0.0, 0.0, now 0.0 deg; turning at 0.0 "
+        "deg/s.",
+        "Drone altitude: 20.0, 20.0, 20.0, 20.0, now 20.0 m; change 0 m.",
+    ]
+
+
+def test_both_languages_state_the_same_numbers():
+    for hidden in ((False,) * 5, (True, False, False, True, False), (False, False, False, False, True), (True,) * 5):
+        for vocabulary in (RELATIVE, PAPER):
+            told = [lines_of(make_window(hidden), vocabulary, language) for language in ("en", "zh")]
+            numbers = [
+                [re.findall(r"(?<![a-zA-Z])[+-]?\d[\d.]*\d|(?<![a-zA-Z])[+-]?\d", line) for line in lines]
+                for lines in told
+            ]
+            assert numbers[0][2:] == numbers[1][2:]
+            assert sorted(numbers[0][0]) == sorted(numbers[1][0]) == ["0.5", "5"]
+
+
+def test_nothing_is_stated_of_a_hidden_target():
+    lines = lines_of(make_window((True, False, False, False, True)))
+    assert lines[2] == "Target visibility: occluded, visible, visible, visible, now occluded."
+    assert lines[3] == "Target forward of the drone: -, 19.5, 19.0, 18.5, now - m; change - m."
+    assert lines[11] == "Target speed: -, 2.00, 2.00, 2.00, now - m/s; change - m/s."
+    late = lines_of(make_window((True, False, False, False, False)))
+    assert late[3] == "Target forward of the drone: -, 19.5, 19.0, 18.5, now 18.0 m; change -1.5 m."
+    [_, _, _, once, *_] = lines_of(make_window((True, True, True, True, False)))
+    assert once == "Target forward of the drone: -, -, -, -, now 18.0 m; change - m."
+    assert "Target velocity over all frames: forward -, left - m/s." in lines_of(make_window((True,) * 5))
+    paper = lines_of(make_window((True, False, False, True, True)), PAPER)
+    assert paper[4] == "Target ground speed: 2.00 m/s."
+    assert paper[7].endswith(": unknown; (101.00, 20.00, 0.90); (100.00, 20.00, 0.90); unknown; unknown.")
+
+
+def test_a_change_is_the_fact_of_its_slot():
+    window = make_window((True, False, False, False, False))
+    lines, facts = lines_of(window), measure_facts(window)
+    for line, slot in (
+        (6, "change:distance"),
+        (7, "change:bearing"),
+        (10, "growth:box_height"),
+        (11, "change:target_speed"),
+        (16, "change:altitude"),
+    ):
+        reference = parse_reference(slot)
+        assert reference is not None
+        fact = find_fact(reference, facts)
+        assert isinstance(fact, Fact)
+        assert [float(change) for change in re.findall(r"change ([+-]?[\d.]+) ", lines[line])] == [fact.value]
+
+
+def test_the_relative_state_does_not_depend_on_the_place_in_the_world():
+    window = make_window()
+    turned = dataclasses.replace(window, frames=tuple(
+        dataclasses.replace(
+            frame, position_m=(-frame.position_m[1] + 7.0, frame.position_m[0] - 9.0, frame.position_m[2]),
+            target_m=(-frame.target_m[1] + 7.0, frame.target_m[0] - 9.0, frame.target_m[2]),
+            rotation_deg=(frame.rotation_deg[0], frame.rotation_deg[1] + 90.0, frame.rotation_deg[2]),
+        )
+        for frame in window.frames
+    ))  # fmt: skip
+    assert lines_of(turned) == lines_of(window)
+    assert lines_of(turned, PAPER) != lines_of(window, PAPER)
+
+
+def test_the_papers_state():
+    lines = lines_of(make_window(), PAPER)
+    assert lines[1] == "Velocity: [0.0, 1.00, 1.00, 1.00, 1.00] m/s (the first frame has no earlier one and reads 0.0)."
+    assert lines[2] == "Altitude: [20.0, 20.0, 20.0, 20.0, 20.0] m."
+    assert lines[4] == "Target ground speed: 2.00 m/s."
+    assert lines[6].partition(": ")[2].startswith("(100.00, 0.00, 20.00; -45.0, 90.0, 0.0); (100.00, 0.50,")
+
+
+def test_measurements_can_be_omitted():
+    for vocabulary in (RELATIVE, PAPER):
+        for user in user_prompts(window := make_window(), measure_facts(window), vocabulary).values():
+            assert Prompt(system="", user=user).told("P", measured=False).user.count("\n") == 0
+
+
+def test_the_questions_of_both_languages_have_the_same_slots():
+    for name in ("user", "user_paper"):
+        english, chinese = (set(slots_of(shipped_prompts()[f"{name}_{language}"])) for language in ("en", "zh"))
+        assert english == chinese
+
+
+def test_the_example_of_the_slots_prompt_is_accepted():
+    way = way_of("slots", RELATIVE)
+    [example] = [line for line in RELATIVE.templates[way.system].template.splitlines() if line.startswith('{"')]
+    answer = parse_answer(example, more=("therefore",))
+    draft = way.read(answer, measure_facts(make_window(turn_deg=1.0)))
+    assert isinstance(draft, Draft), draft
+    assert "now 18.1 m" in draft.coc.reasoning_trace
+    assert draft.num_filled == 7
+
 
 OWN_LINE = "Costs $$5 & 100 %: you speak as a coast guard."
 
@@ -36,7 +190,7 @@ def test_what_is_exported_is_what_ships(tmp_path):
     (folder / "user_zh.txt").unlink()  # as after a kill
     assert invoke("caption prompts --export", folder).exit_code == 0
     for name in ("user_en", "system_zh"):
-        edit(folder / f"{name}.txt", "the" if name == "user_en" else "1", "2")
+        edit(folder / f"{name}.txt", "the" if name == "user_en" else "无人机", "2")
     (folder / "user_zh.txt").unlink()
     again = invoke("caption prompts --export", folder)
     assert not (folder / "user_zh.txt").exists()
@@ -68,24 +222,20 @@ def test_captions_are_asked_with_them_and_keep_them(tmp_path):
     for name in ("system_en", "system_zh", "system_slots_en", "system_prose_en"):
         with (mine / f"{name}.txt").open("a", encoding="utf-8") as file:
             file.write(OWN_LINE + "\n")
-    edit(mine / "user_en.txt", "Velocity: [$speed]", "SPEED [${speed}] 100 % $$1")
+    edit(mine / "user_en.txt", "Target speed: $target_speed_before", "SPEED ${target_speed_before} 100 % $$1")
     product = run(CaptionConfig(prompts=mine), tree, out, workers=2)
     for caption in read_captions(product):
         assert caption.prompt["en"].system.endswith(OWN_LINE.replace("$$", "$"))
         assert caption.prompt["zh"].system.endswith(OWN_LINE.replace("$$", "$"))
-        assert caption.prompt["en"].user.splitlines()[1].startswith("SPEED [0.0,")
-        assert (
-            caption.prompt["en"]
-            .user.splitlines()[1]
-            .endswith("100 % $1 m/s (the first frame has no earlier one and reads 0.0).")
-        )
+        [line] = [line for line in caption.prompt["en"].user.splitlines() if line.startswith("SPEED ")]
+        assert " 100 % $1, now " in line
     assert {p.name: p.read_bytes() for p in (out / OWN_PROMPTS).iterdir()} == {
         p.name: p.read_bytes() for p in mine.iterdir()
     }
     listed = {entry["path"] for entry in json.loads((out / "manifest.json").read_text())["outputs"]}
     assert {f"{OWN_PROMPTS}/{p.name}" for p in mine.iterdir()} <= listed
-    with pytest.raises(ResumeError, match="the prompts changed"):
+    with pytest.raises(ResumeError, match="prompts"):
         run(CaptionConfig(), tree, out)
     edit(mine / "hint_en.txt", "Hint:", "A hint:")
-    with pytest.raises(ResumeError, match="the prompts changed"):
+    with pytest.raises(ResumeError, match="prompts"):
         run(CaptionConfig(prompts=mine), tree, out)

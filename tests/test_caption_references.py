@@ -1,11 +1,11 @@
-"""References, facts and claims: the fact at an address, worked out by hand for one window, and what holds of it."""
+"""References: the fact at an address, worked out by hand for one window."""
 
 import dataclasses
 
 from specimens_captions import GAP
 from tables import each
 
-from caption.verification.references import Fact, look_up, parse_reference, word_holds
+from caption.verification.references import Fact, look_up, parse_reference
 
 FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0))
 
@@ -16,20 +16,20 @@ FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0))
     ("distance@t3", "unknown_fact"),
     ("distance@t5", "unobserved_frame"),
     ("change:distance", Fact(-2.0, "m", 1)),
-    ("change:distance@t0-t2", Fact(1.0, "m", 1)),
+    ("change:distance@t0-t2", Fact(-1.0, "m", 1)),
     ("change:distance@t3-t4", "unknown_fact"),
     ("growth:box_height", Fact(20.0, "percent", 0)),
     ("rate:altitude@t3-t4", Fact(2.0, "mps", 1)),
     ("rate:yaw@t2-t4", Fact(7.0, "dps", 1)),
     ("climb_rate@t2", Fact(1.0, "mps", 2)),
-    ("mean:speed", Fact(2.88, "mps", 2)),
+    ("mean:speed", Fact(2.75, "mps", 2)),
+    ("mean:speed@t2-t4", Fact(3.17, "mps", 2)),
     ("max:speed", Fact(4.0, "mps", 2)),
     ("min:speed@t2-t4", Fact(2.5, "mps", 2)),
-    ("speed@t0", "unknown_fact"),
+    ("speed@t0", Fact(2.0, "mps", 2)),
     ("mean:target_speed", Fact(1.6, "mps", 2)),
-    ("speed_ratio", Fact(2.5, "times", 2)),
-    ("change:target_heading", Fact(-30.0, "deg", 1)),
-    ("side:target_heading", Fact("right")),
+    ("speed_ratio", Fact(1.72, "times", 2)),
+    ("change:target_heading", "unknown_fact"),
     ("side:yaw", Fact("left")),
     ("side:offset_x", Fact("left")),
     ("side:offset_x@t1", Fact("centred")),
@@ -41,7 +41,9 @@ FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0))
     ("visibility@t3", Fact("occluded")),
     ("target_motion", Fact("walking")),
     ("drone_motion", Fact("moving")),
-    ("heading", "unknown_fact"),
+    ("bearing", "unknown_fact"),
+    ("sideways_speed", Fact(0.0, "mps", 2)),
+    ("forward_speed@t3", "unknown_fact"),
 ])  # fmt: skip
 def test_the_fact_at_an_address(address, fact):
     reference = parse_reference(address)
@@ -62,4 +64,3 @@ def test_a_series_that_ends_where_it_began_has_no_trend():
     for distance_m in ((20.5, 20.8, 20.5, 19.3, 20.5), (20.0, 22.0, 18.0, 21.0, 20.2)):
         facts = dataclasses.replace(FACTS, distance_m=distance_m)
         assert look_up(parse_reference("trend:distance"), facts) == Fact("mixed")
-        assert word_holds("mixed", parse_reference("trend:distance"), facts)

@@ -121,9 +121,9 @@ FAULTS: dict[str, tuple] = {
         "asks to wait 1000000000000000000 s", 1)),
     # --- bodies
     "vLLM: all in its thoughts, vllm 17349": (message(content=None, reasoning_content="{}"),
-        dropped("structure_empty")),
+        dropped("structure")),
     "nobody: thoughts without end": (message(content="<think>" + "a <think> {" * 30_000),
-        dropped("structure_too_long")),
+        dropped("structure")),
     # --- the wire
     "nobody: a body of 20 MB": (page(200, "[" + "1," * 10_000_000 + "1]"), silent("bad_reply",
         "longer than 0.5 MB")),

@@ -102,7 +102,7 @@ def test_unlabelled_flights_are_captioned_and_marked(place, tmp_path):
         assert (caption.teacher.kind, caption.teacher.model, caption.writing) == ("student", "test-teacher", "prose")
         assert caption.teacher.settings.temperature == 0.0
         assert caption.verdict in ("CONSISTENT", "SOFT_CONFLICT", "ABSTAIN")
-        assert caption.checks.sentences is not None
+        assert caption.checks.values is not None
         assert caption.zh is not None
         assert caption.picture_px == read_chat_format(place / "trained").looks[0].size_px
     told = (tmp_path / "out" / "stage.json").read_text()
@@ -121,7 +121,7 @@ def test_another_version_of_the_prompt_is_refused(place, tmp_path):
     english = taught["prompts"]["en"]
     for number, changed in enumerate([
         {"system": english["system"] + " Be brief.", "user": english["user"]},
-        {"system": english["system"], "user": english["user"].replace("Altitude:", "Height:")},
+        {"system": english["system"], "user": english["user"].replace("Drone altitude:", "Height:")},
         {"system": english["system"], "user": english["user"].replace("5 observed", "7 observed")},
         {"system": english["system"], "user": english["user"].replace("2 pictures", "3 pictures")},
     ]):  # fmt: skip

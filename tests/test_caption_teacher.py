@@ -34,7 +34,7 @@ def test_a_decision_against_its_own_reasoning_is_asked_for_again_with_what_was_w
         cfg = settings(server.url, limit=1, repair=KEEP, writing=writing)
         captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
     assert [c.status for c in captions] == ["accepted"]
-    assert captions[0].checks.refused == ["decision_against_reasoning"]
+    assert captions[0].checks.refused == ["decision_mismatch"]
     assert captions[0].therefore == captions[0].en.flight_decision == "ascend"
     asked, corrected, _ = (json.loads(body) for body in server.bodies)
     assert corrected["messages"][:2] == asked["messages"]
@@ -72,7 +72,7 @@ def test_strategies_ask_by_their_rungs(tree, tmp_path, strategy, rungs):
     schemas = [
         body["response_format"]["json_schema"]["schema"]["properties"]["flight_decision"]["enum"]
         for body in map(json.loads, server.bodies)
-        if "Hard constraint" in body["messages"][0]["content"]
+        if "Constraint: the flight" in body["messages"][0]["content"]
     ]
     assert [len(enum) for enum in schemas] == [1] * len(repaired) * ("anchored" in rungs)
     repair = report_of(tmp_path / "out")["repair"]
@@ -159,7 +159,7 @@ def test_a_retry_after_holds_every_request():
 
 def test_a_hopeless_teacher_is_stopped_and_its_commonest_reasons_are_explained(tree, tmp_path):
     cfg = {"stop_after_dropped": 3, "endpoint": {"concurrency": 1}, "repair": KEEP}
-    told = r"none of the first 3 answers.*3 structure_.*\(no answer had the fields"
+    told = r"none of the first 3 answers.*3 structure .*\(no answer had the requested fields"
     with deciding("ascend", lambda number, body: "short") as server:
         with pytest.raises(TeacherError, match=told):
             run(settings(server.url, **cfg), tree, tmp_path / "out")

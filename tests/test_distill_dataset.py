@@ -66,7 +66,7 @@ def test_what_two_splits_share_is_found():
 
 def test_which_captions_teach_and_how_much():
     repaired = {"strategy": "anchored", "asks": 2, "first_decision": "hover", "first_verdict": "HARD_CONFLICT"}
-    checks = {"sentences": {"en": ["proved", "contradicted"], "zh": ["proved"]}}
+    checks = {"values": {"en": {"values_filled": 1, "values_contradicted": 1}, "zh": {"values_filled": 1}}}
 
     def made(changes: dict, language: str = "en", variant: str = "ORI", **settings) -> Sample | str:
         caption = make_caption("Town01", "trajectory_1", variant, 4, **changes)
@@ -117,7 +117,7 @@ def test_a_student_may_get_text_alone_or_pictures_alone(asked, language):
     told = {"en": "No pictures are given.", "zh": "未提供图像。"}[language]
     assert told in text.prompt.user
     assert text.images == []
-    assert both.prompt.user.count("\n") == text.prompt.user.count("\n") == 7
+    assert both.prompt.user.count("\n") == text.prompt.user.count("\n") > 10
     line = pictures.prompt.user
     assert "\n" not in line
     assert line == both.prompt.user.partition("\n")[0]

@@ -17,7 +17,7 @@ from cosfly.runtime.json_io import dump_json
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
 from distill.evaluation.floors import Floors, coc_of, majority
 from distill.evaluation.measure import STUDENT, measure, pair_up, read_report, text_of
-from distill.evaluation.scores import STATES, VERDICTS, ScoredAnswer, Scores, differences_of, figures_of, score_answers
+from distill.evaluation.scores import VALUES, VERDICTS, ScoredAnswer, Scores, differences_of, figures_of, score_answers
 from distill.evaluation.stage import EvaluateConfig, run
 from distill.inference.outcome import failed_prediction, make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
@@ -128,7 +128,7 @@ def made_up(num_walks: int, rng: np.random.Generator, *, size: int = 6, skill: f
     reference = rng.integers(0, 3, count).astype(np.int8)
     texts = {name: np.full(count, "x", dtype=object) for name in ("language", "against")}
     texts |= {"key": np.array([f"{name}/{i}" for i, name in enumerate(walk)], dtype=object), "walk": walk}
-    unknown = {name: np.full(count, np.nan) for name in ("precision", "recall", "f1", "drawn_ahead", *STATES)}
+    unknown = {name: np.full(count, np.nan) for name in ("precision", "recall", "f1", "drawn_ahead", *VALUES)}
     codes = {name: np.full(count, -1, dtype=np.int8) for name in ("label", "verdict")}
     flags = {name: np.ones(count, dtype=bool) for name in ("answered", "unmended")}
     answer, tokens = np.where(right, reference, 5).astype(np.int8), np.zeros(count, dtype=np.int64)

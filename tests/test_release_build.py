@@ -356,7 +356,7 @@ def test_load_dataset_gives_pictures_poses_and_both_languages(loaded, release_in
     assert row["teacher_kind"] == "rules"
     for row in captioned:
         assert (row["writing"], row["caption_picture_px"]) == ("slots", [96, 54])
-        assert row["sentence_states_zh"] is None
+        assert row["values_filled_zh"] is None
     bare = loaded.filter(lambda row: not row["has_caption"])
     assert bare[0]["caption_en_reasoning_trace"] is None
     assert bare[0]["caption_window"] is bare[0]["caption_picture_px"] is bare[0]["target_mask_bbox"] is None

@@ -78,6 +78,12 @@ def test_a_release_is_counted_again(built, tmp_path):
     assert "<title>one</title>" in page  # the run's name
     places = [
         page.index(text)
-        for text in (f"<b>{numbers['frames']:,}</b>frames", "are proved", "<img", 'id="release"', "<h2>Rules")
+        for text in (
+            f"<b>{numbers['frames']:,}</b>frames",
+            "are filled",
+            "<img",
+            'id="release"',
+            "<h2>Rules",
+        )
     ]
     assert places == sorted(places)  # how much, how good, a picture, tables, formulas

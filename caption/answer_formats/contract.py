@@ -1,4 +1,4 @@
-"""What a way of writing is: how a teacher states its reasons so that they can be held against the facts.
+"""What an answer format is: how a teacher writes its reasons so that their values can be compared with the facts.
 
 The window loop asks, reads and records; what differs between slots and prose is in `WayOfWriting`, and WAYS names them.
 """
@@ -6,13 +6,12 @@ The window loop asks, reads and records; what differs between slots and prose is
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Protocol
 
-from caption.schema import Judged
 from caption.verification.facts import Facts
+from caption.verification.values import ValueCheck
 from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import TOKENS, Coc, Language, Template, Writing
 from cosfly.llm.answer_text import Parsed
@@ -21,26 +20,30 @@ WAYS: dict[Writing, str] = {
     "slots": "caption.answer_formats.slots:Slots",
     "prose": "caption.answer_formats.prose:Prose",
 }
-DECISION_REASON = "decision_against_reasoning"
+INVALID_SLOT, DECISION_MISMATCH = "invalid_slot", "decision_mismatch"  # reasons
+# Asked for between the texts and the decision. It is free even where the decision is given.
+THEREFORE = {"therefore": {"type": "string", "enum": list(TOKENS)}}
 
 
 @dataclass(frozen=True)
 class Draft:
-    """A caption in one language: its plain text, and what that came from. therefore: of the English alone.
+    """A caption in one language.
 
-    judged: its sentences, where making the text has told their states. doubt: what its writer is asked to mend once,
-    though it is taken as it stands.
+    Args:
+        coc: its plain text. therefore: the decision to which the reasoning leads, of the English alone.
+        template: what the text was filled from. outside: the sentences without their slots.
+        num_filled: slots that were filled with a value.
     """
 
     coc: Coc
     therefore: str | None = None
     template: Template | None = None
-    judged: tuple[Judged, ...] = ()
-    doubt: str = ""
+    outside: tuple[str, ...] = ()
+    num_filled: int = 0
 
     @property
     def written(self) -> dict[str, Any]:
-        """What was written, as the teacher's answer had it: the template where there is one."""
+        """The answer as the teacher wrote it: the template where there is one."""
         return self.coc.model_dump() | (self.template.model_dump() if self.template else {})
 
 
@@ -48,8 +51,9 @@ class Draft:
 class Refused:
     """An answer of the right structure that is not taken.
 
-    reason: a word that is counted. complaint: what is wrong and what is allowed, for who wrote it. draft: what could be
-    read of it.
+    Args:
+        reason: a code that is counted. complaint: the fault and what is allowed, for the teacher. draft: what could be
+            read of the answer.
     """
 
     reason: str
@@ -58,49 +62,38 @@ class Refused:
 
 
 class WayOfWriting(Protocol):
-    """One way of writing, in a vocabulary; nothing else stays in it.
-
-    name: among WAYS. system, mirror_system: prompt files (`system` is asked in English). fields: further fields of an
-    answer, name -> JSON schema, in the order in which they stand between the texts and `therefore`. optional: more of
-    them, which an answer in either language may leave out.
-    """
+    """One answer format. name: among WAYS. system, mirror_system: prompt files (`system` is asked in English)."""
 
     name: Writing
     system: str
     mirror_system: str
-    fields: Mapping[str, dict]
-    optional: Mapping[str, dict]
     vocabulary: Vocabulary
 
     def __init__(self, vocabulary: Vocabulary) -> None:
         self.vocabulary = vocabulary
 
     def table(self, facts: Facts) -> str:
-        """Return what the question shows beside the flight data; "" for nothing."""
+        """Return what the question shows after the measured state; "" for nothing."""
 
     def read(self, answer: Parsed, facts: Facts) -> Draft | Refused:
         """Make an English draft of an answer of the right structure."""
 
     def read_mirror(self, answer: Parsed, english: Draft, facts: Facts) -> Draft | Refused:
-        """Make the Chinese draft, and hold it against the English one."""
+        """Make the Chinese draft, and compare it with the English one."""
 
-    def judge(self, draft: Draft, facts: Facts, language: Language) -> list[Judged]:
-        """Return the state of every sentence of both texts, in order."""
+    def check(self, draft: Draft, facts: Facts, language: Language) -> ValueCheck:
+        """Count the values of a draft: filled, matched and contradicted."""
 
 
 @lru_cache
 def way_of(name: Writing, vocabulary: Vocabulary) -> WayOfWriting:
+    """Return an answer format by its name."""
     module, _, attribute = WAYS[name].partition(":")
     return getattr(importlib.import_module(module), attribute)(vocabulary)
 
 
-def more_fields(way: WayOfWriting) -> dict[str, dict]:
-    """Return the fields of an answer beyond the paper's three. `therefore` is free even where the decision is given."""
-    return {**way.fields, **way.optional, "therefore": {"type": "string", "enum": list(TOKENS)}}
-
-
 def refuse_decision(answer: Parsed) -> Refused | None:
-    """Refuse an answer whose decision is not the one that its reasoning came to."""
+    """Refuse an answer whose decision is not the one that its reasoning leads to."""
     assert answer.coc is not None
     decision, therefore = answer.coc.flight_decision, answer.therefore
     if decision == therefore:
@@ -109,4 +102,4 @@ def refuse_decision(answer: Parsed) -> Refused | None:
         f'"therefore" says {therefore} and "flight_decision" says {decision}: both name the one action that your '
         f"reasoning leads to. Let the reasoning lead to the decision."
     )
-    return Refused(DECISION_REASON, complaint)
+    return Refused(DECISION_MISMATCH, complaint)

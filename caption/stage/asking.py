@@ -225,7 +225,8 @@ class Asking:
             self.failed_in_row = 0
             self.quarantine.pop(sample_id, None)
         else:
-            self.quarantine[sample_id] = Failed(id=sample_id, code=str(caption.drop_reason), message=refusal)
+            code, _, message = refusal.partition(": ")
+            self.quarantine[sample_id] = Failed(id=sample_id, code=code, message=message)
             self._note_failure(refusal)
 
     def _note_outcome(self, caption: Caption) -> None:

@@ -1,18 +1,18 @@
-"""`compare-strategies`: the four ways of re-generation on the same conflicts.
+"""`compare-strategies`: the four strategies of re-generation on the same conflicts (fig:regen_strategy).
 
 Reads a playback tree, writes `compare_strategies.json` and, for an endpoint, its journal of answers. Nothing of it
-enters a data set. The distance of a repaired text from the first answer stands for naturalness: what a model says
-freely is natural, and the further a constraint moves it, the less it is.
+enters a data set.
 """
 
 from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from difflib import SequenceMatcher
 from pathlib import Path
+from statistics import fmean
 from typing import get_args
 
 from rich.table import Table
@@ -37,61 +37,68 @@ RESULT = "compare_strategies.json"
 
 @dataclass(frozen=True)
 class Comparison:
-    """One strategy over all conflicts; means are over the conflicts, the distance over those repaired.
+    """The results of one strategy on all conflicts.
 
-    consistent: final decision equals the label. repaired: no longer rejected.
+    Args:
+        repaired: conflicts with a new answer that is not rejected.
+        consistency: share of the conflicts whose new decision is the label.
+        naturalness: mean over the repaired ones of the share of words that the new text has in common with the free
+            one; None where nothing was repaired. A model's free text is natural, and a constraint moves it away.
     """
 
     strategy: Strategy
     num_conflicts: int
     repaired: int
-    consistent: int
-    text_distance: float | None
+    consistency: float
+    naturalness: float | None
     asks_per_conflict: float
     tokens_per_conflict: float
 
 
-def text_distance(one: Coc, two: Coc) -> float:
-    """Return 0 for the same words in the same order, 1 where no word is shared."""
+def words_in_common(one: Coc, two: Coc) -> float:
+    """Return the share of words that two texts have in common, in order: 1 for equal texts."""
     a, b = (f"{coc.critical_components} {coc.reasoning_trace}".split() for coc in (one, two))
-    return 1.0 - SequenceMatcher(None, a, b, autojunk=False).ratio()
+    return SequenceMatcher(None, a, b, autojunk=False).ratio()
 
 
-def compare(strategy: Strategy, trials: list[Trial]) -> Comparison:
-    """Sum up the trials of one strategy."""
-    distances = [text_distance(trial.first, trial.last) for trial in trials if trial.last is not None]
-    count = max(1, len(trials))
+def compare(strategy: Strategy, trials: Sequence[Trial]) -> Comparison:
+    """Return the results of a strategy over at least one trial."""
+    repaired = [(trial.first, trial.last) for trial in trials if trial.last is not None]
+    consistent = sum(trial.last is not None and trial.verdict == "CONSISTENT" for trial in trials)
     return Comparison(
         strategy=strategy,
         num_conflicts=len(trials),
-        repaired=len(distances),
-        consistent=sum(trial.verdict == "CONSISTENT" for trial in trials if trial.last is not None),
-        text_distance=round(sum(distances) / len(distances), 3) if distances else None,
-        asks_per_conflict=round(sum(trial.asks for trial in trials) / count, 3),
-        tokens_per_conflict=round(sum(trial.tokens for trial in trials) / count, 1),
+        repaired=len(repaired),
+        consistency=round(consistent / len(trials), 3),
+        naturalness=round(fmean(itertools.starmap(words_in_common, repaired)), 3) if repaired else None,
+        asks_per_conflict=round(fmean(trial.asks for trial in trials), 3),
+        tokens_per_conflict=round(fmean(trial.tokens for trial in trials), 1),
     )
 
 
 def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: int = 50) -> list[Comparison]:
-    """Find conflicts among the first answers and repair each by every strategy.
+    """Find conflicts among the free answers and repair each by every strategy.
 
     Args:
-        conflicts: stop looking after so many.
+        conflicts: the search stops after so many.
+
     Raises:
-        ConfigError: the captions are a file's. InputError: no conflict was found. TeacherError: the endpoint cannot be
-        used.
+        ConfigError: the captions come from a file.
+        InputError: no conflict was found.
+        TeacherError: the endpoint cannot be used.
     """
     if cfg.caption_file is not None:
-        raise ConfigError("captions of a file cannot be asked for again", where="--teacher", got=cfg.teacher)
+        fix = "give a teacher that can be asked: rules, a URL or vllm:MODEL_DIR"
+        raise ConfigError("captions of a file cannot be regenerated", where="--teacher", got=cfg.teacher, fix=fix)
     out.mkdir(parents=True, exist_ok=True)
     refuse_links(out)
     num_windows, trials = run_until_interrupted(_try_all(cfg, vocabulary_of(cfg), data, out, seed, conflicts))
     if not trials[STRATEGIES[0]]:
-        raise InputError("no conflict to repair", where=data, got=f"{num_windows} windows, all without one")
+        raise InputError("no conflict to repair", where=data, got=f"{num_windows} windows without a conflict")
     comparisons = [compare(strategy, trials[strategy]) for strategy in STRATEGIES]
     value = {
         "schema": "cosfly.compare_strategies",
-        "schema_version": "1.0",
+        "schema_version": "2.0",
         "teacher": cfg.teacher_kind,
         "windows": num_windows,
         "strategies": [asdict(comparison) for comparison in comparisons],
@@ -122,7 +129,7 @@ async def _try_all(
 async def _try_each(
     window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary
 ) -> dict[Strategy, Trial] | None:
-    """Return a trial per strategy; None where the first answer is no conflict or an answer is missing."""
+    """Return a trial of each strategy; None where the free answer is not in conflict or an answer is missing."""
     found: dict[Strategy, Trial] = {}
     for strategy in STRATEGIES:
         try:
@@ -140,15 +147,18 @@ def _windows(cfg: CaptionConfig, data: Path) -> Iterable[Window]:
         yield from (window for window in flight.windows(cfg) if window.problem is None)
 
 
-def comparison_table(comparisons: list[Comparison]) -> Table:
+def comparison_table(comparisons: Sequence[Comparison]) -> Table:
     """Return the comparison as a table for the terminal."""
-    table = Table(title=f"Re-generation of the same {comparisons[0].num_conflicts} conflicts", title_justify="left")
-    for column in ("strategy", "repaired", "consistent", "text distance", "asks each", "tokens each"):
+    table = Table(title=f"Regeneration of the same {comparisons[0].num_conflicts} conflicts", title_justify="left")
+    for column in ("strategy", "repaired", "consistency", "naturalness", "asks each", "tokens each"):
         table.add_column(column, justify="left" if column == "strategy" else "right", no_wrap=column == "strategy")
-    for c in comparisons:
-        share = f"{100 * c.consistent / c.num_conflicts:.1f} %"
-        distance = "-" if c.text_distance is None else f"{c.text_distance:.3f}"
+    for one in comparisons:
         table.add_row(
-            c.strategy, str(c.repaired), share, distance, f"{c.asks_per_conflict:.2f}", f"{c.tokens_per_conflict:.0f}"
+            one.strategy,
+            str(one.repaired),
+            f"{100 * one.consistency:.1f} %",
+            "-" if one.naturalness is None else f"{100 * one.naturalness:.1f} %",
+            f"{one.asks_per_conflict:.2f}",
+            f"{one.tokens_per_conflict:.0f}",
         )
     return table

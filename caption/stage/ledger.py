@@ -17,7 +17,7 @@ NUM_CARDS = 24
 # Fields of the report that count captions by a word.
 WORDS = (
     "structured", "verdicts_of_first_answers", "verdicts_of_accepted", "labels", "label_from", "judgements",
-    "bilingual", "writing", "evidence_contradictions", "recovered",
+    "structure", "bilingual", "writing", "recovered",
 )  # fmt: skip
 
 
@@ -69,20 +69,20 @@ class CaptionReport(_Record):
     repair: RepairCounts
     judgements: dict[str, int]
     keyframes: KeyframeCounts | None  # None: all windows were taken
+    structure: dict[str, int]
     bilingual: dict[str, int]
     writing: dict[str, int]  # of accepted captions: how the texts were made
-    sentences: dict[str, dict[str, int]]  # of accepted captions: language -> proved, contradicted, unread
-    evidence_contradictions: dict[str, int]
+    values: dict[str, dict[str, int]]  # of all captions: language -> values_filled, _matched, _contradicted
+    contradicted_captions: int
     recovered: dict[str, int]
-    refusals: dict[str, str] = {}  # of dropped windows: reason -> what the server said last
+    refusals: dict[str, str] = {}  # of dropped windows: code -> the last message of the server
     judge_tokens: Usage | None = None
 
     def warnings(self) -> list[str]:
         """Return what a person must know before the captions are used."""
         return [
-            f"{self.windows.dropped[reason]} windows were dropped: {reason} ({words}); --retry-failed asks about them "
-            f"again"
-            for reason, words in self.refusals.items()
+            f"windows were dropped because of {code} ({words}); --retry-failed asks about them again"
+            for code, words in self.refusals.items()
         ]
 
     def as_json(self) -> dict:
@@ -129,7 +129,8 @@ class Ledger:
         self.words = {name: Counter[str]() for name in WORDS}
         self.keyframes: Counter[str] = Counter()
         self.repairs: Counter[str] = Counter()
-        self.sentences: Counter[tuple[str, str]] = Counter()  # language, state
+        self.values: Counter[tuple[str, str]] = Counter()  # language, name of the count
+        self.num_contradicted = 0
         self.refusals: dict[str, str] = {}
         self.tokens: Counter[str] = Counter()
         self.repair_asks: Counter[int] = Counter()
@@ -147,12 +148,11 @@ class Ledger:
             self.windows.kept += 1
             self.words["verdicts_of_accepted"][str(caption.verdict)] += 1
             self.words["writing"][caption.writing] += 1
-            for language, states in (caption.checks.sentences or {}).items():
-                self.sentences.update((language, state) for state in states)
         else:
             self.windows.dropped[str(caption.drop_reason)] += 1
             if caption.checks.refusal is not None:
-                self.refusals[str(caption.drop_reason)] = caption.checks.refusal
+                code, _, words = caption.checks.refusal.partition(": ")
+                self.refusals[code] = words
         repair = caption.repair
         if caption.en is not None:
             self.words["verdicts_of_first_answers"][str(repair.first_verdict if repair else caption.verdict)] += 1
@@ -176,11 +176,13 @@ class Ledger:
             self.keyframes[checks.keyframe.reason] += 1
             self.num_skipped += checks.keyframe.skipped
             self.num_missed += checks.keyframe.missed
-        if isinstance(checks.evidence, list):
-            self.words["evidence_contradictions"].update({problem.partition(":")[0] for problem in checks.evidence})
-            self.words["evidence_contradictions"]["samples"] += 1
-        if checks.bilingual is not None:
-            self.words["bilingual"][checks.bilingual] += 1
+        for language, counts in (checks.values or {}).items():
+            for name, count in counts.model_dump().items():
+                self.values[language, name] += count
+        self.num_contradicted += checks.contradictions is not None
+        for name in ("structure", "bilingual"):
+            if (outcome := getattr(checks, name)) is not None:
+                self.words[name][outcome] += 1
         self.words["recovered"].update(checks.recovered or ())
         self.words["structured"][caption.teacher.structured or "none"] += 1
 
@@ -210,7 +212,8 @@ class Ledger:
                 asks={str(asks): count for asks, count in sorted(self.repair_asks.items())},
             ),
             keyframes=self._keyframes(),
-            sentences=_nested(self.sentences),
+            values=_nested(self.values),
+            contradicted_captions=self.num_contradicted,
             refusals=dict(sorted(self.refusals.items())),
             judge_tokens=judge_tokens,
         )

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from caption.stage.ledger import CaptionReport
-from cosfly.formats.captions import TOKENS, Caption, Language
+from cosfly.formats.captions import TOKENS, Caption, Language, ValueCounts
 from cosfly.formats.frames import frame_name
 from cosfly.formats.places import flight_of
-from cosfly.llm.answer_text import sentences_of
 from cosfly.llm.answers import BudgetConfig
 from cosfly.runtime.io import read_text, write_bytes
 from cosfly.viz.frame_views import thumbnail
@@ -24,7 +23,7 @@ VERDICTS = {  # what it means
     "HARD_CONFLICT": "the flight contradicts the decision",
     "ABSTAIN": "geometry cannot tell",
 }
-STATES = ("proved", "contradicted", "unread")
+VALUES = tuple(ValueCounts.model_fields)
 LANGUAGE_NAMES = {"en": "English", "zh": "Chinese"}
 STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
 
@@ -56,7 +55,7 @@ def page_html(
     teacher = report.teacher
     verdicts = [("First answers", report.verdicts_of_first_answers), ("Accepted captions", report.verdicts_of_accepted)]
     return page(
-        "caption/stage/report.html", title=name, style=STYLE, report=report, meanings=VERDICTS, states=STATES,
+        "caption/stage/report.html", title=name, style=STYLE, report=report, meanings=VERDICTS, values=VALUES,
         who=f"teacher: {teacher.kind}, model {teacher.model}" if teacher else "teacher: none, model unknown",
         is_rules=teacher is not None and teacher.kind == "rules", tiles=_tiles(report), verdicts=verdicts, share=_share,
         language_names=LANGUAGE_NAMES,
@@ -112,9 +111,10 @@ def _checks(report: CaptionReport) -> Rows:
     rows = [(f"label from: {source}", f"{count:,}") for source, count in report.label_from.items()]
     rows += [(f"dropped: {reason}", f"{count:,}") for reason, count in report.windows.dropped.items()]
     rows += [(f"the server, {reason}", words) for reason, words in report.refusals.items()]
+    rows += [(f"structure: {name}", f"{count:,}") for name, count in report.structure.items()]
     rows += [(f"languages: {name}", f"{count:,}") for name, count in report.bilingual.items()]
-    rows += [(f"evidence: {name}", f"{count:,}") for name, count in report.evidence_contradictions.items()]
-    rows += [(f"mended: {name.replace('_', ' ')}", f"{count:,}") for name, count in report.recovered.items()]
+    rows += [("captions with a contradicted value", f"{report.contradicted_captions:,}")]
+    rows += [(f"recovered: {name.replace('_', ' ')}", f"{count:,}") for name, count in report.recovered.items()]
     return rows
 
 
@@ -141,22 +141,17 @@ def _card(caption: Caption, folders: Mapping[str, Path]) -> dict[str, Any]:
         (index, None if folder is None else thumbnail(folder / frame_name(index), PICTURE_WIDTH_PX, jpeg_quality=75))
         for index in caption.window[-5:]
     ]
-    problems = caption.checks.evidence
     return {
         "caption": caption,
         "pictures": pictures,
-        "problems": problems if isinstance(problems, list) else [],
+        "problems": caption.checks.contradictions or [],
         "texts": {"en": _texts(caption, "en"), "zh": _texts(caption, "zh")},
     }
 
 
 def _texts(caption: Caption, language: Language) -> dict[str, Any] | None:
-    """Return sentences, each with what was read of it; None where there is no text."""
+    """Return the texts and the decision; None where there is no text."""
     coc = caption.en if language == "en" else caption.zh
     if coc is None:
         return None
-    states = (caption.checks.sentences or {}).get(language, [])
-    marked: dict[str, list[tuple[str, str]]] = {"C": [], "R": []}
-    for i, (name, text) in enumerate(sentences_of(coc)):
-        marked[name[0]].append((text, states[i] if i < len(states) else ""))
-    return {"critical": marked["C"], "reasoning": marked["R"], "decision": coc.flight_decision}
+    return {"critical": coc.critical_components, "reasoning": coc.reasoning_trace, "decision": coc.flight_decision}

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from caption.answer_formats.contract import Draft, Refused, refuse_decision
-from caption.schema import CaptionConfig, Judged, Strategy, Window
+from caption.schema import CaptionConfig, Strategy, Window
+from caption.stage.reasons import REASONS
 from caption.teachers.foreign import Terms
 from caption.teachers.judge import Case, Judge
 from caption.teachers.prompts import Correction, Question, make_question, prompt_hash
@@ -20,7 +21,7 @@ from caption.teachers.teacher import Teacher, terms_of
 from caption.verification.actions import TABLE, Motion, measure
 from caption.verification.facts import Facts
 from caption.verification.mirror import check_translation
-from caption.verification.references import measured_series
+from caption.verification.values import ValueCheck, measured_lines
 from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import (
     ACTIONS,
@@ -40,6 +41,7 @@ from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.model_json import CONTEXT_FULL
 
 MAX_COMPLAINTS = 8  # named at once
+CONTRADICTED = "contradicted_value"
 
 
 class Prepared(NamedTuple):
@@ -57,7 +59,7 @@ class Prepared(NamedTuple):
 def prepare(windows: Sequence[Window], teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary) -> list[Prepared]:
     """Measure windows and write their questions: each step for all of them, while the processor's caches hold its
     code."""
-    terms = [terms_of(teacher, window.observed.sample_id, cfg, vocabulary) for window in windows]
+    terms = [terms_of(teacher, window.observed.sample_id, cfg) for window in windows]
     questions = [
         make_question(w.observed, cfg.image, t.writing, vocabulary) for w, t in zip(windows, terms, strict=True)
     ]
@@ -103,10 +105,10 @@ async def caption_prepared(
             if not error.is_final:
                 raise
             reason = error.cause
-            if not prepared.terms.is_given:  # else nobody was asked: the file does not hold it
-                loop.checks["refusal"] = error.detail
+            if reason not in REASONS:
+                reason, loop.checks["refusal"] = "refused", str(error)
         except (InputError, RenderError) as error:  # a picture that cannot be read or encoded
-            reason = "unreadable_frame"
+            reason = "unusable_frame"
             loop.checks["frame"] = error.what
     return _record(prepared, teacher, loop, reason)
 
@@ -161,7 +163,7 @@ async def try_strategy(
     """Repair a window's first answer by a strategy; None where that answer is none or is not rejected.
 
     Raises:
-        NoAnswer: the teacher gave none.
+        NoAnswer: the teacher gave none, and asking again later may help.
     """
     repair = cfg.repair.model_copy(update={"strategy": strategy})
     [prepared] = prepare([window], teacher, cfg, vocabulary)
@@ -171,7 +173,13 @@ async def try_strategy(
         return None
     assert loop.english is not None
     first, asked, tokens = loop.english.coc, loop.asks, loop.usage.total
-    last = loop.english.coc if await loop.regenerate(question) is None else None
+    try:
+        reason = await loop.regenerate(question)
+    except NoAnswer as error:  # a teacher without a reason for the label has not repaired the conflict
+        if not error.is_final:
+            raise
+        reason = error.cause
+    last = loop.english.coc if reason is None else None
     return Trial(first, last, loop.verdict, loop.asks - asked, loop.usage.total - tokens)
 
 
@@ -208,13 +216,14 @@ class _Loop:
     async def run(self, question: Question) -> str | None:
         """Ask, verify, repair, mirror; gives the reason to drop the window, None to accept it."""
         reason = await self._attempt(question)
-        if reason == "evidence" and self.cfg.correction_asks:  # once more, with what was measured
+        if reason == CONTRADICTED and self.cfg.correction_asks:  # once more, with what was measured
             assert self.english is not None
+            assert self.answered is not None  # anchored, perhaps
             self._refused.append(reason)
-            complaint = self._facts_against(question.facts)
-            mended = Correction(dump_json(self.english.written), complaint, self.cfg.correction_asks + 1)
+            complaint = self._complaint(question.facts)
+            correction = Correction(dump_json(self.english.written), complaint, self.cfg.correction_asks + 1)
             self.english = self.chinese = None
-            reason = await self._attempt(replace(question, correction=mended))
+            reason = await self._attempt(replace(self.answered, correction=correction))
         if self._recovered:
             self.checks["recovered"] = sorted(self._recovered)
         if self._refused:
@@ -230,15 +239,14 @@ class _Loop:
         elif reason is None:
             self.checks["bilingual"] = "no_chinese"
         if reason is None or (self.terms.is_given and self.english is not None):
-            found = self._check_evidence(question)  # what was given is judged even where its window is dropped
-            reason = reason or found
+            contradicted = self._check_values(question)  # given captions are checked even where they are dropped
+            reason = reason or contradicted
         return reason
 
-    def _facts_against(self, facts: Facts) -> str:
-        """Return what was measured of all that a text states and that is not so."""
-        problems = self.checks["evidence"]
-        named = [line for line in measured_series(facts) if any(line.partition(":")[0] in one for one in problems)]
-        return f"It contradicts the facts: {'; '.join(problems[:MAX_COMPLAINTS])}. Measured: {'; '.join(named)}."
+    def _complaint(self, facts: Facts) -> str:
+        """Return the contradicted values of a text with the measured ones."""
+        problems = self.checks["contradictions"][:MAX_COMPLAINTS]
+        return f"It contradicts the measured facts: {'; '.join(problems)}. Measured: {measured_lines(facts, problems)}."
 
     def drafts(self) -> dict[str, Any]:
         """Return what was written, as fields of the record."""
@@ -266,28 +274,22 @@ class _Loop:
             if answer.complaint or answer.reason == CONTEXT_FULL:
                 break  # of the right structure, and corrected in vain; or there is no room for one
         self.checks["structure"] = "ok" if answer.complaint else answer.reason
-        return answer.reason if answer.complaint else f"structure_{answer.reason}"
+        if answer.complaint or answer.reason == CONTEXT_FULL:
+            return answer.reason
+        return "structure"
 
     async def _answer(self, question: Question) -> Draft | Refused:
-        """Ask, and while the answer is refused for what it says ask for a correction. A wrong structure has no
+        """Ask, and ask for a correction while the content of the answer is refused. A wrong structure has no
         complaint."""
-        taken: Draft | None = None  # which its writer is asked to better
         earlier = question.correction.number if question.correction else 0
         for number in range(self.cfg.correction_asks + 1):
             reply = await self.teacher.ask(question)
             answer = self._draft(reply, question)
-            if isinstance(answer, Draft):
-                if taken is not None or not answer.doubt or number == self.cfg.correction_asks:
-                    return answer
-                taken = answer
-                self._refused.append("unread")
-            elif not answer.complaint:
+            if isinstance(answer, Draft) or not answer.complaint:
                 break
-            else:
-                self._refused.append(answer.reason)
-            complaint = answer.doubt if isinstance(answer, Draft) else answer.complaint
-            question = replace(question, correction=Correction(reply.text, complaint, earlier + number + 1))
-        return taken or answer
+            self._refused.append(answer.reason)
+            question = replace(question, correction=Correction(reply.text, answer.complaint, earlier + number + 1))
+        return answer
 
     def _draft(self, reply: Reply, question: Question) -> Draft | Refused:
         parsed = self._read(reply, "en")
@@ -302,10 +304,8 @@ class _Loop:
         treatment = self.cfg.repair.treatment_of(self.verdict)
         if self.judge is not None and self.verdict in ("HARD_CONFLICT", "SOFT_CONFLICT"):
             treatment = "repair" if await self._is_rejected(question) else "keep"
-        if treatment == "drop":
-            return str(self.verdict).lower()
-        if treatment == "repair" and self.terms.is_given:
-            return "conflict_not_repairable"
+        if treatment == "drop" or (treatment == "repair" and self.terms.is_given):
+            return "conflict"
         return await self.regenerate(question) if treatment == "repair" else None
 
     async def _is_rejected(self, question: Question) -> bool:
@@ -326,21 +326,13 @@ class _Loop:
             self.judgement.overruled_by = "geometry"
         if verdict == "FIX_LABEL" and self.label is not None:
             fixed = replace(self.english, coc=english.model_copy(update={"flight_decision": self.label}))
-            if not self._states_decision(fixed, english, question.facts):
+            if ACTIONS[english.flight_decision].en not in english.reasoning_trace.lower():
                 self.repair = self._repair("fix_label")
                 self.repair.outcome, self.repair.rung = "repaired", "fix_label"
                 self._accept(fixed, question)
                 return False
             self.judgement.overruled_by = "text"
         return verdict != "ACCEPT_ALTERNATIVE" or self.verdict == "HARD_CONFLICT"
-
-    def _states_decision(self, fixed: Draft, before: Coc, facts: Facts) -> bool:
-        """Return whether the text states the decision that it was written for, so that another one would make it a
-        lie."""
-        if ACTIONS[before.flight_decision].en in before.reasoning_trace.lower():
-            return True
-        judged = self.way.judge(fixed, facts, "en")
-        return any(problem.startswith("decision:") for sentence in judged for problem in sentence.problems)
 
     def _repair(self, strategy: str) -> RepairRecord:
         assert self.english is not None
@@ -354,14 +346,14 @@ class _Loop:
         self.repair = self._repair(self.cfg.repair.strategy)
         rungs = _rungs(self.cfg.repair.strategy, self.cfg.repair.max_asks)
         if self.label is None and "anchored" in rungs:
-            return "conflict_without_label"
+            return "no_label"
+        self.repair.outcome = "failed"  # until an answer is taken
         for ask, rung in enumerate(rungs):
             self.repair.asks = ask + 1
             asked = self._reworked(question, rung, rejected, ask)
             answer = await self._answer(asked)
             if isinstance(answer, Refused) and answer.reason == CONTEXT_FULL:
-                self.repair.outcome = "failed"
-                return f"regeneration_{CONTEXT_FULL}"  # not that the teacher cannot
+                return CONTEXT_FULL  # not a failure of the teacher
             if isinstance(answer, Refused) or (asked.decision and answer.coc.flight_decision != asked.decision):
                 continue
             decision = answer.coc.flight_decision
@@ -373,7 +365,6 @@ class _Loop:
                 self._accept(answer, asked)
                 self.repair.outcome, self.repair.rung = "repaired", rung
                 return None
-        self.repair.outcome = "failed"
         return "regeneration_failed"
 
     def _reworked(self, question: Question, rung: str, rejected: str, ask: int) -> Question:
@@ -404,7 +395,7 @@ class _Loop:
                 break
             self.chinese, problem, complaint = answer.draft, answer.reason, answer.complaint
         self.checks["bilingual"] = problem or "ok"
-        return None if problem is None else f"bilingual_{problem}"
+        return None if problem is None else "bilingual"
 
     def _translated(self, english: Draft, chinese: Draft) -> Draft | Refused:
         """Hold what was asked for as a translation against its source; templates have been, and what was given is
@@ -414,40 +405,31 @@ class _Loop:
         found = check_translation(english.coc, chinese.coc)
         return Refused(*found, chinese) if found else chinese
 
-    def _check_evidence(self, question: Question) -> str | None:
-        """Put on record what was found out about every sentence; gives the reason to drop the window."""
+    def _check_values(self, question: Question) -> str | None:
+        """Record the values of both languages; return the reason to drop the window."""
         assert self.english is not None
         drafts: dict[Language, Draft] = {"en": self.english}
         if self.chinese is not None:
             drafts["zh"] = self.chinese
-        judged: dict[Language, list[Judged]] = {
-            language: self.way.judge(draft, question.facts, language) for language, draft in drafts.items()
+        checks: dict[Language, ValueCheck] = {
+            language: self.way.check(draft, question.facts, language) for language, draft in drafts.items()
         }
-        self.checks["sentences"] = {
-            language: [sentence.state for sentence in sentences] for language, sentences in judged.items()
-        }
-        found = [
-            f"{language} {problem}"
-            for language, sentences in judged.items()
-            for sentence in sentences
-            for problem in sentence.problems
-        ]
-        self.checks["evidence"] = found or "ok"
-        drop = self.cfg.evidence.drop
-        return "evidence" if found and (self.terms.writing == "slots" if drop is None else drop) else None
+        self.checks["values"] = {language: check.counts for language, check in checks.items()}
+        contradictions = [f"{language} {text}" for language, check in checks.items() for text in check.contradictions]
+        self.checks["contradictions"] = contradictions or None
+        return CONTRADICTED if contradictions and self.cfg.contradicted_values == "drop" else None
 
     def _read(self, reply: Reply, language: Language) -> Parsed:
         self.asks += 1
         if reply.usage is not None:
             self.usage += reply.usage
         self.structured = reply.structured
-        more = self.terms.fields if language == "en" else tuple(self.way.optional)
-        parsed = parse_answer(reply.text, language, more, reply.finish_reason, self.way.optional)
+        more = self.terms.fields if language == "en" else ()
+        parsed = parse_answer(reply.text, language, more, reply.finish_reason)
         if parsed.reason == CONTEXT_FULL:
             usage = reply.usage or Usage()
-            self.checks["refusal"] = (
-                f"cut: {usage.prompt_tokens} tokens asked and {usage.completion_tokens} answered fill the context"
-            )
+            asked, answered = usage.prompt_tokens, usage.completion_tokens
+            self.checks["refusal"] = f"{CONTEXT_FULL}: {asked} tokens asked and {answered} answered fill the context"
         self._recovered.update(parsed.recovered)
         return parsed
 

@@ -52,7 +52,7 @@ def cut_windows(flight: Track, cfg: WindowConfig, twin: Track | None = None) -> 
         currents, keyframes = [currents[i] for i in chosen], list(chosen.values())
     for current, keyframe in zip(currents, keyframes, strict=True):
         observed = _observe(flight, frames, slice(current - cfg.num_frames + 1, current + 1), folders, files)
-        problem = "missing_frame" if missing.intersection(observed.indices) else None
+        problem = "unusable_frame" if missing.intersection(observed.indices) else None
         if problem is None and order_comes_within(flight.mission, current, cfg.future_frames):
             problem = "order_to_come"
         future = cut_future(flight, motion, current, cfg.future_frames)

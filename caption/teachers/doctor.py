@@ -16,15 +16,15 @@ import cv2
 import httpx
 import numpy as np
 
-from caption.answer_formats.contract import more_fields, way_of
+from caption.answer_formats.contract import THEREFORE
 from caption.schema import CaptionConfig, ObservedWindow, observed_frames
 from caption.teachers.prompts import (
     MAX_RETURNED_CHARACTERS,
     Correction,
     correction_messages,
     make_question,
+    teacher_prompt,
     text_of,
-    way_prompt,
 )
 from caption.verification.vocabulary import Vocabulary
 from cosfly.llm.answer_text import answer_schema
@@ -175,8 +175,7 @@ class _Examination:
         """Send a prompt as long as ours get, with our answer limit and schema."""
         limit, length = self.cfg.endpoint.max_tokens, self.client.context
         messages = largest_messages(self.cfg, self.vocabulary, self._pictures())
-        more = more_fields(way_of(self.cfg.writing, self.vocabulary))
-        schema = answer_schema(more=more) if self.takes_schema else None
+        schema = answer_schema(more=THEREFORE) if self.takes_schema else None
         probe = await self._ask(messages, limit, schema)
         known = f" of {length} that the model holds" if length else ""
         if probe.reply is None:
@@ -225,7 +224,7 @@ def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary, pictures: list[
     question = make_question(window, cfg.image, cfg.writing, vocabulary)
     content = [*pictures, {"type": "text", "text": text_of(question)}]
     messages: list[dict] = [
-        {"role": "system", "content": way_prompt(question.way)},
+        {"role": "system", "content": teacher_prompt(question.way)},
         {"role": "user", "content": content},
     ]
     if not cfg.correction_asks:

@@ -12,12 +12,11 @@ from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from rich.table import Table
 
 from caption.schema import JudgeConfig, Judgement
-from caption.verification.facts import Facts
 from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import Coc, JudgeRecord, Language
 from cosfly.formats.places import flight_of
@@ -50,7 +49,7 @@ class GoldCaption(Record):
 
     id: str
     language: Language
-    facts: Facts
+    facts: dict[str, Any]  # the measured series by name
     label: str
     critical_components: str
     reasoning_trace: str
@@ -202,17 +201,17 @@ def _gold_case(caption: GoldCaption, answer: Coc, kind: str) -> Case:
     facts = caption.facts
 
     def listed(name: str) -> str:
-        return ", ".join("unknown" if value is None else f"{value:g}" for value in getattr(facts, name))
+        return ", ".join("unknown" if value is None else f"{value:g}" for value in facts[name])
 
     flight = (
         f"Velocity: [{listed('speed_mps')}] m/s.\nAltitude: [{listed('altitude_m')}] m.\n"
         f"Yaw against the first frame: [{listed('yaw_deg')}] deg (positive to the left).\n"
         f"Horizontal distance to the target: [{listed('distance_m')}] m, in 3D: [{listed('slant_m')}] m.\n"
-        f"Target ground speed: {facts.target_speed_mps} m/s, change of its direction: {facts.target_turn_deg} deg.\n"
+        f"Target ground speed: {facts['target_speed_mps']} m/s, change of its direction: {facts['target_turn_deg']} deg.\n"
         f"Target's box: widths [{listed('box_width_px')}], heights [{listed('box_height_px')}] px; its offset from the "
         f"image centre: "
-        f"[{listed('offset_x_px')}] px to the right, [{listed('offset_y_px')}] px down, of {facts.width_px} x "
-        f"{facts.height_px}.\nVisibility: [{', '.join(facts.visibility)}]."
+        f"[{listed('offset_x_px')}] px to the right, [{listed('offset_y_px')}] px down, of {facts['width_px']} x "
+        f"{facts['height_px']}.\nVisibility: [{', '.join(facts['visibility'])}]."
     )
     return Case(f"gold_{caption.id}_{kind}_frame_00000", flight, answer, caption.label)
 

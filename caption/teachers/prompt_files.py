@@ -1,7 +1,7 @@
-"""The prompt files: those that ship, or a folder of somebody's own (`caption.prompts`), which is held against them.
+"""The prompt files: those that ship, or a folder of the user's own (`caption.prompts`) with the same names and slots.
 
-Each file begins with a line `# version: ...`; the rest is the prompt, with `$slots` for what is filled in and `$$` for
-a dollar sign.
+Each file begins with a line `# version: ...`; the rest is the prompt, with `$slots` that are filled in and `$$` for a
+dollar sign.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def shipped_prompts() -> dict[str, str]:
 
 
 def own_prompts(folder: Path) -> dict[str, str]:
-    """Read a folder of prompts, in the place of those that ship."""
+    """Read a folder of prompts that replaces those that ship."""
     if not folder.is_dir():
         raise ConfigError(
             "no such folder of prompts",
@@ -61,7 +61,7 @@ def own_prompts(folder: Path) -> dict[str, str]:
 
 
 def _problems(path: Path, text: str) -> Iterator[str]:
-    """Return what is wrong with a file of somebody's own, a line each."""
+    """Yield a message for each problem of a user's prompt file."""
     shipped = shipped_prompts().get(path.stem)
     if shipped is None:
         yield f"{path}: no prompt has this name{nearest(path.stem, shipped_prompts())}"
@@ -78,7 +78,7 @@ def _problems(path: Path, text: str) -> Iterator[str]:
 
 
 def slots_of(text: str) -> list[str]:
-    """Name the slots of a prompt, each once."""
+    """Return the names of the slots of a prompt, each once."""
     return Template(text).get_identifiers()
 
 
@@ -95,7 +95,7 @@ def prompt_format(name: str, vocabulary: Vocabulary) -> str:
 
 
 def export_prompts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
-    """Write prompts into a folder, to begin with; files that stand there already stay."""
+    """Write prompts into a folder as a start. Files that exist there must have the same text."""
     with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     refuse_links(folder)
@@ -110,18 +110,18 @@ def export_prompts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
 
 
 def _is_another(path: Path, text: str) -> bool:
-    """Return whether something else stands where a text is to be written; the text itself may, of an export that was
-    killed."""
+    """Return whether a path exists with another content. The same text can be there from an interrupted export."""
     return path.exists() and not (path.is_file() and read_text(path) == text)
 
 
 def vocabulary_of(cfg: CaptionConfig) -> Vocabulary:
     """Read the prompts that the settings name."""
-    return Vocabulary(shipped_prompts() if cfg.prompts is None else own_prompts(cfg.prompts))
+    prompts = shipped_prompts() if cfg.prompts is None else own_prompts(cfg.prompts)
+    return Vocabulary(prompts, cfg.text_state)
 
 
 def keep_own_prompts(out: Path, vocabulary: Vocabulary) -> list[Path]:
-    """Copy prompts that do not ship next to the captions, so that readers know them; return what was written."""
+    """Write prompts that do not ship next to the captions, so that readers know them; return their paths."""
     texts = {} if vocabulary.prompts == shipped_prompts() else vocabulary.prompts
     paths = [out / OWN_PROMPTS / f"{name}{SUFFIX}" for name in texts]
     if paths:

@@ -1,24 +1,185 @@
 """The embedded rule teacher: deterministic, looks only at the facts measured on the observed frames.
 
-It decides from pixel offset, distances, speeds and visibility, and writes English and Chinese templates, filled as any
-other teacher's are. Wording varies with the sample. Its records say `kind: rules`; it is no model and sees no picture.
+It extrapolates the motion of drone and target to choose a decision, and writes English and Chinese templates whose
+slots are filled as any other teacher's are. A sentence is used only where its condition holds: CONDITIONS names them,
+`rule_sentences.yaml` has the sentences of each. Records say `kind: rules`: it is no model and sees no picture.
 """
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
-from caption.verification.facts import Facts
-from caption.verification.references import QUANTITIES, Fact, find_fact, parse_reference
+from caption.verification.facts import Facts, wrapped
+from caption.verification.references import Fact, find_fact, parse_reference
+from cosfly.formats.segments import MISSION_KINDS
 from cosfly.runtime.config import read_yaml
 
+MODEL = "rules-8"  # its name in the records; counts changes of decisions and wording
 Both = tuple[str, str]  # English, Chinese
+Condition = Callable[[Facts, int], bool]  # of the facts and the side of the decision: 1 left, -1 right, 0 neither
 
-CENTERED_SHARE = 0.02  # of the image width: nearer than this to the middle counts as centred
-BEND_DEG = 15.0  # a change of the walker's heading that is worth a word
+HORIZON_S = 2.5  # over which motion is extrapolated
+LEAST_TURN_DEG, LEAST_CLIMB_M, LEAST_ADVANCE_M = 3.0, 1.0, 1.0  # that call for a manoeuvre
+SHAKEN_M, SHAKEN_GAP_M = 0.4, 1.0  # a larger second difference of altitude, of distance: the track is perturbed
+CLEAR_WALK_MPS, CLEAR_GAP_M = 0.9, 4.0  # less is taken for shaking on a perturbed track
+BEND_DEG = 15.0  # a change of the target's heading that is worth a sentence
+BORDER_SHARE = 0.35  # of the picture's width: farther from the middle is near the border
+SMALL_SHARE, LARGE_SHARE = 0.04, 0.4  # of the picture's height
+STEEP_DEG = 55.0
+NEAR_M, COMING_M = 3.0, 6.0  # from the target to a bystander at its side, to one on the way to it
+MOST_DIFFERENCES = 1  # in appearance, of a person who is similar
+SLOW_MPS, SLIDING_MPS = 0.3, 0.5
+SIDES = (("left", "right"), ("left",), ("right",))  # by the side of the decision
+HIDDEN = ("occluded", "out_of_view")
+
+
+# --- the decision -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Gains:
+    """How much of the extrapolated motion is expected, fitted on training towns.
+
+    Attributes:
+        last_turn, turn, sight: of the turn of the nose in the last step and over its neighbours, and of the turn of the
+            line of sight to the target. bearing: of the target's bearing. climb: of the climb.
+        trend: steps over which the last change of the drone's speed goes on; 0: speeds are those of the whole window.
+        braking: of the last loss of speed, which calls for slowing down.
+        strafe_m, retreat_m, advance_m: extrapolated motion that calls for a strafe, a move backward, a move forward.
+        circle_m, circle_turn_deg, circle_walk: a circle is flown sideways so far and turned so much, round a target
+            that walks less than this share of it.
+        brisk_mps, lag_mps: a drone that flies so fast slows down; one that is so much slower than the target speeds up.
+        hover_mps, hover_walk_mps: the drone hovers where it and the target are slower.
+    """
+
+    last_turn: float
+    turn: float
+    sight: float
+    bearing: float
+    climb: float
+    trend: float
+    braking: float
+    strafe_m: float
+    retreat_m: float
+    advance_m: float
+    circle_m: float
+    circle_turn_deg: float
+    circle_walk: float
+    brisk_mps: float
+    lag_mps: float
+    hover_mps: float
+    hover_walk_mps: float
+
+
+SMOOTH = Gains(
+    last_turn=1.1, turn=0.35, sight=-0.75, bearing=0.0, climb=0.85, trend=2.8, braking=2.5, strafe_m=1.2, retreat_m=1.5,
+    advance_m=1.8, circle_m=7.0, circle_turn_deg=25.0, circle_walk=0.85, brisk_mps=2.8, lag_mps=1.3, hover_mps=0.16,
+    hover_walk_mps=2.5,
+)  # fmt: skip
+SHAKEN = Gains(
+    last_turn=0.0, turn=0.22, sight=0.3, bearing=0.2, climb=0.4, trend=0.0, braking=0.0, strafe_m=1.6, retreat_m=2.0,
+    advance_m=3.2, circle_m=7.0, circle_turn_deg=15.0, circle_walk=1.5, brisk_mps=2.7, lag_mps=3.2, hover_mps=0.28,
+    hover_walk_mps=0.28,
+)  # fmt: skip
+
+
+def is_shaken(f: Facts) -> bool:
+    """Return whether positions jitter from frame to frame, as on the perturbed track."""
+    if "shaken" not in f.found:
+        distances = [distance for distance in f.distance_m if distance is not None]
+        f.found["shaken"] = _jerk(f.altitude_m) > SHAKEN_M or _jerk(distances) > SHAKEN_GAP_M
+    return bool(f.found["shaken"])
+
+
+def _jerk(values: Sequence[float]) -> float:
+    """Return the largest second difference of a series."""
+    return max([abs(a - 2.0 * b + c) for a, b, c in zip(values, values[1:], values[2:], strict=False)], default=0.0)
+
+
+def decide(f: Facts) -> str:
+    """Choose a decision from the observed frames alone."""
+    if f.mission is not None:  # a drone that has turned away already is on the way home
+        return "return_to_home" if f.visibility[-1] == "out_of_view" else "break_off"
+    if not f.is_visible_now:
+        return "search_to_reacquire_target"
+    sizes = expected_sizes(f)
+    for tokens in (("hover",), ("circle_left", "circle_right"), tuple(sizes)):
+        token = max(tokens, key=sizes.__getitem__)
+        if sizes[token] >= 1.0:
+            return token
+    return "track_straight"
+
+
+def expected_sizes(f: Facts) -> dict[str, float]:
+    """Return how much of each manoeuvre the smoothed motion leads to expect; 1.0 is enough to decide for it."""
+    if "sizes" not in f.found:
+        f.found["sizes"] = _expect(f, SHAKEN if is_shaken(f) else SMOOTH)
+    return f.found["sizes"]  # type: ignore[no-any-return]
+
+
+def _expect(f: Facts, g: Gains) -> dict[str, float]:
+    speed_mps, walk_mps, gain_mps = f.speed_mps[-1] or 0.0, f.target_speed_mps or 0.0, 0.0
+    ahead_m, left_m, _ = [axis_mps * HORIZON_S for axis_mps in f.velocity_mps]
+    if g.trend:
+        share = min(2.0, speed_mps / max(0.05, f.mean_speed_mps))
+        ahead_m, left_m = share * ahead_m, share * left_m
+        gain_mps = (f.step_speeds_mps[-1] or 0.0) - (f.step_speeds_mps[-2] or 0.0)
+    turn_deg = _expected_turn_deg(f, g)
+    climb_m = g.climb * (f.climb_mps[-1] or 0.0) * HORIZON_S
+    is_sideways = abs(left_m) > abs(ahead_m)
+    is_calm = abs(turn_deg) < LEAST_TURN_DEG and abs(climb_m) < LEAST_CLIMB_M and walk_mps < g.hover_walk_mps
+    sizes = {
+        "yaw_left_to_follow": turn_deg / LEAST_TURN_DEG,
+        "yaw_right_to_follow": -turn_deg / LEAST_TURN_DEG,
+        "ascend": climb_m / LEAST_CLIMB_M,
+        "descend": -climb_m / LEAST_CLIMB_M,
+        "slow_down": speed_mps / g.brisk_mps - g.braking * min(0.0, gain_mps),
+        "speed_up": (walk_mps - speed_mps) / g.lag_mps,
+        "move_backward": 0.0 if is_sideways else -ahead_m / g.retreat_m,
+        "move_forward": _closing_m(f, ahead_m, left_m) / g.advance_m if ahead_m > LEAST_ADVANCE_M else 0.0,
+        "hover": float(is_calm and speed_mps + g.trend * gain_mps < g.hover_mps),
+    }
+    for side, name in ((1, "left"), (-1, "right")):
+        # A strafe keeps the nose still; a circle turns it back to a target that hardly walks.
+        is_held = is_sideways and side * turn_deg > -LEAST_TURN_DEG
+        is_round = is_sideways and walk_mps * HORIZON_S < g.circle_walk * abs(left_m)
+        is_round = is_round and -side * turn_deg > g.circle_turn_deg
+        sizes[f"strafe_{name}"] = side * left_m / g.strafe_m if is_held else 0.0
+        sizes[f"circle_{name}"] = side * left_m / g.circle_m if is_round else 0.0
+    return sizes
+
+
+def _expected_turn_deg(f: Facts, g: Gains) -> float:
+    pairs = zip(f.yaw_deg, f.bearing_deg, strict=True)
+    sight = [(i, yaw + bearing) for i, (yaw, bearing) in enumerate(pairs) if bearing is not None]
+    sight_dps = _slope(sight) / f.step_s if len(sight) > 2 else 0.0
+    last_dps = (f.yaw_deg[-1] - f.yaw_deg[-2]) / f.step_s
+    turn_dps = g.last_turn * last_dps + g.turn * (f.yaw_rate_dps[-1] or 0.0) + g.sight * sight_dps
+    return turn_dps * HORIZON_S + g.bearing * (f.bearing_deg[-1] or 0.0)
+
+
+def _slope(points: Sequence[tuple[float, float]]) -> float:
+    """Return the slope of the straight line that fits points best."""
+    middle = sum([x for x, _ in points]) / len(points)
+    return sum([(x - middle) * y for x, y in points]) / sum([(x - middle) ** 2 for x, _ in points])
+
+
+def _closing_m(f: Facts, ahead_m: float, left_m: float) -> float:
+    """Return how much nearer the drone comes to the target, as much as is its own doing; 0 where it is not known."""
+    place, walk = f.place_m[-1], f.target_velocity_mps
+    if place is None or walk is None:
+        return 0.0
+    now_m, x, y = math.hypot(place[0], place[1]), place[0] - ahead_m, place[1] - left_m
+    then_m = math.hypot(x + walk[0] * HORIZON_S, y + walk[1] * HORIZON_S)
+    return min(now_m - math.hypot(x, y), now_m - then_m)
+
+
+# --- conditions -------------------------------------------------------------------------------------------------------
 
 
 def word_of(f: Facts, address: str) -> str | None:
@@ -31,349 +192,299 @@ def word_of(f: Facts, address: str) -> str | None:
     return str(fact.value) if isinstance(fact, Fact) else None
 
 
-def describe(f: Facts) -> list[tuple[Both, ...]]:
-    """Return the statements about a window, each as a tuple of wordings; those of the last state different facts."""
-    parts = [_seen(f)]
-    if f.is_legible_now:
-        parts += [_box(f), _position(f)]
-    parts += [_walk(f), _distance(f), _speed(f), _keeping_pace(f), _altitude(f), _yaw(f), _others(f), _more(f)]
-    return [part for part in parts if part]
+def says(address: str, word: str, *conditions: Condition) -> Condition:
+    """Return the condition that a word is true at an address and that other conditions hold."""
+    return lambda f, side: word_of(f, address) == word and all(condition(f, side) for condition in conditions)
 
 
-@cache
-def _wordings() -> dict[str, tuple[Both, ...]]:
-    table = read_yaml(Path(__file__).with_name("statements.yaml"))
-    return {name: tuple((en, zh) for en, zh in pairs) for name, pairs in table.items()}
+def sees(word: str) -> Condition:
+    return lambda f, side: f.visibility[-1] == word
 
 
-def _seen(f: Facts) -> tuple[Both, ...]:
-    return _wordings()["seen" if f.visibility[0] == f.visibility[-1] else "seen_otherwise"]
+def is_smooth(f: Facts, side: int) -> bool:
+    return not is_shaken(f)
 
 
-def _walk(f: Facts) -> tuple[Both, ...]:
-    if f.target_speed_mps is None:
-        return ()
-    if word_of(f, "target_motion") == "standing":
-        return _wordings()["stands"]
-    is_bend = f.target_turn_deg is not None and abs(f.target_turn_deg) >= BEND_DEG
-    return _wordings()["bends" if is_bend else "walks"]
+def is_walk_known(f: Facts, side: int) -> bool:
+    return f.is_visible_now and f.target_speeds_mps[-1] is not None
 
 
-def _box(f: Facts) -> tuple[Both, ...]:
-    if f.box_width_px[-1] is None or f.box_height_px[-1] is None:
-        return ()
-    changes = (
-        f.box_width_px[0] and f.box_height_px[0] and word_of(f, "trend:box_height") in ("increasing", "decreasing")
-    )
-    return _wordings()["box_changes" if changes else "box"]
+def is_walk_known_at_first(f: Facts, side: int) -> bool:
+    return is_walk_known(f, side) and f.target_speeds_mps[0] is not None and not is_shaken(f)
 
 
-def _position(f: Facts) -> tuple[Both, ...]:
-    side = word_of(f, "side:offset_x")
-    return () if side is None else _wordings()["centred" if side == "centred" else "beside"]
+def is_gap_clear(f: Facts, side: int) -> bool:
+    first, last = f.distance_m[0], f.distance_m[-1]
+    return first is not None and last is not None and (not is_shaken(f) or abs(last - first) >= CLEAR_GAP_M)
 
 
-def _course(f: Facts, name: str, en: str, zh: str, first: int = 0) -> tuple[Both, ...]:
-    """State how a quantity went; what it is where it stayed, or where its first value is not known."""
-    trend, values = word_of(f, f"trend:{name}"), QUANTITIES[name].read(f)
-    is_back = trend == "mixed" and values[first] == values[-1]  # "varies, from 20.0 m at t0 to 20.0 m now" says nothing
-    if trend in (None, "steady") or values[first] is None or is_back:
-        return _wordings()[name]
-    return _courses("mixed" if trend == "mixed" else "directed", name, en, zh, first)
+def is_box_known_at_first(f: Facts, side: int) -> bool:
+    return f.box_height_px[0] is not None and not is_shaken(f)
 
 
-@cache
-def _courses(course: str, name: str, en: str, zh: str, first: int) -> tuple[Both, ...]:
-    given = {"name": name, "en": en, "zh": zh, "first": first}
-    return tuple((one.format(**given), other.format(**given)) for one, other in _wordings()[course])
+walks = says("target_motion", "walking", is_walk_known)
+hurries = says("trend:target_speed", "increasing", is_walk_known_at_first)
+centred = says("side:offset_x", "centred")
+gap_opens = says("trend:distance", "increasing", is_gap_clear)
+gap_closes = says("trend:distance", "decreasing", is_gap_clear)
 
 
-def _distance(f: Facts) -> tuple[Both, ...]:
-    return () if f.distance_m[-1] is None else _course(f, "distance", "The horizontal distance", "水平距离")
+def sets_off(f: Facts, side: int) -> bool:
+    return hurries(f, side) and (f.target_speeds_mps[0] or 0.0) < SLOW_MPS
 
 
-def _speed(f: Facts) -> tuple[Both, ...]:
-    return _course(f, "speed", "The drone speed", "无人机速度", first=1)
+def turns(f: Facts, side: int) -> bool:
+    turn_deg = f.target_turn_deg or 0.0
+    return walks(f, side) and not is_shaken(f) and (side * turn_deg if side else abs(turn_deg)) >= BEND_DEG
 
 
-def _keeping_pace(f: Facts) -> tuple[Both, ...]:
-    word = word_of(f, "comparison:speed")
-    if word is None or word_of(f, f"comparison:speed@t{len(f) - 1}") != word:
-        return ()  # the slot compares with the target's last step, and the sentence before it gives the target's mean
-    return _wordings()["pace"]
+def _walk_deg(f: Facts) -> float | None:
+    """Return the angle between the walk and the line of sight, None where it is not clear."""
+    course, bearing = f.target_headings_deg[-1], f.bearing_deg[-1]
+    is_unclear = is_shaken(f) and (f.target_speed_mps or 0.0) < CLEAR_WALK_MPS
+    if course is None or bearing is None or is_unclear or not walks(f, 0):
+        return None
+    return abs(wrapped(course - f.heading_deg[-1] - bearing))
 
 
-def _altitude(f: Facts) -> tuple[Both, ...]:
-    return _course(f, "altitude", "The altitude", "高度")
+def crosses(f: Facts, side: int) -> bool:
+    off_deg, walk = _walk_deg(f), f.target_velocity_mps
+    if off_deg is None or walk is None or side * walk[1] < 0.0 or abs(walk[1]) < SLIDING_MPS:
+        return False
+    return abs(off_deg - 90.0) < (25.0 if is_shaken(f) else 45.0)
 
 
-def _yaw(f: Facts) -> tuple[Both, ...]:
-    return _wordings()["yaw_straight" if word_of(f, "side:yaw") == "straight" else "yaw"]
+def comes(f: Facts, side: int) -> bool:
+    return (_walk_deg(f) or 0.0) > (150.0 if is_shaken(f) else 135.0)
 
 
-def _others(f: Facts) -> tuple[Both, ...]:
-    """Tell of other people, where there are some."""
-    if not f.others_in_view or not f.others_in_view[-1]:
-        return ()
-    alike = () if f.alike_differences[-1] is None else _wordings()["most_alike"]
-    return _wordings()["nearest_other"] + alike + (_wordings()["others"] if f.others_in_view[-1] > 1 else ())
+def walks_away(f: Facts, side: int) -> bool:
+    off_deg = _walk_deg(f)
+    return off_deg is not None and off_deg < 45.0
 
 
-def _more(f: Facts) -> tuple[Both, ...]:
-    """Return statements of which a caption makes one."""
-    is_walking = word_of(f, "target_motion") == "walking" and word_of(f, "target_travelled") is not None
-    known = {
-        "flown": bool(f.travelled_m),
-        "heading": bool(f.travelled_m),
-        "target_walked": is_walking,
-        "depression": bool(f.depression_deg and f.depression_deg[-1] is not None),
-        "slant": f.slant_m[-1] is not None,
-    }
-    return tuple(_wordings()[name][0] for name, is_known in known.items() if is_known)
+def off_centre(f: Facts, side: int) -> bool:
+    return word_of(f, "side:offset_x") in SIDES[side]
 
 
-MODEL = "rules-7"  # its name in the records; counts changes of decisions and wording
-STEPS_AHEAD = 5.0  # the observed trend is taken to hold for the next 2.5 s
-DEGREES_PER_IMAGE_WIDTH = 60.0  # a typical field of view: turns a pixel offset into a bearing
-MIN_TURN_DEG, MIN_CLIMB_M, MIN_GAP_M, MIN_PACE_MPS, STILL_MPS = 3.0, 1.0, 1.0, 0.3, 0.3
+def near_border(f: Facts, side: int) -> bool:
+    return off_centre(f, side) and abs(f.offset_x_px[-1] or 0) > BORDER_SHARE * f.width_px
+
+
+def sight_swings(f: Facts, side: int) -> bool:
+    turn = expected_sizes(f)["yaw_left_to_follow"]
+    return f.is_visible_now and (side * turn if side else abs(turn)) >= 1.0
+
+
+def nose_turns(f: Facts, side: int) -> bool:
+    return not is_shaken(f) and abs(f.yaw_deg[-1]) >= LEAST_TURN_DEG and word_of(f, "side:yaw") in SIDES[side]
+
+
+def slides(f: Facts, side: int) -> bool:
+    ahead_mps, left_mps, _ = f.velocity_mps
+    least_mps = CLEAR_WALK_MPS if is_shaken(f) else SLIDING_MPS
+    return (side * left_mps if side else abs(left_mps)) >= max(least_mps, abs(ahead_mps))
+
+
+def gap_scatters(f: Facts, side: int) -> bool:
+    has_trend = gap_opens(f, 0) or gap_closes(f, 0) or word_of(f, "trend:distance") == "steady"
+    return is_shaken(f) and f.is_visible_now and not has_trend
+
+
+def bystander_closes(f: Facts, side: int) -> bool:
+    is_coming = f.is_visible_now and word_of(f, "trend:other_distance") == "decreasing"
+    return is_coming and (f.other_distance_m[-1] or math.inf) <= COMING_M
 
 
 @dataclass(frozen=True)
-class Cues:
-    """Trends derived from facts; 0.0 where a fact is missing."""
+class Family:
+    """Decisions that are argued alike: their topics are those of `facts` in rule_sentences.yaml.
 
-    offset_share: float  # of the image width, positive to the right
-    last_turn_deg: float
-    last_climb_m: float
-    turn_deg: float  # expected of the next steps, positive to the left
-    climb_m: float
-    gap_m: float  # change of the horizontal distance over the window
-    pace_mps: float  # drone speed less target speed
-    speed_now_mps: float
+    Attributes:
+        tokens: one decision, or the same to the left and to the right.
+        deciding: topics on which the decision rests. more: others that may matter. why: its consequences.
+    """
 
-
-def find_cues(facts: Facts) -> Cues:
-    """Measure what the rules decide by, on the observed frames alone."""
-    dx = facts.offset_x_px[-1] if facts.is_visible_now else None
-    first, last = facts.distance_m[0], facts.distance_m[-1]
-    # The camera follows the line of sight, which is the heading less the target's place in the picture: one shaky frame
-    # moves both and leaves their difference as it is.
-    offsets = facts.offset_x_px if None not in facts.offset_x_px else [0] * len(facts.yaw_deg)
-    degrees = DEGREES_PER_IMAGE_WIDTH / facts.width_px
-    sight_deg = [yaw_deg - degrees * (offset or 0) for yaw_deg, offset in zip(facts.yaw_deg, offsets, strict=True)]
-    speed = facts.speed_mps[-1] or 0.0
-    return Cues(
-        offset_share=0.0 if dx is None else dx / facts.width_px,
-        last_turn_deg=facts.yaw_deg[-1] - facts.yaw_deg[-2],
-        last_climb_m=facts.altitude_m[-1] - facts.altitude_m[-2],
-        turn_deg=STEPS_AHEAD * _slope(sight_deg) - degrees * (dx or 0),
-        climb_m=STEPS_AHEAD * _slope(facts.altitude_m),
-        gap_m=0.0 if first is None or last is None else last - first,
-        pace_mps=0.0 if facts.target_speed_mps is None else speed - facts.target_speed_mps,
-        speed_now_mps=speed,
-    )
+    tokens: tuple[str, ...]
+    deciding: tuple[str, ...]
+    more: tuple[str, ...]
+    why: str = "others"
 
 
-def _slope(values: Sequence[float]) -> float:
-    """Return the change per step of the straight line nearest to a series."""
-    weights, norm = _slope_weights(len(values))
-    return sum([w * v for w, v in zip(weights, values, strict=True)]) / norm
+FAMILIES = {
+    "straight": Family(("track_straight",), ("people", "cover"), ("motion", "place", "gap", "pace", "course"), "straight"),
+    "yaw": Family(
+        ("yaw_left_to_follow", "yaw_right_to_follow"), ("heading", "people", "cover"), ("motion", "place", "gap", "view"), "yaw"
+    ),
+    "circle": Family(("circle_left", "circle_right"), ("drone", "motion"), ("heading", "gap", "place")),
+    "strafe": Family(("strafe_left", "strafe_right"), ("drone", "motion"), ("course", "gap", "place")),
+    "ascend": Family(("ascend",), ("height", "cover"), ("motion", "size", "gap", "place")),
+    "descend": Family(("descend",), ("height", "size"), ("motion", "view", "gap", "place")),
+    "forward": Family(("move_forward",), ("gap", "size"), ("motion", "view", "place", "drone")),
+    "backward": Family(("move_backward",), ("gap", "motion"), ("size", "view", "place", "drone")),
+    "speed_up": Family(("speed_up",), ("pace", "motion"), ("gap", "place", "view", "drone")),
+    "slow_down": Family(("slow_down",), ("pace", "motion"), ("gap", "place", "view", "drone")),
+    "hover": Family(("hover",), ("drone",), ("motion", "place", "gap", "view", "people"), "hover"),
+    "search": Family(("search_to_reacquire_target",), ("view", "cover", "last"), ("drone", "motion"), "lost"),
+    "break_off": Family(("break_off",), ("order",), ("view", "drone", "gap", "motion"), "order"),
+    "home": Family(("return_to_home",), ("order",), ("view", "drone", "gap", "motion"), "order"),
+}  # fmt: skip
+
+
+def expects(family: Family) -> Condition:
+    """Return the condition that the observed frames themselves lead to a decision of a family, on its side."""
+    return lambda f, side: decide(f) == family.tokens[side < 0]
+
+
+def is_ordered(kind: str) -> Condition:
+    return lambda f, side: f.mission == kind
+
+
+# The names by which rule_sentences.yaml refers to conditions.
+CONDITIONS: dict[str, Condition] = {
+    "always": lambda f, side: True,
+    "stands": says("target_motion", "standing", is_walk_known),
+    "sets_off": sets_off, "turns": turns, "crosses": crosses, "comes": comes, "walks_away": walks_away, "walks": walks,
+    "slows": says("trend:target_speed", "decreasing", is_walk_known_at_first),
+    "hurries": hurries,
+    "centred": centred, "off_centre": off_centre, "near_border": near_border, "sight_swings": sight_swings,
+    "swings_through_jitter": lambda f, side: is_shaken(f) and sight_swings(f, side),
+    "on_axis": lambda f, side: centred(f, side) and not sight_swings(f, 0),
+    "gap_steady": says("trend:distance", "steady"),
+    "gap_opens": gap_opens, "gap_closes": gap_closes, "gap_scatters": gap_scatters,
+    "pace_matched": says("comparison:speed", "matching", is_smooth, walks),
+    "outrun": says("comparison:speed", "slower", is_smooth, walks),
+    "overtakes": says("comparison:speed", "faster", is_smooth, walks),
+    "nose_steady": says("side:yaw", "straight", is_smooth),
+    "nose_turns": nose_turns,
+    "drone_hovers": says("drone_motion", "hovering", lambda f, side: (f.speed_mps[-1] or 0.0) < SLOW_MPS),
+    "drone_flies": says("drone_motion", "moving"),
+    "slides": slides,
+    "slides_past": lambda f, side: slides(f, -side),
+    "drone_climbs": says("trend:altitude", "increasing", is_smooth),
+    "drone_sinks": says("trend:altitude", "decreasing", is_smooth),
+    "steep": lambda f, side: (f.depression_deg[-1] or 0.0) >= STEEP_DEG,
+    "small": lambda f, side: 0 < (f.box_height_px[-1] or 0) < SMALL_SHARE * f.height_px,
+    "large": lambda f, side: (f.box_height_px[-1] or 0) > LARGE_SHARE * f.height_px,
+    "grows": says("trend:box_height", "increasing", is_box_known_at_first),
+    "shrinks": says("trend:box_height", "decreasing", is_box_known_at_first),
+    "hidden": sees("occluded"), "out_of_view": sees("out_of_view"), "faint": sees("illegible"),
+    "partly_hidden": sees("partly_occluded"),
+    "cover_closes": says("visibility@t0", "visible", sees("partly_occluded")),
+    "reappeared": lambda f, side: f.is_legible_now and any(word in HIDDEN for word in f.visibility),
+    "stays_hidden": lambda f, side: all(word in HIDDEN for word in f.visibility),
+    "seen_at_first": lambda f, side: not f.is_visible_now and f.distance_m[0] is not None,
+    "bystander_near": lambda f, side: f.is_visible_now and (f.other_distance_m[-1] or math.inf) <= NEAR_M,
+    "bystander_closes": bystander_closes,
+    "similar_near": lambda f, side: f.is_visible_now and f.alike_differences[-1] in range(MOST_DIFFERENCES + 1),
+    **{f"expects_{name}": expects(family) for name, family in FAMILIES.items()},
+    **{kind: is_ordered(kind) for kind in MISSION_KINDS},
+}  # fmt: skip
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Group:
+    """The sentences of one condition. shaken: those of them for a perturbed track."""
+
+    name: str
+    holds: Condition
+    smooth: tuple[Both, ...]
+    shaken: tuple[Both, ...]
+
+
+# Numbers that the shaking of a perturbed track changes more than the motion does.
+_JITTERS = re.compile(
+    r"\{(?:change:|yaw|mean:speed|mean:target|target_|speed|sideways_|(?:altitude|distance|box_height)@)"
+)
 
 
 @cache
-def _slope_weights(count: int) -> tuple[list[float], float]:
-    middle = (count - 1) / 2.0
-    weights = [i - middle for i in range(count)]
-    return weights, sum(w * w for w in weights)
+def sentences() -> dict[str, dict[str, dict[str, Group]]]:
+    """Read the sentences: section -> topic or family -> name of a condition -> its sentences."""
+    table = read_yaml(Path(__file__).with_name("rule_sentences.yaml"))
+    return {
+        section: {part: {name: _group(name, pairs) for name, pairs in groups.items()} for part, groups in parts.items()}
+        for section, parts in table.items()
+    }
 
 
-def decide(facts: Facts) -> str:
-    """Choose an action from the observed frames alone."""
-    return _decided(facts, find_cues(facts))
+def _group(name: str, pairs: Sequence[Sequence[str]]) -> Group:
+    smooth = tuple([(en, zh) for en, zh in pairs])
+    return Group(name, CONDITIONS[name], smooth, tuple([pair for pair in smooth if not _JITTERS.search(pair[0])]))
 
 
-def _decided(facts: Facts, cues: Cues) -> str:
-    # A shaken camera goes up and down, near and far; who climbs or closes in goes one way.
-    turn_deg, climb_m = cues.turn_deg, cues.climb_m if _goes_one_way(facts.altitude_m) else 0.0
-    gap_m = cues.gap_m if _goes_one_way(facts.distance_m) else 0.0
-    if facts.mission is not None:  # who has turned away already is on the way home
-        return "return_to_home" if facts.visibility[-1] == "out_of_view" else "break_off"
-    if not facts.is_visible_now:
-        return "search_to_reacquire_target"
-    if cues.speed_now_mps < STILL_MPS and abs(turn_deg) < MIN_TURN_DEG and abs(climb_m) < MIN_CLIMB_M:
-        return "hover"
-    if abs(turn_deg) >= MIN_TURN_DEG:
-        return "yaw_left_to_follow" if turn_deg > 0 else "yaw_right_to_follow"
-    if abs(climb_m) >= MIN_CLIMB_M:
-        return "ascend" if climb_m > 0 else "descend"
-    if gap_m >= MIN_GAP_M and cues.pace_mps <= -MIN_PACE_MPS:
-        return "speed_up"
-    if gap_m <= -MIN_GAP_M and cues.pace_mps >= MIN_PACE_MPS:
-        return "slow_down"
-    return "track_straight"
+class Chooser:
+    """Chooses by random bytes among sentences that are true of a window."""
+
+    def __init__(self, facts: Facts, draws: bytes) -> None:
+        self.facts, self._draws, self._is_shaken = facts, iter(draws), is_shaken(facts)
+
+    def below(self, count: int) -> int:
+        return next(self._draws) % count
+
+    def holding(self, groups: dict[str, Group], side: int) -> list[Group]:
+        """Return the groups whose condition holds and that have a sentence for this track."""
+        usable = [group for group in groups.values() if group.shaken or not self._is_shaken]
+        return [group for group in usable if group.holds(self.facts, side)]
+
+    def sentence(self, group: Group) -> Both:
+        pairs = group.shaken if self._is_shaken else group.smooth
+        return pairs[self.below(len(pairs))]
 
 
-def _goes_one_way(values: Sequence[float | None]) -> bool:
-    """Return whether a series never turns back; not where a value is unknown."""
-    known = [value for value in values if value is not None]
-    return len(known) == len(values) and known in (sorted(known), sorted(known, reverse=True))
-
-
-def write_templates(facts: Facts, draws: bytes, decision: str | None = None) -> tuple[dict[str, str], dict[str, str]]:
+def write_templates(
+    facts: Facts, draws: bytes, decision: str | None = None
+) -> tuple[dict[str, str], dict[str, str]] | None:
     """Write the English and the Chinese answer, with slots for the facts.
 
     Args:
-        draws: random, one for each sentence (random_bytes).
+        draws: random bytes, at least 24.
         decision: the decision to justify (anchored); None decides freely.
+
+    Returns:
+        None where the observed frames hold no reason for the given decision.
     """
-    cues = find_cues(facts)
-    token = decision or _decided(facts, cues)
-    *statements, conclusion = [
-        options[draw % len(options)] for options, draw in zip([*describe(facts), _CONCLUSIONS], draws, strict=False)
-    ]
-    causes = [*_causes(facts, cues, token), conclusion]
-    texts = [(" ".join([en for en, _ in both]), "".join([zh for _, zh in both])) for both in (statements, causes)]
+    token = decision or decide(facts)
+    side = ("left" in token) - ("right" in token)
+    name = next(name for name, family in FAMILIES.items() if token in family.tokens)
+    choose = Chooser(facts, draws)
+    reasons = choose.holding(sentences()["reasons"][name], side)
+    if not reasons:
+        return None
+    components, trace = _critical_components(choose, name, side), _reasoning_trace(choose, name, reasons)
+    texts = [(" ".join([en for en, _ in both]), "".join([zh for _, zh in both])) for both in (components, trace)]
     english, chinese = [
-        {"critical_components": critical, "reasoning_trace": reasons, "flight_decision": token}
-        for critical, reasons in zip(*texts, strict=True)
+        {"critical_components": critical, "reasoning_trace": reasoning, "flight_decision": token}
+        for critical, reasoning in zip(*texts, strict=True)
     ]
     return english, chinese
 
 
-_CONCLUSIONS: tuple[Both, ...] = (
-    ("Therefore the drone should {decision}.", "因此无人机应{decision}。"),
-    ("The decision that follows is to {decision}.", "由此得出的决策是{decision}。"),
-    ("For this reason the next step is to {decision}.", "基于此，下一步应{decision}。"),
-)
+def _critical_components(choose: Chooser, name: str, side: int) -> list[Both]:
+    """Return the facts on which a decision rests: those that decide it, and others up to three or four."""
+    family, found, num = FAMILIES[name], list[Group](), 3 + choose.below(2)
+    others = list(family.more)
+    for topic in (*family.deciding, *[others.pop(choose.below(len(others))) for _ in family.more]):
+        if len(found) < num:
+            found += choose.holding(sentences()["facts"][topic], side if topic == "heading" else 0)[:1]
+    return [choose.sentence(found.pop(choose.below(len(found)))) for _ in tuple(found)]
 
 
-# --- causes -----------------------------------------------------------------------------------------------------------
+def _reasoning_trace(choose: Chooser, name: str, reasons: list[Group]) -> list[Both]:
+    """Return the reason, mostly what else matters or what follows from it, and the conclusion."""
+    main = reasons.pop(choose.below(len(reasons) if name == "straight" else min(len(reasons), 2)))
+    remarks = choose.holding(sentences()["remarks"]["any"], 0)
+    consequences = [sentences()["consequences"][FAMILIES[name].why]["always"]]
+    second = (remarks[:1] or consequences, reasons[:1] or consequences, consequences, [])[choose.below(4)]
+    return [choose.sentence(group) for group in (main, *second, _conclusions(name))]
 
 
-def _causes(f: Facts, cues: Cues, token: str) -> list[Both]:
-    """Return the reasons for a decision that the facts hold, else its general reason, which claims nothing measurable."""
-    found = [wording for wording in (cause(f, cues) for cause in _EVIDENCE.get(token, ())) if wording]
-    return found[:2] or [_GENERAL[token]]
-
-
-# Of a decision for which the facts hold no reason; claims nothing measurable.
-_GENERAL: dict[str, Both] = {
-    "track_straight": ("The present course keeps the target in frame.", "当前航向可使目标保持在画面内。"),
-    **dict.fromkeys(("yaw_left_to_follow", "yaw_right_to_follow"), ("The line of sight to the target calls for a correction of the heading.", "对准目标的视线需要修正航向。")),
-    **dict.fromkeys(("circle_left", "circle_right"), ("A view from another side of the target keeps it well in frame.", "换一侧观察目标有利于将其保持在画面内。")),
-    "ascend": ("A higher viewpoint keeps a free line of sight to the target.", "更高的视点可保持对目标的通畅视线。"),
-    "descend": ("A lower viewpoint shows the target at a better scale.", "更低的视点可让目标尺度更合适。"),
-    "move_forward": ("Closing in keeps the target at a useful scale.", "靠近目标可保持合适的尺度。"),
-    "move_backward": ("More room keeps the target and its surroundings in frame.", "留出更多空间可将目标与周围环境保持在画面内。"),
-    **dict.fromkeys(("strafe_left", "strafe_right"), ("A sideways shift keeps the target framed without a turn.", "侧向移动可在不转向的情况下保持目标构图。")),
-    **dict.fromkeys(("slow_down", "speed_up"), ("The pace has to fit that of the target.", "飞行节奏需要与目标相适应。")),
-    "search_to_reacquire_target": ("Contact with the target has to be secured.", "需要确保与目标保持联系。"),
-    "hover": ("Holding the present position keeps the target in frame.", "保持当前位置可使目标留在画面内。"),
-    "break_off": ("The mission ends the pursuit here.", "任务要求在此结束跟踪。"),
-    "return_to_home": ("The mission calls the drone back.", "任务要求无人机返回。"),
-}  # fmt: skip
-
-Cause = Callable[[Facts, Cues], Both | None]
-_TREND = {1: "increasing", -1: "decreasing"}
-
-
-def _offset(side: int, f: Facts, c: Cues) -> Both | None:
-    if -side * c.offset_share < CENTERED_SHARE:
-        return None
-    return (
-        "The target lies {offset_x} {side:offset_x} of the image centre.",
-        "目标在画面中心{side:offset_x}侧 {offset_x}处。",
-    )
-
-
-def _turn(side: int, f: Facts, c: Cues) -> Both | None:
-    if side * c.last_turn_deg < 0.5 or side * f.yaw_deg[-1] < 1.0:
-        return None
-    return (
-        "To keep the target in the image, the nose has turned {yaw} to the {side:yaw}.",
-        "为跟踪目标，机头已向{side:yaw}转动 {yaw}。",
-    )
-
-
-def _bend(side: int, f: Facts, c: Cues) -> Both | None:
-    if f.target_turn_deg is None or side * f.target_turn_deg < BEND_DEG:
-        return None
-    return (
-        "The target bends to the {side:target_heading}, and the nose should follow.",
-        "目标向{side:target_heading}转弯，机头应跟踪。",
-    )
-
-
-def _climb(side: int, f: Facts, c: Cues) -> Both | None:
-    if word_of(f, "trend:altitude") != _TREND[side] or side * c.last_climb_m <= 0:
-        return None
-    return (
-        "The altitude {trend:altitude} to {altitude} over the observed frames.",
-        "观测期间高度{trend:altitude}到 {altitude}。",
-    )
-
-
-def _gap(side: int, f: Facts, c: Cues) -> Both | None:
-    if side * c.gap_m < 0.5 or word_of(f, "trend:distance") != _TREND[side]:
-        return None
-    return (
-        "The horizontal distance has {trend:distance} to {distance} over the observed frames.",
-        "观测期间水平距离已{trend:distance}到 {distance}。",
-    )
-
-
-def _pace(side: int, f: Facts, c: Cues) -> Both | None:
-    if side * c.pace_mps < MIN_PACE_MPS or word_of(f, "comparison:speed") != ("faster" if side > 0 else "slower"):
-        return None
-    return (
-        "With {speed} the drone is {comparison:speed} the target with {mean:target_speed}.",
-        "无人机速度 {speed}，{comparison:speed}目标的 {mean:target_speed}。",
-    )
-
-
-def _steady(f: Facts, c: Cues) -> Both | None:
-    if not f.is_legible_now or word_of(f, "side:offset_x") != "centred" or abs(c.last_turn_deg) >= 1.0:
-        return None
-    return ("The target is {side:offset_x} in the image.", "目标在画面中{side:offset_x}。")
-
-
-def _lost(f: Facts, c: Cues) -> Both | None:
-    if f.is_visible_now:
-        return None
-    return ("The target is {visibility}, so the tracking needs a change.", "目标{visibility}，因此需要应对。")
-
-
-def _standing(f: Facts, c: Cues) -> Both | None:
-    if word_of(f, "target_motion") != "standing":
-        return None
-    return ("The target {target_motion}, so there is nothing to follow.", "目标{target_motion}，因此不需跟踪。")
-
-
-_ORDERS: dict[str, Both] = {
-    "geofence": ("The border of the permitted area ends the pursuit here.", "允许飞行区域的边界使跟踪到此为止。"),
-    "battery": ("The battery is down to the reserve for the way home.", "电池电量已降至返航储备。"),
-    "time_over": ("The time of the mission is over.", "任务时间已到。"),
-}
-
-
-def _order(f: Facts, c: Cues) -> Both | None:
-    return None if f.mission is None else _ORDERS[f.mission]
-
-
-_EVIDENCE: dict[str, tuple[Cause, ...]] = {
-    "track_straight": (_steady,),
-    "yaw_left_to_follow": (partial(_offset, 1), partial(_turn, 1), partial(_bend, 1)),
-    "yaw_right_to_follow": (partial(_offset, -1), partial(_turn, -1), partial(_bend, -1)),
-    "ascend": (partial(_climb, 1),),
-    "descend": (partial(_climb, -1),),
-    "speed_up": (partial(_gap, 1), partial(_pace, -1)),
-    "slow_down": (partial(_gap, -1), partial(_pace, 1)),
-    "move_forward": (partial(_gap, 1),),
-    "move_backward": (partial(_gap, -1),),
-    "strafe_left": (partial(_offset, 1), partial(_bend, 1)),
-    "strafe_right": (partial(_offset, -1), partial(_bend, -1)),
-    "hover": (_standing,),
-    "search_to_reacquire_target": (_lost,),
-    "break_off": (_order,),
-    "return_to_home": (_order,),
-}
+@cache
+def _conclusions(name: str) -> Group:
+    """Return the conclusions that fit a family of decisions: its own, and those that fit all."""
+    parts = sentences()["conclusions"]
+    pairs = tuple([pair for part in (name, "any") if part in parts for pair in parts[part]["always"].smooth])
+    return Group(name, CONDITIONS["always"], pairs, pairs)

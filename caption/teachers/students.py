@@ -17,7 +17,7 @@ import numpy as np
 from caption.answer_formats.contract import Draft
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import Terms
-from caption.teachers.prompts import Question, decision_words, system_prompt
+from caption.teachers.prompts import Question, decision_words, student_prompt
 from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import Language, Prompt
 from cosfly.llm.answer_text import answer_schema
@@ -78,14 +78,14 @@ def check_prompts(taught: ChatFormat, folder: Path, vocabulary: Vocabulary) -> N
         raise ConfigError("the student was taught no English", where=folder, got=", ".join(taught.prompts))
     for language, prompt in taught.prompts.items():
         template = vocabulary.templates[f"user_{language}"]
-        if prompt.system != system_prompt(language, vocabulary) or not _is_of_template(
+        if prompt.system != student_prompt(language, vocabulary) or not _is_of_template(
             prompt.user, language, taught, template
         ):
             raise ConfigError(
                 "the student was taught another version of the prompt", where=f"{folder}: {language}",
                 got=prompt.user[:80],
-                fix="ask it with the prompts (caption.prompts) and the version of cosfly that captioned its training "
-                "set, or train it anew",
+                fix="ask it with the prompts (caption.prompts, caption.text_state) and the version of cosfly that "
+                "captioned its training set, or train it again",
             )  # fmt: skip
 
 

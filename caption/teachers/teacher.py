@@ -13,27 +13,25 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager, nullcontext
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from pydantic_core import to_json
 
-from caption.answer_formats.contract import Draft, more_fields, way_of
+from caption.answer_formats.contract import THEREFORE, Draft
 from caption.schema import CaptionConfig, ImageConfig
 from caption.teachers.foreign import FileTeacher, StudentTeacher, Terms
 from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import Question, mirror_messages, question_messages
 from caption.teachers.rules import MODEL, write_templates
 from caption.teachers.students import TaughtStudent
-from caption.verification.vocabulary import Vocabulary
-from cosfly.formats.captions import TeacherRecord, TeacherSettings, Writing
+from cosfly.formats.captions import TeacherRecord, TeacherSettings
 from cosfly.formats.places import flight_of
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.answers import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, AnswerBook, Budget, KeptAnswers
 from cosfly.llm.client import ChatClient
-from cosfly.llm.contract import Engine, Reply, Request, Troubles
+from cosfly.llm.contract import Engine, NoAnswer, Reply, Request, Troubles
 from cosfly.llm.student_chat import EncodedImage
 from cosfly.llm.vllm_engine import VllmEngine
 from cosfly.runtime.seeding import random_bytes, rng_for
@@ -63,25 +61,31 @@ class RuleTeacher:
         self.seed = seed
         settings = TeacherSettings(seed=seed)
         self.record = TeacherRecord(kind="rules", model=MODEL, settings=settings, structured="native")
-        self._last: tuple[str, tuple[dict[str, str], dict[str, str]]] | None = None
+        self._last_key = ""
+        self._last_answers: tuple[dict[str, str], dict[str, str]] | None = None
 
     def _answers(self, question: Question) -> tuple[dict[str, str], dict[str, str]]:
+        """Return the English and the Chinese answer.
+
+        Raises:
+            NoAnswer: no observed fact supports the given decision.
+        """
         # Corrections have the same answer: the Chinese of `mirror` is of the question alone.
         key = f"{question.window.sample_id}/{replace(question, correction=None).purpose}"
-        if self._last is None or self._last[0] != key:
+        if self._last_key != key:
             draws = random_bytes(self.seed, "caption", key)
-            self._last = (
-                key,
-                write_templates(question.facts, draws, question.decision),
-            )
-        return self._last[1]
+            self._last_key, self._last_answers = key, write_templates(question.facts, draws, question.decision)
+        if self._last_answers is None:
+            raise NoAnswer("no_reason", f"no observed fact supports {question.decision}", is_final=True)
+        return self._last_answers
 
     async def ask(self, question: Question) -> Reply:
-        english = self._answers(question)[0]
+        english, _ = self._answers(question)
         return _native(english | {"therefore": english["flight_decision"]})
 
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply:
-        return _native(self._answers(question)[1])
+        _, chinese = self._answers(question)
+        return _native(chinese)
 
 
 def _native(answer: dict[str, str]) -> Reply:
@@ -190,9 +194,7 @@ class AskingTeacher:
             frames = await self.frames.pictures(question)
             request = self.student.mirror_request(question, english, frames, ask)
         else:
-            optional = question.way.optional.items()
-            more = {name: schema for name, schema in optional if name in english.written}
-            schema = answer_schema(english.coc.flight_decision, "zh", more)
+            schema = answer_schema(english.coc.flight_decision, "zh")
             messages = mirror_messages(english, question.way, complaint)
             request = self.cfg.request(messages, [], schema, sampling_seed(self.seed, sample_id, purpose))
         return await self._kept_answer(question, request, purpose)
@@ -212,7 +214,7 @@ class AskingTeacher:
             return self.student.request(question, await self.frames.pictures(question), question.ask)
         messages, digests = await self.frames.messages(question)
         seed = sampling_seed(self.seed, question.window.sample_id, question.purpose)
-        schema = answer_schema(question.decision, more=more_fields(question.way))
+        schema = answer_schema(question.decision, more=THEREFORE)
         return self.cfg.request(messages, digests, schema, seed)
 
 
@@ -253,15 +255,10 @@ def open_teacher(
     return AskingTeacher(cfg, book, seed, budget, only, troubles)
 
 
-def terms_of(teacher: Teacher, sample_id: str, cfg: CaptionConfig, vocabulary: Vocabulary) -> Terms:
+def terms_of(teacher: Teacher, sample_id: str, cfg: CaptionConfig) -> Terms:
     """Return the terms under which a teacher answers for a window."""
     if isinstance(teacher, FileTeacher | StudentTeacher):
         return teacher.terms(sample_id)
     if isinstance(teacher, AskingTeacher) and teacher.student is not None:
         return teacher.student.terms
-    return _asked_terms(cfg.writing, vocabulary)
-
-
-@lru_cache
-def _asked_terms(writing: Writing, vocabulary: Vocabulary) -> Terms:
-    return Terms(writing, tuple(more_fields(way_of(writing, vocabulary))))
+    return Terms(cfg.writing, tuple(THEREFORE))

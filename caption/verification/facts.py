@@ -1,56 +1,82 @@
-"""What can be measured on an observed window: the series from which prompts, slots, claims and the reader of prose take
+"""What can be measured on an observed window: the one table from which prompts, slots and the check of values take
 every fact.
 
-Values are rounded here, once, as they are printed, so that text and check compare the same numbers. How a single fact
-is named and
-looked up: references.py.
+Values are rounded here, once, as they are printed, so that a text and its check compare the same numbers. How a single
+fact is named and looked up: references.py.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate, pairwise
 from typing import Any, Literal
 
+import numpy as np
+
 from caption.schema import ObservedFrame, ObservedWindow
 
 VisibilityWord = Literal["visible", "partly_occluded", "illegible", "occluded", "out_of_view"]
+Series = Sequence[float | None]
 STANDING_MPS = 0.2  # slower than this a person stands
 PARTLY_BELOW = 0.7  # rendered score under which a visible person counts as partly hidden
+SMOOTHED_OVER = 2  # frames before and after one that its velocity is fitted to
+SMOOTH_M, SMOOTH_DEG = 0.15, 1.0  # a track that deviates by more from a parabola is perturbed
+LEAST_SEEN = 3  # frames at which the target is seen, for a velocity of it
 
 
 @dataclass(frozen=True)
 class Facts:
-    """Measured series, oldest frame first; None where a value cannot be measured, () where a series was not.
+    """Measured series, oldest frame first; None where a value cannot be measured.
 
-    Of the drone: speed_mps is |p_i - p_(i-1)| / dt in 3D; the oldest frame has no earlier one in the window, so its
-    value is None and the prompt prints 0.0, as the paper's sample does. altitude_m: world z. yaw_deg: against the
-    oldest frame; heading_deg: in the world, 0 along x, in (-180, 180]; both positive to the left. pitch_deg: of the
-    camera. travelled_m, displacement_m: way and straight line from the oldest frame.
-    Of the target: target_speed_mps is the mean over the window, target_speeds_mps each step's; target_turn_deg: change
-    of its heading between the first and the last step, target_headings_deg each step's, positive to the left;
-    target_travelled_m: its way on the ground from the oldest frame.
-    Between them: distance_m is horizontal, slant_m in 3D, height_over_target_m from the person's hip; bearing_deg:
-    where the person is, against the drone's heading, positive to the left; depression_deg: of the line of sight below
-    the horizon.
-    mission: the kind of the order that ends the pursuit, once it stands.
+    What is measured of the target is None at frames in which it is hidden or out of view. A velocity is the slope of
+    the straight line that fits positions best: of up to five neighbouring frames, or of the whole window where the
+    track jitters, so that a perturbation is not told as motion. The axes of the drone are those of the current frame:
+    forward along its heading, left, up.
+
+    Of the drone: speed_mps, 3D; velocity_mps (forward, left, up) over the whole window; mean_speed_mps its length;
+    altitude_m: world z; yaw_deg: against the oldest frame; yaw_rate_dps, climb_mps: slopes; heading_deg: in the world,
+    0 along x, in (-180, 180]; both positive to the left; pitch_deg: of the camera; travelled_m, displacement_m: path
+    length and straight line from the oldest frame.
+    Of the target: target_speeds_mps, on the ground; target_velocity_mps (forward, left) over the whole window;
+    target_speed_mps its length; target_turn_deg: change of its heading over the window; target_headings_deg: positive
+    to the left; target_travelled_m: straight line on the ground from the oldest frame.
+    Between them: place_m (forward, left, up): from the drone to the target; distance_m is horizontal, slant_m in 3D,
+    height_over_target_m from the person's hip; bearing_deg: of the target, against the drone's heading, positive to the
+    left; depression_deg: of the line of sight below the horizon.
+    mission: the kind of the order that ends the pursuit, once it is given.
     Of other people: others_in_view, how many have a pixel; other_distance_m, from the target to the nearest of them;
-    alike_differences, in how many things, of figure, top, legs, hat and bag, who looks most like the target differs.
-    In the picture of width_px x height_px, in its pixels: the target's box and its middle's offset from the image
+    alike_differences, in how many things, of figure, top, legs, hat and bag, the most similar person differs.
+    In the picture of width_px x height_px, in its pixels: the target's box and the offset of its centre from the image
     centre, positive to the right and down.
+    step_speeds_mps, target_step_speeds_mps: from each frame to the next, as the paper's state has them.
     """
 
     speed_mps: tuple[float | None, ...]
+    velocity_mps: tuple[float, float, float]
+    mean_speed_mps: float
     altitude_m: tuple[float, ...]
+    climb_mps: tuple[float | None, ...]
     yaw_deg: tuple[float, ...]
+    yaw_rate_dps: tuple[float | None, ...]
+    heading_deg: tuple[float, ...]
     pitch_deg: tuple[float, ...]
-    distance_m: tuple[float | None, ...]
-    slant_m: tuple[float | None, ...]
+    travelled_m: tuple[float, ...]
+    displacement_m: tuple[float, ...]
+    target_speeds_mps: tuple[float | None, ...]
+    target_velocity_mps: tuple[float, float] | None
     target_speed_mps: float | None
     target_turn_deg: float | None
+    target_headings_deg: tuple[float | None, ...]
+    target_travelled_m: tuple[float | None, ...]
+    place_m: tuple[tuple[float, float, float] | None, ...]
+    distance_m: tuple[float | None, ...]
+    slant_m: tuple[float | None, ...]
+    height_over_target_m: tuple[float | None, ...]
+    bearing_deg: tuple[float | None, ...]
+    depression_deg: tuple[float | None, ...]
     box_width_px: tuple[int | None, ...]
     box_height_px: tuple[int | None, ...]
     offset_x_px: tuple[int | None, ...]
@@ -58,37 +84,31 @@ class Facts:
     visibility: tuple[VisibilityWord, ...]
     width_px: int
     height_px: int
-    step_s: float = 0.5
-    heading_deg: tuple[float, ...] = ()
-    travelled_m: tuple[float, ...] = ()
-    displacement_m: tuple[float, ...] = ()
-    target_speeds_mps: tuple[float | None, ...] = ()
-    target_headings_deg: tuple[float | None, ...] = ()
-    target_travelled_m: tuple[float | None, ...] = ()
-    height_over_target_m: tuple[float | None, ...] = ()
-    bearing_deg: tuple[float | None, ...] = ()
-    depression_deg: tuple[float | None, ...] = ()
-    mission: str | None = None
-    others_in_view: tuple[int | None, ...] = ()
-    other_distance_m: tuple[float | None, ...] = ()
-    alike_differences: tuple[int | None, ...] = ()
+    step_s: float
+    mission: str | None
+    others_in_view: tuple[int | None, ...]
+    other_distance_m: tuple[float | None, ...]
+    alike_differences: tuple[int | None, ...]
+    step_speeds_mps: tuple[float | None, ...] = ()
+    target_step_speeds_mps: tuple[float | None, ...] = ()
 
     def __len__(self) -> int:
         return len(self.yaw_deg)
 
     @property
     def is_visible_now(self) -> bool:
-        """Return whether nothing hides the person: what labels go by, as the flight was planned."""
+        """Return whether nothing hides the target. Labels depend on this."""
         return self.visibility[-1] in ("visible", "partly_occluded", "illegible")
 
     @property
     def is_legible_now(self) -> bool:
-        """Return whether somebody could see the person in the picture: what claims of sight go by."""
+        """Return whether a person could see the target in the picture. Statements about its appearance depend on
+        this."""
         return self.visibility[-1] in ("visible", "partly_occluded")
 
     @cached_property
     def found(self) -> dict[Any, Any]:
-        """What references.py has looked up so far; several languages and checks ask for the same facts."""
+        """The facts that were looked up (references.py): several languages and checks ask for the same ones."""
         return {}
 
 
@@ -96,109 +116,206 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
     """Measure a window. Reads nothing but the window.
 
     Args:
-        picture_px: (width, height) of the pictures that are shown, which pixels refer to; None: the camera's own.
+        picture_px: (width, height) of the pictures that are shown, to which pixels refer; None: the camera's own.
     """
-    width_px, height_px = picture_px or (window.width_px, window.height_px)
+    camera_px = (window.width_px, window.height_px)
+    picture_px = picture_px or camera_px
     frames = window.frames
-    camera_px, picture_px = (window.width_px, window.height_px), (width_px, height_px)
-    altitude, pitch, heading, distance, slant, height, bearing, depression, *seen, visibility = zip(
+    count = len(frames)
+    altitude, pitch, heading, *measured, visibility = zip(
         *[_measure_frame(frame, camera_px, picture_px) for frame in frames], strict=True
     )
-    box_width, box_height, offset_x, offset_y = seen
-    steps_s, turns_deg, flown, speed, walked, walked_m, walking_mps, walking, course = zip(
-        *[_measure_step(before, after) for before, after in pairwise(frames)], strict=True
-    )
-    start = frames[0].position_m
+    distance, slant, height, bearing, depression, box_width, box_height, offset_x, offset_y = measured
+    xs, ys, zs = zip(*[frame.position_m for frame in frames], strict=True)
+    seen = tuple([distance_m is not None for distance_m in distance])
+    step_s = (frames[-1].time_s - frames[0].time_s) / (count - 1)
+    turns_deg = [wrapped(after.rotation_deg[1] - before.rotation_deg[1]) for before, after in pairwise(frames)]
+    yaw_deg = [0.0, *accumulate(turns_deg)]
+    is_known = (True,) * count
+    velocities = list(zip(*_velocities((xs, ys, zs), is_known, step_s, SMOOTH_M), strict=True))
+    yaw_rad = math.radians(frames[-1].rotation_deg[1])
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    v_x, v_y, v_z = (_slope(axis, is_known, step_s) for axis in (xs, ys, zs))
+    steps_m = [math.dist(before.position_m, after.position_m) for before, after in pairwise(frames)]
     return Facts(
-        speed_mps=(None, *speed),
+        speed_mps=_rounded([math.hypot(*velocity) for velocity in velocities], 2),
+        velocity_mps=(_round(v_x * cos + v_y * sin, 2), _round(v_y * cos - v_x * sin, 2), _round(v_z, 2)),
+        mean_speed_mps=_round(math.hypot(v_x, v_y, v_z), 2),
         altitude_m=altitude,
-        yaw_deg=(0.0, *[round(a, 1) + 0.0 for a in accumulate(turns_deg)]),
+        climb_mps=_rounded([velocity[2] for velocity in velocities], 2),
+        yaw_deg=tuple([_round(angle, 1) for angle in yaw_deg]),
+        yaw_rate_dps=_rounded(_velocities((yaw_deg,), is_known, step_s, SMOOTH_DEG)[0], 1),
+        heading_deg=heading,
         pitch_deg=pitch,
+        travelled_m=(0.0, *[_round(way, 1) for way in accumulate(steps_m)]),
+        displacement_m=tuple([_round(math.dist(frames[0].position_m, frame.position_m), 1) for frame in frames]),
+        **_measure_target(frames, seen, step_s, cos, sin),
         distance_m=distance,
         slant_m=slant,
-        target_speed_mps=_rounded([sum(walking_mps) / len(walking_mps)], 2)[0],
-        target_turn_deg=_turn_deg(walked[0], walked[-1], min(walking_mps[0], walking_mps[-1])),
+        height_over_target_m=height,
+        bearing_deg=bearing,
+        depression_deg=depression,
         box_width_px=box_width,
         box_height_px=box_height,
         offset_x_px=offset_x,
         offset_y_px=offset_y,
         visibility=visibility,
-        width_px=width_px,
-        height_px=height_px,
-        step_s=round(sum(steps_s) / len(steps_s), 3),
-        heading_deg=heading,
-        travelled_m=(0.0, *[round(way, 1) for way in accumulate(flown)]),
-        displacement_m=tuple([round(math.dist(start, frame.position_m), 1) for frame in frames]),
-        target_speeds_mps=(None, *walking),
-        target_headings_deg=(None, *course),
-        target_travelled_m=(0.0, *_rounded(accumulate(walked_m), 1)),
-        height_over_target_m=height,
-        bearing_deg=bearing,
-        depression_deg=depression,
+        width_px=picture_px[0],
+        height_px=picture_px[1],
+        step_s=round(step_s, 3),
         mission=window.mission,
         others_in_view=_whole([frame.others_in_view for frame in frames]),
         other_distance_m=_rounded([frame.other_distance_m for frame in frames], 1),
         alike_differences=_whole([frame.alike_differences for frame in frames]),
+        step_speeds_mps=(None, *_rounded([step_m / step_s for step_m in steps_m], 2)),
     )
 
 
-@lru_cache(maxsize=64)  # five windows of a flight share a frame
+def _measure_target(
+    frames: Sequence[ObservedFrame], seen: tuple[bool, ...], step_s: float, cos: float, sin: float
+) -> dict[str, Any]:
+    """Measure where the target is and how it moves, at the frames at which it is seen.
+
+    Args:
+        cos, sin: of the drone's heading at the current frame.
+    """
+    xs, ys, _ = zip(*[frame.target_m for frame in frames], strict=True)
+    places = []
+    for frame, is_seen in zip(frames, seen, strict=True):
+        away_x, away_y, away_z = (b - a for a, b in zip(frame.position_m, frame.target_m, strict=True))
+        place = (away_x * cos + away_y * sin, away_y * cos - away_x * sin, away_z)
+        places.append((_round(place[0], 1), _round(place[1], 1), _round(place[2], 1)) if is_seen else None)
+    # The paper's state has the speed from frame to frame.
+    steps_mps = [
+        math.hypot(xs[i] - xs[i - 1], ys[i] - ys[i - 1]) / step_s if seen[i] and seen[i - 1] else math.nan
+        for i in range(1, len(frames))
+    ]
+    first = seen.index(True) if any(seen) else 0
+    travelled = [math.hypot(x - xs[first], y - ys[first]) for x, y in zip(xs, ys, strict=True)]
+    motion: dict[str, Any] = {
+        "place_m": tuple(places),
+        "target_step_speeds_mps": (None, *_rounded(steps_mps, 2)),
+        "target_travelled_m": tuple(
+            [_round(way, 1) if is_seen else None for way, is_seen in zip(travelled, seen, strict=True)]
+        ),
+    }
+    nothing = (None,) * len(frames)
+    if sum(seen) < LEAST_SEEN:
+        return motion | {
+            "target_speeds_mps": nothing, "target_headings_deg": nothing,
+            "target_velocity_mps": None, "target_speed_mps": None, "target_turn_deg": None,
+        }  # fmt: skip
+    v_x, v_y = _slope(xs, seen, step_s), _slope(ys, seen, step_s)
+    velocities = list(zip(*_velocities((xs, ys), seen, step_s, SMOOTH_M), strict=True))
+    speeds = [math.hypot(*velocity) for velocity in velocities]
+    headings = [
+        math.degrees(math.atan2(y, x)) if speed > STANDING_MPS else math.nan  # NaN is not larger either
+        for (x, y), speed in zip(velocities, speeds, strict=True)
+    ]
+    known = [heading for heading in headings if heading == heading]
+    return motion | {
+        "target_speeds_mps": _rounded(speeds, 2),
+        "target_headings_deg": _rounded(headings, 1),
+        "target_velocity_mps": (_round(v_x * cos + v_y * sin, 2), _round(v_y * cos - v_x * sin, 2)),
+        "target_speed_mps": _round(math.hypot(v_x, v_y), 2),
+        # The heading of someone who stands is noise.
+        "target_turn_deg": _round(wrapped(known[-1] - known[0]), 1) if len(known) == sum(seen) else None,
+    }
+
+
+@lru_cache(maxsize=256)
+def _slope_weights(known: tuple[bool, ...], at: int | None) -> tuple[float, ...]:
+    """Return the weights whose sum with a series is the slope, per step, of the straight line that fits it best.
+
+    Args:
+        known: frames that may be used. at: the frame whose neighbours are used; None: all frames.
+    """
+    near = [i for i, is_known in enumerate(known) if is_known and (at is None or abs(i - at) <= SMOOTHED_OVER)]
+    if len(near) < 2 or (at is not None and not known[at]):
+        return (math.nan,) * len(known)
+    middle = sum(near) / len(near)
+    norm = sum((i - middle) ** 2 for i in near)
+    return tuple((i - middle) / norm if i in near else 0.0 for i in range(len(known)))
+
+
+def _slope(values: Sequence[float], known: tuple[bool, ...], step_s: float, at: int | None = None) -> float:
+    """Return the slope of a series in units per second; NaN where it is not known."""
+    weights = _slope_weights(known, at)
+    return sum([w * v for w, v in zip(weights, values, strict=True) if w]) / step_s
+
+
+def _velocities(
+    axes: Sequence[Sequence[float]], known: tuple[bool, ...], step_s: float, smooth: float
+) -> list[list[float]]:
+    """Return the slope of each axis at each frame, NaN where the frame is not known.
+
+    Args:
+        smooth: the largest root mean square deviation from a parabola, in units of the axes, at which neighbouring
+            frames tell the velocity; beyond it every frame has that of the whole window.
+    """
+    places = range(len(known))
+    if _deviation(axes, known) > smooth:
+        return [[_slope(axis, known, step_s) if known[at] else math.nan for at in places] for axis in axes]
+    return [[_slope(axis, known, step_s, at) for at in places] for axis in axes]
+
+
+def _deviation(axes: Sequence[Sequence[float]], known: tuple[bool, ...]) -> float:
+    """Return the root mean square deviation of a path from the parabolas that fit its axes best."""
+    residuals = _parabola_residuals(known)
+    near = [i for i, is_known in enumerate(known) if is_known]
+    total = 0.0
+    for axis in axes:
+        values = [axis[i] for i in near]
+        total += sum([sum([w * v for w, v in zip(row, values, strict=True)]) ** 2 for row in residuals])
+    return math.sqrt(total / len(near))
+
+
+@lru_cache(maxsize=256)
+def _parabola_residuals(known: tuple[bool, ...]) -> list[list[float]]:
+    """Return the matrix that maps the values at known frames to their deviations from the parabola that fits them."""
+    near = np.array([i for i, is_known in enumerate(known) if is_known], dtype=float)
+    basis = np.vander(near - near.mean(), 3)
+    return (np.eye(len(near)) - basis @ np.linalg.pinv(basis)).tolist()
+
+
+@lru_cache(maxsize=64)  # five windows of a track share a frame
 def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px: tuple[int, int]) -> tuple[Any, ...]:
-    """Measure what one frame tells.
+    """Measure one frame.
 
     Returns:
-        altitude, pitch, heading, distance, slant, height over the target, bearing, depression, the box's width and
-        height, its middle's
-        offset to the right and down, the word for visibility: as the facts have them.
+        altitude, pitch, heading, distance, slant, height over the target, bearing, depression, width and height of the
+        box, offset of its centre to the right and down, the word for visibility: as the facts have them.
     """
     (x, y, z), (u, v, w), (pitch, heading, _) = frame.position_m, frame.target_m, frame.rotation_deg
+    drone = (_round(z, 1), _round(pitch, 1), _round(wrapped(heading), 1))
+    word = _word(frame)
+    if u != u or word in ("occluded", "out_of_view"):
+        return (*drone, *(None,) * 9, word)
     # + 0.0: no negative zero, which is equal to zero here and another direction to atan2
     away_x, away_y, away_z = u - x + 0.0, v - y + 0.0, w - z + 0.0
     distance = math.hypot(away_x, away_y)
-    slant = math.sqrt(away_x * away_x + away_y * away_y + away_z * away_z)
+    slant = math.hypot(distance, away_z)
     bearing = wrapped(math.degrees(math.atan2(away_y, away_x)) - heading)
     depression = math.degrees(math.atan2(-away_z, distance))
-    own = (round(z, 1) + 0.0, round(pitch, 1) + 0.0, round(wrapped(heading), 1) + 0.0)
     return (
-        *own,
+        *drone,
         *_rounded((distance, slant, -away_z, bearing, depression), 1),
         *_measure_picture(frame, camera_px, picture_px),
-        _word(frame),
+        word,
     )
 
 
 def _measure_picture(
     frame: ObservedFrame, camera_px: tuple[int, int], picture_px: tuple[int, int]
 ) -> tuple[int | None, ...]:
-    """Measure the target in the picture: its box's width and height, its offset from the middle to the right and
-    down."""
+    """Measure the target in the picture: width and height of its box, offset of its centre to the right and down."""
     (width_px, height_px), (u, v) = picture_px, frame.target_uv
     x_scale, y_scale = width_px / camera_px[0], height_px / camera_px[1]
     left, top, right, bottom = frame.target_bbox
     left, top, right, bottom = left * x_scale, top * y_scale, right * x_scale, bottom * y_scale
-    # The middle of the box is where the person is seen; uv (the hip) stands in where a tree has no box.
+    # The centre of the box is where the person is seen; uv (the hip) replaces it where a tree has no box.
     u, v = (u * x_scale, v * y_scale) if left != left else ((left + right) / 2.0, (top + bottom) / 2.0)
     return _whole([right - left, bottom - top, u - width_px / 2.0, v - height_px / 2.0])
-
-
-@lru_cache(maxsize=64)
-def _measure_step(before: ObservedFrame, after: ObservedFrame) -> tuple[Any, ...]:
-    """Measure what happened between two frames.
-
-    Returns:
-        time in s, turn in degrees, way in m, speed as the facts have it; of the target: (x, y) walked, way, speed, and
-        as the facts have them speed and heading.
-    """
-    step_s = after.time_s - before.time_s
-    (x0, y0, _), (x1, y1, _) = before.target_m, after.target_m
-    x, y = x1 - x0, y1 - y0
-    way_m, flown_m = math.hypot(x, y), math.dist(before.position_m, after.position_m)
-    walking_mps = way_m / step_s
-    turn_deg = wrapped(after.rotation_deg[1] - before.rotation_deg[1])
-    # NaN is not larger either
-    heading_deg = round(math.degrees(math.atan2(y, x)), 1) + 0.0 if walking_mps > STANDING_MPS else None
-    speed, walking = _rounded((flown_m / step_s, walking_mps), 2)
-    return step_s, turn_deg, flown_m, speed, (x, y), way_m, walking_mps, walking, heading_deg
 
 
 def wrapped(angle_deg: float) -> float:
@@ -206,20 +323,16 @@ def wrapped(angle_deg: float) -> float:
     return (angle_deg + 180.0) % 360.0 - 180.0
 
 
+def _round(value: float, digits: int) -> float:
+    return round(value, digits) + 0.0  # no negative zero
+
+
 def _rounded(values: Iterable[float], digits: int) -> tuple[float | None, ...]:
     return tuple([None if v != v else round(v, digits) + 0.0 for v in values])  # NaN is not equal to itself
 
 
-def _whole(values: list[float]) -> tuple[int | None, ...]:
+def _whole(values: Sequence[float]) -> tuple[int | None, ...]:
     return tuple([None if v != v else round(v) for v in values])
-
-
-def _turn_deg(first: tuple[float, float], last: tuple[float, float], slowest_mps: float) -> float | None:
-    """Heading change of the target; None where it stands (a heading of no motion is noise) or is unknown."""
-    (x0, y0), (x1, y1) = first, last
-    if not slowest_mps > STANDING_MPS or x0 != x0 or x1 != x1:
-        return None
-    return round(math.degrees(math.atan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1)), 1) + 0.0
 
 
 def _word(frame: ObservedFrame) -> VisibilityWord:

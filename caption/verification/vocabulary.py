@@ -1,4 +1,4 @@
-"""The prompts of a run, and the words of both languages that they quote."""
+"""The prompts of a run, and the terms whose translation is fixed."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from string import Template
 
-from caption.verification.glossary import load_glossary, term_pattern
+from caption.schema import TextState
+from caption.verification.glossary import LANGUAGES, load_glossary, term_pattern
 from cosfly.formats.captions import ACTIONS
 
-# Terms that a translation must have besides the names of the actions: English -> Chinese.
+# Terms with a fixed translation, in addition to the names of the actions: English -> Chinese.
 TERMS = {
     "target": "目标",
     "pedestrian": "行人",
@@ -30,20 +31,28 @@ TERMS = {
 
 @dataclass(frozen=True, eq=False)
 class Vocabulary:
-    """prompts: name of a prompt file -> its text, with its version line.
+    """The prompts of a run.
 
-    Hashed by identity, so that caches of what is worked out of it are fast.
+    Hashed by identity, so that caches of its prompts are fast.
+
+    Args:
+        prompts: name of a prompt file -> its text, with its version line.
+        text_state: which flight data the questions contain.
     """
 
     prompts: Mapping[str, str]
+    text_state: TextState = "relative"
 
     @cached_property
     def templates(self) -> dict[str, Template]:
-        """The prompts without their version lines."""
-        return {name: Template(text.partition("\n")[2].rstrip("\n")) for name, text in self.prompts.items()}
+        """The prompts without their version lines; `user_en` and `user_zh` are those of the text state."""
+        templates = {name: Template(text.partition("\n")[2].rstrip("\n")) for name, text in self.prompts.items()}
+        if self.text_state == "paper":
+            templates |= {f"user_{language}": templates[f"user_paper_{language}"] for language in LANGUAGES}
+        return templates
 
     def quoted(self) -> str:
-        """Return names, words and terms as lines for a translation prompt."""
+        """Return the fixed translations as lines of a prompt."""
         names = [(action.en, action.zh) for action in ACTIONS.values()]
         return "\n".join(f"{en} = {zh}" for en, zh in [*names, *load_glossary().pairs(), *TERMS.items()])
 

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from caption.answer_formats.contract import Draft, more_fields
+from caption.answer_formats.contract import THEREFORE, Draft
 from caption.schema import CaptionConfig, ObservedWindow, observed_frames
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.prompts import Question, make_question
@@ -184,8 +184,8 @@ class PromptedEngine:
 
     def _read(self, text: str, question: Question, answer_s: float | None, finish_reason: str | None) -> EngineDecision:
         """Return the decision of an answer. Its words are the reasons with their slots filled, or the raw text."""
-        more = {} if self.cfg.student.folder is not None else more_fields(question.way)
-        parsed = parse_answer(text, more=tuple(more), finish_reason=finish_reason, optional=question.way.optional)
+        more = () if self.cfg.student.folder is not None else tuple(THEREFORE)
+        parsed = parse_answer(text, more=more, finish_reason=finish_reason)
         if parsed.coc is None:
             answer: Answer = "invalid" if parsed.reason == NO_SET else "unreadable"
             return EngineDecision(answer, None, text[:MOST_WORDS], answer_s)
@@ -269,6 +269,6 @@ class LocalEngine(PromptedEngine):
             sample_id=window.sample_id, window_id=window.sample_id, run="", town=window.town,
             trajectory=window.trajectory, variant=window.variant, walk="", window=window.indices, language="en",
             views=pictures.views, picture_px=pictures.size_px, depth_range_m=pictures.depth_range_m,
-            prompt=question.asked["en"], answer="", decision="", label=None, contradicted=None, proved=None,
-            repair=None, weight=1.0,
+            prompt=question.asked["en"], answer="", decision="", label=None, contradicted=None,
+            values_contradicted=None, repair=None, weight=1.0,
         )  # fmt: skip

@@ -18,8 +18,6 @@ FIELDS = ("critical_components", "reasoning_trace", "flight_decision")
 Language = Literal["en", "zh"]
 TeacherKind = Literal["rules", "endpoint", "vllm", "file", "student"]
 Writing = Literal["slots", "prose"]
-Modality = Literal["observed", "predicted", "hypothetical"]
-SentenceState = Literal["proved", "contradicted", "unread"]
 Verdict = Literal["CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN"]
 # The motion from which a label follows: that of a clean track itself (flight), of the clean twin, of a perturbed track
 # without the recorded offsets, or of the perturbed track itself if none are recorded; such a label is noisy.
@@ -109,7 +107,7 @@ def not_in_set(token: object, where: object) -> InputError:
 
 
 OWN_PROMPTS = "prompts"  # folder next to `captions.jsonl` with prompts that are not part of cosfly
-QUESTIONS = ("user_en", "user_zh")  # the prompts that ask about a window
+QUESTIONS = ("user_en", "user_zh", "user_paper_en", "user_paper_zh")  # the prompts that ask about a window
 GOAL_WORDS: dict[Language, str] = {"en": "Goal: follow %s.", "zh": "任务：跟踪%s。"}  # one line of a prompt
 GOAL_BEGINS = tuple(words.partition("%s")[0] for words in GOAL_WORDS.values())
 PICTURES_MARK = "<pictures>"  # replaced in a prompt by the sentence about the pictures
@@ -201,50 +199,44 @@ class KeyframeRecord(Record, frozen=False):
 Pixels = Annotated[int, Field(ge=1, le=1 << 20)]
 
 
-class Claim(BaseModel):
-    """One statement of a sentence.
-
-    sentence: `C1` is the first of critical_components, `R1` the first of reasoning_trace. quantity: With its aspect
-    (`distance`, `trend:speed`), or `decision`. at: `t4` or `t0-t4`; None: the current frame, or the whole window. unit:
-    Such as m, mps, deg. quote: The words of the statement in the sentence.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    sentence: str
-    quantity: str
-    at: str | None = None
-    value: Annotated[float, Field(strict=True)] | str  # strict: true is not 1.0
-    unit: str | None = None
-    modality: Modality = "observed"
-    quote: _Omitted[str] = None
-
-
 class Template(Record):
-    """The two texts of an answer with slots in place of facts. claims: Claims of the words outside slots."""
+    """The two texts of an answer with slots in place of facts."""
 
     critical_components: str
     reasoning_trace: str
-    claims: _Omitted[list[Claim]] = None
+
+
+class ValueCounts(Record):
+    """The values of a caption in one language: numbers with a unit, and relations that fill slots.
+
+    values_filled: Filled from the facts, and therefore right. values_matched: Written by the teacher and equal to a
+    fact of the same unit, perhaps of another quantity. values_contradicted: Equal to none. Nothing else of the text is
+    checked.
+    """
+
+    values_filled: int = 0
+    values_matched: int = 0
+    values_contradicted: int = 0
 
 
 class Evidence(Record):
-    """The evidence for the states of a caption's sentences: the column `evidence` of a release.
+    """The evidence for the checks of a caption: the column `evidence` of a release.
 
-    slots: Templates of the texts. problems: Contradictions. contradicted: Decisions that the track contradicts.
+    slots: Templates of the texts. contradictions: Contradicted values. contradicted: Decisions that the track
+    contradicts.
     """
 
     slots: _Omitted[dict[Language, Template]] = None
-    problems: list[str] = Field([])
+    contradictions: list[str] = Field([])
     contradicted: list[str] = Field([])
 
 
 class Checks(Record, frozen=False):
     """Results of the checks of a caption.
 
-    structure, bilingual: `ok` or a reason. refused: Why answers of the right structure were refused. evidence: `ok` or
-    the contradictions. sentences: By language, the state of each sentence of both texts, in order. contradicted:
-    Decisions that the track contradicts. recovered: Fixes of the text of the answers. frame: The problem of a picture.
+    structure, bilingual: `ok` or a reason. refused: Why answers of the right structure were refused. values: Counts of
+    values by language. contradictions: A message for each contradicted value. contradicted: Decisions that the track
+    contradicts. recovered: Fixes of the text of the answers. frame: The problem of a picture.
     refusal: The message of a server that refused the window, or the reason why it cut the answer.
     """
 
@@ -252,8 +244,8 @@ class Checks(Record, frozen=False):
     structure: _Omitted[str] = None
     refused: _Omitted[list[str]] = None
     bilingual: _Omitted[str] = None
-    evidence: _Omitted[Literal["ok"] | list[str]] = None
-    sentences: _Omitted[dict[Language, list[SentenceState]]] = None
+    values: _Omitted[dict[Language, ValueCounts]] = None
+    contradictions: _Omitted[list[str]] = None
     contradicted: _Omitted[list[str]] = None
     recovered: _Omitted[list[str]] = None
     frame: _Omitted[str] = None
@@ -299,13 +291,9 @@ class Caption(BaseModel):
 
     @property
     def evidence(self) -> Evidence:
-        problems = self.checks.evidence if isinstance(self.checks.evidence, list) else []
-        return Evidence(slots=self.slots, problems=problems, contradicted=self.checks.contradicted or [])
-
-    def coverage(self, language: Language) -> float | None:
-        """Return the share of a language's sentences that are supported; None if none was checked."""
-        states = (self.checks.sentences or {}).get(language)
-        return states.count("proved") / len(states) if states else None
+        checks = self.checks
+        contradictions = checks.contradictions or []
+        return Evidence(slots=self.slots, contradictions=contradictions, contradicted=checks.contradicted or [])
 
 
 def line_of(caption: Caption) -> bytes:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
 
 from cosfly.formats.captions import BY_LETTERS, FIELDS, TOKENS, Coc, Language
 from cosfly.runtime.model_json import find_object
@@ -63,14 +62,13 @@ class Parsed:
     """A checked answer.
 
     coc: The answer; None if its structure is wrong. reason: The problem then. recovered: Wrappings that were removed.
-    therefore: The action in that field, if the prompt asks for it. more: The other further fields, unchecked.
+    therefore: The action in that field, if the prompt asks for it.
     """
 
     coc: Coc | None
     reason: str | None = None
     recovered: tuple[str, ...] = ()
     therefore: str | None = None
-    more: Mapping[str, Any] = field(default_factory=dict)
 
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
@@ -90,7 +88,6 @@ def parse_answer(
     language: Language = "en",
     more: Collection[str] = (),
     finish_reason: str | None = None,
-    optional: Collection[str] = (),
 ) -> Parsed:
     """Check the structure of a raw answer (phase 3 of sec:appendix_e).
 
@@ -100,13 +97,11 @@ def parse_answer(
     Args:
         more: Names of the further fields that the prompt asks for.
         finish_reason: Why the model stopped, if it is known.
-        optional: Fields of `more` that an answer may omit.
     """
     names = (*FIELDS, *more)
     answer = find_object(text, names, finish_reason)
     if (value := answer.value) is None:
         return Parsed(None, answer.reason, answer.recovered)
-    names = tuple(name for name in names if name in value or name not in optional)
     if len(value) != len(names) or not all(map(value.__contains__, names)):
         return Parsed(None, "missing_field" if set(names) - value.keys() else "extra_field", answer.recovered)
     texts = [value[name] for name in FIELDS]
@@ -123,8 +118,7 @@ def parse_answer(
     therefore = normalize_action(stated) if isinstance(stated, str) else None
     if therefore is None and "therefore" in names:
         return Parsed(None, "therefore_not_in_closed_set", recovered)
-    others = {name: value[name] for name in names if name not in (*FIELDS, "therefore")}
-    return Parsed(Coc(**cleaned | {"flight_decision": action}), None, recovered, therefore, others)
+    return Parsed(Coc(**cleaned | {"flight_decision": action}), None, recovered, therefore)
 
 
 def _problem_of(texts: Mapping[str, str], language: Language) -> str | None:

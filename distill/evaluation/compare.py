@@ -155,7 +155,7 @@ def _mismatches(reports: Names) -> list[str]:
 _TABLE = (
     *("parsed", "bertscore_precision", "bertscore_recall", "bertscore_f1", "accuracy", "accuracy_parsed", "macro_f1"),
     *("accuracy_settled", "drawn_ahead"),
-    *("consistent", "hard_conflict", "proved", "contradicted", "tokens"),
+    *("consistent", "hard_conflict", "values_matched", "values_contradicted", "tokens"),
 )
 
 

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.formats.captions import FIELDS, TOKENS, Coc, Language, SentenceState, read_captions
+from cosfly.formats.captions import FIELDS, TOKENS, Coc, Language, ValueCounts, read_captions
 from cosfly.formats.episodes import Figure
 from cosfly.formats.predictions import FAILED, Prediction, Split
 from cosfly.geometry.trajectory_metrics import draw_pedestrians
@@ -80,7 +80,7 @@ REPORT, REPORT_FORMAT = "report.json", FileFormat("cosfly.distill_report", "3.0"
 STAGE = "distill.evaluate"
 STUDENT = "student"
 UNPARSED_NAME = "(unparsed)"  # column of the confusion table beside the decisions
-SentenceStates = Mapping[str, Sequence[SentenceState]]  # sample's key -> states of the student's sentences
+JudgedValues = Mapping[str, ValueCounts]  # sample's key -> values of the student's text
 TextScorer = Callable[[Sequence[tuple[str, str]]], np.ndarray]  # (candidate, reference) -> (n, 3)
 
 
@@ -125,7 +125,7 @@ class Evaluation(Record):
     seed: int
     not_asked: int
     metrics: dict[Language, Metric | None]  # None: BERTScore was not computed
-    judged: bool  # whether the student's sentences were judged
+    judged: bool  # whether the values of the student's texts were compared with the facts
     speed: Speed
     languages: dict[Language, Measurement]
     all: Measurement
@@ -160,8 +160,8 @@ def pair_up(samples: Sequence[Sample], predictions: Sequence[Prediction]) -> lis
     return [(sample, by_key[sample.key]) for sample in samples if sample.key in by_key]
 
 
-def read_judged(paths: Sequence[Path], samples: Iterable[Sample]) -> SentenceStates:
-    """Read what `cosfly caption --teacher student:` found out about a student's sentences: sample's key -> states.
+def read_judged(paths: Sequence[Path], samples: Iterable[Sample]) -> JudgedValues:
+    """Read the values that `cosfly caption --teacher student:` counted in a student's texts, by the sample's key.
 
     Args:
         paths: one file a tree.
@@ -169,19 +169,19 @@ def read_judged(paths: Sequence[Path], samples: Iterable[Sample]) -> SentenceSta
     keys: dict[str, dict[str, str]] = {}  # window and language -> run -> sample's key
     for sample in samples:
         keys.setdefault(f"{sample.window_id}/{sample.language}", {})[sample.run] = sample.key
-    found: dict[str, Sequence[SentenceState]] = {}
+    found: dict[str, ValueCounts] = {}
     for path, caption in ((file, caption) for file in paths for caption in read_captions(file)):
         where, kind = f"{path}: {caption.sample_id}", caption.teacher.kind
         if kind != "student":
             fix = "give what cosfly caption --teacher student:PREDICTIONS wrote"
             raise InputError("these are no captions of a student", where=where, got=kind, fix=fix)
-        for language, states in (caption.checks.sentences or {}).items():
+        for language, counts in (caption.checks.values or {}).items():
             by_run = keys.get(f"{caption.sample_id}/{language}", {})
             if caption.teacher.run is None and len(by_run) > 1:
                 got, fix = ", ".join(sorted(by_run)), "caption each tree with --set caption.student.run=NAME"
                 raise InputError("several trees have a window of this name", where=where, got=got, fix=fix)
             of_run = by_run.values() if caption.teacher.run is None else filter(None, [by_run.get(caption.teacher.run)])
-            found |= dict.fromkeys(of_run, states)
+            found |= dict.fromkeys(of_run, counts)
     return found
 
 
@@ -193,7 +193,7 @@ def text_of(coc: Coc | None) -> str:
 
 
 def score_language(
-    pairs: Sequence[tuple[Sample, Prediction]], floors: Floors, scorer: TextScorer | None, judged: SentenceStates
+    pairs: Sequence[tuple[Sample, Prediction]], floors: Floors, scorer: TextScorer | None, judged: JudgedValues
 ) -> dict[str, Scores]:
     """Score the student and the floors on the samples of one language: who -> scores."""
     samples = [sample for sample, _ in pairs]

@@ -65,7 +65,7 @@ def _notes(report: Evaluation) -> list[str]:
     notes = [f"intervals: {report.confidence:.0%}, {report.resamples} draws of {report.all.walks} walks", *report.notes]
     notes += metric_lines(report)
     if not report.judged:
-        notes.append("sentences were not judged: give --judged what cosfly caption --teacher student: wrote")
+        notes.append("no values were checked: give --judged what cosfly caption --teacher student: wrote")
     if speed.samples_per_s is not None:
         notes.append(f"its last start answered for {speed.seconds:.1f} s, {speed.samples_per_s:.2f} samples/s")
     if speed.latency_s is not None:

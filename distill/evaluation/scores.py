@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cosfly.formats.captions import TOKENS, Coc, SentenceState, Verdict, not_in_set, verdict_on
+from cosfly.formats.captions import TOKENS, Coc, ValueCounts, Verdict, not_in_set, verdict_on
 from cosfly.formats.episodes import Figure
 from cosfly.formats.predictions import FAILED, Prediction
 from cosfly.geometry.trajectory_metrics import draw_pedestrians, figure_of_draws, interval_of
@@ -32,7 +32,7 @@ SCORES = "scores.parquet"
 CONFIDENCE = 0.95  # level of the intervals
 REFERENCE_DIGITS = 16  # of a digest of 64
 VERDICTS: tuple[Verdict, ...] = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
-STATES: tuple[SentenceState, ...] = ("proved", "contradicted", "unread")
+VALUES = ("values_matched", "values_contradicted")  # of a student's text
 UNPARSED = -2  # the number of the decision that an answer without one makes
 NONE = -1  # the number of a label or verdict that nobody knows
 _VERDICT = {name: number for number, name in enumerate(VERDICTS)}
@@ -60,8 +60,8 @@ class Scores:
     key, walk, language (n,) str; against (n,) str, a digest of what
     the answer is held against; reference, answer, label (n,) int8 numbers of decisions, UNPARSED, NONE; answered,
     unmended (n,) bool; drawn_ahead (n,) 1, 0, or NaN where it is not known; verdict (n,) int8 number of VERDICTS or
-    NONE; precision, recall, f1 (n,) of BERTScore, NaN where it was not computed; proved, contradicted, unread (n,)
-    numbers of sentences, NaN where nobody judged them; num_tokens (n,).
+    NONE; precision, recall, f1 (n,) of BERTScore, NaN where it was not computed; values_matched,
+    values_contradicted (n,): numbers of values, NaN where nobody compared them; num_tokens (n,).
     """
 
     key: np.ndarray
@@ -78,9 +78,8 @@ class Scores:
     precision: np.ndarray
     recall: np.ndarray
     f1: np.ndarray
-    proved: np.ndarray
-    contradicted: np.ndarray
-    unread: np.ndarray
+    values_matched: np.ndarray
+    values_contradicted: np.ndarray
     num_tokens: np.ndarray
 
     def __len__(self) -> int:
@@ -121,13 +120,13 @@ def score_answers(
     samples: Sequence[Sample],
     answers: Sequence[ScoredAnswer],
     texts: np.ndarray | None = None,
-    judged: Mapping[str, Sequence[SentenceState]] | None = None,
+    judged: Mapping[str, ValueCounts] | None = None,
 ) -> Scores:
     """Score answers, one a sample.
 
     Args:
         texts: (n, 3) precision, recall, F1 of BERTScore, NaN where it was not computed.
-        judged: sample's key -> its sentences' states.
+        judged: sample's key -> the values of the student's text.
     """
     verdicts = []
     for sample, answer in zip(samples, answers, strict=True):
@@ -140,9 +139,9 @@ def score_answers(
     is_answered = np.array([answer.is_answered for answer in answers], dtype=bool)
     bert = np.where(is_answered[:, None], np.nan if texts is None else texts, np.nan) * np.ones((1, 3))
     found = [(judged or {}).get(sample.key) for sample in samples]
-    sentences = {
-        state: np.array([np.nan if states is None else list(states).count(state) for states in found], dtype=float)
-        for state in STATES
+    values = {
+        name: np.array([np.nan if counts is None else getattr(counts, name) for counts in found], dtype=float)
+        for name in VALUES
     }
     return Scores(
         key=np.array([sample.key for sample in samples], dtype=object),
@@ -160,7 +159,7 @@ def score_answers(
         recall=bert[:, 1],
         f1=bert[:, 2],
         num_tokens=np.array([a.num_tokens for a in answers], dtype=np.int64),
-        **sentences,
+        **values,
     )
 
 
@@ -234,12 +233,11 @@ FIGURES: dict[str, str] = {
     "bertscore_recall": "BERTScore recall",
     "bertscore_f1": "BERTScore F1",
     "bertscore_f1_parsed": "BERTScore F1, parsed answers",
-    "proved": "sentences that the geometry proves",
-    "contradicted": "sentences that it contradicts",
-    "unread": "sentences that nobody can read",
+    "values_matched": "values that match a measured fact",
+    "values_contradicted": "values that match none",
     "tokens": "tokens of an answer",
 }
-LESS_IS_BETTER = ("hard_conflict", "contradicted", "unread")
+LESS_IS_BETTER = ("hard_conflict", "values_contradicted")
 NEITHER = ("soft_conflict", "abstain", "drawn_ahead", "tokens")  # more of it is neither better nor worse
 
 
@@ -266,7 +264,7 @@ def _terms(scores: Scores) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     labelled = answered & (scores.label != NONE)
     judged = answered & (scores.verdict != NONE)
     known, ahead = answered & ~np.isnan(scores.f1), scores.drawn_ahead
-    sentences = sum((np.nan_to_num(getattr(scores, state)) for state in STATES), np.zeros(len(scores)))
+    values = sum((np.nan_to_num(getattr(scores, name)) for name in VALUES), np.zeros(len(scores)))
     terms: dict[str, tuple[np.ndarray, np.ndarray]] = {
         "answered": (answered, np.ones(len(scores))),
         "parsed": (parsed, answered),
@@ -283,8 +281,8 @@ def _terms(scores: Scores) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     for name in ("precision", "recall", "f1"):
         terms[f"bertscore_{name}"] = (np.where(known, getattr(scores, name), 0.0), known)
     terms["bertscore_f1_parsed"] = (np.where(known & parsed, scores.f1, 0.0), known & parsed)
-    for state in STATES:
-        terms[state] = (np.nan_to_num(getattr(scores, state)) * answered, sentences * answered)
+    for name in VALUES:
+        terms[name] = (np.nan_to_num(getattr(scores, name)) * answered, values * answered)
     return terms
 
 

@@ -30,8 +30,8 @@ from distill.evaluation.measure import (
     STAGE,
     STUDENT,
     Evaluation,
+    JudgedValues,
     Measurement,
-    SentenceStates,
     examples_of,
     measure,
     pair_up,
@@ -97,8 +97,8 @@ def run(
         raise InputError("predictions of one split are needed", where=predictions, got=", ".join(splits) or "none")
     samples = list(open_split(dataset, splits[0]))
     pairs = pair_up(samples, found)
-    sentences = read_judged(judged, samples)
-    report, scores = _evaluate(cfg, pairs, dataset, models, sentences, seed)
+    values = read_judged(judged, samples)
+    report, scores = _evaluate(cfg, pairs, dataset, models, values, seed)
     num_left = len(samples) - len(pairs)
     report = report.model_copy(update={"not_asked": num_left, "speed": speed_of(predictions, found)})
     write_model(path, report, REPORT_FORMAT)
@@ -124,7 +124,7 @@ def _evaluate(
     pairs: Sequence[tuple[Sample, Prediction]],
     dataset: Path,
     models: Mapping[Language, Path],
-    judged: SentenceStates,
+    judged: JudgedValues,
     seed: int,
 ) -> tuple[Evaluation, Scores]:
     given: Any = {"resamples": cfg.resamples, "confidence": CONFIDENCE, "seed": seed}

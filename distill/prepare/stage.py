@@ -222,6 +222,7 @@ def make_sample(
         where, expected = f"{caption.sample_id}: prompt.{language}", f"{PICTURES_MARK} in it"
         raise InputError("no place for the pictures", where=where, expected=expected, fix="run cosfly caption anew")
     pictures = Pictures(cfg.modalities, caption.picture_px, depth_range_m=caption.depth_range_m or DEPTH_RANGE_M)
+    values = (caption.checks.values or {}).get(language)
     is_noisy = caption.label_from == "perturbed"  # and so is what that future rules out
     place = {"town": caption.town, "trajectory": caption.trajectory, "variant": caption.variant, "walk": walk}
     return Sample(
@@ -239,8 +240,8 @@ def make_sample(
         decision=parsed.coc.flight_decision,
         label=None if is_noisy else caption.label,
         contradicted=None if is_noisy or (ruled_out := caption.checks.contradicted) is None else tuple(ruled_out),
-        repair=None if caption.repair is None else caption.repair.strategy,
-        proved=caption.coverage(language),
+        repair=None if caption.repair is None else caption.repair.rung or caption.repair.strategy,
+        values_contradicted=None if values is None else values.values_contradicted,
         weight=1.0,
     )
 
@@ -253,7 +254,8 @@ def _reason_to_leave_out(caption: Caption, language: Language, cfg: PrepareConfi
         return "repaired"
     if caption.verdict not in cfg.verdicts:
         return f"verdict_{str(caption.verdict).lower()}"
-    if cfg.contradicted == "exclude" and "contradicted" in (caption.checks.sentences or {}).get(language, []):
+    values = (caption.checks.values or {}).get(language)
+    if cfg.contradicted == "exclude" and values is not None and values.values_contradicted:
         return "contradicted"
     return None
 

@@ -22,7 +22,16 @@ from cosfly.formats.weather import preset_token
 from cosfly.geometry.coverage import Coverage
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.tables import arrow_errors, num_rows, open_table, row_groups
-from release.columns import CAPTION_FIELDS, COUNTED, LANGUAGES, PICTURES, PLACE, POINT, REQUIRED, schema
+from release.columns import (
+    CAPTION_FIELDS,
+    COUNTED,
+    PICTURES,
+    PLACE,
+    POINT,
+    REQUIRED,
+    VALUE_COLUMNS,
+    schema,
+)
 from release.record import CaptionNumbers, FileNumbers, FramesBy, Numbers, Spread
 
 DIGITS = 4
@@ -31,11 +40,10 @@ LARGEST = 1e9  # of a value: beyond any town, flight and picture
 # Columns of yes and no whose frames are counted.
 FLAGS = ("is_perturbed", "target_in_view", "target_visible", "target_legible", "has_caption")
 COVERED = ("style", "pace", "label")
-PROVED = {f"proved_{language}": f"sentence_states_{language}" for language in LANGUAGES}  # mean -> column
 COLUMNS = [
     "sample_id", *PLACE, "track", "style", "pace", "weather", "time_of_day", "frame_index", "time_s", "width_px",
     "height_px", "fov_deg", "pose", "drone_offset", "target",
-    "target_heading_deg", "target_mask_bbox", "visibility", *FLAGS, *COUNTED, *PROVED.values(), *CAPTION_FIELDS,
+    "target_heading_deg", "target_mask_bbox", "visibility", *FLAGS, *COUNTED, *VALUE_COLUMNS, *CAPTION_FIELDS,
 ]  # fmt: skip
 SCHEMA = schema(tuple(PICTURES))
 Place3 = tuple[float, float, float]  # m
@@ -179,7 +187,7 @@ def clean_place(row: Mapping[str, Any]) -> Place3 | None:
     return x, y, z
 
 
-SUMS = ("height_m", "distance_m", "visibility", *PROVED)
+SUMS = ("height_m", "distance_m", "visibility")
 
 
 @dataclass
@@ -192,6 +200,7 @@ class RowCounts:
     )
     totals: Counter[str] = field(default_factory=Counter)
     characters: Counter[str] = field(default_factory=Counter)
+    values: Counter[str] = field(default_factory=Counter)
     sums: dict[str, Sum] = field(default_factory=lambda: {name: Sum() for name in SUMS})
     flights: dict[tuple[str, ...], FlightCount] = field(default_factory=dict)  # by track and PLACE
     fovs: dict[tuple[str, ...], Counter[str]] = field(default_factory=dict)  # of a trajectory: field of view -> frames
@@ -248,9 +257,8 @@ class RowCounts:
             self.counts[name]["none" if row[name] is None else row[name]] += 1
         self.totals["with_label"] += row["label"] is not None
         self.totals["decision_equals_label"] += row["label"] is not None and row["decision"] == row["label"]
-        for name, column in PROVED.items():
-            if states := row[column]:
-                self.sums[name].add(states.count("proved") / len(states))
+        for name in VALUE_COLUMNS:
+            self.values[name] += row[name] or 0
         texts = {name: row[name] for name in CAPTION_FIELDS}
         self.example = self.example or {"sample_id": row["sample_id"], **texts}
         self.characters.update({name: len(text or "") for name, text in texts.items()})
@@ -297,7 +305,7 @@ class RowCounts:
             with_label=self.totals["with_label"],
             decision_equals_label=self.totals["decision_equals_label"],
             frames_by={name: _sorted(self.counts[name]) for name in COUNTED},
-            mean_proved={name: self.sums[name].spread().mean for name in PROVED},
+            values={name: self.values[name] for name in VALUE_COLUMNS},
             mean_characters={
                 name: round(characters[name] / num_captions, 1) if num_captions else None for name in CAPTION_FIELDS
             },

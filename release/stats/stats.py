@@ -76,7 +76,7 @@ def tiles_of(record: ReleaseRecord, stats: Stats) -> list[tuple[str, str]]:
     """Return what a person asks first: how much there is, and how good it is."""
     numbers, captions, found = record.numbers, record.numbers.captions, record.history.flights
     quality = {row[0]: row[1] for table in stats.tables if table.key == "quality_stats" for row in table.rows}
-    seen, proved = numbers.visibility.mean, captions.mean_proved["proved_en"]
+    seen, filled = numbers.visibility.mean, captions.values["values_filled_en"]
     values: list[tuple[str, Any, Any]] = [  # name, value or count, of how many
         ("frames", numbers.frames, None),
         ("flights", numbers.flights, None),
@@ -90,7 +90,7 @@ def tiles_of(record: ReleaseRecord, stats: Stats) -> list[tuple[str, str]]:
         ("of the person is seen, on average", seen, None if seen is None else 1),
         ("mean smoothness score", quality["mean smoothness score S"], None),
         ("of the decisions are those of the geometry", captions.decision_equals_label, captions.with_label),
-        ("of a caption's sentences are proved", proved, None if proved is None else 1),
+        ("values of the English captions are filled from facts", filled, None),
     ]
     return [
         (name, shown(value) if whole is None else f"{100 * value / whole:.1f} %")

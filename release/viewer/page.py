@@ -55,6 +55,7 @@ from release.columns import (
     POINT,
     SHORT_NAMES,
     TARGET_PICTURE,
+    VALUES,
     Column,
     Placement,
     caption_values,
@@ -413,19 +414,15 @@ def _caption(row: Mapping[str, Any], caption: Caption | None = None) -> dict[str
     texts = {}
     for language in LANGUAGES:
         coc = Coc(**{name: row[f"caption_{language}_{name}"] or "" for name in FIELDS})
-        named, states = list(sentences_of(coc)), row[f"sentence_states_{language}"] or []
-        states = states if len(states) == len(named) else [None] * len(named)  # those of another text
-        texts[language] = [
-            {"field": TEXTS[name[0]], "text": text, "state": state}
-            for (name, text), state in zip(named, states, strict=True)
-        ]
+        texts[language] = [{"field": TEXTS[name[0]], "text": text} for name, text in sentences_of(coc)]
     shown = {name: row[name] for name in ("decision", "label", "verdict")} | {"repair": row["repair_strategy"]}
-    shown |= {"facts": _facts(CAPTION, row), "texts": texts, "problems": [], "dropped": None}
+    values = {name: sum(row[f"{name}_{language}"] or 0 for language in LANGUAGES) for name in VALUES}
+    shown |= {"facts": _facts(CAPTION, row), "texts": texts, "values": values, "problems": [], "dropped": None}
     if caption is not None and caption.repair is not None:
         repair, first = caption.repair, f"first {caption.repair.first_decision} ({caption.repair.first_verdict})"
         shown["repair"] = shown["facts"]["repair"] = f"{repair.rung or repair.outcome}, {first}"
     if caption is not None:
-        shown["problems"] = caption.checks.evidence if isinstance(caption.checks.evidence, list) else []
+        shown["problems"] = caption.checks.contradictions or []
         shown["dropped"] = caption.drop_reason if caption.status == "dropped" else None
     return shown
 

@@ -5,6 +5,9 @@ need no rendering.
     python tests/benchmarks/bench_blind.py --seeds 0 1 2 3       the same with four times the walks
     python tests/benchmarks/bench_blind.py --delft FILE --simworld FILE    and cities by other makers, flown alike
 
+The first table reads exact poses. The second reads facts of poses as they are drawn, on the clean and the perturbed
+track: there the embedded rule teacher is compared with a network. Shares are in percent.
+
 The walker counts as visible where a ray of five reaches it and the camera looks that way.
 """
 
@@ -13,20 +16,26 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from caption.schema import WindowConfig
-from caption.stage.windows import current_frames, cut_future, label_motion, order_comes_within
+from caption.stage.windows import cut_windows, order_comes_within
+from caption.teachers.rules import decide
 from caption.verification.actions import TABLE, measure
+from caption.verification.facts import Facts, measure_facts
+from cosfly.formats.boxes import BoxMap
 from cosfly.formats.captions import TOKENS
+from cosfly.formats.frames import Camera
 from cosfly.formats.pedestrian_paths import walk_id
-from cosfly.formats.playback import Track
+from cosfly.formats.playback import Perturbation, TargetRecord, Track
 from cosfly.formats.traces import DroneTrace
-from cosfly.geometry.axes import look_at, wrap_deg
+from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera, wrap_deg
 from cosfly.geometry.kernels import obstacle_index
 from cosfly.inspection.blind_baseline import FITTED_ON, fit_deciders, is_drawn_ahead, past_of
 from cosfly.maps.stage import load_map
@@ -34,6 +43,8 @@ from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import walkable_ground
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.stage import draw_styles_of, plan_trajectory, screens_of
+from cosfly.render.camera import view_target
+from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, perturb
 from cosfly.runtime.config import load, shipped
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import simplify
@@ -41,10 +52,28 @@ from specimens import make_flight
 
 UNSEEN = ("old_town", "market")
 HALF_VIEW_DEG = (30.0, 17.0)  # of the narrowest camera
-Windows = tuple[np.ndarray, np.ndarray, np.ndarray]  # pasts (n, d), labels (n,), drawn ahead (n,)
+SIZE_PX, FOV_DEG = (640, 360), 50.0
+TRACKS = ("clean", "perturbed")
 
 
-def flights_of(cfg: RunConfig, name: str) -> Iterator[DroneTrace]:
+class Windows(NamedTuple):
+    """Of n windows.
+
+    Attributes:
+        pasts: (n, d) exact geometry. labels: (n,). is_ahead: (n,) whether the label was drawn after the window.
+        rows: per track, (n, d) facts as drawn. decisions: per track, (n,) by the rule teacher. is_hard: per track,
+            (n, number of decisions) whether a decision is a hard conflict.
+    """
+
+    pasts: np.ndarray
+    labels: np.ndarray
+    is_ahead: np.ndarray
+    rows: dict[str, np.ndarray]
+    decisions: dict[str, np.ndarray]
+    is_hard: dict[str, np.ndarray]
+
+
+def flights_of(cfg: RunConfig, name: str) -> Iterator[tuple[DroneTrace, BoxMap, PerturbationConfig]]:
     town = cfg.of_town(name)
     box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map
     ground, ids = walkable_ground(box_map, town.pedestrians), map(walk_id, range(town.pedestrians.num_paths))
@@ -55,35 +84,84 @@ def flights_of(cfg: RunConfig, name: str) -> Iterator[DroneTrace]:
     for walk, styles in zip(walks, draw_styles_of(walks, town.plan, town.seed), strict=True):
         trace = plan_trajectory(walk, obstacles, town.plan, town.seed, screens, styles)
         if trace.drop_reason is None:
-            yield trace
+            yield trace, box_map, town.render.perturbation
 
 
-def flight_of(trace: DroneTrace) -> Track:
-    pitch, yaw = np.degrees(look_at(trace.positions_m, trace.targets_m))
-    aside = np.abs(wrap_deg(yaw - trace.rotations_deg[:, 1])), np.abs(pitch - trace.rotations_deg[:, 0])
-    visible = (trace.visibility > 0) & (aside[0] < HALF_VIEW_DEG[0]) & (aside[1] < HALF_VIEW_DEG[1])
-    flight = make_flight(len(trace.time_s))[0]
-    return replace(
-        flight, time_s=trace.time_s, positions_m=trace.positions_m,
-        rotations_deg=trace.rotations_deg, targets_m=trace.targets_m, target=replace(flight.target, visible=visible),
-        segments=trace.segments, mission=trace.mission,
+def tracks_of(trace: DroneTrace, box_map: BoxMap, cfg: PerturbationConfig) -> tuple[Track, Track]:
+    """Return the clean and the perturbed track of a trajectory."""
+    camera = Camera(*SIZE_PX, intrinsic_matrix(*SIZE_PX, FOV_DEG))
+    poses = Poses(trace.positions_m, trace.rotations_deg, trace.targets_m, trace.clearances_m)
+    rng = rng_for(0, "bench.blind", trace.path_id)
+    perturbed = perturb(poses, [camera] * len(trace.time_s), Surroundings(box_map), cfg, rng)
+    offsets = perturbed.drone_offsets_m, perturbed.rotation_offsets_deg, perturbed.target_offsets_m
+    nothing = Perturbation(np.zeros(len(trace.time_s), dtype=bool), *(np.zeros_like(one) for one in offsets))
+    clean = track_of(trace, poses, camera, nothing)
+    other = track_of(trace, perturbed.poses, camera, Perturbation(perturbed.is_perturbed, *offsets))
+    return clean, replace(other, is_original=False, variant="aug_001")
+
+
+def track_of(trace: DroneTrace, poses: Poses, camera: Camera, perturbation: Perturbation) -> Track:
+    pitch, yaw = np.degrees(look_at(poses.positions_m, poses.targets_m))
+    aside = np.abs(wrap_deg(yaw - poses.rotations_deg[:, 1])), np.abs(pitch - poses.rotations_deg[:, 0])
+    in_view = (aside[0] < HALF_VIEW_DEG[0]) & (aside[1] < HALF_VIEW_DEG[1])
+    matrices = [world_from_camera(*pose) for pose in zip(poses.positions_m, poses.rotations_deg, strict=True)]
+    views = [view_target(at_m, pose, camera) for at_m, pose in zip(poses.targets_m, matrices, strict=True)]
+    target = TargetRecord(
+        in_view=in_view, visible=in_view & (trace.visibility > 0), depth_m=np.array([view.depth_m for view in views]),
+        uv=np.array([view.uv for view in views]), bbox=np.array([view.bbox_px for view in views]),
+        visibility=trace.visibility,
     )  # fmt: skip
+    return replace(
+        make_flight(len(trace.time_s))[0], folder=Path(), camera=camera, time_s=trace.time_s,
+        positions_m=poses.positions_m, rotations_deg=poses.rotations_deg, targets_m=poses.targets_m, target=target,
+        perturbation=perturbation, segments=trace.segments, mission=trace.mission,
+    )  # fmt: skip
+
+
+def row_of(facts: Facts) -> np.ndarray:
+    """Return the facts of a window that a network reads, (d,); unknown values are 0."""
+    turns_deg = [after - before for before, after in pairwise(facts.yaw_deg)]
+    climbs_m = [after - before for before, after in pairwise(facts.altitude_m)]
+    numbers = [
+        *facts.velocity_mps, facts.mean_speed_mps, *(facts.target_velocity_mps or (0.0, 0.0)), facts.target_speed_mps,
+        facts.target_turn_deg, *(one for place in facts.place_m[-3:] for one in place or (0.0, 0.0, 0.0)),
+        *facts.distance_m[-3:], *facts.bearing_deg[-3:], *turns_deg, *climbs_m, *facts.pitch_deg[-2:],
+        facts.yaw_rate_dps[-1], facts.speed_mps[-1], facts.climb_mps[-1], *facts.step_speeds_mps[-3:],
+        *(word in ("visible", "partly_occluded") for word in facts.visibility[-3:]), facts.mission is not None,
+    ]  # fmt: skip
+    return np.array([0.0 if number is None else float(number) for number in numbers])
 
 
 def windows_of(cfg: RunConfig, names: list[str]) -> Windows:
     cut, numbers = WindowConfig(), {name: k for k, name in enumerate(TOKENS)}
     found = []
-    for flight in (flight_of(trace) for name in names for trace in flights_of(cfg, name)):
-        motion = label_motion(flight)
-        for now in current_frames(len(flight), cut):
-            label = TABLE.label_of(measure(cut_future(flight, motion, now, cut.future_frames)))
-            if label is None or order_comes_within(flight.mission, now, cut.future_frames):
+    for clean, perturbed in (tracks_of(*flight) for name in names for flight in flights_of(cfg, name)):
+        for pair in zip(cut_windows(clean, cut), cut_windows(perturbed, cut, clean), strict=True):
+            now = pair[0].observed.indices[-1]
+            label = TABLE.label_of(measure(pair[0].future))
+            if label is None or order_comes_within(clean.mission, now, cut.future_frames):
                 continue
-            is_ordered = flight.mission is not None and flight.mission.order_at(now) is not None
-            past = past_of(flight, range(now - cut.num_frames + 1, now + 1), is_ordered)
-            found.append((past, numbers[label], is_drawn_ahead(flight, now, now + cut.future_frames, is_ordered)))
-    pasts, labels, ahead = zip(*found, strict=True)
-    return np.array(pasts), np.array(labels), np.array(ahead, dtype=bool)
+            is_ordered = clean.mission is not None and clean.mission.order_at(now) is not None
+            past = past_of(clean, pair[0].observed.indices, is_ordered)
+            is_ahead = is_drawn_ahead(clean, now, now + cut.future_frames, is_ordered)
+            facts = [measure_facts(window.observed) for window in pair]
+            hard = [TABLE.contradicted_by(motion := measure(w.future), TABLE.label_of(motion)) for w in pair]
+            found.append((
+                past, numbers[label], is_ahead, *map(row_of, facts), *(numbers[decide(one)] for one in facts),
+                *([token in one for token in TOKENS] for one in hard),
+            ))  # fmt: skip
+    pasts, labels, ahead, *drawn = map(np.array, zip(*found, strict=True))
+    by_track = [dict(zip(TRACKS, drawn[i : i + 2], strict=True)) for i in (0, 2, 4)]
+    return Windows(pasts, labels, ahead.astype(bool), *by_track)
+
+
+def joined(parts: list[Windows]) -> Windows:
+    arrays = [np.concatenate(column) for column in zip(*(part[:3] for part in parts), strict=True)]
+    tables = [
+        {t: np.concatenate([one[t] for one in column]) for t in TRACKS}
+        for column in zip(*(part[3:] for part in parts), strict=True)
+    ]
+    return Windows(*arrays, *tables)
 
 
 def main() -> None:

@@ -19,15 +19,15 @@ const FACETS = [
   ["track", "track", (sample) => flightOf(sample).track],
   ["verdict", "verdict", ofCaption("verdict")],
   ["decision", "decision", ofCaption("decision")],
-  ["evidence", "evidence", (sample) => evidenceOf(captionOf(sample))],
+  ["values", "values", (sample) => valuesOf(captionOf(sample))],
   ["repair", "repaired", (sample) => { const caption = captionOf(sample); return caption ? (caption.repair ? "yes" : "no") : null; }],
 ];
-function evidenceOf(caption) {
+function valuesOf(caption) {
   if (!caption) return null;
-  const states = Object.values(caption.texts).flat().map((sentence) => sentence.state);
-  if (states.includes("contradicted")) return "contradicted";
-  if (states.includes("unread")) return "partly unread";
-  return states.length && states.every((state) => state === "proved") ? "all proved" : "not judged";
+  const { values_filled, values_matched, values_contradicted } = caption.values;
+  if (values_contradicted) return "contradicted";
+  if (values_matched) return "matched";
+  return values_filled ? "filled" : "no values";
 }
 const textOf = (sample) => {
   const flight = flightOf(sample), frame = flight.frames[sample.frame], caption = frame.caption;
@@ -195,15 +195,15 @@ function drawCaption(sample) {
     const fields = Object.entries(FIELDS).flatMap(([field, names]) => {
       const mine = sentences.filter((sentence) => sentence.field === field);
       if (!mine.length) return [];
-      const parts = mine.flatMap((sentence) => [make("span", { class: `sentence ${sentence.state || "unjudged"}`, title: sentence.state || "not judged" }, sentence.text), " "]);
+      const parts = mine.flatMap((sentence) => [make("span", {}, sentence.text), " "]);
       return [make("h4", {}, names[number]), make("p", {}, ...parts)];
     });
     return make("div", { lang: language === "zh" ? "zh-CN" : "en" }, make("h3", {}, title), ...(fields.length ? fields : [make("p", { class: "nothing" }, "no text")]));
   });
-  const key = ["proved", "contradicted", "unread"].map((name) => make("span", { class: `sentence ${name}` }, name));
+  const values = Object.entries(caption.values).map(([name, count]) => `${name.replace("values_", "")} ${count}`).join(", ");
   show("caption", make("div", { class: "tags" }, ...tags), make("div", { class: "texts" }, ...columns),
     caption.problems.length ? make("ul", { class: "problems" }, ...caption.problems.map((problem) => make("li", {}, problem))) : null,
-    make("p", { class: "key" }, "Sentences against the geometry of the flight: ", ...key.flatMap((one) => [one, " "])));
+    make("p", { class: "key" }, `Values (numbers with a unit, relations in slots): ${values}. Nothing else of the text is checked.`));
 }
 
 // --- what happens ----------------------------------------------------------------------------------------------------

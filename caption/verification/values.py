@@ -1,0 +1,251 @@
+"""Values in running text: each number with a unit is compared with the measured facts of its window.
+
+A number that is one of the facts of its unit (a frame's value, a mean, a difference between two frames, a rate) is
+matched: it may still be the wrong quantity. Where its clause names one quantity, the facts of this quantity alone
+count. A number that matches none is contradicted. Words without numbers are not checked.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations
+
+from caption.verification.facts import Facts, Series, wrapped
+from caption.verification.glossary import load_glossary, mentions
+from caption.verification.numerals import Numeral, read_numerals
+from cosfly.formats.captions import Language, ValueCounts
+
+LONGEST = 500  # characters of a sentence that is read; a model that repeats itself ends none
+SHOWN = 80  # characters of a clause in a message
+MEASURED = ("m", "mps", "deg", "dps", "px")
+ABOUT_SHARE = 0.08  # by which an approximate number may miss its fact
+ABOUT_LEAST = {"m": 0.5, "mps": 0.1, "deg": 2.0, "dps": 1.0, "px": 4.0}
+BOUND_SHARE = 0.3  # "more than 20 m" is matched by 20 to 26 m
+FOREIGN_SHARE = 0.03  # of a number in another unit than ours, which its writer has converted
+DIGITS = {"m": 1, "mps": 2, "deg": 1, "dps": 1, "px": 0}  # digits with which facts are printed
+_BETWEEN: dict[Language, str] = {
+    "en": r"[,;:()]|\.\s|\s[-–—]\s|\b(?:and|but|while|whereas|whilst|although|though|versus|vs\.?|against|with|which|who)\b",
+    "zh": r"[，；：。、（）]|而|但|并且|同时|相比|相对",
+}
+
+
+@dataclass(frozen=True)
+class ValueCheck:
+    """The values of one text. contradictions: a message for each contradicted value."""
+
+    filled: int = 0
+    matched: int = 0
+    contradictions: tuple[str, ...] = ()
+
+    @property
+    def counts(self) -> ValueCounts:
+        return ValueCounts(
+            values_filled=self.filled, values_matched=self.matched, values_contradicted=len(self.contradictions)
+        )
+
+
+def check_values(sentences: Sequence[str], facts: Facts, language: Language, filled: int = 0) -> ValueCheck:
+    """Compare the numbers of a text with the facts of its window.
+
+    Args:
+        sentences: in order; without the slots that were filled. filled: number of these.
+    """
+    matched = 0
+    is_hypothetical = mentions("hypothetical", "", language)
+    contradictions: list[str] = []
+    for sentence in sentences:
+        if len(sentence) > LONGEST or not _may_hold_numbers(language).search(sentence):
+            continue
+        for numeral in read_numerals(sentence, language):
+            clause = _clause_around(sentence, numeral, language)
+            if numeral.unit not in MEASURED or is_hypothetical.search(clause):
+                continue
+            name = named_quantity(clause, numeral, language)
+            if _is_picture_size(numeral, facts) or _matches_any(numeral, _pool_of(name, numeral.unit, facts)):
+                matched += 1
+            else:
+                of = name.replace("_", " ") if name else "quantity"
+                contradictions.append(
+                    f'number: "{numeral.text.strip()}" in "{clause.strip()[:SHOWN]}" is no measured {of} of the window'
+                )
+    return ValueCheck(filled, matched, tuple(contradictions))
+
+
+@cache
+def _may_hold_numbers(language: Language) -> re.Pattern[str]:
+    """Return a pattern that is quick to search and finds something in every text with a number."""
+    tens = "(?:thir|four|fif|six|seven|eigh|nine)t(?:een|y)"
+    words = (
+        rf"\d|\b(?:half|one|two|three|four|five|six|seven|eight|nine|ten|eleven|twelve|twenty|forty|{tens}|hundred)\b"
+    )
+    return re.compile(words if language == "en" else r"[\d一二两三四五六七八九十百半]", re.IGNORECASE)
+
+
+def _clause_around(sentence: str, numeral: Numeral, language: Language) -> str:
+    """Return the clause of a sentence in which a number stands."""
+    start, end = 0, len(sentence)
+    for match in re.finditer(_BETWEEN[language], sentence, re.IGNORECASE):
+        if match.end() <= numeral.start:
+            start = match.end()
+        elif match.start() >= numeral.start + len(numeral.text):
+            end = match.start()
+            break
+    return sentence[start:end]
+
+
+# Unit -> the quantities that a clause may name.
+_NAMES = {"m": ("altitude", "distance"), "px": ("box", "offset"), "deg": ("yaw",)}
+
+
+def named_quantity(clause: str, numeral: Numeral, language: Language) -> str:
+    """Return the one quantity with which a number is compared, as its clause names it; "" where it is not clear.
+
+    A speed is of the drone or of the target where one of them alone is named, before the number. A clause that compares
+    may give a difference.
+    """
+    if numeral.unit == "mps":
+        before = clause[: max(0, clause.find(numeral.text))]
+        named = [name for name in ("drone", "target") if mentions("subjects", name, language).search(clause)]
+        if len(named) != 1 or not mentions("subjects", named[0], language).search(before):
+            return ""
+        compares = mentions("comparatives", "", language).search(clause) or len(read_numerals(clause, language)) > 1
+        return "" if compares else named[0]
+    quantities = load_glossary().file.quantities
+    named = [name for name in quantities if mentions("quantities", name, language).search(clause)]
+    return named[0] if len(named) == 1 and named[0] in _NAMES.get(numeral.unit, ()) else ""
+
+
+# --- what a number may be ---------------------------------------------------------------------------------------------
+
+
+def _components(vectors: Sequence[Sequence[float] | None], axis: int) -> Series:
+    return [None if vector is None else vector[axis] for vector in vectors]
+
+
+# (unit, quantity that a clause names) -> its series. "" has the series of its unit that no quantity has.
+_SERIES: dict[tuple[str, str], Callable[[Facts], tuple[Series, ...]]] = {
+    ("m", "altitude"): lambda f: (f.altitude_m, f.height_over_target_m),
+    ("m", "distance"): lambda f: (
+        f.distance_m, f.slant_m, f.travelled_m, f.displacement_m, f.target_travelled_m, f.other_distance_m,
+        _components(f.place_m, 0),
+    ),
+    ("m", ""): lambda f: (_components(f.place_m, 1),),
+    ("mps", "drone"): lambda f: (
+        f.speed_mps, f.step_speeds_mps, f.climb_mps, (f.mean_speed_mps,), *[(speed,) for speed in f.velocity_mps],
+    ),
+    ("mps", "target"): lambda f: (
+        f.target_speeds_mps, f.target_step_speeds_mps, (f.target_speed_mps,),
+        *[(speed,) for speed in f.target_velocity_mps or ()],
+    ),
+    ("deg", "yaw"): lambda f: (f.yaw_deg, f.heading_deg, f.bearing_deg),
+    ("deg", ""): lambda f: (f.pitch_deg, f.depression_deg, f.target_headings_deg, (f.target_turn_deg,)),
+    ("dps", ""): lambda f: (f.yaw_rate_dps,),
+    ("px", "box"): lambda f: (f.box_width_px, f.box_height_px),
+    ("px", "offset"): lambda f: (f.offset_x_px, f.offset_y_px),
+}  # fmt: skip
+_RATE_OF = {"mps": "m", "dps": "deg"}  # unit -> unit of what changes by it per second
+
+
+def _series_of(name: str, unit: str, facts: Facts) -> list[Series]:
+    """Return the series that a number of a unit may be of, where its clause names a quantity ("": any of the unit)."""
+    keys = [key for key in _SERIES if key[0] == unit and name in ("", key[1])]
+    return [series for key in keys for series in _SERIES[key](facts)]
+
+
+def _pool_of(name: str, unit: str, facts: Facts) -> tuple[set[float], set[float]]:
+    """Return what a number may be: the facts as printed, and means, differences and rates of them."""
+    key = ("pool", name, unit)
+    if key not in facts.found:
+        facts.found[key] = _make_pool(name, unit, facts)
+    return facts.found[key]
+
+
+def _make_pool(name: str, unit: str, facts: Facts) -> tuple[set[float], set[float]]:
+    exact: set[float] = set()
+    derived: set[float] = set()
+    for series in _series_of(name, unit, facts):
+        known = [value for value in series if value is not None]
+        exact.update(map(abs, known))
+        derived.update(abs(b - a) for a, b in combinations(known, 2))
+        derived.update(
+            abs(sum(part) / len(part)) for start in range(len(known)) for part in (known[start:], known[: start + 1])
+        )
+    if unit == "deg":
+        derived |= {360.0 - angle for angle in derived}
+    for series in _series_of("", _RATE_OF[unit], facts) if unit in _RATE_OF else ():
+        for (i, a), (j, b) in combinations(enumerate(series), 2):
+            if a is not None and b is not None:
+                derived.add(abs(b - a) / ((j - i) * facts.step_s))
+    if not name:
+        derived.update(_differences(unit, facts))
+    return exact, derived
+
+
+def _differences(unit: str, facts: Facts) -> Iterator[float]:
+    """Yield by how much the drone and the target differ at the same time, in speed or heading."""
+    mean = (facts.target_speed_mps,) * len(facts)
+    pairs: dict[str, tuple[tuple[Series, Series], ...]] = {
+        "mps": (
+            (facts.speed_mps, facts.target_speeds_mps), (facts.step_speeds_mps, facts.target_step_speeds_mps),
+            (facts.step_speeds_mps, mean), ((facts.mean_speed_mps,) * len(facts), mean),
+            (facts.velocity_mps[:2], facts.target_velocity_mps or (None, None)),
+        ),
+        "deg": ((facts.heading_deg, facts.target_headings_deg),),
+    }  # fmt: skip
+    for of_drone, of_target in pairs.get(unit, ()):
+        for a, b in zip(of_drone, of_target, strict=True):
+            if a is not None and b is not None:
+                yield abs(wrapped(b - a)) if unit == "deg" else abs(b - a)
+
+
+def _is_picture_size(numeral: Numeral, facts: Facts) -> bool:
+    sizes = (facts.width_px, facts.height_px, facts.width_px / 2, facts.height_px / 2)
+    return numeral.unit == "px" and numeral.value in sizes
+
+
+def _matches_any(numeral: Numeral, pool: tuple[set[float], set[float]]) -> bool:
+    exact, derived = pool
+    printed = 10.0 ** -DIGITS[numeral.unit]
+    return any(_matches(numeral, fact, 0.5 * printed) for fact in exact) or any(
+        _matches(numeral, fact, printed) for fact in derived
+    )
+
+
+def _matches(numeral: Numeral, fact: float, rounding: float) -> bool:
+    """Return whether a number is a fact, to the digits with which it is written.
+
+    Args:
+        rounding: how far the fact itself may be off.
+    """
+    value = numeral.value
+    slack = max(numeral.half, rounding) + 1e-9
+    if numeral.factor != 1.0:
+        slack += FOREIGN_SHARE * value
+    if numeral.is_about:
+        slack = max(slack, ABOUT_SHARE * fact, ABOUT_LEAST[numeral.unit])
+    if numeral.bound and -slack <= numeral.bound * (fact - value) <= BOUND_SHARE * value + slack:
+        return True
+    return abs(value - fact) <= slack
+
+
+def measured_lines(facts: Facts, contradictions: Sequence[str]) -> str:
+    """Return what was measured of the quantities that contradictions name, for the teacher to correct its text."""
+    lines = {
+        "altitude": ("altitude", facts.altitude_m, "m"),
+        "distance": ("horizontal distance", facts.distance_m, "m"),
+        "drone": ("drone speed", facts.speed_mps, "m/s"),
+        "target": ("target speed", facts.target_speeds_mps, "m/s"),
+        "yaw": ("yaw against the first frame", facts.yaw_deg, "deg"),
+        "box": ("box height", facts.box_height_px, "px"),
+        "offset": ("offset to the right of the image centre", facts.offset_x_px, "px"),
+    }
+    named = [name for name in lines if any(f"measured {name} " in text for text in contradictions)] or list(lines)
+    texts = []
+    for name in named:
+        label, series, unit = lines[name]
+        values = ", ".join("-" if value is None else f"{value:g}" for value in series)
+        texts.append(f"{label}: {values} {unit}")
+    return "; ".join(texts)
