@@ -45,19 +45,28 @@ def test_every_window_is_one_line_sorted_and_labelled_from_geometry(tree, done):
         assert caption.en.flight_decision == caption.zh.flight_decision
 
 
-def test_the_report_adds_up_and_repairs_stay_on_record(done):
+def test_the_report_adds_up_and_repairs_stay_on_record(tree, tmp_path):
+    cfg = CaptionConfig.model_validate({"repair": {"soft_conflict": "repair"}})
+    done = run(cfg, tree, tmp_path / "out").parent
     captions = list(read_captions(done / "captions.jsonl"))
     report = json.loads((done / "caption_report.json").read_text())
     manifest = json.loads((done / "manifest.json").read_text())
-    assert report["windows"] == manifest["counts"] == {"input": 54, "kept": 54, "dropped": {}, "failed": {}}
+    accepted = [caption for caption in captions if caption.status == "accepted"]
+    dropped = Counter(caption.drop_reason for caption in captions if caption.status == "dropped")
+    counts = {"input": 54, "kept": len(accepted), "dropped": dict(dropped), "failed": {}}
+    assert report["windows"] == manifest["counts"] == counts
+    assert set(dropped) <= {"no_reason"}
     assert report["labels"] == dict(Counter(caption.label or "none" for caption in captions).most_common())
     repaired = [caption for caption in captions if caption.repair]
     assert repaired, "the specimens must hold a conflict for this test to mean anything"
-    assert report["repair"]["rejected"] == report["verdicts_of_first_answers"]["HARD_CONFLICT"] == len(repaired)
-    assert all(c.repair.strategy == "anchored" and c.en.flight_decision == c.label for c in repaired)
+    first = report["verdicts_of_first_answers"]
+    assert report["repair"]["rejected"] == first["SOFT_CONFLICT"] + first.get("HARD_CONFLICT", 0) == len(repaired)
+    assert any(caption.repair.rung == "anchored" for caption in repaired)
+    anchored = [caption for caption in repaired if caption.status == "accepted"]
+    assert all(c.repair.strategy == "anchored" and c.en.flight_decision == c.label for c in anchored)
     first = sum(count for row in report["confusion_label_to_first_decision"].values() for count in row.values())
     assert first == sum(report["verdicts_of_first_answers"].values()) == 54
-    filled = [sum(caption.checks.values[language].values_filled for caption in captions) for language in ("en", "zh")]
+    filled = [sum(caption.checks.values[language].values_filled for caption in accepted) for language in ("en", "zh")]
     assert [report["values"][language]["values_filled"] for language in ("en", "zh")] == filled
     assert min(filled) > 54
     assert not (done / "parts").exists()
