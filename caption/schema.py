@@ -1,7 +1,7 @@
 """Types and settings of the caption stage.
 
-`ObservedWindow` is all that a teacher may know: it has no future. `FutureMotion` is what the label and the verdict come
-from. Only `windows.py` makes them, and nothing that builds a prompt takes a `FutureMotion`.
+`ObservedWindow` is all that a teacher may know: it has no future. Label and verdict follow from `FutureMotion`. Only
+`windows.py` makes both, and nothing that builds a prompt takes a `FutureMotion`.
 """
 
 from __future__ import annotations
@@ -37,14 +37,13 @@ TextState = Literal["relative", "paper"]
 
 @dataclass(frozen=True, eq=False)
 class ObservedFrame:
-    """What was known at one frame, in plain numbers; windows share it, so what is worked out of it is worked out once.
+    """The flight data of one frame, in plain numbers. Windows share it, so that its values are computed once.
 
-    position_m, target_m (x, y, z), the target's NaN where unknown; rotation_deg: pitch, yaw, roll; target_uv (u, v) px
-    and target_bbox (left, top, right, bottom) px of what is seen of the target (where a tree does not say, of its
-    projected 3D box), NaN where unknown;
-    visibility: score, NaN where unknown; legible: whether who is visible can be made out, true where a tree is silent.
-    others_in_view, other_distance_m, alike_differences: other people who are seen, from the target to the nearest, and
-    in how many things the most alike looks otherwise; NaN where unknown.
+    position_m, target_m: (x, y, z), the target's NaN if unknown. rotation_deg: pitch, yaw, roll. target_uv: (u, v) px.
+    target_bbox: (left, top, right, bottom) px of the visible part of the target, or of its projected 3D box if the tree
+    has no masks; NaN if unknown. visibility: Score, NaN if unknown. legible: A visible target can be recognized.
+    others_in_view: Number of other people in view; other_distance_m: from the target to the nearest;
+    alike_differences: items in which the most alike of them looks different; NaN if unknown.
     """
 
     time_s: float
@@ -63,7 +62,7 @@ class ObservedFrame:
 
 
 def observed_frames(*columns: np.ndarray) -> tuple[ObservedFrame, ...]:
-    """Return the frames of n rows, from an array (n, ...) for each of their fields in order."""
+    """Return n frames from one array (n, ...) per field, in the order of the fields."""
     return tuple([ObservedFrame(*row) for row in zip(*[column.tolist() for column in columns], strict=True)])
 
 
@@ -71,9 +70,9 @@ def observed_frames(*columns: np.ndarray) -> tuple[ObservedFrame, ...]:
 class ObservedWindow:
     """The observed frames t0..t(n-1) of one sample, oldest first; the last is the current one. Right-handed axes.
 
-    indices: of the n frames in their flight. mission: what the drone knows at the current frame of an order that ends
-    the pursuit, its kind (MISSION_KINDS), None before; goal: whom it follows, in words, None in flights without other
-    people; frame_folders: n folders; frame_files: the names that each holds.
+    indices: Frame indices in the track. mission: Kind of the order that ends the pursuit (MISSION_KINDS) if it is known
+    at the current frame. goal: Description of the target by language, in tracks with other people.
+    frame_files: File names in each frame folder.
     """
 
     sample_id: str
@@ -92,11 +91,11 @@ class ObservedWindow:
 
 @dataclass(frozen=True)
 class FutureMotion:
-    """What the drone did next: row 0 is the current frame, the others follow. Never shown to a teacher.
+    """The motion after the current frame. Never shown to a teacher.
 
-    indices: the future frames' indices (m,). time_s, yaw_deg, visible (m + 1,); positions_m, targets_m (m + 1, 3).
-    speed_before_mps: over the last observed step, the reference of a speed change. label_from: whose motion this is.
-    order: the decision that the mission orders at the current frame, None without an order.
+    indices: (m,), of the future frames. time_s, yaw_deg, visible: (m + 1,), positions_m, targets_m: (m + 1, 3); the
+    first row is the current frame. speed_before_mps: Over the last observed step, the reference of a speed change.
+    order: The decision that the mission orders at the current frame.
     """
 
     indices: tuple[int, ...]
@@ -112,12 +111,12 @@ class FutureMotion:
 
 @dataclass(frozen=True)
 class Window:
-    """What was observed and what came after. Whoever asks a teacher passes on `observed` only."""
+    """The observed frames and the future of one sample. A teacher gets `observed` only."""
 
     observed: ObservedWindow
     future: FutureMotion
     problem: str | None = None  # why no teacher may be asked, for instance a missing image
-    keyframe: KeyframeRecord | None = None  # why it was taken, and how many windows after it were not
+    keyframe: KeyframeRecord | None = None  # why it was chosen, and how many windows after it were skipped
 
 
 # --- settings ---------------------------------------------------------------------------------------------------------
@@ -151,7 +150,7 @@ class ImageConfig(Config):
 
 
 class JudgeConfig(Config):
-    """A language model that judges conflicts between a decision and the label; never over a hard conflict."""
+    """A language model that judges conflicts between a decision and the label; it never excuses a hard conflict."""
 
     url: str | None = Field(None, description="OpenAI-compatible endpoint of the judge; empty: no judge")
     model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
@@ -165,7 +164,7 @@ class JudgeConfig(Config):
         return self
 
     def recorded(self) -> dict[str, Any]:
-        """Where a judge is asked does not decide what it says."""
+        """Return the settings without the address, which does not change the judgements."""
         return super().recorded() | {"url": None if self.url is None else "endpoint"}
 
 
@@ -180,35 +179,34 @@ class RepairConfig(Config):
     )
     strategy: Strategy = Field(
         "anchored",
-        description="anchored: the true decision is given; hint: the rejected one is named; multi_sample: asked anew; "
+        description="anchored: the true decision is given; hint: the rejected one is named; multi_sample: asked again; "
         "cascade: hint, then multi_sample, then anchored, until an answer is the label",
     )
     max_asks: int = Field(3, ge=0, le=10, description="asks per rejected sample; 0 drops it at once")
 
     def treatment_of(self, verdict: Verdict | None) -> Treatment:
-        """Return what becomes of an answer with this verdict."""
+        """Return the treatment of an answer with this verdict."""
         return {"HARD_CONFLICT": self.hard_conflict, "SOFT_CONFLICT": self.soft_conflict}.get(str(verdict), "keep")
 
 
 class StudentConfig(Config):
-    """A student as a teacher: behind a server or in vLLM, asked as it was taught (caption/teachers/students.py), or by
-    its predictions."""
+    """A student as a teacher: behind a server or in vLLM (caption/teachers/students.py), or by its predictions."""
 
     folder: Path | None = Field(
         None,
-        description="what `distill train` or `distill merge` wrote; it decides windows, pictures, prompts and "
-        "sampling. Empty: the teacher is none",
+        description="output of `distill train` or `distill merge`; it determines windows, pictures, prompts and "
+        "sampling. Empty: the teacher is not a student",
     )
     max_new_tokens: ClassVar[int] = MAX_ANSWER_TOKENS  # longest answer
     constrained: bool = Field(False, description="hold its answers to their JSON schema")
     run: str | None = Field(
         None,
-        description="of student:PATH, predictions for several trees: the one whose windows are captioned, as the "
-        "training set names it",
+        description="of student:PATH with predictions for several trees: the tree to caption, as named in the training "
+        "set",
     )
 
     def recorded(self) -> dict[str, Any]:
-        """Where the folder stands does not decide what is asked: what it says stands in the other settings."""
+        """Return the settings without the place of the folder; its content is recorded in the other settings."""
         return super().recorded() | {"folder": None if self.folder is None else "student"}
 
 
@@ -218,7 +216,7 @@ class CaptionConfig(Config):
     teacher: str = Field(
         "rules",
         description="`rules` (embedded, no model), the URL of an OpenAI-compatible endpoint, `vllm:MODEL_DIR`, "
-        "`file:PATH`, captions of somebody else, one a line, or `student:PATH`, what `distill infer` wrote",
+        "`file:PATH`, given captions, one a line, or `student:PATH`, output of `distill infer`",
     )
     writing: Writing = Field(
         "slots",
@@ -231,22 +229,21 @@ class CaptionConfig(Config):
     )
     prompts: Path | None = Field(
         None,
-        description="folder with prompts of yours in the place of those that ship; `cosfly caption prompts --export "
-        "DIR` writes one to begin with",
+        description="folder with your own prompts; `cosfly caption prompts --export DIR` writes one to begin with",
     )
     flights: TrackChoice = Field(TrackChoice(), description="which flights of the tree")
     window: WindowConfig = Field(WindowConfig(), description="windows")
     image: ImageConfig = Field(ImageConfig(), description="pictures in a request")
     contradicted_values: Literal["drop", "keep"] = Field(
-        "drop", description="what becomes of a caption with a number that contradicts the measured facts"
+        "drop", description="treatment of a caption with a number that contradicts the measured facts"
     )
-    endpoint: EndpointConfig = Field(EndpointConfig(), description="how an endpoint is asked")
-    student: StudentConfig = Field(StudentConfig(), description="a teacher that is a student, asked as it was taught")
+    endpoint: EndpointConfig = Field(EndpointConfig(), description="requests to an endpoint")
+    student: StudentConfig = Field(StudentConfig(), description="a teacher that is a student")
     vllm: MayDiffer[VllmConfig] = Field(VllmConfig(), description="the engine of teacher vllm:MODEL_DIR")
     budget: MayDiffer[BudgetConfig] = Field(BudgetConfig(), description="prices and limits of tokens and money")
-    repair: RepairConfig = Field(RepairConfig(), description="re-generation of rejected samples")
+    repair: RepairConfig = Field(RepairConfig(), description="regeneration of rejected samples")
     judge: JudgeConfig = Field(JudgeConfig(), description="an optional judge of conflicts")
-    # Requests for one text, at most; of a student, which answers the same again, 1, 0 and 1.
+    # Most requests for one text; 1, 0 and 1 for a student, which gives the same answer again.
     structure_asks: ClassVar[int] = 3  # until an answer has the right structure
     correction_asks: ClassVar[int] = 1  # that name what was wrong with an answer of the right structure
     mirror_asks: ClassVar[int] = 2  # for the Chinese mirror, until the pair is consistent
@@ -256,24 +253,15 @@ class CaptionConfig(Config):
     limit: MayDiffer[int | None] = Field(None, ge=1, description="caption at most this many windows; empty takes all")
 
     @model_validator(mode="after")
-    def _rules_write_slots(self) -> Self:
-        if self.teacher == "rules" and self.writing != "slots":
+    def _fits_teacher(self) -> Self:
+        kind = self.teacher_kind
+        if kind == "rules" and self.writing != "slots":
+            raise ValueError(f"the rule teacher writes slots, got writing {self.writing!r}; choose another teacher")
+        if self.student.folder is not None and kind not in ("endpoint", "vllm"):
             raise ValueError(
-                f"the rule teacher writes slots, got writing {self.writing!r}; give --teacher, or leave it out"
+                f"student.folder needs a teacher that is asked (URL, vllm:MODEL_DIR), got {self.teacher!r}"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _student_is_asked(self) -> Self:
-        if self.student.folder is not None and self.teacher_kind not in ("endpoint", "vllm"):
-            raise ValueError(
-                f"student.folder needs a teacher that is asked (a URL, vllm:MODEL_DIR), got {self.teacher!r}"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _known_teacher(self) -> Self:
-        if self.teacher_kind == "endpoint":
+        if kind == "endpoint":
             try:
                 check_url(self.teacher)
             except ValueError as error:
@@ -285,34 +273,33 @@ class CaptionConfig(Config):
     def teacher_kind(self) -> TeacherKind:
         if self.teacher == "rules":
             return "rules"
-        if self.teacher.startswith("file:"):
-            return "file"
-        if self.teacher.startswith("student:"):
-            return "student"
-        return "vllm" if self.teacher.startswith("vllm:") else "endpoint"
+        kinds: tuple[TeacherKind, ...] = ("file", "student", "vllm")
+        return next((kind for kind in kinds if self.teacher.startswith(f"{kind}:")), "endpoint")
 
     @property
     def caption_file(self) -> Path | None:
         """The captions of teacher file:PATH, the predictions of student:PATH."""
-        if self.teacher_kind == "student":
-            path = Path(self.teacher.removeprefix("student:"))
-            return path / PREDICTIONS if path.is_dir() else path
-        return Path(self.teacher.removeprefix("file:")) if self.teacher_kind == "file" else None
+        if self.teacher_kind not in ("file", "student"):
+            return None
+        path = Path(self.teacher.partition(":")[2])
+        return path / PREDICTIONS if self.teacher_kind == "student" and path.is_dir() else path
 
     @property
     def most_in_flight(self) -> int:
-        """Requests that the teacher takes at once."""
+        """Number of requests that the teacher takes at once."""
         if self.teacher_kind == "endpoint":
             return self.endpoint.concurrency
         return self.vllm.batch if self.teacher_kind == "vllm" else 1
 
     @property
     def num_images(self) -> int:
-        """Pictures of one question, at most."""
+        """Largest number of pictures of a question."""
         return self.window.num_frames * (1 if self.image.layout == "tiled" else len(self.image.modalities))
 
     def recorded(self) -> dict[str, Any]:
-        """Where a teacher is asked does not decide what it says, so its kind is put on record; of own files their
-        digests stand beside."""
+        """Return the settings without places: the kind of the teacher, and whether prompts are the user's own.
+
+        The address of a teacher does not change its answers, and the digests of own files are recorded separately.
+        """
         own = "own" if self.prompts else None
         return super().recorded() | {"teacher": self.teacher_kind, "prompts": own}

@@ -126,8 +126,8 @@ def test_a_judges_tokens_count_in_the_budget_and_are_shown(tree, tmp_path):
 
 
 def test_the_check_tells_a_perfect_judge_and_one_that_always_says_the_same():
-    gold = [pair for judgement in JUDGEMENTS for pair in [p for p in gold_conflicts() if p[1] == judgement][:12]]
-    right = {judge_messages(case, VOCABULARY)[1]["content"]: verdict for case, verdict in gold}
+    gold = [pair for judgement in JUDGEMENTS for pair in [g for g in gold_conflicts() if g.judgement == judgement][:12]]
+    right = {judge_messages(case, VOCABULARY)[1]["content"]: case.judgement for case in gold}
 
     def checked(answer):
         with judging_server(lambda body: json.dumps({"verdict": answer(body), "reason": "because"})) as server:

@@ -1,7 +1,7 @@
-"""`compare-strategies`: the four strategies of re-generation on the same conflicts (fig:regen_strategy).
+"""`compare-strategies`: the four strategies of regeneration on the same conflicts (fig:regen_strategy).
 
-Reads a playback tree, writes `compare_strategies.json` and, for an endpoint, its journal of answers. Nothing of it
-enters a data set.
+Reads a playback tree, writes `compare_strategies.json` and, for an endpoint, its journal of answers. A data set uses
+none of it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rich.table import Table
 
 from caption.schema import CaptionConfig, Strategy, Window
 from caption.stage.asking import ANSWERS
-from caption.stage.flights import allot, named_flights
+from caption.stage.tracks import find_inputs
 from caption.stage.window_loop import Trial, try_strategy
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
@@ -40,10 +40,10 @@ class Comparison:
     """The results of one strategy on all conflicts.
 
     Args:
-        repaired: conflicts with a new answer that is not rejected.
-        consistency: share of the conflicts whose new decision is the label.
-        naturalness: mean over the repaired ones of the share of words that the new text has in common with the free
-            one; None where nothing was repaired. A model's free text is natural, and a constraint moves it away.
+        repaired: Conflicts with a new answer that is not rejected.
+        consistency: Share of the conflicts whose new decision is the label.
+        naturalness: Mean share of words that a new text has in common with the free one; None if nothing was repaired.
+            A model's free text is natural, and a constraint changes it.
     """
 
     strategy: Strategy
@@ -77,15 +77,10 @@ def compare(strategy: Strategy, trials: Sequence[Trial]) -> Comparison:
 
 
 def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: int = 50) -> list[Comparison]:
-    """Find conflicts among the free answers and repair each by every strategy.
-
-    Args:
-        conflicts: the search stops after so many.
+    """Find so many conflicts among the free answers and regenerate each by every strategy.
 
     Raises:
-        ConfigError: the captions come from a file.
-        InputError: no conflict was found.
-        TeacherError: the endpoint cannot be used.
+        ConfigError: The captions come from a file. InputError: There is no conflict. TeacherError: The endpoint fails.
     """
     if cfg.caption_file is not None:
         fix = "give a teacher that can be asked: rules, a URL or vllm:MODEL_DIR"
@@ -93,9 +88,9 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
     out.mkdir(parents=True, exist_ok=True)
     refuse_links(out)
     num_windows, trials = run_until_interrupted(_try_all(cfg, vocabulary_of(cfg), data, out, seed, conflicts))
-    if not trials[STRATEGIES[0]]:
+    if not trials:
         raise InputError("no conflict to repair", where=data, got=f"{num_windows} windows without a conflict")
-    comparisons = [compare(strategy, trials[strategy]) for strategy in STRATEGIES]
+    comparisons = list(map(compare, STRATEGIES, zip(*trials, strict=True)))
     value = {
         "schema": "cosfly.compare_strategies",
         "schema_version": "2.0",
@@ -109,28 +104,23 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
 
 async def _try_all(
     cfg: CaptionConfig, vocabulary: Vocabulary, data: Path, out: Path, seed: int, most: int
-) -> tuple[int, dict[Strategy, list[Trial]]]:
-    trials: dict[Strategy, list[Trial]] = {strategy: [] for strategy in STRATEGIES}
+) -> tuple[int, list[list[Trial]]]:
+    """Return the number of windows asked about, and for each of at most `most` conflicts a trial of each strategy."""
+    trials: list[list[Trial]] = []
     num_windows = 0
-    with AnswerBook(out / ANSWERS) as book:  # the first answer is asked once for all strategies
+    with AnswerBook(out / ANSWERS) as book:  # the first answer is asked for once for all strategies
         async with open_teacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
             windows = iter(_windows(cfg, data))
-            while batch := list(itertools.islice(windows, cfg.most_in_flight)):
+            while len(trials) < most and (batch := list(itertools.islice(windows, cfg.most_in_flight))):
                 num_windows += len(batch)
-                for tried in await asyncio.gather(*(_try_each(window, teacher, cfg, vocabulary) for window in batch)):
-                    if tried is not None and len(trials[STRATEGIES[0]]) < most:
-                        for strategy in STRATEGIES:
-                            trials[strategy].append(tried[strategy])
-                if len(trials[STRATEGIES[0]]) >= most:
-                    break
-    return num_windows, trials
+                found = await asyncio.gather(*(_try_each(window, teacher, cfg, vocabulary) for window in batch))
+                trials += [one for one in found if one is not None]
+    return num_windows, trials[:most]
 
 
-async def _try_each(
-    window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary
-) -> dict[Strategy, Trial] | None:
-    """Return a trial of each strategy; None where the free answer is not in conflict or an answer is missing."""
-    found: dict[Strategy, Trial] = {}
+async def _try_each(window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary) -> list[Trial] | None:
+    """Return a trial of each strategy; None if the free answer is not in conflict or an answer is missing."""
+    found: list[Trial] = []
     for strategy in STRATEGIES:
         try:
             trial = await try_strategy(window, teacher, cfg, vocabulary, strategy)
@@ -138,13 +128,13 @@ async def _try_each(
             return None
         if trial is None:
             return None
-        found[strategy] = trial
+        found.append(trial)
     return found
 
 
 def _windows(cfg: CaptionConfig, data: Path) -> Iterable[Window]:
-    for flight in allot(named_flights(data, cfg.flights), cfg)[0]:
-        yield from (window for window in flight.windows(cfg) if window.problem is None)
+    for track in find_inputs(cfg, data)[0]:
+        yield from (window for window in track.windows(cfg) if window.problem is None)
 
 
 def comparison_table(comparisons: Sequence[Comparison]) -> Table:

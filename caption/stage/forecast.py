@@ -1,7 +1,7 @@
 """`cosfly caption --plan`: calls, tokens, time and money of a run, estimated from a few trial windows.
 
-The trial windows are real ones, spread over the flights, asked as the run will ask them; their answers stay in the
-journal, so the run does not ask them again.
+The trial windows are real ones, spread over the tracks. Their answers stay in the journal, so the run does not ask for
+them again.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from pathlib import Path
 
 from caption.schema import CaptionConfig
 from caption.stage.asking import ANSWERS
-from caption.stage.flights import allot, named_flights
 from caption.stage.progress import duration
 from caption.stage.stage import open_stage
+from caption.stage.tracks import find_inputs
 from caption.stage.window_loop import caption_window
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.students import as_taught
@@ -32,21 +32,20 @@ TRIAL_WINDOWS = 6
 def make_forecast(
     cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, resume: Resume = "if-same"
 ) -> list[tuple[str, str]]:
-    """Return the rows of a table: what a run will take, scaled from the means of a few windows."""
+    """Return the rows of a table: the cost of a run, scaled from the means of a few windows."""
     if cfg.teacher_kind != "endpoint":
         raise ConfigError("a plan needs an endpoint", where="--plan", got=cfg.teacher, expected="--teacher URL")
     vocabulary = vocabulary_of(cfg)
     cfg = as_taught(cfg, vocabulary)
     stage = open_stage(cfg, data, out, seed, resume)
-    allotted, _ = allot(named_flights(data, cfg.flights), cfg)
-    guesses = {flight.name: flight.guess_num_windows(cfg.window) for flight in allotted}
-    left = [f for f in allotted if guesses[f.name] and not stage.is_complete and not f.part(out).exists()]
-    num_windows = sum(guesses[flight.name] for flight in left)
+    tracks, _ = find_inputs(cfg, data)
+    guesses = {track: track.guess_num_windows(cfg.window) for track in tracks}
+    left = [track for track in tracks if guesses[track] and not stage.is_complete and not track.part(out).exists()]
+    num_windows = sum(guesses[track] for track in left)
     if not num_windows:
-        raise InputError("no window to plan for", where=data, got=f"{len(left)} flights to do")
+        raise InputError("no window to plan for", where=data, got=f"{len(left)} tracks to do")
     chosen = [left[number * len(left) // TRIAL_WINDOWS] for number in range(TRIAL_WINDOWS)]
-    counts = {flight.name: chosen.count(flight) for flight in chosen}
-    windows = [w for f in dict.fromkeys(chosen) for w in islice(f.windows(cfg), counts[f.name])]
+    windows = [w for track in dict.fromkeys(chosen) for w in islice(track.windows(cfg), chosen.count(track))]
 
     async def ask() -> tuple[list[Caption | BaseException], float]:
         with AnswerBook(out / ANSWERS) as book:
@@ -63,13 +62,13 @@ def make_forecast(
     scale = num_windows / len(captions)
     usage = sum((caption.usage for caption in captions), Usage())
     prompt, completion = scale * usage.prompt_tokens, scale * usage.completion_tokens
-    priced = cfg.budget.price_prompt or cfg.budget.price_completion
-    cost = f"{cfg.budget.cost(prompt, completion):,.2f}" if priced else "no prices set (budget.price_prompt)"
-    accepted = sum(caption.status == "accepted" for caption in captions)
-    done = sum(guesses.values()) - num_windows
+    is_priced = cfg.budget.price_prompt or cfg.budget.price_completion
+    cost = f"{cfg.budget.cost(prompt, completion):,.2f}" if is_priced else "no prices set (budget.price_prompt)"
+    num_accepted = sum(caption.status == "accepted" for caption in captions)
+    num_done = sum(guesses.values()) - num_windows
     return [
-        ("windows", f"about {num_windows:,} to do" + (f", {done:,} done" if done else "")),
-        ("trial", f"{len(captions)} windows, {accepted} accepted; their answers are kept"),
+        ("windows", f"about {num_windows:,} to do" + (f", {num_done:,} done" if num_done else "")),
+        ("trial", f"{len(captions)} windows, {num_accepted} accepted; their answers are kept"),
         ("calls", f"{scale * sum(caption.attempts for caption in captions):,.0f}"),
         ("tokens in", f"{prompt:,.0f}"),
         ("tokens out", f"{completion:,.0f}"),

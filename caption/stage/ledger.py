@@ -1,16 +1,19 @@
-"""The stage's ledger: what became of every window, in counts that add up."""
+"""What became of every window: the reasons to drop one, and counts that add up."""
 
 from __future__ import annotations
 
 from bisect import insort
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from itertools import zip_longest
+from operator import itemgetter
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.formats.captions import TOKENS, Caption, TeacherRecord, Usage
 from cosfly.runtime.io import sha256_bytes
+from cosfly.runtime.json_io import Record
 from cosfly.runtime.run_dir import Tally
 
 NUM_CARDS = 24
@@ -19,17 +22,45 @@ WORDS = (
     "structured", "verdicts_of_first_answers", "verdicts_of_accepted", "labels", "label_from", "judgements",
     "structure", "bilingual", "writing", "recovered",
 )  # fmt: skip
+# The codes of `drop_reason` and their meanings, for messages and docs/captions.md.
+REASONS = {
+    "order_to_come": "the mission's order comes in the window's future and is not known in an observed frame; the "
+    "teacher is not asked",
+    "unusable_frame": "a picture of the window is missing or cannot be read; see `checks.frame`",
+    "refused": "the server or engine refused the request; see `checks.refusal`",
+    "not_in_file": "the file of captions or predictions has none for this window",
+    "structure": "no answer had the requested fields; see `checks.structure`",
+    "context_full": "prompt and answer fill the server's context: raise it, or send smaller pictures",
+    "conflict": "the decision is in conflict with the flight (see `verdict`), and the settings or a given caption "
+    "exclude a regeneration",
+    "no_label": "the decision is in conflict, and geometry has no label to anchor a regeneration to",
+    "regeneration_failed": "no answer of caption.repair.max_asks asks had a decision without conflict",
+    "decision_mismatch": "the reasoning leads to another action than the decision",
+    "contradicted_value": "a number of the text contradicts the measured facts; see `checks.contradictions`",
+    "invalid_slot": "a slot names nothing, an unknown fact or an unobserved frame, or its braces, unit or side do not "
+    "fit",
+    "no_reason": "no observed fact supports the given decision",
+    "bilingual": "the two languages do not say the same; see `checks.bilingual`",
+}
+
+
+def most_common(counts: Mapping[str, int]) -> dict[str, int]:
+    """Return counts in falling order; equal ones by name."""
+    return dict(sorted(counts.items(), key=lambda pair: (-pair[1], pair[0])))
+
+
+def explain_drops(dropped: Mapping[str, int]) -> str:
+    """Return the three most common reasons with their counts and meanings."""
+    reasons = list(most_common(dropped).items())[:3]
+    unknown = "docs/captions.md explains no such code"
+    return "; ".join(f"{count} {reason} ({REASONS.get(reason, unknown)})" for reason, count in reasons)
 
 
 # --- the report -------------------------------------------------------------------------------------------------------
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(extra="forbid", populate_by_name=True)
-
-
-class RepairCounts(_Record):
-    """Rejected answers: rung or, where none mended it, outcome -> count; strategy -> the same; asks -> count."""
+class RepairCounts(Record):
+    """Counts of rejected answers. rungs: By the attempt that fixed them, or by the outcome if none did."""
 
     rejected: int
     rungs: dict[str, int]
@@ -37,8 +68,8 @@ class RepairCounts(_Record):
     asks: dict[str, int]
 
 
-class KeyframeCounts(_Record):
-    """What keyframes saved and what they missed."""
+class KeyframeCounts(Record):
+    """Counts of chosen windows, and of the windows, calls and label changes that they skip."""
 
     windows: int
     taken: int
@@ -47,11 +78,13 @@ class KeyframeCounts(_Record):
     changes_missed: int
 
 
-class CaptionReport(_Record):
+class CaptionReport(BaseModel):
     """`caption_report.json`. Counts by a word are in falling order; `confusion`: label -> first decision -> count.
 
-    judge_tokens: of all runs into the folder; left out where no judge was asked.
+    judge_tokens: Of all runs into the directory; not written if no judge was asked.
     """
+
+    model_config = ConfigDict(extra="forbid", populate_by_name=True)
 
     schema_: Literal["cosfly.caption_report"] = Field("cosfly.caption_report", alias="schema")
     schema_version: Literal["1.0"] = "1.0"
@@ -68,7 +101,7 @@ class CaptionReport(_Record):
     confusion: dict[str, dict[str, int]] = Field(alias="confusion_label_to_first_decision")
     repair: RepairCounts
     judgements: dict[str, int]
-    keyframes: KeyframeCounts | None  # None: all windows were taken
+    keyframes: KeyframeCounts | None  # None: all windows were used
     structure: dict[str, int]
     bilingual: dict[str, int]
     writing: dict[str, int]  # of accepted captions: how the texts were made
@@ -79,43 +112,38 @@ class CaptionReport(_Record):
     judge_tokens: Usage | None = None
 
     def warnings(self) -> list[str]:
-        """Return what a person must know before the captions are used."""
+        """Return what a reader must know before using the captions."""
         return [
-            f"windows were dropped because of {code} ({words}); --retry-failed asks about them again"
-            for code, words in self.refusals.items()
+            f"windows were dropped because of {code} ({message}); --retry-failed asks about them again"
+            for code, message in self.refusals.items()
         ]
 
     def as_json(self) -> dict:
-        left_out = {"judge_tokens"} if self.judge_tokens is None else set()
-        return self.model_dump(mode="json", by_alias=True, exclude=left_out)
+        return self.model_dump(mode="json", by_alias=True, exclude=set() if self.judge_tokens else {"judge_tokens"})
 
 
 # --- the ledger -------------------------------------------------------------------------------------------------------
 
 
-class Shelf:
-    """Keeps some captions of every kind for a person to read: those of the smallest hash, whatever the order they come
-    in."""
+class SampleCards:
+    """Samples captions of every kind for the page: those of the smallest hash, in whatever order they come."""
 
-    def __init__(self, per_kind: int = NUM_CARDS) -> None:
-        self.per_kind = per_kind
-        self._kinds: dict[str, list[tuple[str, str, Caption]]] = {}
+    def __init__(self) -> None:
+        self._kinds: dict[str, list[tuple[tuple[str, str], Caption]]] = {}
 
     def add(self, caption: Caption) -> None:
         kind = "dropped" if caption.status == "dropped" else "repaired" if caption.repair else str(caption.verdict)
-        shelf = self._kinds.setdefault(kind, [])
-        entry = (sha256_bytes(caption.sample_id.encode())[:16], caption.sample_id, caption)
-        if len(shelf) < self.per_kind or entry[:2] < shelf[-1][:2]:
-            insort(shelf, entry, key=lambda kept: kept[:2])
-            del shelf[self.per_kind :]
+        cards = self._kinds.setdefault(kind, [])
+        key = (sha256_bytes(caption.sample_id.encode())[:16], caption.sample_id)
+        if len(cards) < NUM_CARDS or key < cards[-1][0]:
+            insort(cards, (key, caption), key=itemgetter(0))
+            del cards[NUM_CARDS:]
 
-    def cards(self) -> list[Caption]:
-        """Return up to `per_kind` captions in order of their ids, the kinds taking turns."""
-        left = [list(self._kinds[kind]) for kind in sorted(self._kinds)]
-        chosen: list[Caption] = []
-        while len(chosen) < self.per_kind and any(left):
-            chosen += [shelf.pop(0)[2] for shelf in left if shelf]
-        return sorted(chosen[: self.per_kind], key=lambda caption: caption.sample_id)
+    def chosen(self) -> list[Caption]:
+        """Return up to NUM_CARDS captions, the kinds in turn, sorted by id."""
+        turns = zip_longest(*(self._kinds[kind] for kind in sorted(self._kinds)))
+        captions = [card[1] for turn in turns for card in turn if card is not None]
+        return sorted(captions[:NUM_CARDS], key=lambda caption: caption.sample_id)
 
 
 class Ledger:
@@ -123,52 +151,53 @@ class Ledger:
 
     def __init__(self) -> None:
         self.windows = Tally()
-        self.num_asks = self.num_skipped = self.num_missed = 0
+        self.num_asks = self.num_skipped = self.num_missed = self.num_contradicted = 0
         self.teacher: TeacherRecord | None = None
-        self.shelf = Shelf()
+        self.cards = SampleCards()
         self.words = {name: Counter[str]() for name in WORDS}
         self.keyframes: Counter[str] = Counter()
-        self.repairs: Counter[str] = Counter()
         self.values: Counter[tuple[str, str]] = Counter()  # language, name of the count
-        self.num_contradicted = 0
         self.refusals: dict[str, str] = {}
         self.tokens: Counter[str] = Counter()
         self.repair_asks: Counter[int] = Counter()
         self.confusion: Counter[tuple[str, str]] = Counter()  # label, first decision
-        self.outcomes: Counter[tuple[str, str]] = Counter()  # strategy, rung or why there is none
+        self.outcomes: Counter[tuple[str, str]] = Counter()  # strategy, rung or outcome
 
     def add(self, caption: Caption) -> None:
+        """Count a caption."""
         self.windows.input += 1
         self.num_asks += caption.attempts
         self.teacher = caption.teacher.model_copy(update={"structured": None})
         self.tokens.update(caption.usage.model_dump())
-        self.words["labels"][caption.label or "none"] += 1
+        self.cards.add(caption)
+        self._add_outcome(caption)
+        self._add_checks(caption)
+        label, repair, judge = caption.label or "none", caption.repair, caption.judge
+        self.words["labels"][label] += 1
         self.words["label_from"][caption.label_from] += 1
+        self.words["structured"][caption.teacher.structured or "none"] += 1
+        if caption.en is not None:
+            verdict = repair.first_verdict if repair else caption.verdict
+            self.words["verdicts_of_first_answers"][str(verdict)] += 1
+            self.confusion[label, repair.first_decision if repair else caption.en.flight_decision] += 1
+        if repair:
+            self.repair_asks[repair.asks] += 1
+            self.outcomes[repair.strategy, repair.rung or repair.outcome] += 1
+        if judge:
+            self.words["judgements"][judge.verdict] += 1
+            if judge.overruled_by is not None:
+                self.words["judgements"][f"overruled_by_{judge.overruled_by}"] += 1
+
+    def _add_outcome(self, caption: Caption) -> None:
         if caption.status == "accepted":
             self.windows.kept += 1
             self.words["verdicts_of_accepted"][str(caption.verdict)] += 1
             self.words["writing"][caption.writing] += 1
-        else:
-            self.windows.dropped[str(caption.drop_reason)] += 1
-            if caption.checks.refusal is not None:
-                code, _, words = caption.checks.refusal.partition(": ")
-                self.refusals[code] = words
-        repair = caption.repair
-        if caption.en is not None:
-            self.words["verdicts_of_first_answers"][str(repair.first_verdict if repair else caption.verdict)] += 1
-            decision = repair.first_decision if repair else caption.en.flight_decision
-            self.confusion[caption.label or "none", decision] += 1
-        if repair:
-            became = repair.rung or repair.outcome
-            self.repairs[became] += 1
-            self.repair_asks[repair.asks] += 1
-            self.outcomes[repair.strategy, became] += 1
-        self.shelf.add(caption)
-        if caption.judge:
-            self.words["judgements"][caption.judge.verdict] += 1
-            if caption.judge.overruled_by is not None:
-                self.words["judgements"][f"overruled_by_{caption.judge.overruled_by}"] += 1
-        self._add_checks(caption)
+            return
+        self.windows.dropped[str(caption.drop_reason)] += 1
+        if caption.checks.refusal is not None:
+            code, _, message = caption.checks.refusal.partition(": ")
+            self.refusals[code] = message
 
     def _add_checks(self, caption: Caption) -> None:
         checks = caption.checks
@@ -180,34 +209,33 @@ class Ledger:
             for name, count in counts.model_dump().items():
                 self.values[language, name] += count
         self.num_contradicted += checks.contradictions is not None
-        for name in ("structure", "bilingual"):
-            if (outcome := getattr(checks, name)) is not None:
-                self.words[name][outcome] += 1
+        self.words["structure"].update([checks.structure] if checks.structure else [])
+        self.words["bilingual"].update([checks.bilingual] if checks.bilingual else [])
         self.words["recovered"].update(checks.recovered or ())
-        self.words["structured"][caption.teacher.structured or "none"] += 1
 
     def tally(self, num_unanswered: int) -> Tally:
-        """Return the windows' tally and check that nothing was lost."""
-        assert self.repairs.total() == self.repair_asks.total()
+        """Return the tally of the windows and check that none was lost."""
         failed = Counter({"no_answer": num_unanswered} if num_unanswered else {})
         tally = self.windows.model_copy(update={"input": self.windows.input + num_unanswered, "failed": failed})
         tally.check()
         return tally
 
-    def report(self, flights: Tally, windows: Tally, judge_tokens: Usage | None) -> CaptionReport:
+    def report(self, tracks: Tally, windows: Tally, judge_tokens: Usage | None) -> CaptionReport:
         order = {token: i for i, token in enumerate((*TOKENS, "none"))}
-        confusion = _nested(self.confusion, lambda pair: (order[pair[0]], order[pair[1]]))
+        rungs: Counter[str] = Counter()
+        for (_, rung), count in self.outcomes.items():
+            rungs[rung] += count
         return CaptionReport(
             teacher=self.teacher,
-            flights=flights,
+            flights=tracks,
             windows=windows,
-            **{name: _sorted(counts) for name, counts in self.words.items()},
+            **{name: most_common(counts) for name, counts in self.words.items()},
             asks=self.num_asks,
             tokens=dict(sorted(self.tokens.items())),
-            confusion=confusion,
+            confusion=_nested(self.confusion, lambda pair: (order[pair[0]], order[pair[1]])),
             repair=RepairCounts(
-                rejected=self.repairs.total(),
-                rungs=_sorted(self.repairs),
+                rejected=rungs.total(),
+                rungs=most_common(rungs),
                 outcomes_by_strategy=_nested(self.outcomes),
                 asks={str(asks): count for asks, count in sorted(self.repair_asks.items())},
             ),
@@ -219,14 +247,14 @@ class Ledger:
         )
 
     def _keyframes(self) -> KeyframeCounts | None:
-        taken = self.keyframes.total()
-        if not taken:
+        num_chosen = self.keyframes.total()
+        if not num_chosen:
             return None
         return KeyframeCounts(
-            windows=taken + self.num_skipped,
-            taken=taken,
-            reasons=_sorted(self.keyframes),
-            calls_saved=round(self.num_skipped * (self.num_asks / taken)),
+            windows=num_chosen + self.num_skipped,
+            taken=num_chosen,
+            reasons=most_common(self.keyframes),
+            calls_saved=round(self.num_skipped * (self.num_asks / num_chosen)),
             changes_missed=self.num_missed,
         )
 
@@ -235,10 +263,6 @@ def _nested(
     counts: Counter[tuple[str, str]], key: Callable[[tuple[str, str]], Any] | None = None
 ) -> dict[str, dict[str, int]]:
     found: dict[str, dict[str, int]] = {}
-    for one, two in sorted(counts, key=key):
-        found.setdefault(one, {})[two] = counts[one, two]
+    for outer, inner in sorted(counts, key=key):
+        found.setdefault(outer, {})[inner] = counts[outer, inner]
     return found
-
-
-def _sorted(counts: Counter[str]) -> dict[str, int]:
-    return dict(sorted(counts.items(), key=lambda pair: (-pair[1], pair[0])))

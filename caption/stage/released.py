@@ -1,7 +1,7 @@
-"""Labels and verdicts of released captions, recomputed from the flight that they are released with.
+"""Labels and verdicts of released captions, recomputed from the track that they are released with.
 
-A reader for `cosfly release verify`, which gives a flight as its rows show it. What the rows do not show (the frames
-after a window, where a stride left them out) is not judged.
+A reader for `cosfly release verify`, which gives a track as its rows show it. A window whose future frames a stride
+left out of the rows is not checked.
 """
 
 from __future__ import annotations
@@ -21,48 +21,41 @@ NUDGE = 1e-9  # of a threshold: rounding error of subtracting the offsets again
 
 
 def read_released(shown: ReleasedTrack) -> list[Mismatch]:
-    """Return the labels and verdicts of a flight's captions that its frames do not give."""
+    """Return the labels and verdicts of a track's captions that do not follow from its frames."""
     rows = {int(index): row for row, index in enumerate(shown.frame_indices)}
     motion = label_motion(shown.flight, shown.twin)
-    return [lie for caption in shown.captions for lie in _label_lies(shown, motion, caption, rows)]
+    found = (_mismatch(shown, motion, caption, rows) for caption in shown.captions)
+    return [mismatch for mismatch in found if mismatch is not None]
 
 
 def _has_order(caption: ShownCaption) -> bool:
     """Return whether a prompt ends with the line of an order."""
-    return any(
-        text.endswith("\n" + line)
-        for language, text in caption.prompts.items()
-        for line in mission_lines(language).values()
-    )
+    endings = {
+        language: tuple("\n" + line for line in mission_lines(language).values()) for language in caption.prompts
+    }
+    return any(text.endswith(endings[language]) for language, text in caption.prompts.items())
 
 
-def _label_lies(
+def _mismatch(
     shown: ReleasedTrack, motion: LabelMotion, caption: ShownCaption, rows: dict[int, int]
-) -> list[Mismatch]:
-    """Compare label and verdict with the frames after the window, where these are released."""
-    where = f"{caption.sample_id}: label"
-    is_order = caption.label in ORDERS
-    has_order = _has_order(caption)
-    if caption.prompts and is_order != has_order:
+) -> Mismatch | None:
+    """Compare label and verdict with the frames after the window, if these are released."""
+    where, has_order = f"{caption.sample_id}: label", _has_order(caption)
+    if caption.prompts and has_order != (caption.label in ORDERS):
         got = f"{caption.label}, and {'an order' if has_order else 'no order'} in the prompt"
-        return [("label", where, got, "an order as label exactly where the prompt tells of one")]
-    num_future = int(shown.settings.get("window", {}).get("future_frames", 5))
-    future = _future(shown, motion, caption, rows, num_future)
+        return "label", where, got, "an order as label exactly if the prompt contains one"
+    future = _future(shown, motion, caption, rows)
     if future is None:
-        return []
-    if has_order:
-        future = replace(future, order=caption.label)
-    measured = measure(future)
+        return None
+    measured = measure(replace(future, order=caption.label) if has_order else future)
     label = TABLE.label_of(measured)
     if label != caption.label and caption.label not in _nearly(measured):
-        return [("label", where, str(caption.label), f"{label}, which the frames after the window show")]
-    if caption.verdict is None:
-        return []
+        return "label", where, str(caption.label), f"{label}, by the frames after the window"
     verdict = TABLE.verdict_of(caption.decision, measured, caption.label)
-    if verdict != caption.verdict:
-        got = f"{caption.verdict} for {caption.decision} (label {caption.label})"
-        return [("verdict", f"{caption.sample_id}: verdict", got, f"{verdict}, by the frames after the window")]
-    return []
+    if caption.verdict is None or verdict == caption.verdict:
+        return None
+    got = f"{caption.verdict} for {caption.decision} (label {caption.label})"
+    return "verdict", f"{caption.sample_id}: verdict", got, f"{verdict}, by the frames after the window"
 
 
 def _nearly(measured: Motion) -> set[str | None]:
@@ -73,15 +66,14 @@ def _nearly(measured: Motion) -> set[str | None]:
 
 
 def _future(
-    shown: ReleasedTrack, motion: LabelMotion, caption: ShownCaption, rows: dict[int, int], num_future: int
+    shown: ReleasedTrack, motion: LabelMotion, caption: ShownCaption, rows: dict[int, int]
 ) -> FutureMotion | None:
-    """Return the motion after a window from the released rows; None where one of its frames is not released."""
-    found = [rows.get(caption.frame_index + k) for k in range(-1, num_future + 1)]
-    wanted = [row for row in found if row is not None]
-    if len(wanted) < len(found) or wanted != list(range(wanted[0], wanted[0] + len(wanted))):
+    """Return the motion after a window from the released rows; None if one of its frames is not released."""
+    num_future = int(shown.settings.get("window", {}).get("future_frames", 5))
+    first = rows.get(caption.frame_index - 1)
+    wanted = [rows.get(caption.frame_index + k) for k in range(-1, num_future + 1)]
+    if first is None or wanted != list(range(first, first + len(wanted))):
         return None
-    return (
-        None
-        if np.isnan(shown.flight.positions_m[wanted]).any()
-        else cut_future(shown.flight, motion, wanted[1], num_future)
-    )
+    if np.isnan(shown.flight.positions_m[first : first + len(wanted)]).any():
+        return None
+    return cut_future(shown.flight, motion, first + 1, num_future)

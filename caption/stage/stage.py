@@ -1,7 +1,7 @@
-"""Stage `caption`: reads a playback tree, writes `captions.jsonl` and `caption_report.json`.
+"""Stage `caption`: reads a playback tree, writes `captions.jsonl`, `caption_report.json` and `report.html`.
 
-Teachers that ask nobody work on flights in processes; who takes its time is asked from one process (asking.py). Each
-finished flight is a part file; the parts are merged last, so that memory stays flat.
+Teachers that ask no model work on tracks in several processes; models are asked from one process (asking.py). Each
+finished track is a part file; the parts are merged at the end, so that memory stays flat.
 """
 
 from __future__ import annotations
@@ -14,13 +14,12 @@ from itertools import islice
 from pathlib import Path
 
 from caption.schema import CaptionConfig, Window
-from caption.stage.asking import ANSWERS, Asked, Asking, common_causes, read_quarantine
-from caption.stage.flights import PARTS, Allotted, allot, named_flights, parts_of, restore_parts
-from caption.stage.ledger import Ledger
-from caption.stage.reasons import explained
+from caption.stage.asking import ANSWERS, NOT_ASKED, Asking, AskingOutcome, common_causes, read_quarantine
+from caption.stage.ledger import Ledger, explain_drops
 from caption.stage.report import write_page
+from caption.stage.tracks import PARTS, TrackInput, find_inputs, parts_of, restore_parts
 from caption.stage.window_loop import caption_prepared, prepare
-from caption.teachers.foreign import given_samples
+from caption.teachers.foreign import given_samples, read_given
 from caption.teachers.prompt_files import PROMPTS, keep_own_prompts, vocabulary_of
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
@@ -39,8 +38,8 @@ from cosfly.runtime.worker import Item, Outcome, Work, advance
 log = logging.getLogger(__name__)
 
 PRODUCT, REPORT, PAGE = "captions.jsonl", "caption_report.json", "report.html"
-PACKAGE_FILES = {"glossary": GLOSSARY_FILE}  # one folder never holds captions of two glossaries, nor of two prompts
-WINDOWS_AT_ONCE = 128  # that are prepared for a teacher that asks nobody
+PACKAGE_FILES = {"glossary": GLOSSARY_FILE}  # a directory never mixes captions of two glossaries or two prompts
+WINDOWS_AT_ONCE = 128  # prepared together for an embedded teacher
 
 
 def run(
@@ -54,102 +53,89 @@ def run(
     resume: Resume = "if-same",
     retry_failed: bool = False,
 ) -> Path:
-    """Caption the flights of a playback tree.
+    """Caption the tracks of a playback tree; return the path of `captions.jsonl`.
 
     Args:
-        data: playback tree, ours or of the public layout.
-        workers: processes of a teacher that asks nobody, without a judge; requests in flight are
-        `endpoint.concurrency`.
-        retry_failed: ask only about the windows that stand in `quarantine.jsonl`: without an answer, or refused by the
-        server.
-    Returns:
-        `captions.jsonl`.
+        data: Playback tree, ours or of the public layout.
+        workers: Processes of an embedded teacher without a judge; a model takes `endpoint.concurrency` requests.
+        retry_failed: Ask only about the windows in `quarantine.jsonl`: without an answer, or refused by the server.
+
     Raises:
-        InputError: no flight. NothingKept: none is long enough, or no window gave a caption.
-        ConfigError: `retry_failed` with a teacher that asks nobody.
-        TeacherError: the endpoint cannot be used, a budget is used up, or windows stayed without an answer; what was
-            answered is kept.
+        InputError: There is no track. NothingKept: No track is long enough, or no window got a caption.
+        ConfigError: `retry_failed` with an embedded teacher.
+        TeacherError: The endpoint cannot be used, a budget is used up, or windows got no answer. Answers are kept.
     """
     if cfg.teacher_kind in EMBEDDED and retry_failed:
-        raise ConfigError(
-            "this teacher never fails to answer", where="--retry-failed", got=cfg.teacher_kind, fix="leave it out"
-        )
+        what, fix = "this teacher never fails to answer", "remove the option"
+        raise ConfigError(what, where="--retry-failed", got=cfg.teacher_kind, fix=fix)
     vocabulary = vocabulary_of(cfg)
     cfg = as_taught(cfg, vocabulary)
-    foreign = None if cfg.caption_file is None else given_samples(cfg, cfg.caption_file)
+    unused = set[str]() if cfg.caption_file is None else given_samples(read_given(cfg))
     stage = open_stage(cfg, data, out, seed, resume)
-    was_whole = stage.is_complete and not _has_more(stage, cfg)
-    if was_whole and not (retry_failed and _has_refused(stage, cfg)):
+    was_complete = stage.is_complete and not _has_more(stage, cfg)
+    if was_complete and not (retry_failed and _has_refused(stage, cfg)):
         if read_manifest(out).facts.get("limit") is None:
-            shutil.rmtree(out / PARTS, ignore_errors=True)  # a kill came before they were gone
+            shutil.rmtree(out / PARTS, ignore_errors=True)  # the process was killed before it removed them
         return out / PRODUCT
-    allotted, is_cut = allot(named_flights(data, cfg.flights), cfg)
-    restore_parts(stage.path, out / PRODUCT, allotted)
+    tracks, is_cut = find_inputs(cfg, data)
+    restore_parts(stage.path, out / PRODUCT, tracks)
     if cfg.teacher_kind in EMBEDDED and cfg.judge.url is None:
-        items = [Item(flight.item_id, flight) for flight in allotted]
+        items = [Item(track.item_id, track) for track in tracks]
         args = (cfg, vocabulary, stage.path, seed)
-        asked = Asked(run_items(stage, items, make_worker, args, workers=workers, watch=watch, label="caption").tally)
+        finished = run_items(stage, items, make_worker, args, workers=workers, watch=watch, label="caption")
+        outcome = AskingOutcome(finished.tally)
     else:
         if retry_failed:
-            _take_back(stage, allotted)
-        asking = Asking(stage, cfg, vocabulary, seed, retry_failed=retry_failed, was_whole=was_whole)
-        asked = run_until_interrupted(asking.run(allotted))
-    return _publish(stage, cfg, vocabulary, asked, allotted, foreign, is_cut=is_cut)
+            _reopen_tracks(stage, tracks)
+        asking = Asking(stage, cfg, vocabulary, seed, retry_failed=retry_failed, was_complete=was_complete)
+        outcome = run_until_interrupted(asking.run(tracks))
+    ledger = _merge(stage, parts_of(stage.path, tracks, bool(outcome.unanswered)), unused)
+    if unused and not is_cut:
+        log.warning("caption: %d captions of %s match no window of this tree", len(unused), cfg.caption_file)
+    return _publish(stage, cfg, vocabulary, outcome, tracks, ledger, is_cut=is_cut)
 
 
 def _publish(
-    stage: StageFolder, cfg: CaptionConfig, vocabulary: Vocabulary, asked: Asked, allotted: list[Allotted],
-    foreign: set[str] | None, *, is_cut: bool,
+    stage: StageFolder, cfg: CaptionConfig, vocabulary: Vocabulary, outcome: AskingOutcome, tracks: list[TrackInput],
+    ledger: Ledger, *, is_cut: bool,
 ) -> Path:  # fmt: skip
-    """Put what was answered together, with report and page; the stage is finished where no window is left."""
+    """Write report and page, and finish the stage if every window has an outcome."""
     out = stage.path
-    ledger = Ledger()
-    _merge(stage, ledger, allotted, foreign, with_gaps=bool(asked.unanswered))
-    tally = ledger.tally(len(asked.unanswered))
-    is_whole = not (asked.unanswered or asked.num_flights_left)
+    tally = ledger.tally(len(outcome.unanswered))
+    is_whole = not (outcome.unanswered or outcome.num_tracks_left)
     if tally.input == 0 and is_whole:
         num_frames = cfg.window.num_frames + cfg.window.future_frames
-        raise stage.nothing_kept(asked.flights, expected=f"a flight of at least {num_frames} frames")
-    report = ledger.report(asked.flights, tally, asked.judge_usage)
-    write_json(stage.path / REPORT, report.as_json())
+        raise stage.nothing_kept(outcome.tracks, expected=f"a track of at least {num_frames} frames")
+    report = ledger.report(outcome.tracks, tally, outcome.judge_usage)
+    write_json(out / REPORT, report.as_json())
     for warning in report.warnings():
         log.warning("caption: %s", warning)
-    if foreign and not is_cut:
-        log.warning("caption: %d captions of %s are of no window of this tree", len(foreign), cfg.caption_file)
-    folders = {flight.name: flight.folder for flight in allotted}
-    write_page(stage.path / PAGE, report, ledger.shelf.cards(), folders, cfg.budget)
+    write_page(out / PAGE, report, ledger.cards.chosen(), {track.name: track.folder for track in tracks}, cfg.budget)
     if not is_whole:
-        _tell_what_is_left(cfg, asked, tally)
+        _report_unanswered(cfg, outcome, tally)
         return out / PRODUCT
     if not tally.kept:
-        fix = f"mend what is dropped ({explained(tally.dropped)}), or change the settings and choose another --out"
+        fix = f"fix what is dropped ({explain_drops(tally.dropped)}), or change the settings and choose another --out"
         raise stage.nothing_kept(tally, where=out / PRODUCT, fix=fix)
     outputs = [out / PRODUCT, out / REPORT, out / PAGE, *sorted((out / ANSWERS).glob("*.jsonl"))]
     outputs += keep_own_prompts(out, vocabulary)
-    stage.finish(outputs, tally, flights=asked.flights.model_dump(), limit=cfg.limit if is_cut else None)
+    stage.finish(outputs, tally, flights=outcome.tracks.model_dump(), limit=cfg.limit if is_cut else None)
     if not is_cut:
         shutil.rmtree(out / PARTS, ignore_errors=True)  # a cut run keeps them, for the next with a larger limit
     return out / PRODUCT
 
 
 def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Resume) -> StageFolder:
-    """Open the stage's folder for these settings."""
+    """Open the output directory for these settings."""
     inputs = {"data": data} if cfg.caption_file is None else {"data": data, "captions": cfg.caption_file}
     if cfg.student.folder is not None:
         inputs |= student_files(cfg.student.folder)
-    return StageFolder.open(
-        out,
-        "caption",
-        config=cfg,
-        inputs=inputs,
-        seed=seed,
-        resume=resume,
-        package_files=PACKAGE_FILES | {"prompts": cfg.prompts or PROMPTS},
-    )
+    files = PACKAGE_FILES | {"prompts": cfg.prompts or PROMPTS}
+    return StageFolder.open(out, "caption", config=cfg, inputs=inputs, seed=seed, resume=resume, package_files=files)
 
 
 def _has_more(stage: StageFolder, cfg: CaptionConfig) -> bool:
-    """Return whether a complete folder was cut by a limit smaller than the one now; it is then open again."""
+    """Reopen a complete directory whose limit was smaller than the one now; return whether it was."""
     limit = read_manifest(stage.path).facts.get("limit")
     if limit is None or (cfg.limit is not None and cfg.limit <= limit):
         return False
@@ -158,36 +144,36 @@ def _has_more(stage: StageFolder, cfg: CaptionConfig) -> bool:
 
 
 def _has_refused(stage: StageFolder, cfg: CaptionConfig) -> bool:
-    """Return whether the server refused windows of a complete folder; it is then open again."""
+    """Reopen a complete directory in which the server refused windows; return whether it did."""
     if not read_quarantine(stage.path):
         return False
     num_windows = read_manifest(stage.path).counts.input
     if cfg.limit is not None and cfg.limit < num_windows:
         raise ResumeError(
-            "the folder holds more windows than the limit allows, so it stays as it is", where=stage.path,
+            "the directory holds more windows than the limit allows, so it is not changed", where=stage.path,
             got=f"{num_windows} windows", expected=f"at most {cfg.limit} (caption.limit)",
-            fix="leave --limit out, or raise it",
+            fix="remove --limit, or raise it",
         )  # fmt: skip
     stage.reopen()
     return True
 
 
-def _take_back(stage: StageFolder, allotted: list[Allotted]) -> None:
-    """Make the flights of windows in quarantine unfinished again."""
+def _reopen_tracks(stage: StageFolder, tracks: list[TrackInput]) -> None:
+    """Make the tracks of windows in quarantine unfinished again."""
     names = {flight_of(sample_id) for sample_id in read_quarantine(stage.path)}
-    for flight in allotted:
-        if flight.name in names:
-            flight.part(stage.path).unlink(missing_ok=True)
+    for track in tracks:
+        if track.name in names:
+            track.part(stage.path).unlink(missing_ok=True)
 
 
-def _tell_what_is_left(cfg: CaptionConfig, asked: Asked, tally: Tally) -> None:
-    """Return why the product is not whole."""
-    missed = [failure for failure in asked.unanswered if failure.code != "not_asked"]
-    if asked.stopped:
+def _report_unanswered(cfg: CaptionConfig, outcome: AskingOutcome, tally: Tally) -> None:
+    """Raise an error about windows that should have got an answer."""
+    missed = [failure for failure in outcome.unanswered if failure.code != NOT_ASKED]
+    if outcome.stopped:
         raise TeacherError(
             "stopped before the budget was passed",
             where=cfg.teacher,
-            got=f"{asked.stopped}; {tally.kept} windows accepted so far",
+            got=f"{outcome.stopped}; {tally.kept} windows accepted so far",
             fix="raise --max-cost or --max-tokens and run the same command again: nothing answered is asked twice",
         )
     if missed:
@@ -197,67 +183,54 @@ def _tell_what_is_left(cfg: CaptionConfig, asked: Asked, tally: Tally) -> None:
             got=f"{common_causes(missed)}; the last: {missed[-1].message}",
             fix="run the same command again (what was answered is not asked twice), or --retry-failed for these alone",
         )
-    log.info("caption: the whole quarantine was asked about; run again without --retry-failed for what was never asked")
+    log.info("caption: the quarantine is empty; run again without --retry-failed for windows that were never asked")
+
+
+def _merge(stage: StageFolder, parts: list[Path], unused: set[str]) -> Ledger:
+    """Join the parts to `captions.jsonl`, one at a time, and count the captions.
+
+    Args:
+        unused: Windows of a file of captions; those that are captioned are removed.
+    """
+    ledger = Ledger()
+
+    def lines() -> Iterator[bytes]:
+        for part in parts:
+            for line, caption in caption_lines(part):
+                ledger.add(caption)
+                unused.discard(caption.sample_id)
+                yield line.encode()
+
+    write_caption_lines(stage.path / PRODUCT, lines())
+    return ledger
 
 
 # --- embedded teachers ------------------------------------------------------------------------------------------------
 
 
 def make_worker(cfg: CaptionConfig, vocabulary: Vocabulary, stage_path: Path, seed: int) -> Work:
-    """Make what a process does with one flight."""
+    """Return the function that captions one track in a process."""
     teacher = embedded_teacher(cfg, seed)
 
     def work(item: Item) -> Outcome:
-        flight: Allotted = item.payload
-        windows, part = flight.windows(cfg), flight.part(stage_path)
-        num_windows = asyncio.run(caption_in_order(windows, teacher, cfg, vocabulary, part))
-        if num_windows == 0:
+        track: TrackInput = item.payload
+        lines = asyncio.run(_caption_in_order(track.windows(cfg), teacher, cfg, vocabulary))
+        if not lines:
             return Outcome({}, drop_reason="too_short")
-        return Outcome({"windows": num_windows})
+        write_caption_lines(track.part(stage_path), lines)
+        return Outcome({"windows": len(lines)})
 
     return work
 
 
-async def caption_in_order(
-    windows: Iterable[Window], teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary, part: Path
-) -> int:
-    """Caption the windows of a flight in order, and write their part; gives how many there are.
-
-    A caption is kept as its line: a hundred times fewer objects, through which the garbage collector would go again and
-    again.
-    """
+async def _caption_in_order(
+    windows: Iterable[Window], teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary
+) -> list[bytes]:
+    """Return the lines of the captions of windows; a line takes far less time in garbage collection than a caption."""
     lines: list[bytes] = []
     rest = iter(windows)
-    while some := list(islice(rest, WINDOWS_AT_ONCE)):
-        for prepared in prepare(some, teacher, cfg, vocabulary):
+    while batch := list(islice(rest, WINDOWS_AT_ONCE)):
+        for prepared in prepare(batch, teacher, cfg, vocabulary):
             lines.append(line_of(await caption_prepared(prepared, teacher, cfg)))
             advance()
-    if lines:
-        write_caption_lines(part, lines)
-    return len(lines)
-
-
-# --- the product ------------------------------------------------------------------------------------------------------
-
-
-def _merge(
-    stage: StageFolder, ledger: Ledger, allotted: list[Allotted], foreign: set[str] | None, *, with_gaps: bool
-) -> None:
-    """Join the parts to `captions.jsonl`, one at a time, and count on the way.
-
-    Args:
-        foreign: windows of a file of captions; those that are captioned are taken out.
-        with_gaps: windows are still without an answer.
-    """
-    product = stage.path / PRODUCT
-    parts = parts_of(stage.path, allotted, with_gaps)
-
-    def lines() -> Iterator[str]:
-        for part in parts:
-            for line, caption in caption_lines(part):
-                ledger.add(caption)
-                if foreign:
-                    foreign.discard(caption.sample_id)
-                yield line
-
-    write_caption_lines(product, (line.encode() for line in lines()))
+    return lines

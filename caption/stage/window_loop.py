@@ -1,8 +1,7 @@
 """The bounded ask-verify loop of one window.
 
-Every window ends in one outcome: accepted, dropped for a reason, or failed because the teacher did not answer. A
-decision that the flight contradicts is asked for again, by default anchored to the true one; the record says so for
-ever.
+Every window has one outcome: accepted, dropped for a reason, or failed because the teacher did not answer. A decision
+that the flight contradicts is asked for again, by default anchored to the label; the record says so.
 """
 
 from __future__ import annotations
@@ -13,15 +12,14 @@ from typing import Any, NamedTuple
 
 from caption.answer_formats.contract import Draft, Refused, refuse_decision
 from caption.schema import CaptionConfig, Strategy, Window
-from caption.stage.reasons import REASONS
+from caption.stage.ledger import REASONS
 from caption.teachers.foreign import Terms
-from caption.teachers.judge import Case, Judge
+from caption.teachers.judge import Conflict, Judge
 from caption.teachers.prompts import Correction, Question, make_question, prompt_hash
-from caption.teachers.teacher import Teacher, terms_of
+from caption.teachers.teacher import Teacher
 from caption.verification.actions import TABLE, Motion, measure
-from caption.verification.facts import Facts
 from caption.verification.mirror import check_translation
-from caption.verification.values import ValueCheck, measured_lines
+from caption.verification.values import measured_lines
 from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import (
     ACTIONS,
@@ -44,8 +42,8 @@ MAX_COMPLAINTS = 8  # named at once
 CONTRADICTED = "contradicted_value"
 
 
-class Prepared(NamedTuple):
-    """A window, what is asked about it, and what its answer is held against."""
+class PreparedWindow(NamedTuple):
+    """A window, its question, and the measurements that verify the answer."""
 
     window: Window
     terms: Terms
@@ -56,10 +54,11 @@ class Prepared(NamedTuple):
     contradicted: list[str]
 
 
-def prepare(windows: Sequence[Window], teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary) -> list[Prepared]:
-    """Measure windows and write their questions: each step for all of them, while the processor's caches hold its
-    code."""
-    terms = [terms_of(teacher, window.observed.sample_id, cfg) for window in windows]
+def prepare(
+    windows: Sequence[Window], teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary
+) -> list[PreparedWindow]:
+    """Measure windows and write their questions: step by step for all, so that the code stays in the CPU's caches."""
+    terms = [teacher.terms(window.observed.sample_id) for window in windows]
     questions = [
         make_question(w.observed, cfg.image, t.writing, vocabulary) for w, t in zip(windows, terms, strict=True)
     ]
@@ -67,88 +66,48 @@ def prepare(windows: Sequence[Window], teacher: Teacher, cfg: CaptionConfig, voc
     motions = [measure(window.future) for window in windows]
     labels = [TABLE.label_of(motion) for motion in motions]
     contradicted = [TABLE.contradicted_by(m, label) for m, label in zip(motions, labels, strict=True)]
-    return list(map(Prepared, windows, terms, questions, hashes, motions, labels, contradicted))
+    return list(map(PreparedWindow, windows, terms, questions, hashes, motions, labels, contradicted))
 
 
 async def caption_window(
-    window: Window,
-    teacher: Teacher,
-    cfg: CaptionConfig,
-    vocabulary: Vocabulary,
-    judge: Judge | None = None,
+    window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary, judge: Judge | None = None
 ) -> Caption:
     """Caption one window.
 
-    Args:
-        judge: asked about conflicts; None: none is.
     Raises:
-        NoAnswer: the teacher gave none, and asking again later may help.
-        TeacherError: no window will get one.
+        NoAnswer: The teacher gave none, but may later. TeacherError: No window will get an answer.
     """
     [prepared] = prepare([window], teacher, cfg, vocabulary)
     return await caption_prepared(prepared, teacher, cfg, judge)
 
 
 async def caption_prepared(
-    prepared: Prepared, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None
+    prepared: PreparedWindow, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None
 ) -> Caption:
-    """Caption a window that is prepared; as `caption_window`."""
-    window, question = prepared.window, prepared.question
-    loop = _Loop(teacher, cfg, prepared, judge)
-    loop.checks["keyframe"] = window.keyframe
+    """Caption a prepared window; raises like `caption_window`."""
+    loop = _WindowLoop(teacher, cfg, prepared, judge)
+    loop.checks["keyframe"] = prepared.window.keyframe
     loop.checks["contradicted"] = prepared.contradicted
-    reason = window.problem
+    reason = prepared.window.problem
     if reason is None:
         try:
-            reason = await loop.run(question)
+            reason = await loop.run(prepared.question)
         except NoAnswer as error:
             if not error.is_final:
                 raise
             reason = error.cause
             if reason not in REASONS:
-                reason, loop.checks["refusal"] = "refused", str(error)
+                reason = "refused"
+                loop.checks["refusal"] = str(error)
         except (InputError, RenderError) as error:  # a picture that cannot be read or encoded
             reason = "unusable_frame"
             loop.checks["frame"] = error.what
-    return _record(prepared, teacher, loop, reason)
-
-
-def _record(prepared: Prepared, teacher: Teacher, loop: _Loop, reason: str | None) -> Caption:
-    """Return what is kept of a window. reason: to drop it."""
-    window, question = prepared.window, prepared.question
-    observed, pictures, answered = window.observed, question.pictures, teacher.record
-    if answered.structured != loop.structured:
-        answered = answered.model_copy(update={"structured": loop.structured})
-    return Caption(
-        sample_id=observed.sample_id,
-        town=observed.town,
-        trajectory=observed.trajectory,
-        variant=observed.variant,
-        frame_index=observed.indices[-1],
-        window=list(observed.indices),
-        future=list(window.future.indices),
-        prompt={"en": question.prompts["en"], "zh": question.prompts["zh"]},
-        prompt_hash=prepared.prompt_hash,
-        picture_px=pictures.size_px,
-        depth_range_m=pictures.depth_range_m if "depth" in pictures.views else None,
-        teacher=answered,
-        usage=loop.usage,
-        attempts=loop.asks,
-        **loop.drafts(),
-        label_from=window.future.label_from,
-        label=loop.label,
-        verdict=loop.verdict,
-        judge=loop.judgement,
-        repair=loop.repair,
-        checks=Checks(**loop.checks),
-        status="accepted" if reason is None else "dropped",
-        drop_reason=reason,
-    )
+    return loop.record(reason)
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One conflict and what a strategy made of it; `last` is None where it did not repair it. Mirror not included."""
+    """One conflict and its regeneration by a strategy, without the mirror. last: None if it failed."""
 
     first: Coc
     last: Coc | None
@@ -160,49 +119,39 @@ class Trial:
 async def try_strategy(
     window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary, strategy: Strategy
 ) -> Trial | None:
-    """Repair a window's first answer by a strategy; None where that answer is none or is not rejected.
-
-    Raises:
-        NoAnswer: the teacher gave none, and asking again later may help.
-    """
+    """Regenerate the first answer of a window by a strategy; None if it is not rejected. NoAnswer: There is none."""
     repair = cfg.repair.model_copy(update={"strategy": strategy})
     [prepared] = prepare([window], teacher, cfg, vocabulary)
-    question = prepared.question
-    loop = _Loop(teacher, cfg.model_copy(update={"repair": repair}), prepared)
-    if await loop.ask_freely(question) is not None or repair.treatment_of(loop.verdict) == "keep" or loop.label is None:
+    loop = _WindowLoop(teacher, cfg.model_copy(update={"repair": repair}), prepared)
+    reason = await loop.ask_freely(prepared.question)
+    if reason is not None or repair.treatment_of(loop.verdict) == "keep" or loop.label is None:
         return None
     assert loop.english is not None
-    first, asked, tokens = loop.english.coc, loop.asks, loop.usage.total
+    first, num_asks, tokens = loop.english.coc, loop.asks, loop.usage.total
     try:
-        reason = await loop.regenerate(question)
+        reason = await loop.regenerate(prepared.question)
     except NoAnswer as error:  # a teacher without a reason for the label has not repaired the conflict
         if not error.is_final:
             raise
         reason = error.cause
     last = loop.english.coc if reason is None else None
-    return Trial(first, last, loop.verdict, loop.asks - asked, loop.usage.total - tokens)
+    return Trial(first, last, loop.verdict, loop.asks - num_asks, loop.usage.total - tokens)
 
 
-def _rungs(strategy: Strategy, max_asks: int) -> list[str]:
-    """Return the kind of each ask: a cascade climbs from the freest to the surest."""
-    if strategy == "cascade":
-        return ["hint", "multi_sample", *["anchored"] * max(0, max_asks - 2)][:max_asks]
-    return [strategy] * max_asks
+class _WindowLoop:
+    """The asks of one window and their results."""
 
-
-class _Loop:
-    """The asks of one window and what came of them."""
-
-    def __init__(self, teacher: Teacher, cfg: CaptionConfig, prepared: Prepared, judge: Judge | None = None) -> None:
-        terms = prepared.terms
+    def __init__(
+        self, teacher: Teacher, cfg: CaptionConfig, prepared: PreparedWindow, judge: Judge | None = None
+    ) -> None:
         once = {"structure_asks": 1, "correction_asks": 0, "mirror_asks": 1}
-        self.cfg = cfg.model_copy(update=once) if terms.is_given else cfg
-        self.teacher, self.terms, self.judge = teacher, terms, judge
-        self.motion, self.label = prepared.motion, prepared.label
-        self.way = prepared.question.way
+        self.terms = prepared.terms
+        self.cfg = cfg.model_copy(update=once) if self.terms.is_given else cfg
+        self.teacher, self.prepared, self.judge = teacher, prepared, judge
+        self.label, self.way = prepared.label, prepared.question.way
         self.english: Draft | None = None
         self.chinese: Draft | None = None
-        self.answered: Question | None = None  # the one that `english` answers
+        self.answered: Question | None = None  # the question that `english` answers
         self.verdict: Verdict | None = None
         self.judgement: JudgeRecord | None = None
         self.repair: RepairRecord | None = None
@@ -213,14 +162,57 @@ class _Loop:
         self._recovered: set[str] = set()
         self._refused: list[str] = []
 
+    def record(self, reason: str | None) -> Caption:
+        """Return the record of the window. reason: To drop it."""
+        window, question = self.prepared.window, self.prepared.question
+        observed, pictures, teacher = window.observed, question.pictures, self.teacher.record
+        if teacher.structured != self.structured:
+            teacher = teacher.model_copy(update={"structured": self.structured})
+        drafts = self._drafts()
+        return Caption(
+            sample_id=observed.sample_id,
+            town=observed.town,
+            trajectory=observed.trajectory,
+            variant=observed.variant,
+            frame_index=observed.indices[-1],
+            window=list(observed.indices),
+            future=list(window.future.indices),
+            prompt={"en": question.prompts["en"], "zh": question.prompts["zh"]},
+            prompt_hash=self.prepared.prompt_hash,
+            picture_px=pictures.size_px,
+            depth_range_m=pictures.depth_range_m if "depth" in pictures.views else None,
+            teacher=teacher,
+            usage=self.usage,
+            attempts=self.asks,
+            writing=self.terms.writing,
+            therefore=self.english.therefore if self.english else None,
+            en=self.english.coc if self.english else None,
+            zh=self.chinese.coc if self.chinese else None,
+            slots={language: draft.template for language, draft in drafts.items() if draft.template} or None,
+            label_from=window.future.label_from,
+            label=self.label,
+            verdict=self.verdict,
+            judge=self.judgement,
+            repair=self.repair,
+            checks=Checks(**self.checks),
+            status="accepted" if reason is None else "dropped",
+            drop_reason=reason,
+        )
+
+    def _drafts(self) -> dict[Language, Draft]:
+        drafts: dict[Language, Draft | None] = {"en": self.english, "zh": self.chinese}
+        return {language: draft for language, draft in drafts.items() if draft is not None}
+
     async def run(self, question: Question) -> str | None:
-        """Ask, verify, repair, mirror; gives the reason to drop the window, None to accept it."""
+        """Ask, verify, regenerate and translate; return the reason to drop the window, None to accept it."""
         reason = await self._attempt(question)
-        if reason == CONTRADICTED and self.cfg.correction_asks:  # once more, with what was measured
+        if reason == CONTRADICTED and self.cfg.correction_asks:  # once more, with the measured values
             assert self.english is not None
             assert self.answered is not None  # anchored, perhaps
             self._refused.append(reason)
-            complaint = self._complaint(question.facts)
+            problems = self.checks["contradictions"][:MAX_COMPLAINTS]
+            measured = measured_lines(question.facts, problems)
+            complaint = f"It contradicts the measured facts: {'; '.join(problems)}. Measured: {measured}."
             correction = Correction(dump_json(self.english.written), complaint, self.cfg.correction_asks + 1)
             self.english = self.chinese = None
             reason = await self._attempt(replace(self.answered, correction=correction))
@@ -231,56 +223,37 @@ class _Loop:
         return reason
 
     async def _attempt(self, question: Question) -> str | None:
-        reason = await self.ask_freely(question)
-        if reason is None:
-            reason = await self._treat(question)
+        reason = await self.ask_freely(question) or await self._treat_verdict(question)
         if reason is None and self.terms.has_mirror:
             reason = await self._mirror()
         elif reason is None:
             self.checks["bilingual"] = "no_chinese"
         if reason is None or (self.terms.is_given and self.english is not None):
-            contradicted = self._check_values(question)  # given captions are checked even where they are dropped
+            contradicted = self._check_values(question)  # given captions are checked even if they are dropped
             reason = reason or contradicted
         return reason
 
-    def _complaint(self, facts: Facts) -> str:
-        """Return the contradicted values of a text with the measured ones."""
-        problems = self.checks["contradictions"][:MAX_COMPLAINTS]
-        return f"It contradicts the measured facts: {'; '.join(problems)}. Measured: {measured_lines(facts, problems)}."
-
-    def drafts(self) -> dict[str, Any]:
-        """Return what was written, as fields of the record."""
-        english, chinese = self.english, self.chinese
-        if english is None:
-            return {"writing": self.terms.writing}
-        drafts: dict[Language, Draft] = {"en": english} if chinese is None else {"en": english, "zh": chinese}
-        return {
-            "writing": self.terms.writing,
-            "therefore": english.therefore,
-            **{language: draft.coc for language, draft in drafts.items()},
-            "slots": {language: draft.template for language, draft in drafts.items() if draft.template} or None,
-        }
+    # --- the English answer ---
 
     async def ask_freely(self, question: Question) -> str | None:
-        answer = Refused("", "")
+        """Ask until an answer is accepted; return the reason to drop the window if none is."""
+        refused = Refused("", "")
         for ask in range(self.cfg.structure_asks):
             asked = replace(question, ask=ask) if ask else question
-            found = await self._answer(asked)
-            if isinstance(found, Draft):
-                self._accept(found, asked)
+            answer = await self._answer(asked)
+            if isinstance(answer, Draft):
+                self._accept(answer, asked)
                 self.checks["structure"] = "ok"
                 return None
-            answer = found
-            if answer.complaint or answer.reason == CONTEXT_FULL:
-                break  # of the right structure, and corrected in vain; or there is no room for one
-        self.checks["structure"] = "ok" if answer.complaint else answer.reason
-        if answer.complaint or answer.reason == CONTEXT_FULL:
-            return answer.reason
+            refused = answer
+            if refused.complaint or refused.reason == CONTEXT_FULL:
+                self.checks["structure"] = "ok" if refused.complaint else refused.reason
+                return refused.reason  # the corrections did not help, or there is no room for an answer
+        self.checks["structure"] = refused.reason
         return "structure"
 
     async def _answer(self, question: Question) -> Draft | Refused:
-        """Ask, and ask for a correction while the content of the answer is refused. A wrong structure has no
-        complaint."""
+        """Ask, and ask for a correction while the content is refused. A wrong structure has no complaint."""
         earlier = question.correction.number if question.correction else 0
         for number in range(self.cfg.correction_asks + 1):
             reply = await self.teacher.ask(question)
@@ -295,84 +268,114 @@ class _Loop:
         parsed = self._read(reply, "en")
         if parsed.coc is None:
             return Refused(parsed.reason or "", "")
-        if "therefore" in self.terms.fields and (refused := refuse_decision(parsed)):
-            return refused
-        return self.way.read(parsed, question.facts)
+        refused = refuse_decision(parsed) if "therefore" in self.terms.fields else None
+        return refused or self.way.read(parsed, question.facts)
 
-    async def _treat(self, question: Question) -> str | None:
-        """Keep, repair or drop the answer for its verdict; gives the reason to drop the window."""
+    def _read(self, reply: Reply, language: Language) -> Parsed:
+        self.asks += 1
+        usage = reply.usage or Usage()
+        self.usage += usage
+        self.structured = reply.structured
+        fields = self.terms.fields if language == "en" else ()
+        parsed = parse_answer(reply.text, language, fields, reply.finish_reason)
+        if parsed.reason == CONTEXT_FULL:
+            asked, answered = usage.prompt_tokens, usage.completion_tokens
+            self.checks["refusal"] = f"{CONTEXT_FULL}: {asked} tokens asked and {answered} answered fill the context"
+        self._recovered.update(parsed.recovered)
+        return parsed
+
+    def _accept(self, draft: Draft, question: Question) -> None:
+        self.english, self.answered = draft, question
+        self.verdict = self._verdict_of(draft)
+
+    def _verdict_of(self, draft: Draft) -> Verdict:
+        return TABLE.verdict_of(draft.coc.flight_decision, self.prepared.motion, self.label)
+
+    # --- regeneration ---
+
+    async def _treat_verdict(self, question: Question) -> str | None:
+        """Keep, regenerate or drop the answer according to its verdict; return the reason to drop the window."""
         treatment = self.cfg.repair.treatment_of(self.verdict)
         if self.judge is not None and self.verdict in ("HARD_CONFLICT", "SOFT_CONFLICT"):
-            treatment = "repair" if await self._is_rejected(question) else "keep"
-        if treatment == "drop" or (treatment == "repair" and self.terms.is_given):
+            treatment = "repair" if await self._is_rejected(question, self.judge) else "keep"
+        if treatment == "keep":
+            return None
+        if treatment == "drop" or self.terms.is_given:
             return "conflict"
-        return await self.regenerate(question) if treatment == "repair" else None
+        return await self.regenerate(question)
 
-    async def _is_rejected(self, question: Question) -> bool:
+    async def _is_rejected(self, question: Question, judge: Judge) -> bool:
         """Ask the judge whether an answer in conflict must be asked for again.
 
-        A hard conflict stays one whatever the judge says. A soft one is kept only where the judge accepts it: what it
-        rejects or what cannot be read as a judgement is asked for again. A label that the judge would put in the
-        decision's place is put there only where the text does not state another decision.
+        A hard conflict stays one whatever the judge says. A soft one is kept only if the judge accepts it. A label that
+        the judge would put in place of the decision replaces it only if the text does not state another decision.
         """
         assert self.english is not None
-        assert self.judge is not None
         english = self.english.coc
-        flight = question.prompts["en"].told(replace(question.pictures, views=()).sentence("en"))  # it sees none
-        case = Case(question.window.sample_id, flight.user, english, self.label)
-        self.judgement = await self.judge.judge(case)
+        flight_data = question.prompts["en"].told(replace(question.pictures, views=()).sentence("en")).user
+        self.judgement = await judge.judge(
+            Conflict(sample_id=question.window.sample_id, flight_data=flight_data, answer=english, label=self.label)
+        )
         verdict = self.judgement.verdict
-        if verdict == "ACCEPT_ALTERNATIVE" and self.verdict == "HARD_CONFLICT":
-            self.judgement.overruled_by = "geometry"
-        if verdict == "FIX_LABEL" and self.label is not None:
-            fixed = replace(self.english, coc=english.model_copy(update={"flight_decision": self.label}))
-            if ACTIONS[english.flight_decision].en not in english.reasoning_trace.lower():
-                self.repair = self._repair("fix_label")
-                self.repair.outcome, self.repair.rung = "repaired", "fix_label"
-                self._accept(fixed, question)
-                return False
+        if verdict == "ACCEPT_ALTERNATIVE":
+            if self.verdict == "HARD_CONFLICT":
+                self.judgement.overruled_by = "geometry"
+            return self.verdict == "HARD_CONFLICT"
+        if verdict != "FIX_LABEL" or self.label is None:
+            return True
+        if ACTIONS[english.flight_decision].en in english.reasoning_trace.lower():
             self.judgement.overruled_by = "text"
-        return verdict != "ACCEPT_ALTERNATIVE" or self.verdict == "HARD_CONFLICT"
+            return True
+        self.repair = self._begin_repair("fix_label", self.english)
+        self.repair.outcome = "repaired"
+        self.repair.rung = "fix_label"
+        fixed = english.model_copy(update={"flight_decision": self.label})
+        self._accept(replace(self.english, coc=fixed), question)
+        return False
 
-    def _repair(self, strategy: str) -> RepairRecord:
-        assert self.english is not None
-        decision = self.english.coc.flight_decision
+    def _begin_repair(self, strategy: str, english: Draft) -> RepairRecord:
+        decision = english.coc.flight_decision
         return RepairRecord(strategy=strategy, first_decision=decision, first_verdict=self.verdict)
 
     async def regenerate(self, question: Question) -> str | None:
         """Ask again by the chosen strategy until an answer is no longer rejected (sec:appendix_e, four strategies)."""
         assert self.english is not None
         rejected = self.english.coc.flight_decision
-        self.repair = self._repair(self.cfg.repair.strategy)
-        rungs = _rungs(self.cfg.repair.strategy, self.cfg.repair.max_asks)
+        cfg = self.cfg.repair
+        self.repair = repair = self._begin_repair(cfg.strategy, self.english)
+        rungs: list[str] = [cfg.strategy] * cfg.max_asks
+        if cfg.strategy == "cascade":  # from the freest to the surest
+            rungs = ["hint", "multi_sample", *["anchored"] * cfg.max_asks][: cfg.max_asks]
         if self.label is None and "anchored" in rungs:
             return "no_label"
-        self.repair.outcome = "failed"  # until an answer is taken
+        repair.outcome = "failed"
         for ask, rung in enumerate(rungs):
-            self.repair.asks = ask + 1
-            asked = self._reworked(question, rung, rejected, ask)
+            repair.asks = ask + 1
+            if rung == "anchored":
+                asked = replace(question, decision=self.label, ask=ask)
+            elif rung == "hint":
+                asked = replace(question, rejected=rejected, ask=ask)
+            else:
+                asked = replace(question, ask=self.cfg.structure_asks + ask)  # the same under another sampling seed
             answer = await self._answer(asked)
-            if isinstance(answer, Refused) and answer.reason == CONTEXT_FULL:
-                return CONTEXT_FULL  # not a failure of the teacher
-            if isinstance(answer, Refused) or (asked.decision and answer.coc.flight_decision != asked.decision):
+            if isinstance(answer, Refused):
+                if answer.reason == CONTEXT_FULL:
+                    return CONTEXT_FULL  # not a failure of the teacher
                 continue
-            decision = answer.coc.flight_decision
-            verdict = TABLE.verdict_of(decision, self.motion, self.label)
-            is_enough = (
-                verdict == "CONSISTENT" or self.cfg.repair.strategy != "cascade"
-            )  # which has surer rungs to come
-            if self.cfg.repair.treatment_of(verdict) == "keep" and decision != rejected and is_enough:
+            verdict, decision = self._verdict_of(answer), answer.coc.flight_decision
+            is_accepted = cfg.treatment_of(verdict) == "keep" and decision != rejected
+            if asked.decision is not None:
+                is_accepted = is_accepted and decision == asked.decision
+            if cfg.strategy == "cascade":  # surer rungs follow
+                is_accepted = is_accepted and verdict == "CONSISTENT"
+            if is_accepted:
                 self._accept(answer, asked)
-                self.repair.outcome, self.repair.rung = "repaired", rung
+                repair.outcome = "repaired"
+                repair.rung = rung
                 return None
         return "regeneration_failed"
 
-    def _reworked(self, question: Question, rung: str, rejected: str, ask: int) -> Question:
-        if rung == "anchored":
-            return replace(question, decision=self.label, ask=ask)
-        if rung == "hint":
-            return replace(question, rejected=rejected, ask=ask)
-        return replace(question, ask=self.cfg.structure_asks + ask)  # the same question under another sampling seed
+    # --- the Chinese mirror and the values ---
 
     async def _mirror(self) -> str | None:
         assert self.english is not None
@@ -389,7 +392,7 @@ class _Loop:
                 continue
             answer = self.way.read_mirror(parsed, self.english, self.answered.facts)
             if isinstance(answer, Draft):
-                answer = self._translated(self.english, answer)
+                answer = self._compare(self.english, answer)
             if isinstance(answer, Draft):
                 self.chinese, problem = answer, None
                 break
@@ -397,9 +400,8 @@ class _Loop:
         self.checks["bilingual"] = problem or "ok"
         return None if problem is None else "bilingual"
 
-    def _translated(self, english: Draft, chinese: Draft) -> Draft | Refused:
-        """Hold what was asked for as a translation against its source; templates have been, and what was given is
-        nobody's translation."""
+    def _compare(self, english: Draft, chinese: Draft) -> Draft | Refused:
+        """Compare a translation with its source. Templates are compared already; a given text translates nothing."""
         if self.terms.is_given or not self.terms.is_translated or chinese.template is not None:
             return chinese
         found = check_translation(english.coc, chinese.coc)
@@ -407,32 +409,10 @@ class _Loop:
 
     def _check_values(self, question: Question) -> str | None:
         """Record the values of both languages; return the reason to drop the window."""
-        assert self.english is not None
-        drafts: dict[Language, Draft] = {"en": self.english}
-        if self.chinese is not None:
-            drafts["zh"] = self.chinese
-        checks: dict[Language, ValueCheck] = {
-            language: self.way.check(draft, question.facts, language) for language, draft in drafts.items()
+        checks = {
+            language: self.way.check(draft, question.facts, language) for language, draft in self._drafts().items()
         }
-        self.checks["values"] = {language: check.counts for language, check in checks.items()}
         contradictions = [f"{language} {text}" for language, check in checks.items() for text in check.contradictions]
+        self.checks["values"] = {language: check.counts for language, check in checks.items()}
         self.checks["contradictions"] = contradictions or None
         return CONTRADICTED if contradictions and self.cfg.contradicted_values == "drop" else None
-
-    def _read(self, reply: Reply, language: Language) -> Parsed:
-        self.asks += 1
-        if reply.usage is not None:
-            self.usage += reply.usage
-        self.structured = reply.structured
-        more = self.terms.fields if language == "en" else ()
-        parsed = parse_answer(reply.text, language, more, reply.finish_reason)
-        if parsed.reason == CONTEXT_FULL:
-            usage = reply.usage or Usage()
-            asked, answered = usage.prompt_tokens, usage.completion_tokens
-            self.checks["refusal"] = f"{CONTEXT_FULL}: {asked} tokens asked and {answered} answered fill the context"
-        self._recovered.update(parsed.recovered)
-        return parsed
-
-    def _accept(self, draft: Draft, question: Question) -> None:
-        self.english, self.answered = draft, question
-        self.verdict = TABLE.verdict_of(draft.coc.flight_decision, self.motion, self.label)

@@ -7,17 +7,16 @@ answer or in the count of tokens.
 from __future__ import annotations
 
 import asyncio
-import base64
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import httpx
 import numpy as np
 
 from caption.answer_formats.contract import THEREFORE
 from caption.schema import CaptionConfig, ObservedWindow, observed_frames
+from caption.teachers.images import encode_image
 from caption.teachers.prompts import (
     MAX_RETURNED_CHARACTERS,
     Correction,
@@ -31,7 +30,7 @@ from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Reply
 from cosfly.llm.protocol import BadReply, read_body, thoughts_of
-from cosfly.llm.refusals import MEANINGS, Refusal, RefusedRequest
+from cosfly.llm.refusals import MEANINGS, RefusedRequest
 from cosfly.runtime.errors import TeacherError
 from cosfly.runtime.json_io import parse_json
 from cosfly.viz.frame_views import VIEW_FILES
@@ -40,12 +39,19 @@ State = Literal["ok", "warning", "unusable"]
 
 MAX_COMPLAINT = 2000  # characters that a complaint hardly ever takes
 ODD_WORD = "zebra-41"  # what no model writes to a greeting unless it is made to
+ODD_SCHEMA = {
+    "type": "object",
+    "properties": {"animal": {"type": "string", "enum": [ODD_WORD]}, "legs": {"type": "integer", "enum": [7]}},
+    "required": ["animal", "legs"],
+    "additionalProperties": False,
+}
+READY = "Reply with the one word: ready"
 NO_THINKING = "endpoint.extra_body={chat_template_kwargs: {enable_thinking: false}}"
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the table. `unusable`: captioning cannot work; `warning`: it can, and what to know."""
+    """One line of the table. `unusable`: captioning cannot work; `warning`: it can, with a limitation."""
 
     name: str
     state: State
@@ -53,21 +59,21 @@ class Finding:
 
 
 def examine_endpoint(url: str, cfg: CaptionConfig, vocabulary: Vocabulary) -> list[Finding]:
-    """Try an endpoint. It is usable if no finding is `unusable`.
-
-    Raises:
-        TeacherError: it is no URL that can be asked.
-    """
+    """Try an endpoint; it is usable if no finding is `unusable`. TeacherError: the URL cannot be asked."""
     return asyncio.run(_Examination(ChatClient(url, cfg.endpoint), cfg, vocabulary).run())
 
 
 @dataclass(frozen=True)
 class _Probe:
-    """What one request gave. reply: None where there was none; detail: why; thoughts: characters before the answer."""
+    """The result of one request.
+
+    reply: None if the request failed. detail: Why it failed. refuses_schema: The server refused the schema.
+    thoughts: Characters before the answer.
+    """
 
     reply: Reply | None
     detail: str = ""
-    refusal: Refusal | None = None
+    refuses_schema: bool = False
     thoughts: int = 0
 
     @property
@@ -88,14 +94,13 @@ class _Examination:
     async def run(self) -> list[Finding]:
         try:
             await self.client.start()
-        except TeacherError as error:
-            return [Finding("model", "unusable", str(error))]
-        else:
             self._add("model", "ok", self.client.model)
-            if await self._text():
-                await self._schema()
-                if await self._images():
-                    await self._context()
+            if await self._answers():
+                await self._try_schema()
+                if await self._takes_images():
+                    await self._try_context()
+        except TeacherError as error:
+            self._add("model", "unusable", str(error))
         finally:
             await self.client.close()
         return self.findings
@@ -113,32 +118,30 @@ class _Examination:
         except RefusedRequest as error:
             refusal = error.refusal
             fix = "" if refusal.kind == "unknown" else f"; {refusal.meaning.fix}"
-            return _Probe(None, refusal.summary + fix, refusal)
+            return _Probe(None, refusal.summary + fix, refusal.kind == "schema")
         except BadReply as error:
             return _Probe(None, str(error))
-        return _Probe(reply, "", None, thoughts_of(read_body(response.body)))
+        return _Probe(reply, thoughts=thoughts_of(read_body(response.body)))
 
-    async def _text(self) -> bool:
-        probe = await self._ask([_user("Reply with the one word: ready")], self.cfg.endpoint.max_tokens)
+    async def _answers(self) -> bool:
+        probe = await self._ask([_user(READY)], self.cfg.endpoint.max_tokens)
         if not probe.text:
-            only = f"{probe.thoughts} characters of thinking and no answer: {NO_THINKING}"
-            self._add("answers", "unusable", probe.detail or (only if probe.thoughts else "an empty answer"))
+            empty = "an empty answer"
+            if probe.thoughts:
+                empty = f"{probe.thoughts} characters of thinking and no answer: {NO_THINKING}"
+            self._add("answers", "unusable", probe.detail or empty)
             return False
         self._add("answers", "ok", f"{probe.text[:40]!r}")
-        is_on = probe.thoughts > 0 or "<think" in probe.text
-        self._add("thinking", "warning" if is_on else "ok", f"switch it off: {NO_THINKING}" if is_on else "off")
+        if probe.thoughts or "<think" in probe.text:
+            self._add("thinking", "warning", f"switch it off: {NO_THINKING}")
+        else:
+            self._add("thinking", "ok", "off")
         return True
 
-    async def _schema(self) -> None:
-        schema = {
-            "type": "object",
-            "properties": {"animal": {"type": "string", "enum": [ODD_WORD]}, "legs": {"type": "integer", "enum": [7]}},
-            "required": ["animal", "legs"],
-            "additionalProperties": False,
-        }
-        probe = await self._ask([_user("Hello! How are you today?")], 256, schema)
+    async def _try_schema(self) -> None:
+        probe = await self._ask([_user("Hello! How are you today?")], 256, ODD_SCHEMA)
         if probe.reply is None:
-            self.takes_schema &= probe.refusal is None or probe.refusal.kind != "schema"
+            self.takes_schema &= not probe.refuses_schema
             self._add("JSON schema", "warning", f"refused ({probe.detail}); answers are parsed from plain text")
             return
         try:
@@ -147,21 +150,21 @@ class _Examination:
             is_applied = False
         if is_applied:
             self._add("JSON schema", "ok", "applied: the answer had a shape that the model would not choose")
-            return
-        got = f"asked for {{animal: {ODD_WORD}}}, got {probe.text[:40]!r}"
-        after = "answers are parsed from plain text, an anchored decision is not enforced"
-        self._add("JSON schema", "warning", f"accepted and ignored: {got}; {after}")
+        else:
+            got = f"accepted and ignored: asked for {{animal: {ODD_WORD}}}, got {probe.text[:40]!r}"
+            effect = "answers are parsed from plain text, an anchored decision is not enforced"
+            self._add("JSON schema", "warning", f"{got}; {effect}")
 
-    async def _images(self) -> bool:
+    async def _takes_images(self) -> bool:
         """Send as many pictures as a prompt of ours holds."""
-        question, count = "Reply with the one word: ready", self.cfg.num_images
-        probe = await self._ask([_user(question, self._pictures())], self.cfg.endpoint.max_tokens)
+        count, limit = self.cfg.num_images, self.cfg.endpoint.max_tokens
+        probe = await self._ask([_user(READY, self._pictures())], limit)
         if probe.reply is None:
             self._add("image input", "unusable", f"{count} of a prompt refused: {probe.detail}")
             return False
-        without = await self._ask([_user(question)], self.cfg.endpoint.max_tokens)
+        without = await self._ask([_user(READY)], limit)
         if probe.prompt_tokens is None or without.prompt_tokens is None:
-            detail = "accepted; whether they are looked at cannot be seen without token usage"
+            detail = "accepted; without token usage it is unknown whether the model sees them"
             self._add("image input", "warning", f"{count} in a prompt {detail}")
             return True
         tokens = probe.prompt_tokens - without.prompt_tokens
@@ -171,34 +174,34 @@ class _Examination:
         self._add("image input", "ok", f"{count} in a prompt, {tokens} tokens")
         return True
 
-    async def _context(self) -> None:
+    async def _try_context(self) -> None:
         """Send a prompt as long as ours get, with our answer limit and schema."""
-        limit, length = self.cfg.endpoint.max_tokens, self.client.context
+        limit, context = self.cfg.endpoint.max_tokens, self.client.context
         messages = largest_messages(self.cfg, self.vocabulary, self._pictures())
-        schema = answer_schema(more=THEREFORE) if self.takes_schema else None
-        probe = await self._ask(messages, limit, schema)
-        known = f" of {length} that the model holds" if length else ""
+        probe = await self._ask(messages, limit, answer_schema(more=THEREFORE) if self.takes_schema else None)
+        used, known = probe.prompt_tokens, f" of {context} that the model holds" if context else ""
+        detail = f"{used or 'unknown'} tokens of the largest prompt and {limit} for the answer"
         if probe.reply is None:
             self._add("context length", "unusable", f"the largest prompt{known} refused: {probe.detail}")
-            return
-        used = probe.prompt_tokens
-        detail = f"{used or 'unknown'} tokens of the largest prompt and {limit} for the answer"
-        if length and used is not None and used + limit > length:
-            self._add("context length", "unusable", f"{detail}, more than {length}: {MEANINGS['too_long'].fix}")
+        elif context and used is not None and used + limit > context:
+            self._add("context length", "unusable", f"{detail}, more than {context}: {MEANINGS['too_long'].fix}")
         else:
             self._add("context length", "ok", f"{detail}{known}")
 
     def _pictures(self) -> list[dict]:
-        """Make pictures of the number and size of a prompt of ours."""
-        side = self.cfg.image.max_side_px
-        width = side * (len(self.cfg.image.modalities) if self.cfg.image.layout == "tiled" else 1)
-        return [_picture(width, side * 9 // 16, number) for number in range(self.cfg.num_images)]
+        """Return pictures of the number and size of a prompt of ours, each another."""
+        image = self.cfg.image
+        width = image.max_side_px * (len(image.modalities) if image.layout == "tiled" else 1)
+        size = (image.max_side_px * 9 // 16, width, 3)
+        count = self.cfg.num_images
+        pictures = [encode_image(np.full(size, 200 * number // count, np.uint8), image) for number in range(count)]
+        return [{"type": "image_url", "image_url": {"url": picture.url}} for picture in pictures]
 
 
 def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary, pictures: list[dict]) -> list[dict]:
     """Return messages as long as ours get: a made-up window whose numbers have many digits."""
     count = cfg.window.num_frames
-    far = np.full((count, 3), -12345.67) + np.arange(count)[:, None]
+    far_m = np.full((count, 3), -12345.67) + np.arange(count)[:, None]
     window = ObservedWindow(
         sample_id="doctor_ORI_frame_00004",
         town="doctor",
@@ -209,38 +212,25 @@ def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary, pictures: list[
         height_px=720,
         frames=observed_frames(
             0.5 * np.arange(count),
-            far,
+            far_m,
             np.tile([-123.4, -123.4, -123.4], (count, 1)),
-            far + 100.0,
+            far_m + 100.0,
             np.tile([1234.5, 654.3], (count, 1)),
             np.tile([1200.0, 600.0, 1260.0, 700.0], (count, 1)),
             np.ones(count, bool),
             np.ones(count, bool),
             np.full(count, 0.5),
         ),
-        frame_folders=tuple(Path(f"frame_{i:05d}") for i in range(count)),
-        frame_files=tuple(frozenset(VIEW_FILES.values()) for _ in range(count)),
+        frame_folders=(Path("frame"),) * count,
+        frame_files=(frozenset(VIEW_FILES.values()),) * count,
     )
     question = make_question(window, cfg.image, cfg.writing, vocabulary)
-    content = [*pictures, {"type": "text", "text": text_of(question)}]
-    messages: list[dict] = [
-        {"role": "system", "content": teacher_prompt(question.way)},
-        {"role": "user", "content": content},
-    ]
+    messages = [{"role": "system", "content": teacher_prompt(question.way)}, _user(text_of(question), pictures)]
     if not cfg.correction_asks:
         return messages
-    words = "Nothing has to change. " * (MAX_RETURNED_CHARACTERS // 23)
-    return messages + correction_messages(Correction(words, words[:MAX_COMPLAINT], 1), vocabulary)
+    refused = "Nothing has to change. " * (MAX_RETURNED_CHARACTERS // 23)
+    return messages + correction_messages(Correction(refused, refused[:MAX_COMPLAINT], 1), vocabulary)
 
 
 def _user(text: str, pictures: list[dict] | None = None) -> dict:
     return {"role": "user", "content": [*pictures, {"type": "text", "text": text}] if pictures else text}
-
-
-def _picture(width: int, height: int, number: int) -> dict:
-    image = np.full((height, width, 3), (40, 40, 200), np.uint8)
-    cv2.putText(image, str(number), (width // 8, height // 2), cv2.FONT_HERSHEY_SIMPLEX, 2.0, (255, 255, 255), 3)
-    done, data = cv2.imencode(".jpg", image)
-    assert done
-    url = f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
-    return {"type": "image_url", "image_url": {"url": url}}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -14,22 +13,23 @@ import numpy as np
 
 from caption.schema import ImageConfig, ObservedWindow
 from cosfly.llm.student_chat import EncodedImage
+from cosfly.runtime.io import sha256_bytes
 from cosfly.viz.frame_views import VIEW_FILES, Pictures, encode_picture, scaled_size
 
-CACHE_FRAMES = 256  # encoded ones kept in memory for the windows that share them
+CACHE_FRAMES = 256  # encoded frames in memory, for the windows that share them
 JPEG_QUALITY = 90
 
 
 class FrameSource(Protocol):
-    """Gives the pictures of a frame: read from its folder, or drawn."""
+    """A source of the pictures of a frame: read from its folder, or drawn."""
 
     def encode(self, frame: Path, pictures: Pictures) -> list[EncodedImage]: ...
 
 
 def pictures_of(window: ObservedWindow, cfg: ImageConfig) -> Pictures:
-    """Return what is shown of a window: the wanted views that every observed frame has (public trees can lack depth).
+    """Return which pictures of a window are sent: the wanted views that every observed frame has.
 
-    Without any, pixels are the camera's, or where none is wanted those that the settings name.
+    Public trees can lack depth. Without any view, pixels are the camera's; if none is wanted, those of the settings.
     """
     in_all = frozenset.intersection(*window.frame_files)
     views = tuple([view for view in cfg.modalities if VIEW_FILES[view] in in_all])
@@ -38,29 +38,23 @@ def pictures_of(window: ObservedWindow, cfg: ImageConfig) -> Pictures:
 
 
 class FrameEncoder:
-    """Reads and encodes frames; keeps the last CACHE_FRAMES of them."""
+    """Reads and encodes frames on any thread; keeps the last CACHE_FRAMES of them."""
 
     def __init__(self, cfg: ImageConfig, encode: Callable[[np.ndarray], EncodedImage] | None = None) -> None:
         """
         Args:
-            encode: makes what is sent of a picture; None: as the settings say.
+            encode: Encodes one picture; None encodes it as the settings say.
         """
-        self.cfg = cfg
         self._encode = encode or (lambda rgb: encode_image(rgb, cfg))
-        self.num_encoded = 0
         self._cache: OrderedDict[tuple[Path, Pictures], list[EncodedImage]] = OrderedDict()
-        self._lock = threading.Lock()  # frames are encoded on several threads
+        self._lock = threading.Lock()
 
     def holds(self, frame: Path, pictures: Pictures) -> bool:
-        """Return whether a frame is encoded already."""
+        """Return whether a frame is in the cache."""
         return (frame, pictures) in self._cache
 
     def encode(self, frame: Path, pictures: Pictures) -> list[EncodedImage]:
-        """Return the pictures of one frame: one per view, or one in all when tiled.
-
-        Raises:
-            InputError: a file is missing or not an image.
-        """
+        """Return the pictures of one frame, one per view or a tiled one; InputError if a file cannot be read."""
         key = (frame, pictures)
         with self._lock:
             if key in self._cache:
@@ -68,7 +62,6 @@ class FrameEncoder:
                 return self._cache[key]
         images = [self._encode(picture) for picture in pictures.read(frame)]
         with self._lock:
-            self.num_encoded += 1
             self._cache[key] = images
             while len(self._cache) > CACHE_FRAMES:
                 self._cache.popitem(last=False)
@@ -79,4 +72,4 @@ def encode_image(rgb: np.ndarray, cfg: ImageConfig) -> EncodedImage:
     """Encode a picture, (h, w, 3) uint8 RGB, as the data URL of a request, with the sha256 of its bytes."""
     data = encode_picture(rgb, cfg.encoding, JPEG_QUALITY)
     url = f"data:image/{cfg.encoding};base64,{base64.b64encode(data).decode('ascii')}"
-    return EncodedImage(url, hashlib.sha256(data).hexdigest())
+    return EncodedImage(url, sha256_bytes(data))

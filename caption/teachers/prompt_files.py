@@ -7,6 +7,7 @@ dollar sign.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator, Mapping
 from functools import cache, lru_cache
 from pathlib import Path
@@ -32,31 +33,26 @@ def shipped_prompts() -> dict[str, str]:
 
 def own_prompts(folder: Path) -> dict[str, str]:
     """Read a folder of prompts that replaces those that ship."""
+    export = "cosfly caption prompts --export DIR writes those that ship"
     if not folder.is_dir():
-        raise ConfigError(
-            "no such folder of prompts",
-            where=folder,
-            fix="cosfly caption prompts --export DIR writes one to begin with",
-        )
+        raise ConfigError("the folder of prompts does not exist", where=folder, fix=export)
     found, problems = dict[str, str](), list[str]()
     for path in sorted(folder.glob(f"*{SUFFIX}")):
+        found[path.stem] = ""
         try:
             found[path.stem] = read_text(path, what="prompt", tree=folder)
         except InputError as error:
             problems.append(str(error))
-            found[path.stem] = ""
-            continue
-        problems += _problems(path, found[path.stem])
+        else:
+            problems += _problems(path, found[path.stem])
     problems += [f"{folder / name}{SUFFIX}: the file is missing" for name in shipped_prompts() if name not in found]
     for problem in problems:
         log.error("%s", problem)
     if problems:
-        raise ConfigError(
-            "these prompts cannot be used", where=folder,
-            got=problems[0] + (f", and {len(problems) - 1} more" if problems[1:] else ""),
-            expected="the files and slots of those that ship",
-            fix=f"{len(problems)} to fix; cosfly caption prompts --export DIR writes those that ship",
-        )  # fmt: skip
+        got = problems[0] + (f", and {len(problems) - 1} more" if problems[1:] else "")
+        expected = "the files and slots of those that ship"
+        fix = f"{len(problems)} to fix; {export}"
+        raise ConfigError("these prompts cannot be used", where=folder, got=got, expected=expected, fix=fix)
     return found
 
 
@@ -71,9 +67,10 @@ def _problems(path: Path, text: str) -> Iterator[str]:
         yield f"{path}:1: the first line must be {VERSION!r} and a version of yours"
     if not body.strip():
         yield f"{path}:2: the prompt is empty"
+    wrong = set(slots_of(shipped)).symmetric_difference(slots_of(text))
     if not Template(text).is_valid():
         yield f"{path}: a $ that begins no slot; write $$ for a dollar sign"
-    elif wrong := {*slots_of(shipped)} ^ {*slots_of(text)}:
+    elif wrong:
         yield f"{path}: slots that are missing or unknown: {', '.join(sorted(wrong))}"
 
 
@@ -85,33 +82,35 @@ def slots_of(text: str) -> list[str]:
 @lru_cache
 def prompt_format(name: str, vocabulary: Vocabulary) -> str:
     """Return a prompt as a format for `%`, which is ten times faster than a template."""
-    template, pieces, end = vocabulary.templates[name].template, list[str](), 0
-    for match in Template.pattern.finditer(template):
-        pieces.append(template[end : match.start()].replace("%", "%%"))
-        slot = match["named"] or match["braced"]
-        pieces.append(f"%({slot})s" if slot else "$")
-        end = match.end()
-    return "".join([*pieces, template[end:].replace("%", "%%")])
+    template = vocabulary.templates[name]
+    marked = template.substitute({slot: f"\0{slot}\0" for slot in template.get_identifiers()})
+    return re.sub("\0(.+?)\0", r"%(\1)s", marked.replace("%", "%%"))
 
 
 def export_prompts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
-    """Write prompts into a folder as a start. Files that exist there must have the same text."""
+    """Write prompts into a folder; return their paths. Existing files must have the same text.
+
+    Files of the same text can be there from an interrupted export.
+    """
     with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     refuse_links(folder)
-    there = [name for name, text in texts.items() if _is_another(folder / f"{name}{SUFFIX}", text)]
-    if there:
-        names = ", ".join(f"{name}{SUFFIX}" for name in there)
-        raise ConfigError("prompts of another text are there", where=folder, got=names, fix="choose another folder")
+    others = [f"{name}{SUFFIX}" for name, text in texts.items() if _is_another(folder / f"{name}{SUFFIX}", text)]
+    if others:
+        what, fix = "the folder has prompts with another text", "choose another folder"
+        raise ConfigError(what, where=folder, got=", ".join(others), fix=fix)
+    return _write(folder, texts)
+
+
+def _is_another(path: Path, text: str) -> bool:
+    return path.exists() and not (path.is_file() and read_text(path) == text)
+
+
+def _write(folder: Path, texts: Mapping[str, str]) -> list[Path]:
     paths = [folder / f"{name}{SUFFIX}" for name in texts]
     for path, text in zip(paths, texts.values(), strict=True):
         write_bytes(path, text.encode())
     return paths
-
-
-def _is_another(path: Path, text: str) -> bool:
-    """Return whether a path exists with another content. The same text can be there from an interrupted export."""
-    return path.exists() and not (path.is_file() and read_text(path) == text)
 
 
 def vocabulary_of(cfg: CaptionConfig) -> Vocabulary:
@@ -122,10 +121,7 @@ def vocabulary_of(cfg: CaptionConfig) -> Vocabulary:
 
 def keep_own_prompts(out: Path, vocabulary: Vocabulary) -> list[Path]:
     """Write prompts that do not ship next to the captions, so that readers know them; return their paths."""
-    texts = {} if vocabulary.prompts == shipped_prompts() else vocabulary.prompts
-    paths = [out / OWN_PROMPTS / f"{name}{SUFFIX}" for name in texts]
-    if paths:
-        (out / OWN_PROMPTS).mkdir(exist_ok=True)
-    for path, text in zip(paths, texts.values(), strict=True):
-        write_bytes(path, text.encode())
-    return paths
+    if vocabulary.prompts == shipped_prompts():
+        return []
+    (out / OWN_PROMPTS).mkdir(exist_ok=True)
+    return _write(out / OWN_PROMPTS, vocabulary.prompts)

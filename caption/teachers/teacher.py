@@ -1,7 +1,7 @@
-"""Teachers: who answers a `Question`.
+"""Teachers: what answers a `Question`.
 
-`RuleTeacher` is embedded and deterministic. `AskingTeacher` asks a language model through an engine (cosfly/llm);
-every answer is journaled before it is handed on.
+`RuleTeacher` is embedded and deterministic. `AskingTeacher` asks a language model through an engine (cosfly/llm); every
+answer is journaled before it is used.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from pydantic_core import to_json
 
 from caption.answer_formats.contract import THEREFORE, Draft
 from caption.schema import CaptionConfig, ImageConfig
-from caption.teachers.foreign import FileTeacher, StudentTeacher, Terms
+from caption.teachers.foreign import GivenTeacher, Terms
 from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import Question, mirror_messages, question_messages
 from caption.teachers.rules import MODEL, write_templates
-from caption.teachers.students import TaughtStudent
+from caption.teachers.students import TrainedStudent
 from cosfly.formats.captions import TeacherRecord, TeacherSettings
 from cosfly.formats.places import flight_of
 from cosfly.llm.answer_text import answer_schema
@@ -38,46 +38,47 @@ from cosfly.runtime.seeding import random_bytes, rng_for
 from cosfly.viz.frame_views import Pictures
 
 ENCODING_THREADS = 4
+EMBEDDED = ("rules", "file", "student")  # kinds of teacher that answer at once, in the process
 
 
 class Teacher(Protocol):
-    """`ask` answers in English, `mirror` gives the Chinese of an English answer; `complaint`: what was wrong with the
-    last one."""
+    """What answers. `ask` answers in English, `mirror` gives the Chinese of an English answer.
+
+    complaint: What was wrong with the last Chinese answer.
+    """
 
     record: TeacherRecord
+
+    def terms(self, sample_id: str) -> Terms: ...
 
     async def ask(self, question: Question) -> Reply: ...
 
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply: ...
 
 
-# --- rules ------------------------------------------------------------------------------------------------------------
-
-
 class RuleTeacher:
-    """Answers from the question's facts alone; see rules.py."""
+    """Answers from the facts of the question alone; see rules.py."""
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
         settings = TeacherSettings(seed=seed)
         self.record = TeacherRecord(kind="rules", model=MODEL, settings=settings, structured="native")
         self._last_key = ""
-        self._last_answers: tuple[dict[str, str], dict[str, str]] | None = None
+        self._last: tuple[dict[str, str], dict[str, str]] | None = None
+
+    def terms(self, sample_id: str) -> Terms:
+        return Terms("slots", tuple(THEREFORE))
 
     def _answers(self, question: Question) -> tuple[dict[str, str], dict[str, str]]:
-        """Return the English and the Chinese answer.
-
-        Raises:
-            NoAnswer: no observed fact supports the given decision.
-        """
-        # Corrections have the same answer: the Chinese of `mirror` is of the question alone.
+        """Return the English and the Chinese answer; a correction does not change them."""
         key = f"{question.window.sample_id}/{replace(question, correction=None).purpose}"
-        if self._last_key != key:
+        if key != self._last_key:
             draws = random_bytes(self.seed, "caption", key)
-            self._last_key, self._last_answers = key, write_templates(question.facts, draws, question.decision)
-        if self._last_answers is None:
+            self._last = write_templates(question.facts, draws, question.decision)
+            self._last_key = key
+        if self._last is None:
             raise NoAnswer("no_reason", f"no observed fact supports {question.decision}", is_final=True)
-        return self._last_answers
+        return self._last
 
     async def ask(self, question: Question) -> Reply:
         english, _ = self._answers(question)
@@ -93,7 +94,10 @@ def _native(answer: dict[str, str]) -> Reply:
 
 
 class SharedFrames:
-    """Encodes frames on threads, each once however many windows wait for it."""
+    """Encodes frames on threads, each once however many windows wait for it.
+
+    `messages` and `pictures` raise InputError or RenderError if a picture cannot be read or encoded.
+    """
 
     def __init__(self, cfg: ImageConfig, encode: Callable[[np.ndarray], EncodedImage] | None = None) -> None:
         self.encoder = FrameEncoder(cfg, encode)
@@ -101,16 +105,12 @@ class SharedFrames:
         self._underway: dict[tuple[Path, Pictures], asyncio.Future] = {}
 
     async def messages(self, question: Question) -> tuple[list[dict], list[str]]:
-        """Return the chat messages of a question and the digests of its pictures.
-
-        Raises:
-            InputError, RenderError: a picture cannot be read or encoded.
-        """
+        """Return the chat messages of a question and the digests of its pictures."""
         await self.pictures(question)
         return question_messages(question, self.encoder)
 
     async def pictures(self, question: Question) -> list[list[EncodedImage]]:
-        """Return the pictures of each frame of a question; raises as `messages`."""
+        """Return the pictures of each frame of a question."""
         if not question.pictures.views:
             return [[] for _ in question.window.frame_folders]
         frames = [(folder, question.pictures) for folder in question.window.frame_folders]
@@ -131,26 +131,6 @@ class SharedFrames:
         self._threads.shutdown(wait=False, cancel_futures=True)
 
 
-def sampling_seed(seed: int, sample_id: str, purpose: str) -> int:
-    """Return the seed of one ask: the same in every run, another for every ask of a window."""
-    return int(rng_for(seed, "teacher", f"{sample_id}/{purpose}").integers(1 << 31))
-
-
-def first_budget(cfg: CaptionConfig, *counts: Counter[str]) -> Budget:
-    """Make the budget of a run; until an answer tells more, a request counts as 16 of the largest pictures and much
-    text.
-
-    Args:
-        counts: `totals` of each book of answers.
-    """
-    pictures = 16 * cfg.image.max_side_px * cfg.image.max_side_px * 9 // 16 // PIXELS_PER_TOKEN
-    first = pictures + 16_000 // BYTES_PER_TOKEN
-    return Budget(cfg.budget, *counts, first_prompt=first, first_completion=cfg.endpoint.max_tokens)
-
-
-# --- a language model -------------------------------------------------------------------------------------------------
-
-
 class AskingTeacher:
     """Asks a language model. Use as an async context manager; its engine is started on entry."""
 
@@ -163,10 +143,10 @@ class AskingTeacher:
         only: frozenset[str] | None = None,
         troubles: Troubles | None = None,
     ) -> None:
-        self.all_cfg, self.cfg, self.seed = cfg, cfg.endpoint, seed
+        self.cfg, self.seed = cfg, seed
         self.engine = make_engine(cfg, troubles)
         self.kept = KeptAnswers(self.engine, book, budget, only)
-        self.student = None if cfg.student.folder is None else TaughtStudent(cfg)
+        self.student = None if cfg.student.folder is None else TrainedStudent(cfg)
         self.frames = SharedFrames(cfg.image, self.student.encode if self.student else None)
 
     async def __aenter__(self) -> AskingTeacher:
@@ -175,7 +155,8 @@ class AskingTeacher:
         except BaseException:
             await self.__aexit__()
             raise
-        sampling = {name: getattr(self.cfg, name) for name in ("temperature", "top_p", "max_tokens", "extra_body")}
+        names = ("temperature", "top_p", "max_tokens", "extra_body")
+        sampling = {name: getattr(self.cfg.endpoint, name) for name in names}
         settings = TeacherSettings(**sampling, seed=self.seed)
         kind = "student" if self.student else self.engine.kind
         self.record = TeacherRecord(kind=kind, model=self.engine.model, settings=settings)
@@ -185,56 +166,62 @@ class AskingTeacher:
         self.frames.close()
         await self.engine.close()
 
+    def terms(self, sample_id: str) -> Terms:
+        return self.student.terms if self.student else Terms(self.cfg.writing, tuple(THEREFORE))
+
     async def ask(self, question: Question) -> Reply:
-        return await self._kept_answer(question, await self.request(question), question.purpose)
+        if self.student is not None:
+            self.student.check(question)
+            frames = await self.frames.pictures(question)
+            request = self.student.request(question, frames, question.ask)
+        else:
+            messages, digests = await self.frames.messages(question)
+            schema = answer_schema(question.decision, more=THEREFORE)
+            request = self._request(question, question.purpose, messages, digests, schema)
+        return await self._kept_answer(question, request, question.purpose)
 
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply:
-        sample_id, purpose = question.window.sample_id, f"mirror/{ask}"
+        purpose = f"mirror/{ask}"
         if self.student is not None:
             frames = await self.frames.pictures(question)
             request = self.student.mirror_request(question, english, frames, ask)
         else:
-            schema = answer_schema(english.coc.flight_decision, "zh")
             messages = mirror_messages(english, question.way, complaint)
-            request = self.cfg.request(messages, [], schema, sampling_seed(self.seed, sample_id, purpose))
+            schema = answer_schema(english.coc.flight_decision, "zh")
+            request = self._request(question, purpose, messages, [], schema)
         return await self._kept_answer(question, request, purpose)
+
+    def _request(
+        self, question: Question, purpose: str, messages: list[dict], digests: list[str], schema: dict
+    ) -> Request:
+        """Return a request; its sampling seed is the same in every run, and another for every ask of a window."""
+        item = f"{question.window.sample_id}/{purpose}"
+        seed = int(rng_for(self.seed, "teacher", item).integers(1 << 31))
+        return self.cfg.endpoint.request(messages, digests, schema, seed)
 
     async def _kept_answer(self, question: Question, request: Request, purpose: str) -> Reply:
         sample_id = question.window.sample_id
         return await self.kept.ask(request, flight_of(sample_id), sample_id, purpose)
 
-    async def request(self, question: Question) -> Request:
-        """Return what is asked of the engine.
 
-        Raises:
-            InputError, RenderError: a picture cannot be read or encoded.
-        """
-        if self.student is not None:
-            self.student.check(question)
-            return self.student.request(question, await self.frames.pictures(question), question.ask)
-        messages, digests = await self.frames.messages(question)
-        seed = sampling_seed(self.seed, question.window.sample_id, question.purpose)
-        schema = answer_schema(question.decision, more=THEREFORE)
-        return self.cfg.request(messages, digests, schema, seed)
+def first_budget(cfg: CaptionConfig, *counts: Counter[str]) -> Budget:
+    """Return the budget of a run. Until the first answer, a request counts as 16 of the largest pictures and much text.
 
-
-EMBEDDED = ("rules", "file", "student")  # kinds that answer at once, in the process
+    Args:
+        counts: `totals` of each answer journal.
+    """
+    pictures = 16 * cfg.image.max_side_px * cfg.image.max_side_px * 9 // 16 // PIXELS_PER_TOKEN
+    first = pictures + 16_000 // BYTES_PER_TOKEN
+    return Budget(cfg.budget, *counts, first_prompt=first, first_completion=cfg.endpoint.max_tokens)
 
 
 def embedded_teacher(cfg: CaptionConfig, seed: int) -> Teacher:
-    """Make a teacher that asks nobody."""
-    path = cfg.caption_file
-    if path is None:
-        return RuleTeacher(seed)
-    return StudentTeacher(path, cfg.student.run, seed) if cfg.teacher_kind == "student" else FileTeacher(path, seed)
+    """Return a teacher that asks no model."""
+    return RuleTeacher(seed) if cfg.teacher_kind == "rules" else GivenTeacher(cfg, seed)
 
 
 def make_engine(cfg: CaptionConfig, troubles: Troubles | None = None) -> Engine:
-    """Make the engine that the settings name.
-
-    Args:
-        troubles: where a server notes tries that fail.
-    """
+    """Return the engine that the settings name. troubles: Records the failed tries of a server."""
     if cfg.teacher_kind == "endpoint":
         return ChatClient(cfg.teacher, cfg.endpoint, troubles)
     folder = Path(cfg.teacher.removeprefix("vllm:"))
@@ -249,16 +236,7 @@ def open_teacher(
     only: frozenset[str] | None = None,
     troubles: Troubles | None = None,
 ) -> AbstractAsyncContextManager[Teacher]:
-    """Make the teacher that the settings name; it is ready inside `async with`."""
+    """Return the teacher that the settings name; it is ready inside `async with`."""
     if cfg.teacher_kind in EMBEDDED:
         return nullcontext(embedded_teacher(cfg, seed))
     return AskingTeacher(cfg, book, seed, budget, only, troubles)
-
-
-def terms_of(teacher: Teacher, sample_id: str, cfg: CaptionConfig) -> Terms:
-    """Return the terms under which a teacher answers for a window."""
-    if isinstance(teacher, FileTeacher | StudentTeacher):
-        return teacher.terms(sample_id)
-    if isinstance(teacher, AskingTeacher) and teacher.student is not None:
-        return teacher.student.terms
-    return Terms(cfg.writing, tuple(THEREFORE))

@@ -28,8 +28,8 @@ from teacher_server import CHINESE, ENGLISH
 
 from caption.schema import CaptionConfig
 from caption.stage.asking import Asking
-from caption.stage.flights import allot, named_flights
 from caption.stage.stage import open_stage
+from caption.stage.tracks import find_inputs
 from caption.teachers.images import FrameEncoder
 from caption.teachers.teacher import SharedFrames
 from cosfly.formats.frames import SKY_DEPTH_M
@@ -88,7 +88,7 @@ def _client(
     The product is not merged: only asking counts.
     """
     stage = open_stage(cfg, tree, out, 0, "never")
-    allotted, _ = allot(named_flights(tree), cfg)
+    tracks, _ = find_inputs(cfg, tree)
     bodies: list[bytes] = []
     frames: list[SharedFrames] = []
     plain_init, plain_encode = SharedFrames.__init__, protocol.encode_body
@@ -103,11 +103,11 @@ def _client(
         bodies.append(plain_encode(payload))
         return bodies[-1]
 
-    SharedFrames.__init__ = init  # type: ignore[method-assign]
+    SharedFrames.__init__ = init  # type: ignore[method-assign, assignment]
     protocol.encode_body = recording if encoder is None else plain_encode
     try:
         start_s = time.monotonic()
-        asked = asyncio.run(Asking(stage, cfg, VOCABULARY, 0).run(allotted))
+        asked = asyncio.run(Asking(stage, cfg, VOCABULARY, 0).run(tracks))
         seconds = time.monotonic() - start_s
     finally:
         SharedFrames.__init__, protocol.encode_body = plain_init, plain_encode  # type: ignore[method-assign, assignment]
