@@ -126,25 +126,15 @@ class WindowConfig(Config):
     num_frames: int = Field(5, ge=3, le=32, description="observed frames of a window, one time step apart")
     future_frames: int = Field(5, ge=1, le=32, description="frames after the current one that give the label")
     stride: int = Field(1, ge=1, description="frames between the current frames of two windows; 1 takes every frame")
-    keyframes: bool = Field(
-        False, description="take only the windows at which the label changes, and each tenth after one"
-    )
+    keyframes: bool = Field(False, description="only windows at which the label changes, and each tenth after one")
     keyframe_stride: ClassVar[int] = 10  # windows from one keyframe to the next within a label, at most
     require_images: bool = Field(True, description="drop a window that lacks the rgb.png of an observed frame")
 
 
 class ImageConfig(Config):
-    modalities: tuple[View, ...] = Field(
-        ("rgb", "depth", "segmentation"), min_length=1, description="pictures of each observed frame"
-    )
-    layout: Layout = Field(
-        "separate", description="separate: one image per view; tiled: one image per frame, side by side"
-    )
-    max_side_px: int = Field(
-        640,
-        ge=28,
-        description="longest side of one view's picture; pixels in facts, prompt and answer are this picture's",
-    )
+    modalities: tuple[View, ...] = Field(("rgb", "depth", "segmentation"), min_length=1, description="views of a frame")
+    layout: Layout = Field("separate", description="separate: one image per view; tiled: one per frame, side by side")
+    max_side_px: int = Field(640, ge=28, description="longest side of a view, to which pixels in texts refer")
     depth_range_m: float = Field(DEPTH_RANGE_M, gt=0, description="depth at the dark end of the pseudo-colour")
     encoding: ClassVar[Literal["jpeg", "png"]] = "jpeg"  # of the pictures in a request; a student's are PNG
 
@@ -170,17 +160,15 @@ class JudgeConfig(Config):
 
 class RepairConfig(Config):
     hard_conflict: Treatment = Field(
-        "repair", description="a decision that the flight contradicts: repair (ask again), drop, or keep as it is"
+        "repair", description="decision that the flight contradicts: repair (ask again), drop or keep"
     )
     soft_conflict: Treatment = Field(
-        "keep",
-        description="another decision than the label that the flight does not contradict, where no judge is asked: "
-        "keep, repair (ask again) or drop",
+        "keep", description="another decision than the label, without a judge: keep, repair (ask again) or drop"
     )
     strategy: Strategy = Field(
         "anchored",
-        description="anchored: the true decision is given; hint: the rejected one is named; multi_sample: asked again; "
-        "cascade: hint, then multi_sample, then anchored, until an answer is the label",
+        description="anchored: the label is given; hint: the rejected decision is named; multi_sample: asked again; "
+        "cascade: hint, multi_sample, anchored, until an answer is the label",
     )
     max_asks: int = Field(3, ge=0, le=10, description="asks per rejected sample; 0 drops it at once")
 
@@ -194,15 +182,13 @@ class StudentConfig(Config):
 
     folder: Path | None = Field(
         None,
-        description="output of `distill train` or `distill merge`; it determines windows, pictures, prompts and "
-        "sampling. Empty: the teacher is not a student",
+        description="output of `distill train` or `merge`, to ask the teacher in the form of its training; empty: no "
+        "student",
     )
     max_new_tokens: ClassVar[int] = MAX_ANSWER_TOKENS  # longest answer
     constrained: bool = Field(False, description="hold its answers to their JSON schema")
     run: str | None = Field(
-        None,
-        description="of student:PATH with predictions for several trees: the tree to caption, as named in the training "
-        "set",
+        None, description="tree to caption, as named in the training set, if student:PATH has predictions for several"
     )
 
     def recorded(self) -> dict[str, Any]:

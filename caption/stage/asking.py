@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from caption.schema import CaptionConfig, Window
 from caption.stage.ledger import explain_drops, most_common
-from caption.stage.progress import Display
+from caption.stage.progress import show_progress
 from caption.stage.tracks import TrackInput
 from caption.stage.window_loop import caption_window
 from caption.teachers.judge import open_judge
@@ -107,7 +106,8 @@ class Asking:
             with AnswerBook(path / ANSWERS) as answers, AnswerBook(path / JUDGEMENTS) as judgements:
                 self.books = (answers, judgements)
                 budget = first_budget(self.cfg, answers.totals, judgements.totals)
-                with Display(sum(guesses), budget, troubles) as self.display:
+                total = None if self.cfg.window.keyframes else sum(guesses)
+                with show_progress(total, budget, troubles) as self.progress:
                     async with (
                         open_teacher(self.cfg, answers, self.seed, budget, self.only, troubles) as teacher,
                         open_judge(self.cfg.judge, self.vocabulary, self.seed, judgements, budget, troubles) as judge,
@@ -123,15 +123,16 @@ class Asking:
         self.outcome.tracks.input = len(tracks) - self.outcome.num_tracks_left
         return self.outcome
 
-    async def _update_display(self) -> None:
+    async def _show_progress(self) -> None:
+        """Update the progress regularly, even if no window is finished."""
         while True:
             await asyncio.sleep(SECONDS_BETWEEN_LINES)
-            self.display.update()
+            self.progress.show()
 
     async def _ask_all(self, tracks: list[TrackInput], guesses: list[int], teacher: Teacher) -> None:
         """Keep `concurrency` requests in flight, whatever track they belong to."""
         running: set[asyncio.Task] = set()
-        heartbeat = asyncio.create_task(self._update_display())
+        heartbeat = asyncio.create_task(self._show_progress())
         try:
             for track, guess in zip(tracks, guesses, strict=True):
                 part = track.part(self.stage.path)
@@ -139,13 +140,13 @@ class Asking:
                     if self.dropped is not None and any(one.status == "accepted" for one in read_captions(part)):
                         self.dropped = None
                     self.outcome.tracks.kept += 1
-                    self.display.num_before += guess
+                    self.progress.skip(guess)
                     continue
                 is_for_later = self.tracks_to_retry is not None and track.name not in self.tracks_to_retry
                 if self.outcome.stopped or (is_for_later and guess):
                     self.outcome.num_tracks_left += 1
                     continue
-                running = await self._ask_track(track, guess, teacher, running)
+                running = await self._ask_track(track, teacher, running)
             while running:
                 running = await _wait_for_one(running)
         finally:
@@ -154,9 +155,7 @@ class Asking:
                 task.cancel()
             await asyncio.gather(*running, return_exceptions=True)
 
-    async def _ask_track(
-        self, source: TrackInput, guess: int, teacher: Teacher, running: set[asyncio.Task]
-    ) -> set[asyncio.Task]:
+    async def _ask_track(self, source: TrackInput, teacher: Teacher, running: set[asyncio.Task]) -> set[asyncio.Task]:
         """Begin the windows of a track; return the tasks that are not done."""
         track, tally = _OpenTrack(source), self.outcome.tracks
         num_windows = 0
@@ -179,15 +178,12 @@ class Asking:
                 tally.kept += 1
             else:
                 tally.dropped["too_short"] += 1
-        if not self.outcome.stopped:
-            self.display.total += num_windows - guess
         track.is_read = True
         self._write_if_done(track)
         return running
 
     async def _ask_window(self, track: _OpenTrack, window: Window, teacher: Teacher) -> None:
-        sample_id, start_s = window.observed.sample_id, time.monotonic()
-        self.display.num_open += 1
+        sample_id = window.observed.sample_id
         try:
             caption = await caption_window(window, teacher, self.cfg, self.vocabulary, self.judge)
         except BudgetSpent as error:
@@ -203,9 +199,7 @@ class Asking:
             track.captions.append(caption)
             self._record_refusal(caption)
             self._stop_if_hopeless(caption)
-            self.display.finish(caption, time.monotonic() - start_s)
-        finally:
-            self.display.num_open -= 1
+            self.progress.finish(caption)
         track.num_pending -= 1
         self._write_if_done(track)
 
@@ -215,8 +209,7 @@ class Asking:
         self.outcome.unanswered.append(failure)
         if failure.code != NOT_ASKED:
             self.quarantine[failure.id] = failure
-            self.display.num_unanswered += 1
-            self.display.update()
+            self.progress.miss()
             self._count_failure(f"{common_causes(self.outcome.unanswered)}; the last: {failure.message}")
 
     def _record_refusal(self, caption: Caption) -> None:

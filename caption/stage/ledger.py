@@ -160,6 +160,7 @@ class Ledger:
         self.refusals: dict[str, str] = {}
         self.tokens: Counter[str] = Counter()
         self.repair_asks: Counter[int] = Counter()
+        self.rungs: Counter[str] = Counter()  # the attempt that repaired, or the outcome if none did
         self.confusion: Counter[tuple[str, str]] = Counter()  # label, first decision
         self.outcomes: Counter[tuple[str, str]] = Counter()  # strategy, rung or outcome
 
@@ -182,7 +183,9 @@ class Ledger:
             self.confusion[label, repair.first_decision if repair else caption.en.flight_decision] += 1
         if repair:
             self.repair_asks[repair.asks] += 1
-            self.outcomes[repair.strategy, repair.rung or repair.outcome] += 1
+            rung = repair.rung or repair.outcome
+            self.rungs[rung] += 1
+            self.outcomes[repair.strategy, rung] += 1
         if judge:
             self.words["judgements"][judge.verdict] += 1
             if judge.overruled_by is not None:
@@ -222,9 +225,6 @@ class Ledger:
 
     def report(self, tracks: Tally, windows: Tally, judge_tokens: Usage | None) -> CaptionReport:
         order = {token: i for i, token in enumerate((*TOKENS, "none"))}
-        rungs: Counter[str] = Counter()
-        for (_, rung), count in self.outcomes.items():
-            rungs[rung] += count
         return CaptionReport(
             teacher=self.teacher,
             flights=tracks,
@@ -234,8 +234,8 @@ class Ledger:
             tokens=dict(sorted(self.tokens.items())),
             confusion=_nested(self.confusion, lambda pair: (order[pair[0]], order[pair[1]])),
             repair=RepairCounts(
-                rejected=rungs.total(),
-                rungs=most_common(rungs),
+                rejected=self.rungs.total(),
+                rungs=most_common(self.rungs),
                 outcomes_by_strategy=_nested(self.outcomes),
                 asks={str(asks): count for asks, count in sorted(self.repair_asks.items())},
             ),

@@ -1,7 +1,7 @@
 """Labels and verdicts of released captions, recomputed from the track that they are released with.
 
-A reader for `cosfly release verify`, which gives a track as its rows show it. A window whose future frames a stride
-left out of the rows is not checked.
+A reader for `cosfly release verify`, which gives a track as its rows show it. A window is checked only if its future
+frames are released.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ def run(
     resume: Resume = "if-same",
     retry_failed: bool = False,
 ) -> Path:
-    """Caption the tracks of a playback tree; return the path of `captions.jsonl`.
+    """Write captions of the tracks of a playback tree; return the path of `captions.jsonl`.
 
     Args:
         data: Playback tree, ours or of the public layout.

@@ -72,7 +72,7 @@ def prepare(
 async def caption_window(
     window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary, judge: Judge | None = None
 ) -> Caption:
-    """Caption one window.
+    """Make the caption of one window.
 
     Raises:
         NoAnswer: The teacher gave none, but may later. TeacherError: No window will get an answer.
@@ -84,7 +84,7 @@ async def caption_window(
 async def caption_prepared(
     prepared: PreparedWindow, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None
 ) -> Caption:
-    """Caption a prepared window; raises like `caption_window`."""
+    """Make the caption of a prepared window; raises like `caption_window`."""
     loop = _WindowLoop(teacher, cfg, prepared, judge)
     loop.checks["keyframe"] = prepared.window.keyframe
     loop.checks["contradicted"] = prepared.contradicted
@@ -119,7 +119,7 @@ class Trial:
 async def try_strategy(
     window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary, strategy: Strategy
 ) -> Trial | None:
-    """Regenerate the first answer of a window by a strategy; None if it is not rejected. NoAnswer: There is none."""
+    """Repair the first answer of a window by a strategy; None if it is not rejected. NoAnswer: There is none."""
     repair = cfg.repair.model_copy(update={"strategy": strategy})
     [prepared] = prepare([window], teacher, cfg, vocabulary)
     loop = _WindowLoop(teacher, cfg.model_copy(update={"repair": repair}), prepared)

@@ -1,1 +1,1 @@
-"""Who answers: prompts, pictures, and the teachers."""
+"""Teachers, their prompts and their pictures."""

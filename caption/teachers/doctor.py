@@ -7,7 +7,7 @@ answer or in the count of tokens.
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +15,7 @@ import httpx
 import numpy as np
 
 from caption.answer_formats.contract import THEREFORE
-from caption.schema import CaptionConfig, ObservedWindow, observed_frames
+from caption.schema import CaptionConfig, ObservedFrame, ObservedWindow
 from caption.teachers.images import encode_image
 from caption.teachers.prompts import (
     MAX_RETURNED_CHARACTERS,
@@ -201,7 +201,9 @@ class _Examination:
 def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary, pictures: list[dict]) -> list[dict]:
     """Return messages as long as ours get: a made-up window whose numbers have many digits."""
     count = cfg.window.num_frames
-    far_m = np.full((count, 3), -12345.67) + np.arange(count)[:, None]
+    far_m = (-12345.67, -12345.67, -12345.67)
+    box_px = (1200.0, 600.0, 1260.0, 700.0)
+    frame = ObservedFrame(0.0, far_m, (-123.4, -123.4, -123.4), far_m, (1234.5, 654.3), box_px, True, True, 0.5)
     window = ObservedWindow(
         sample_id="doctor_ORI_frame_00004",
         town="doctor",
@@ -210,17 +212,7 @@ def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary, pictures: list[
         indices=tuple(range(count)),
         width_px=1280,
         height_px=720,
-        frames=observed_frames(
-            0.5 * np.arange(count),
-            far_m,
-            np.tile([-123.4, -123.4, -123.4], (count, 1)),
-            far_m + 100.0,
-            np.tile([1234.5, 654.3], (count, 1)),
-            np.tile([1200.0, 600.0, 1260.0, 700.0], (count, 1)),
-            np.ones(count, bool),
-            np.ones(count, bool),
-            np.full(count, 0.5),
-        ),
+        frames=tuple(replace(frame, time_s=0.5 * i, target_m=(i - 12245.67, -12245.67, 0.0)) for i in range(count)),
         frame_folders=(Path("frame"),) * count,
         frame_files=(frozenset(VIEW_FILES.values()),) * count,
     )

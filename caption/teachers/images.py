@@ -6,6 +6,7 @@ import base64
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Protocol
 
@@ -38,7 +39,7 @@ def pictures_of(window: ObservedWindow, cfg: ImageConfig) -> Pictures:
 
 
 class FrameEncoder:
-    """Reads and encodes frames on any thread; keeps the last CACHE_FRAMES of them."""
+    """Reads and encodes frames on any thread, each once; keeps the last CACHE_FRAMES of them."""
 
     def __init__(self, cfg: ImageConfig, encode: Callable[[np.ndarray], EncodedImage] | None = None) -> None:
         """
@@ -46,26 +47,28 @@ class FrameEncoder:
             encode: Encodes one picture; None encodes it as the settings say.
         """
         self._encode = encode or (lambda rgb: encode_image(rgb, cfg))
-        self._cache: OrderedDict[tuple[Path, Pictures], list[EncodedImage]] = OrderedDict()
+        self._cache: OrderedDict[tuple[Path, Pictures], Future[list[EncodedImage]]] = OrderedDict()
         self._lock = threading.Lock()
-
-    def holds(self, frame: Path, pictures: Pictures) -> bool:
-        """Return whether a frame is in the cache."""
-        return (frame, pictures) in self._cache
 
     def encode(self, frame: Path, pictures: Pictures) -> list[EncodedImage]:
         """Return the pictures of one frame, one per view or a tiled one; InputError if a file cannot be read."""
         key = (frame, pictures)
         with self._lock:
-            if key in self._cache:
-                self._cache.move_to_end(key)
-                return self._cache[key]
-        images = [self._encode(picture) for picture in pictures.read(frame)]
-        with self._lock:
-            self._cache[key] = images
-            while len(self._cache) > CACHE_FRAMES:
+            is_new = key not in self._cache
+            future = self._cache.setdefault(key, Future())
+            self._cache.move_to_end(key)
+            if len(self._cache) > CACHE_FRAMES:
                 self._cache.popitem(last=False)
-        return images
+        if is_new:  # other threads wait for it
+            try:
+                future.set_result([self._encode(picture) for picture in pictures.read(frame)])
+            except Exception as error:
+                future.set_exception(error)
+        return future.result()
+
+    def encode_window(self, window: ObservedWindow, pictures: Pictures) -> list[list[EncodedImage]]:
+        """Return the pictures of each frame of a window."""
+        return [self.encode(frame, pictures) if pictures.views else [] for frame in window.frame_folders]
 
 
 def encode_image(rgb: np.ndarray, cfg: ImageConfig) -> EncodedImage:

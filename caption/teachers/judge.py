@@ -93,7 +93,7 @@ class Judge:
         self.sampling = {"temperature": 0.0, "seed": seed, "max_tokens": MAX_TOKENS, **cfg.extra_body}
 
     async def judge(self, conflict: Conflict, order: Sequence[Judgement] = JUDGEMENTS) -> JudgeRecord:
-        """Judge a conflict; the verdict is `unjudged` without a readable answer. BudgetSpent: the limit is reached."""
+        """Return the verdict on a conflict, `unjudged` without a readable answer. BudgetSpent: A limit is reached."""
         messages = judge_messages(conflict, self.vocabulary, order)
         request = Request(messages, [], judge_schema(order), self.sampling)
         try:

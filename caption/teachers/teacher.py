@@ -14,13 +14,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
-import numpy as np
 from pydantic_core import to_json
 
 from caption.answer_formats.contract import THEREFORE, Draft
-from caption.schema import CaptionConfig, ImageConfig
+from caption.schema import CaptionConfig
 from caption.teachers.foreign import GivenTeacher, Terms
 from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import Question, mirror_messages, question_messages
@@ -32,12 +31,11 @@ from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.answers import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, AnswerBook, Budget, KeptAnswers
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Engine, NoAnswer, Reply, Request, Troubles
-from cosfly.llm.student_chat import EncodedImage
 from cosfly.llm.vllm_engine import VllmEngine
 from cosfly.runtime.seeding import random_bytes, rng_for
-from cosfly.viz.frame_views import Pictures
 
 ENCODING_THREADS = 4
+Result = TypeVar("Result")
 EMBEDDED = ("rules", "file", "student")  # kinds of teacher that answer at once, in the process
 
 
@@ -93,44 +91,6 @@ def _native(answer: dict[str, str]) -> Reply:
     return Reply(to_json(answer).decode(), None, "native", "stop")  # a tenth of the time of the json module
 
 
-class SharedFrames:
-    """Encodes frames on threads, each once however many windows wait for it.
-
-    `messages` and `pictures` raise InputError or RenderError if a picture cannot be read or encoded.
-    """
-
-    def __init__(self, cfg: ImageConfig, encode: Callable[[np.ndarray], EncodedImage] | None = None) -> None:
-        self.encoder = FrameEncoder(cfg, encode)
-        self._threads = ThreadPoolExecutor(min(ENCODING_THREADS, os.cpu_count() or 1), "encode")
-        self._underway: dict[tuple[Path, Pictures], asyncio.Future] = {}
-
-    async def messages(self, question: Question) -> tuple[list[dict], list[str]]:
-        """Return the chat messages of a question and the digests of its pictures."""
-        await self.pictures(question)
-        return question_messages(question, self.encoder)
-
-    async def pictures(self, question: Question) -> list[list[EncodedImage]]:
-        """Return the pictures of each frame of a question."""
-        if not question.pictures.views:
-            return [[] for _ in question.window.frame_folders]
-        frames = [(folder, question.pictures) for folder in question.window.frame_folders]
-        missing = [frame for frame in frames if not self.encoder.holds(*frame)]
-        if missing:
-            await asyncio.gather(*(self._encode(frame) for frame in missing))
-        return [self.encoder.encode(*frame) for frame in frames]
-
-    async def _encode(self, frame: tuple[Path, Pictures]) -> None:
-        underway = self._underway.get(frame)
-        if underway is None:
-            loop = asyncio.get_running_loop()
-            underway = self._underway[frame] = loop.run_in_executor(self._threads, self.encoder.encode, *frame)
-            underway.add_done_callback(lambda _: self._underway.pop(frame, None))
-        await asyncio.shield(underway)  # a window that is cancelled does not take the frame from the others
-
-    def close(self) -> None:
-        self._threads.shutdown(wait=False, cancel_futures=True)
-
-
 class AskingTeacher:
     """Asks a language model. Use as an async context manager; its engine is started on entry."""
 
@@ -147,7 +107,8 @@ class AskingTeacher:
         self.engine = make_engine(cfg, troubles)
         self.kept = KeptAnswers(self.engine, book, budget, only)
         self.student = None if cfg.student.folder is None else TrainedStudent(cfg)
-        self.frames = SharedFrames(cfg.image, self.student.encode if self.student else None)
+        self.encoder = FrameEncoder(cfg.image, self.student.encode if self.student else None)
+        self._threads = ThreadPoolExecutor(min(ENCODING_THREADS, os.cpu_count() or 1), "encode")
 
     async def __aenter__(self) -> AskingTeacher:
         try:
@@ -163,7 +124,7 @@ class AskingTeacher:
         return self
 
     async def __aexit__(self, *exc: object) -> None:
-        self.frames.close()
+        self._threads.shutdown(wait=False, cancel_futures=True)
         await self.engine.close()
 
     def terms(self, sample_id: str) -> Terms:
@@ -172,10 +133,10 @@ class AskingTeacher:
     async def ask(self, question: Question) -> Reply:
         if self.student is not None:
             self.student.check(question)
-            frames = await self.frames.pictures(question)
+            frames = await self._in_thread(self.encoder.encode_window, question.window, question.pictures)
             request = self.student.request(question, frames, question.ask)
         else:
-            messages, digests = await self.frames.messages(question)
+            messages, digests = await self._in_thread(question_messages, question, self.encoder)
             schema = answer_schema(question.decision, more=THEREFORE)
             request = self._request(question, question.purpose, messages, digests, schema)
         return await self._kept_answer(question, request, question.purpose)
@@ -183,13 +144,17 @@ class AskingTeacher:
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply:
         purpose = f"mirror/{ask}"
         if self.student is not None:
-            frames = await self.frames.pictures(question)
+            frames = await self._in_thread(self.encoder.encode_window, question.window, question.pictures)
             request = self.student.mirror_request(question, english, frames, ask)
         else:
             messages = mirror_messages(english, question.way, complaint)
             schema = answer_schema(english.coc.flight_decision, "zh")
             request = self._request(question, purpose, messages, [], schema)
         return await self._kept_answer(question, request, purpose)
+
+    async def _in_thread(self, function: Callable[..., Result], *args: Any) -> Result:
+        """Call a function that reads and encodes pictures without blocking the other windows."""
+        return await asyncio.get_running_loop().run_in_executor(self._threads, function, *args)
 
     def _request(
         self, question: Question, purpose: str, messages: list[dict], digests: list[str], schema: dict

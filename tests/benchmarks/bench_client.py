@@ -31,7 +31,7 @@ from caption.stage.asking import Asking
 from caption.stage.stage import open_stage
 from caption.stage.tracks import find_inputs
 from caption.teachers.images import FrameEncoder
-from caption.teachers.teacher import SharedFrames
+from caption.teachers.teacher import AskingTeacher
 from cosfly.formats.frames import SKY_DEPTH_M
 from cosfly.llm import protocol
 from cosfly.viz.frame_views import VIEW_FILES
@@ -90,29 +90,29 @@ def _client(
     stage = open_stage(cfg, tree, out, 0, "never")
     tracks, _ = find_inputs(cfg, tree)
     bodies: list[bytes] = []
-    frames: list[SharedFrames] = []
-    plain_init, plain_encode = SharedFrames.__init__, protocol.encode_body
+    teachers: list[AskingTeacher] = []
+    plain_init, plain_encode = AskingTeacher.__init__, protocol.encode_body
 
-    def init(self: SharedFrames, *args) -> None:
+    def init(self: AskingTeacher, *args) -> None:
         plain_init(self, *args)
         if encoder is not None:
             self.encoder = encoder
-        frames.append(self)
+        teachers.append(self)
 
     def recording(payload: dict) -> bytes:
         bodies.append(plain_encode(payload))
         return bodies[-1]
 
-    SharedFrames.__init__ = init  # type: ignore[method-assign, assignment]
+    AskingTeacher.__init__ = init  # type: ignore[method-assign, assignment]
     protocol.encode_body = recording if encoder is None else plain_encode
     try:
         start_s = time.monotonic()
         asked = asyncio.run(Asking(stage, cfg, VOCABULARY, 0).run(tracks))
         seconds = time.monotonic() - start_s
     finally:
-        SharedFrames.__init__, protocol.encode_body = plain_init, plain_encode  # type: ignore[method-assign, assignment]
+        AskingTeacher.__init__, protocol.encode_body = plain_init, plain_encode  # type: ignore[method-assign, assignment]
     assert not asked.unanswered, asked.unanswered[:3]
-    return seconds, bodies, frames[0].encoder
+    return seconds, bodies, teachers[0].encoder
 
 
 async def _bare(url: str, bodies: list[bytes], concurrency: int, num_clients: int) -> float:
