@@ -1,37 +1,87 @@
-"""The rule teacher: true sentences, the same in both languages, and a decision with a reason."""
+"""The rule teacher: sentences that agree in both languages, true facts, a reason for each decision."""
 
 import re
+from collections import Counter
+from dataclasses import replace
 
 import pytest
 
 from caption.schema import WindowConfig
 from caption.stage.windows import cut_windows
-from caption.teachers.rules import sentences
-from caption.verification.references import parse_reference
+from caption.teachers.rule_decisions import is_shaken
+from caption.teachers.rules import FAMILIES, decide, sentences, write_templates
+from caption.verification.facts import measure_facts
+from caption.verification.glossary import load_glossary
+from caption.verification.references import Fact, look_up, parse_reference
 from caption.verification.vocabulary import terms_in
+from cosfly.formats.captions import TOKENS
+from cosfly.llm.answer_text import cut_sentences
+from cosfly.runtime.seeding import random_bytes
 from specimens import make_flight
 
 SLOT = re.compile(r"\{([^{}]*)\}")
+FIELDS = ("critical_components", "reasoning_trace")
 PAIRS = [
-    (part, group.name, pair)
+    pair
     for parts in sentences().values()
-    for part, groups in parts.items()
+    for groups in parts.values()
     for group in groups.values()
     for pair in group.smooth
 ]
 
 
-def windows(tmp_path):
-    for seed in range(6):
+def poles_of(text, language):
+    return Counter((name, sign) for name, sign, _ in load_glossary().poles(SLOT.sub("", text), language))
+
+
+@pytest.fixture(scope="module")
+def facts(tmp_path_factory):
+    folder, found = tmp_path_factory.mktemp("flights"), []
+    for seed in range(4):
         for variant in ("ORI", "aug_001"):
-            flight = make_flight(seed=seed, variant=variant)[0]
-            flight = flight.__class__(**{**vars(flight), "folder": tmp_path})
-            yield from (window.observed for window in cut_windows(flight, WindowConfig()))
+            flight = replace(make_flight(seed=seed, variant=variant)[0], folder=folder)
+            found += [measure_facts(window.observed) for window in cut_windows(flight, WindowConfig())]
+    return found
 
 
-@pytest.mark.parametrize(("part", "name", "pair"), PAIRS, ids=[pair[2][0][:40] for pair in PAIRS])
-def test_both_languages_of_a_sentence_hold_the_same_slots_and_terms(part, name, pair):
-    english, chinese = pair
-    assert sorted(SLOT.findall(english)) == sorted(SLOT.findall(chinese)) or "compared:speed" in chinese
-    assert all(zh in chinese for _, zh in terms_in(SLOT.sub("", english)))
-    assert all(slot == "decision" or parse_reference(slot) for slot in SLOT.findall(english + chinese))
+def test_both_languages_of_a_sentence_agree():
+    for english, chinese in PAIRS:
+        assert sorted(SLOT.findall(english)) == sorted(SLOT.findall(chinese)), english
+        assert all(zh in chinese for _, zh in terms_in(SLOT.sub("", english))), english
+        assert poles_of(english, "en") == poles_of(chinese, "zh"), english
+        assert all(slot == "decision" or parse_reference(slot) for slot in SLOT.findall(english)), english
+        assert len(cut_sentences(english)) == len(cut_sentences(chinese)) == 1, english
+
+
+def test_a_caption_has_few_facts_a_reason_and_known_values(facts):
+    for i, one in enumerate(facts):
+        english, chinese = write_templates(one, random_bytes(0, "rules", str(i)))
+        assert english["flight_decision"] == chinese["flight_decision"] == decide(one)
+        for name in FIELDS:
+            assert len(cut_sentences(english[name])) == len(cut_sentences(chinese[name]))
+            for slot in set(SLOT.findall(english[name])) - {"decision"}:
+                assert isinstance(look_up(parse_reference(slot), one), Fact), slot
+        assert 1 <= len(cut_sentences(english["critical_components"])) <= 5
+        assert "{decision}" in english["reasoning_trace"]
+
+
+def test_a_shaken_track_tells_no_motion_in_numbers(facts):
+    shaken = [one for one in facts if is_shaken(one)]
+    for one in shaken:
+        english, _ = write_templates(one, random_bytes(0, "rules", "shaken"))
+        assert not re.search(r"\{(change:|mean:target_speed|mean:speed|yaw\})", " ".join(english.values()))
+
+
+def test_a_decision_without_a_reason_is_not_argued(facts):
+    given = {token: [write_templates(one, bytes(32), token) for one in facts] for token in TOKENS}
+    assert all(answer is None for answer in given["return_to_home"])
+    assert any(answer is None for answer in given["yaw_left_to_follow"])
+    assert all(answer is None or answer[0]["flight_decision"] == token for token in TOKENS for answer in given[token])
+
+
+def test_each_decision_has_a_family_and_each_family_sentences():
+    assert sorted(token for family in FAMILIES.values() for token in family.tokens) == sorted(TOKENS)
+    assert len({english for english, _ in PAIRS}) >= 60
+    for name, family in FAMILIES.items():
+        assert sentences()["reasons"][name]
+        assert {*family.deciding, *family.more} <= sentences()["facts"].keys()

@@ -37,7 +37,7 @@ from cosfly.formats.playback import Perturbation, TargetRecord, Track
 from cosfly.formats.traces import DroneTrace
 from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera, wrap_deg
 from cosfly.geometry.kernels import obstacle_index
-from cosfly.inspection.blind_baseline import FITTED_ON, fit_deciders, is_drawn_ahead, past_of
+from cosfly.inspection.blind_baseline import FITTED_ON, fit_deciders, fit_network, is_drawn_ahead, past_of
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import walkable_ground
@@ -156,11 +156,8 @@ def windows_of(cfg: RunConfig, names: list[str]) -> Windows:
 
 
 def joined(parts: list[Windows]) -> Windows:
-    arrays = [np.concatenate(column) for column in zip(*(part[:3] for part in parts), strict=True)]
-    tables = [
-        {t: np.concatenate([one[t] for one in column]) for t in TRACKS}
-        for column in zip(*(part[3:] for part in parts), strict=True)
-    ]
+    arrays = [np.concatenate([part[i] for part in parts]) for i in range(3)]
+    tables = [{track: np.concatenate([part[i][track] for part in parts]) for track in TRACKS} for i in range(3, 6)]
     return Windows(*arrays, *tables)
 
 
@@ -177,12 +174,11 @@ def main() -> None:
     towns = [name for name in cfgs[0].towns if name not in told]
 
     def all_of(*names: str) -> Windows:
-        parts = [windows_of(cfg, list(names)) for cfg in cfgs]
-        return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
+        return joined([windows_of(cfg, list(names)) for cfg in cfgs])
 
-    pasts, labels, _ = all_of(*(name for name in towns if name not in UNSEEN))
-    some = rng_for(0, "bench.blind", "some").permutation(len(labels))[:FITTED_ON]
-    pasts, labels = pasts[some], labels[some]
+    fitted = all_of(*(name for name in towns if name not in UNSEEN))
+    some = rng_for(0, "bench.blind", "some").permutation(len(fitted.labels))[:FITTED_ON]
+    pasts, labels = fitted.pasts[some], fitted.labels[some]
     begun, rules = time.process_time(), {}
     for draw in range(3):
         rules[draw] = fit_deciders(pasts, labels, rng_for(0, "bench.blind", str(draw)))
@@ -190,13 +186,28 @@ def main() -> None:
     print(f"fitted on {len(labels):,} windows, {pasts.shape[1]} numbers each, {seconds:.1f} s of processor time a draw")
     print("| town | windows | most frequent | rule | network (three draws) | drawn ahead | of these | of the others |")
     print("|---|---|---|---|---|---|---|---|")
-    for title, names in [(" and ".join(UNSEEN), UNSEEN), *((name, (name,)) for name in told)]:
-        asked_of, wanted, ahead = all_of(*names)
-        right = [rules[draw]["blind"](asked_of) == wanted for draw in rules]
-        cells = [(wanted == np.bincount(labels).argmax()).mean(), (rules[0]["rule"](asked_of) == wanted).mean()]
+    unseen = {" and ".join(UNSEEN): all_of(*UNSEEN)} | {name: all_of(name) for name in told}
+    for title, asked_of in unseen.items():
+        wanted, ahead = asked_of.labels, asked_of.is_ahead
+        right = [rules[draw]["blind"](asked_of.pasts) == wanted for draw in rules]
+        cells = [(wanted == np.bincount(labels).argmax()).mean(), (rules[0]["rule"](asked_of.pasts) == wanted).mean()]
         cells = [f"{100 * cell:.1f}" for cell in cells] + [", ".join(f"{100 * one.mean():.1f}" for one in right)]
         cells += [f"{100 * share:.1f}" for share in (ahead.mean(), right[0][ahead].mean(), right[0][~ahead].mean())]
         print(f"| {title} | {len(wanted):,} | {' | '.join(cells)} |", flush=True)
+    print("\n| town | track | rule teacher: labels | hard conflicts | network: labels | hard conflicts |")
+    print("|---|---|---|---|---|---|")
+    rows = np.concatenate([fitted.rows[track][some] for track in TRACKS])
+    network = fit_network(rows, np.tile(labels, 2), rng_for(0, "bench.blind", "drawn"))
+    for title, asked_of in unseen.items():
+        for track in TRACKS:
+            made = asked_of.decisions[track], network(asked_of.rows[track])
+            shares = [share for by in made for share in shares_of(by, asked_of.labels, asked_of.is_hard[track])]
+            print(f"| {title} | {track} | {' | '.join(f'{100 * share:.1f}' for share in shares)} |", flush=True)
+
+
+def shares_of(decisions: np.ndarray, labels: np.ndarray, is_hard: np.ndarray) -> tuple[float, float]:
+    """Return the share of decisions that are the label, and that of hard conflicts."""
+    return (decisions == labels).mean(), is_hard[np.arange(len(labels)), decisions].mean()
 
 
 if __name__ == "__main__":
