@@ -53,17 +53,6 @@ class AskingOutcome:
     judge_usage: Usage | None = None
 
 
-@dataclass
-class _OpenTrack:
-    """A track whose windows are being asked. num_pending: Windows in work."""
-
-    source: TrackInput
-    captions: list[Caption] = field(default_factory=list)
-    num_pending: int = 0
-    is_read: bool = False
-    has_gap: bool = False
-
-
 class Asking:
     """One run of a teacher over tracks."""
 
@@ -90,7 +79,8 @@ class Asking:
         self.tracks_to_retry: set[str] | None = None
         if self.only is not None and not was_complete:
             self.tracks_to_retry = {flight_of(sample_id) for sample_id in self.only}
-        self.most_open = max(cfg.most_in_flight, cfg.judge.concurrency if cfg.judge.url else 0) + WAITING_WINDOWS
+        most_in_flight = max(cfg.most_in_flight, cfg.judge.concurrency if cfg.judge.url else 0)
+        self.slots = asyncio.Semaphore(most_in_flight + WAITING_WINDOWS)  # one for each window in work
         self.num_failed_in_row = 0
         self.dropped: Counter[str] | None = Counter()  # of the windows that were asked; None once one was accepted
 
@@ -131,81 +121,88 @@ class Asking:
 
     async def _ask_all(self, tracks: list[TrackInput], guesses: list[int], teacher: Teacher) -> None:
         """Keep `concurrency` requests in flight, whatever track they belong to."""
-        running: set[asyncio.Task] = set()
         heartbeat = asyncio.create_task(self._show_progress())
         try:
-            for track, guess in zip(tracks, guesses, strict=True):
-                part = track.part(self.stage.path)
-                if part.exists():
-                    if self.dropped is not None and any(one.status == "accepted" for one in read_captions(part)):
-                        self.dropped = None
-                    self.outcome.tracks.kept += 1
-                    self.progress.skip(guess)
-                    continue
-                is_for_later = self.tracks_to_retry is not None and track.name not in self.tracks_to_retry
-                if self.outcome.stopped or (is_for_later and guess):
-                    self.outcome.num_tracks_left += 1
-                    continue
-                running = await self._ask_track(track, teacher, running)
-            while running:
-                running = await _wait_for_one(running)
+            async with asyncio.TaskGroup() as tasks:  # an error in one task cancels the others
+                for track, guess in zip(tracks, guesses, strict=True):
+                    part = track.part(self.stage.path)
+                    is_for_later = self.tracks_to_retry is not None and track.name not in self.tracks_to_retry
+                    if part.exists():
+                        if self.dropped is not None and any(one.status == "accepted" for one in read_captions(part)):
+                            self.dropped = None
+                        self.outcome.tracks.kept += 1
+                        self.progress.skip(guess)
+                    elif self.outcome.stopped or (is_for_later and guess):
+                        self.outcome.num_tracks_left += 1
+                    else:
+                        await self._ask_track(track, teacher, tasks)
+        except BaseExceptionGroup as errors:
+            raise errors.exceptions[0] from None
         finally:
-            running.add(heartbeat)
-            for task in running:
-                task.cancel()
-            await asyncio.gather(*running, return_exceptions=True)
+            heartbeat.cancel()
 
-    async def _ask_track(self, source: TrackInput, teacher: Teacher, running: set[asyncio.Task]) -> set[asyncio.Task]:
-        """Begin the windows of a track; return the tasks that are not done."""
-        track, tally = _OpenTrack(source), self.outcome.tracks
-        num_windows = 0
+    async def _ask_track(self, track: TrackInput, teacher: Teacher, tasks: asyncio.TaskGroup) -> None:
+        """Begin the windows of a track; another task writes it after the last of them."""
+        tally = self.outcome.tracks
+        windows: list[asyncio.Task[Caption | None]] = []
+        is_cut = False
         try:
-            for window in source.windows(self.cfg):
-                num_windows += 1
-                track.num_pending += 1
-                running.add(asyncio.create_task(self._ask_window(track, window, teacher)))
-                if len(running) >= self.most_open:
-                    running = await _wait_for_one(running)
+            for window in track.windows(self.cfg):
+                await self.slots.acquire()
                 if self.outcome.stopped:
-                    track.has_gap = True
+                    self.slots.release()
+                    is_cut = True
                     break
+                windows.append(tasks.create_task(self._ask_window(window, teacher)))
         except InputError as error:
-            self.failures.append(Failed(id=source.name, code=error.code, message=str(error)))
+            self.failures.append(Failed(id=track.name, code=error.code, message=str(error)))
             tally.failed[error.code] += 1
-            log.error("caption: %s: %s", source.name, error)
+            log.error("caption: %s: %s", track.name, error)
+            return
+        if windows or is_cut:
+            tally.kept += 1
         else:
-            if num_windows:
-                tally.kept += 1
-            else:
-                tally.dropped["too_short"] += 1
-        track.is_read = True
-        self._write_if_done(track)
-        return running
+            tally.dropped["too_short"] += 1
+        tasks.create_task(self._write_track(track, windows, is_cut))
 
-    async def _ask_window(self, track: _OpenTrack, window: Window, teacher: Teacher) -> None:
+    async def _write_track(self, track: TrackInput, windows: list[asyncio.Task[Caption | None]], is_cut: bool) -> None:
+        """Write the part of a track after its last window. One with a gap stays unfinished, for the next run."""
+        answers = await asyncio.gather(*windows)
+        captions = [caption for caption in answers if caption is not None]
+        has_gap = is_cut or len(captions) < len(windows)
+        part, gap = track.part(self.stage.path), track.gap(self.stage.path)
+        if captions:
+            write_captions(gap if has_gap else part, captions)
+        if not has_gap:
+            gap.unlink(missing_ok=True)
+        for book in self.books:
+            book.forget(track.name)
+
+    async def _ask_window(self, window: Window, teacher: Teacher) -> Caption | None:
+        """Return the caption of a window; None without an answer."""
         sample_id = window.observed.sample_id
         try:
             caption = await caption_window(window, teacher, self.cfg, self.vocabulary, self.judge)
         except BudgetSpent as error:
             self.outcome.stopped = self.outcome.stopped or error.what
-            self._record_gap(track, Failed(id=sample_id, code=NOT_ASKED, message=error.what))
+            self._record_gap(Failed(id=sample_id, code=NOT_ASKED, message=error.what))
         except NoAnswer as error:
-            self._record_gap(track, Failed(id=sample_id, code=error.cause, message=str(error)))
+            self._record_gap(Failed(id=sample_id, code=error.cause, message=str(error)))
         except CosflyError as error:
             if error.fatal:
                 raise
-            self._record_gap(track, Failed(id=sample_id, code=error.code, message=str(error)))
+            self._record_gap(Failed(id=sample_id, code=error.code, message=str(error)))
         else:
-            track.captions.append(caption)
             self._record_refusal(caption)
             self._stop_if_hopeless(caption)
             self.progress.finish(caption)
-        track.num_pending -= 1
-        self._write_if_done(track)
+            return caption
+        finally:
+            self.slots.release()
+        return None
 
-    def _record_gap(self, track: _OpenTrack, failure: Failed) -> None:
+    def _record_gap(self, failure: Failed) -> None:
         """Record a window without an answer; those that were not asked are no failures."""
-        track.has_gap = True
         self.outcome.unanswered.append(failure)
         if failure.code != NOT_ASKED:
             self.quarantine[failure.id] = failure
@@ -250,27 +247,6 @@ class Asking:
                 fix=f"read {self.stage.path / ANSWERS}/*.jsonl, run `cosfly caption doctor`, or continue with "
                 "--set caption.stop_after_dropped=0",
             )
-
-    def _write_if_done(self, track: _OpenTrack) -> None:
-        """Write the part of a track after its last window. One with a gap stays unfinished, for the next run."""
-        if not track.is_read or track.num_pending:
-            return
-        part, gap = track.source.part(self.stage.path), track.source.gap(self.stage.path)
-        if track.captions:
-            track.captions.sort(key=lambda caption: caption.frame_index)
-            write_captions(gap if track.has_gap else part, track.captions)
-        if not track.has_gap:
-            gap.unlink(missing_ok=True)
-        for book in self.books:
-            book.forget(track.source.name)
-
-
-async def _wait_for_one(running: set[asyncio.Task]) -> set[asyncio.Task]:
-    """Wait until a task is done; return the others. Raises the error of a task, which ends the run."""
-    done, pending = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
-    for task in done:
-        task.result()
-    return pending
 
 
 def read_quarantine(stage_path: Path) -> dict[str, Failed]:

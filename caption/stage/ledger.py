@@ -4,24 +4,18 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import zip_longest
 from operator import itemgetter
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
 
-from cosfly.formats.captions import TOKENS, Caption, TeacherRecord, Usage
+from cosfly.formats.captions import TOKENS, Caption, Checks, TeacherRecord, Usage
 from cosfly.runtime.io import sha256_bytes
-from cosfly.runtime.json_io import Record
 from cosfly.runtime.run_dir import Tally
 
 NUM_CARDS = 24
-# Fields of the report that count captions by a word.
-WORDS = (
-    "structured", "verdicts_of_first_answers", "verdicts_of_accepted", "labels", "label_from", "judgements",
-    "structure", "bilingual", "writing", "recovered",
-)  # fmt: skip
 # The codes of `drop_reason` and their meanings, for messages and docs/captions.md.
 REASONS = {
     "order_to_come": "the mission's order comes in the window's future and is not known in an observed frame; the "
@@ -59,28 +53,43 @@ def explain_drops(dropped: Mapping[str, int]) -> str:
 # --- the report -------------------------------------------------------------------------------------------------------
 
 
-class RepairCounts(Record):
-    """Counts of rejected answers. rungs: By the attempt that fixed them, or by the outcome if none did."""
-
-    rejected: int
-    rungs: dict[str, int]
-    outcomes_by_strategy: dict[str, dict[str, int]]
-    asks: dict[str, int]
+def _by_name(counts: Mapping[str, Any]) -> dict[str, Any]:
+    return dict(sorted(counts.items()))
 
 
-class KeyframeCounts(Record):
-    """Counts of chosen windows, and of the windows, calls and label changes that they skip."""
+def _by_token(confusion: Mapping[str, Mapping[str, int]]) -> dict[str, dict[str, int]]:
+    order = {token: i for i, token in enumerate((*TOKENS, "none"))}
+    labels = sorted(confusion, key=order.__getitem__)
+    return {label: dict(sorted(confusion[label].items(), key=lambda pair: order[pair[0]])) for label in labels}
 
-    windows: int
-    taken: int
-    reasons: dict[str, int]
-    calls_saved: int
-    changes_missed: int
+
+Counts = Annotated[Counter[str], PlainSerializer(most_common)]
+
+
+class RepairCounts(BaseModel, extra="forbid"):
+    """Counts of rejected answers. rungs: By the attempt that repaired them, or by the outcome if none did."""
+
+    rejected: int = 0
+    rungs: Counts = Counter()
+    outcomes_by_strategy: Annotated[dict[str, Counter[str]], PlainSerializer(_by_name)] = {}
+    asks: Annotated[Counter[str], PlainSerializer(_by_name)] = Counter()
+
+
+class KeyframeCounts(BaseModel, extra="forbid"):
+    """Counts of chosen windows, and of the calls and label changes that are skipped with the others."""
+
+    windows: int = 0
+    taken: int = 0
+    reasons: Counts = Counter()
+    calls_saved: int = 0
+    changes_missed: int = 0
 
 
 class CaptionReport(BaseModel):
-    """`caption_report.json`. Counts by a word are in falling order; `confusion`: label -> first decision -> count.
+    """`caption_report.json`: counts of captions, which are added one by one. Counts by a word are in falling order.
 
+    flights: Tracks. confusion: Label -> first decision -> count. values: Language -> values_filled, values_matched,
+    values_contradicted. writing: Of accepted captions. refusals: Of dropped windows, code -> last message of a server.
     judge_tokens: Of all runs into the directory; not written if no judge was asked.
     """
 
@@ -88,27 +97,29 @@ class CaptionReport(BaseModel):
 
     schema_: Literal["cosfly.caption_report"] = Field("cosfly.caption_report", alias="schema")
     schema_version: Literal["1.0"] = "1.0"
-    teacher: TeacherRecord | None
-    flights: Tally
-    windows: Tally
-    asks: int
-    tokens: dict[str, int]
-    structured: dict[str, int]
-    verdicts_of_first_answers: dict[str, int]
-    verdicts_of_accepted: dict[str, int]
-    labels: dict[str, int]
-    label_from: dict[str, int]
-    confusion: dict[str, dict[str, int]] = Field(alias="confusion_label_to_first_decision")
-    repair: RepairCounts
-    judgements: dict[str, int]
-    keyframes: KeyframeCounts | None  # None: all windows were used
-    structure: dict[str, int]
-    bilingual: dict[str, int]
-    writing: dict[str, int]  # of accepted captions: how the texts were made
-    values: dict[str, dict[str, int]]  # of all captions: language -> values_filled, _matched, _contradicted
-    contradicted_captions: int
-    recovered: dict[str, int]
-    refusals: dict[str, str] = {}  # of dropped windows: code -> the last message of the server
+    teacher: TeacherRecord | None = None
+    flights: Tally = Tally()
+    windows: Tally = Tally()
+    asks: int = 0
+    tokens: Counts = Counter()
+    structured: Counts = Counter()
+    verdicts_of_first_answers: Counts = Counter()
+    verdicts_of_accepted: Counts = Counter()
+    labels: Counts = Counter()
+    label_from: Counts = Counter()
+    confusion: Annotated[dict[str, Counter[str]], PlainSerializer(_by_token)] = Field(
+        {}, alias="confusion_label_to_first_decision"
+    )
+    repair: RepairCounts = RepairCounts()
+    judgements: Counts = Counter()
+    keyframes: KeyframeCounts | None = None  # None: all windows were used
+    structure: Counts = Counter()
+    bilingual: Counts = Counter()
+    writing: Counts = Counter()
+    values: Annotated[dict[str, Counter[str]], PlainSerializer(_by_name)] = {}
+    contradicted_captions: int = 0
+    recovered: Counts = Counter()
+    refusals: dict[str, str] = {}
     judge_tokens: Usage | None = None
 
     def warnings(self) -> list[str]:
@@ -121,8 +132,69 @@ class CaptionReport(BaseModel):
     def as_json(self) -> dict:
         return self.model_dump(mode="json", by_alias=True, exclude=set() if self.judge_tokens else {"judge_tokens"})
 
+    def add(self, caption: Caption) -> None:
+        """Count a caption."""
+        label, repair = caption.label or "none", caption.repair
+        self.teacher = caption.teacher.model_copy(update={"structured": None})
+        self.windows.input += 1
+        self.asks += caption.attempts
+        self.tokens.update(caption.usage.model_dump())
+        self.structured[caption.teacher.structured or "none"] += 1
+        self.labels[label] += 1
+        self.label_from[caption.label_from] += 1
+        if caption.en is not None:
+            self.verdicts_of_first_answers[str(repair.first_verdict if repair else caption.verdict)] += 1
+            decision = repair.first_decision if repair else caption.en.flight_decision
+            self.confusion.setdefault(label, Counter())[decision] += 1
+        if repair:
+            rung = repair.rung or repair.outcome
+            self.repair.rejected += 1
+            self.repair.rungs[rung] += 1
+            self.repair.asks[str(repair.asks)] += 1
+            self.repair.outcomes_by_strategy.setdefault(repair.strategy, Counter())[rung] += 1
+        if caption.judge:
+            self.judgements[caption.judge.verdict] += 1
+            if caption.judge.overruled_by is not None:
+                self.judgements[f"overruled_by_{caption.judge.overruled_by}"] += 1
+        self._add_checks(caption.checks)
+        if caption.status == "accepted":
+            self.windows.kept += 1
+            self.verdicts_of_accepted[str(caption.verdict)] += 1
+            self.writing[caption.writing] += 1
+        else:
+            self.windows.dropped[str(caption.drop_reason)] += 1
+            if caption.checks.refusal is not None:
+                code, _, message = caption.checks.refusal.partition(": ")
+                self.refusals[code] = message
 
-# --- the ledger -------------------------------------------------------------------------------------------------------
+    def _add_checks(self, checks: Checks) -> None:
+        if checks.keyframe is not None:
+            self.keyframes = self.keyframes or KeyframeCounts()
+            self.keyframes.windows += 1 + checks.keyframe.skipped
+            self.keyframes.taken += 1
+            self.keyframes.reasons[checks.keyframe.reason] += 1
+            self.keyframes.changes_missed += checks.keyframe.missed
+        for language, counts in (checks.values or {}).items():
+            self.values.setdefault(language, Counter()).update(counts.model_dump())
+        self.contradicted_captions += checks.contradictions is not None
+        self.structure.update([checks.structure] if checks.structure else [])
+        self.bilingual.update([checks.bilingual] if checks.bilingual else [])
+        self.recovered.update(checks.recovered or ())
+
+    def finish(self, tracks: Tally, num_unanswered: int, judge_tokens: Usage | None) -> None:
+        """Complete the counts after the last caption, and check that no window was lost."""
+        self.flights = tracks
+        self.judge_tokens = judge_tokens
+        self.windows.input += num_unanswered
+        if num_unanswered:
+            self.windows.failed["no_answer"] = num_unanswered
+        self.windows.check()
+        if self.keyframes is not None:
+            num_skipped = self.keyframes.windows - self.keyframes.taken
+            self.keyframes.calls_saved = round(num_skipped * self.asks / self.keyframes.taken)
+
+
+# --- samples for the page ---------------------------------------------------------------------------------------------
 
 
 class SampleCards:
@@ -144,125 +216,3 @@ class SampleCards:
         turns = zip_longest(*(self._kinds[kind] for kind in sorted(self._kinds)))
         captions = [card[1] for turn in turns for card in turn if card is not None]
         return sorted(captions[:NUM_CARDS], key=lambda caption: caption.sample_id)
-
-
-class Ledger:
-    """Counts captions one by one; memory does not grow with them."""
-
-    def __init__(self) -> None:
-        self.windows = Tally()
-        self.num_asks = self.num_skipped = self.num_missed = self.num_contradicted = 0
-        self.teacher: TeacherRecord | None = None
-        self.cards = SampleCards()
-        self.words = {name: Counter[str]() for name in WORDS}
-        self.keyframes: Counter[str] = Counter()
-        self.values: Counter[tuple[str, str]] = Counter()  # language, name of the count
-        self.refusals: dict[str, str] = {}
-        self.tokens: Counter[str] = Counter()
-        self.repair_asks: Counter[int] = Counter()
-        self.rungs: Counter[str] = Counter()  # the attempt that repaired, or the outcome if none did
-        self.confusion: Counter[tuple[str, str]] = Counter()  # label, first decision
-        self.outcomes: Counter[tuple[str, str]] = Counter()  # strategy, rung or outcome
-
-    def add(self, caption: Caption) -> None:
-        """Count a caption."""
-        self.windows.input += 1
-        self.num_asks += caption.attempts
-        self.teacher = caption.teacher.model_copy(update={"structured": None})
-        self.tokens.update(caption.usage.model_dump())
-        self.cards.add(caption)
-        self._add_outcome(caption)
-        self._add_checks(caption)
-        label, repair, judge = caption.label or "none", caption.repair, caption.judge
-        self.words["labels"][label] += 1
-        self.words["label_from"][caption.label_from] += 1
-        self.words["structured"][caption.teacher.structured or "none"] += 1
-        if caption.en is not None:
-            verdict = repair.first_verdict if repair else caption.verdict
-            self.words["verdicts_of_first_answers"][str(verdict)] += 1
-            self.confusion[label, repair.first_decision if repair else caption.en.flight_decision] += 1
-        if repair:
-            self.repair_asks[repair.asks] += 1
-            rung = repair.rung or repair.outcome
-            self.rungs[rung] += 1
-            self.outcomes[repair.strategy, rung] += 1
-        if judge:
-            self.words["judgements"][judge.verdict] += 1
-            if judge.overruled_by is not None:
-                self.words["judgements"][f"overruled_by_{judge.overruled_by}"] += 1
-
-    def _add_outcome(self, caption: Caption) -> None:
-        if caption.status == "accepted":
-            self.windows.kept += 1
-            self.words["verdicts_of_accepted"][str(caption.verdict)] += 1
-            self.words["writing"][caption.writing] += 1
-            return
-        self.windows.dropped[str(caption.drop_reason)] += 1
-        if caption.checks.refusal is not None:
-            code, _, message = caption.checks.refusal.partition(": ")
-            self.refusals[code] = message
-
-    def _add_checks(self, caption: Caption) -> None:
-        checks = caption.checks
-        if checks.keyframe is not None:
-            self.keyframes[checks.keyframe.reason] += 1
-            self.num_skipped += checks.keyframe.skipped
-            self.num_missed += checks.keyframe.missed
-        for language, counts in (checks.values or {}).items():
-            for name, count in counts.model_dump().items():
-                self.values[language, name] += count
-        self.num_contradicted += checks.contradictions is not None
-        self.words["structure"].update([checks.structure] if checks.structure else [])
-        self.words["bilingual"].update([checks.bilingual] if checks.bilingual else [])
-        self.words["recovered"].update(checks.recovered or ())
-
-    def tally(self, num_unanswered: int) -> Tally:
-        """Return the tally of the windows and check that none was lost."""
-        failed = Counter({"no_answer": num_unanswered} if num_unanswered else {})
-        tally = self.windows.model_copy(update={"input": self.windows.input + num_unanswered, "failed": failed})
-        tally.check()
-        return tally
-
-    def report(self, tracks: Tally, windows: Tally, judge_tokens: Usage | None) -> CaptionReport:
-        order = {token: i for i, token in enumerate((*TOKENS, "none"))}
-        return CaptionReport(
-            teacher=self.teacher,
-            flights=tracks,
-            windows=windows,
-            **{name: most_common(counts) for name, counts in self.words.items()},
-            asks=self.num_asks,
-            tokens=dict(sorted(self.tokens.items())),
-            confusion=_nested(self.confusion, lambda pair: (order[pair[0]], order[pair[1]])),
-            repair=RepairCounts(
-                rejected=self.rungs.total(),
-                rungs=most_common(self.rungs),
-                outcomes_by_strategy=_nested(self.outcomes),
-                asks={str(asks): count for asks, count in sorted(self.repair_asks.items())},
-            ),
-            keyframes=self._keyframes(),
-            values=_nested(self.values),
-            contradicted_captions=self.num_contradicted,
-            refusals=dict(sorted(self.refusals.items())),
-            judge_tokens=judge_tokens,
-        )
-
-    def _keyframes(self) -> KeyframeCounts | None:
-        num_chosen = self.keyframes.total()
-        if not num_chosen:
-            return None
-        return KeyframeCounts(
-            windows=num_chosen + self.num_skipped,
-            taken=num_chosen,
-            reasons=most_common(self.keyframes),
-            calls_saved=round(self.num_skipped * (self.num_asks / num_chosen)),
-            changes_missed=self.num_missed,
-        )
-
-
-def _nested(
-    counts: Counter[tuple[str, str]], key: Callable[[tuple[str, str]], Any] | None = None
-) -> dict[str, dict[str, int]]:
-    found: dict[str, dict[str, int]] = {}
-    for outer, inner in sorted(counts, key=key):
-        found.setdefault(outer, {})[inner] = counts[outer, inner]
-    return found

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from caption.stage.ledger import CaptionReport
+from caption.stage.ledger import CaptionReport, most_common
 from cosfly.formats.captions import TOKENS, Caption, Coc, ValueCounts
 from cosfly.formats.frames import frame_name
 from cosfly.formats.places import flight_of
@@ -83,14 +83,15 @@ def _confusion(confusion: Mapping[str, Mapping[str, int]]) -> dict[str, list[str
 
 
 def _rows(kind: str, counts: Mapping[str, int]) -> Rows:
-    return [(f"{kind}: {name.replace('_', ' ')}", f"{count:,}") for name, count in counts.items()]
+    return [(f"{kind}: {name.replace('_', ' ')}", f"{count:,}") for name, count in most_common(counts).items()]
 
 
 def _repairs(report: CaptionReport) -> Rows:
     rows: Rows = []
-    for strategy, outcomes in report.repair.outcomes_by_strategy.items():
+    for strategy, outcomes in sorted(report.repair.outcomes_by_strategy.items()):
         rows += _rows(strategy, outcomes)
-    rows += [(f"after {asks} more ask{'s' if asks != '1' else ''}", f"{n:,}") for asks, n in report.repair.asks.items()]
+    for asks, count in sorted(report.repair.asks.items()):
+        rows.append((f"after {asks} more ask{'s' if asks != '1' else ''}", f"{count:,}"))
     return rows + _rows("judge", report.judgements)
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from caption.schema import CaptionConfig, Window
 from caption.stage.asking import ANSWERS, NOT_ASKED, Asking, AskingOutcome, common_causes, read_quarantine
-from caption.stage.ledger import Ledger, explain_drops
+from caption.stage.ledger import CaptionReport, SampleCards, explain_drops
 from caption.stage.report import write_page
 from caption.stage.tracks import PARTS, TrackInput, find_inputs, parts_of, restore_parts
 from caption.stage.window_loop import caption_prepared, prepare
@@ -89,31 +89,29 @@ def run(
             _reopen_tracks(stage, tracks)
         asking = Asking(stage, cfg, vocabulary, seed, retry_failed=retry_failed, was_complete=was_complete)
         outcome = run_until_interrupted(asking.run(tracks))
-    ledger = _merge(stage, parts_of(stage.path, tracks, bool(outcome.unanswered)), unused)
+    report, cards = _merge(stage, parts_of(stage.path, tracks, bool(outcome.unanswered)), unused)
+    report.finish(outcome.tracks, len(outcome.unanswered), outcome.judge_usage)
     if unused and not is_cut:
         log.warning("caption: %d captions of %s match no window of this tree", len(unused), cfg.caption_file)
-    return _publish(stage, cfg, vocabulary, outcome, tracks, ledger, is_cut=is_cut)
-
-
-def _publish(
-    stage: StageFolder, cfg: CaptionConfig, vocabulary: Vocabulary, outcome: AskingOutcome, tracks: list[TrackInput],
-    ledger: Ledger, *, is_cut: bool,
-) -> Path:  # fmt: skip
-    """Write report and page, and finish the stage if every window has an outcome."""
-    out = stage.path
-    tally = ledger.tally(len(outcome.unanswered))
-    is_whole = not (outcome.unanswered or outcome.num_tracks_left)
-    if tally.input == 0 and is_whole:
-        num_frames = cfg.window.num_frames + cfg.window.future_frames
-        raise stage.nothing_kept(outcome.tracks, expected=f"a track of at least {num_frames} frames")
-    report = ledger.report(outcome.tracks, tally, outcome.judge_usage)
-    write_json(out / REPORT, report.as_json())
+    write_json(stage.path / REPORT, report.as_json())
     for warning in report.warnings():
         log.warning("caption: %s", warning)
-    write_page(out / PAGE, report, ledger.cards.chosen(), {track.name: track.folder for track in tracks}, cfg.budget)
-    if not is_whole:
+    folders = {track.name: track.folder for track in tracks}
+    write_page(stage.path / PAGE, report, cards.chosen(), folders, cfg.budget)
+    return _finish(stage, cfg, vocabulary, outcome, report.windows, is_cut)
+
+
+def _finish(
+    stage: StageFolder, cfg: CaptionConfig, vocabulary: Vocabulary, outcome: AskingOutcome, tally: Tally, is_cut: bool
+) -> Path:
+    """Finish the stage if every window has an outcome."""
+    out = stage.path
+    if outcome.unanswered or outcome.num_tracks_left:
         _report_unanswered(cfg, outcome, tally)
         return out / PRODUCT
+    if tally.input == 0:
+        num_frames = cfg.window.num_frames + cfg.window.future_frames
+        raise stage.nothing_kept(outcome.tracks, expected=f"a track of at least {num_frames} frames")
     if not tally.kept:
         fix = f"fix what is dropped ({explain_drops(tally.dropped)}), or change the settings and choose another --out"
         raise stage.nothing_kept(tally, where=out / PRODUCT, fix=fix)
@@ -186,23 +184,24 @@ def _report_unanswered(cfg: CaptionConfig, outcome: AskingOutcome, tally: Tally)
     log.info("caption: the quarantine is empty; run again without --retry-failed for windows that were never asked")
 
 
-def _merge(stage: StageFolder, parts: list[Path], unused: set[str]) -> Ledger:
-    """Join the parts to `captions.jsonl`, one at a time, and count the captions.
+def _merge(stage: StageFolder, parts: list[Path], unused: set[str]) -> tuple[CaptionReport, SampleCards]:
+    """Join the parts to `captions.jsonl`, one at a time; return counts and samples of the captions.
 
     Args:
         unused: Windows of a file of captions; those that are captioned are removed.
     """
-    ledger = Ledger()
+    report, cards = CaptionReport(), SampleCards()
 
     def lines() -> Iterator[bytes]:
         for part in parts:
             for line, caption in caption_lines(part):
-                ledger.add(caption)
+                report.add(caption)
+                cards.add(caption)
                 unused.discard(caption.sample_id)
                 yield line.encode()
 
     write_caption_lines(stage.path / PRODUCT, lines())
-    return ledger
+    return report, cards
 
 
 # --- embedded teachers ------------------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ def own_prompts(folder: Path) -> dict[str, str]:
     """Read a folder of prompts that replaces those that ship."""
     export = "cosfly caption prompts --export DIR writes those that ship"
     if not folder.is_dir():
-        raise ConfigError("the folder of prompts does not exist", where=folder, fix=export)
+        raise ConfigError("no such folder of prompts", where=folder, fix=export)
     found, problems = dict[str, str](), list[str]()
     for path in sorted(folder.glob(f"*{SUFFIX}")):
         found[path.stem] = ""
