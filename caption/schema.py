@@ -160,7 +160,7 @@ class JudgeConfig(Config):
 
 class RepairConfig(Config):
     hard_conflict: Treatment = Field(
-        "repair", description="decision that the flight contradicts: repair (ask again), drop or keep"
+        "repair", description="decision that the trajectory contradicts: repair (ask again), drop or keep"
     )
     soft_conflict: Treatment = Field(
         "keep", description="another decision than the label, without a judge: keep, repair (ask again) or drop"

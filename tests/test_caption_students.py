@@ -13,7 +13,7 @@ from teacher_server import TeacherServer
 
 from caption.schema import CaptionConfig
 from caption.stage.stage import run
-from caption.teachers.students import as_taught
+from caption.teachers.students import student_settings
 from cosfly.formats.captions import read_captions
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE, read_chat_format, write_chat_format
 from cosfly.runtime.errors import ConfigError
@@ -127,10 +127,10 @@ def test_another_version_of_the_prompt_is_refused(place, tmp_path):
     ]):  # fmt: skip
         folder = taught_otherwise(place, tmp_path / f"{number}", prompts=taught["prompts"] | {"en": changed})
         with pytest.raises(ConfigError, match="another version of the prompt"):
-            as_taught(settings("http://127.0.0.1:1/v1", folder), VOCABULARY)
+            student_settings(settings("http://127.0.0.1:1/v1", folder), VOCABULARY)
     mission = {"system": english["system"], "user": english["user"] + "\nMission: the time of the mission is over."}
     folder = taught_otherwise(place, tmp_path / "mission", prompts={"en": mission})
-    assert as_taught(settings("http://127.0.0.1:1/v1", folder), VOCABULARY).endpoint.temperature == 0.0
+    assert student_settings(settings("http://127.0.0.1:1/v1", folder), VOCABULARY).endpoint.temperature == 0.0
     folder = taught_otherwise(place, tmp_path / "zh", prompts={"zh": taught["prompts"]["zh"]})
-    with pytest.raises(ConfigError, match="taught no English"):
-        as_taught(settings("http://127.0.0.1:1/v1", folder), VOCABULARY)
+    with pytest.raises(ConfigError, match="trained without English"):
+        student_settings(settings("http://127.0.0.1:1/v1", folder), VOCABULARY)

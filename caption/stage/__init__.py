@@ -1,1 +1,1 @@
-"""The stage: all windows of all flights, counted, shown and resumable."""
+"""The stage: captions of all windows of all tracks, counted and resumable."""

@@ -17,7 +17,7 @@ from caption.stage.stage import open_stage
 from caption.stage.tracks import find_inputs
 from caption.stage.window_loop import caption_window
 from caption.teachers.prompt_files import vocabulary_of
-from caption.teachers.students import as_taught
+from caption.teachers.students import student_settings
 from caption.teachers.teacher import first_budget, open_teacher
 from cosfly.formats.captions import Caption, Usage
 from cosfly.formats.places import flight_of
@@ -36,7 +36,7 @@ def make_forecast(
     if cfg.teacher_kind != "endpoint":
         raise ConfigError("a plan needs an endpoint", where="--plan", got=cfg.teacher, expected="--teacher URL")
     vocabulary = vocabulary_of(cfg)
-    cfg = as_taught(cfg, vocabulary)
+    cfg = student_settings(cfg, vocabulary)
     stage = open_stage(cfg, data, out, seed, resume)
     tracks, _ = find_inputs(cfg, data)
     guesses = {track: track.guess_num_windows(cfg.window) for track in tracks}

@@ -25,7 +25,7 @@ REASONS = {
     "not_in_file": "the file of captions or predictions has none for this window",
     "structure": "no answer had the requested fields; see `checks.structure`",
     "context_full": "prompt and answer fill the server's context: raise it, or send smaller pictures",
-    "conflict": "the decision is in conflict with the flight (see `verdict`), and the settings or a given caption "
+    "conflict": "the decision is in conflict with the trajectory (see `verdict`), and the settings or a given caption "
     "exclude a regeneration",
     "no_label": "the decision is in conflict, and geometry has no label to anchor a regeneration to",
     "regeneration_failed": "no answer of caption.repair.max_asks asks had a decision without conflict",

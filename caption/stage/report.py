@@ -18,8 +18,8 @@ from cosfly.viz.page import page, run_name
 PICTURE_WIDTH_PX = 240
 VERDICTS = {  # with their meanings
     "CONSISTENT": "the decision is the label",
-    "SOFT_CONFLICT": "another decision, which the flight does not contradict",
-    "HARD_CONFLICT": "the flight contradicts the decision",
+    "SOFT_CONFLICT": "another decision, which the trajectory does not contradict",
+    "HARD_CONFLICT": "the trajectory contradicts the decision",
     "ABSTAIN": "geometry cannot tell",
 }
 LANGUAGE_NAMES = {"en": "English", "zh": "Chinese"}

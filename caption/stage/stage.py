@@ -21,7 +21,7 @@ from caption.stage.tracks import PARTS, TrackInput, find_inputs, parts_of, resto
 from caption.stage.window_loop import caption_prepared, prepare
 from caption.teachers.foreign import given_samples, read_given
 from caption.teachers.prompt_files import PROMPTS, keep_own_prompts, vocabulary_of
-from caption.teachers.students import as_taught
+from caption.teachers.students import student_settings
 from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
 from caption.verification.glossary import GLOSSARY_FILE
 from caption.verification.vocabulary import Vocabulary
@@ -69,7 +69,7 @@ def run(
         what, fix = "this teacher never fails to answer", "remove the option"
         raise ConfigError(what, where="--retry-failed", got=cfg.teacher_kind, fix=fix)
     vocabulary = vocabulary_of(cfg)
-    cfg = as_taught(cfg, vocabulary)
+    cfg = student_settings(cfg, vocabulary)
     unused = set[str]() if cfg.caption_file is None else given_samples(read_given(cfg))
     stage = open_stage(cfg, data, out, seed, resume)
     was_complete = stage.is_complete and not _has_more(stage, cfg)

@@ -1,7 +1,7 @@
 """The bounded ask-verify loop of one window.
 
 Every window has one outcome: accepted, dropped for a reason, or failed because the teacher did not answer. A decision
-that the flight contradicts is asked for again, by default anchored to the label; the record says so.
+that the trajectory contradicts is asked for again, by default anchored to the label; the record says so.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ from cosfly.viz.frame_views import Pictures
 Frames = Sequence[Sequence[EncodedImage]]  # pictures of each frame, oldest first
 
 
-def as_taught(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:
+def student_settings(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:
     """Return settings whose windows, pictures, answer format and sampling are those of the student's training.
 
     Without a student the settings do not change.
@@ -43,17 +43,17 @@ def as_taught(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:
     folder = cfg.student.folder
     if folder is None:
         return cfg
-    taught = read_chat_format(folder)
-    check_prompts(taught, folder, vocabulary)
-    first = taught.looks[0]
-    kinds = {(look.views, look.depth_range_m, max(look.size_px)) for look in taught.looks}
+    chat_format = read_chat_format(folder)
+    check_prompts(chat_format, folder, vocabulary)
+    first = chat_format.looks[0]
+    kinds = {(look.views, look.depth_range_m, max(look.size_px)) for look in chat_format.looks}
     if len(kinds) > 1:
-        what = "the student was taught with pictures of several kinds"
-        raise ConfigError(what, where=folder, got=str(taught.looks)[:200])
+        what = "the student was trained with pictures of several kinds"
+        raise ConfigError(what, where=folder, got=str(chat_format.looks)[:200])
     sampling = {name: getattr(StudentEndpointConfig(), name) for name in ("temperature", "top_p", "extra_body")}
     return cfg.model_copy(update={
         "writing": "prose",
-        "window": cfg.window.model_copy(update={"num_frames": taught.num_frames}),
+        "window": cfg.window.model_copy(update={"num_frames": chat_format.num_frames}),
         "image": cfg.image.model_copy(update={
             "modalities": first.views, "layout": "separate", "max_side_px": max(first.size_px),
             "depth_range_m": first.depth_range_m, "encoding": IMAGE_ENCODING,
@@ -66,27 +66,27 @@ def as_taught(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:
     })  # fmt: skip
 
 
-def check_prompts(taught: ChatFormat, folder: Path, vocabulary: Vocabulary) -> None:
+def check_prompts(chat_format: ChatFormat, folder: Path, vocabulary: Vocabulary) -> None:
     """Check that prompts are written today as they were in the student's training."""
-    if "en" not in taught.prompts:
-        raise ConfigError("the student was taught no English", where=folder, got=", ".join(taught.prompts))
-    for language, prompt in taught.prompts.items():
+    if "en" not in chat_format.prompts:
+        raise ConfigError("the student was trained without English", where=folder, got=", ".join(chat_format.prompts))
+    for language, prompt in chat_format.prompts.items():
         is_same = prompt.system == student_prompt(language, vocabulary)
-        if not (is_same and _is_of_template(prompt.user, language, taught, vocabulary)):
+        if not (is_same and _is_of_template(prompt.user, language, chat_format, vocabulary)):
             raise ConfigError(
-                "the student was taught another version of the prompt", where=f"{folder}: {language}",
+                "the student was trained with another version of the prompt", where=f"{folder}: {language}",
                 got=prompt.user[:80],
                 fix="ask it with the prompts (caption.prompts, caption.text_state) and the version of cosfly that "
                 "captioned its training set, or train it again",
             )  # fmt: skip
 
 
-def _is_of_template(user: str, language: Language, taught: ChatFormat, vocabulary: Vocabulary) -> bool:
+def _is_of_template(user: str, language: Language, chat_format: ChatFormat, vocabulary: Vocabulary) -> bool:
     """Return whether a question is the template of its language, filled with the student's pictures."""
     template = vocabulary.templates[f"user_{language}"]
-    pictures = [Pictures(look.views, look.size_px, "separate", look.depth_range_m) for look in taught.looks]
+    pictures = [Pictures(look.views, look.size_px, "separate", look.depth_range_m) for look in chat_format.looks]
     known = {
-        "num_frames": str(taught.num_frames),
+        "num_frames": str(chat_format.num_frames),
         "pictures": "|".join(re.escape(one.sentence(language)) for one in pictures),
     }
     slots = template.get_identifiers()
@@ -102,24 +102,24 @@ class TrainedStudent:
     def __init__(self, cfg: CaptionConfig) -> None:
         """
         Args:
-            cfg: Settings as returned by `as_taught`.
+            cfg: Settings as returned by `student_settings`.
         """
         assert cfg.student.folder is not None
-        self.taught = read_chat_format(cfg.student.folder)
+        self.chat_format = read_chat_format(cfg.student.folder)
         self._sampling = cfg.endpoint
-        self.terms = Terms("prose", has_mirror="zh" in self.taught.prompts, is_translated=False)
+        self.terms = Terms("prose", has_mirror="zh" in self.chat_format.prompts, is_translated=False)
 
     def encode(self, rgb: np.ndarray) -> EncodedImage:
         """Encode a picture as in the student's training."""
-        return picture_to_send(rgb, self.taught.max_pixels)
+        return picture_to_send(rgb, self.chat_format.max_pixels)
 
     def check(self, question: Question) -> None:
         """Check that a window has pictures like those of the training: its views, and the size of its camera."""
         pictures = question.pictures
-        wanted = {(look.views, look.size_px) for look in self.taught.looks}
+        wanted = {(look.views, look.size_px) for look in self.chat_format.looks}
         if (pictures.views, pictures.size_px) not in wanted:
             raise TeacherError(
-                "the student was taught with other pictures than this playback tree has",
+                "the student was trained with other pictures than this playback tree has",
                 where=question.window.sample_id,
                 got=_described(pictures.views, pictures.size_px),
                 expected=" or ".join(_described(*one) for one in sorted(wanted)),

@@ -22,7 +22,7 @@ from caption.answer_formats.contract import THEREFORE, Draft
 from caption.schema import CaptionConfig, ObservedWindow, observed_frames
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.prompts import Question, make_question
-from caption.teachers.students import as_taught
+from caption.teachers.students import student_settings
 from caption.teachers.teacher import first_budget, open_teacher
 from cosfly.closed_loop.settings import BASELINES, FlyConfig
 from cosfly.closed_loop.stepper import ClosedLoopTrajectory, Moment
@@ -147,7 +147,7 @@ class PromptedEngine:
         if folder is not None:
             update["student"] = caption.student.model_copy(update={"folder": folder})
         self.vocabulary = vocabulary_of(caption)
-        self.cfg = as_taught(caption.model_copy(update=update), self.vocabulary)
+        self.cfg = student_settings(caption.model_copy(update=update), self.vocabulary)
         self.limit_s = cfg.answer_limit_s
         self.num_frames = self.cfg.window.num_frames
         self._is_rules = cfg.engine == "rules"
