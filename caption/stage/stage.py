@@ -85,8 +85,11 @@ def run(
         finished = run_items(stage, items, make_worker, args, workers=workers, watch=watch, label="caption")
         outcome = AskingOutcome(finished.tally)
     else:
-        if retry_failed:
-            _reopen_tracks(stage, tracks)
+        if retry_failed:  # the tracks of windows in quarantine are unfinished again
+            names = {flight_of(sample_id) for sample_id in read_quarantine(stage.path)}
+            for track in tracks:
+                if track.name in names:
+                    track.part(stage.path).unlink(missing_ok=True)
         asking = Asking(stage, cfg, vocabulary, seed, retry_failed=retry_failed, was_complete=was_complete)
         outcome = run_until_interrupted(asking.run(tracks))
     report, cards = _merge(stage, parts_of(stage.path, tracks, bool(outcome.unanswered)), unused)
@@ -98,17 +101,33 @@ def run(
         log.warning("caption: %s", warning)
     folders = {track.name: track.folder for track in tracks}
     write_page(stage.path / PAGE, report, cards.chosen(), folders, cfg.budget)
-    return _finish(stage, cfg, vocabulary, outcome, report.windows, is_cut)
+    _finish(stage, cfg, vocabulary, outcome, report.windows, is_cut)
+    return out / PRODUCT
 
 
 def _finish(
     stage: StageFolder, cfg: CaptionConfig, vocabulary: Vocabulary, outcome: AskingOutcome, tally: Tally, is_cut: bool
-) -> Path:
-    """Finish the stage if every window has an outcome."""
+) -> None:
+    """Finish the stage if every window has an outcome; TeacherError if one should have got an answer."""
     out = stage.path
+    missed = [failure for failure in outcome.unanswered if failure.code != NOT_ASKED]
+    if outcome.stopped:
+        raise TeacherError(
+            "stopped before the budget was passed",
+            where=cfg.teacher,
+            got=f"{outcome.stopped}; {tally.kept} windows accepted so far",
+            fix="raise --max-cost or --max-tokens and run the same command again: nothing answered is asked twice",
+        )
+    if missed:
+        raise TeacherError(
+            f"{len(missed)} of {tally.input} windows got no answer",
+            where=cfg.teacher,
+            got=f"{common_causes(missed)}; the last: {missed[-1].message}",
+            fix="run the same command again (what was answered is not asked twice), or --retry-failed for these alone",
+        )
     if outcome.unanswered or outcome.num_tracks_left:
-        _report_unanswered(cfg, outcome, tally)
-        return out / PRODUCT
+        log.info("caption: run again without --retry-failed for the windows that were never asked about")
+        return
     if tally.input == 0:
         num_frames = cfg.window.num_frames + cfg.window.future_frames
         raise stage.nothing_kept(outcome.tracks, expected=f"a track of at least {num_frames} frames")
@@ -120,7 +139,6 @@ def _finish(
     stage.finish(outputs, tally, flights=outcome.tracks.model_dump(), limit=cfg.limit if is_cut else None)
     if not is_cut:
         shutil.rmtree(out / PARTS, ignore_errors=True)  # a cut run keeps them, for the next with a larger limit
-    return out / PRODUCT
 
 
 def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Resume) -> StageFolder:
@@ -154,34 +172,6 @@ def _has_refused(stage: StageFolder, cfg: CaptionConfig) -> bool:
         )  # fmt: skip
     stage.reopen()
     return True
-
-
-def _reopen_tracks(stage: StageFolder, tracks: list[TrackInput]) -> None:
-    """Make the tracks of windows in quarantine unfinished again."""
-    names = {flight_of(sample_id) for sample_id in read_quarantine(stage.path)}
-    for track in tracks:
-        if track.name in names:
-            track.part(stage.path).unlink(missing_ok=True)
-
-
-def _report_unanswered(cfg: CaptionConfig, outcome: AskingOutcome, tally: Tally) -> None:
-    """Raise an error about windows that should have got an answer."""
-    missed = [failure for failure in outcome.unanswered if failure.code != NOT_ASKED]
-    if outcome.stopped:
-        raise TeacherError(
-            "stopped before the budget was passed",
-            where=cfg.teacher,
-            got=f"{outcome.stopped}; {tally.kept} windows accepted so far",
-            fix="raise --max-cost or --max-tokens and run the same command again: nothing answered is asked twice",
-        )
-    if missed:
-        raise TeacherError(
-            f"{len(missed)} of {tally.input} windows got no answer",
-            where=cfg.teacher,
-            got=f"{common_causes(missed)}; the last: {missed[-1].message}",
-            fix="run the same command again (what was answered is not asked twice), or --retry-failed for these alone",
-        )
-    log.info("caption: the quarantine is empty; run again without --retry-failed for windows that were never asked")
 
 
 def _merge(stage: StageFolder, parts: list[Path], unused: set[str]) -> tuple[CaptionReport, SampleCards]:

@@ -86,8 +86,6 @@ async def caption_prepared(
 ) -> Caption:
     """Make the caption of a prepared window; raises like `caption_window`."""
     loop = _WindowLoop(teacher, cfg, prepared, judge)
-    loop.checks["keyframe"] = prepared.window.keyframe
-    loop.checks["contradicted"] = prepared.contradicted
     reason = prepared.window.problem
     if reason is None:
         try:
@@ -155,7 +153,7 @@ class _WindowLoop:
         self.verdict: Verdict | None = None
         self.judgement: JudgeRecord | None = None
         self.repair: RepairRecord | None = None
-        self.checks: dict[str, Any] = {}
+        self.checks: dict[str, Any] = {"keyframe": prepared.window.keyframe, "contradicted": prepared.contradicted}
         self.usage = Usage()
         self.asks = 0
         self.structured: str | None = None
