@@ -182,7 +182,7 @@ class CaptionReport(BaseModel):
         self.recovered.update(checks.recovered or ())
 
     def finish(self, tracks: Tally, num_unanswered: int, judge_tokens: Usage | None) -> None:
-        """Complete the counts after the last caption, and check that no window was lost."""
+        """Close the counts after the last caption, and check that no window was lost."""
         self.flights = tracks
         self.judge_tokens = judge_tokens
         self.windows.input += num_unanswered
