@@ -141,8 +141,7 @@ def _implied(t: Thresholds) -> tuple[tuple[tuple[str, Measure], ...], ...]:
     orders, states, a manoeuvre that has the following ones as its parts, these, and the neutral one."""
 
     def is_round(m: Motion) -> bool:
-        """Following a walker through a bend sweeps an angle too: a circle is flown round someone who moves less than
-        the drone."""
+        """Return whether the target moves less than the drone: to follow it through a bend is no circle."""
         return abs(m.approach_m) < t.approach_m and m.target_path_m < 0.5 * abs(m.left_m)
 
     def circles(side: int) -> Measure:
@@ -151,7 +150,7 @@ def _implied(t: Thresholds) -> tuple[tuple[tuple[str, Measure], ...], ...]:
         )
 
     def closes_in(m: Motion) -> float:
-        """Of a gap that the person closes, only the drone's own part counts."""
+        """Measure the drone's own part of a gap that closes."""
         if not m.forward_m >= t.forward_m:
             return 0.0
         return _least(m.approach_m / t.approach_m, m.closing_m / t.approach_m)
@@ -218,7 +217,7 @@ class ActionTable:
         return shown(motion) < limit
 
     def verdict_of(self, decision: str, motion: Motion, label: str | None) -> Verdict:
-        """Judge a decision against the actual future (the three classes of sec:appendix_e, and ABSTAIN)."""
+        """Compare a decision with the actual future (the three classes of sec:appendix_e, and ABSTAIN)."""
         if decision == label:
             return "CONSISTENT"
         if self.is_contradicted(decision, motion):
