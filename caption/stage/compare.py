@@ -140,8 +140,9 @@ def _windows(cfg: CaptionConfig, data: Path) -> Iterable[Window]:
 def comparison_table(comparisons: Sequence[Comparison]) -> Table:
     """Return the comparison as a table for the terminal."""
     table = Table(title=f"Regeneration of the same {comparisons[0].num_conflicts} conflicts", title_justify="left")
-    for column in ("strategy", "repaired", "consistency", "naturalness", "asks each", "tokens each"):
-        table.add_column(column, justify="left" if column == "strategy" else "right", no_wrap=column == "strategy")
+    table.add_column("strategy", no_wrap=True)
+    for column in ("repaired", "consistency", "naturalness", "asks each", "tokens each"):
+        table.add_column(column, justify="right")
     for one in comparisons:
         table.add_row(
             one.strategy,

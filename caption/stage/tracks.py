@@ -93,14 +93,11 @@ def find_inputs(cfg: CaptionConfig, data: Path) -> tuple[list[TrackInput], bool]
 
 
 def parts_of(stage_path: Path, tracks: Sequence[TrackInput], with_gaps: bool) -> list[Path]:
-    """Return the part files of a run in the order of the product, which is that of the tracks."""
+    """Return the existing part files, or parts with gaps, in the order of the product."""
     found: list[Path] = []
     for track in tracks:
-        part, gap = track.part(stage_path), track.gap(stage_path)
-        if part.exists():
-            found.append(part)
-        elif with_gaps and gap.exists():
-            found.append(gap)
+        paths = [track.part(stage_path), track.gap(stage_path)] if with_gaps else [track.part(stage_path)]
+        found += [path for path in paths if path.exists()][:1]
     return found
 
 
