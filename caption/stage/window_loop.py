@@ -376,31 +376,31 @@ class _WindowLoop:
     # --- the Chinese mirror and the values ---
 
     async def _mirror(self) -> str | None:
+        """Ask for the Chinese text until the pair is consistent; return the reason to drop the window."""
         assert self.english is not None
         assert self.answered is not None
-        problem: str | None = None
         complaint: str | None = None
         for ask in range(self.cfg.mirror_asks):
             reply = await self.teacher.mirror(self.answered, self.english, ask, complaint)
             parsed = self._read(reply, "zh")
-            if parsed.coc is None:
-                problem, complaint = f"structure_{parsed.reason}", None
-                if parsed.reason == CONTEXT_FULL:
-                    break
-                continue
-            answer = self.way.read_mirror(parsed, self.english, self.answered.facts)
+            answer: Draft | Refused = Refused(f"structure_{parsed.reason}", "", self.chinese)
+            if parsed.coc is not None:
+                answer = self._compare(self.english, self.way.read_mirror(parsed, self.english, self.answered.facts))
             if isinstance(answer, Draft):
-                answer = self._compare(self.english, answer)
-            if isinstance(answer, Draft):
-                self.chinese, problem = answer, None
+                self.chinese = answer
+                self.checks["bilingual"] = "ok"
+                return None
+            self.chinese = answer.draft
+            self.checks["bilingual"] = answer.reason
+            complaint = answer.complaint
+            if parsed.reason == CONTEXT_FULL:
                 break
-            self.chinese, problem, complaint = answer.draft, answer.reason, answer.complaint
-        self.checks["bilingual"] = problem or "ok"
-        return None if problem is None else "bilingual"
+        return "bilingual"
 
-    def _compare(self, english: Draft, chinese: Draft) -> Draft | Refused:
+    def _compare(self, english: Draft, chinese: Draft | Refused) -> Draft | Refused:
         """Compare a translation with its source. Templates are compared already; a given text translates nothing."""
-        if self.terms.is_given or not self.terms.is_translated or chinese.template is not None:
+        is_translated = self.terms.is_translated and not self.terms.is_given
+        if isinstance(chinese, Refused) or chinese.template is not None or not is_translated:
             return chinese
         found = check_translation(english.coc, chinese.coc)
         return Refused(*found, chinese) if found else chinese
