@@ -70,6 +70,11 @@ def is_smooth(f: Facts, side: int) -> bool:
     return not is_shaken(f)
 
 
+def is_legible(f: Facts, side: int) -> bool:
+    """Return whether the picture shows the target, so that its place and size in it may be stated."""
+    return f.is_legible_now
+
+
 def is_walk_known(f: Facts, side: int) -> bool:
     return f.is_visible_now and f.target_speeds_mps[-1] is not None
 
@@ -84,12 +89,12 @@ def is_gap_clear(f: Facts, side: int) -> bool:
 
 
 def is_box_known_at_first(f: Facts, side: int) -> bool:
-    return f.box_height_px[0] is not None and not is_shaken(f)
+    return is_legible(f, side) and f.box_height_px[0] is not None and not is_shaken(f)
 
 
 walks = says("target_motion", "walking", is_walk_known)
 hurries = says("trend:target_speed", "increasing", is_walk_known_at_first)
-centred = says("side:offset_x", "centred")
+centred = says("side:offset_x", "centred", is_legible)
 gap_opens = says("trend:distance", "increasing", is_gap_clear)
 gap_closes = says("trend:distance", "decreasing", is_gap_clear)
 
@@ -129,7 +134,7 @@ def walks_away(f: Facts, side: int) -> bool:
 
 
 def off_centre(f: Facts, side: int) -> bool:
-    return word_of(f, "side:offset_x") in SIDES[side]
+    return is_legible(f, side) and word_of(f, "side:offset_x") in SIDES[side]
 
 
 def near_border(f: Facts, side: int) -> bool:
@@ -234,8 +239,8 @@ CONDITIONS: dict[str, Condition] = {
     "drone_climbs": says("trend:altitude", "increasing", is_smooth),
     "drone_sinks": says("trend:altitude", "decreasing", is_smooth),
     "steep": lambda f, side: (f.depression_deg[-1] or 0.0) >= STEEP_DEG,
-    "small": lambda f, side: 0 < (f.box_height_px[-1] or 0) < SMALL_SHARE * f.height_px,
-    "large": lambda f, side: (f.box_height_px[-1] or 0) > LARGE_SHARE * f.height_px,
+    "small": lambda f, side: is_legible(f, side) and 0 < (f.box_height_px[-1] or 0) < SMALL_SHARE * f.height_px,
+    "large": lambda f, side: is_legible(f, side) and (f.box_height_px[-1] or 0) > LARGE_SHARE * f.height_px,
     "grows": says("trend:box_height", "increasing", is_box_known_at_first),
     "shrinks": says("trend:box_height", "decreasing", is_box_known_at_first),
     "hidden": sees("occluded"), "out_of_view": sees("out_of_view"), "faint": sees("illegible"),
