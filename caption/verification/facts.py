@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate, pairwise
+from operator import mul
 from typing import Any, Literal
 
 import numpy as np
@@ -132,10 +133,10 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
     turns_deg = [wrapped(after.rotation_deg[1] - before.rotation_deg[1]) for before, after in pairwise(frames)]
     yaw_deg = [0.0, *accumulate(turns_deg)]
     is_known = (True,) * count
-    velocities = list(zip(*_velocities((xs, ys, zs), is_known, step_s, SMOOTH_M), strict=True))
+    (v_x, v_y, v_z), local = _velocities((xs, ys, zs), is_known, step_s, SMOOTH_M)
+    velocities = list(zip(*local, strict=True))
     yaw_rad = math.radians(frames[-1].rotation_deg[1])
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    v_x, v_y, v_z = (_slope(axis, is_known, step_s) for axis in (xs, ys, zs))
     steps_m = [math.dist(before.position_m, after.position_m) for before, after in pairwise(frames)]
     return Facts(
         speed_mps=_rounded([math.hypot(*velocity) for velocity in velocities], 2),
@@ -144,7 +145,7 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
         altitude_m=altitude,
         climb_mps=_rounded([velocity[2] for velocity in velocities], 2),
         yaw_deg=tuple([_round(angle, 1) for angle in yaw_deg]),
-        yaw_rate_dps=_rounded(_velocities((yaw_deg,), is_known, step_s, SMOOTH_DEG)[0], 1),
+        yaw_rate_dps=_rounded(_velocities((yaw_deg,), is_known, step_s, SMOOTH_DEG)[1][0], 1),
         heading_deg=heading,
         pitch_deg=pitch,
         travelled_m=(0.0, *[_round(way, 1) for way in accumulate(steps_m)]),
@@ -205,8 +206,8 @@ def _measure_target(
             "target_speeds_mps": nothing, "target_headings_deg": nothing,
             "target_velocity_mps": None, "target_speed_mps": None, "target_turn_deg": None,
         }  # fmt: skip
-    v_x, v_y = _slope(xs, seen, step_s), _slope(ys, seen, step_s)
-    velocities = list(zip(*_velocities((xs, ys), seen, step_s, SMOOTH_M), strict=True))
+    (v_x, v_y), local = _velocities((xs, ys), seen, step_s, SMOOTH_M)
+    velocities = list(zip(*local, strict=True))
     speeds = [math.hypot(*velocity) for velocity in velocities]
     headings = [
         math.degrees(math.atan2(y, x)) if speed > STANDING_MPS else math.nan  # NaN is not larger either
@@ -223,59 +224,63 @@ def _measure_target(
     }
 
 
-@lru_cache(maxsize=256)
-def _slope_weights(known: tuple[bool, ...], at: int | None) -> tuple[float, ...]:
-    """Return the weights whose sum with a series is the slope, per step, of the straight line that fits it best.
+@dataclass(frozen=True)
+class _Fit:
+    """Weights that turn a series into slopes per step and deviations, for the frames at which it is known.
 
-    Args:
-        known: frames that may be used. at: the frame whose neighbours are used; None: all frames.
+    whole: (n,) of the straight line through all known frames; local: (n, n) of that through the neighbours of each
+    frame; residuals: (n, n) deviations from the parabola that fits best. Rows of unknown frames are NaN or left out.
     """
-    near = [i for i, is_known in enumerate(known) if is_known and (at is None or abs(i - at) <= SMOOTHED_OVER)]
-    if len(near) < 2 or (at is not None and not known[at]):
-        return (math.nan,) * len(known)
-    middle = sum(near) / len(near)
-    norm = sum((i - middle) ** 2 for i in near)
-    return tuple((i - middle) / norm if i in near else 0.0 for i in range(len(known)))
+
+    whole: tuple[float, ...]
+    local: tuple[tuple[float, ...], ...]
+    residuals: tuple[tuple[float, ...], ...]
 
 
-def _slope(values: Sequence[float], known: tuple[bool, ...], step_s: float, at: int | None = None) -> float:
-    """Return the slope of a series in units per second; NaN where it is not known."""
-    weights = _slope_weights(known, at)
-    return sum([w * v for w, v in zip(weights, values, strict=True) if w]) / step_s
+@lru_cache(maxsize=256)
+def _fit_of(known: tuple[bool, ...]) -> _Fit:
+    frames = [i for i, is_known in enumerate(known) if is_known]
+    basis = np.vander(np.array(frames) - np.mean(frames), 3)
+    residuals = np.zeros((len(frames), len(known)))
+    residuals[:, frames] = np.eye(len(frames)) - basis @ np.linalg.pinv(basis)
+    near = [[i for i in frames if abs(i - at) <= SMOOTHED_OVER] if known[at] else [] for at in range(len(known))]
+    return _Fit(
+        _line_weights(frames, len(known)),
+        tuple(_line_weights(neighbours, len(known)) for neighbours in near),
+        tuple(map(tuple, residuals.tolist())),
+    )
+
+
+def _line_weights(frames: Sequence[int], count: int) -> tuple[float, ...]:
+    """Return the weights whose sum with a series is the slope, per step, of the line through some of its frames."""
+    if len(frames) < 2:
+        return (math.nan,) * count
+    middle = sum(frames) / len(frames)
+    norm = sum((i - middle) ** 2 for i in frames)
+    return tuple((i - middle) / norm if i in frames else 0.0 for i in range(count))
+
+
+def _weighted(weights: Sequence[float], values: Sequence[float]) -> float:
+    return sum(map(mul, weights, values))
 
 
 def _velocities(
     axes: Sequence[Sequence[float]], known: tuple[bool, ...], step_s: float, smooth: float
-) -> list[list[float]]:
-    """Return the slope of each axis at each frame, NaN where the frame is not known.
+) -> tuple[list[float], list[list[float]]]:
+    """Return the slope of each axis over the whole window, and at each frame, NaN where the frame is not known.
 
     Args:
         smooth: the largest root mean square deviation from a parabola, in units of the axes, at which neighbouring
             frames tell the velocity; beyond it every frame has that of the whole window.
     """
-    places = range(len(known))
-    if _deviation(axes, known) > smooth:
-        return [[_slope(axis, known, step_s) if known[at] else math.nan for at in places] for axis in axes]
-    return [[_slope(axis, known, step_s, at) for at in places] for axis in axes]
-
-
-def _deviation(axes: Sequence[Sequence[float]], known: tuple[bool, ...]) -> float:
-    """Return the root mean square deviation of a path from the parabolas that fit its axes best."""
-    residuals = _parabola_residuals(known)
-    near = [i for i, is_known in enumerate(known) if is_known]
-    total = 0.0
-    for axis in axes:
-        values = [axis[i] for i in near]
-        total += sum([sum([w * v for w, v in zip(row, values, strict=True)]) ** 2 for row in residuals])
-    return math.sqrt(total / len(near))
-
-
-@lru_cache(maxsize=256)
-def _parabola_residuals(known: tuple[bool, ...]) -> list[list[float]]:
-    """Return the matrix that maps the values at known frames to their deviations from the parabola that fits them."""
-    near = np.array([i for i, is_known in enumerate(known) if is_known], dtype=float)
-    basis = np.vander(near - near.mean(), 3)
-    return (np.eye(len(near)) - basis @ np.linalg.pinv(basis)).tolist()
+    fit = _fit_of(known)
+    if not all(known):  # a weight of 0 does not hide NaN
+        axes = [[value if is_known else 0.0 for value, is_known in zip(axis, known, strict=True)] for axis in axes]
+    whole = [_weighted(fit.whole, axis) / step_s for axis in axes]
+    squares = sum([_weighted(row, axis) ** 2 for axis in axes for row in fit.residuals])
+    if squares > smooth * smooth * len(fit.residuals):
+        return whole, [[slope if is_known else math.nan for is_known in known] for slope in whole]
+    return whole, [[_weighted(row, axis) / step_s for row in fit.local] for axis in axes]
 
 
 @lru_cache(maxsize=64)  # five windows of a track share a frame
