@@ -30,7 +30,7 @@ PAIRS = [
 ]
 
 
-def opposites_of(text, language):
+def opposites_in(text, language):
     return Counter(load_glossary().opposites(SLOT.sub("", text), language))
 
 
@@ -48,7 +48,7 @@ def test_both_languages_of_a_sentence_agree():
     for english, chinese in PAIRS:
         assert sorted(SLOT.findall(english)) == sorted(SLOT.findall(chinese)), english
         assert all(zh in chinese for _, zh in terms_in(SLOT.sub("", english))), english
-        assert opposites_of(english, "en") == opposites_of(chinese, "zh"), english
+        assert opposites_in(english, "en") == opposites_in(chinese, "zh"), english
         assert all(slot == "decision" or parse_reference(slot) for slot in SLOT.findall(english)), english
         assert len(cut_sentences(english)) == len(cut_sentences(chinese)) == 1, english
 

@@ -58,8 +58,8 @@ SMOOTH = Gains(
     hover_walk_mps=2.5,
 )  # fmt: skip
 SHAKEN = Gains(
-    last_turn=0.0, turn=0.22, sight=0.3, bearing=0.2, climb=0.4, trend=0.0, braking=0.0, strafe_m=2.0, retreat_m=2.0,
-    advance_m=3.2, circle_m=7.0, circle_turn_deg=15.0, circle_walk=1.5, brisk_mps=2.7, lag_mps=3.2, hover_mps=0.28,
+    last_turn=0.0, turn=0.22, sight=0.3, bearing=0.2, climb=0.3, trend=0.0, braking=0.0, strafe_m=2.5, retreat_m=3.0,
+    advance_m=4.0, circle_m=7.0, circle_turn_deg=15.0, circle_walk=1.5, brisk_mps=2.7, lag_mps=3.2, hover_mps=0.28,
     hover_walk_mps=0.28,
 )  # fmt: skip
 
@@ -83,7 +83,12 @@ def decide(f: Facts) -> str:
         return "return_to_home" if f.visibility[-1] == "out_of_view" else "break_off"
     if not f.is_visible_now:
         return "search_to_reacquire_target"
-    sizes = expected_sizes(f)
+    if "decision" not in f.found:
+        f.found["decision"] = _strongest(expected_sizes(f))
+    return str(f.found["decision"])
+
+
+def _strongest(sizes: dict[str, float]) -> str:
     for tokens in (("hover",), ("circle_left", "circle_right"), tuple(sizes)):
         token = max(tokens, key=sizes.__getitem__)
         if sizes[token] >= 1.0:

@@ -32,7 +32,7 @@ SMALL_SHARE, LARGE_SHARE = 0.04, 0.4  # of the picture's height
 STEEP_DEG = 55.0
 NEAR_M, COMING_M = 3.0, 6.0  # from the target to a bystander at its side, to one on the way to it
 MOST_DIFFERENCES = 1  # in appearance, of a person who is similar
-SLOW_MPS, SLIDING_MPS = 0.3, 0.5
+SLOW_MPS, SLIDING_MPS, CRAWLING_MPS = 0.3, 0.5, 0.7
 SIDES = (("left", "right"), ("left",), ("right",))  # by the side of the decision
 HIDDEN = ("occluded", "out_of_view")
 
@@ -97,6 +97,10 @@ hurries = says("trend:target_speed", "increasing", is_walk_known_at_first)
 centred = says("side:offset_x", "centred", is_legible)
 gap_opens = says("trend:distance", "increasing", is_gap_clear)
 gap_closes = says("trend:distance", "decreasing", is_gap_clear)
+
+
+def is_crawling(f: Facts, side: int) -> bool:
+    return (f.speed_mps[-1] or 0.0) < CRAWLING_MPS
 
 
 def sets_off(f: Facts, side: int) -> bool:
@@ -203,6 +207,7 @@ FAMILIES = {
     "break_off": Family(("break_off",), ("order",), ("view", "drone", "gap", "motion"), "order"),
     "home": Family(("return_to_home",), ("order",), ("view", "drone", "gap", "motion"), "order"),
 }  # fmt: skip
+FAMILY_OF = {token: name for name, family in FAMILIES.items() for token in family.tokens}
 
 
 def expects(family: Family) -> Condition:
@@ -232,6 +237,8 @@ CONDITIONS: dict[str, Condition] = {
     "nose_steady": says("side:yaw", "straight", is_smooth),
     "nose_turns": nose_turns,
     "drone_hovers": says("drone_motion", "hovering", lambda f, side: (f.speed_mps[-1] or 0.0) < SLOW_MPS),
+    "drone_brakes": says("trend:speed", "decreasing", is_smooth, is_crawling),
+    "drone_crawls": lambda f, side: is_smooth(f, side) and is_crawling(f, side),
     "drone_flies": says("drone_motion", "moving"),
     "slides": slides,
     "goes_along": lambda f, side: slides(f, side) and walks(f, side) and side * _walk_aside_mps(f) >= SLOW_MPS,
@@ -325,7 +332,7 @@ def write_templates(
     """
     token = decision or decide(facts)
     side = ("left" in token) - ("right" in token)
-    name = next(name for name, family in FAMILIES.items() if token in family.tokens)
+    name = FAMILY_OF[token]
     choose = Chooser(facts, draws)
     reasons = list(choose.holding(sentences()["reasons"][name], side))
     if not reasons:
