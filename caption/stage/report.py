@@ -11,9 +11,9 @@ from cosfly.formats.captions import TOKENS, Caption, Coc, ValueCounts
 from cosfly.formats.frames import frame_name
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import BudgetConfig
-from cosfly.runtime.io import read_text, write_bytes
+from cosfly.runtime.io import read_text
 from cosfly.viz.frame_views import thumbnail
-from cosfly.viz.page import page, run_name
+from cosfly.viz.page import page
 
 PICTURE_WIDTH_PX = 240
 VERDICTS = {  # with their meanings
@@ -28,21 +28,14 @@ STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
 Rows = list[tuple[str, str]]
 
 
-def write_page(
-    path: Path, report: CaptionReport, cards: Sequence[Caption], folders: Mapping[str, Path], budget: BudgetConfig
-) -> None:
-    """Write the page.
+def page_html(
+    report: CaptionReport, cards: Sequence[Caption], folders: Mapping[str, Path], budget: BudgetConfig, name: str
+) -> str:
+    """Return the text of the page of a run with this name.
 
     Args:
         cards: Captions to show. folders: Track id -> its folder, for the pictures.
     """
-    write_bytes(path, page_html(report, cards, folders, budget, run_name(path.parent)).encode())
-
-
-def page_html(
-    report: CaptionReport, cards: Sequence[Caption], folders: Mapping[str, Path], budget: BudgetConfig, name: str
-) -> str:
-    """Return the text of the page of a run with this name."""
     teacher = report.teacher
     verdicts = [("First answers", report.verdicts_of_first_answers), ("Accepted captions", report.verdicts_of_accepted)]
     return page(

@@ -16,7 +16,7 @@ from pathlib import Path
 from caption.schema import CaptionConfig, Window
 from caption.stage.asking import ANSWERS, NOT_ASKED, Asking, AskingOutcome, common_causes, read_quarantine
 from caption.stage.ledger import CaptionReport, SampleCards, explain_drops
-from caption.stage.report import write_page
+from caption.stage.report import page_html
 from caption.stage.tracks import PARTS, TrackInput, find_inputs, parts_of, restore_parts
 from caption.stage.window_loop import caption_prepared, prepare
 from caption.teachers.foreign import given_samples, read_given
@@ -30,10 +30,12 @@ from cosfly.formats.places import flight_of
 from cosfly.llm.contract import run_until_interrupted
 from cosfly.llm.student_chat import student_files
 from cosfly.runtime.errors import ConfigError, ResumeError, TeacherError
+from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import write_json
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally, read_manifest
 from cosfly.runtime.worker import Item, Outcome, Work, advance
+from cosfly.viz.page import run_name
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +102,8 @@ def run(
     for warning in report.warnings():
         log.warning("caption: %s", warning)
     folders = {track.name: track.folder for track in tracks}
-    write_page(stage.path / PAGE, report, cards.chosen(), folders, cfg.budget)
+    html = page_html(report, cards.chosen(), folders, cfg.budget, run_name(stage.path))
+    write_bytes(stage.path / PAGE, html.encode())
     _finish(stage, cfg, vocabulary, outcome, report.windows, is_cut)
     return out / PRODUCT
 

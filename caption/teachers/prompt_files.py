@@ -95,22 +95,18 @@ def export_prompts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
     with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     refuse_links(folder)
-    others = [f"{name}{SUFFIX}" for name, text in texts.items() if _is_another(folder / f"{name}{SUFFIX}", text)]
+    paths = {folder / f"{name}{SUFFIX}": text for name, text in texts.items()}
+    others = [path.name for path, text in paths.items() if _is_another(path, text)]
     if others:
         what, fix = "the folder has prompts with another text", "choose another folder"
         raise ConfigError(what, where=folder, got=", ".join(others), fix=fix)
-    return _write(folder, texts)
+    for path, text in paths.items():
+        write_bytes(path, text.encode())
+    return list(paths)
 
 
 def _is_another(path: Path, text: str) -> bool:
     return path.exists() and not (path.is_file() and read_text(path) == text)
-
-
-def _write(folder: Path, texts: Mapping[str, str]) -> list[Path]:
-    paths = [folder / f"{name}{SUFFIX}" for name in texts]
-    for path, text in zip(paths, texts.values(), strict=True):
-        write_bytes(path, text.encode())
-    return paths
 
 
 def vocabulary_of(cfg: CaptionConfig) -> Vocabulary:
@@ -123,5 +119,4 @@ def keep_own_prompts(out: Path, vocabulary: Vocabulary) -> list[Path]:
     """Write prompts that do not ship next to the captions, so that readers know them; return their paths."""
     if vocabulary.prompts == shipped_prompts():
         return []
-    (out / OWN_PROMPTS).mkdir(exist_ok=True)
-    return _write(out / OWN_PROMPTS, vocabulary.prompts)
+    return export_prompts(out / OWN_PROMPTS, vocabulary.prompts)
