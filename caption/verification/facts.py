@@ -229,7 +229,7 @@ class _Fit:
     """Weights that turn a series into slopes per step and deviations, for the frames at which it is known.
 
     whole: (n,) of the straight line through all known frames; local: (n, n) of that through the neighbours of each
-    frame; residuals: (n, n) deviations from the parabola that fits best. Rows of unknown frames are NaN or left out.
+    frame; residuals: (n, n) deviations from the parabola that fits best. Rows of unknown frames are NaN or skipped.
     """
 
     whole: tuple[float, ...]
