@@ -68,6 +68,7 @@ def first_waypoint(change: Callable[[dict], object]) -> Callable[[dict], object]
     return lambda value: change(value["points"][0]["nav_waypoint"])
 
 
+KEPT = CaptionConfig.model_validate({"repair": {"hard_conflict": "keep"}})  # every window has a caption
 DEMANDS = {
     "trace_dir": lambda v: v.update(trace_dir="trajectory_1776047127"),
     "t1_world is a list": first_waypoint(lambda nav: nav.update(t1_world=list(nav["t1_world"].values()))),
@@ -222,7 +223,7 @@ def way(tmp_path_factory) -> Path:
         root / "tree", towns=("Town01", "Town10HD_Opt"), trajectories=("trajectory_1777083733",), num_points=13
     )
     inspected = inspection.run(InspectConfig(), None, None, tree, root / "inspect")
-    captions = caption_stage.run(CaptionConfig(), tree, root / "caption")
+    captions = caption_stage.run(KEPT, tree, root / "caption")
     for split_by in ("walk", "town"):
         cfg = PrepareConfig(val_fraction=0, test_fraction=0.5, split_by=split_by)
         prepare.run(cfg, [Prepared.of_files(tree, captions)], root / f"by_{split_by}")
@@ -266,7 +267,7 @@ def test_a_foreign_tree_gives_samples_and_a_release(way):
 def test_of_a_foreign_tree_what_was_inspected_is_released_and_nothing_else(tmp_path):
     tree = write_foreign_tree(tmp_path / "tree", num_points=11, files=("rgb.png",))
     inspected = inspection.run(InspectConfig(), None, None, tree, tmp_path / "inspect")
-    captions = caption_stage.run(CaptionConfig(), tree, tmp_path / "caption")
+    captions = caption_stage.run(KEPT, tree, tmp_path / "caption")
     alone = tmp_path / "alone"  # inspections travel without the records of their stage
     alone.mkdir()
     cfg, clean = ReleaseConfig(licence="mit", modalities=("rgb",)), find_tracks(tree)[0]
