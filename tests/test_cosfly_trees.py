@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from specimens_foreign import NOBODY, write_foreign_tree
 
 from caption.schema import CaptionConfig
 from caption.stage import stage as caption_stage
-from cosfly.formats.captions import read_captions
+from cosfly.formats.captions import Verdict, read_captions
 from cosfly.formats.frames import read_instance
 from cosfly.formats.inspection import read_inspection
 from cosfly.formats.playback import read_track, write_track
@@ -225,7 +226,7 @@ def way(tmp_path_factory) -> Path:
     inspected = inspection.run(InspectConfig(), None, None, tree, root / "inspect")
     captions = caption_stage.run(KEPT, tree, root / "caption")
     for split_by in ("walk", "town"):
-        cfg = PrepareConfig(val_fraction=0, test_fraction=0.5, split_by=split_by)
+        cfg = PrepareConfig(val_fraction=0, test_fraction=0.5, split_by=split_by, verdicts=get_args(Verdict))
         prepare.run(cfg, [Prepared.of_files(tree, captions)], root / f"by_{split_by}")
     theirs = ReleaseConfig(licence="cc-by-4.0", credits="Made by somebody else.")
     package.run(theirs, [Source("theirs", tree, captions, inspected)], root / "release")

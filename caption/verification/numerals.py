@@ -120,7 +120,7 @@ def _pattern(language: Language) -> re.Pattern[str]:
     else:
         pattern = (
             rf"(?P<digits>{_DIGITS})\s*个?(?:{unit})?(?P<and_half>半(?![秒步帧]))?|半个?(?:{of_half})"
-            rf"|(?<![第这那数几上])(?P<word>{_CHINESE})个?(?:{of_word})(?P<word_half>半(?![秒步帧]))?"
+            rf"|(?<![第这那数几上])(?!(?<![到约仅了近有])一度)(?P<word>{_CHINESE})个?(?:{of_word})(?P<word_half>半(?![秒步帧]))?"
         )
     return re.compile(pattern, re.IGNORECASE)
 
@@ -174,5 +174,7 @@ def _numeral(match: re.Match[str], unit: str, factor: float, language: Language)
         return Numeral(text, 0.5 * factor, unit, 1, factor, is_in_digits=False)
     word = groups["word"]
     value = half + (english_number(word) if language == "en" else chinese_number(word))
+    if value == 1.0:
+        return None  # "every metre", 一米: no measurement
     digits = len(f"{value:.2f}".rstrip("0").partition(".")[2])
     return Numeral(text, value * factor, unit, digits, factor, is_in_digits=False)

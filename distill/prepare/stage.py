@@ -179,7 +179,7 @@ class PrepareConfig(SplitConfig):
         ("CONSISTENT", "SOFT_CONFLICT", "ABSTAIN"), min_length=1, description="captions of these verdicts are learnt"
     )
     contradicted: Literal["keep", "exclude"] = Field(
-        "exclude", description="what happens to answers of which the geometry contradicts a sentence"
+        "exclude", description="what happens to answers with a value that contradicts the measured facts"
     )
     balance: Literal["none", "decisions"] = Field(
         "none", description="decisions: training windows of a decision beyond an equal share are dropped"
