@@ -35,6 +35,7 @@ MOST_DIFFERENCES = 1  # in appearance, of a person who is similar
 SLOW_MPS, SLIDING_MPS, CRAWLING_MPS = 0.3, 0.5, 0.7
 SIDES = (("left", "right"), ("left",), ("right",))  # by the side of the decision
 HIDDEN = ("occluded", "out_of_view")
+STRIKING = ("off_centre",)  # conditions for which a reason to fly straight on has to account
 
 
 # --- conditions -------------------------------------------------------------------------------------------------------
@@ -101,6 +102,19 @@ gap_closes = says("trend:distance", "decreasing", is_gap_clear)
 
 def is_crawling(f: Facts, side: int) -> bool:
     return (f.speed_mps[-1] or 0.0) < CRAWLING_MPS
+
+
+def walks_evenly(f: Facts, side: int) -> bool:
+    """Return whether the target's mean speed is its speed now, so that a sentence may compare the drone with it."""
+    return word_of(f, "trend:target_speed") not in ("increasing", "decreasing")
+
+
+def gap_moves(f: Facts, side: int) -> bool:
+    return word_of(f, "trend:distance") != "steady"
+
+
+def retreats(f: Facts, side: int) -> bool:
+    return f.velocity_mps[0] <= -SLIDING_MPS and not is_shaken(f)
 
 
 def sets_off(f: Facts, side: int) -> bool:
@@ -199,7 +213,7 @@ FAMILIES = {
     "ascend": Family(("ascend",), ("height", "cover"), ("motion", "size", "gap", "place")),
     "descend": Family(("descend",), ("height", "size"), ("motion", "view", "gap", "place")),
     "forward": Family(("move_forward",), ("gap", "size"), ("motion", "view", "place", "drone")),
-    "backward": Family(("move_backward",), ("gap", "motion"), ("size", "view", "place", "drone")),
+    "backward": Family(("move_backward",), ("drone", "gap", "motion"), ("size", "view", "place")),
     "speed_up": Family(("speed_up",), ("pace", "motion"), ("gap", "place", "view", "drone")),
     "slow_down": Family(("slow_down",), ("pace", "motion"), ("gap", "place", "view", "drone")),
     "hover": Family(("hover",), ("drone",), ("motion", "place", "gap", "view", "people"), "hover"),
@@ -231,16 +245,16 @@ CONDITIONS: dict[str, Condition] = {
     "on_axis": lambda f, side: centred(f, side) and not sight_swings(f, 0),
     "gap_steady": says("trend:distance", "steady"),
     "gap_opens": gap_opens, "gap_closes": gap_closes, "gap_scatters": gap_scatters,
-    "pace_matched": says("comparison:speed", "matching", is_smooth, walks),
-    "outrun": says("comparison:speed", "slower", is_smooth, walks),
-    "overtakes": says("comparison:speed", "faster", is_smooth, walks),
+    "pace_matched": says("comparison:speed", "matching", is_smooth, walks, walks_evenly),
+    "outrun": says("comparison:speed", "slower", is_smooth, walks, walks_evenly, gap_moves),
+    "overtakes": says("comparison:speed", "faster", is_smooth, walks, walks_evenly, gap_moves),
     "nose_steady": says("side:yaw", "straight", is_smooth),
     "nose_turns": nose_turns,
     "drone_hovers": says("drone_motion", "hovering", lambda f, side: (f.speed_mps[-1] or 0.0) < SLOW_MPS),
     "drone_brakes": says("trend:speed", "decreasing", is_smooth, is_crawling),
     "drone_crawls": lambda f, side: is_smooth(f, side) and is_crawling(f, side),
     "drone_flies": says("drone_motion", "moving"),
-    "slides": slides,
+    "slides": slides, "retreats": retreats,
     "goes_along": lambda f, side: slides(f, side) and walks(f, side) and side * _walk_aside_mps(f) >= SLOW_MPS,
     "slides_past": lambda f, side: slides(f, -side),
     "drone_climbs": says("trend:altitude", "increasing", is_smooth),
@@ -359,7 +373,9 @@ def _critical_components(choose: Chooser, name: str, side: int) -> list[Both]:
 
 def _reasoning_trace(choose: Chooser, name: str, reasons: list[Group]) -> list[Both]:
     """Return the reason, mostly what else matters or what follows from it, and the conclusion."""
-    main = reasons.pop(choose.below(len(reasons) if name == "straight" else min(len(reasons), 2)))
+    number = choose.below(len(reasons) if name == "straight" else min(len(reasons), 2))
+    striking = [number for number, group in enumerate(reasons) if group.name in STRIKING]
+    main = reasons.pop(striking[0] if striking else number)  # what a reader would ask about is answered
     remarks = list(islice(choose.holding(sentences()["remarks"]["any"], 0), 1))
     consequences = [sentences()["consequences"][FAMILIES[name].why]["always"]]
     second = (remarks or consequences, reasons[:1] or consequences, consequences, [])[choose.below(4)]
