@@ -35,6 +35,7 @@ MOST_DIFFERENCES = 1  # in appearance, of a person who is similar
 SLOW_MPS, SLIDING_MPS, CRAWLING_MPS = 0.3, 0.5, 0.7
 SIDES = (("left", "right"), ("left",), ("right",))  # by the side of the decision
 HIDDEN = ("occluded", "out_of_view")
+CLOSE_M = 30.0  # a target that comes nearer than this leaves the drone little room
 STRIKING = ("off_centre",)  # conditions for which a reason to fly straight on has to account
 
 
@@ -111,6 +112,10 @@ def walks_evenly(f: Facts, side: int) -> bool:
 
 def gap_moves(f: Facts, side: int) -> bool:
     return word_of(f, "trend:distance") != "steady"
+
+
+def is_close(f: Facts) -> bool:
+    return (f.distance_m[-1] or math.inf) <= CLOSE_M
 
 
 def retreats(f: Facts, side: int) -> bool:
@@ -255,6 +260,8 @@ CONDITIONS: dict[str, Condition] = {
     "drone_crawls": lambda f, side: is_smooth(f, side) and is_crawling(f, side),
     "drone_flies": says("drone_motion", "moving"),
     "slides": slides, "retreats": retreats,
+    "comes_near": lambda f, side: comes(f, side) and is_close(f),
+    "gap_closes_near": lambda f, side: gap_closes(f, side) and is_close(f),
     "goes_along": lambda f, side: slides(f, side) and walks(f, side) and side * _walk_aside_mps(f) >= SLOW_MPS,
     "slides_past": lambda f, side: slides(f, -side),
     "drone_climbs": says("trend:altitude", "increasing", is_smooth),
