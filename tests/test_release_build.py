@@ -250,7 +250,7 @@ DAMAGES = {
         "decide differently"),
     "a frame that is no number": (caption(frame_index="x"), "frame_index"),
     "a picture of 2^64 px": (caption(picture_px=[2**64, 54]), r"picture_px\[0\]: .*got 18446744"),
-    "captions of another version": (caption(schema_version="1.0"), "another version"),
+    "captions of another version": (caption(schema_version="1.0"), "version that is not supported"),
 }  # fmt: skip
 
 

@@ -386,7 +386,14 @@ def _reasoning_trace(choose: Chooser, name: str, reasons: list[Group]) -> list[B
     remarks = list(islice(choose.holding(sentences()["remarks"]["any"], 0), 1))
     consequences = [sentences()["consequences"][FAMILIES[name].why]["always"]]
     second = (remarks or consequences, reasons[:1] or consequences, consequences, [])[choose.below(4)]
-    return [choose.sentence(group) for group in (main, *second, _conclusions(name))]
+    first, *others = [choose.sentence(group) for group in (main, *second, _conclusions(name))]
+    lead = sentences()["leads"][name]["always"].smooth[0]
+    return [(f"{lead[0]} {_continued(first[0])}", lead[1] + first[1]), *others]
+
+
+def _continued(sentence: str) -> str:
+    """Return an English sentence as it is written after a colon."""
+    return sentence[0].lower() + sentence[1:]
 
 
 @cache
