@@ -437,7 +437,7 @@ def test_the_very_object_comes_back_from_any_noise(first, second, before, after,
 def test_no_text_takes_long(text):
     start_s = time.process_time()
     find_object(text, GOOD)
-    assert time.process_time() - start_s < 30.0, "at most 2 s, unless the processor is many times slower"
+    assert time.process_time() - start_s < 8.0  # they take below 2 s; a quadratic one took 40
 
 
 @given(st.text(max_size=30))
