@@ -212,7 +212,9 @@ class _WindowLoop:
             measured = measured_lines(question.facts, problems)
             complaint = f"It contradicts the measured facts: {'; '.join(problems)}. Measured: {measured}."
             correction = Correction(dump_json(self.english.written), complaint, self.cfg.correction_asks + 1)
-            self.english = self.chinese = None
+            self.english = self.chinese = self.verdict = None
+            for name in ("values", "contradictions"):  # they are of the refused answer
+                self.checks.pop(name, None)
             reason = await self._attempt(replace(self.answered, correction=correction))
         if self._recovered:
             self.checks["recovered"] = sorted(self._recovered)
