@@ -17,7 +17,7 @@ from cosfly.pedestrians import stage as pedestrians_stage
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.pipeline import library
 from cosfly.planners import stage as plan_stage
-from cosfly.planners.contract import PlanConfig
+from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.render.contract import PERSON_ID
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
@@ -136,6 +136,64 @@ def test_a_setting_without_effect_is_refused(town, section):
     for name in others:
         with pytest.raises(ConfigError, match=f"some settings have no effect here; got {name};"):
             call(town, **{name: dict(model())[name]})
+
+
+VIEW = {"rotation_deg": [-30, 0, 0], "size_px": (32, 18)}
+FIXED = {"weather_mode": "fixed", "weather_name": "clear", "tod_name": "night"}
+PATH, HURRY = [[0, 0], [9, 0]], {"pace": {"hurry": 1}}
+# Of each section: what takes its settings, and calls that together read all that are taken.
+TAKING = {
+    "plan": (
+        PlanConfig,
+        PlanConfig.model_fields.keys(),
+        [lambda the_map, n=n: cosfly.plan(the_map, pedestrian=WALK, planner=n, styles={"side": 1}) for n in PLANNERS],
+    ),
+    "walk": (
+        PedestriansConfig,
+        library.PEDESTRIAN_SETTINGS,
+        [lambda the_map, p=p, **more: cosfly.plan(the_map, pedestrian=WALK | p | more) for p in ({}, HURRY)],
+    ),
+    "walk on a way": (
+        PedestriansConfig,
+        library.PACE_SETTINGS,
+        [lambda the_map, p=p, **more: cosfly.plan(the_map, PATH, pedestrian=p | more) for p in ({}, HURRY)],
+    ),
+    "render": (
+        RenderConfig,
+        library.PICTURE_SETTINGS,
+        [
+            lambda the_map, **more: cosfly.render_frames(the_map, [0, 0, 60], **VIEW, **more or FIXED),
+            lambda the_map: cosfly.render_frames(the_map, [0, 0, 60], **VIEW, weather_mode="random_per_path"),
+            lambda the_map: cosfly.render_frames(the_map, [0, 0, 60], **VIEW, weather_mode="by_weight"),
+        ],
+    ),
+}
+
+
+@pytest.mark.slow
+@each("section", TAKING)
+def test_no_setting_is_ignored(town, monkeypatch, section):
+    (model, taken, calls), read, is_built = TAKING[section], set(), False
+
+    def get(self, name):
+        if is_built and name in model.model_fields:
+            read.add(name)
+        return super(watched, self).__getattribute__(name)
+
+    def build(*given):
+        nonlocal is_built
+        is_built = False  # validators read them all
+        cfg = real_build(*given)
+        is_built = True
+        return cfg
+
+    watched, real_build = type(model.__name__, (model,), {"__getattribute__": get}), library.build
+    with monkeypatch.context() as patch:
+        patch.setattr(library, "build", build)
+        patch.setattr(library, model.__name__, watched)
+        for call in calls:
+            call(town)
+    assert set(taken) - read == set(), "taken, and never read"
 
 
 def test_the_notebook_runs_and_its_numbers_fit():
