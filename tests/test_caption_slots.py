@@ -246,6 +246,18 @@ def test_a_contradicted_value_is_asked_for_again_with_the_measured_ones(tree, tm
     assert all('"47.5 m"' in text and "horizontal distance: " in text for text in complaints)
 
 
+def test_a_failed_correction_leaves_no_checks_of_the_refused_answer(tree, tmp_path):
+    with (
+        writing_server("The gap of 47.5 m calls for it.", "The gap of {gap} calls for it.") as server,
+        pytest.raises(NothingKept),
+    ):
+        run(settings(server.url, limit=2), tree, tmp_path / "out")
+    for caption in read_captions(tmp_path / "out" / "captions.jsonl"):
+        assert (caption.drop_reason, caption.checks.refused[0]) == ("invalid_slot", "contradicted_value")
+        assert (caption.en, caption.verdict) == (None, None)
+        assert (caption.checks.values, caption.checks.contradictions) == (None, None)
+
+
 @each(("reasons", "reason", "asks"), [
     ("The gap of 47.5 m calls for nothing.", "contradicted_value", 6),  # both answers share one mirror
     ("The gap of {gap} calls for this decision.", "invalid_slot", 4),
