@@ -184,7 +184,7 @@ def leaderboard(
     out: options.Out,
     rounds: Annotated[bool, Option("--rounds", help="They are rounds of one student, in order.")] = False,
 ) -> None:
-    """Compare students: figures with intervals, and frames of their best and worst trajectories."""
+    """Compare students: figures with intervals, floors and a ceiling."""
     from cosfly.closed_loop.leaderboard import LeaderboardConfig
 
     named_folders = []

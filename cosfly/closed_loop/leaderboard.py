@@ -7,30 +7,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
-
-import numpy as np
+from typing import Literal
 
 from cosfly.closed_loop.measures import MEASURES, SHARES, figures_of, score_measured
 from cosfly.closed_loop.settings import BASELINES
-from cosfly.formats.episodes import Figure, Score, episode_file, read_episode, read_score
-from cosfly.formats.playback import read_track
-from cosfly.formats.tracks import find_tracks
+from cosfly.formats.episodes import Figure, Score, read_score
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes, write_bytes
 from cosfly.runtime.json_io import FileFormat, Record, write_model
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.runtime.seeding import rng_for
-from cosfly.viz.frame_views import thumbnail
 from cosfly.viz.page import page
 from distill.evaluation.pages import COLORS, STYLE, bars, shown_as
 
 Role = Literal["student", "floor", "ceiling"]
 RANKED_BY = ("success", "in_view")
 HEADLINE = ("success", "in_view", "tracked_frames", "kept_s", "lost", "crashed")
-STRIP_FRAMES = 8  # pictures of an episode
-STRIP_PX = 200  # their width
 BOARD_FORMAT = FileFormat("cosfly.leaderboard", "1.0", "leaderboard")
 
 
@@ -98,7 +91,7 @@ def run(
     if not stage.is_complete:
         board = Leaderboard(tables=tuple(tables_of(students, cfg, seed)))
         write_model(record, board, BOARD_FORMAT)
-        write_bytes(path, page_of(board, students).encode())
+        write_bytes(path, page_of(board).encode())
         stage.finish([record, path], Tally(input=len(folders), kept=len(folders)))
     return path
 
@@ -149,47 +142,16 @@ def _shown(name: str, figure: Figure, *, signed: bool = False) -> str:
     return shown_as(f"{{:+{digits}}}" if signed else f"{{:{digits}}}", figure)
 
 
-def page_of(board: Leaderboard, students: Mapping[str, StudentFolders]) -> str:
-    """Return the page; a student whose episodes were deleted has figures but no pictures."""
+def page_of(board: Leaderboard) -> str:
+    """Return the page."""
     tables = []
     for table in board.tables:
         chart = {
             title: {standing.name: standing.score.figures[measure] for standing in table.standings}
             for title, measure in (("success", "success"), ("target visible", "in_view"))
         }
-        strips = [strip for standing in table.standings for strip in _strips(standing, students[standing.name])]
-        tables.append({"table": table, "chart": bars(chart), "strips": strips})
+        tables.append({"table": table, "chart": bars(chart)})
     return page(
         "cosfly/closed_loop/leaderboard.html", title="Closed loop", style=STYLE, tables=tables, measures=MEASURES,
-        headline=HEADLINE, shown=_shown, colors=COLORS, width_px=STRIP_PX,
+        headline=HEADLINE, shown=_shown, colors=COLORS,
     )  # fmt: skip
-
-
-def _strips(standing: Standing, folders: StudentFolders) -> list[dict[str, Any]]:
-    """Return frames of the episodes with the largest and smallest share of frames with a visible target."""
-    folder_of = {(flight.town, flight.episode): folder for folder, score in folders.items() for flight in score.flights}
-    shares = {}
-    for flight in standing.score.flights:
-        num_in_view, num_frames = flight.sums["in_view"]
-        shares[flight.town, flight.episode] = num_in_view / num_frames
-    ranked = sorted(shares, key=lambda key: (shares[key], key[1]))
-    strips = []
-    for title, (town, episode) in (("best", ranked[-1]), ("worst", ranked[0])):
-        folder = folder_of[town, episode]
-        path = episode_file(folder, episode)
-        if not path.is_file():
-            continue
-        record = read_episode(path)
-        tree = folder / "render"
-        tracks = (read_track(track_folder) for track_folder in find_tracks(tree)) if tree.is_dir() else ()
-        track = next((track for track in tracks if track.source.get("scenario_id") == record.walk), None)
-        indices = np.unique(np.linspace(record.num_lead, len(record.frames) - 1, STRIP_FRAMES).astype(int)).tolist()
-        strips.append(
-            {
-                "title": f"{standing.name}: {title}: {town}, {episode}",
-                "ended": record.ended,
-                "seen": shares[town, episode],
-                "frames": [(record.frames[i], track and thumbnail(track.frame_folder(i), STRIP_PX)) for i in indices],
-            }
-        )
-    return strips

@@ -18,7 +18,6 @@ from pydantic import Field, FiniteFloat
 
 from cosfly.formats.issues import Issue
 from cosfly.formats.playback import ORIGINAL
-from cosfly.geometry.coverage import Coverage
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_file
 from cosfly.runtime.journal import Journal
@@ -103,7 +102,6 @@ class Inspection(Record):
 
     settings: dict[str, Any]
     funnel: Funnel
-    coverage: Coverage | None = None  # of the accepted tracks; None in older inspections
     flights: list[TrackInspection]
 
 

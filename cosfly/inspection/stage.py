@@ -25,8 +25,7 @@ from cosfly.formats.issues import Report
 from cosfly.formats.playback import read_track
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.tracks import find_tracks
-from cosfly.geometry.coverage import Coverage
-from cosfly.inspection.report import TrackView, report_html
+from cosfly.inspection.report import FramePicture, report_html
 from cosfly.inspection.settings import PAGE_MB, InspectConfig
 from cosfly.inspection.track import InspectedTrack, inspect_track, trace_id
 from cosfly.runtime.errors import InputError
@@ -43,13 +42,12 @@ def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None
     """Open map and plans in this process; return the function that inspects one track."""
     from cosfly.geometry.kernels import obstacle_index
 
-    box_map = None if simplified is None else read_boxes(simplified)
-    obstacles = None if box_map is None else obstacle_index(box_map)
+    obstacles = None if simplified is None else obstacle_index(read_boxes(simplified))
     by_id = None if traces is None else {trace.path_id: trace for trace in read_traces(traces)}
     recorded = recorded_digests(data)
 
     def work(item: Item) -> Outcome:
-        inspected = inspect_track(data / item.payload, data, by_id, box_map, obstacles, cfg, recorded)
+        inspected = inspect_track(data / item.payload, data, by_id, obstacles, cfg, recorded)
         record = inspected.record
         return Outcome(
             inspected.model_dump(mode="json"), drop_reason=record.reason if record.result == "rejected" else None
@@ -92,9 +90,9 @@ def run(
     items = [Item(name, name, num_steps=max(1, count)) for name, count in zip(names, frames, strict=True)]
     arguments = (cfg, simplified, traces, data)
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="inspect: frames")
-    inspection, views = assemble(finished, planned, cfg, data)
+    inspection, pictures = assemble(finished, planned, cfg, data)
     write_inspection(product, inspection)
-    write_bytes(out / "report.html", report_html(run_name(out), inspection, views, PAGE_MB).encode())
+    write_bytes(out / "report.html", report_html(run_name(out), inspection, pictures, PAGE_MB).encode())
     stage.finish([product, out / "report.html"], finished.tally, funnel=inspection.funnel.model_dump(mode="json"))
     _log_review(inspection.funnel.flights, out)
     return product
@@ -113,29 +111,24 @@ def _log_review(counts: TrackFunnel, out: Path) -> None:
 
 def assemble(
     finished: ItemOutcomes, planned: list[DroneTrace] | None, cfg: InspectConfig, data: Path
-) -> tuple[Inspection, dict[str, TrackView]]:
-    """Merge the outcomes of all tracks: the inspection, and the report's views by track folder."""
+) -> tuple[Inspection, dict[str, list[FramePicture]]]:
+    """Merge the outcomes of all tracks: the inspection, and the report's pictures by track folder."""
     tracks = list[TrackInspection]()
-    views = dict[str, TrackView]()
-    covered = list[Coverage]()
+    pictures = dict[str, list[FramePicture]]()
     for outcome in finished.records:
         if isinstance(outcome, Failed):
             tracks.append(_unreadable(outcome, planned or [], data))
             continue
         inspected = result_of(outcome, InspectedTrack)
         tracks.append(inspected.record)
-        views[outcome.id] = inspected.view
-        if inspected.record.result == "accepted":
-            covered.append(inspected.coverage)
+        pictures[outcome.id] = inspected.pictures
     # An unreadable track gets the plan of the other track of its trajectory.
     trace_ids = {Path(track.folder).parent: track.trace_id for track in tracks if track.trace_id is not None}
     planned_as = [track.trace_id or trace_ids.get(Path(track.folder).parent) for track in tracks]
     tracks = [track.model_copy(update={"trace_id": i}) for track, i in zip(tracks, planned_as, strict=True)]
     funnel = Funnel(trajectories=_trajectory_funnel(tracks, planned), flights=_track_funnel(tracks))
     funnel.trajectories.check()
-    settings = cfg.model_dump(mode="json")
-    coverage = Coverage.total(covered)
-    return Inspection(settings=settings, funnel=funnel, coverage=coverage, flights=tracks), views
+    return Inspection(settings=cfg.model_dump(mode="json"), funnel=funnel, flights=tracks), pictures
 
 
 def _unreadable(outcome: Failed, planned: list[DroneTrace], data: Path) -> TrackInspection:

@@ -20,9 +20,7 @@ from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.playback import STATES, Track, read_track
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.tracks import read_twin
-from cosfly.formats.weather import preset_token
 from cosfly.geometry.axes import project, step_s, world_from_camera, wrap_deg
-from cosfly.geometry.coverage import Coverage
 from cosfly.geometry.trajectory_metrics import (
     CLEARANCE_CAP_M,
     CLEARANCE_TOLERANCE_M,
@@ -40,14 +38,13 @@ from cosfly.inspection.frames import (
     listed_digests,
     target_box,
 )
-from cosfly.inspection.report import TrackView, draw_track
+from cosfly.inspection.report import FramePicture, pictures_of
 from cosfly.inspection.settings import InspectConfig
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.run_dir import digest_of, folder_digests
 from cosfly.runtime.worker import advance
 
 if TYPE_CHECKING:
-    from cosfly.formats.boxes import BoxMap
     from cosfly.geometry.kernels import BoxIndex
 
 TIME_TOLERANCE_S = 1e-3
@@ -55,18 +52,16 @@ Metrics = dict[str, float | int | None]
 
 
 class InspectedTrack(BaseModel):
-    """A track's record, view and coverage, as in `items.jsonl`."""
+    """A track's record and pictures, as in `items.jsonl`."""
 
     record: TrackInspection
-    view: TrackView
-    coverage: Coverage
+    pictures: list[FramePicture]
 
 
 def inspect_track(
     folder: Path,
     root: Path,
     traces: dict[str, DroneTrace] | None,
-    box_map: BoxMap | None,
     obstacles: BoxIndex | None,
     cfg: InspectConfig,
     recorded: Mapping[str, str],
@@ -75,7 +70,7 @@ def inspect_track(
 
     Args:
         traces: Plans by id; None if the tree has none.
-        box_map, obstacles: The map and its obstacles; None if there is no map.
+        obstacles: Of the map; None if there is no map.
         recorded: sha256 by path of the tree's manifest; empty if there is none.
     """
     report = Report()
@@ -88,7 +83,8 @@ def inspect_track(
     elif traces is not None:
         got = f"no trace {trace_id(track)!r}"
         report.warn("no_trace", "trajectory.json: source.scenario_id", got, "the id of a plan")
-    clearance_m = None if obstacles is None else check_surroundings(track, obstacles, cfg, report, metrics)
+    if obstacles is not None:
+        check_surroundings(track, obstacles, cfg, report, metrics)
     check_shifts(track, report, metrics)
     if not track.is_original:
         counts = Counter(track.states)
@@ -113,20 +109,7 @@ def inspect_track(
         result=result, issues=issues,
         metrics={name: None if value is None else round(value, 4) for name, value in metrics.items()},
     )  # fmt: skip
-    view = draw_track(track, _heights_m(track), clearance_m, box_map, limits.THUMBNAIL_PX, report.issues)
-    return InspectedTrack(record=record, view=view, coverage=coverage_of(track))
-
-
-def coverage_of(track: Track) -> Coverage:
-    """Count the frames of a track."""
-    box = track.target.bbox if track.target.mask_bbox is None else track.target.mask_bbox
-    heights_px = box[:, 3] - box[:, 1]
-    headings_deg = track.target_headings_deg
-    seen = [track.positions_m - track.targets_m, headings_deg, heights_px, track.target.visibility]
-    weather, time = (name and preset_token(name) for name in track.weather.values())
-    paces = [track.pace] * len(track)
-    skies = [(weather, time)] * len(track)
-    return Coverage.of(np.column_stack(seen), TARGET_HEIGHT_M, track.styles, paces, skies=skies)
+    return InspectedTrack(record=record, pictures=pictures_of(track, limits.THUMBNAIL_PX, report.issues))
 
 
 def trace_id(track: Track) -> str:
@@ -162,13 +145,10 @@ def check_plan(trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: M
         report.warn("smoothness", where, f"S = {score:.3f}", f"at least {cfg.smoothness_min:g}")
 
 
-def check_surroundings(
-    track: Track, obstacles: BoxIndex, cfg: InspectConfig, report: Report, metrics: Metrics
-) -> np.ndarray:
+def check_surroundings(track: Track, obstacles: BoxIndex, cfg: InspectConfig, report: Report, metrics: Metrics) -> None:
     """Measure the poses against the map: clearance of the drone, five-ray visibility, a target in an obstacle.
 
-    Returns:
-        (n,) clearance, metres: on the path to the next pose, or of the poses only in a perturbed track.
+    The clearance is that of the path to the next pose, in a perturbed track that of the poses only.
     """
     from cosfly.geometry.kernels import signed_distances, swept_distances, visibility
 
@@ -187,7 +167,7 @@ def check_surroundings(
         report.error(code, where, f"{gaps_m[i]:.2f} m", f"at least {cfg.clearance_min_m:g} m to every obstacle")
     with_target = np.flatnonzero(~np.isnan(track.targets_m).any(axis=1))
     if not len(with_target):
-        return gaps_m
+        return
     inside, _ = signed_distances(obstacles, track.targets_m[with_target], 0.0)
     for i in with_target[inside < 0]:
         where = f"trajectory.json: points[{i}].target.world_location"
@@ -199,7 +179,6 @@ def check_surroundings(
     if len(judged) and five_ray < cfg.five_ray_mean_min:
         expected = f"a mean of at least {cfg.five_ray_mean_min:g}"
         report.error("five_ray_visibility", "trajectory.json: points", f"{five_ray:.3f}", expected)
-    return gaps_m
 
 
 def check_shifts(track: Track, report: Report, metrics: Metrics) -> None:
@@ -313,12 +292,13 @@ def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Met
     quality = float(np.mean(frames.track_ious)) if frames.track_ious else None
     invalid = max(frames.invalid_depth_shares, default=None)
     heights_px = (target.bbox[:, 3] - target.bbox[:, 1])[target.in_view]
+    heights_m = track.positions_m[:, 2] - (track.targets_m[:, 2] - TARGET_HEIGHT_M)  # over the target's feet
     is_judged = target.legible is not None and len(heights_px) > 0
     metrics.update(
         num_frames_checked=frames.num_checked,
         num_frames_compared=frames.num_compared,
         length_m=length_m(track.positions_m),
-        height_mean_m=float(np.nanmean(_heights_m(track))) if not np.isnan(track.targets_m).all() else None,
+        height_mean_m=None if np.isnan(heights_m).all() else float(np.nanmean(heights_m)),
         rendered_visibility_mean=float(visibility.mean()) if len(visibility) else None,
         visible_share=float(target.visible.mean()),
         legible_share=None if target.legible is None else float(target.legible.mean()),
@@ -335,8 +315,3 @@ def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Met
     if invalid is not None and invalid > limits.INVALID_DEPTH_MAX:
         expected = f"at most {limits.INVALID_DEPTH_MAX:g} of the pixels of a frame"
         report.warn("invalid_depth", "depth.npy", f"{invalid:.3f} of a frame", expected)
-
-
-def _heights_m(track: Track) -> np.ndarray:
-    """Return the height of the drone over the target's feet, (n,) m."""
-    return track.positions_m[:, 2] - (track.targets_m[:, 2] - TARGET_HEIGHT_M)
