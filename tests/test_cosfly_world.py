@@ -140,11 +140,13 @@ def test_a_models_plan_is_followed_and_its_trace_kept(tmp_path):
 def test_worlds_go_on_to_releases_with_the_settings_that_are_told(tmp_path):
     small = ("pedestrians.num_paths=1", "render.width_px=160", "render.height_px=90", "render.frame_stride=8")
     told = [word for setting in small for word in ("--set", setting)]
-    result = invoke("world", ["a small village", *told], "--count 2 --run --seed 5 --out", [tmp_path / "many"])
+    result = invoke("world", ["a small village"], "--count 2 --seed 5 --out", [tmp_path / "many"])
     assert result.exit_code == 0, result.output
     for number in range(2):
-        run_folder = tmp_path / f"many/world_{number:03}/run"
-        assert read_json(run_folder / "roi_polygon.json", what="region")["points_world"]
+        folder = tmp_path / f"many/world_{number:03}"
+        run_folder = folder / "run"
+        result = invoke("run", [folder / "loop.yaml", *told], f"--seed {5 + number} --out", [run_folder])
+        assert result.exit_code == 0, result.output
         assert read_manifest(run_folder / "render").counts.kept == 2
         assert (run_folder / "release/dataset/README.md").is_file()
         assert (run_folder / "viewer.html").is_file()

@@ -11,7 +11,7 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import STAGE, WORKERS, Job, SettingOption, command, resolve, track_options
+from cosfly.cli.options import STAGE, WORKERS, Job, SettingOption, command, track_options
 
 for stage in ("maps", "plan", "inspect"):
     options.add_group(stage)
@@ -37,7 +37,6 @@ def world(
     prompt: Annotated[str, Argument(help="The world, in plain English.")],
     out: Annotated[Path | None, Option(show_default="worlds/<prompt>-<time>", help="New folder.")] = None,
     count: Annotated[int, Option(min=1, max=1000, help="Number of worlds, each with its own seed.")] = 1,
-    run: Annotated[bool, Option("--run", help="Also make a data set in it, as `cosfly run` does.")] = False,
 ) -> None:
     """Make a world from text: SimWorld's combined_world.json of the town that a prompt describes."""
     from cosfly.runtime.config import build
@@ -49,34 +48,6 @@ def world(
     seeds = range(job.cfg.seed, job.cfg.seed + count)
     for seed, folder in zip(seeds, folders, strict=True):
         job.run("cosfly.worldgen.stage", cfg, folder, seed=seed)
-    if run:
-        for seed, folder in zip(seeds, folders, strict=True):
-            _make_data_set(job, folder, seed)
-
-
-def _make_data_set(job: Job, folder: Path, seed: int) -> None:
-    """Run all stages on a world, with a region of interest that is proposed from the simplified map."""
-    from cosfly.cli.run import print_run
-    from cosfly.pedestrians.roi_editor import run_propose
-    from cosfly.pipeline import run as pipeline
-    from cosfly.worldgen.stage import LOOP_FILE
-
-    out = folder / "run"
-    roi = out / "roi_polygon.json"
-    settings = {
-        "workers": job.cfg.workers,
-        "engine": job.cfg.engine,
-        "ray.address": job.cfg.ray.address,
-        "seed": seed,
-        "roi": roi,
-    }
-    cfg = resolve(folder / LOOP_FILE, job.overrides, settings)
-    for stage in pipeline.stages(cfg, out)[:2]:  # maps and simplify, which the region needs
-        stage.work()
-    if not roi.exists():
-        run_propose(out / "simplify/step2_simplified.json", cfg.pedestrians, roi)
-    pipeline.run(cfg, out)
-    print_run(out)
 
 
 @command("cosfly maps --source synthetic --out maps", "maps", "town seed resume", source=SOURCE)
