@@ -13,8 +13,9 @@ from test_pipeline_tiny import make_tiny_run
 
 FOLDER = Path(__file__).parent / "benchmarks"
 SMALL_TOWN = """
-import scenes, cosfly
-scenes.town, scenes.city = lambda seed=0: cosfly.load_map(seed=seed), lambda: None
+import scenes
+from cosfly.maps.synthetic import SyntheticConfig, load
+scenes.town, scenes.city = lambda seed=0: load(SyntheticConfig(), seed), lambda: None
 """
 DRAWN_SMALL = "--set render.width_px=160 --set render.height_px=90 --set fly.tree=false --set fly.most_decisions=6"
 
@@ -33,8 +34,8 @@ bench.load = lambda model, path, told: plain(model, path, [*told, "pedestrians.n
     ("bench_flying", "--envs", r"2 side by side: .* steps a second",
              "import cosfly.envs.episodes; cosfly.envs.episodes.NUM_DECISIONS = 4"),
     ("bench_pages", "", r"turns at \d+ frames/s", """
-import cosfly
-bench.TURNS, bench.census_town = 1, lambda name, seed: cosfly.load_map(seed=seed)
+from cosfly.maps.synthetic import SyntheticConfig, load
+bench.TURNS, bench.census_town = 1, lambda name, seed: load(SyntheticConfig(), seed)
 """),
     ("bench_planning", "--maps a --planners track_astar muco", r"the same loss from the same start",
              SMALL_TOWN + "scenes.NUM_WALKS, bench.WALKS = 2, bench.WALKS.model_copy(update={'num_paths': 2})"),
