@@ -213,16 +213,13 @@ def depth(
     job: Job,
     out: Annotated[Path, Option(help="Folder for depth_study.json, depth_study.md and depth_study.png.")],
     data: options.Trees = None,
-    frame: Annotated[Path | None, Option(help="Frame folder in the tree, or a .npy in metres.")] = None,
+    frame: Annotated[Path | None, Option(help="Frame folder in the tree.")] = None,
 ) -> None:
     """Compare ways to store the depth of one frame: errors, entropy, edges and size."""
     from cosfly.viz.gallery import best_frame, frame_in
 
-    if frame is None:
-        frame = best_frame(job.tree(data), "depth.npy")
-    elif data and not frame.exists():
-        frame = frame_in(job.tree(data), frame)
-    job.call("cosfly.studies.depth", frame, out)
+    tree = job.tree(data)
+    job.call("cosfly.studies.depth", frame_in(tree, frame) if frame else best_frame(tree, "depth.npy"), out)
     typer.echo(out / "depth_study.md")
 
 
@@ -232,18 +229,9 @@ def weather(
     map_: options.Map,
     traces: options.Traces,
     out: Annotated[Path, Option(help="Folder for weather_gallery.jpg and weather_sheet.jpg.")],
-    frame: Annotated[int | None, Option(show_default="looks down least", help="Index of a frame of the first.")] = None,
-    fov: Annotated[float, Option(min=1.0, max=169.0, help="Horizontal field of view, degrees.")] = 67.38,
 ) -> None:
     """Draw one view under every weather and time of day: nine pictures, and a sheet of all."""
-    from cosfly.formats.weather import TIMES, WEATHERS
-    from cosfly.runtime.console import progress_bar
-
-    view = {"frame": frame, "fov_deg": fov}
-    with progress_bar("study weather: pictures", len(WEATHERS) * len(TIMES)) as advance:
-        cfg = job.cfg.render
-        paths = job.call("cosfly.studies.weather", cfg, map_, traces, out, **view, advance=lambda: advance(1))
-    for path in paths:
+    for path in job.call("cosfly.studies.weather", job.cfg.render, map_, traces, out):
         typer.echo(path)
 
 

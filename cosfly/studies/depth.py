@@ -1,7 +1,6 @@
 """`cosfly study depth`: ways to store the depth of one frame (tab:depth_format_comparison, fig:depth_comparison).
 
-Integers of 8 to 16 bits divide the frame's own range evenly, as in the paper. The reference is the file's float64 or
-float32; a 32-bit float stores the latter without loss.
+Integers of 8 to 16 bits divide the frame's own range evenly, as in the paper. The reference is the file's float32.
 """
 
 from __future__ import annotations
@@ -13,13 +12,12 @@ import cv2
 import numpy as np
 
 from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M, frame_path, read_depth, read_rgb
-from cosfly.runtime.arrays import parse_array, parse_array_header
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import read_bytes, write_bytes
+from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, write_json
 from cosfly.viz.frame_views import depth_colors
 from cosfly.viz.tables import TextTable
-from cosfly.viz.topview import Color, add_caption, draw_line, draw_text, png_bytes
+from cosfly.viz.topview import Color, captioned_grid, draw_line, draw_text, png_bytes
 
 FORMAT = FileFormat("cosfly.depth_study", "2.0")
 BITS = (8, 10, 12, 16)
@@ -40,51 +38,44 @@ COLUMNS = {
 
 
 def run(frame: Path, out: Path) -> dict[str, Any]:
-    """Read a frame folder or a `.npy` file; write `depth_study.json`, which is returned, `.md` and `.png`.
+    """Read a frame folder; write `depth_study.json`, which is returned, `.md` and `.png`.
 
     Raises:
-        InputError: There is no depth image, its unit is not metres, or it holds fewer than two different depths.
+        InputError: There is no depth image, or it holds fewer than two different depths.
     """
-    is_folder = frame.is_dir()
-    file = frame_path(frame, "depth.npy") if is_folder else frame
-    truth = read_depth(frame) if is_folder else _read_npy(frame)
+    file = frame_path(frame, "depth.npy")
+    truth = read_depth(frame)
     truth = np.where(np.isfinite(truth), truth, truth.dtype.type(INVALID_DEPTH_M))
-    measured = (truth != INVALID_DEPTH_M) & (truth != SKY_DEPTH_M)
+    study, decoded = study_of(truth, "/".join(file.absolute().parts[-2:]))
+    write_json(out / "depth_study.json", {**FORMAT.header, **study})
+    write_bytes(out / "depth_study.md", markdown(study).encode())
+    rgb = read_rgb(frame) if (frame / "rgb.png").exists() else np.full((*truth.shape, 3), 255, np.uint8)
+    write_bytes(out / "depth_study.png", draw_study(rgb, truth, is_measured(truth), decoded))
+    return study
+
+
+def is_measured(truth: np.ndarray) -> np.ndarray:
+    """Return which pixels are neither sky nor invalid, (h, w) bool."""
+    return (truth != INVALID_DEPTH_M) & (truth != SKY_DEPTH_M)
+
+
+def study_of(truth: np.ndarray, frame: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return the figures of a depth image, (h, w) m, and by coding the depth that it decodes to."""
+    measured = is_measured(truth)
     depths = truth[measured]
     if not depths.size or depths.min() == depths.max() or depths.min() < 0:
         got = f"{depths.min():g} to {depths.max():g} m" if depths.size else "no measured pixel"
         expected = "at least two different depths of 0 m or more"
-        raise InputError("the depth image has too few depths for a study", where=file, got=got, expected=expected)
+        raise InputError("the depth image has too few depths for a study", where=frame, got=got, expected=expected)
     decoded = {f"{bits}-bit": quantised(truth, measured, bits)[1] for bits in BITS}
     decoded["32-bit float"] = truth.astype(np.float32).astype(np.float64)
     sizes = zip(decoded.items(), (*BITS, 32), strict=True)
-    study = {
-        "frame": "/".join(file.absolute().parts[-2:]), "width_px": truth.shape[1], "height_px": truth.shape[0],
+    return {
+        "frame": frame, "width_px": truth.shape[1], "height_px": truth.shape[0],
         "truth": str(truth.dtype), "min_m": float(depths.min()), "max_m": float(depths.max()),
         "share_measured": float(measured.mean()),  # of the pixels: neither sky nor invalid
         "rows": [_row(coding, bits, values, truth, measured) for (coding, values), bits in sizes],
-    }  # fmt: skip
-    write_json(out / "depth_study.json", {**FORMAT.header, **study})
-    write_bytes(out / "depth_study.md", markdown(study).encode())
-    rgb = read_rgb(frame) if is_folder and (frame / "rgb.png").exists() else np.full((*truth.shape, 3), 255, np.uint8)
-    write_bytes(out / "depth_study.png", draw_study(rgb, truth, measured, decoded))
-    return study
-
-
-def _read_npy(file: Path) -> np.ndarray:
-    """Read depth in metres from a `.npy` file, (h, w) float32 or float64."""
-    data = read_bytes(file, what="depth image")
-    kind = parse_array_header(memoryview(data), file, what="depth image").dtype
-    if kind.kind in "iu":
-        raise InputError(
-            "the unit of the depth image is unknown, because its numbers are integers",
-            where=file,
-            got=str(kind),
-            expected="float32 or float64",
-            fix='save metres as float32; from millimetres: np.save("depth.npy", (image / 1000).astype("float32"))',
-        )
-    dtype = np.float64 if kind == np.float64 else np.float32
-    return parse_array(data, file, dtype=dtype, ndim=2, what="depth image")
+    }, decoded  # fmt: skip
 
 
 def quantised(truth: np.ndarray, measured: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:
@@ -159,14 +150,13 @@ def draw_study(rgb: np.ndarray, truth: np.ndarray, measured: np.ndarray, decoded
         if len(columns) > 1:
             draw_line(profile, np.stack([columns * PANEL_PX[0] / truth.shape[1], rows], axis=1), color)
         name_x = draw_text(profile, name, name_x, 18, 0.45, color) + 16
-    panels = {
-        "(a) colours": rgb,
-        f"(b) float32, inferno reversed, to {high:.0f} m": depth_colors(truth.astype(np.float32), high),
-        f"(c) error of 8 bits: up to {errors.max() * CM:.2g} cm": np.ascontiguousarray(
-            cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1]
+    panels = [
+        ("(a) colours", rgb),
+        (f"(b) float32, inferno reversed, to {high:.0f} m", depth_colors(truth.astype(np.float32), high)),
+        (
+            f"(c) error of 8 bits: up to {errors.max() * CM:.2g} cm",
+            np.ascontiguousarray(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1]),
         ),
-        "(d) middle row": profile,
-    }
-    sized = {title: cv2.resize(panel, PANEL_PX, interpolation=cv2.INTER_AREA) for title, panel in panels.items()}
-    tiles = [add_caption(panel, title) for title, panel in sized.items()]
-    return png_bytes(np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[2:])]))
+        ("(d) middle row", profile),
+    ]
+    return png_bytes(captioned_grid(panels, 2, PANEL_PX))

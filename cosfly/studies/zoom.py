@@ -24,7 +24,7 @@ from cosfly.render.settings import RenderConfig
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, write_json
 from cosfly.viz.tables import TextTable, cells
-from cosfly.viz.topview import add_caption
+from cosfly.viz.topview import captioned_grid
 
 FORMAT = FileFormat("cosfly.zoom_study", "3.0")
 FIGURES = ("width_px", "height_px", "visibility", "track_quality")
@@ -133,10 +133,9 @@ def _draw_levels(levels: dict[float, list[Track]]) -> bytes:
     """Draw one frame of up to four tracks, one row each, at every level (fig:zoom_demo); return a PNG."""
     wide = next(iter(levels.values()))
     picked = np.unique(np.linspace(0, len(wide) - 1, min(len(wide), MOST_SHOWN)).round().astype(int))
-    rows = []
+    panels = []
     for k in picked.tolist():
         i = _best_frame(wide[k])
-        tiles = []
         for fov, tracks in levels.items():
             rgb = read_rgb(tracks[k].frame_folder(i)).copy()
             title = f"{level_name(fov)} {fov:g} deg"
@@ -144,9 +143,8 @@ def _draw_levels(levels: dict[float, list[Track]]) -> bytes:
                 x0, y0, x1, y1 = tracks[k].target.bbox[i].round().astype(int).tolist()
                 cv2.rectangle(rgb, (x0, y0), (x1, y1), TARGET_COLOR, max(1, rgb.shape[1] // 640))
                 title += f", target {x1 - x0} x {y1 - y0} px"
-            tiles.append(_tile(rgb, TILE_WIDTH_PX, title))
-        rows.append(np.hstack(tiles))
-    return rgb_bytes(np.vstack(rows))
+            panels.append((title, _scaled(rgb, TILE_WIDTH_PX)))
+    return rgb_bytes(captioned_grid(panels, len(levels)))
 
 
 def _draw_fidelity(wide: Track, longer: Track) -> bytes:
@@ -156,14 +154,14 @@ def _draw_fidelity(wide: Track, longer: Track) -> bytes:
     half = 0.5 / MAGNIFICATION
     low, high = (np.round(size * share).astype(int).tolist() for share in (0.5 - half, 0.5 + half))
     marked = cv2.rectangle(rgb.copy(), low, high, CROP_COLOR, max(2, int(size[0]) // 400))
-    tiles = [_tile(marked, PANEL_WIDTH_PX, f"{wide.camera.fov_deg:.3g} deg, 1.0x")]
+    panels = [(f"{wide.camera.fov_deg:.3g} deg, 1.0x", marked)]
     for kernel, method in KERNELS.items():
         digital = _enlarged(rgb, method)
         error = np.mean((digital.astype(np.float64) - optical) ** 2)
         psnr_db = 10.0 * np.log10(255.0**2 / max(float(error), 1e-5))
-        tiles.append(_tile(digital, PANEL_WIDTH_PX, f"digital {MAGNIFICATION:g}x, {kernel}: {psnr_db:.1f} dB"))
-    tiles.append(_tile(optical, PANEL_WIDTH_PX, f"optical {MAGNIFICATION:g}x"))
-    return rgb_bytes(np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[2:])]))
+        panels.append((f"digital {MAGNIFICATION:g}x, {kernel}: {psnr_db:.1f} dB", digital))
+    panels.append((f"optical {MAGNIFICATION:g}x", optical))
+    return rgb_bytes(captioned_grid([(title, _scaled(panel, PANEL_WIDTH_PX)) for title, panel in panels], 2))
 
 
 def _enlarged(rgb: np.ndarray, method: int) -> np.ndarray:
@@ -175,8 +173,8 @@ def _enlarged(rgb: np.ndarray, method: int) -> np.ndarray:
     return cv2.warpAffine(rgb, matrix, size, flags=method | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _tile(rgb: np.ndarray, width_px: int, title: str) -> np.ndarray:
-    """Return a picture scaled to a width, with a title."""
+def _scaled(rgb: np.ndarray, width_px: int) -> np.ndarray:
+    """Return a picture scaled to a width."""
     height_px = max(1, round(width_px * rgb.shape[0] / rgb.shape[1]))
     method = cv2.INTER_AREA if rgb.shape[1] > width_px else cv2.INTER_NEAREST
-    return add_caption(cv2.resize(rgb, (width_px, height_px), interpolation=method), title)
+    return cv2.resize(rgb, (width_px, height_px), interpolation=method)

@@ -20,7 +20,7 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import inside, write_bytes
 from cosfly.viz.frame_views import DEPTH_RANGE_M, VIEW_FILES, read_view, spread
 from cosfly.viz.overlay import Overlay
-from cosfly.viz.topview import add_caption, draw_text
+from cosfly.viz.topview import captioned_grid, draw_text
 
 TILE_PX = (320, 180)
 NUM_RGB_TILES = 4
@@ -78,16 +78,13 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
     else:
         fix = "pass --map boxes_3d.json, or render with --set render.debug=true"
         raise InputError("the frame has no debug.png, and no map is given to draw one", where=folder, fix=fix)
-    panels = [rgb, read_view(folder, "depth"), read_view(folder, "segmentation"), debug]
-    titles = (
-        f"RGB, {meta.camera.fov_deg:.0f} deg",
-        f"depth, black: {DEPTH_RANGE_M:g} m and beyond",
-        "instances, the target red",
-        f"boxes, ids, distances; visibility {meta.target.visibility:.2f}",
-    )
-    tiles = [add_caption(panel, title) for panel, title in zip(panels, titles, strict=True)]
-    picture = np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[2:])])
-    write_bytes(out_png, rgb_bytes(picture))
+    panels = [
+        (f"RGB, {meta.camera.fov_deg:.0f} deg", rgb),
+        (f"depth, black: {DEPTH_RANGE_M:g} m and beyond", read_view(folder, "depth")),
+        ("instances, the target red", read_view(folder, "segmentation")),
+        (f"boxes, ids, distances; visibility {meta.target.visibility:.2f}", debug),
+    ]
+    write_bytes(out_png, rgb_bytes(captioned_grid(panels, 2)))
     return folder.relative_to(tree).as_posix()
 
 

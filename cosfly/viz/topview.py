@@ -126,6 +126,17 @@ def add_caption(picture: np.ndarray, text: str) -> np.ndarray:
     return np.vstack([strip, picture])
 
 
+def captioned_grid(
+    panels: Sequence[tuple[str, np.ndarray]], num_columns: int, size_px: tuple[int, int] | None = None
+) -> np.ndarray:
+    """Return pictures of one size in rows, each below its caption; size_px: width and height, if they are scaled."""
+    tiles = [
+        add_caption(panel if size_px is None else cv2.resize(panel, size_px, interpolation=cv2.INTER_AREA), title)
+        for title, panel in panels
+    ]
+    return np.vstack([np.hstack(tiles[k : k + num_columns]) for k in range(0, len(tiles), num_columns)])
+
+
 def png_bytes(picture: np.ndarray) -> bytes:
     """Encode an RGB picture."""
     ok, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
