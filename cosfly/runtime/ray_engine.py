@@ -193,13 +193,14 @@ def _host() -> type:
                 got = f"{cosfly.__version__} ({python})"
                 what = "the node has another version of cosfly"
                 return node, None, {"what": what, "got": got, "expected": version, "fix": fix}
+            from cosfly.runtime.errors import InputError
             from cosfly.runtime.io import sha256_file
             from cosfly.runtime.local_transport import LocalTransport
 
             try:
                 os.chdir(cwd)
                 is_same = sha256_file(Path(folder) / "stage.json") == record_sha256
-            except (OSError, cosfly.runtime.errors.InputError):
+            except (OSError, InputError):
                 is_same = False
             if not is_same:
                 got = f"no {Path(cwd) / folder}, or another folder of that name"
