@@ -76,11 +76,7 @@ class DecisionEngine(Protocol):
 
 
 def open_engine(cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed: int, answers: Path) -> DecisionEngine:
-    """Open the student of the settings. answers: folder of a model's answer journal.
-
-    Raises:
-        ConfigError, InputError, TeacherError, EnvironmentMissing: The student cannot be used.
-    """
+    """Open the student of the settings. answers: folder of a model's answer journal."""
     if cfg.student == "planner":
         return PlannerEngine()
     if cfg.student in BASELINES:

@@ -46,11 +46,6 @@ def run(
 ) -> Path:  # fmt: skip
     """Read a folder of `cosfly fly` and its map; write `drone_trace.json`, the playback tree `render/` of the planner's
     continuations, and the teacher's `caption/` of it. Return the output directory.
-
-    Raises:
-        InputError: A file is invalid.
-        ConfigError: Another planner than foresight, or render settings that differ from the student's.
-        NothingKept: No decision gives a trajectory.
     """
     inputs = {"flown": flown, "boxes": boxes, "simplified": simplified}
     seed = _seed_of(flown, cfg)

@@ -175,12 +175,6 @@ def run(
 ) -> Path:  # fmt: skip
     """Read a map, its obstacles, pedestrian trajectories and bystanders; write `plan/`, `episodes/`, the flown
     `drone_trace.json`, `score.json` and, if set, the playback tree `render/`. Return the output directory.
-
-    Raises:
-        ConfigError: The settings cannot be flown.
-        InputError: A file is invalid.
-        NothingKept: No pedestrian trajectory has a plan.
-        TeacherError: The student's engine cannot be used.
     """
     if cfg.render.frame_stride != 1:
         raise ConfigError(

@@ -25,12 +25,7 @@ class ListConfig(ClosedLoopConfig):
 def run(
     cfg: ListConfig, out: Path, *, seed: int = 0, workers: int = 1, watch: Watch = Watch(), resume: Resume = "if-same"
 ) -> Path:
-    """Fly each episode of a list; write `episodes/` and `score.json`. Return the output directory.
-
-    Raises:
-        InputError: The environment, list or policy does not exist.
-        TeacherError: The student's engine cannot be used.
-    """
+    """Fly each episode of a list; write `episodes/` and `score.json`. Return the output directory."""
     _, episodes, _ = benchmark.read_list(cfg.env)
     files = {"controller": cfg.fly.table, "episodes": benchmark.EPISODES_FILE}
     stage = StageFolder.open(out, "fly", config=cfg, inputs={}, seed=seed, resume=resume, package_files=files)

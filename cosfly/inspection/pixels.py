@@ -56,11 +56,7 @@ class PixelFigures:
 
 
 def unpack(files: dict[str, bytes], where: Path) -> Picture:
-    """Decode the files of a frame, by name; depth and `instance.png` are optional.
-
-    Raises:
-        InputError: If a file is invalid.
-    """
+    """Decode the files of a frame, by name; depth and `instance.png` are optional."""
     colours = colours_of(files["rgb.png"], where / "rgb.png")
     instance = NO_IDS
     if "instance.png" in files:

@@ -56,11 +56,7 @@ class Bench(BaseModel):
 
 
 def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterable[int]) -> Bench:
-    """Read a run up to `stage`; write `bench.json` and the events of each measurement.
-
-    Raises:
-        ConfigError: The stage has no items, or a server processes them. ResumeError: `out` is not empty.
-    """
+    """Read a run up to `stage`; write `bench.json` and the events of each measurement."""
     if stage not in STAGES:
         problem = "this stage cannot be measured"
         raise ConfigError(problem, where="--stage", got=stage, expected=f"one of {', '.join(STAGES)}")

@@ -110,9 +110,6 @@ def run(
     Args:
         pedestrians: Number of pedestrians that planners are measured on.
         pool: `workers` and `watch` of stages.
-
-    Raises:
-        InputError: It is not a run directory, has several towns, or no drone trajectories yet.
     """
     done = [stage.name for stage in summarize(folder).stages if stage.state == "complete"]
     if missing := [name for name in STAGES if name not in done]:

@@ -150,11 +150,7 @@ def _run_directory(cfg: RunConfig, out: Path) -> Iterator[None]:
 
 
 def check(cfg: RunConfig) -> dict[str, RunConfig]:
-    """Check, before the first stage, the requirements of the last one; return the settings of each town.
-
-    Raises:
-        ConfigError: The licence of the release is not known, or it needs pictures that are not rendered.
-    """
+    """Check, before the first stage, the requirements of the last one; return the settings of each town."""
     towns = {name: cfg.of_town(name) for name in cfg.towns}
     maps = [(name, town.maps.licence) for name, town in towns.items()] or [(cfg.maps.source, cfg.maps.licence)]
     choose_licence(cfg.release.licence, maps)
@@ -194,11 +190,7 @@ def check_out(out: Path) -> None:
 
 
 def check_with_files(cfg: RunConfig) -> None:
-    """Check the requirements of the last stage, and that the files of all maps exist.
-
-    Raises:
-        CosflyError: Something is missing; several problems are reported in one error.
-    """
+    """Check the requirements of the last stage, and that the files of all maps exist."""
     towns = [cfg.of_town(name) for name in cfg.towns] or [cfg]
     run_checks([partial(check, cfg), *(partial(_check_files, town) for town in towns)], cfg.name)
 

@@ -83,12 +83,7 @@ class RunSummary:
 
 
 def summarize(run: Path) -> RunSummary:
-    """Return the summary of a run directory.
-
-    Raises:
-        InputError: It is not a run directory.
-        ConfigError: Its `run.yaml` is not of this version.
-    """
+    """Return the summary of a run directory."""
     if not (run / "run.yaml").is_file():
         raise InputError(
             "the folder is not a run directory",
@@ -106,11 +101,7 @@ def summarize(run: Path) -> RunSummary:
 
 
 def find_runs(root: Path, depth: int = 2) -> Iterator[Path]:
-    """Yield the run directories below a folder, sorted by name; the towns of a run are not yielded themselves.
-
-    Raises:
-        InputError: There is no such folder.
-    """
+    """Yield the run directories below a folder, sorted by name; the towns of a run are not yielded themselves."""
     if not root.is_dir():
         raise InputError("the folder does not exist", where=root, expected="a folder with run directories")
     if (root / "run.yaml").is_file():
@@ -172,11 +163,7 @@ class StageEstimate:
 
 
 def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
-    """Estimate each stage of a run; with several towns, each stage of each town, and then the release.
-
-    Raises:
-        CosflyError: A product of the run cannot be read.
-    """
+    """Estimate each stage of a run; with several towns, each stage of each town, and then the release."""
     if not cfg.towns:
         return list(_estimates(cfg, out, STAGES))
     rows: list[StageEstimate] = []

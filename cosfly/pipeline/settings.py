@@ -69,11 +69,7 @@ class RunConfig(CommandConfig):
         self.of_town(name)
 
     def of_town(self, name: str) -> RunConfig:
-        """Return the settings of one town's run. Its seed derives from the run's seed and the town's name.
-
-        Raises:
-            ConfigError: Its settings are invalid; the error names the town and the setting.
-        """
+        """Return the settings of one town's run. Its seed derives from the run's seed and the town's name."""
         changes = self.towns[name]
         if "towns" in changes:
             fix = "move these towns to the section `towns` at the top of the file"

@@ -103,10 +103,6 @@ def run(
     A pedestrian trajectory that no planner can follow, such as one through a house, is a failure and no scenario.
     Planning times are written to `items.jsonl` and the manifest, the only files that differ between equal runs. Return
     the path of `benchmark.json`.
-
-    Raises:
-        InputError: If an input file is invalid.
-        NothingKept: If no planner finds any trajectory.
     """
     cfg = _without_missing(cfg)
     product = out / "benchmark.json"

@@ -260,10 +260,6 @@ def run(
 
     A pedestrian trajectory that a planner cannot follow is dropped with that planner's name; one that no planner can
     follow is a failure. Return the path of `compare.json`.
-
-    Raises:
-        InputError: If an input file is invalid.
-        NothingKept: If there is no pedestrian trajectory that all planners follow.
     """
     product = out / "compare.json"
     inputs = {"map": simplified_map, "paths": paths}

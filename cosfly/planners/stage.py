@@ -290,10 +290,6 @@ def run(
 
     Trajectories that the filter drops are written too, with their reason; a pedestrian trajectory without a drone
     trajectory is a counted failure. Return the path of `drone_trace.json`.
-
-    Raises:
-        InputError: If an input file is invalid.
-        NothingKept: If no trajectory is found, or the filter dropped all of them.
     """
     from cosfly.planners.overview import draw_trajectories
 

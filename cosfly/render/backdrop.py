@@ -63,9 +63,6 @@ def run(
 
     Args:
         bounds_m: Shown part; None shows the whole map.
-
-    Raises:
-        ConfigError: If the bounds have no area, or the picture would have too many pixels.
     """
     box_map = read_boxes(boxes)
     check_ground(box_map, boxes)

@@ -159,11 +159,6 @@ def run(
     bystanders, `others.json`; writes the playback tree.
 
     Trajectories that the planner dropped are not drawn; the manifest counts them. Returns the tree's root, `out`.
-
-    Raises:
-        InputError: If an input is missing or malformed.
-        NothingKept: If no trajectory is left to draw.
-        EnvironmentMissing: If the renderer cannot run here.
     """
     inputs = {"boxes": boxes, "simplified": simplified, "traces": traces} | ({"others": others} if others else {})
     pools = read_pools(cfg)  # before anything is written

@@ -38,11 +38,7 @@ COLUMNS = {
 
 
 def run(frame: Path, out: Path) -> dict[str, Any]:
-    """Read a frame folder; write `depth_study.json`, which is returned, `.md` and `.png`.
-
-    Raises:
-        InputError: There is no depth image, or it holds fewer than two different depths.
-    """
+    """Read a frame folder; write `depth_study.json`, which is returned, `.md` and `.png`."""
     file = frame_path(frame, "depth.npy")
     truth = read_depth(frame)
     truth = np.where(np.isfinite(truth), truth, truth.dtype.type(INVALID_DEPTH_M))

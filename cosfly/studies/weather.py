@@ -41,9 +41,6 @@ def run(cfg: RenderConfig, boxes: Path, traces: Path, out: Path, *, seed: int = 
     """Read `boxes_3d.json` and `drone_trace.json`; write the figure and the sheet and return their paths.
 
     They show the frame of the first trajectory that looks down least.
-
-    Raises:
-        InputError: There is no trajectory, or an input is malformed.
     """
     all_traces = read_traces(traces)
     if not all_traces:

@@ -59,8 +59,6 @@ def run(
     Args:
         every: Every how many poses of a track are drawn.
         options: `seed`, `workers`, `watch` and `resume` of the render stage.
-    Raises:
-        NothingKept: No trajectory could be drawn.
     """
 
     def draw(fov_deg: float, path_index: int | None = None) -> list[Track]:

@@ -69,9 +69,6 @@ def run(
 
     Args:
         picture_px: Width of frames. max_mb: Size of the page; frames are skipped evenly to stay below it.
-
-    Raises:
-        InputError: If a file cannot be read, or the page is too large without any frame.
     """
     box_map = read_boxes(map_)
     notes = list[str]()

@@ -93,9 +93,6 @@ def run(folder: Path, out: Path, cfg: ViewerConfig, captions: Path | None = None
 
     Args:
         captions: `captions.jsonl` of a playback tree; a run has its own.
-
-    Raises:
-        InputError: If the folder is none of these, or something in it cannot be read.
     """
     dataset = next((place for place in (folder, folder / "dataset") if (place / "release.json").exists()), None)
     data = _show_run(folder, cfg, captions) if dataset is None else _show_release(dataset, cfg)
