@@ -134,22 +134,6 @@ def test_a_release_is_shown_as_its_rows_say(built, tmp_path):
     assert any("flights are shown" in note for note in two["notes"])
 
 
-def test_a_page_keeps_its_size(run_folder, tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 24, width_px=320, height_px=180, with_augmented=False)
-    rng = np.random.default_rng(0)
-    for path in tree.rglob("rgb.png"):
-        cv2.imwrite(str(path), rng.integers(0, 256, (180, 320, 3), np.uint8))
-    whole = run(tree, tmp_path / "whole.html", ViewerConfig(frames=24, picture_px=640))
-    cut = run(tree, tmp_path / "cut.html", ViewerConfig(frames=24, picture_px=640, max_mb=1))
-    assert whole.stat().st_size > 2 * 2**20
-    assert cut.stat().st_size < 2**20
-    data = data_of(cut.read_text(encoding="utf-8"))
-    bare = sum(not frame["pictures"] for flight in data["flights"] for frame in flight["frames"])
-    assert 0 < bare < 24
-    assert any(f"{bare} of 24 shown frames have no pictures" in note for note in data["notes"])
-    assert [len(flight["frames"]) for flight in data["flights"]] == [24]
-
-
 @pytest.fixture(scope="module")
 def tab(tmp_path_factory):
     folder = tmp_path_factory.mktemp("chromium") / "profile"

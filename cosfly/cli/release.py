@@ -120,12 +120,12 @@ def view(
     frame: Annotated[str | None, Option(help="With a .png: the pictures of this frame, or `best`.")] = None,
     map_: Annotated[Path | None, Option("--map", help="With --frame: boxes_3d.json that was drawn.")] = None,
     picture_px: Annotated[int, Option(min=32, max=1280, help="Width of a frame on a page, px.")] = 320,
-    max_mb: Annotated[int, Option(min=1, help="Size of a page, MB; frames are omitted to stay below it.")] = 24,
 ) -> None:
     """Make a page or a picture of a map, a playback tree, a run or a release; pages work offline."""
-    size = {"picture_px": picture_px, "max_mb": max_mb}
     if source.is_file():
-        job.call("cosfly.viz.scene_page", source, out, paths=paths, traces=traces or [], data=data, **size)
+        job.call(
+            "cosfly.viz.scene_page", source, out, paths=paths, traces=traces or [], data=data, picture_px=picture_px
+        )
     elif out.suffix in (".png", ".gif"):
         from cosfly.formats.boxes import read_boxes
         from cosfly.viz import gallery
@@ -141,5 +141,5 @@ def view(
     else:
         from release.viewer.page import ViewerConfig, run
 
-        run(source, out, ViewerConfig(**size), captions)
+        run(source, out, ViewerConfig(picture_px=picture_px), captions)
     typer.echo(f"{out}: {out.stat().st_size / 1e6:,.1f} MB")

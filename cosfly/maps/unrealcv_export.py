@@ -36,7 +36,6 @@ CUBE_M = 1.0
 SKEWED = 0.2  # cosine of twice a yaw, below which the sides of a turned box do not follow from its bounds
 OBJECTS_FILE = "boxes_meta.json"
 VIEWER = "boxes.html"
-MOST_PAGE_MB = 200.0
 
 
 class UnrealCvMapConfig(UnrealCvConfig):
@@ -210,4 +209,4 @@ def write_objects(box_map: BoxMap, out: Path) -> list[Path]:
         "dropped_objects": header.dropped_objects, "objects": objects,
     }  # fmt: skip
     write_json(out / OBJECTS_FILE, sidecar, indent=None)
-    return [out / OBJECTS_FILE, scene_page.run(out / "boxes_3d.json", out / VIEWER, max_mb=MOST_PAGE_MB)]
+    return [out / OBJECTS_FILE, scene_page.run(out / "boxes_3d.json", out / VIEWER)]

@@ -215,6 +215,19 @@ def small_jpeg(rgb: np.ndarray, width_px: int, jpeg_quality: int = 80) -> str:
     return base64.b64encode(encode_picture(small, "jpeg", jpeg_quality)).decode("ascii")
 
 
+def page_pictures(views: Mapping[View, Callable[[], np.ndarray]], width_px: int) -> dict[View, str]:
+    """Return the pictures of a frame on a page, JPEG in base64, without those that cannot be read.
+
+    Args:
+        views: Readers of views as (h, w, 3) uint8 RGB. width_px: Of the colours; other views have half of it.
+    """
+    pictures: dict[View, str] = {}
+    for view, read in views.items():
+        with contextlib.suppress(InputError):
+            pictures[view] = small_jpeg(read(), width_px if view == "rgb" else width_px // 2, PAGE_JPEG_QUALITY)
+    return pictures
+
+
 def _palette() -> np.ndarray:
     """Return muted tones, NUM_SHADES of each class, (29 * NUM_SHADES, 3), with vivid pedestrians only."""
     hues = (np.arange(len(KINDS)) * 111) % 180
@@ -235,54 +248,3 @@ def _bounded(image: np.ndarray, max_side_px: int | None, *, nearest: bool = Fals
     if size == (width, height):
         return image
     return cv2.resize(image, size, interpolation=cv2.INTER_NEAREST if nearest else cv2.INTER_AREA)
-
-
-# --- pictures of a page -----------------------------------------------------------------------------------------------
-
-
-class PagePictures:
-    """The encoder of the pictures of a page of limited size: if not all fit, every n-th frame has some."""
-
-    def __init__(self, room_bytes: float, num_frames: int, width_px: int) -> None:
-        self._room = room_bytes
-        self._num_frames = max(1, num_frames)
-        self._width_px = width_px
-        self._asked = 0
-        self._every = 1
-        self._skipped = 0
-        self._unreadable = 0
-
-    def of_frame(self, views: Mapping[View, Callable[[], np.ndarray]]) -> dict[View, str]:
-        """Return a frame's pictures, JPEG in base64; an empty table if there is no room for them.
-
-        Args:
-            views: Readers of views as (h, w, 3) uint8 RGB; a damaged view is skipped.
-        """
-        number = self._asked
-        self._asked += 1
-        pictures: dict[View, str] = {}
-        if number % self._every == 0:
-            for view, read in views.items():
-                with contextlib.suppress(InputError):
-                    width_px = self._width_px if view == "rgb" else self._width_px // 2
-                    pictures[view] = small_jpeg(read(), width_px, PAGE_JPEG_QUALITY)
-            self._unreadable += len(pictures) < len(views)
-        size = sum(map(len, pictures.values()))
-        if number == 0 and size * self._num_frames > self._room:
-            self._every = min(self._num_frames, -(-size * self._num_frames // max(1, int(self._room))))
-        if number % self._every or size > self._room:
-            self._skipped += 1
-            return {}
-        self._room -= size
-        return pictures
-
-    def notes(self) -> list[str]:
-        """Return notes on frames without pictures."""
-        notes = []
-        if self._skipped:
-            notes.append(
-                f"{self._skipped:,} of {self._asked:,} shown frames have no pictures, to limit the page's size"
-            )
-        if self._unreadable:
-            notes.append(f"of {self._unreadable:,} frames a picture cannot be read")
-        return notes

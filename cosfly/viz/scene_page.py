@@ -25,19 +25,18 @@ from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import rotation_matrices
 from cosfly.geometry.grid import occupancy
-from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.io import write_bytes
-from cosfly.viz.frame_views import PagePictures
+from cosfly.viz.frame_views import page_pictures, spread
 from cosfly.viz.page import page, scripts
 from cosfly.viz.topview import COLORS, OTHER_COLOR
 
-MB = 1024 * 1024
 # 1 is opaque.
 OPACITIES = {"Buildings": 0.5, "Vegetation": 0.35, "Walls": 0.6, "Bridge": 0.6}
 LAYER_M = 0.02  # between coplanar surfaces
 MOST_MATRIX_CELLS = 64_000_000
 MOST_PATHS = 100
+MOST_PICTURES = 1200  # on a page, evenly spread over the frames; about 20 KB each
 
 
 @dataclass
@@ -63,12 +62,11 @@ def run(
     traces: Sequence[Path] = (),
     data: Path | None = None,
     picture_px: int = 320,
-    max_mb: float = 24.0,
 ) -> Path:
     """Read a map, pedestrian trajectories, drone trajectories of planners and a playback tree; write one page.
 
     Args:
-        picture_px: Width of frames. max_mb: Size of the page; frames are skipped evenly to stay below it.
+        picture_px: Width of the pictures of frames.
     """
     box_map = read_boxes(map_)
     notes = list[str]()
@@ -94,12 +92,7 @@ def run(
             if path.path_id in shown
         ],
     }
-    room_bytes = max_mb * MB - sum(len(str(part)) for part in content.values())
-    room_bytes -= sum(60 * track.rows.size for track in tracks)
-    if room_bytes < 0:
-        fix = "raise --max-mb, or use a simplified map and fewer paths"
-        raise InputError("the scene page would be too large", where=map_, expected=f"at most {max_mb:g} MB", fix=fix)
-    notes += _add_pictures(tracks, room_bytes, picture_px)
+    notes += _add_pictures(tracks, picture_px)
     content["tracks"] = [
         {
             "path": shown.index(track.path), "kind": for_terminal(track.kind), "rows": _packed(track.rows),
@@ -172,12 +165,11 @@ def _matrix(box_map: BoxMap) -> dict[str, Any] | None:
     return {"png": base64.b64encode(png.tobytes()).decode(), "bounds": [grid.x_min_m, grid.y_min_m, east, north]}
 
 
-def _add_pictures(tracks: Sequence[PageTrack], room_bytes: float, picture_px: int) -> list[str]:
-    """Add pictures to the tracks of a tree, as many as fit; return notes on skipped frames."""
-    shown = [(track, track.drawn) for track in tracks if track.drawn is not None]
-    pictures = PagePictures(room_bytes, sum(len(drawn) for _, drawn in shown), picture_px)
-    for track, drawn in shown:
-        for index in range(len(drawn)):
-            if picture := pictures.of_frame({"rgb": partial(read_rgb, drawn.frame_folder(index))}):
-                track.pictures[index] = picture["rgb"]
-    return pictures.notes()
+def _add_pictures(tracks: Sequence[PageTrack], picture_px: int) -> list[str]:
+    """Add pictures to the tracks of a tree; return a note if some frames have none."""
+    shown = [(track, track.drawn, i) for track in tracks if track.drawn is not None for i in range(len(track.drawn))]
+    for track, drawn, index in (shown[k] for k in spread(len(shown), MOST_PICTURES)):
+        if picture := page_pictures({"rgb": partial(read_rgb, drawn.frame_folder(index))}, picture_px):
+            track.pictures[index] = picture["rgb"]
+    num_pictures = sum(len(track.pictures) for track in tracks)
+    return [f"{num_pictures:,} of {len(shown):,} frames have pictures"] if num_pictures < len(shown) else []

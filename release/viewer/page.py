@@ -34,9 +34,9 @@ from cosfly.runtime.io import write_bytes
 from cosfly.runtime.tables import arrow_errors, row_groups
 from cosfly.viz.frame_views import (
     VIEW_FILES,
-    PagePictures,
     View,
     depth_colors,
+    page_pictures,
     read_view,
     segmentation_colors,
     spread,
@@ -67,8 +67,6 @@ Place = tuple[str, ...]  # PLACE
 Views = Mapping[View, Callable[[], np.ndarray]]
 Item = TypeVar("Item")
 
-MB = 1024 * 1024
-FRAME_BYTES, TRACK_BYTES = 7_000, 14_000  # on the page: a frame without pictures, and a track with its paths
 PATH_POINTS = 240
 MOST_BOXES, MARGIN_M = 2_500, 30.0  # of one map
 VIEW_OF: dict[FrameFile, View] = {"rgb": "rgb", "depth": "depth", "instance": "segmentation"}
@@ -85,7 +83,6 @@ class ViewerConfig(Config):
     flights: int = Field(100, ge=1, description="most tracks on a page; of more, whole trajectories, evenly spread")
     frames: int = Field(16, ge=1, description="most frames of a track, among them one of each verdict and decision")
     picture_px: int = Field(320, ge=32, le=1280, description="width of a colour picture, px; half of it for the others")
-    max_mb: int = Field(64, ge=1, description="size of the page, MB; frames lose their pictures to stay below it")
 
 
 def run(folder: Path, out: Path, cfg: ViewerConfig, captions: Path | None = None) -> Path:
@@ -148,7 +145,7 @@ def _show_release(dataset: Path, cfg: ViewerConfig) -> dict[str, Any]:
     for place, indices in frames.items():
         for path, group in (scanned[place][index].stored for index in indices):
             wanted[path].add(group)
-    notes += _add_frames(tracks, frames, _release_rows(dataset, record, frames, wanted), cfg)
+    _add_frames(tracks, frames, _release_rows(dataset, record, frames, wanted), cfg.picture_px)
     return {"title": record.name, "kind": "release", "notes": notes, "maps": {}, "flights": list(tracks.values())}
 
 
@@ -260,7 +257,7 @@ def _show_run(folder: Path, cfg: ViewerConfig, captions: Path | None) -> dict[st
         kind = "clean" if track.is_original else "perturbed"
         tracks[place] |= {"town": track.town, "track": kind, "split": None, "result": results.get(place)}
     rows = _run_rows({place: found[place][1] for place in frames}, frames, trees)
-    notes += _add_frames(tracks, frames, rows, cfg)
+    _add_frames(tracks, frames, rows, cfg.picture_px)
     shown = list(tracks.values())
     title = folder.absolute().name
     return {"title": title, "kind": "run", "notes": notes, "maps": _maps(trees, shown), "flights": shown}
@@ -360,19 +357,15 @@ def _add_frames(
     tracks: Mapping[Place, dict[str, Any]],
     frames: Mapping[Place, list[int]],
     rows: Iterable[tuple[Place, dict[str, Any], Views, dict[str, Any] | None]],
-    cfg: ViewerConfig,
-) -> list[str]:
-    """Add rows with their pictures and captions to the tracks; return notes on missing pictures."""
-    num_frames = sum(map(len, frames.values()))
-    room = cfg.max_mb * MB - FRAME_BYTES * num_frames - TRACK_BYTES * len(tracks)
-    pictures = PagePictures(room, num_frames, cfg.picture_px)
-    with progress_bar("viewer: frames", num_frames) as advance:
+    picture_px: int,
+) -> None:
+    """Add rows with their pictures and captions to the tracks."""
+    with progress_bar("viewer: frames", sum(map(len, frames.values()))) as advance:
         for place, row, views, caption in rows:
-            tracks[place]["frames"].append(_frame(row, pictures.of_frame(views), caption))
+            tracks[place]["frames"].append(_frame(row, page_pictures(views, picture_px), caption))
             advance(1)
     for track in tracks.values():
         track["frames"].sort(key=lambda frame: frame["index"])
-    return pictures.notes()
 
 
 def _frame(row: Mapping[str, Any], pictures: dict[View, str], caption: dict[str, Any] | None) -> dict[str, Any]:
