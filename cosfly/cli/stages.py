@@ -56,7 +56,7 @@ def maps(job: Job, out: options.Out) -> None:
     job.run("cosfly.maps.stage", job.cfg.maps, out, follow_links=job.cfg.follow_links)
 
 
-@command("cosfly maps roi-backdrop --map boxes_3d.json --out above.png", "render", "seed", backend=BACKEND)
+@command("cosfly maps roi-backdrop --map boxes_3d.json --out above.png", "render", backend=BACKEND)
 def roi_backdrop(
     job: Job,
     map_: options.Map,

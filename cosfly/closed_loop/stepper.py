@@ -56,7 +56,7 @@ class Airspace:
         """
         self.cfg = as_drawn(cfg, seed).model_copy(update={"first_timestamp": cfg.first_timestamp or 0})
         self.seed = seed
-        self.renderer = renderer_of(cfg, boxes, seed, num_others)
+        self.renderer = renderer_of(cfg, boxes, num_others)
         self.pools = read_pools(cfg)
         self.surroundings = Surroundings(simplified)
         self.ground = simplified.ground

@@ -26,7 +26,7 @@ NO_HAZE_M = 1e9
 Bounds = tuple[float, float, float, float]  # west, south, east, north, m
 
 
-def draw_backdrop(cfg: RenderConfig, box_map: BoxMap, view: TopView, seed: int = 0) -> np.ndarray:
+def draw_backdrop(cfg: RenderConfig, box_map: BoxMap, view: TopView) -> np.ndarray:
     """Draw a window of the world by the backend of the settings, without weather and haze.
 
     Returns:
@@ -35,11 +35,11 @@ def draw_backdrop(cfg: RenderConfig, box_map: BoxMap, view: TopView, seed: int =
     side_px = max(16, round(TILE_M * view.pixels_per_m))
     side_m = side_px / view.pixels_per_m
     look = cfg.look.model_copy(update={"haze_m": NO_HAZE_M})
-    cfg = cfg.model_copy(update={"width_px": side_px, "height_px": side_px, "look": look, "rim": False})
+    cfg = cfg.model_copy(update={"width_px": side_px, "height_px": side_px, "look": look})
     intrinsic = intrinsic_matrix(side_px, side_px, float(np.degrees(2.0 * np.arctan(side_m / 2.0 / HEIGHT_M))))
     width, height = view.size_px
     picture = np.empty((height, width, 3), dtype=np.uint8)
-    renderer = renderer_of(cfg, box_map, seed)
+    renderer = renderer_of(cfg, box_map)
     try:
         for top in range(0, height, side_px):
             for left in range(0, width, side_px):
@@ -56,9 +56,7 @@ def draw_backdrop(cfg: RenderConfig, box_map: BoxMap, view: TopView, seed: int =
         renderer.close()
 
 
-def run(
-    cfg: RenderConfig, boxes: Path, out: Path, *, bounds_m: Bounds | None = None, pixels_per_m: float, seed: int = 0
-) -> Path:
+def run(cfg: RenderConfig, boxes: Path, out: Path, *, bounds_m: Bounds | None = None, pixels_per_m: float) -> Path:
     """Read `boxes_3d.json`, write the PNG `out` and its world frame, and return `out`.
 
     Args:
@@ -78,5 +76,5 @@ def run(
         )
     frame = WorldFrame(west_m=west, north_m=north, metres_per_px=1.0 / pixels_per_m)
     view = TopView(west, north, pixels_per_m, (int(size[0]), int(size[1])))
-    write_backdrop(out, png_bytes(draw_backdrop(cfg, box_map, view, seed)), frame)
+    write_backdrop(out, png_bytes(draw_backdrop(cfg, box_map, view)), frame)
     return out

@@ -5,8 +5,8 @@ All renderers draw the same things in the same places, so that depth, kinds and 
 - every box, or something of its kind that stays inside it, with its id of `instance_ids`; the person with PERSON_ID;
   bystanders, people and cars, each with its own id from the caller (`other_id`);
 - of a tree that is one box a stem, and foliage only from `crown_low` of `plants_of` up: people walk under it;
-- a ground plane of Terrain (`ground_plane`) or sloping ground (surfaces.py), scenery beyond the map (rim.py), with
-  NO_INSTANCE; sky where nothing is between NEAR_M and FAR_M (`far_as_sky`);
+- a ground plane of Terrain (`ground_plane`) or sloping ground (surfaces.py), with NO_INSTANCE; sky where nothing is
+  between NEAR_M and FAR_M (`far_as_sky`);
 - of coplanar surfaces the one of the higher layer, and within a layer always the same one.
 """
 
@@ -31,13 +31,12 @@ DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"  # OpenGL without a window, o
 NEAR_M = 0.3  # near clip plane (sec:step5)
 FAR_M = SKY_DEPTH_M  # far clip plane
 
-# Instance ids, 16 bits in instance.png, in addition to PERSON_ID: 0 is no instance (sky, ground plane, rim).
+# Instance ids, 16 bits in instance.png, in addition to PERSON_ID: 0 is no instance (sky, ground plane).
 SHARED_ID, MAX_BOX_ID = 65534, 65533
 NO_INSTANCE = 0
 
 GROUND_PLANE_HALF_M = 1500.0
 GROUND_PLANE_DROP_M = 0.02  # under the lowest slab, so that no pixel alternates between the two
-UNDER_RIM_M = 0.5
 
 # A layer moves the depth *test* by LAYER_STEP of the distance, never the depth written (kinds.LAYERS).
 LAYER_STEP = 1e-4
@@ -111,10 +110,10 @@ Others = Sequence[PosedBystander]
 
 
 class Renderer(Protocol):
-    """A renderer of one map, for one thread: `RENDERERS[name](box_map, width_px, height_px, look, num_others, rim)`.
+    """A renderer of one map, for one thread: `RENDERERS[name](box_map, width_px, height_px, look, num_others)`.
 
-    num_others: ids of `other_id` that no box may have. rim: boxes beyond the map (rim.py), without ids. Opening raises
-    EnvironmentMissing if a package or driver is missing.
+    num_others: ids of `other_id` that no box may have. Opening raises EnvironmentMissing if a package or driver is
+    missing.
     """
 
     dresses: bool  # whether people wear the given clothes; otherwise tracks do not record appearances
@@ -181,14 +180,6 @@ def instance_ids(box_map: BoxMap, num_others: int = 0) -> np.ndarray:
     return ids
 
 
-def with_rim(box_map: BoxMap, num_others: int, rim: BoxMap | None) -> tuple[BoxMap, np.ndarray]:
-    """Return all boxes to draw, n, and the id of each for `instance.png`, (n,) uint16: NO_INSTANCE of the rim's."""
-    ids = instance_ids(box_map, num_others)
-    if rim is None:
-        return box_map, ids
-    return box_map.joined(rim), np.append(ids, np.full(len(rim), NO_INSTANCE, np.uint16))
-
-
 def scene_origin(box_map: BoxMap) -> np.ndarray:
     """Return a whole-metre place in the middle of a map, (3,) world: the origin of float32 computations."""
     low, high = box_map.bounds() if len(box_map) else (np.zeros(3), np.zeros(3))
@@ -203,14 +194,10 @@ def plane_z_m(box_map: BoxMap) -> float:
     return float(tops.min(initial=box_map.header.ground_z_m))
 
 
-def ground_plane(box_map: BoxMap, rim: BoxMap | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre and half sizes, (3,) each, world, of the flat box of Terrain under everything, with NO_INSTANCE.
-
-    Under the fields of a rim it is deeper: a triangle this large is drawn to some centimetres.
-    """
+def ground_plane(box_map: BoxMap) -> tuple[np.ndarray, np.ndarray]:
+    """Return centre and half sizes, (3,) each, world, of the flat box of Terrain under everything, with NO_INSTANCE."""
     x, y, _ = scene_origin(box_map)
-    drop_m = GROUND_PLANE_DROP_M + (0.0 if rim is None else UNDER_RIM_M)
-    center = np.array([x, y, plane_z_m(box_map) - drop_m - 0.5])
+    center = np.array([x, y, plane_z_m(box_map) - GROUND_PLANE_DROP_M - 0.5])
     return center, np.array([GROUND_PLANE_HALF_M, GROUND_PLANE_HALF_M, 0.5])
 
 

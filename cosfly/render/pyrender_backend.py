@@ -69,9 +69,7 @@ class PyrenderRenderer:
 
     dresses = True
 
-    def __init__(
-        self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0, rim: BoxMap | None = None
-    ) -> None:
+    def __init__(self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0) -> None:
         self._screen = _open_screen(width_px, height_px)
         self._look = look
         import pyrender
@@ -80,7 +78,7 @@ class PyrenderRenderer:
         self.device = f"pyrender, EGL, {glGetString(GL_RENDERER).decode()}"
         self._origin = contract.scene_origin(box_map)
         self._scene = pyrender.Scene()
-        self._scene.add(self._mesh(*_all_boxes(box_map, self._origin, num_others, rim)))
+        self._scene.add(self._mesh(*_all_boxes(box_map, self._origin, num_others)))
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
         """Check that no weather is asked for; there are no shadows to compute."""
@@ -152,14 +150,12 @@ def _tags(kinds: np.ndarray, ids: np.ndarray, layers: np.ndarray) -> np.ndarray:
     return np.column_stack([kinds, ids & 255, ids >> 8, contract.LAYER_STEP * layers]).astype(np.float32)
 
 
-def _all_boxes(
-    town: BoxMap, origin: np.ndarray, num_others: int, rim: BoxMap | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _all_boxes(box_map: BoxMap, origin: np.ndarray, num_others: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return triangles, colours and tags of every box and the ground plane; crowns are ellipsoids on stems."""
     import trimesh
 
-    center, half = contract.ground_plane(town, rim)
-    box_map, own_ids = contract.with_rim(town, num_others, rim)
+    center, half = contract.ground_plane(box_map)
+    own_ids = contract.instance_ids(box_map, num_others)
     centers = np.vstack([box_map.centers, center]) - origin
     halves = np.maximum(np.vstack([box_map.half_extents, half]), 1e-3)
     turns = rotation_matrices(np.radians(np.vstack([box_map.rotations_deg, np.zeros(3)])))

@@ -70,11 +70,6 @@ class RenderConfig(WeatherConfig):
         "frames and actions at 10 Hz, 5 frames at 2 Hz with actions at 10 Hz",
     )
     debug: bool = Field(False, description="also write debug.png: boxes, ids and distances over the colours")
-    rim: bool = Field(
-        False,
-        description="draw fields, roads, low houses and a skyline beyond the map, instead of a lawn to the horizon; "
-        "trajectories must stay within 70 m of the map's bounds",
-    )
     visible_threshold: float = Field(
         0.1,
         ge=0,
@@ -85,7 +80,7 @@ class RenderConfig(WeatherConfig):
     def recorded(self) -> dict[str, Any]:
         """Return the recorded settings, without those that are unused."""
         unused = {name for name in SIMULATORS if name != self.backend}
-        unused |= {name for name in ("rim", "path_index") if getattr(self, name) in (False, None)}
+        unused |= {"path_index"} if self.path_index is None else set()
         return {name: value for name, value in super().recorded().items() if name not in unused}
 
     @field_validator("fovs_deg")
@@ -99,8 +94,8 @@ class RenderConfig(WeatherConfig):
 
     @model_validator(mode="after")
     def _weather_can_be_drawn(self) -> RenderConfig:
-        if self.backend in SIMULATORS and (self.look != Look() or self.rim):
-            raise ValueError(f"backend {self.backend} draws its own sun, air and horizon; remove look and rim")
+        if self.backend in SIMULATORS and self.look != Look():
+            raise ValueError(f"backend {self.backend} draws its own sun and air; remove look")
         if self.weather_mode != "off" and self.backend in ("pyrender", "unrealcv"):
             raise ValueError(f"backend {self.backend} cannot draw weather; use gl or carla, or weather_mode off")
         if self.weather_mode != "off" and self.look != Look():

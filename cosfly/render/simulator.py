@@ -49,9 +49,8 @@ class SimulatorRenderer(ABC):
     device: str
 
     def __init__(
-        self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0,
-        rim: BoxMap | None = None, *, settings: Any,
-    ) -> None:  # fmt: skip
+        self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0, *, settings: Any
+    ) -> None:
         self._map = box_map
         self._size_px = (width_px, height_px)
         self._num_others = num_others

@@ -25,7 +25,6 @@ from cosfly.render.camera import zoomed_deg
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
 from cosfly.render.person import choose_clothes, dress_bystanders, gait_of
 from cosfly.render.perturbation import PERTURBED, PerturbedTrack, Poses, Surroundings, perturb
-from cosfly.render.rim import check_outside_rim, rim_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.track import VARIANTS, TrackScript, check_track, render_track
 from cosfly.render.weather import fog_hides, random_seed, read_pools, weathers_of
@@ -62,21 +61,19 @@ def open_renderer(
     height_px: int,
     look: Look | None = None,
     num_others: int = 0,
-    rim: BoxMap | None = None,
     settings: Config | None = None,
 ) -> Renderer:
     """Open a renderer for one map and at most `num_others` bystanders; settings: the renderer's own, if it has any."""
     module, _, attribute = RENDERERS[name].partition(":")
     options = {} if settings is None else {"settings": settings}
     renderer = getattr(importlib.import_module(module), attribute)
-    return renderer(box_map, width_px, height_px, look or Look(), num_others, rim, **options)
+    return renderer(box_map, width_px, height_px, look or Look(), num_others, **options)
 
 
-def renderer_of(cfg: RenderConfig, box_map: BoxMap, seed: int, num_others: int = 0) -> Renderer:
+def renderer_of(cfg: RenderConfig, box_map: BoxMap, num_others: int = 0) -> Renderer:
     """Open the renderer that the settings ask for."""
-    rim = rim_of(box_map, seed) if cfg.rim else None
     settings = getattr(cfg, cfg.backend, None)
-    return open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look, num_others, rim, settings)
+    return open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look, num_others, settings)
 
 
 # --- scripts of tracks ------------------------------------------------------------------------------------------------
@@ -297,15 +294,13 @@ def make_worker(cfg: RenderConfig, inputs: Inputs, out: Path, town: str, seed: i
     bystanders, num_others = bystanders_of(others, all_traces)
     box_map = read_boxes(boxes)
     weathers = weathers_of(cfg, read_pools(cfg), (trace.drawn_as(n).number for n, trace in enumerate(all_traces)))
-    renderer = renderer_of(cfg, box_map, seed, num_others)
+    renderer = renderer_of(cfg, box_map, num_others)
     overlay = Overlay(box_map, instance_ids(box_map, num_others)) if cfg.debug else None
 
     def work(item: Item) -> Outcome:
         number, track = item.payload
         trace = all_traces[number]
         check_track(trace, surroundings)
-        if cfg.rim:
-            check_outside_rim(trace, box_map)
         weather = weathers[trace.drawn_as(number).number]
         trace_bystanders = bystanders.get(trace.path_id, ())
         script = make_track_script(trace, number, track, town, surroundings, cfg, seed, trace_bystanders, weather)

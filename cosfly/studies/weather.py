@@ -58,7 +58,7 @@ def run(cfg: RenderConfig, boxes: Path, traces: Path, out: Path, *, seed: int = 
     intrinsic = intrinsic_matrix(cfg.width_px, cfg.height_px, FOV_DEG)
     pictures = {}
     with (
-        contextlib.closing(renderer_of(cfg, box_map, seed)) as renderer,
+        contextlib.closing(renderer_of(cfg, box_map)) as renderer,
         progress_bar("study weather: pictures", len(WEATHERS) * len(TIMES)) as advance,
     ):
         for weather, time_of_day in product(WEATHERS, TIMES):

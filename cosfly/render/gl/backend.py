@@ -47,16 +47,14 @@ class GlRenderer:
 
     dresses = True
 
-    def __init__(
-        self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0, rim: BoxMap | None = None
-    ) -> None:
+    def __init__(self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0) -> None:
         self.context = programs.open_context()
         self._release = weakref.finalize(self, _release, self.context)  # closed or not
         self._release.atexit = False
         driver = (str(self.context.info[f"GL_{name}"]) for name in ("VENDOR", "RENDERER", "VERSION"))
         self.device = ", ".join(("EGL", *driver))
         self._is_software = SOFTWARE in self.device
-        self.scene = build_scene(box_map, num_others, rim)
+        self.scene = build_scene(box_map, num_others)
         self.look = look
         self.num_others = num_others
         self.width_px, self.height_px = width_px, height_px

@@ -228,7 +228,6 @@ void ground_cover(inout Surface s, vec2 p, vec3 local, vec3 h, float w) {
         s.albedo *= 0.7 + 0.35 * patches + 0.3 * tufts + 0.5 * blades;
         s.albedo = mix(s.albedo, vec3(0.20, 0.17, 0.085), 0.55 * smoothstep(0.55, 0.85, noise2(p * 0.045 + 11.0)));
         s.albedo += vec3(0.02, 0.03, 0.0) * noise2(p * 0.6);
-        s.albedo *= 1.0 - 0.22 * step(1.0, f_color.a) * stripes(local.y / 1.4, 0.45, w / 1.4);   // furrows of a field
     } else if (material == GRAVEL) {
         float stones = mix(0.5, hash21(p * 17.0), fine);
         s.albedo *= 0.7 + 0.25 * patches + 0.2 * mix(0.5, noise2(p * 1.7), medium) + 0.3 * stones;

@@ -180,10 +180,10 @@ class Scene:
         return centers.min(axis=0) + self.origin_m, centers.max(axis=0) + self.origin_m
 
 
-def build_scene(town: BoxMap, num_others: int = 0, rim: BoxMap | None = None) -> Scene:
-    """Convert a map and its rim to drawable parts, with a ground plane under everything."""
-    origin = contract.scene_origin(town)
-    box_map, all_ids = contract.with_rim(town, num_others, rim)
+def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
+    """Convert a map to drawable parts, with a ground plane under everything."""
+    origin = contract.scene_origin(box_map)
+    all_ids = contract.instance_ids(box_map, num_others)
     are_meshes = are_solids(box_map)
     all_parts = list[Parts]()
     lies = is_draped(box_map) & ~are_meshes
@@ -195,8 +195,8 @@ def build_scene(town: BoxMap, num_others: int = 0, rim: BoxMap | None = None) ->
     seeds = seeds_of(box_map.ids)
     turns = rotation_matrices(np.radians(box_map.rotations_deg))
     half = np.maximum(box_map.half_extents, 1e-3)
-    if (town.kinds == KINDS["RoadLines"]).any():
-        seeds[(box_map.kinds == KINDS["Roads"]) & (all_ids != NO_INSTANCE)] = HAS_PAINT
+    if (box_map.kinds == KINDS["RoadLines"]).any():
+        seeds[box_map.kinds == KINDS["Roads"]] = HAS_PAINT
     for kind in np.unique(box_map.kinds[~are_meshes]).tolist():
         rows = np.flatnonzero((box_map.kinds == kind) & ~are_meshes)
         boxes = Boxes(centers[rows], half[rows], turns[rows], all_ids[rows], seeds[rows], kind, tiers[rows])
@@ -205,7 +205,7 @@ def build_scene(town: BoxMap, num_others: int = 0, rim: BoxMap | None = None) ->
             lying[rows] = kind_parts[0].records
             kind_parts = [kind_parts[0].select(~lies[rows])]
         all_parts += kind_parts
-    center, half_m = contract.ground_plane(town, rim)
+    center, half_m = contract.ground_plane(box_map)
     ids = np.full(1, NO_INSTANCE, np.uint16)
     zero = np.zeros(1)  # seed and tier
     plane = Boxes((center - origin)[None], half_m[None], np.eye(3)[None], ids, zero, KINDS["Terrain"], zero)
@@ -215,8 +215,8 @@ def build_scene(town: BoxMap, num_others: int = 0, rim: BoxMap | None = None) ->
     if not box_map.ground.is_flat:
         loose.vertices.update(_draped(drape(box_map), origin, lying))
     joined = Parts.joined(all_parts)
-    lamps = np.zeros((0, 3)) if len(joined.lamps()) else lamps_along_streets(town) - origin
-    return Scene(joined, origin, contract.plane_z_m(town), town.ground, loose, lamps)
+    lamps = np.zeros((0, 3)) if len(joined.lamps()) else lamps_along_streets(box_map) - origin
+    return Scene(joined, origin, contract.plane_z_m(box_map), box_map.ground, loose, lamps)
 
 
 def _draped(draped: Triangles, origin: np.ndarray, records: np.ndarray) -> dict[int, np.ndarray]:

@@ -30,12 +30,6 @@ TILE_COLORS = np.array([
 PLAIN_COLORS = np.array(
     [[0.35, 0.33, 0.30], [0.22, 0.27, 0.22], [0.40, 0.30, 0.20], [0.28, 0.29, 0.31], [0.45, 0.42, 0.36]]
 )
-MEADOW_COLORS = np.array([[0.105, 0.14, 0.045], [0.085, 0.135, 0.04], [0.125, 0.15, 0.05], [0.12, 0.135, 0.055]])
-FIELD_COLORS = np.array([
-    [0.105, 0.14, 0.045], [0.075, 0.135, 0.03], [0.14, 0.165, 0.04], [0.24, 0.20, 0.09], [0.155, 0.105, 0.065],
-    [0.20, 0.155, 0.085], [0.09, 0.12, 0.05], [0.21, 0.20, 0.055],
-])  # fmt: skip
-LARGEST_MEADOW_M = 20.0  # half of the longer side; larger fields are tilled
 BARK_COLOR = (0.16, 0.11, 0.075)
 CAR_COLORS = np.array([
     [0.62, 0.63, 0.65], [0.05, 0.05, 0.06], [0.80, 0.80, 0.79], [0.36, 0.03, 0.03], [0.04, 0.09, 0.26],
@@ -54,16 +48,6 @@ Shape = Callable[[Boxes], list[Parts]]
 def _box(material: int, color: tuple[float, float, float], layer: int | None = None) -> Shape:
     """Return the shape of the box itself: a ground surface in its layer, or a standing thing."""
     return lambda boxes: [boxes.part(meshes.BOX, boxes.half, material, color, layer=layer)]
-
-
-def _terrain(boxes: Boxes) -> list[Parts]:
-    """Return lawns of the map, in one colour; meadows and fields of the rim."""
-    is_rim = boxes.ids[:, None] == contract.NO_INSTANCE
-    is_tilled = boxes.half[:, :1] > LARGEST_MEADOW_M
-    crops = np.where(is_tilled, boxes.pick(FIELD_COLORS), boxes.pick(MEADOW_COLORS))
-    colors = np.where(is_rim, crops, MEADOW_COLORS[0])
-    rows = replace(boxes, seeds=boxes.seeds * 0.999 + (is_rim & is_tilled)[:, 0])  # the shader draws furrows from 1 on
-    return [rows.part(meshes.BOX, boxes.half, parts.GRASS, colors, layer=LAYERS["Terrain"])]
 
 
 def _sidewalks(boxes: Boxes) -> list[Parts]:
@@ -304,7 +288,7 @@ SHAPES: dict[int, Shape] = {
     for name, build in {
         "Roads": _box(parts.ROAD, (0.095, 0.095, 0.1), LAYERS["Roads"]),
         "Sidewalks": _sidewalks,
-        "Terrain": _terrain,
+        "Terrain": _box(parts.GRASS, (0.105, 0.14, 0.045), LAYERS["Terrain"]),
         "Ground": _box(parts.GRAVEL, (0.30, 0.275, 0.235), LAYERS["Ground"]),
         "RoadLines": _box(parts.ROAD_LINE, (0.62, 0.62, 0.6), LAYERS["RoadLines"]),
         "RailTrack": _box(parts.GRAVEL, (0.20, 0.18, 0.165), LAYERS["RailTrack"]),
