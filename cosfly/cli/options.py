@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, cast
 import typer
 from typer import Option
 
-from cosfly.runtime.errors import ConfigError, InputError, nearest, plain
+from cosfly.runtime.errors import ConfigError, InputError, nearest
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -93,7 +93,6 @@ class Job:
     """The resolved settings of a command."""
 
     cfg: RunConfig
-    overrides: Sequence[str] = ()  # values of --set
     resume: Resume = "if-same"
     set_by_options: Collection[str] = ()  # names of the settings that the user set by options of the command
 
@@ -168,22 +167,6 @@ class Job:
             )
 
 
-class _Root(typer.core.TyperGroup):
-    """The root command; it explains an invalid value of an option in plain words."""
-
-    def invoke(self, ctx: Any) -> Any:
-        try:
-            return super().invoke(ctx)
-        except typer.BadParameter as error:
-            from pydantic import ValidationError
-
-            if isinstance(error.__cause__, ValidationError):
-                detail = error.__cause__.errors()[0]
-                got = "" if detail["type"] == "value_error" else f", got {detail['input']!r}"
-                error.message = f"{plain(error.message)}{got}"
-            raise
-
-
 class StageGroup(typer.core.TyperGroup):
     """The command of a stage, with subcommands that do not need the stage's own options."""
 
@@ -195,7 +178,6 @@ class StageGroup(typer.core.TyperGroup):
 
 
 app = typer.Typer(
-    cls=_Root,
     help="Make data sets from 3D maps that teach a vision-language model to follow a person from the air.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -248,7 +230,7 @@ def command(
             cfg = resolve(values["config"], values["overrides"], settings, used)
             if "town" in listed:
                 cfg = _town_of(cfg, values["town"])
-            job = Job(cfg, values["overrides"] or (), values.get("resume", "if-same"), settings)
+            job = Job(cfg, values.get("resume", "if-same"), settings)
             function(job, **{name: _opened(cfg, values[name]) for name in own_names})
 
         called.__signature__ = Signature([  # type: ignore[attr-defined]

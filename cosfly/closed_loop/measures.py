@@ -18,7 +18,6 @@ import numpy as np
 
 from cosfly.formats.episodes import Episode, EpisodeScore, Figure, Score
 from cosfly.geometry.trajectory_metrics import RELAXED_SAFETY_M, derivative_rms, draw_pedestrians, figure_of_draws
-from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.seeding import rng_for
@@ -145,36 +144,20 @@ def episode_digest(episode: Episode) -> str:
 
 
 def score_episodes(records: Iterable[Episode], *, trained_on: Sequence[str] | None = None, seed: int = 0) -> Score:
-    """Score the episodes of one student, in any order."""
+    """Score the episodes of one student, at least one, in any order."""
     measured = []
     digests = []
-    students = set()
     for episode in records:
         measured.append(measure(episode, trained_on))
         digests.append(episode_digest(episode))
-        students.add((episode.student, episode.engine, episode.list_sha256 or ""))
-    if not students:
-        raise InputError("there is no episode to score", where="episodes", expected="at least one episode")
-    if len(students) > 1:
-        raise InputError(
-            f"the episodes come from {len(students)} different combinations of student, engine and episode list",
-            where="episodes",
-            got="; ".join(
-                f"student {student or 'unknown'}, engine {engine or 'unknown'}, list {digest[:12] or 'none'}"
-                for student, engine, digest in sorted(students)[:3]
-            ),
-            fix="score the episodes of each combination separately",
-        )
-    measured.sort(key=lambda score: (score.town, score.episode))
-    student, engine, list_sha256 = students.pop()
     return score_measured(
-        measured,
+        sorted(measured, key=lambda score: (score.town, score.episode)),
         seed,
         episodes_sha256=sha256_bytes(dump_json(sorted(digests)).encode()),
         trained_on=trained_on,
-        student=student or None,
-        engine=engine or None,
-        list_sha256=list_sha256 or None,
+        student=episode.student or None,
+        engine=episode.engine or None,
+        list_sha256=episode.list_sha256,
     )
 
 
