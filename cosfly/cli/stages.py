@@ -28,7 +28,7 @@ BACKEND = SettingOption("render.backend", "Renderer: gl, pyrender, carla or unre
 @command(
     'cosfly world "a small village by a river" --out village',
     "world",
-    f"seed {WORKERS} resume",
+    "seed resume",
     planner=SettingOption("world.planner", "Language model that plans the world; none: embedded rules.", metavar="URL"),
     model=SettingOption("world.model", "Name of the language model."),
 )

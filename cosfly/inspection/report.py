@@ -32,7 +32,7 @@ OF_FRAME = re.compile(r"(?:frame_|points\[|frame )(\d+)")  # the frame's index i
 BETWEEN_FRAMES = ("temporal_jump", "frozen_frame", "teleport")
 
 
-class FramePicture(BaseModel):
+class ReportPicture(BaseModel):
     """One picture of a track."""
 
     frame: int
@@ -40,11 +40,13 @@ class FramePicture(BaseModel):
     of_issue: bool  # whether an issue names the frame
 
 
-def pictures_of(track: Track, width_px: int, issues: Sequence[Issue]) -> list[FramePicture]:
+def pictures_of(track: Track, width_px: int, issues: Sequence[Issue]) -> list[ReportPicture]:
     """Return three pictures of a width, first of the frames of issues, then of the first, middle and last frame."""
     asked = frames_of_issues(issues, len(track))
     frames = sorted([*asked, 0, len(track) // 2, len(track) - 1][:3])
-    return [FramePicture(frame=i, jpeg=thumbnail(track.frame_folder(i), width_px), of_issue=i in asked) for i in frames]
+    return [
+        ReportPicture(frame=i, jpeg=thumbnail(track.frame_folder(i), width_px), of_issue=i in asked) for i in frames
+    ]
 
 
 def frames_of_issues(issues: Sequence[Issue], num_frames: int) -> list[int]:
@@ -58,7 +60,7 @@ def frames_of_issues(issues: Sequence[Issue], num_frames: int) -> list[int]:
 
 
 def report_html(
-    name: str, inspection: Inspection, pictures: Mapping[str, Sequence[FramePicture]], page_mb: float
+    name: str, inspection: Inspection, pictures: Mapping[str, Sequence[ReportPicture]], page_mb: float
 ) -> str:
     """Return the page, with the tracks that need a decision first.
 
@@ -68,7 +70,7 @@ def report_html(
     """
     tracks = sorted(inspection.flights, key=lambda track: (-RESULTS.index(track.result), track.folder))
     room = page_mb * MB
-    shown = dict[str, Sequence[FramePicture]]()
+    shown = dict[str, Sequence[ReportPicture]]()
     for folder in (track.folder for track in tracks if track.folder in pictures):
         room -= sum(len(picture.jpeg or "") for picture in pictures[folder])
         if room >= 0:

@@ -25,7 +25,7 @@ from cosfly.formats.issues import Report
 from cosfly.formats.playback import read_track
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.tracks import find_tracks
-from cosfly.inspection.report import FramePicture, report_html
+from cosfly.inspection.report import ReportPicture, report_html
 from cosfly.inspection.settings import PAGE_MB, InspectConfig
 from cosfly.inspection.track import InspectedTrack, inspect_track, trace_id
 from cosfly.runtime.errors import InputError
@@ -111,10 +111,10 @@ def _log_review(counts: TrackFunnel, out: Path) -> None:
 
 def assemble(
     finished: ItemOutcomes, planned: list[DroneTrace] | None, cfg: InspectConfig, data: Path
-) -> tuple[Inspection, dict[str, list[FramePicture]]]:
+) -> tuple[Inspection, dict[str, list[ReportPicture]]]:
     """Merge the outcomes of all tracks: the inspection, and the report's pictures by track folder."""
     tracks = list[TrackInspection]()
-    pictures = dict[str, list[FramePicture]]()
+    pictures = dict[str, list[ReportPicture]]()
     for outcome in finished.records:
         if isinstance(outcome, Failed):
             tracks.append(_unreadable(outcome, planned or [], data))

@@ -38,7 +38,7 @@ from cosfly.inspection.frames import (
     listed_digests,
     target_box,
 )
-from cosfly.inspection.report import FramePicture, pictures_of
+from cosfly.inspection.report import ReportPicture, pictures_of
 from cosfly.inspection.settings import InspectConfig
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.run_dir import digest_of, folder_digests
@@ -55,7 +55,7 @@ class InspectedTrack(BaseModel):
     """A track's record and pictures, as in `items.jsonl`."""
 
     record: TrackInspection
-    pictures: list[FramePicture]
+    pictures: list[ReportPicture]
 
 
 def inspect_track(
