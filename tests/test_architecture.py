@@ -159,7 +159,6 @@ ALLOWED_TO_READ = {
     ("cosfly.runtime.events", "read_bytes"),  # /proc, whose files have no size
     ("cosfly.formats.png", "decompress"),  # of a picture, up to the size that its header gives
     ("cosfly.llm.protocol", "loads"),  # the reply, of a bounded size
-    ("cosfly.closed_loop.policy", "loads"),  # the answer of a process that it started, of a bounded size
     ("distill.student.random_student", "loads"),  # what the tokenizer's own library gives
     ("distill.student.checkpoint", "load_file"),  # tensors, whose checksums were compared
     ("cosfly.simulators.guard", "loads"),  # lines of the process that started it

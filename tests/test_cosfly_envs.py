@@ -1,7 +1,6 @@
 """cosfly/envs: the environments as Gymnasium has them, episodes, rewards that no cheat earns, policies that fail."""
 
 import json
-import sys
 import warnings
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,10 +10,9 @@ import numpy as np
 import pytest
 from commands import invoke
 from gymnasium.utils.env_checker import check_env
-from processes import is_running, wait_until
 
 import cosfly.envs
-from cosfly.closed_loop.policy import MOST_LATE, Policy
+from cosfly.closed_loop.policy import Policy
 from cosfly.envs.episodes import HELD_OUT, TASKS, TRAINING, read_list
 from cosfly.envs.follow import FULL_REWARD_M, NO_REWARD_M, reward_of
 from cosfly.formats.episodes import read_episode
@@ -130,7 +128,7 @@ def test_lists_are_fixed_and_their_digests_are_those_of_the_document():
 
 
 POLICIES = """
-import os, subprocess, sys, time
+import os, sys, time
 import numpy as np
 
 class Fine:
@@ -150,8 +148,6 @@ class Nothing(Fine): answer = None
 class Object(Fine): answer = {"a": 1}
 class Raises(Fine):
     def act(self, observation): raise RuntimeError("oops")
-class Dies(Fine):
-    def act(self, observation): os._exit(7)
 class Quits(Fine):
     def act(self, observation): sys.exit(3)
 class Never(Fine):
@@ -162,21 +158,6 @@ class Slow(Fine):
         while not os.path.exists("go"): time.sleep(0.01)
         return 0
 class Complex(Fine): answer = np.zeros(5, complex)
-class Pipe(Fine):
-    def act(self, observation):
-        for fd in range(3, 30):
-            try: os.write(fd, self.answer)
-            except OSError: pass
-        return 0
-class Forged(Pipe): answer = b"\\0\\0\\0\\x0b[1, [2, 3]]"
-class Mistyped(Pipe): answer = b'\\0\\0\\0\\x21["ok", ["a", "b", "c", "d", "e"]]'
-class Huge(Pipe): answer = b"\\xff" * 12
-class Closes(Fine):
-    def act(self, observation): os.closerange(3, 30); time.sleep(600)
-class Starts(Fine):
-    def __init__(self):
-        self.count = 0
-        with open("child.pid", "w") as file: file.write(str(subprocess.Popen(["sleep", "600"]).pid))
 class BadReset(Fine):
     def reset(self, goal, seed): raise ValueError("no")
 class NoAct: pass
@@ -193,14 +174,11 @@ def ask(follow, tmp_path, monkeypatch):
     def answers(name, limit_s=60.0, slow_at=None):
         policy = Policy(f"own:{name}", limit_s, 0)
         found, go = [], tmp_path / "go"
-        try:
-            for number, one in enumerate("aaaab"):
-                policy._limit_s = limit_s if number != slow_at else 0.5
-                go.touch() if number != slow_at else go.unlink()
-                found.append(policy.decide([SimpleNamespace(**vars(observation), episode=one)])[0])
-            return found
-        finally:
-            policy.close()
+        for number, one in enumerate("aaaab"):
+            policy._limit_s = limit_s if number != slow_at else 0.5
+            go.touch() if number != slow_at else go.unlink()
+            found.append(policy.decide([SimpleNamespace(**vars(observation), episode=one)])[0])
+        return found
 
     return answers
 
@@ -208,23 +186,14 @@ def ask(follow, tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "wanted"), [
     ("Token", "ok"), ("Command", "ok"), ("Word", "invalid"), ("Beyond", "invalid"), ("Seventeen", "invalid"), ("Nothing", "unreadable"), ("Object", "unreadable"), ("Raises", "none"),
-    ("Dies", "none"), ("Quits", "none"), ("Never", "late"), ("BadReset", "none"),
-    ("Complex", "unreadable"), ("Forged", "none"), ("Mistyped", "none"), ("Huge", "none"), ("Closes", "none"),
+    ("Quits", "none"), ("Never", "late"), ("BadReset", "none"), ("Complex", "unreadable"),
 ])  # fmt: skip
 def test_what_a_policy_does_is_told_as_its_answer(ask, name, wanted):
     assert [one.answer for one in ask(name, 60.0 if wanted != "late" else 0.4)] == [wanted] * 5
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
-def test_what_a_policy_started_ends_with_it(ask, tmp_path):
-    ask("Starts", 10)
-    pid = int((tmp_path / "child.pid").read_text())
-    wait_until(lambda: not is_running(pid))
-
-
 def test_a_slow_answer_is_late_once_and_the_next_ones_are_in_time(ask):
     assert [one.answer for one in ask("Slow", slow_at=1)] == ["ok", "late", "ok", "ok", "ok"]
-    assert MOST_LATE > 1
 
 
 @pytest.mark.slow
