@@ -60,7 +60,7 @@ SERVER_FAULTS = {
     "a lower image limit": (400, IMAGES, "--limit-mm-per-prompt"),
     "no vision": (500, "image input is not supported - hint: if this is unexpected, you may need to provide the mmproj",
         "--mmproj"),
-    "another model": (404, f"The model `{MODEL}` does not exist.", "check URL and model"),
+    "another model": (404, f"The model `{MODEL}` does not exist.", "correct the URL or --model"),
     "a parameter": (400, "Unsupported parameter: 'max_tokens' is not supported with this model.", "extra_body"),
     "no credit": (429, "You exceeded your current quota. insufficient_quota", "account"),
 }  # fmt: skip

@@ -183,7 +183,7 @@ def windows_of(out: Path) -> Counter[str]:
 # What is sent in place of the list of models, and what the run says; or that it goes on.
 LISTS: dict[str, tuple] = {
     "an error": (page(500, "broken"), "HTTP 500 broken"),
-    "401 that quotes the key": (page(401, "bad key sk-very-secret"), "refuses the key; got HTTP 401 bad key ***"),
+    "401 that quotes the key": (page(401, "bad key sk-very-secret"), "refuses the API key; got HTTP 401 bad key ***"),
     "names of wrong types": (page(200, json.dumps({"data": [{"id": 7}, {"id": "a\x1b[2J"}, "b", {"id": "x" * 999},
         {"id": MODEL}]})), None),
     "ten thousand models": (page(200, json.dumps({"data": [{"id": f"m{i}"} for i in range(10_000)]})),

@@ -87,7 +87,7 @@ def test_the_key_reaches_the_header_and_nothing_else(tree, tmp_path, monkeypatch
     assert {headers["authorization"] for headers in server.headers} == {"Bearer sk-very-secret-123"}
     with TeacherServer(lambda number, body: "echo_key") as server, pytest.raises(TeacherError) as caught:
         run(settings(server.url, limit=2), tree, tmp_path / "bad")
-    assert "refuses the key" in str(caught.value)
+    assert "refuses the API key" in str(caught.value)
     assert "sk-very-secret" not in str(caught.value)
     assert "***" in str(caught.value)
     assert "sk-very-secret" not in caplog.text

@@ -49,7 +49,7 @@ def test_a_table_is_read(tmp_path, caplog):
         assert_allclose(box_map.centers, [[10, 20, 4], [40, -5, 3], [25, 0, -0.15]], atol=1e-9)
         assert_allclose(box_map.half_extents, [[6, 4, 4], [2, 2, 3], [45, 3.5, 0.15]], atol=1e-9)
         assert_allclose(box_map.rotations_deg[:, 1], [30, 0, 0], atol=1e-9)
-    assert "6 to 8 m high, feet 0 to 0 m above the ground, yaw 0 to 30 degrees, 0% overlap another" in caplog.text
+    assert "6 to 8 m high, bases 0 to 0 m above the ground, yaw 0 to 30 degrees, 0% overlap another" in caplog.text
     box_map = loaded(tmp_path, PLAIN.replace("8,Vegetation,40,-5", "8,Vegetation,12,20"))
     assert "100% overlap another" in plausibility(box_map)
 
@@ -128,9 +128,9 @@ def test_all_that_is_wrong_with_a_table_is_told(tmp_path, subtests):
 def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
     for text, words in [
             (collection(feature("LineString", [[0, 0], [1, 1]], type="Walls")),
-             "feature 1: unsupported geometry LineString; expected one of Point"),
+             "feature 1: the geometry LineString is not supported; expected one of Point"),
             (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")),
-             "feature 1: invalid coordinates of a Polygon; expected at least four finite"),
+             "feature 1: the coordinates of the Polygon are invalid; expected at least four points"),
             (collection(feature("Polygon", [[[0, 0], [9, "x"], [9, 9], [0, 0]]], type="Walls")),
              "of a Polygon; expected at least four"),
             (collection(feature("Polygon", [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]], type="Buildings", height_m=3)),
@@ -147,7 +147,7 @@ def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
                     feature("Point", [5, 5], type="Vegetation", name="old oak", height_m="tall"),
                     feature("Point", [5, 5], type="house", levels=3, length_m=4, width_m=4, height_m=6),
                 ),
-                r"unknown column 'levels'.*feature 1 \(way/7\): unsupported geometry.*feature 2 \(old oak\): "
+                r"unknown column 'levels'.*feature 1 \(way/7\): the geometry .* is not supported.*feature 2 \(old oak\): "
                 r"length_m is missing, width_m is missing, height_m is not a finite number: 'tall'"
                 r".*feature 3: unknown type 'house'.*expected columns .*types .*4 to fix",
             ),
@@ -161,7 +161,7 @@ def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
 def test_a_file_is_needed_and_known_by_its_suffix(tmp_path):
     with pytest.raises(ConfigError, match=r"--set maps\.boxes\.path"):
         load(BoxesConfig())
-    with pytest.raises(InputError, match=r"expected \.json, \.csv, \.geojson"):
+    with pytest.raises(InputError, match=r"expected \.json, \.csv or \.geojson"):
         loaded(tmp_path, PLAIN, ".txt")
     with pytest.raises(ValueError, match="unknown type 'House'"):
         BoxesConfig(types={"haus": "House"})

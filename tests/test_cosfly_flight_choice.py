@@ -36,5 +36,5 @@ def test_patterns_are_of_folders_and_those_above_them(tree):
     words = r"no track of the tree matches the patterns; got Town9; .*Town01/trajectory_1777083733/ORI"
     with pytest.raises(InputError, match=words):
         names(tree, match=("Town9",))
-    with pytest.raises(InputError, match="no track of the tree is of the chosen kind; got perturbed"):
+    with pytest.raises(InputError, match="the tree has no track of the chosen kind; got perturbed"):
         names(tree, match=("*/ORI",), tracks=("perturbed",))

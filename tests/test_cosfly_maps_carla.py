@@ -103,7 +103,7 @@ def test_what_is_odd_is_left_out_counted_and_told(caplog):
     reach = 4.0 * np.cos(np.radians(30)) + 3.0 * np.sin(np.radians(30))
     assert house.maxs[0, 0] == pytest.approx(10.0 + reach), "corners after the turn"
     assert header.ground_z_m == pytest.approx(0.1), "the road's top"
-    for words in ("no objects of Train, Bus", "'huge': 2", "1 objects repeated an id", "2 of 3 points on roads"):
+    for words in ("no objects with the labels Train, Bus", "huge 2", "1 objects had the id", "2 of 3 points on roads"):
         assert words in caplog.text
 
 

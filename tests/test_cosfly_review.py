@@ -92,5 +92,5 @@ def test_the_command_decides_and_says_what_is_open(product):
     assert ask("--accept", first).exit_code == 2, "who, and why?"
     done = ask("--accept", first, "--accept", second, "--reject", third, "--by", "Bo", "--reason", "steady")
     assert done.exit_code == 0, done.output
-    assert "4 flights in review: 2 accepted, 1 rejected, 1 open" in done.output
+    assert "4 tracks in review: 2 accepted, 1 rejected, 1 open" in done.output
     assert ask().output == done.output

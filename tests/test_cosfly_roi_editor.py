@@ -144,5 +144,5 @@ def test_only_our_own_page_is_answered(map_file, tmp_path):
         assert read_roi(out).points_world == [(10, 10), (90, 10), (90, 70), (10, 70)]
         out.write_text(json.dumps({"points_world": SQUARE[:3]}))
         status, said = asked(server, "POST", f"{ours}save", body)
-        assert (status, b"changed by somebody else" in said) == (400, True)
+        assert (status, b"another program changed the file" in said) == (400, True)
         assert len(read_roi(out).points_world) == 3

@@ -107,7 +107,7 @@ def test_a_dying_worker_loses_no_other_item_and_leaves_the_stage_open(tmp_path):
     payloads = [("keep", k) for k in range(5)]
     payloads[2] = ("die", 0)
     stage = _stage(tmp_path / "s")
-    with pytest.raises(EnvironmentMissing, match=r"1 of 5 items without an outcome.*fewer --workers"):
+    with pytest.raises(EnvironmentMissing, match=r"1 of 5 items without a result.*fewer --workers"):
         run_items(stage, _items(*payloads), make_worker, (tmp_path / "log",), workers=2)
     assert sorted(r["id"] for r in stage.journal.read() if r["status"] == "kept") == ["i0", "i1", "i3", "i4"]
     assert not _stage(tmp_path / "s").is_complete
@@ -164,14 +164,14 @@ def test_an_item_that_never_ends_has_failed_and_the_others_are_done(tmp_path, ca
     assert finished.tally.model_dump()["failed"] == {"timed_out": 1}
     failure = next(record for record in finished.records if isinstance(record, Failed))
     assert "finished no step within its time limit, 3 times" in failure.message
-    assert caplog.text.count("it is tried again") >= 2
+    assert caplog.text.count("cosfly tries the item again") >= 2
     assert not list((tmp_path / "s").glob(".*.partial"))
 
 
 def test_workers_that_die_all_the_time_end_the_stage(tmp_path):
     kinds = ["nothing"] + ["die"] * 30
     with pytest.raises(
-        EnvironmentMissing, match=r"die or stall again and again.*3 workers lost, 1 items done.*item_limit_s"
+        EnvironmentMissing, match=r"worker processes died or stalled.*3 workers lost, 1 items done.*item_limit_s"
     ):
         work_on(tmp_path, kinds, workers=1, watch=Watch(restarts=1))
     assert [record.id for record in stage_in(tmp_path).items()] == ["i0"]

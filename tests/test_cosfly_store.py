@@ -125,7 +125,7 @@ def test_other_settings_and_inputs_are_named(tmp_path):
     ):
         with pytest.raises(ResumeError, match=words):
             _open(out, inputs=inputs, **changes)
-        with pytest.raises(ResumeError, match="already holds work"):
+        with pytest.raises(ResumeError, match="already contains results"):
             _open(out, inputs=inputs, **changes, resume="never")
     write_json(source, 2)
     with pytest.raises(ResumeError, match="the input map"):
@@ -158,7 +158,7 @@ def test_a_folder_in_which_another_process_works_is_refused(tmp_path, held_by_an
     out = tmp_path / "out"
     _open(out).journal.append({"id": "a", "status": "kept"})
     with held_by_another(out):
-        with pytest.raises(ResumeError, match="another process is at work"):
+        with pytest.raises(ResumeError, match="another cosfly process uses"):
             _open(out)
         assert (out / ".lock").exists()
     assert not _open(out).is_complete  # the other was killed: what it left behind holds nobody up

@@ -101,7 +101,7 @@ def test_what_a_prompt_says_there_is_none_of_is_not_there():
 
 @each("prompt", ["asdf qwer zxcv", "一个带喷泉的小村庄", "42"])
 def test_a_prompt_of_which_nothing_can_be_read_is_refused_in_words(prompt):
-    with pytest.raises(InputError, match=r"planner without a model knows no word.*expected English.*--planner URL"):
+    with pytest.raises(InputError, match=r"rule-based planner recognises no word.*expected an English.*--planner URL"):
         by_rules(prompt)
 
 

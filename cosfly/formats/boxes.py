@@ -17,7 +17,7 @@ from cosfly.formats.kinds import GROUND_KINDS, KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.formats.meshes import Meshes, MeshRef
 from cosfly.geometry.axes import axis_aligned_half_extents
 from cosfly.geometry.ground import Ground
-from cosfly.runtime.errors import InputError, nearest
+from cosfly.runtime.errors import InputError, json_type, nearest
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import MISSING, FileFormat, Record, check_schema, dump_json, read_json, validated
 
@@ -216,7 +216,7 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
     check("extent", half, half >= 0, "the box has a negative extent", "half sizes of at least 0 m")
     unknown = [int(kind) for kind in np.unique(box_map.kinds) if int(kind) not in KIND_NAMES]
     if unknown:
-        expected = f"{min(KIND_NAMES)} to {max(KIND_NAMES)}"
+        expected = f"an id from {min(KIND_NAMES)} to {max(KIND_NAMES)}"
         raise InputError("the semantic id is unknown", where=where, got=str(unknown[0]), expected=expected)
     ids, counts = np.unique(box_map.ids, return_counts=True)
     if (counts > 1).any():
@@ -333,7 +333,7 @@ def read_boxes(path: Path) -> BoxMap:
             raise InputError(
                 "the field is not a list of boxes",
                 where=f"{path}: boxes",
-                got=type(records).__name__,
+                got=json_type(records),
                 expected="a list",
             )
     if not records:
@@ -379,7 +379,7 @@ def _check_computed(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, 
         bad = _first_row(differs)
         if bad is not None:
             raise InputError(
-                "the corner does not follow from center, extent and rotation",
+                "the corner does not match center, extent and rotation of the box",
                 where=f"{path}: box {boxes[bad].id}: {name}",
                 got=str(file_corners[bad].tolist()),
                 expected=str(rounded(corners[bad])),

@@ -10,7 +10,7 @@ import numpy as np
 from cosfly.formats.columns import as_columns, column, columns, read_items, records, rounded, text_id, write_items
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.json_io import FileFormat
 
 BYSTANDERS_FILE = "others.json"
@@ -86,7 +86,10 @@ class Bystander:
         kind = record.get("kind")
         if not isinstance(kind, str) or kind not in BUILDS:
             raise InputError(
-                "the kind is unknown", where=f"{where}.kind", got=repr(kind)[:60], expected=" or ".join(BUILDS)
+                "the kind of the bystander is unknown",
+                where=f"{where}.kind",
+                got=shown(kind),
+                expected=" or ".join(BUILDS),
             )
         positions_m = columns(record, "xyz", where)
         yaw = column(record, "yaw", where, len(positions_m))
@@ -108,7 +111,8 @@ class Bystanders:
         entries = records(record, "others", where)
         bystanders = [Bystander.from_json(entry, f"{where}.others[{i}]") for i, entry in enumerate(entries)]
         if len({len(bystander.positions_m) for bystander in bystanders}) > 1:
-            raise InputError("the columns differ in length", where=f"{where}.others")
+            expected = "the same number of positions for each bystander"
+            raise InputError("the columns differ in length", where=f"{where}.others", expected=expected)
         return cls(text_id(record, where), bystanders)
 
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from cosfly.geometry.axes import step_s
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.json_io import MISSING, FileFormat, check_schema, read_json, write_json
 
 Item = TypeVar("Item")
@@ -59,7 +59,7 @@ def text_id(record: dict, where: str) -> str:
     if value is None:
         raise InputError(MISSING, where=f"{where}.id", expected="text")
     if not isinstance(value, str):
-        raise InputError("the id is not text", where=f"{where}.id", got=repr(value)[:60], expected="text")
+        raise InputError("the id is not text", where=f"{where}.id", got=shown(value), expected="text")
     return value
 
 
@@ -80,11 +80,11 @@ def numbers(value: Any, *shape: int | None) -> np.ndarray | None:
 def column(record: dict, name: str, where: str, *shape: int | None) -> np.ndarray:
     """Read numbers of a shape, in which None is any length but 0; raises InputError for anything else."""
     shape_text = str(tuple("n" if side is None else side for side in shape)).replace("'", "")
-    expected = f"finite numbers of shape {shape_text}" + (", n at least 1" if None in shape else "")
+    expected = f"finite numbers of shape {shape_text}" + (" with n of at least 1" if None in shape else "")
     values = numbers(record.get(name), *shape)
     if values is None or len(values) == 0:
-        what = "the column has the wrong form" if name in record else MISSING
-        got = repr(record[name])[:60] if name in record else None
+        what = "the column has the wrong shape or content" if name in record else MISSING
+        got = shown(record[name]) if name in record else None
         raise InputError(what, where=f"{where}.{name}", got=got, expected=expected)
     return values
 

@@ -50,7 +50,9 @@ def features_of(value: Any, path: Path) -> list[Feature]:
         raise InputError("this file is not GeoJSON", where=f"{path}: type", expected=expected)
     items = value.get("features") if value["type"] == "FeatureCollection" else [value]
     if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
-        raise InputError("the file has no list of features", where=f"{path}: features", expected="a list of Feature")
+        raise InputError(
+            "the file has no list of features", where=f"{path}: features", expected="a list of Feature objects"
+        )
     return [_feature(item, number) for number, item in enumerate(items, 1)]
 
 
@@ -68,13 +70,13 @@ def _feature(item: dict[str, Any], number: int) -> Feature:
         geometry = {}
     kind = geometry.get("type")
     if kind not in GEOMETRIES:
-        problem = f"unsupported geometry {str(kind)[:MOST_NAME]}; expected one of {', '.join(GEOMETRIES)}"
+        problem = f"the geometry {str(kind)[:MOST_NAME]} is not supported; expected one of {', '.join(GEOMETRIES)}"
         return Feature(where, properties, [], problem)
     parts = _parts(kind, geometry.get("coordinates"))
     if parts is not None:
         return Feature(where, properties, parts)
-    expected = "one finite [x, y]" if kind == "Point" else "at least four finite [x, y], the last equal to the first"
-    return Feature(where, properties, [], f"invalid coordinates of a {kind}; expected {expected}")
+    expected = "one point [x, y]" if kind == "Point" else "at least four points [x, y], the last equal to the first"
+    return Feature(where, properties, [], f"the coordinates of the {kind} are invalid; expected {expected}")
 
 
 def _parts(kind: str, coordinates: Any) -> list[list[np.ndarray]] | None:

@@ -129,7 +129,7 @@ def read_inspection(path: Path) -> Inspection:
     inspection = read_model(path, Inspection, INSPECT_FORMAT)
     counts = Counter(flight.folder for flight in inspection.flights)
     if repeated := [folder for folder, count in counts.items() if count > 1]:
-        expected = "one record for each folder of a track"
+        expected = "one record for each track folder"
         raise InputError("a track has two records", where=f"{path}: flights", got=repeated[0], expected=expected)
     return inspection
 
@@ -212,9 +212,9 @@ def summary(inspected: Path) -> str:
     verdicts = [decisions[folder].verdict for folder in queue if folder in decisions]
     waiting = [folder for folder in queue if folder not in decisions]
     counts = f"{verdicts.count('accepted')} accepted, {verdicts.count('rejected')} rejected, {len(waiting)} open"
-    text = f"{len(queue)} flights in review: {counts}"
+    text = f"{len(queue)} tracks in review: {counts}"
     if num_others := len(decisions.keys() - set(queue)):
-        text += f"; {num_others} others rejected"
+        text += f"; {num_others} other tracks rejected"
     if waiting:
         text += f" ({', '.join(waiting[:3])}{', ...' if len(waiting) > 3 else ''})"
     return text
@@ -273,6 +273,6 @@ def _chosen(choice: Choice, tracks: list[TrackInspection], inspected: Path) -> l
     results = ("review",) if choice.verdict == "accepted" else ("review", "accepted")
     chosen = tracks_of_name or [track for track in of_trajectory if track.result in results] or of_trajectory
     if not chosen:
-        expected = f"the folder of a track or of a trajectory, as {', '.join(_folders_in_review(tracks)[:3])}"
+        expected = f"the folder of a track or of a trajectory, such as {', '.join(_folders_in_review(tracks)[:3])}"
         raise InputError("the inspection has no such track", where=inspected, got=choice.folder, expected=expected)
     return chosen

@@ -95,7 +95,9 @@ def read_meshes(path: Path, *, tree: Path) -> dict[str, Mesh]:
     try:
         meshes = readers[path.suffix.lower()](data, _Folder(path, tree))
     except NOT_READ as error:
-        raise InputError("the mesh is malformed", where=path, got=f"{type(error).__name__}: {error}"[:120]) from None
+        raise InputError(
+            "the mesh file cannot be parsed", where=path, got=f"{type(error).__name__}: {error}"[:120]
+        ) from None
     if not any(map(len, meshes.values())):
         raise InputError("the mesh has no triangles", where=path)
     for name, mesh in meshes.items():
@@ -112,7 +114,7 @@ def read_meshes(path: Path, *, tree: Path) -> dict[str, Mesh]:
 
 def _read_glb(data: bytes, folder: _Folder) -> dict[str, Mesh]:
     if struct.unpack_from("<II", data.ljust(20)) != (GLB_MAGIC, 2):
-        raise InputError("this file is not a binary glTF 2.0", where=folder.path)
+        raise InputError("this file is not a binary glTF 2.0 file", where=folder.path)
     chunks: dict[int, bytes] = {}
     end = GLB_HEADER_BYTES
     while end + 8 <= len(data):
@@ -148,8 +150,13 @@ def _read_gltf(data: bytes, folder: _Folder, binary: bytes = b"") -> dict[str, M
     counts = [*(accessors[k]["count"] for k in used), *(view["byteLength"] for view in views)]
     most = int(MOST_NUMBERS + FILE_MB * MB)
     if min(counts, default=0) < 0 or sum(counts) > most:
-        expected = f"counts from 0 to {most:,} in all"
-        raise InputError("the mesh has too many numbers", where=folder.path, got=f"{sum(counts):,}", expected=expected)
+        expected = f"counts of at least 0 and a sum of at most {most:,}"
+        raise InputError(
+            "the counts of the mesh are negative or too large",
+            where=folder.path,
+            got=f"{sum(counts):,}",
+            expected=expected,
+        )
     read_buffer = functools.cache(lambda uri: _buffer(uri, binary, folder))  # several buffers may name one file
     buffers = {str(k): read_buffer(b.get("uri")) for k, b in enumerate(document.get("buffers", ()))}
     flat_document = {
@@ -314,8 +321,8 @@ class Meshes:
             nodes = nodes_by_file.get(ref.file, self.made)
             if ref.node is not None and ref.node not in nodes:
                 raise InputError(
-                    "the mesh has no such node",
-                    where=f"{ref.file}, which box {box_id} names",
+                    "the mesh file has no node of this name",
+                    where=f"box {box_id}: {ref.file}",
                     got=ref.node[:80],
                     expected=", ".join(list(nodes)[:8]),
                 )

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.formats.columns import as_columns, column, columns, read_items, rounded, step_field, text_id, write_items
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.json_io import FileFormat
 from cosfly.runtime.seeding import draw_to_quota, rng_for
 
@@ -79,9 +79,7 @@ def pace_of(record: dict, where: str) -> str:
     """Read the pace of a record, PLAIN_PACE where it names none."""
     pace = record.get("pace", PLAIN_PACE)
     if not isinstance(pace, str):
-        raise InputError(
-            "the pace is not text", where=f"{where}.pace", got=repr(pace)[:60], expected="the name of a pace"
-        )
+        raise InputError("the pace is not text", where=f"{where}.pace", got=shown(pace), expected="the name of a pace")
     return pace
 
 

@@ -121,7 +121,9 @@ class Goal:
     def __post_init__(self) -> None:
         in_order = tuple(term for term in GOAL_TERMS if term in self.says)
         if self.says != in_order or not {*self.says} & {*GARMENT_TERMS}:
-            raise ValueError(f"says must be some of {', '.join(GOAL_TERMS)}, in this order, and at least one garment")
+            raise ValueError(
+                f"says must list some of {', '.join(GOAL_TERMS)}, in this order, with at least one garment"
+            )
 
 
 def read_goal(record: Any, num_frames: int, where: str) -> Goal:

@@ -39,7 +39,7 @@ from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import mirror_poses, step_s
 from cosfly.geometry.motion import PlannedMotion, without_perturbation
 from cosfly.runtime.arrays import check_pixels
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import InputError, json_type, shown
 from cosfly.runtime.io import read_bytes
 from cosfly.runtime.json_io import MISSING, read_object, validated, write_json
 
@@ -359,7 +359,7 @@ class _FieldReader:
         self.issues: list[str] = []
 
     def error(self, message: str, where: str, got: object, expected: str) -> InputError:
-        if str(got) in ("None", "NoneType"):
+        if got == "null":
             return InputError(MISSING, where=f"{self.path}: {where}", expected=expected)
         return InputError(message, where=f"{self.path}: {where}", got=str(got), expected=expected)
 
@@ -369,7 +369,7 @@ class _FieldReader:
         self.issues.append(str(error))
 
     def issue(self, where: str, got: object, expected: str) -> None:
-        self.note(self.error("the field breaks the layout of the playback tree", where, got, expected))
+        self.note(self.error("the field does not follow the layout of the playback tree", where, got, expected))
 
     def optional(self, read: Callable[[], Value]) -> Value | None:
         """Return an optional field; record an issue and return None if its content is invalid."""
@@ -381,12 +381,12 @@ class _FieldReader:
 
     def equal(self, where: str, got: object, expected: object) -> None:
         if got != expected:
-            self.issue(where, repr(got), repr(expected))
+            self.issue(where, shown(got), shown(expected))
 
     def points(self, raw: dict) -> list[dict]:
         points = raw.get("points", None if self.strict else raw.get("waypoints"))
         if not isinstance(points, list) or not points or not all(isinstance(p, dict) for p in points):
-            raise self.error("the field is not a list of objects", "points", type(points).__name__, "a list of objects")
+            raise self.error("the field is not a list of objects", "points", json_type(points), "a list of objects")
         for i, point in enumerate(points):
             self.equal(f"points[{i}].index", point.get("index"), i)
         return points
@@ -417,7 +417,7 @@ class _FieldReader:
         if value is None and name in ("pitch", "roll") and not self.strict:
             return 0.0
         if value is None or not is_number(value):
-            raise self.error("the field is not a number", f"{where}.{name}", repr(value)[:60], "a finite number")
+            raise self.error("the field is not a number", f"{where}.{name}", shown(value), "a finite number")
         return float(value)
 
     def poses(self, points: list[dict]) -> np.ndarray:
@@ -436,7 +436,7 @@ class _FieldReader:
                 expected = "null at the last point"
                 is_right = waypoint is None
             if not is_right:
-                self.issue(f"points[{i}].nav_waypoint.t1_world", repr(waypoint)[:60], expected)
+                self.issue(f"points[{i}].nav_waypoint.t1_world", shown(waypoint), expected)
                 break  # one issue per file
         return poses
 
@@ -447,7 +447,9 @@ class _FieldReader:
         poses = numbers([point.get("between") for point in points[:-1]], None, None, len(POSE))
         if poses is None:
             self.issue(
-                "points[].between", "other values", "the same number of poses, of 6 finite numbers each, at each point"
+                "points[].between",
+                "lists of other forms",
+                "as many poses at each point, of 6 finite numbers each",
             )
             return None
         return np.concatenate([mirror_poses(poses), np.full((1, *poses.shape[1:]), np.nan)])
@@ -460,11 +462,11 @@ class _FieldReader:
         matrix = numbers(group.get("intrinsic"), 3, 3)
         if width < 1 or height < 1:
             got, expected = f"{width:g} x {height:g} px", "at least 1 x 1 px"
-            raise self.error("the pictures of the camera have no size", "camera", got, expected)
+            raise self.error("the picture size of the camera is not positive", "camera", got, expected)
         if matrix is None or matrix[0, 0] <= 0:
-            got = repr(group.get("intrinsic"))[:60]
+            got = shown(group.get("intrinsic"))
             expected = "a 3x3 matrix with a positive focal length"
-            raise self.error("the camera has no usable matrix", "camera.intrinsic", got, expected)
+            raise self.error("the intrinsic matrix of the camera is invalid", "camera.intrinsic", got, expected)
         check_pixels(width * height, f"{self.path}: camera", f"{width:g} x {height:g} px")
         return Camera(int(width), int(height), matrix)
 

@@ -49,7 +49,7 @@ def parse_png(data: bytes | memoryview, where: object) -> Png:
     except UNPACK_ERROR as error:
         raise _broken(where, f"a damaged compressed stream: {error}") from None
     if len(raw) != height * stride or not unpacker.eof:
-        raise _broken(where, "a compressed stream with another number of bytes than the picture")
+        raise _broken(where, f"a compressed stream whose length does not match {width} x {height} px")
     lines = np.frombuffer(raw, np.uint8).reshape(height, stride)
     if (lines[:, 0] > PAETH).any():
         raise _broken(where, "a row with an unknown filter")
@@ -124,7 +124,9 @@ def _packed(data: memoryview) -> bytes:
 
 
 def _broken(where: object, got: str) -> InputError:
-    return InputError("the image cannot be decoded", where=str(where), got=got, expected="a complete PNG")
+    return InputError(
+        "the image cannot be decoded", where=str(where), got=got, expected="a complete PNG file with 8 bits per channel"
+    )
 
 
 def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, bytes]:

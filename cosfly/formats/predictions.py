@@ -42,6 +42,8 @@ def read_predictions(path: Path) -> list[Prediction]:
     lines = model_lines(path, Prediction, what="predictions", fix="run cosfly distill infer first")
     for number, (_, prediction) in enumerate(lines, 1):
         if prediction.key in predictions:
-            raise InputError("the file has two predictions for a sample", where=f"{path}:{number}", got=prediction.key)
+            raise InputError(
+                "the file has two predictions for the same sample", where=f"{path}:{number}", got=prediction.key
+            )
         predictions[prediction.key] = prediction
     return list(predictions.values())

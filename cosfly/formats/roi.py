@@ -62,7 +62,7 @@ class Roi(RoiPolygon):
                     where=f"{where}: {name}",
                     got=got,
                     expected=expected,
-                    fix="draw the region on this map: cosfly roi edit",
+                    fix="draw the region on this map with cosfly roi edit",
                 )
 
 
@@ -116,7 +116,9 @@ def _polygons_of(features: list[Feature], path: Path) -> list[dict[str, Any]]:
         for rings in feature.parts:
             spread = np.ptp(rings[0], axis=0).max()
             if len(rings[0]) < 4 or spread < SMALLEST_M:
-                problems.append(f"{feature.where}: {len(rings[0])} points within {spread:.3g} m are not a region")
+                problems.append(
+                    f"{feature.where}: {len(rings[0])} points within {spread:.3g} m are too few or too close"
+                )
             points, *holes = (ring[:-1].tolist() for ring in rings)
             polygons.append({"points_world": points, "holes": holes})
     if problems:

@@ -27,7 +27,7 @@ def find_tracks(root: Path, choice: TrackChoice = ALL_TRACKS) -> list[Path]:
             where=root,
             got="no trajectory.json below the folder",
             expected="Town*/trajectory_*/ORI/trajectory.json",
-            fix="check --data",
+            fix="pass the folder of a playback tree with --data",
         )
     matching = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
     if not matching:
@@ -36,14 +36,14 @@ def find_tracks(root: Path, choice: TrackChoice = ALL_TRACKS) -> list[Path]:
             where=root,
             got=", ".join(choice.match),
             expected=f"a pattern for folders such as {folders[0].relative_to(root).as_posix()}",
-            fix="check --flights",
+            fix="change --flights",
         )
     if len(choice.tracks) == len(TRACKS):
         return matching
     chosen = [folder for folder in matching if track_of(folder) in choice.tracks]
     if not chosen:
         got = ", ".join(choice.tracks)
-        raise InputError("no track of the tree is of the chosen kind", where=root, got=got, fix="check --tracks")
+        raise InputError("the tree has no track of the chosen kind", where=root, got=got, fix="change --tracks")
     return chosen
 
 
@@ -69,7 +69,10 @@ def read_twin(track: Track) -> Track | None:
     has_same_times = len(twin) == len(track) and np.abs(twin.time_s - track.time_s).max() < TWIN_TOLERANCE_S
     if not twin.is_original:
         raise VerifyError(
-            "the clean track's folder holds a perturbed track", where=twin.folder, got="is_original false"
+            "the clean track's folder holds a perturbed track",
+            where=twin.folder,
+            got="is_original false",
+            expected="is_original true",
         )
     if not has_same_times:
         raise VerifyError(

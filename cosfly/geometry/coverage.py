@@ -49,9 +49,9 @@ class Axis:
 
 
 AXES = {
-    "height_m": Axis("height over the person's ground", "m", 0.0, 2.0, 50),
+    "height_m": Axis("height above the ground under the person", "m", 0.0, 2.0, 50),
     "distance_m": Axis("distance to the person", "m", 0.0, 2.0, 50),
-    "azimuth_deg": Axis("where the drone stands round the walker: 0 in front, 90 to the left", "deg", -180.0, 15.0, 24),
+    "azimuth_deg": Axis("direction from the person to the drone: 0 in front, 90 to the left", "deg", -180.0, 15.0, 24),
     "target_height_px": Axis("height of the person in the picture", "px", 0.0, 4.0, 50),
     "visibility": Axis("visible share of the person", "", 0.0, 0.05, 20),
 }

@@ -137,7 +137,7 @@ def assign_splits(
     *,
     too_few: Literal["refuse", "fill"],
     what: str = "pedestrian trajectories",
-    fix: str = "give more of them, or set a fraction to 0",
+    fix: str = "provide more of them, or set the fraction of a split to 0",
 ) -> dict[str, Split]:
     """Assign groups to splits: group -> split.
 
@@ -154,9 +154,9 @@ def assign_splits(
     if len(ranked) < len(requested):
         if too_few == "refuse" or not ranked:
             raise InputError(
-                f"there are too few {what}, because each belongs to one split only",
+                f"there are too few {what} for the splits, because each belongs to one split only",
                 got=f"{len(ranked)} {what}",
-                expected=f"{len(requested)} or more, one for each of {', '.join(requested)}",
+                expected=f"at least {len(requested)}, one for each of {', '.join(requested)}",
                 fix=fix,
             )
         return dict(zip(ranked, requested, strict=False))

@@ -174,15 +174,17 @@ class AnswerBook:
 class BudgetConfig(Config):
     """Limits over all runs into one folder, including the tokens of a judge."""
 
-    price_prompt: float = Field(0.0, ge=0, description="price of a million prompt tokens, in your currency")
-    price_completion: float = Field(0.0, ge=0, description="price of a million answer tokens, in your currency")
+    price_prompt: float = Field(0.0, ge=0, description="price of one million prompt tokens, in your currency")
+    price_completion: float = Field(0.0, ge=0, description="price of one million answer tokens, in your currency")
     max_cost: float | None = Field(None, gt=0, description="stop before this cost is exceeded; empty: no limit")
     max_tokens: int | None = Field(None, ge=1, description="stop before this many tokens are exceeded; empty: no limit")
 
     @model_validator(mode="after")
     def _priced(self) -> Self:
         if self.max_cost is not None and self.price_prompt == self.price_completion == 0:
-            raise ValueError("max_cost needs price_prompt or price_completion: without a price the cost is always 0")
+            raise ValueError(
+                "max_cost needs price_prompt or price_completion, because without a price the cost is always 0"
+            )
         return self
 
     def cost(self, prompt_tokens: float, completion_tokens: float) -> float:
@@ -250,11 +252,11 @@ class Budget:
         totals = self.totals
         tokens = totals["prompt_tokens"] + totals["completion_tokens"]
         if self.cfg.max_tokens is not None and tokens + prompt + completion > self.cfg.max_tokens:
-            problem = f"{tokens:,} of at most {self.cfg.max_tokens:,} tokens are used"
-            return BudgetSpent(problem, where="budget.max_tokens", fix="raise the limit")
+            problem = f"the next request may exceed the limit: {tokens:,} of {self.cfg.max_tokens:,} tokens are used"
+            return BudgetSpent(problem, where="budget.max_tokens", fix="raise the limit and run the same command again")
         if self.cfg.max_cost is not None and self.spent + self.cfg.cost(prompt, completion) > self.cfg.max_cost:
-            problem = f"{self.spent:.4f} of at most {self.cfg.max_cost:g} are spent"
-            return BudgetSpent(problem, where="budget.max_cost", fix="raise the limit")
+            problem = f"the next request may exceed the limit: {self.spent:.4f} of {self.cfg.max_cost:g} is spent"
+            return BudgetSpent(problem, where="budget.max_cost", fix="raise the limit and run the same command again")
         return None
 
     def note(self, usage: Usage | None, where: str, num_pictures: int = 0) -> None:
@@ -299,7 +301,7 @@ class KeptAnswers:
             if recorded is not None and not (is_retried and recorded.finish_reason == CONTEXT_FULL):
                 return recorded.reply
             if self.only is not None and not is_retried:
-                raise NoAnswer("not_asked", "this run asks about other windows only")
+                raise NoAnswer("not_asked", "this run sends requests for other windows only")
             async with self.budget.request(num_pictures) if self.budget else contextlib.nullcontext():
                 start_s = time.monotonic()
                 reply = await engine.answer(request)

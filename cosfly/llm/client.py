@@ -43,15 +43,23 @@ _tls = functools.cache(httpx.create_ssl_context)  # certificates are read once: 
 
 
 class EndpointConfig(Config):
-    model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
+    model: str | None = Field(None, description="name of the model; empty: the endpoint's only model")
     temperature: float = Field(0.6, ge=0, le=2, description="sampling temperature; 0 is greedy")
     top_p: ClassVar[float] = 0.95  # nucleus sampling; extra_body may set another
     max_tokens: int = Field(1024, ge=64, description="longest answer, tokens")
-    concurrency: MayDiffer[int] = Field(16, ge=1, le=4096, description="most requests in flight; fewer when it is busy")
-    timeout_s: MayDiffer[float] = Field(120.0, gt=0, description="limit of one request, first byte to last")
-    max_tries: MayDiffer[int] = Field(6, ge=1, description="tries of one request when the server is busy or fails")
+    concurrency: MayDiffer[int] = Field(
+        16, ge=1, le=4096, description="most requests in flight; fewer while the server is busy"
+    )
+    timeout_s: MayDiffer[float] = Field(
+        120.0, gt=0, description="time limit of one request, from first to last byte, s"
+    )
+    max_tries: MayDiffer[int] = Field(
+        6, ge=1, description="most attempts at one request if the server is busy or fails"
+    )
     json_schema: bool = Field(True, description="ask the server to enforce the answer's JSON schema")
-    extra_body: dict[str, Any] = Field({}, description="further fields, as chat_template_kwargs; null removes a field")
+    extra_body: dict[str, Any] = Field(
+        {}, description="further fields of a request, such as chat_template_kwargs; a null value removes one"
+    )
 
     def request(self, messages: list[dict], digests: list[str], schema: dict, seed: int) -> Request:
         """Return a request with these sampling settings; a null in `extra_body` removes a field."""
@@ -128,7 +136,7 @@ class ChatClient:
             raise TeacherError(
                 "the API key contains a character that an HTTP header must not contain, such as a line break",
                 where=KEY_VARIABLE,
-                fix="check the environment variable",
+                fix="set this environment variable to the key alone",
             )
         self._free = [self._connect()]
         self._jitter = random.Random()  # for retry pauses only: no product depends on it
@@ -167,7 +175,7 @@ class ChatClient:
             if self.troubles.failed(failure.detail):
                 action = "giving up" if is_last or is_late else "trying again"
                 count = self.troubles.num
-                log.warning("%s: %s; %s, failed tries so far: %d", self.where, failure.detail, action, count)
+                log.warning("%s: %s; %s, failed attempts so far: %d", self.where, failure.detail, action, count)
             if is_last:
                 raise failure
             if is_late:
@@ -201,7 +209,11 @@ class ChatClient:
             refused_schema = error.refusal
         _, reply = await self.ask_once(request, None)
         if self._asks_for_schema:
-            log.warning("%s: refuses a JSON schema (%s); asking without one", self.where, refused_schema.summary)
+            log.warning(
+                "%s: the server refuses a JSON schema (%s); requests are sent without one",
+                self.where,
+                refused_schema.summary,
+            )
             self._asks_for_schema = False
         return reply
 
@@ -227,7 +239,7 @@ class ChatClient:
             is_long = wait_s is not None and wait_s > TOTAL_TIMEOUT_S
             if refusal.status in BUSY_STATUS:
                 self.concurrency.was_busy(sent_s, None if is_long else wait_s)
-            asked = f" (asks to wait {wait_s:.0f} s)" if is_long else ""
+            asked = f" (the server asks to wait {wait_s:.0f} s)" if is_long else ""
             return NoAnswer(f"http_{refusal.status}", refusal.summary + asked, wait_s=wait_s)
         return NoAnswer(refusal.code, refusal.summary, fix=refusal.meaning.fix, is_final=True)
 
@@ -256,7 +268,7 @@ class ChatClient:
         try:
             response = await self._exchange("models")
         except (TimeoutError, httpx.RequestError) as error:
-            fix = "start the server or check its address"
+            fix = "start the server, or correct its address"
             raise self._error("cannot reach the teacher", got=self.message_of(error), fix=fix) from None
         if response.status in (401, 403):
             raise self._refused(self._refusal(response), 0.0, None)
@@ -270,13 +282,13 @@ class ChatClient:
             self.model = wanted  # some hosts list no models; the first request shows whether it exists
         elif entries is None:
             what = "the server does not return a list of models, so it may not be an OpenAI-compatible endpoint"
-            raise self._error(what, got=self._refusal(response).summary, fix="check the URL, or set --model")
+            raise self._error(what, got=self._refusal(response).summary, fix="correct the URL, or pass --model")
         elif not names:
-            raise self._error("the endpoint lists no model with a usable name", fix="set --model")
+            raise self._error("the endpoint lists no model with a usable name", fix="pass --model")
         else:
             what = "the endpoint does not have this model" if wanted else "the endpoint has several models"
             got = wanted or f"{len(names)} models"
-            raise self._error(what, got=got, expected=f"one of {', '.join(names[:8])}", fix="set --model")
+            raise self._error(what, got=got, expected=f"one of {', '.join(names[:8])}", fix="pass --model")
 
     # --- responses ---
 
@@ -366,5 +378,5 @@ class ChatClient:
                 "the proxy or the certificates cannot be used",
                 where="HTTPS_PROXY, ALL_PROXY, SSL_CERT_FILE",
                 got=type(error).__name__,
-                fix="check these environment variables",
+                fix="correct these environment variables, or unset them",
             ) from None

@@ -40,7 +40,7 @@ def check_url(url: str) -> None:
     is_host = parts.scheme in ("http", "https") and parts.host and "%" not in parts.host
     is_port = parts.port is None or 0 < parts.port < 65_536
     if not (is_host and is_port) or re.search(r"[\s\x00-\x1f\x7f]", url):
-        problem = "the URL must have http:// or https://, a host name, a port below 65536 if any, and no spaces"
+        problem = "the URL must start with http:// or https:// and have a host name, no spaces, and no port above 65535"
         raise ValueError(f"{problem}{got}")
 
 

@@ -46,7 +46,7 @@ MEANINGS: dict[Kind, Meaning] = {
         r"|max_num_tokens|session max length|max length exceeded|model token limit|too many tokens",
     ),
     "num_images": Meaning(
-        "the server takes fewer or smaller pictures than the prompts hold",
+        "the prompts have more or larger pictures than the server accepts",
         f"raise the limit (vLLM: --limit-mm-per-prompt), or {SMALLER}",
         True,
         r"at most \d+ (image|item)|too many images|image count \d+ exceeds|\d+ images, exceeding|too much media"
@@ -54,7 +54,7 @@ MEANINGS: dict[Kind, Meaning] = {
         r"|limit-mm-per-prompt|images? exceeds? max",
     ),
     "no_vision": Meaning(
-        "the model or its server takes no pictures",
+        "the model or its server does not accept pictures",
         "serve a vision model (llama.cpp: with --mmproj)",
         True,
         r"not a multimodal model|mmproj|image input is not supported|(does|do)( not|n't) support (image|vision"
@@ -80,17 +80,19 @@ MEANINGS: dict[Kind, Meaning] = {
     ),
     "content": Meaning(
         "the server's filter refuses the content",
-        "check the window, or use another server",
+        "look at the pictures of the window, or use another server",
         False,
         r"content[_ ](filter|management policy|policy)|data_?inspection|inappropriate content|safety|moderation"
         r"|flagged",
     ),
-    "unknown": Meaning("the server refuses the request", "check the server", False),
+    "unknown": Meaning("the server refuses the request", "read the log of the server", False),
 }
 STATUSES = {  # meaning of a status if no pattern matches the text
-    **dict.fromkeys((401, 403), Meaning("the teacher refuses the key", f"set {KEY_VARIABLE}", True)),
-    404: Meaning("the server has no such model or is no chat endpoint", "check URL and model", True),
-    **dict.fromkeys((*range(300, 400), 405), Meaning("not a chat endpoint", "check the URL", True)),
+    **dict.fromkeys((401, 403), Meaning("the server refuses the API key", f"set {KEY_VARIABLE} to a valid key", True)),
+    404: Meaning(
+        "the server does not have this model, or the URL is not a chat endpoint", "correct the URL or --model", True
+    ),
+    **dict.fromkeys((*range(300, 400), 405), Meaning("the URL is not a chat endpoint", "correct the URL", True)),
 }
 # Statuses of a server that is busy or away (above 511: Cloudflare's, 424: TGI's of a failed generation); only an empty
 # account takes precedence.

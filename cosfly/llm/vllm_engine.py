@@ -31,8 +31,10 @@ FINISHED = ("stop", "length")  # finish reasons of an answer; others are failure
 class VllmConfig(Config):
     """The engine in this process, over a model folder."""
 
-    batch: int = Field(256, ge=1, description="most requests in the engine at once")
-    max_model_len: int | None = Field(None, ge=1024, description="context length; empty takes the model's")
+    batch: int = Field(256, ge=1, description="most requests that the engine processes at once")
+    max_model_len: int | None = Field(
+        None, ge=1024, description="context length, tokens; empty: the model's context length"
+    )
     engine: dict[str, Any] = Field(default_factory=dict, description="further arguments of vllm.LLM")
 
 
@@ -52,7 +54,7 @@ class VllmEngine:
         if not (folder / "config.json").is_file():
             expected = "a folder with config.json"
             raise InputError(
-                "this folder does not hold a model", where=folder, expected=expected, fix="check --teacher"
+                "this folder contains no model", where=folder, expected=expected, fix="pass such a folder to --teacher"
             )
         self.folder = folder
         self.model = folder.name
@@ -176,7 +178,7 @@ class VllmEngine:
             if completion.finish_reason in FINISHED:
                 answered.set_result(Reply(completion.text, usage, structured, completion.finish_reason))
             else:
-                answered.set_exception(NoAnswer("engine", f"it ended with {completion.finish_reason!r}"))
+                answered.set_exception(NoAnswer("engine", f"the request ended with {completion.finish_reason!r}"))
 
     def _break(self, error: Exception, *unopened: Future[Reply]) -> None:
         got = f"{type(error).__name__}: {_one_line(error)}"

@@ -50,17 +50,23 @@ EARTH_M, EARTH_E2 = 6_378_137.0, 0.00669437999014  # WGS 84: equatorial radius, 
 class BoxesConfig(Config):
     """Boxes of your own."""
 
-    name: str = Field("Boxes", min_length=1, description="map name, the head of the playback tree's folder names")
-    path: Path | None = Field(None, description="boxes_3d.json, .csv or .geojson; names of columns: docs/files.md")
+    name: str = Field(
+        "Boxes", min_length=1, description="name of the map, with which folder names in the playback tree begin"
+    )
+    path: Path | None = Field(None, description="boxes_3d.json, .csv or .geojson file; docs/files.md lists the columns")
     units: Literal["m", "degrees"] = Field(
         "m", description="unit of the coordinates of GeoJSON: m, or degrees of longitude and latitude"
     )
-    types: dict[str, str] = Field({}, description="names of the file -> types of cosfly, as in {house: Buildings}")
+    types: dict[str, str] = Field(
+        {}, description="type names of the file and their types in cosfly, such as {house: Buildings}"
+    )
     ignore: list[str] = Field([], description="columns or properties to ignore; ['*']: all unknown ones")
     ground_z_m: float = Field(0.0, description="height of the flat ground, in the file's coordinates, m")
-    derive_ground: bool = Field(False, description="the same as maps.cityjson.derive_ground")
-    licence: LicenceId = Field(UNKNOWN_LICENCE, description="licence of the boxes, as the hub spells it (cc-by-4.0)")
-    credits: str = Field("", description="attribution: the map's makers, one sentence or more")
+    derive_ground: bool = Field(False, description="derive streets, pavements and lawn from the buildings")
+    licence: LicenceId = Field(
+        UNKNOWN_LICENCE, description="licence of the boxes, as spelled on the Hugging Face Hub (cc-by-4.0)"
+    )
+    credits: str = Field("", description="attribution of the map's makers, in one or more sentences")
 
     @field_validator("types")
     @classmethod
@@ -89,7 +95,7 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     suffix = path.suffix.lower()
     if suffix not in (".json", ".csv", ".geojson"):
         raise InputError(
-            "the file type of the map is unknown", where=path, got=path.suffix, expected=".json, .csv, .geojson"
+            "the file type of the map is unknown", where=path, got=path.suffix, expected=".json, .csv or .geojson"
         )
     if suffix == ".json" and (cfg.types or cfg.ignore or cfg.ground_z_m):
         raise ConfigError(
@@ -127,9 +133,9 @@ def plausibility(box_map: BoxMap) -> str:
     shared_m = np.minimum(*solid.maxs[[first, second], 2]) - np.maximum(*solid.mins[[first, second], 2])
     overlapping = np.unique(first[(first != second) & (shared_m > OVERLAP_M)])
     return (
-        f"{text}; obstacles {heights_m.min():.4g} to {heights_m.max():.4g} m high, feet {feet_m.min():.4g} to "
+        f"{text}; obstacles {heights_m.min():.4g} to {heights_m.max():.4g} m high, bases {feet_m.min():.4g} to "
         f"{feet_m.max():.4g} m above the ground, yaw {yaws_deg.min():.4g} to {yaws_deg.max():.4g} degrees, "
-        f"{len(overlapping) / len(solid):.0%} overlap another"
+        f"{len(overlapping) / len(solid):.0%} overlap another obstacle"
     )
 
 
@@ -231,7 +237,7 @@ def _to_metres(cfg: BoxesConfig, places: np.ndarray, path: Path) -> Callable[[np
     if cfg.units == "m":
         return lambda ring: ring
     middle = (low + high) / 2
-    log.info("longitude and latitude: metres east and north of %.6f, %.6f", *middle)
+    log.info("longitude and latitude are converted to metres east and north of %.6f, %.6f", *middle)
     latitude = math.radians(middle[1])
     curvature = 1 - EARTH_E2 * math.sin(latitude) ** 2
     east_m = EARTH_M / math.sqrt(curvature) * math.cos(latitude)  # metres in a radian of longitude

@@ -61,6 +61,6 @@ def required(path: Path | None, setting: str) -> Path:
     """Return the path of a setting; raise ConfigError if it is not set."""
     if path is None:
         raise ConfigError(
-            "the setting has no value", where=setting, expected="a path", fix=f"pass --set {setting}=FILE"
+            "the setting has no value", where=setting, expected="the path of a file", fix=f"pass --set {setting}=FILE"
         )
     return path

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
 from cosfly.formats.kinds import KINDS
-from cosfly.runtime.errors import EnvironmentMissing, InputError
+from cosfly.runtime.errors import EnvironmentMissing, InputError, counts_text
 from cosfly.runtime.io import sha256_bytes
 from cosfly.simulators.carla_client import CarlaConfig, connect
 from cosfly.simulators.conventions import world_pose
@@ -36,10 +36,14 @@ SLOPE_M = 1.0  # roads with a larger range of heights are not on flat ground
 class CarlaMapConfig(CarlaConfig):
     """The town of a running CARLA server."""
 
-    name: str | None = Field(None, min_length=1, description="map name; null takes the town's")
-    licence: LicenceId = Field("cc-by-4.0", description="licence, as the hub spells it; goes into every release")
-    credits: str = Field("CARLA Simulator, Computer Vision Center", description="attribution: the town's makers")
-    ground_z_m: float | None = Field(None, description="height of the ground, m; null takes the roads' median top")
+    name: str | None = Field(None, min_length=1, description="name of the map; null: the town's name")
+    licence: LicenceId = Field(
+        "cc-by-4.0", description="licence, as spelled on the Hugging Face Hub; copied to every release"
+    )
+    credits: str = Field("CARLA Simulator, Computer Vision Center", description="attribution of the town's makers")
+    ground_z_m: float | None = Field(
+        None, description="height of the ground, m; null: the median height of road surfaces"
+    )
     # terrain or vegetation longer than this both ways is dropped and counted, m; low slabs stay
     huge_m: ClassVar[float] = 150.0
 
@@ -88,7 +92,7 @@ def load(cfg: CarlaMapConfig, seed: int) -> BoxMap:
         try:
             answers = pool.submit(ask, cfg).result()
         except BrokenProcessPool:
-            fix = "check that the server is CARLA 0.9.16, then try again"
+            fix = "check that the server is CARLA 0.9.16, then run the same command again"
             raise EnvironmentMissing("the client of CARLA crashed", where=f"{cfg.host}:{cfg.port}", fix=fix) from None
     return box_map_of(answers, cfg)
 
@@ -115,9 +119,9 @@ def box_map_of(answers: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
         raise InputError(
             "no object of the town can be used",
             where=where,
-            got=f"{len(answers.rows)} objects, dropped: {dict(dropped)}",
+            got=f"{len(answers.rows)} objects, dropped: {counts_text(dropped)}",
             expected="at least one object of get_environment_objects with a usable box",
-            fix="check the loaded town",
+            fix="load a town whose objects have boxes",
         )
     header = MapHeader(
         name=cfg.name or answers.town, source=MapSource(tool="CARLA", version=answers.version, file=answers.town),
@@ -149,14 +153,14 @@ def _report(answers: CarlaTown, box_map: BoxMap, where: str, tops_m: np.ndarray)
     """Log the known defects of such exports."""
     header = box_map.header
     if answers.empty_labels:
-        log.info("%s: no objects of %s", where, ", ".join(answers.empty_labels))
+        log.info("%s: the town has no objects with the labels %s", where, ", ".join(answers.empty_labels))
     if header.dropped_objects:
-        log.warning("%s: dropped: %s", where, header.dropped_objects)
+        log.warning("%s: dropped objects: %s", where, counts_text(header.dropped_objects))
     if num := header.model_extra and header.model_extra["repeated_ids"]:
-        log.warning("%s: %d objects repeated an id and got a new one", where, num)
+        log.warning("%s: %d objects had the id of another object and got a new id", where, num)
     if len(tops_m) and np.ptp(tops_m) > SLOPE_M:
         log.warning(
-            "%s: roads are %.1f to %.1f m high, but the ground is flat at %.1f m: pedestrians leave the roads",
+            "%s: roads are %.1f to %.1f m high, but the ground is flat at %.1f m, so pedestrians leave their surface",
             where, tops_m.min(), tops_m.max(), header.ground_z_m,
         )  # fmt: skip
     points_m = [world_pose((*point, 0.0, 0.0, 0.0))[0][:2] for point in answers.road_points_m]
@@ -164,6 +168,7 @@ def _report(answers: CarlaTown, box_map: BoxMap, where: str, tops_m: np.ndarray)
     gaps_m = [np.maximum(low_m - point, point - high_m).max(axis=1).min() for point in points_m]
     if num := sum(gap > ALONG_M for gap in gaps_m):
         log.warning(
-            "%s: %d of %d points on roads have no object within %.0f m: large maps load only tiles near the spectator",
+            "%s: %d of %d points on roads have no object within %.0f m; CARLA loads a large map only near the "
+            "spectator",
             where, num, len(points_m), ALONG_M,
         )  # fmt: skip

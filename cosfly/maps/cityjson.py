@@ -64,10 +64,14 @@ SAME_PLACE_M = 0.1  # vertices nearer than this are one, at their mean height
 class CityJsonConfig(Config):
     """A CityJSON city model."""
 
-    name: str = Field("CityJson", min_length=1, description="map name, the head of the playback tree's folder names")
-    path: Path | None = Field(None, description="the CityJSON file, .json or .city.jsonl, or either gzipped")
-    licence: LicenceId = Field(UNKNOWN_LICENCE, description="licence of the model, as the hub spells it (cc-by-4.0)")
-    credits: str = Field("", description="attribution: the model's makers, one sentence or more")
+    name: str = Field(
+        "CityJson", min_length=1, description="name of the map, with which folder names in the playback tree begin"
+    )
+    path: Path | None = Field(None, description="CityJSON file: .json or .city.jsonl, also gzipped")
+    licence: LicenceId = Field(
+        UNKNOWN_LICENCE, description="licence of the model, as spelled on the Hugging Face Hub (cc-by-4.0)"
+    )
+    credits: str = Field("", description="attribution of the model's makers, in one or more sentences")
     tool: str = Field("CityJSON", description="tool and version that made the file, for the records")
     solids: bool = Field(True, description="draw solids with their own roofs and walls; planners use the boxes")
     derive_ground: bool = Field(True, description="derive streets, pavements and lawn for a model that has no streets")
@@ -350,19 +354,21 @@ def ground_of(objects: list[CityObject]) -> Ground:
     terrain = [item.corners() for item in objects if item.rule.form == "surface" and item.rule.kind in TERRAIN_KINDS]
     if terrain:
         samples = np.concatenate(terrain)
-        origin = "its terrain and streets"
+        origin = "terrain and streets"
     else:
         solids = [item for item in objects if item.rule.form == "solid"] or objects
         samples = np.array([_foot(item.corners()) for item in solids])
-        origin = "the feet of its buildings"
+        origin = "the bases of buildings"
     low, high = np.percentile(samples[:, 2], RISE_SHARES)
     if high - low <= FLAT_WITHIN_M:
         if high - low > REPORTED_RISE_M:
-            log.warning("the ground rises by %.1f m and is made flat, as less than %g m is", high - low, FLAT_WITHIN_M)
+            log.warning("the ground rises by %.1f m, at most %g m, so it is made flat", high - low, FLAT_WITHIN_M)
         return Ground.flat(0.0)
     bounds = np.concatenate([item.corners()[:, :2] for item in objects])
     ground = _gridded(samples, bounds.min(axis=0), bounds.max(axis=0))
-    log.info("the ground rises by %.1f m: heights every %g m from %s", high - low, ground.cell_m, origin)
+    log.info(
+        "the ground rises by %.1f m; its heights are sampled every %g m from %s", high - low, ground.cell_m, origin
+    )
     return GroundGrid.of(ground).ground()
 
 
@@ -393,5 +399,5 @@ def _gridded(samples: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ground:
         linear = LinearNDInterpolator(places, heights)(nodes)
         node_heights = np.where(np.isnan(linear), node_heights, linear)
     except QhullError:  # too few samples, or all on one line
-        log.warning("the ground has %d samples, that span no area: heights are those of the nearest", len(places))
+        log.warning("the %d ground samples span no area, so heights are those of the nearest sample", len(places))
     return Ground(node_heights.reshape(num_y, num_x), float(west_south[0]), float(west_south[1]), cell_m)

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import AliasPath, BaseModel, Field, FiniteFloat
 
 from cosfly.formats.columns import numbers
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import InputError, counts_text, json_type, shown
 from cosfly.runtime.io import over_limit, read_unpacked
 from cosfly.runtime.json_io import parse_document, parse_json, validated
 
@@ -184,7 +184,7 @@ def read_model(path: Path) -> CityModel:
                 objects[object_id] = candidate
     dropped = {reason: count for reason, count in dropped.items() if count}
     if not objects:
-        counts = ", ".join(f"{count} {reason}" for reason, count in dropped.items()) or "no objects"
+        counts = f"dropped objects: {counts_text(dropped)}" if dropped else "no objects"
         raise InputError("the model has no usable object", where=f"{path}: CityObjects", got=counts)
     return CityModel(list(objects.values()), dropped, num_objects, version)
 
@@ -200,13 +200,13 @@ def _read_parts(path: Path) -> tuple[str, _Document, list[tuple[str, _Part]]]:
     parts = list[tuple[str, Any]]()
     for where, text in texts:
         value = parse_document(text, where)
-        object_type = value.get("type") if isinstance(value, dict) else type(value).__name__
+        object_type = shown(value.get("type")) if isinstance(value, dict) else json_type(value)
         expected = "CityJSONFeature" if parts else "CityJSON"
-        if object_type != expected:
+        if object_type != repr(expected):
             raise InputError(
                 "the object has an unexpected type",
                 where=f"{where}: type",
-                got=repr(object_type)[:80],
+                got=object_type,
                 expected=repr(expected),
                 fix=None if parts else "put the CityJSON object with version and transform on the first line",
             )
@@ -216,7 +216,7 @@ def _read_parts(path: Path) -> tuple[str, _Document, list[tuple[str, _Part]]]:
                 raise InputError(
                     "the version of CityJSON is not supported",
                     where=f"{where}: version",
-                    got=repr(value.get("version"))[:80],
+                    got=shown(value.get("version")),
                     expected=" or ".join(VERSIONS),
                     fix="convert the file, for instance with `cjio OLD upgrade save NEW`",
                 )
@@ -269,7 +269,7 @@ def _city_object(object_id: str, item: _Object, part: _Part, vertices: _Vertices
         raise _Dropped("group")
     rule = next((rule for rule in RULES if rule.covers(item)), None)
     if rule is None:
-        log.warning("%s: no rule for the type %s; dropped", object_id, item.type)
+        log.warning("%s: dropped, because cosfly has no rule for the type %s", object_id, item.type)
         raise _Dropped("unmapped_type")
     candidates = [
         _resolve_instance(geometry, vertices, f"{where}.geometry[{k}]") for k, geometry in enumerate(item.geometry)
@@ -305,7 +305,7 @@ def _resolve_instance(geometry: _Geometry, vertices: _Vertices, where: str) -> _
         raise InputError(
             "the instance must have exactly one reference point",
             where=f"{where}.boundaries",
-            got=repr(geometry.boundaries)[:40],
+            got=shown(geometry.boundaries),
             expected="the index of one vertex",
         )
     if len(geometry.transformationMatrix) != 16:
@@ -321,7 +321,7 @@ def _resolve_instance(geometry: _Geometry, vertices: _Vertices, where: str) -> _
 def _require_list(value: Any, where: str) -> list:
     if not isinstance(value, list):
         problem = "the boundaries are not nested as the geometry's type requires"
-        raise InputError(problem, where=where, got=repr(value)[:40], expected="a list")
+        raise InputError(problem, where=where, got=shown(value), expected="a list")
     return value
 
 
@@ -331,7 +331,7 @@ def _rings(surface: Any, vertices: np.ndarray, where: str) -> Surface:
     for ring in _require_list(surface, where):
         if not isinstance(ring, list) or len(ring) < 3 or not all(type(index) is int for index in ring):
             expected = "at least three vertex indices"
-            raise InputError("the ring is malformed", where=where, got=repr(ring)[:60], expected=expected)
+            raise InputError("the ring is malformed", where=where, got=shown(ring), expected=expected)
         low, high = min(ring), max(ring)
         if low < 0 or high >= len(vertices):
             raise InputError(
@@ -346,5 +346,7 @@ def _rings(surface: Any, vertices: np.ndarray, where: str) -> Surface:
     if not all(np.isfinite(ring).all() for ring in rings):
         raise InputError("a vertex of the surface is not finite", where=where, expected="finite coordinates")
     if (num_vertices := sum(map(len, rings))) > MOST_VERTICES:
-        raise over_limit(where, f"a surface of {num_vertices:,} vertices", f"{MOST_VERTICES:,}", "simplify it")
+        raise over_limit(
+            where, f"a surface of {num_vertices:,} vertices", f"{MOST_VERTICES:,} vertices", "simplify the surface"
+        )
     return rings

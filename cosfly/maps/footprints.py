@@ -128,8 +128,8 @@ def _cut(piece: Polygon, rectangle: Rectangle, shares: Sequence[float]) -> list[
 def check_outline(polygon: Polygon, where: str) -> None:
     """Reject an outline with so many crossings that making it valid would take minutes and gigabytes."""
     if not polygon.is_valid and num_crossings(polygon) > MOST_CROSSINGS:
-        fix = "correct the outline"
-        raise over_limit(where, "an outline that crosses itself more often", f"{MOST_CROSSINGS:,} crossings", fix)
+        most = f"{MOST_CROSSINGS:,} crossings"
+        raise over_limit(where, f"an outline with more than {most} of itself", most, "correct the outline")
 
 
 def num_crossings(polygon: Polygon) -> int:

@@ -50,13 +50,17 @@ SURFACE_NODE = "Sidewalks_C"  # only worlds with their own surfaces have it
 class SimWorldConfig(Config):
     """A SimWorld city."""
 
-    name: str = Field("SimWorld", min_length=1, description="map name, the head of the playback tree's folder names")
+    name: str = Field(
+        "SimWorld", min_length=1, description="name of the map, with which folder names in the playback tree begin"
+    )
     world: Path | None = Field(None, description="world file, progen_world.json")
     sizes: list[Path] = Field(
-        [], description="asset size tables, the first with an asset counts; none: Bbox.json nearby"
+        [], description="asset size tables, of which the first with an asset applies; empty: Bbox.json near the world"
     )
-    licence: LicenceId = Field("apache-2.0", description="licence, as the hub spells it; goes into every release")
-    credits: str = Field("SimWorld, maitrix-org and contributors", description="attribution: the world's makers")
+    licence: LicenceId = Field(
+        "apache-2.0", description="licence, as spelled on the Hugging Face Hub; copied to every release"
+    )
+    credits: str = Field("SimWorld, maitrix-org and contributors", description="attribution of the world's makers")
     unknown: Literal["error", "drop"] = Field(
         "error", description="assets without a kind or a size: fail, or drop them"
     )
@@ -201,7 +205,7 @@ def _check_unknown(cfg: SimWorldConfig, node: _Node, what: str) -> None:
             f"the asset has no {what}", where=f"{cfg.world}: {node.id}.instance_name", got=node.instance_name,
             fix=f"{fix}, or drop such assets with --set maps.simworld.unknown=drop",
         )  # fmt: skip
-    log.warning("%s: %s has no %s and is dropped", node.id, node.instance_name, what)
+    log.warning("%s: the asset %s has no %s, so the object is dropped", node.id, node.instance_name, what)
 
 
 def _add_node(boxes: BoxList, node: _Node, asset: Asset, size_cm: np.ndarray, stand_m: float, world: Path) -> str:
@@ -212,7 +216,7 @@ def _add_node(boxes: BoxList, node: _Node, asset: Asset, size_cm: np.ndarray, st
     if not LEAST_M <= size.min() <= size.max() <= LARGEST:
         raise InputError(
             "the size of the object is out of range", where=f"{world}: {node.id}", got=f"{size.tolist()} m",
-            expected=f"{LEAST_M:g} m or more", fix="correct the scale of the object or the size of its asset",
+            expected=f"sides of at least {LEAST_M:g} m", fix="correct the scale of the object or the size of its asset",
         )  # fmt: skip
     foot = node.location.z * M_PER_CM
     low = 0.0 if 0 < foot <= stand_m else foot

@@ -39,7 +39,7 @@ class MapsConfig(Config):
     """Where the map comes from."""
 
     source: Literal["synthetic", "simworld", "cityjson", "boxes", "carla", "unrealcv"] = Field(
-        "synthetic", description="what to read"
+        "synthetic", description="source of the map"
     )
     synthetic: SyntheticConfig = Field(SyntheticConfig(), description="the seeded town")
     simworld: SimWorldConfig = Field(SimWorldConfig(), description="a SimWorld world with asset sizes")
@@ -87,6 +87,6 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same"
     dropped = box_map.header.dropped_objects
     num_objects = len(box_map) if box_map.header.num_objects is None else box_map.header.num_objects
     tally = Tally(input=num_objects, kept=num_objects - sum(dropped.values()), dropped=dropped)
-    log.info("%d boxes of %d objects", len(box_map), num_objects)
+    log.info("the map has %d boxes of %d objects", len(box_map), num_objects)
     stage.finish(outputs, tally, num_boxes=len(box_map), counts_by_kind=box_map.counts())
     return product

@@ -107,7 +107,9 @@ PRESETS = {
 class SyntheticConfig(Config):
     """The synthetic town."""
 
-    name: str = Field("SynthTown", min_length=1, description="map name, the head of the playback tree's folder names")
+    name: str = Field(
+        "SynthTown", min_length=1, description="name of the map, with which folder names in the playback tree begin"
+    )
     preset: str = Field("small_town", description=f"kind of town: {', '.join(PRESETS)}")
     size_m: float | None = Field(
         None, ge=80.0, le=4000.0, description="side of the square town, m; null takes the preset's"

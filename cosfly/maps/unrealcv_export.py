@@ -21,7 +21,7 @@ from pydantic import Field
 from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
 from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.maps.simworld import read_sizes
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import InputError, counts_text
 from cosfly.runtime.json_io import write_json
 from cosfly.simulators.assets import asset_of, id_of, is_no_part_of_town, kind_of
 from cosfly.simulators.conventions import CM_PER_M, world_pose
@@ -41,15 +41,19 @@ VIEWER = "boxes.html"
 class UnrealCvMapConfig(UnrealCvConfig):
     """The level of a running UnrealCV server."""
 
-    name: str | None = Field(None, min_length=1, description="map name; null takes the level's")
-    licence: LicenceId = Field("apache-2.0", description="licence, as the hub spells it; goes into every release")
-    credits: str = Field("SimWorld, maitrix-org and contributors", description="attribution: the level's makers")
-    sizes: list[Path] = Field([], description="asset size tables of SimWorld, the first with an asset counts")
-    ground_z_m: float | None = Field(None, description="height of the ground, m; null takes the roads' median top")
+    name: str | None = Field(None, min_length=1, description="name of the map; null: the level's name")
+    licence: LicenceId = Field(
+        "apache-2.0", description="licence, as spelled on the Hugging Face Hub; copied to every release"
+    )
+    credits: str = Field("SimWorld, maitrix-org and contributors", description="attribution of the level's makers")
+    sizes: list[Path] = Field([], description="asset size tables of SimWorld, of which the first with an asset applies")
+    ground_z_m: float | None = Field(
+        None, description="height of the ground, m; null: the median height of road surfaces"
+    )
     # objects longer than this both ways and higher than 2 m, landscapes, are dropped and counted, m
     huge_m: ClassVar[float] = 150.0
     most_default: float | None = Field(
-        None, ge=0, le=1, description="largest share of boxes of a `default` size; null: any"
+        None, ge=0, le=1, description="largest share of boxes with a default size; null: no limit"
     )
 
     def inputs(self) -> dict[str, Path]:
@@ -117,8 +121,8 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
         raise InputError(
             "no object of the level can be used",
             where=where,
-            got=f"{len(objects)} objects of vget /objects, dropped: {dict(dropped)}",
-            fix="check the loaded level and the table of sizes",
+            got=f"{len(objects)} objects of vget /objects, dropped: {counts_text(dropped)}",
+            fix="load a level with assets, or add their sizes to maps.unrealcv.sizes",
         )
     share = counts["default"] / len(rows)
     if cfg.most_default is not None and share > cfg.most_default:
@@ -139,9 +143,9 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
         licence=cfg.licence, credits=cfg.credits, ground_z_m=ground_z_m, extent_sources=counts,
         num_objects=len(objects), dropped_objects=dict(dropped),
     )  # fmt: skip
-    log.info("%s: sizes from %s", where, counts)
+    log.info("%s: sources of sizes: %s", where, counts_text(counts))
     if dropped:
-        log.warning("%s: dropped: %s", where, dict(dropped))
+        log.warning("%s: dropped objects: %s", where, counts_text(dropped))
     ids = [id_of(name) for name, _, _ in used]
     box_map = make_box_map(boxes[:, :3], boxes[:, 3:6], boxes[:, 6:], kinds, ids, header)
     return LevelMap(**vars(box_map), objects=tuple(used))

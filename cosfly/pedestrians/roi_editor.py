@@ -71,7 +71,7 @@ def _is_large(ring: shapely.LinearRing) -> bool:
 def run_propose(map_: Path, cfg: PedestriansConfig, out: Path) -> str:
     """Read a map, write a first `roi_polygon.json` and return a report of its content."""
     if out.is_dir():
-        raise InputError("the output is a folder, not a file", where=out, fix="choose another --out")
+        raise InputError("the output path is a folder", where=out, fix="pass the path of a file as --out")
     if out.exists():
         raise InputError("the output file already exists", where=out, fix="choose another --out, or remove this file")
     box_map = _read_map(map_)
@@ -170,8 +170,8 @@ class Editor:
         with self.lock:
             digest = sha256_bytes(read_bytes(self.path)) if self.path.exists() else None
             if digest != self.digest:
-                what = "the file was changed by somebody else, so nothing is written"
-                raise InputError(what, where=self.path, fix="start the editor again")
+                what = "another program changed the file, so nothing is written"
+                raise InputError(what, where=self.path, fix="restart the editor")
             write_roi(self.path, roi)
             self.digest = sha256_bytes(read_bytes(self.path))
         return {"figures": figures, "saved": str(self.path)}
@@ -225,7 +225,7 @@ def open_editor(map_: Path, cfg: PedestriansConfig, roi: Path, port: int, backdr
             "the backdrop lies outside the map",
             where=backdrop,
             got=f"a picture of {shown}",
-            expected=f"a picture of some of {_area_text(low_m[0], high_m[0], low_m[1], high_m[1])}",
+            expected=f"a picture that overlaps {_area_text(low_m[0], high_m[0], low_m[1], high_m[1])}",
             fix="correct the JSON file next to the picture",
         )
     return PageServer(Editor(box_map, cfg, roi, map_, picture), port)

@@ -44,17 +44,20 @@ SLOPE_MAX = 0.58  # rise over run, 30 degrees: as steep as stairs
 class PedestriansConfig(Config):
     """Settings of the pedestrian stage; the defaults are the paper's (tab:ped_params, eq:speed)."""
 
-    num_paths: int = Field(20, ge=1, le=100_000, description="pedestrian trajectories to make")
+    num_paths: int = Field(20, ge=1, le=100_000, description="number of pedestrian trajectories")
     resolution_m: float = Field(0.5, gt=0, le=10, description="side of a grid cell, m")
     human_height_m: ClassVar[float] = 2.0  # boxes that reach between the ground and this height block, m
     safety_radius_m: float = Field(0.5, ge=0, le=50, description="distance to keep from obstacles, m; 0: none")
     min_distance_m: float = Field(50.0, gt=0, description="least straight distance from start to goal, m")
     max_distance_m: float = Field(100.0, gt=0, le=2000, description="greatest straight distance from start to goal, m")
     min_component_cells: int = Field(4000, ge=1, description="smallest connected free area that is used, cells")
-    num_retries: int = Field(5, ge=0, description="further pairs of ends tried where the first pair is rejected")
-    max_detour: float = Field(3.0, ge=0, description="longest route, times the straight distance; 0: no limit")
+    num_retries: int = Field(
+        5, ge=0, description="number of further pairs of start and goal to try if the first is rejected"
+    )
+    max_detour: float = Field(3.0, ge=0, description="largest ratio of route length to straight distance; 0: no limit")
     ground: Literal["anywhere", "surfaces", "paved"] = Field(
-        "surfaces", description="walkable ground: anywhere; any ground box (if a map knows its ground); or paved ones"
+        "surfaces",
+        description="walkable ground: anywhere; surfaces: ground boxes, if the map has them; paved: paved ones only",
     )
     road_cost: int = Field(
         1, ge=1, le=100, description="cost of a metre of carriageway off crossings, in metres of pavement; 1: all "
@@ -66,10 +69,14 @@ class PedestriansConfig(Config):
     speed_jitter: ClassVar[float] = 0.15  # beta of eq:speed: random share of the speed
     min_speed_mps: ClassVar[float] = 0.0  # least speed, m/s
     max_speed_mps: ClassVar[float] = 1.6  # greatest speed, m/s
-    pace: dict[str, float] = Field({PLAIN_PACE: 1.0}, description=f"share of each pace, to a quota: {', '.join(PACES)}")
-    hurry_speed_mps: float = Field(1.6, ge=SLOWEST_SPEED_MPS, description="cruising speed of paces that hurry, m/s")
+    pace: dict[str, float] = Field(
+        {PLAIN_PACE: 1.0}, description=f"share of trajectories with each pace: {', '.join(PACES)}"
+    )
+    hurry_speed_mps: float = Field(1.6, ge=SLOWEST_SPEED_MPS, description="cruising speed of hurrying pedestrians, m/s")
     others: int = Field(0, ge=0, le=500, description="bystanders around each pedestrian trajectory")
-    look_alikes: int = Field(0, ge=0, le=500, description="bystanders dressed as the target but for one thing")
+    look_alikes: int = Field(
+        0, ge=0, le=500, description="bystanders who wear the same as the target except for one item"
+    )
     traffic: int = Field(0, ge=0, le=500, description="cars around each trajectory, where the map has straight roads")
     others_reach_m: ClassVar[float] = 40.0  # greatest distance of bystanders and cars from the trajectory, m
     dt_s: float = Field(
@@ -98,15 +105,15 @@ class PedestriansConfig(Config):
     def _ranges_are_ordered(self) -> PedestriansConfig:
         problems = []
         if self.min_distance_m >= self.max_distance_m:
-            problems.append(f"min_distance_m {self.min_distance_m} must be below max_distance_m {self.max_distance_m}")
+            problems.append(
+                f"min_distance_m ({self.min_distance_m}) must be below max_distance_m ({self.max_distance_m})"
+            )
         if self.look_alikes > self.others:
             problems.append(
-                f"look_alikes {self.look_alikes} is above others {self.others}, although others include them"
+                f"look_alikes ({self.look_alikes}) must not be above others ({self.others}), which include them"
             )
         if 0 < self.max_detour < 1:
-            problems.append(
-                f"max_detour {self.max_detour} is between 0 and 1, but must be at least 1, or 0 for no limit"
-            )
+            problems.append(f"max_detour ({self.max_detour}) must be at least 1, or 0 for no limit")
         if problems:
             raise ValueError("; ".join(problems))
         return self
@@ -337,8 +344,8 @@ def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | 
         raise NoPathError(
             "no free cell lies on the requested ground",
             where=where,
-            got=f"{counts['cells_free']} free cells",
-            expected="a free cell on ground of that kind",
+            got=f"{counts['cells_free']} free cells, all on other ground",
+            expected="a free cell on ground of the kind in the setting ground",
             fix="set ground to surfaces or anywhere",
         )
     raise NoPathError(

@@ -92,9 +92,9 @@ def _header(start: bytes, size: int, where: str | Path, what: str) -> ArrayHeade
     matches = [pattern.search(text) for pattern in (_DESCR, _ORDER, _SHAPE)]
     fields = [match.group(1).decode() for match in matches if match]
     if len(fields) < len(matches):
-        raise not_an_array(f"a header of {length} bytes, {text[:80].decode('latin-1')!r}")
+        raise not_an_array(f"a header of {length} bytes that begins with {text[:80].decode('latin-1')!r}")
     descr, order, shape = fields
-    incomplete = not_an_array(f"{size} bytes that are not a complete NumPy array, {descr} ({shape})")
+    incomplete = not_an_array(f"{size} bytes, which are not a whole array of type {descr} and shape ({shape})")
     try:
         lengths = tuple(int(part) for part in shape.split(",") if part.strip())
         header = ArrayHeader(np.dtype(descr), lengths, order == "True", text_start + length)
@@ -114,7 +114,7 @@ def check_pixels(num_pixels: float, where: str | Path, got: str) -> None:
     """Raise InputError if a picture or array has more pixels than are read."""
     if num_pixels > LONGEST_SIDE_PX**2:
         limit = f"{LONGEST_SIDE_PX} x {LONGEST_SIDE_PX} px"
-        raise over_limit(where, got, limit, "scale the pictures down, or cut them")
+        raise over_limit(where, got, limit, "scale the pictures down or crop them")
 
 
 def png_size(data: bytes) -> tuple[int, int] | None:

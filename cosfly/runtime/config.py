@@ -17,7 +17,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import to_jsonable_python
 
-from cosfly.runtime.errors import ConfigError, InputError, nearest, plain
+from cosfly.runtime.errors import ConfigError, InputError, json_type, nearest, plain, shown
 from cosfly.runtime.io import read_text
 
 MOST_BYTES = 1_000_000  # the settings of a run take some 10 kB, the longest shipped word list 100 kB
@@ -108,7 +108,7 @@ def read_yaml(path: Path) -> dict:
     value = parse_yaml(text, path)
     if not isinstance(value, dict | None):
         what = "the configuration is not a mapping"
-        raise ConfigError(what, where=path, got=type(value).__name__, expected="lines of the form key: value")
+        raise ConfigError(what, where=path, got=json_type(value), expected="lines of the form key: value")
     return value or {}
 
 
@@ -160,12 +160,12 @@ def _problem(model: type[BaseModel], detail: Any) -> str:
             return f"{field}: unknown setting (did you mean {' or '.join(map(repr, elsewhere))}?)"
         hint = nearest(str(last), names)
         if not hint and len(names) <= MOST_LISTED:
-            hint = f" (there are {', '.join(names)})"
+            hint = f" (the settings here are {', '.join(names)})"
         return f"{field}: unknown setting{hint}"
     if kind in ("list_type", "tuple_type"):
-        return f"{field}: the value is not a list, got {detail['input']!r}; write [{detail['input']}]"
-    got = "" if isinstance(detail["input"], dict) else f", got {detail['input']!r}"
-    return f"{field}: {'not a group of settings' if kind == 'model_type' else plain(detail['msg'])}{got}"
+        return f"{field}: the value is not a list, got {shown(detail['input'])}; write [{detail['input']}]"
+    got = "" if isinstance(detail["input"], dict) else f", got {shown(detail['input'])}"
+    return f"{field}: {'the value is not a group of settings' if kind == 'model_type' else plain(detail['msg'])}{got}"
 
 
 def _names(model: Any, above: str = "") -> Iterator[str]:
@@ -206,7 +206,7 @@ def config_file(config: Path | None) -> Path | None:
     names = sorted(path.stem for path in shipped(".").glob("*.yaml") if path.stem != "glossary")
     expected = f"a YAML file, a run directory, or one of {', '.join(names)}"
     if config.is_dir():
-        fix = f"cosfly list {config} shows the runs in it"
+        fix = f"run cosfly list {config} to see the runs in this folder"
         raise ConfigError(
             "this folder is not a run directory", where=config, got="no run.yaml", expected=expected, fix=fix
         )

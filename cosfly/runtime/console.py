@@ -51,7 +51,7 @@ class _File(logging.FileHandler):
 
     def handleError(self, record: logging.LogRecord) -> None:  # the name of the library
         logging.getLogger().removeHandler(self)
-        log.warning("the log %s cannot be written any more: %s", self.baseFilename, sys.exc_info()[1])
+        log.warning("no more lines are written to the log file %s: %s", self.baseFilename, sys.exc_info()[1])
 
 
 def set_up_logging(level: int, file: Path | None = None) -> None:

@@ -5,7 +5,8 @@ A *fatal* error ends the stage; any other, raised inside one item, is recorded f
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import reprlib
+from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
@@ -47,7 +48,7 @@ class CosflyError(Exception):
         self.what, self.where, self.got, self.expected, self.fix = what, where, got, expected, fix
 
     def __str__(self) -> str:
-        got = self.got if self.got is None or isinstance(self.got, str) else repr(self.got)
+        got = self.got if self.got is None or isinstance(self.got, str) else shown(self.got)
         details = (("got ", got), ("expected ", self.expected), ("", self.fix))
         parts = [self.what if self.where is None else f"{self.where}: {self.what}"]
         parts += [word + text for word, text in details if text is not None]
@@ -105,6 +106,26 @@ class TeacherError(CosflyError, code="teacher", fatal=True):
 
 class VerifyError(CosflyError, code="verify"):
     """A finished product differs from its records."""
+
+
+def shown(value: Any, longest: int = 80) -> str:
+    """Return a value of a JSON or YAML file for a message, cut to `longest` characters: null for None, 'text', 1.5."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return (reprlib.repr(value) if isinstance(value, dict | list) else repr(value))[:longest]
+
+
+def json_type(value: Any) -> str:
+    """Return the words for the type of a JSON or YAML value in a message: null, text, a list."""
+    words = {type(None): "null", str: "text", bool: "a truth value", list: "a list", dict: "an object"}
+    return words.get(type(value), "a number")
+
+
+def counts_text(counts: Mapping[str, int]) -> str:
+    """Return counts by reason for a message, such as `huge 3, no size 2`."""
+    return ", ".join(f"{reason} {count}" for reason, count in sorted(counts.items()))
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

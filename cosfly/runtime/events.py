@@ -24,9 +24,9 @@ STAT_UTIME, STAT_STIME, STAT_RSS = 14 - 3, 15 - 3, 24 - 3
 Loss = Literal["heartbeat_lost", "timed_out", "worker_died"]
 # Events that end a worker, as a message says them.
 LOSSES: dict[str, str] = {
-    "heartbeat_lost": "its worker neither reported nor computed",
-    "timed_out": "it finished no step within its time limit",
-    "worker_died": "its worker process died; it may need more memory than is free",
+    "heartbeat_lost": "its worker process sent no heartbeat and used no CPU time",
+    "timed_out": "the item finished no step within its time limit",
+    "worker_died": "its worker process died, perhaps because memory ran out",
 }
 Kind = Loss | Literal["began", "worker_started", "restarted", "item_done", "retried", "given_up", "probe", "ended"]
 

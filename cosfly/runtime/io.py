@@ -31,7 +31,7 @@ LINE_MB = 64  # of a line of a JSON-lines file; a caption with its evidence has 
 UNPACK_FACTOR = 100  # largest ratio of unpacked to packed size; it is 3 for JSON and 15 for indented JSON
 SMALL_UNPACKED_MB = 64  # unpacked size that is allowed for any ratio
 CHECK_PATH = "check the path"
-SPLIT = "split it, or cut out the part that is needed"
+SPLIT = "split the file, or cut out the part that you need"
 GZIP_MAGIC = b"\x1f\x8b"
 LONGEST_NAME = 255  # bytes of one part of a path, on every common file system
 CHECKSUMS = "checksums.sha256"
@@ -100,12 +100,12 @@ def read_bytes(
     with open_file(path, what=what, fix=fix, tree=tree) as file, disk_errors(path, what, fix):
         first, size = span or (0, os.fstat(file.fileno()).st_size)
         if size > most_mb * MB:
-            raise over_limit(path, f"{size / MB:,.3g} MB", f"{most_mb:,g} MB in one piece", SPLIT)
+            raise over_limit(path, f"{size / MB:,.3g} MB", f"{most_mb:,g} MB", SPLIT)
         file.seek(first)
         data = file.read(size)
     if span is not None and len(data) != size:
         got = f"{first + len(data)} bytes"
-        fix = "try again when no other process writes the file"
+        fix = "run the command again when no other process writes this file"
         raise InputError(f"the {what} became shorter during reading", where=path, got=got, fix=fix)
     return data
 
@@ -133,8 +133,8 @@ def read_lines(path: Path, *, what: str = "file", fix: str = CHECK_PATH) -> Iter
             with disk_errors(path, what, fix):
                 line = file.readline(LINE_MB * MB + 1)
             if len(line) > LINE_MB * MB:
-                fix = "check that the file is JSON lines, with one record in each line"
-                raise over_limit(f"{path}:{number}", "a longer line", f"{LINE_MB} MB", fix)
+                fix = "check that the file is in JSON Lines format, with one record in each line"
+                raise over_limit(f"{path}:{number}", f"a line of more than {LINE_MB} MB", f"{LINE_MB} MB", fix)
             if not line:
                 return
             yield line
@@ -152,11 +152,12 @@ def read_unpacked(path: Path, *, what: str = "file", most_mb: float = FILE_MB) -
     except (OSError, EOFError, zlib.error) as error:
         raise InputError("the gzip data is damaged", where=path, got=str(error)) from None
     if len(unpacked) > most_mb * MB:
-        raise over_limit(path, "more when unpacked", f"{most_mb:,g} MB in one piece", SPLIT)
+        limit = f"{most_mb:,g} MB"
+        raise over_limit(path, f"more than {limit} after decompression", limit, SPLIT)
     if len(unpacked) > by_factor:
-        got = f"{len(data):,} bytes that unpack to more"
+        got = f"{len(data):,} bytes, which decompress to more than {by_factor:,} bytes"
         fix = "if you trust the file, run gunzip on it first"
-        raise over_limit(path, got, f"{UNPACK_FACTOR} times the file", fix)
+        raise over_limit(path, got, f"{UNPACK_FACTOR} times the size of the file", fix)
     return unpacked
 
 
@@ -194,7 +195,11 @@ def files_named(tree: Path, name: str) -> list[Path]:
             elif entry.is_symlink() and os.path.isdir(entry.path):  # isdir is false for a link to itself
                 real = os.path.realpath(entry.path)
                 if not (isinstance(tree, LinkedPath) or is_below(real, parent)):
-                    log.warning("%s: leads to %s, skipped; --set follow_links=true follows it", entry.path, real)
+                    log.warning(
+                        "%s: skipped, because this link leads to %s; pass --set follow_links=true to follow it",
+                        entry.path,
+                        real,
+                    )
                 elif real not in above and real != parent:  # a link to a folder above would be followed forever
                     waiting.append((folder / entry.name, (*above, real)))
     return sorted(matches)
@@ -308,7 +313,8 @@ def storage_errors(path: Path) -> Iterator[None]:
 def atomic_file(path: Path) -> Iterator[IO[bytes]]:
     """Open a file under a temporary name that is renamed at the end: a kill leaves either the old file or the new."""
     if path.is_dir():
-        raise StorageError("cannot write the file: it is a folder", where=path, fix="name a file in this folder")
+        fix = "pass the path of a file, not of a folder"
+        raise StorageError("cannot write the file, because a folder has this path", where=path, fix=fix)
     with _renamed(path) as partial, open(partial, "xb") as file:
         yield file
         file.flush()

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import SchemaValidator, from_json
 
-from cosfly.runtime.errors import InputError, plain
+from cosfly.runtime.errors import InputError, json_type, plain, shown
 from cosfly.runtime.io import CHECK_PATH, FILE_MB, decoded, read_bytes, read_lines, write_bytes
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -103,7 +103,7 @@ def read_object(path: Path, *, what: str = "file", tree: Path | None = None) -> 
     """Read a JSON file that holds an object."""
     value = read_json(path, what=what, tree=tree)
     if not isinstance(value, dict):
-        raise InputError(f"the {what} is not a JSON object", where=path, got=type(value).__name__, expected="an object")
+        raise InputError(f"the {what} is not a JSON object", where=path, got=json_type(value), expected="an object")
     return value
 
 
@@ -141,11 +141,9 @@ def validated(kind: type[Kind], value: Any, where: str | Path) -> Kind:
         detail = error.errors(include_url=False, include_context=False)[0]
         parts = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in detail["loc"])
         field = "".join(parts).removeprefix(".") or "top level"
-        value = detail["input"]
         is_object_error = detail["type"] in ("model_type", "dataclass_type")
         what = "the value is not an object" if is_object_error else plain(detail["msg"])
-        got = (reprlib.repr(value) if isinstance(value, dict | list) else repr(value))[:80]
-        raise InputError(what, where=f"{where}: {field}", got=got) from None
+        raise InputError(what, where=f"{where}: {field}", got=shown(detail["input"])) from None
 
 
 @functools.cache
@@ -179,7 +177,7 @@ def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Itera
             raise InputError(
                 f"a line of the {what} has a version that is not supported",
                 where=f"{where}: schema_version",
-                got=repr(found)[:80],
+                got=shown(found),
                 expected=repr(version),
                 fix=f"make the file again: {fix}",
             )
@@ -203,18 +201,18 @@ def check_schema(value: Any, form: FileFormat, path: Path | str) -> dict:
     """Return a JSON value that is an object of the wanted schema and major version."""
     if not isinstance(value, dict):
         expected = f"an object with schema {form.schema}"
-        raise InputError("this is not a file of cosfly", where=path, got=type(value).__name__, expected=expected)
+        raise InputError("the file is not a JSON object", where=path, got=json_type(value), expected=expected)
     for key, wanted in form.header.items():
         found = value.get(key)
         where = f"{path}: {key}"
         if found is None:
-            fix = f"check that this file is the {form.what}"
+            fix = f"pass a file that cosfly wrote with this schema ({form.what})"
             raise InputError(MISSING, where=where, expected=repr(wanted), fix=fix)
         is_schema = key == "schema"
         is_right = found == wanted if is_schema else str(found).split(".")[0] == wanted.split(".")[0]
         if not is_right:
-            what = "this is another kind of file" if is_schema else "the version of the file is not supported"
-            raise InputError(what, where=where, got=repr(found)[:80], expected=repr(wanted))
+            what = "the file is of another kind" if is_schema else "the version of the file is not supported"
+            raise InputError(what, where=where, got=shown(found), expected=repr(wanted))
     return value
 
 

@@ -77,7 +77,7 @@ def run_items(
     indices = np.flatnonzero(line_bytes < 0)
     todo = [items[index] for index in indices.tolist()]
     if num_finished := len(items) - len(todo):
-        log.info("%s: %d of %d items were finished before", stage.stage, num_finished, len(items))
+        log.info("%s: %d of %d items are already finished", stage.stage, num_finished, len(items))
     progress = _Progress(items, todo)
     start = partial(make_worker, *worker_args)
     if workers and todo:
@@ -98,9 +98,9 @@ def run_items(
     if "worker_died" in tally.failed:
         # The cause is the machine, not the item, so it must not become a result: the stage stays incomplete.
         raise EnvironmentMissing(
-            "worker processes were killed, three times for the same item",
+            "a worker process died in each of three attempts at the same item",
             where=stage.path,
-            got=f"{tally.failed['worker_died']} of {len(items)} items without an outcome",
+            got=f"{tally.failed['worker_died']} of {len(items)} items without a result",
             fix=f"free some memory or use fewer --workers, {RUN_AGAIN}",
         )
     return finished

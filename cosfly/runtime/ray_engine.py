@@ -45,12 +45,12 @@ class RayConfig(Config):
 
     address: str = Field(
         "", pattern=r"^(auto|[^/\s]+:\d+)?$",
-        description="the head node's host:port, or auto for that of this machine; empty: $RAY_ADDRESS, and without it "
-        "a cluster of this machine alone, which ends with the command",
+        description="host:port of the head node, or auto for the cluster of this machine; empty: the address in "
+        "$RAY_ADDRESS, or else a cluster of this machine alone, which ends with the command",
     )  # fmt: skip
-    worker_cpus: float = Field(1.0, gt=0, description="CPUs that a worker takes of its node")
+    worker_cpus: float = Field(1.0, gt=0, description="number of CPUs that a worker reserves on its node")
     worker_gpus: float = Field(
-        0.0, ge=0, description="GPUs that a worker takes: 0.25 lets four share one; 0: where CPUs are free"
+        0.0, ge=0, description="number of GPUs that a worker reserves; 0.25 lets four workers share one; 0: none"
     )
 
 
@@ -78,7 +78,7 @@ class Cluster:
             raise EnvironmentMissing(
                 "no node is large enough for a worker",
                 got=f"nodes with {got}",
-                expected=self.needs,
+                expected=f"a node with at least {self.needs}",
                 fix="lower ray.worker_cpus or ray.worker_gpus, or add a larger node",
             )
         self._actor = self._ray.remote(_host())
@@ -119,7 +119,7 @@ class RayTransport:
                         raise EnvironmentMissing(where=f"node {node}", **problem)
                     self.node, self.pid = node, pid
                 elif self._worker_index == 0:
-                    log.warning("worker 0 waits for a node with %s free; `ray status` shows who has them", self._needs)
+                    log.warning("worker 0 waits until a node has %s free; run `ray status` for details", self._needs)
             self._call = self._host.exchange.remote(data)
 
     def receive(self) -> Message:
@@ -182,7 +182,7 @@ def _host() -> type:
             try:
                 import cosfly
             except ImportError as error:
-                fix = f"install cosfly {version} on the node, or start the node with the Python that has it"
+                fix = f"install cosfly {version} on the node, or start Ray there with the Python that has cosfly"
                 return (
                     node,
                     None,
@@ -191,7 +191,7 @@ def _host() -> type:
             if cosfly.__version__ != version:
                 fix = "install the same version on every node, then start Ray again on the nodes"
                 got = f"{cosfly.__version__} ({python})"
-                what = "the node has another version of cosfly"
+                what = "the node has a different version of cosfly"
                 return node, None, {"what": what, "got": got, "expected": version, "fix": fix}
             from cosfly.runtime.errors import InputError
             from cosfly.runtime.io import sha256_file
@@ -203,9 +203,9 @@ def _host() -> type:
             except (OSError, InputError):
                 is_same = False
             if not is_same:
-                got = f"no {Path(cwd) / folder}, or another folder of that name"
-                fix = "put run folder and inputs on storage that all nodes share, at the same path"
-                return node, None, {"what": "the node does not see the folder of the stage", "got": got, "fix": fix}
+                got = f"no folder {Path(cwd) / folder}, or one with a different stage.json"
+                fix = "put the run directory and the inputs on storage that all nodes mount at the same path"
+                return node, None, {"what": "the node cannot read the folder of the stage", "got": got, "fix": fix}
             if devices := ray.get_gpu_ids():
                 os.environ.setdefault("GLCONTEXT_DEVICE_INDEX", str(devices[0]))  # EGL lists NVIDIA devices first
             sys.path.extend(entry for entry in path if entry not in sys.path)  # a spawned process inherits it
@@ -292,6 +292,6 @@ def _check_reachable(address: str) -> None:
 
 
 def _refused(address: str, error: Exception | str) -> EnvironmentMissing:
-    fix = "start a cluster at this address (ray start --head), or omit --address to use this machine"
+    fix = "start a cluster there (ray start --head), or omit --address to use this machine alone"
     got = " ".join(str(error).split())
-    return EnvironmentMissing("no Ray cluster answers", where=address, got=got, fix=fix)
+    return EnvironmentMissing("no Ray cluster answers at this address", where=address, got=got, fix=fix)

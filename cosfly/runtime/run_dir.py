@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_serializer
 
 import cosfly
 from cosfly.runtime.config import Config
-from cosfly.runtime.errors import InputError, NothingKept, ResumeError, StorageError, VerifyError
+from cosfly.runtime.errors import InputError, NothingKept, ResumeError, StorageError, VerifyError, counts_text, shown
 from cosfly.runtime.events import EVENTS, lost_steps
 from cosfly.runtime.io import (
     CHECKSUMS,
@@ -95,7 +95,7 @@ def hold_folder(folder: Path) -> FolderLock:
             lock.acquire()
         except Timeout:
             fix = "wait for that process or stop it, then run the same command again; or choose another --out"
-            raise ResumeError("another process is at work in this folder", where=path.parent, fix=fix) from None
+            raise ResumeError("another cosfly process uses this folder", where=path.parent, fix=fix) from None
         except NotImplementedError:
             fix = "choose an --out on another file system"
             raise StorageError("the file system does not support file locks", where=path.parent, fix=fix) from None
@@ -233,8 +233,7 @@ class Tally(BaseModel):
         text = f"{self.kept} kept"
         for outcome, reasons in (("dropped", self.dropped), ("failed", self.failed)):
             if reasons:
-                by_reason = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
-                text += f", {reasons.total()} {outcome} ({by_reason})"
+                text += f", {reasons.total()} {outcome} ({counts_text(reasons)})"
         return f"{text} of {self.input}"
 
 
@@ -373,7 +372,7 @@ class StageFolder:
             self._lock.release()
         log.info("%s: %s, %.1f s", self.stage, tally, seconds)
         if lost:
-            log.info("%s: %d steps of lost workers and failed items were repeated or skipped", self.stage, lost)
+            log.info("%s: %d finished steps were lost with workers that died or items that failed", self.stage, lost)
 
     def nothing_kept(
         self, tally: Tally, *, expected: str | None = None, where: Path | None = None, fix: str | None = None
@@ -387,7 +386,9 @@ class StageFolder:
         failures = read_failures(path) if path.exists() else []
         if failures:
             got += f"; the first failure: {failures[0].message}"
-        fix = fix or "fix the causes in failures.jsonl and items.jsonl, or change settings and choose another --out"
+        fix = (
+            fix or "fix the causes listed in failures.jsonl and items.jsonl, or choose other settings and another --out"
+        )
         what = f"{self.stage} kept nothing, so the next stage has no input"
         return NothingKept(what, where=where or self.path, got=got, expected=expected, fix=fix)
 
@@ -397,7 +398,7 @@ def _prepare_resume(out: Path, record: StageRecord, resume: Resume, begun: Colle
     if not (out / "stage.json").exists():
         # A kill during the write of the record leaves its partial file.
         if any(entry.name != LOCK and not entry.match(".stage.json.*.partial") for entry in out.iterdir()):
-            problem = "the output folder holds files that cosfly did not write"
+            problem = "the output folder contains files that cosfly did not write"
             raise ResumeError(problem, where=out, fix="choose an empty --out")
     elif _holds_work(out, begun):
         _check_same(out, record, resume)
@@ -425,14 +426,14 @@ def _check_same(out: Path, record: StageRecord, resume: Resume) -> None:
     previous = read_stage_record(out)
     if resume == "never":
         raise ResumeError(
-            "the folder already holds work of an earlier command",
+            "the folder already contains results of an earlier command",
             where=out,
             fix="choose another --out, or --resume if-same",
         )
     before = flattened(previous.config) | {"seed": previous.seed}
     after = flattened(record.config) | {"seed": record.seed}
     differences = [
-        f"{key} was {before.get(key)!r}, is {after.get(key)!r}"
+        f"{key} was {shown(before.get(key))}, is {shown(after.get(key))}"
         for key in sorted(before.keys() | after.keys(), key=lambda key: (key == "seed", key))
         if before.get(key) != after.get(key)
     ]
@@ -446,13 +447,15 @@ def _check_same(out: Path, record: StageRecord, resume: Resume) -> None:
             differences.append(f"the {name} has changed")
     if differences:
         raise ResumeError(
-            "the folder holds work made with other settings or inputs",
+            "the folder contains results made with other settings or inputs",
             where=out,
             got="; ".join(differences),
             fix="choose another --out, or restore the previous settings and inputs",
         )
     if previous.code_version != record.code_version:
-        log.warning("%s: resumed by version %s, started by %s", out, record.code_version, previous.code_version)
+        log.warning(
+            "%s: cosfly %s resumes a stage that cosfly %s started", out, record.code_version, previous.code_version
+        )
 
 
 def _digest(path: Path) -> str:
@@ -574,7 +577,7 @@ def _check_finished(path: Path) -> None:
                 "the stage that makes this input is not finished, or its records are missing",
                 where=path,
                 got=f"no {name} in {folder}",
-                expected=f"{name} of that stage",
+                expected="a finished stage",
                 fix="run that stage again; to use its files as they are, copy them to an empty folder",
             )
     name = os.path.relpath(path, folder)
@@ -585,14 +588,14 @@ def _check_finished(path: Path) -> None:
             if not file.is_file():
                 problems.append(f"{file} is missing")
             elif sha256_file(file) != digest:
-                problems.append(f"{file} has other bytes")
+                problems.append(f"{file} has changed")
     if problems:
         more = f" and {len(problems) - NUM_NAMED} more" if len(problems) > NUM_NAMED else ""
         raise VerifyError(
             "files of this stage were changed after it finished",
             where=folder,
             got="; ".join(problems[:NUM_NAMED]) + more,
-            expected="the files whose digests are in its records",
+            expected="files with the digests that the stage recorded",
             fix="restore the files or run the stage again; to use a file that you changed, copy it to an empty folder",
         )
 

@@ -24,7 +24,7 @@ MOST_FOOTER_BYTES = 100 * MB  # of the strings and lists of a footer; ours have 
 WORTH_THREADS_BYTES = 8 * MB  # of a row group; for smaller ones a single thread is faster and needs less memory
 LEAST_ROW_BYTES = 1_000  # of a row as Python values; a million equal rows take only a few kB in the file
 GROUPS_HELD = 4  # row groups that reading single rows keeps in memory
-SMALLER_GROUPS = "write it again with smaller row groups, as pyarrow's row_group_size does"
+SMALLER_GROUPS = "write the file again with smaller row groups (row_group_size in pyarrow)"
 
 
 @contextlib.contextmanager
@@ -90,8 +90,8 @@ def read_row_group(path: Path | str, table: _Table, k: int, columns: list[str] |
         size = sum(_text_bytes(chunk) for column in group.columns for chunk in column.chunks)
     stored = sum(metadata.column(j).total_compressed_size for j in range(metadata.num_columns))
     if size > max(SMALL_UNPACKED_MB * MB, UNPACK_FACTOR * stored):
-        got = f"{stored:,} bytes with texts of {size:,} bytes"
-        raise over_limit(f"{path}: row group {k}", got, f"{UNPACK_FACTOR} times the row group", SMALLER_GROUPS)
+        got = f"{stored:,} stored bytes, which decompress to {size:,} bytes of text"
+        raise over_limit(f"{path}: row group {k}", got, f"{UNPACK_FACTOR} times the stored bytes", SMALLER_GROUPS)
     with arrow_errors(path):
         fields = [field.with_type(_unpacked_type(field.type)) for field in group.schema]
         return group.cast(pa.schema(fields, group.schema.metadata))

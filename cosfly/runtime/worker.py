@@ -93,7 +93,7 @@ def attempt(work: Work, item: Item, on_steps: Callable[[int], None] | None = Non
             raise
         return Failed(id=item.item_id, code=error.code, message=str(error))
     except Exception as error:  # a bug in one item must not lose the others
-        log.error("%s: a bug in cosfly\n%s", item.item_id, traceback.format_exc())
+        log.error("%s: this item failed because of a bug in cosfly:\n%s", item.item_id, traceback.format_exc())
         return Failed(id=item.item_id, code="bug", message=f"{type(error).__name__}: {error}")
     finally:
         _on_steps = None

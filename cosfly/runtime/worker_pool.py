@@ -307,9 +307,9 @@ class WorkerPool:
         self.events.write(loss, **fields)
         if self.num_lost > self.watch.restarts + self._num_done:
             raise EnvironmentMissing(
-                "workers die or stall again and again",
+                "too many worker processes died or stalled",
                 where=None if attempt is None else attempt.item.item_id,
-                got=f"{self.num_lost} workers lost, {self._num_done} items done; the last loss: {LOSSES[loss]}",
+                got=f"{self.num_lost} workers lost, {self._num_done} items done; in the last loss, {LOSSES[loss]}",
                 fix=f"see events.jsonl; free some memory, use fewer --workers or raise item_limit_s, {RUN_AGAIN}",
             )
         if attempt is not None:
@@ -322,10 +322,10 @@ class WorkerPool:
         if num_tries > self.watch.retries:
             self.events.write("given_up", item=item_id)
             code = "worker_died" if loss == "worker_died" else "timed_out"
-            message = f"{item_id}: {LOSSES[loss]}, {num_tries} times"
+            message = f"{item_id}: {num_tries} attempts failed; in the last one, {LOSSES[loss]}"
             yield attempt.item_index, Failed(id=item_id, code=code, message=message)
             return
-        log.warning("%s: %s; it is tried again", item_id, LOSSES[loss])
+        log.warning("%s: %s; cosfly tries the item again", item_id, LOSSES[loss])
         attempts = self._alone if num_tries == self.watch.retries else self._todo
         attempts.append(replace(attempt, number=num_tries))
         self.events.write("retried", item=item_id, attempt=num_tries)

@@ -184,7 +184,7 @@ class SimplifyConfig(Config):
 
     merge: bool = Field(True, description="replace clusters of neighbouring boxes by one box")
     merge_by: Literal["gap", "center"] = Field(
-        "gap", description="neighbours have near faces, or near centres (SimWorld)"
+        "gap", description="boxes are neighbours by the gap between them, or by their centres (SimWorld)"
     )
     # Largest gap on every axis between neighbours by kind, m; None: kinds that are not merged. Canopy parts of
     # simulators are closer than 2 m, wall segments of one building closer than 5 m.
@@ -192,22 +192,29 @@ class SimplifyConfig(Config):
         "Vegetation": 2.0, "Buildings": 5.0, "Walls": None, "Fences": None, "Static": None,
     }  # fmt: skip
     min_fill: float = Field(
-        0.85, ge=0.0, le=1.0, description="least filled share of a merged footprint; 0: the paper's rule"
+        0.85,
+        ge=0.0,
+        le=1.0,
+        description="smallest share of a merged footprint that its boxes cover; 0: the paper's rule",
     )
     min_canopy_fill: float = Field(0.5, ge=0.0, le=1.0, description="the same for vegetation, whose crowns are round")
     crop_tree: bool = Field(True, description="split vegetation into trunk and lifted canopy")
-    crop_strategy: Literal["fixed", "adaptive"] = Field("fixed", description="one cut, or low pieces (SimWorld)")
+    crop_strategy: Literal["fixed", "adaptive"] = Field(
+        "fixed", description="fixed: one cut; adaptive: low pieces (SimWorld)"
+    )
     cut_height_m: ClassVar[float] = 2.0  # height over the ground of the split, m
     lift_m: ClassVar[float] = 0.5  # how far the canopy is lifted over the cut, m
-    trunk: Literal["stem", "full"] = Field("stem", description="below the cut: stems, or full footprints (paper)")
+    trunk: Literal["stem", "full"] = Field(
+        "stem", description="box below the cut: a stem, or the full footprint (paper)"
+    )
     stem_radius_m: ClassVar[float] = 0.25  # half width of a stem, m
     split_z_m: ClassVar[float] = 5.0  # adaptive: height over the ground of the lowest cut, m
     adaptive_height_m: ClassVar[float] = 5.0  # adaptive: higher vegetation is cut, m
     cell_size_m: ClassVar[float] = 0.5  # adaptive: width of the stem below the lowest cut, m
     crop_below_ground: bool = Field(True, description="drop boxes, except surfaces, with their top below the ground")
     below_ground: Literal["drop", "clip"] = Field("drop", description="clip: also cut boxes at the ground (SimWorld)")
-    prune_nested: bool = Field(True, description="drop boxes inside another of the same kind")
-    nested_tolerance_m: float = Field(0.01, ge=0.0, description="how far a nested box may stick out, m")
+    prune_nested: bool = Field(True, description="drop boxes inside another box of the same kind")
+    nested_tolerance_m: float = Field(0.01, ge=0.0, description="length by which a nested box may stick out, m")
 
 
 @dataclass(frozen=True)

@@ -85,7 +85,7 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same
             "every box lies below the ground",
             where=maps,
             expected="boxes above the ground",
-            fix="check the map's ground_z_m",
+            fix="correct ground_z_m in the header of the map",
         )
     write_boxes(product, result.box_map)
     facts = report(raw, result, cfg)
@@ -98,7 +98,7 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same
         text = f"{title}: {len(box_map)} boxes, {area:.0f} m2 walkable (drawn: boxes below 2 m)"
         halves.append(add_caption(draw_map(shown, view), text))
     write_bytes(out / "simplify.png", png_bytes(np.hstack(halves)))
-    log.info("%d boxes become %d", len(raw), len(result.box_map))
+    log.info("simplified %d boxes to %d", len(raw), len(result.box_map))
     tally = Tally(input=1, kept=1)
     stage.finish([product, out / "simplify_report.json", out / "simplify.png"], tally, num_boxes=facts["num_boxes"])
     return product

@@ -20,9 +20,9 @@ class CarlaConfig(Config):
     """A CARLA server."""
 
     host: MayDiffer[str] = Field("127.0.0.1", min_length=1, description="address of the server")
-    port: MayDiffer[int] = Field(2000, ge=1, le=65533, description="its RPC port (-carla-rpc-port)")
-    town: str | None = Field(None, description="map to load, as Town10HD_Opt; null uses the loaded one")
-    timeout_s: MayDiffer[float] = Field(60.0, gt=0, description="time limit of an answer, s")
+    port: MayDiffer[int] = Field(2000, ge=1, le=65533, description="RPC port of the server (-carla-rpc-port)")
+    town: str | None = Field(None, description="map to load, such as Town10HD_Opt; null uses the loaded one")
+    timeout_s: MayDiffer[float] = Field(60.0, gt=0, description="time limit for an answer, s")
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:
             if cfg.town not in towns:
                 what = f"the server has no town of this name{nearest(cfg.town, towns)}"
                 where = f"{endpoint} (CARLA {version})"
-                raise ConfigError(what, where=where, got=cfg.town, expected=", ".join(towns))
+                raise ConfigError(what, where=where, got=cfg.town, expected=f"one of {', '.join(towns)}")
             world = client.load_world(cfg.town)
     return CarlaConnection(carla, client, world, endpoint, version, cfg.town or loaded)
 
@@ -100,6 +100,6 @@ def _server_errors(what: str, endpoint: str, version: str) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, OSError) as error:
-        fix = "check that a server runs there (one for each of --workers, ports 10 apart), or raise timeout_s"
+        fix = "start a server there (one for each of --workers, ports 10 apart), or raise timeout_s"
         where = f"{endpoint} (CARLA {version})"
         raise EnvironmentMissing(what, where=where, got=str(error) or type(error).__name__, fix=fix) from None

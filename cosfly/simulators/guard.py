@@ -159,7 +159,7 @@ def main(engine: str, host: str, port: str, command: str) -> None:
                 _restore_unrealcv(host, int(port), lines[0])
         except (RuntimeError, EnvironmentMissing) as error:
             # No answer usually means that the server has ended, so there is nothing to restore.
-            print(f"{engine} at {host}:{port} was not restored: {error}", file=sys.stderr)
+            print(f"{engine} at {host}:{port}: the level was not restored: {error}", file=sys.stderr)
 
 
 if __name__ == "__main__":

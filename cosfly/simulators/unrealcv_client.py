@@ -30,10 +30,10 @@ class UnrealCvConfig(Config):
     """An UnrealCV server."""
 
     host: MayDiffer[str] = Field("127.0.0.1", min_length=1, description="address of the server")
-    port: MayDiffer[int] = Field(9000, ge=1, le=65535, description="its port; often 9001 where 9000 is taken")
+    port: MayDiffer[int] = Field(9000, ge=1, le=65535, description="port of the server; often 9001 if 9000 is in use")
     level: str | None = Field(None, pattern=r"^[\w/.-]+$", description="level to open; null uses the open one")
-    timeout_s: MayDiffer[float] = Field(60.0, gt=0, description="time limit of an answer, s")
-    coord_scale: float = Field(100.0, gt=0, description="Unreal's units in 1 m: centimetres")
+    timeout_s: MayDiffer[float] = Field(60.0, gt=0, description="time limit for an answer, s")
+    coord_scale: float = Field(100.0, gt=0, description="Unreal units per metre; 100: centimetres")
 
 
 OURS = "COSFLY_"  # prefix of the names of spawned objects
@@ -77,7 +77,7 @@ class UnrealCvConnection:
             if is_refusal(answer):
                 got = f"{command}: {answer!r}"
                 fix = "use a build of UnrealCV that has this command"
-                raise EnvironmentMissing("the server does not accept a command", where=self.where, got=got, fix=fix)
+                raise EnvironmentMissing("the server refuses a command", where=self.where, got=got, fix=fix)
 
     def numbers(self, answer: str | bytes, num: int) -> tuple[float, ...] | None:
         """Return the numbers of an answer; None if it does not hold `num` finite numbers."""
@@ -144,7 +144,7 @@ def _opened(cfg: UnrealCvConfig, port: int, connection: UnrealCvConnection) -> U
             break
         time.sleep(0.5)
     connection.close()
-    fix = "open the level by hand and set the answer to `vget /level/name`, or remove the setting"
+    fix = "open the level in Unreal and set level to the answer of `vget /level/name`, or remove the setting"
     raise ConfigError("the server did not open the level", where=before, got=cfg.level, fix=fix)
 
 
@@ -201,5 +201,5 @@ def _server_errors(what: str, where: str) -> Iterator[None]:
     try:
         yield
     except NoAnswerError as error:
-        fix = "check that the server runs and listens there, or raise timeout_s"
+        fix = "start the server at this address, or raise timeout_s"
         raise EnvironmentMissing(what, where=where, got=str(error), fix=fix) from None

@@ -108,11 +108,11 @@ class WorldPlan(BaseModel):
             low, high = getattr(self, name)
             if not least <= low <= high <= most:
                 raise ValueError(
-                    f"{name} is {low:g} to {high:g}, but must be lowest to highest, within {least:g} to {most:g}"
+                    f"{name} is {low:g} to {high:g}, but must lie within {least:g} to {most:g}, the lower value first"
                 )
         if self.plazas + self.greens >= self.blocks_along**2:
             raise ValueError(
-                f"{self.plazas} plazas and {self.greens} greens leave none of {self.blocks_along**2} blocks to build on"
+                f"{self.plazas} plazas and {self.greens} greens leave no buildings on {self.blocks_along**2} blocks"
             )
         narrowest_m = self.block_m * (1.0 - self.unevenness) / (1.0 + self.unevenness)
         if narrowest_m < MIN_BLOCK_M + 1.0 or self.setback_m > narrowest_m / 5:

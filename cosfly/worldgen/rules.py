@@ -49,9 +49,9 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
     not_in_table = _find_unknown(remaining_text)
     if not (objects or not_in_table or without or set(words) & KNOWN):
         raise InputError(
-            "the planner without a model knows no word of this prompt", where="PROMPT", got=repr(prompt[:60]),
-            expected="English, as in 'a small village with a church'",
-            fix="name a kind of place, or let a language model plan with --planner URL",
+            "the rule-based planner recognises no word of this prompt", where="PROMPT", got=repr(prompt[:60]),
+            expected="an English description, such as 'a small village with a church'",
+            fix="name a kind of place, or use a language model with --planner URL",
         )  # fmt: skip
     settlements = WORDS["settlements"]
     kind = next((name for name, entry in settlements.items() if set(entry["words"].split()) & set(words)), "town")
@@ -67,8 +67,8 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
     if heights := _HEIGHTS.search(prompt.lower()):
         plan["heights_m"] = float(heights[1]), float(heights[2])
         if not 3 <= plan["heights_m"][0] <= plan["heights_m"][1] <= 450:
-            expected = "lowest to highest, within 3 to 450 m"
-            what = "the heights of buildings are not a possible range"
+            expected = "a lowest and a highest height, within 3 to 450 m"
+            what = "the range of building heights is impossible"
             raise InputError(what, where="PROMPT", got=heights[0], expected=expected)
     plan |= _open_and_water(words, objects, plan)
     if without:

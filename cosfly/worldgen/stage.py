@@ -50,8 +50,10 @@ class WorldConfig(Config):
 
     prompt: str = Field("", description="description of the world, in plain English")
     name: str = Field("TextWorld", min_length=1, max_length=60, description="name of the world's map")
-    planner: str | None = Field(None, description="URL of the language model that plans; empty: the embedded rules")
-    model: str | None = Field(None, description="name of the language model; empty takes the endpoint's only model")
+    planner: str | None = Field(
+        None, description="URL of the language model that plans the world; empty: built-in rules plan it"
+    )
+    model: str | None = Field(None, description="name of the language model; empty: the endpoint's only model")
 
 
 def _buildings_of(box_map: BoxMap) -> tuple[np.ndarray, np.ndarray]:
@@ -156,7 +158,7 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
     answer = find_object(reply.text, WorldPlan.model_fields.keys(), reply.finish_reason)
     if answer.value is None:
         raise TeacherError(
-            "the answer of the planner has no plan", where=where,
+            "the answer of the planner contains no plan", where=where,
             got=f"{answer.reason}: {' '.join(reply.text.split())[:80]!r}", expected="a JSON object",
             fix="try another --seed, prompt or model, or omit --planner to plan by rules without a model",
         )  # fmt: skip
@@ -169,7 +171,7 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same
     """
     prompt = " ".join(cfg.prompt.split())
     if not re.search(r"\w", prompt) or len(prompt) > MOST_CHARACTERS:
-        expected = f"1 to {MOST_CHARACTERS} characters, as in 'a small village with a church'"
+        expected = f"1 to {MOST_CHARACTERS} characters, such as 'a small village with a church'"
         got = f"{len(prompt)} characters"
         raise InputError("the prompt is empty or too long", where="PROMPT", got=got, expected=expected)
     stage = StageFolder.open(out, "world", config=cfg, inputs={}, seed=seed, resume=resume)
@@ -195,7 +197,7 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same
         if not check["is_met"]:
             log.warning("%(check)s: %(got)g, expected %(least)g to %(most)g", check)
     for name, reason in town.not_placed:
-        log.warning("not placed: %s (%s)", name, reason)
+        log.warning("the object %s is not placed: %s", name, reason)
     num_kept = 1 + len(town.placed)
     dropped = Counter(reason.replace(" ", "_") for _, reason in town.not_placed)
     tally = Tally(input=num_kept + len(town.not_placed), kept=num_kept, dropped=dropped)
