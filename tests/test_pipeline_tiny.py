@@ -103,7 +103,7 @@ def test_a_dry_run_writes_nothing(base):
     assert three["caption"].count == 3 * one["caption"].count
     shown = CliRunner().invoke(app, ["run", str(base), "--out", str(beside), "--dry-run"])
     assert shown.exit_code == 0, shown.output
-    assert "in all about" in shown.output
+    assert "total: about" in shown.output
     assert not beside.exists()
 
 

@@ -34,7 +34,7 @@ STUDENT = "Output of `distill train` or `merge`: ask the model in the form that 
     model=MODEL,
     judge=SettingOption("caption.judge.url", "URL of a server that judges conflicts."),
     keyframes=SettingOption(
-        "caption.window.keyframes", "Only windows at which the label changes, and every tenth.", bool
+        "caption.window.keyframes", "Caption only windows at which the label changes, and every tenth.", bool
     ),
     limit=SettingOption("caption.limit", "Caption at most this many windows; a later run resumes.", int),
     max_cost=SettingOption("caption.budget.max_cost", "Stop before this cost; prices: caption.budget.price_*.", float),
@@ -44,8 +44,12 @@ def caption(
     job: Job,
     data: options.Trees = None,
     out: Annotated[Path | None, Option(show_default="`caption` next to the tree", help="Output directory.")] = None,
-    plan_only: Annotated[bool, Option("--plan", help="Ask about a few windows and estimate the rest.")] = False,
-    retry_failed: Annotated[bool, Option("--retry-failed", help="Only the windows in quarantine.jsonl.")] = False,
+    plan_only: Annotated[
+        bool, Option("--plan", help="Caption a few windows and estimate time and cost of the rest.")
+    ] = False,
+    retry_failed: Annotated[
+        bool, Option("--retry-failed", help="Caption only the windows in quarantine.jsonl.")
+    ] = False,
     check: Annotated[bool, Option(help="Test the server before the first request of a directory.")] = True,
 ) -> None:
     """Ask a teacher for the reason of every manoeuvre, verify it against geometry, regenerate, translate (step 7)."""
@@ -120,7 +124,7 @@ def compare_strategies(
     job: Job,
     out: Annotated[Path, Option(help="Folder for compare_strategies.json and the answers.")],
     data: options.Trees = None,
-    conflicts: Annotated[int, Option(min=1, help="Stop after so many conflicts.")] = 50,
+    conflicts: Annotated[int, Option(min=1, help="Stop after this number of conflicts.")] = 50,
 ) -> None:
     """Compare hint, multi_sample, anchored and cascade on the same conflicts: consistency, text, requests, tokens."""
     from caption.stage.compare import comparison_table

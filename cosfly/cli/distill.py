@@ -103,8 +103,8 @@ def evaluate(
     predictions: Annotated[Path, Option(help="Predictions: the output of `distill infer`.")],
     out: options.Out,
     data: Annotated[list[Path] | None, Option(help="Playback tree, for the page's pictures; repeat it.")] = None,
-    bertscore_en: Annotated[Path | None, Option(help="roberta-large, for BERTScore of English.")] = None,
-    bertscore_zh: Annotated[Path | None, Option(help="bert-base-chinese, for BERTScore of Chinese.")] = None,
+    bertscore_en: Annotated[Path | None, Option(help="Folder of roberta-large, for BERTScore of English.")] = None,
+    bertscore_zh: Annotated[Path | None, Option(help="Folder of bert-base-chinese, for BERTScore of Chinese.")] = None,
     judged: Annotated[list[Path] | None, Option(help=JUDGED)] = None,
 ) -> None:
     """Score predictions: parse rate, decisions, verdicts, BERTScore and evidence, with baselines and intervals."""
@@ -135,7 +135,7 @@ FLYING = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR; baselines: track
     "fly plan render caption distill",
     STAGE,
     student=SettingOption("fly.student", FLYING, default="rules"),
-    as_student=SettingOption("fly.as_student", "Folder of `distill train` or `merge`: the model behind a URL.", Path),
+    as_student=SettingOption("fly.as_student", "Output of `distill train` or `merge`: the student behind a URL.", Path),
     adapter=SettingOption("fly.adapter", "Adapter of transformers:MODEL_DIR.", Path),
 )
 def fly(
@@ -182,7 +182,7 @@ def leaderboard(
     job: Job,
     folders: Annotated[list[str], Argument(metavar="[NAME=]DIR...", help="Outputs of `cosfly fly`, by student.")],
     out: options.Out,
-    rounds: Annotated[bool, Option("--rounds", help="They are rounds of one student, in order.")] = False,
+    rounds: Annotated[bool, Option("--rounds", help="The folders are rounds of one student, in order.")] = False,
 ) -> None:
     """Compare students: figures with intervals, floors and a ceiling."""
     from cosfly.closed_loop.leaderboard import LeaderboardConfig

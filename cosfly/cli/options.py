@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, cast
 import typer
 from typer import Option
 
-from cosfly.runtime.errors import ConfigError, InputError, nearest
+from cosfly.runtime.errors import ConfigError, InputError, counts_text, nearest
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -58,7 +58,7 @@ class SettingOption(NamedTuple):
 
 GLOB_HELP = "Only tracks whose folder, or one above it, matches: 'Town01/trajectory_17*/ORI', 'Town0[12]'; repeat it."
 ENGINE_HELP = "Where workers run: in processes of this machine, or on the nodes of a Ray cluster."
-ADDRESS_HELP = "Head node for --engine ray, or auto; none: $RAY_ADDRESS, or a cluster on this machine."
+ADDRESS_HELP = "Head node for --engine ray, or auto; by default $RAY_ADDRESS, or a cluster on this machine."
 RESUME_HELP = "With existing work in the output directory: refuse, or resume if settings and inputs agree."
 COMMON_SETTINGS = {
     "seed": SettingOption("seed", "Seed; every random choice derives from it.", int),
@@ -155,13 +155,13 @@ class Job:
 
     def check_failures(self, counts_by_stage: Mapping[str, Tally], where: Path) -> None:
         """Raise InputError if more items failed than the settings accept; all work is done before."""
-        failed = {stage: dict(counts.failed) for stage, counts in counts_by_stage.items() if counts.failed}
-        num_failed = sum(sum(reasons.values()) for reasons in failed.values())
+        failed = {stage: counts.failed for stage, counts in counts_by_stage.items() if counts.failed}
+        num_failed = sum(counts.total() for counts in failed.values())
         if num_failed > self.cfg.max_failed:
             raise InputError(
                 "more items failed than max_failed allows; all other items are complete",
                 where=where,
-                got=str(failed),
+                got="; ".join(f"{stage}: {counts_text(counts)}" for stage, counts in failed.items()),
                 expected=f"at most {self.cfg.max_failed}",
                 fix="fix the causes in failures.jsonl, and run the command again for the failed items",
             )

@@ -56,7 +56,7 @@ def _print_estimate(cfg: RunConfig, out: Path) -> None:
         else:
             time = duration(row.seconds)
         cells.append((row.name, row.amount, time, runs.in_words(row.bytes)))
-    title = f"What {out} would take; nothing is written"
+    title = f"Estimate for {out}; nothing is written"
     options.print_table(("stage", "to do", "time", "disk"), cells, title, is_answer=True)
     options.print_lines(runs.remarks(cfg, out, rows))
 
@@ -86,7 +86,7 @@ def print_run(run: Path, *, with_settings: bool = False) -> None:
     head = ("stage", "state", "items", "seconds", "on disk")
     options.print_table(head, rows, left=("state", "items"), is_answer=True, **PLAIN)
     differing = changed(summary.cfg) if with_settings else []
-    lines = ["settings that are not the defaults:"] if differing else []
+    lines = ["settings that differ from the defaults:"] if differing else []
     lines += [f"  {setting.name} = {dump_json(setting.value)}" for setting in differing]
     for folder, count in summary.waiting().items():
         lines.append(f"review   {count} tracks wait for a decision: {how_to_decide(Path(os.path.relpath(folder)))}")
@@ -148,9 +148,11 @@ def bench(
 @command("cosfly reproduce runs/first", "*", f"{WORKERS} resume")
 def reproduce(
     job: Job,
-    config: Annotated[Path, Argument(metavar="[RUN]", help="Run directory; of several towns, that of one.")] = Path(),
+    config: Annotated[
+        Path, Argument(metavar="[RUN]", help="Run directory; with several towns, that of one town.")
+    ] = Path(),
     out: Annotated[Path | None, Option(show_default="RUN/reproduce", help="Folder for the page.")] = None,
-    pedestrians: Annotated[int, Option(min=1, help="Number that planners are measured on.")] = 20,
+    pedestrians: Annotated[int, Option(min=1, help="Number of pedestrians for the measurement of planners.")] = 20,
 ) -> None:
     """Compare the paper's tables and figures with those of one run, on one page. Repeat the command to resume."""
     out = out or config / "reproduce"
@@ -173,10 +175,10 @@ def check(job: Job, config: Annotated[Path, Argument(help="YAML file, or the nam
 @options.groups["config"].command("show", epilog="cosfly config show --describe plan")
 def config_show(
     config: Annotated[str | None, Argument(help="YAML file, a shipped name, or a section; none: defaults.")] = None,
-    section: Annotated[str | None, Argument(help="Only this section or setting, such as plan.muco.")] = None,
+    section: Annotated[str | None, Argument(help="Show only this section or setting, such as plan.muco.")] = None,
     overrides: Annotated[list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Set a setting.")] = None,
-    describe: Annotated[bool, Option("--describe", help="Explain each setting, and what it may be.")] = False,
-    changed: Annotated[bool, Option("--changed", help="Only settings that are not the defaults.")] = False,
+    describe: Annotated[bool, Option("--describe", help="Explain each setting and its possible values.")] = False,
+    changed: Annotated[bool, Option("--changed", help="Show only settings that differ from the defaults.")] = False,
 ) -> None:
     """Print the resolved configuration: every setting with its value."""
     import yaml
@@ -242,7 +244,7 @@ def zoom(
     simplified: options.Simplified,
     traces: options.Traces,
     out: options.Out,
-    every: Annotated[int, Option(min=1, max=100, help="Draw one of this many frames.")] = 2,
+    every: Annotated[int, Option(min=1, max=100, help="Draw every n-th frame.")] = 2,
 ) -> None:
     """Compare levels of zoom on the same trajectories: target size, visibility, track quality; optical and digital."""
     from cosfly.runtime.json_io import read_object

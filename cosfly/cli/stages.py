@@ -29,7 +29,9 @@ BACKEND = SettingOption("render.backend", "Renderer: gl, pyrender, carla or unre
     'cosfly world "a small village by a river" --out village',
     "world",
     "seed resume",
-    planner=SettingOption("world.planner", "Language model that plans the world; none: embedded rules.", metavar="URL"),
+    planner=SettingOption(
+        "world.planner", "Language model that plans the world; by default, built-in rules.", metavar="URL"
+    ),
     model=SettingOption("world.model", "Name of the language model."),
 )
 def world(
@@ -65,7 +67,7 @@ def roi_backdrop(
         tuple[float, float, float, float] | None,
         Option(metavar="W S E N", show_default="the whole map", help="Area to draw, world metres."),
     ] = None,
-    pixels_per_m: Annotated[float, Option(min=0.01, max=100, help="Scale.")] = 4.0,
+    pixels_per_m: Annotated[float, Option(min=0.01, max=100, help="Scale, pixels per metre.")] = 4.0,
 ) -> None:
     """Draw the map from above with a renderer, for `roi edit --backdrop`."""
     drawing = {"bounds_m": bounds, "pixels_per_m": pixels_per_m}
@@ -164,7 +166,7 @@ def benchmark(
     "render",
     STAGE,
     backend=BACKEND,
-    weather_mode=SettingOption("render.weather_mode", "How weather is chosen."),
+    weather_mode=SettingOption("render.weather_mode", "Choice of weather: off, fixed, random_per_path or by_weight."),
     weather_name=SettingOption("render.weather_name", "Weather of mode fixed, such as heavy_rain."),
     tod_name=SettingOption("render.tod_name", "Time of day of mode fixed, such as night."),
     weather_pool=SettingOption("render.weather_pool", "YAML file with your own weather presets.", Path),
@@ -180,7 +182,7 @@ def benchmark(
     settle_delay=SettingOption(
         "render.unrealcv.settle_delay_s", "UnrealCV: seconds from a pose to its pictures.", float
     ),
-    coord_scale=SettingOption("render.unrealcv.coord_scale", "UnrealCV: its units per metre.", float),
+    coord_scale=SettingOption("render.unrealcv.coord_scale", "UnrealCV: Unreal units per metre.", float),
     coord_z_offset=SettingOption("render.unrealcv.coord_z_offset", "UnrealCV: metres added to heights.", float),
 )
 def render(
@@ -242,7 +244,7 @@ def review(
     by: Annotated[str | None, Option(help="Name of the reviewer.")] = None,
     reason: Annotated[str | None, Option(help="Reason of the decision.")] = None,
 ) -> None:
-    """Decide tracks that wait for review, into review.jsonl; without a decision, list them."""
+    """Record decisions on tracks in review in review.jsonl; without a decision, list these tracks."""
     from cosfly.formats.inspection import Choice, add_decisions, summary
 
     product = folder / "inspect.json" if folder.is_dir() else folder

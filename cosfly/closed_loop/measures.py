@@ -41,7 +41,7 @@ MEASURES = {
     "kept_s": "time to the first loss, crash or the end, s",
     "lost": f"episodes that lose the target for {LOSS_S:g} s",
     "reacquired": "losses after which the target is found again",
-    "reacquire_s": "time until it is found, s",
+    "reacquire_s": "time until the target is found again, s",
     "distance_m": "distance over ground, m",
     "in_band": f"frames at {BAND_M[0]:g} to {BAND_M[1]:g} m",
     "height_m": "height over the target's ground, m",

@@ -32,7 +32,7 @@ from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_on
 from cosfly.render import stage as rendering
-from cosfly.runtime.errors import ConfigError, InputError, NoPathError
+from cosfly.runtime.errors import ConfigError, InputError, NoPathError, shown
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Resume, StageFolder, flattened, read_stage_record
 from cosfly.runtime.worker import Item, Outcome, Work, advance
@@ -92,7 +92,9 @@ def _seed_of(flown: Path, cfg: ClosedLoopConfig) -> int:
         )
     was = flattened(begun.config["render"], "render")
     now = flattened(cfg.recorded()["render"], "render")
-    if changed := [f"{key} was {was.get(key)!r}, is {value!r}" for key, value in now.items() if was.get(key) != value]:
+    if changed := [
+        f"{key} was {shown(was.get(key))}, is {shown(value)}" for key, value in now.items() if was.get(key) != value
+    ]:
         raise ConfigError(
             "the render settings differ from those of the recorded episodes",
             where=flown,

@@ -59,8 +59,10 @@ class RelabelConfig(Config):
     """Settings of `cosfly fly --relabel`."""
 
     stride: int = Field(5, ge=1, description="frames between relabelled decisions")
-    future_frames: int = Field(10, ge=5, le=100, description="frames of the planner after the student's")
-    mistakes_only: bool = Field(False, description="skip decisions that were no mistake; students then get worse")
+    future_frames: int = Field(
+        10, ge=5, le=100, description="number of frames that the planner adds after those of the student"
+    )
+    mistakes_only: bool = Field(False, description="skip decisions that were no mistakes, which makes students worse")
     round: int = Field(1, ge=1, description="round of DAgger, recorded in the output")
 
 
@@ -74,14 +76,18 @@ KINDS = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR, policy:MODULE:CLA
 class FlyConfig(Config):
     """Settings of `cosfly fly`."""
 
-    student: str = Field("rules", description=f"who decides: {KINDS}")
-    as_student: Path | None = Field(None, description="output of `distill train` or `merge`: the format for a URL")
-    adapter: Path | None = Field(None, description="adapter of transformers:MODEL_DIR, as `distill train` wrote it")
+    student: str = Field("rules", description=f"source of the decisions: {KINDS}")
+    as_student: Path | None = Field(None, description="output of `distill train` or `merge`, whose prompts a URL gets")
+    adapter: Path | None = Field(None, description="adapter of `distill train` for transformers:MODEL_DIR")
     controller: Path | None = Field(None, description="table of commands per decision, instead of controller.yaml")
-    lead_frames: int = Field(21, ge=5, le=1000, description="frames of the plan up to the first decision's")
-    answer_limit_s: float = Field(60.0, gt=0, description="a later decision counts as late, and the drone hovers")
-    lost_s: float = Field(30.0, ge=0, description="an episode ends after so long without a visible target; 0: never")
-    most_decisions: int = Field(0, ge=0, description="an episode ends after so many decisions; 0: with its trajectory")
+    lead_frames: int = Field(21, ge=5, le=1000, description="number of planned frames up to that of the first decision")
+    answer_limit_s: float = Field(60.0, gt=0, description="time limit of a decision, s; after it, the drone hovers")
+    lost_s: float = Field(
+        30.0, ge=0, description="an episode ends after this time without a visible target, s; 0: never"
+    )
+    most_decisions: int = Field(
+        0, ge=0, description="an episode ends after this number of decisions; 0: with its trajectory"
+    )
     side_by_side: int = Field(16, ge=1, le=1024, description="episodes that a worker flies at once, as one batch")
     tree: bool = Field(True, description="render the playback tree of what was flown")
     trained_on: tuple[str, ...] | None = Field(None, description="towns of the student's training; null: unknown")

@@ -54,7 +54,9 @@ TASKS = {
     "cosfly/Reacquire-v0": _ALONE,
 }
 REACQUIRES = "cosfly/Reacquire-v0"
-UNSUITABLE = "this pedestrian trajectory cannot be an episode: no drone trajectory was found, or it is too short"
+UNSUITABLE = (
+    "this pedestrian trajectory cannot be an episode: no drone trajectory was found, or the one found is too short"
+)
 
 
 class BenchmarkTown(NamedTuple):

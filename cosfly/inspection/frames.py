@@ -148,7 +148,7 @@ def check_recorded(folder: Path, root: Path, recorded: Mapping[str, str], report
             compare_file(folder, name, digest, report, listed_in="the tree's manifest")
         elif name == "trajectory.json":
             got = "no such entry in the tree's manifest"
-            report.error("not_of_this_tree", name, got, "a track that was made with it")
+            report.error("not_of_this_tree", name, got, "a track that this manifest lists")
 
 
 # --- jumps ------------------------------------------------------------------------------------------------------------
@@ -211,10 +211,10 @@ def check_bystanders(
             if distance_m < clearance_min_m - CLEARANCE_TOLERANCE_M:
                 where = f"trajectory.json: points[{i}].drone_pose"
                 got = f"{distance_m:.2f} m to {line.instance_id}"
-                report.error("clearance", where, got, f"at least {clearance_min_m:g} m to others")
+                report.error("clearance", where, got, f"at least {clearance_min_m:g} m to bystanders")
             if bystander.gap_to_person_m(track.targets_m[i]) < -CLEARANCE_TOLERANCE_M:
                 where = f"trajectory.json: points[{i}].target.world_location"
-                report.error("collision", where, f"in {line.instance_id}", "no contact")
+                report.error("collision", where, f"inside bystander {line.instance_id}", "no contact")
     if frames:
         hidden = np.array([frame.target_hidden_by_others for frame in frames.values()])
         metrics.update(
@@ -270,7 +270,7 @@ def check_frames(
             report.error("blank_frame", f"{where}/rgb.png", f"standard deviation {small.std():.2f}", "a picture")
         if previous is not None and (previous[1] == small).all() and _moved(track, previous[0], i):
             got = f"the picture of frame {previous[0]}"
-            report.error("frozen_frame", f"{where}/rgb.png", got, "another picture: the camera has moved")
+            report.error("frozen_frame", f"{where}/rgb.png", got, "a different picture, because the camera has moved")
         previous = (i, small)
         is_bystander = np.zeros(NUM_IDS, dtype=np.bool_)
         others = bystanders[i].others if i in bystanders else ()
@@ -343,7 +343,7 @@ def _check_depth(depth: np.ndarray, where: str, numbers: FrameNumbers, report: R
     elif low < INVALID_DEPTH_M:
         report.error("depth_range", where, f"{low:.3f} to {high:.3f} m", f"{INVALID_DEPTH_M} to {SKY_DEPTH_M} m")
     elif low == high:
-        report.error("depth_range", where, f"{low:.3f} m everywhere", "a depth image")
+        report.error("depth_range", where, f"{low:.3f} m everywhere", "different depths")
     else:
         has_invalid = low <= INVALID_DEPTH_M
         numbers.invalid_depth_shares.append(float((depth == INVALID_DEPTH_M).mean()) if has_invalid else 0.0)

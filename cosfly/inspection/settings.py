@@ -39,19 +39,19 @@ PAGE_MB = 25.0  # size of report.html beyond which tracks have no pictures, acce
 class InspectConfig(Config):
     """Thresholds of the inspection. An error rejects a track, a warning sends it to review."""
 
-    flights: TrackChoice = Field(TrackChoice(), description="tracks of the tree")
+    flights: TrackChoice = Field(TrackChoice(), description="tracks to inspect")
     accel_rms_max_mps2: float = Field(
-        ACCEL_RMS_MAX_MPS2, gt=0, description="planned RMS acceleration above this rejects, m/s^2"
+        ACCEL_RMS_MAX_MPS2, gt=0, description="largest accepted RMS acceleration of a plan, m/s^2"
     )
-    jerk_rms_max_mps3: float = Field(JERK_RMS_MAX_MPS3, gt=0, description="planned RMS jerk above this rejects, m/s^3")
-    smoothness_min: Share = Field(0.5, description="smoothness score S below this goes to review; 0 turns the rule off")
+    jerk_rms_max_mps3: float = Field(JERK_RMS_MAX_MPS3, gt=0, description="largest accepted RMS jerk of a plan, m/s^3")
+    smoothness_min: Share = Field(0.5, description="smallest smoothness score S that needs no review; 0: no limit")
     five_ray_mean_min: Share = Field(
         FIVE_RAY_MEAN_MIN,
-        description="mean five-ray visibility of the poses below this rejects; 0 turns the rule off",
+        description="smallest accepted mean five-ray visibility of the poses; 0: no limit",
     )
     clearance_min_m: float = Field(
         RELAXED_SAFETY_M,
         ge=0,
-        description="a smaller distance of the drone to an obstacle rejects, m; 0: only inside one",
+        description="smallest accepted distance of the drone to obstacles, m; 0: anywhere outside obstacles",
     )
     check_checksums: bool = Field(True, description="read every file and compare it with checksums.sha256")

@@ -104,7 +104,7 @@ def _log_review(counts: TrackFunnel, out: Path) -> None:
     if counts.review:
         log.log(
             logging.INFO if counts.accepted else logging.WARNING,
-            "inspect: %d of %d tracks wait for a person (%s): %s",
+            "inspect: %d of %d tracks need a decision by a person (%s): %s",
             counts.review, counts.inspected, reasons, how_to_decide(out),
         )  # fmt: skip
 

@@ -38,23 +38,27 @@ class CommandConfig(Config):
 
     name: str = Field("run", pattern=r"^[\w-][\w. -]*$", description="name; `cosfly run` writes to runs/<name>")
     seed: int = Field(0, description="seed; every random choice derives from it, the stage and the item")
-    workers: int = Field(0, ge=0, description="worker processes; 0: one per core, or as a Ray cluster has room for")
-    engine: Literal["local", "ray"] = Field("local", description="workers: on this machine, or on the nodes of `ray`")
+    workers: int = Field(
+        0, ge=0, description="worker processes; 0: one per core, or as many as the Ray cluster has room for"
+    )
+    engine: Literal["local", "ray"] = Field(
+        "local", description="local: workers on this machine; ray: workers on the nodes of a Ray cluster"
+    )
     ray: RayConfig = Field(default_factory=RayConfig, description="the cluster of engine ray")
     item_limit_s: float | None = Field(
         None,
         ge=0,
         description="seconds without progress (in rendering: without a new frame) after which a worker is ended and "
-        "its item tried again, twice; null takes the larger of 600 and 20 times the usual time; 0 for no limit",
+        "its item is tried again, at most twice; null: the larger of 600 and 20 times the usual time; 0: no limit",
     )
     max_failed: int = Field(0, ge=0, description="failed items that are accepted; with more, the command exits with 1")
     roi: Path | None = Field(None, description="region for the pedestrians (roi_polygon.json); none: the whole map")
     follow_links: bool = Field(False, description="follow symbolic links out of the run, tree, release or meshes")
     towns: dict[str, dict[str, Any]] = Field(
         {},
-        description="towns of one data set: name -> the settings that differ there; each is a run in a folder of its "
-        "name, and one release is made of all. `maps` of a town replaces the shared one. None: one town, with the "
-        "settings below",
+        description="towns of one data set, by name, with the settings that differ from the shared ones; each town is "
+        "a run in a folder of its name, and one release contains all. `maps` of a town replaces the shared section. "
+        "Empty: one town",
     )
 
     def opened(self, path: Path) -> Path:

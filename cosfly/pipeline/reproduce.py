@@ -31,7 +31,7 @@ from cosfly.planners import compare
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.config import build, read_yaml
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import InputError, json_type
 from cosfly.runtime.events import read_events
 from cosfly.runtime.io import read_bytes, write_bytes
 from cosfly.runtime.json_io import FileFormat, read_object, write_json
@@ -128,7 +128,7 @@ def run(
         try:
             parts.append(make_part(label, table, reader))
         except MissingFile as missing_file:
-            left_out[table.labels(label)] = f"needs {missing_file}, which this run has not made"
+            left_out[table.labels(label)] = f"needs {missing_file}, which this run did not write"
     if "release" in done:
         tables = read_object(out / "release/stats.json", what="statistics")["tables"]
         parts += [Part(**table) for table in tables if table["key"] in OF_RELEASE]
@@ -186,7 +186,7 @@ def our_figures(table: PaperTable, reader: FigureReader) -> tuple[dict[str, list
             raise InputError(
                 "the value at this place is not a table",
                 where=place,
-                got=type(named_rows).__name__,
+                got=json_type(named_rows),
                 expected="an object with one entry for each row name",
                 fix=MAKE_AGAIN,
             )

@@ -230,12 +230,15 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
         time += f", and {', '.join(unknown)}, whose time depends on the teacher"
     existing = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
     free = shutil.disk_usage(existing).free
-    lines = [f"figures: {BASIS}", f"in all about {time}; {in_words(needed)} of disk, {in_words(free)} are free"]
+    lines = [
+        f"estimates are based on {BASIS}",
+        f"total: about {time}; {in_words(needed)} of disk space ({in_words(free)} are free)",
+    ]
     lines += caveats(cfg)
     if unknown:
-        lines.append("cosfly caption --plan estimates the teacher's part")
+        lines.append("run cosfly caption --plan to estimate the time of the teacher")
     if needed > free:
-        lines.append("the disk is too small: choose another --out, or fewer pedestrians or pixels")
+        lines.append("the disk is too small: choose another --out, fewer pedestrians or smaller pictures")
     return lines
 
 

@@ -35,7 +35,7 @@ TOWN_NAME = re.compile(r"[A-Za-z0-9_-]{1,60}")
 class DistillConfig(Config):
     """Settings of students."""
 
-    prepare: PrepareConfig = Field(default_factory=PrepareConfig, description="captions to a training set")
+    prepare: PrepareConfig = Field(default_factory=PrepareConfig, description="training set from captions")
     dual_track: DualTrackConfig = Field(default_factory=DualTrackConfig, description="windows over both tracks")
     train: TrainConfig = Field(default_factory=TrainConfig, description="LoRA training")
     infer: InferConfig = Field(default_factory=InferConfig, description="answers of the student")
@@ -45,7 +45,7 @@ class DistillConfig(Config):
 class RunConfig(CommandConfig):
     """Everything that `cosfly run` needs, and the sections of all other commands."""
 
-    maps: MapsConfig = Field(default_factory=MapsConfig, description="step 1, where the boxes come from")
+    maps: MapsConfig = Field(default_factory=MapsConfig, description="step 1: source of the map")
     simplify: SimplifyConfig = Field(default_factory=SimplifyConfig, description="step 2")
     pedestrians: PedestriansConfig = Field(default_factory=PedestriansConfig, description="step 3")
     plan: PlanConfig = Field(default_factory=PlanConfig, description="step 4")

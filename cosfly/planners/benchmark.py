@@ -88,7 +88,7 @@ class BenchmarkConfig(CompareConfig):
     """Settings of a benchmark: those of a comparison, and the number of scenarios."""
 
     planners: tuple[str, ...] = Field(tuple(ALL_PLANNERS), description="planners to run")
-    scenarios: int = Field(20, ge=1, description="largest number of pedestrian trajectories, from the first one on")
+    scenarios: int = Field(20, ge=1, description="largest number of pedestrian trajectories, in the order of the file")
 
 
 # --- stage ------------------------------------------------------------------------------------------------------------
@@ -130,9 +130,11 @@ def _without_missing(cfg: BenchmarkConfig) -> BenchmarkConfig:
     if not sampling or importlib.util.find_spec("ompl") is not None:
         return cfg
     if len(sampling) == len(cfg.planners):
-        fix = f"name a planner that does not need it, or install it: {INSTALL}"
+        fix = f"choose a planner that works without OMPL, or install OMPL: {INSTALL}"
         raise EnvironmentMissing("OMPL is not installed, and all chosen planners need it", fix=fix)
-    log.warning("OMPL is not installed; skipped: %s; %s", ", ".join(sampling), INSTALL)
+    log.warning(
+        "OMPL is not installed, so these planners are skipped: %s; to install it: %s", ", ".join(sampling), INSTALL
+    )
     return cfg.model_copy(update={"planners": tuple(name for name in cfg.planners if name not in sampling)})
 
 
@@ -231,7 +233,7 @@ def text_tables(benchmark: dict[str, Any]) -> Iterator[TextTable]:
 
     columns = ["visibility", "efficiency", "smoothness", "safety", "mean", "95 %", "paper", "collision", "clearance"]
     shortest = f"{benchmark['shortest_mean_m']:.2f} m (paper: {PAPER_SHORTEST_M} m)"
-    yield TextTable(f"Four axes; efficiency to the shortest mean, {shortest}", ["planner", *columns], [
+    yield TextTable(f"Four axes; efficiency is relative to the shortest mean length, {shortest}", ["planner", *columns], [
         [
             title_of(p), *cells(row["scores"][axis] for axis in AXES_AND_MEAN),
             " to ".join(cells(row["intervals"]["mean"])), *_printed(p, "axes_mean"),
@@ -247,7 +249,7 @@ def text_tables(benchmark: dict[str, Any]) -> Iterator[TextTable]:
         for name, words, digits in FIGURES if benchmark["deltas"]
     ])  # fmt: skip
     words = ", ".join(f"{weight:g} {name}" for name, (*_, weight) in CRITERIA.items())
-    title = f"Weighted score: {words}; each from the worst, 0, to the best, 1"
+    title = f"Weighted score: {words}; each is scaled from 0 (worst planner) to 1 (best planner)"
     yield TextTable(title, ["planner", "score", *CRITERIA, "paper"], [
         [f"{row['rank']} {title_of(p)}", *cells([row["score"], *row["normalized"].values()]), *_printed(p, "weighted")]
         for p, row in benchmark["ranking"].items()
@@ -260,8 +262,8 @@ def text_tables(benchmark: dict[str, Any]) -> Iterator[TextTable]:
         printed = _printed(p, "num_free", "visibility", "clearance_m")
         rows.append([title_of(p), GROUP_OF[p], *counts, *measured, *printed])
     columns = ["found", "free of collisions", "collision", "visibility", "clearance"]
-    columns += ["paper: free of 20", "paper: visibility", "paper: clearance"]
-    title = "Feasibility; a missing trajectory collides and sees nothing"
+    columns += ["paper: free, of 20", "paper: visibility", "paper: clearance"]
+    title = "Feasibility; a missing trajectory counts as a collision without visibility"
     yield TextTable(title, ["planner", "group", *columns], rows)
     names = ("five_ray_mean", "blocked_fraction", "collision_fraction", "clearance_min_m", "length_m")
     columns = ["visibility", "blocked", "collision", "clearance", "length", "paper: visibility"]
@@ -288,7 +290,7 @@ def draw_figures(benchmark: dict[str, Any], planned: dict[str, PlannedItem], box
     Those of TA*+Smooth against MuCO are drawn only where both found trajectories.
     """
     if importlib.util.find_spec("matplotlib") is None:
-        log.warning("matplotlib is not installed; no figures are drawn; %s", INSTALL)
+        log.warning("matplotlib is not installed, so no figures are drawn; to install it: %s", INSTALL)
         return {}
     from matplotlib.figure import Figure
 
@@ -357,7 +359,7 @@ def _pairs(figure: Any, benchmark: dict[str, Any]) -> None:
         axes.margins(0.2)
         axes.grid(alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=len(PLANNERS))
-    figure.suptitle("The axes in pairs; gray: generic planners")
+    figure.suptitle("Pairs of axes; gray: generic planners")
 
 
 def _deltas(figure: Any, benchmark: dict[str, Any]) -> None:

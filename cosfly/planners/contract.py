@@ -103,8 +103,8 @@ class MucoConfig(Config):
     low_visibility_frames: ClassVar[int] = 20  # in a row: visibility and view angle leave the gradient
     step: Literal["newton", "paper"] = Field(
         "newton",
-        description="newton: ours, a band-matrix step that is shortened until the loss falls, then a repair to "
-        "plan.accel_max_mps2; paper: as printed, plain steps along finite differences, without either",
+        description="newton: our band-matrix step, shortened until the loss falls, and a repair to "
+        "plan.accel_max_mps2; paper: steps along finite differences as in the paper, without shortening and repair",
     )
     difference_m: ClassVar[float] = 0.5  # half width of the difference window, m
     learning_rate: ClassVar[float] = 0.05  # of step paper; step newton has none
@@ -137,7 +137,9 @@ class PlanConfig(Config):
         "foresight", description=f"foresight (ours), muco ({STEP_NOTE}) or track_astar ({SMOOTHING_NOTE})"
     )
     safety_distance_m: float = Field(limits.SAFETY_DISTANCE_M, gt=0, description="nominal distance to obstacles, m")
-    relaxed_safety_m: float = Field(limits.RELAXED_SAFETY_M, gt=0, description="distance where that is impossible, m")
+    relaxed_safety_m: float = Field(
+        limits.RELAXED_SAFETY_M, gt=0, description="distance to obstacles where the nominal one is impossible, m"
+    )
     altitude_min_m: float = Field(20.0, gt=0, description="least altitude of the style follow, m")
     altitude_preferred_m: float = Field(20.0, gt=0, description="preferred altitude of the style follow, m")
     altitude_max_m: float = Field(100.0, gt=0, description="greatest altitude, m")
@@ -150,7 +152,7 @@ class PlanConfig(Config):
     )
     heading_smoothing_s: ClassVar[float] = 4.0  # standard deviation of the target's heading filter, s; 0: none
     five_ray_mean_min: float = Field(
-        limits.FIVE_RAY_MEAN_MIN, ge=0, le=1, description="a trajectory of lower mean five-ray visibility is dropped"
+        limits.FIVE_RAY_MEAN_MIN, ge=0, le=1, description="smallest mean five-ray visibility of an accepted trajectory"
     )
     accel_rms_max_mps2: ClassVar[float] = limits.ACCEL_RMS_MAX_MPS2  # of greater RMS acceleration: dropped
     jerk_rms_max_mps3: ClassVar[float] = limits.JERK_RMS_MAX_MPS3  # of greater RMS jerk: dropped
@@ -158,13 +160,14 @@ class PlanConfig(Config):
         {FOLLOW: 1.0}, description="share of each manoeuvre style; shares need not add up to one", examples=[*NAMES]
     )
     style_ranges: dict[str, dict[str, Range]] = Field(
-        {}, description="[least, greatest] instead of the table's ranges, such as {side: {altitude_m: [11, 13]}}"
+        {}, description="[least, greatest] values that replace those of a style, such as {side: {altitude_m: [11, 13]}}"
     )
     segment_s: float = Field(
-        0.0, ge=0, description="approximate length of a segment of one style, s; 0: one style a trajectory"
+        0.0, ge=0, description="approximate duration of a segment with one style, s; 0: one style per trajectory"
     )
     styles_fallback: Literal["drop", "follow"] = Field(
-        "drop", description="where the map cannot hold a style: drop the trajectory, or use follow; both are counted"
+        "drop",
+        description="where the map leaves no room for a style: drop the trajectory, or use follow; both are counted",
     )
     muco: MucoConfig = Field(MucoConfig(), description="the MuCO optimiser")
     track_astar: TrackAStarConfig = Field(TrackAStarConfig(), description="TA*+Smooth, with our smoothing")

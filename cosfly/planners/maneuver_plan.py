@@ -196,8 +196,8 @@ def describe_not_held(
     prevented = ", ".join(f"{share:.0%} {cause}" for cause, share in shares.items() if share > 0)
     return (
         f"{worst.style}, {len(not_held) / len(frames):.0%} of frames {worst.begin} to {worst.end - 1}: "
-        f"requested {medians(requested_m)}; planned {medians(positions_m)} (medians); of the requested positions are "
-        f"{prevented or 'all free, in sight and within reach, but not on the way there'}"
+        f"requested {medians(requested_m)}; planned {medians(positions_m)} (medians); "
+        f"requested positions: {prevented or 'all possible, but the way to them is not'}"
     )
 
 

@@ -271,7 +271,9 @@ def read_inputs(simplified_map: Path, paths: Path) -> tuple[BoxMap, list[Pedestr
         )
     (path_id, count), *_ = Counter(pedestrian.path_id for pedestrian in pedestrians).most_common(1)
     if count > 1:
-        raise InputError("a path id occurs more than once", where=where, got=path_id, expected="unique ids")
+        raise InputError(
+            "several pedestrian trajectories have the same id", where=where, got=path_id, expected="unique ids"
+        )
     return box_map, pedestrians
 
 
@@ -311,7 +313,7 @@ def run(
     header = {"map": box_map.name, "planner": cfg.planner, "seed": seed, "settings": cfg.recorded()}
     for trace in traces:
         if trace.not_held:
-            log.warning("%s: style_not_held: %s", trace.path_id, trace.not_held)
+            log.warning("%s: dropped, because the drone does not hold the style: %s", trace.path_id, trace.not_held)
     write_traces(product, traces, header)
     write_bytes(picture, draw_trajectories(box_map, pedestrians, traces))
     times_ms = 1000.0 * np.array([record.seconds for record in records])  # not in the product, which is reproducible

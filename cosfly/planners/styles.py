@@ -97,7 +97,7 @@ def with_ranges(row: Style, ranges: Mapping[str, Range]) -> Style:
     range_names = [name for name in names if isinstance(getattr(row, name), tuple)]
     for name, (low, high) in ranges.items():
         if name not in range_names:
-            raise ValueError(f"the style has no range of the name {name}; choose from {', '.join(range_names)}")
+            raise ValueError(f"the style has no range with the name {name}; choose from {', '.join(range_names)}")
         if low > high:
             raise ValueError(f"the range {name} must be [least, greatest], got [{low:g}, {high:g}]")
         if low <= 0 and name not in ("bearing_deg", "round_mps", "climb_m"):

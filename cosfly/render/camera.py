@@ -159,11 +159,11 @@ class ZoomConfig(Config):
 
     mode: Literal["fixed", "dynamic"] = Field(
         "fixed",
-        description="fixed: a trajectory keeps its level; dynamic: each of its parts draws one, and meta.json and "
-        "trajectory.json have the intrinsics of each frame",
+        description="fixed: a trajectory keeps one zoom level; dynamic: each part of it draws a level, and meta.json "
+        "and trajectory.json have the intrinsics of each frame",
     )
     part_s: float = Field(20.0, ge=1, description="dynamic: length of the parts of a trajectory without segments, s")
-    ramp_s: float = Field(4.0, ge=0, description="dynamic: duration of a change of level, s; 0: at once")
+    ramp_s: float = Field(4.0, ge=0, description="dynamic: duration of a change of level, s; 0: instantaneous")
 
 
 def zoomed_deg(

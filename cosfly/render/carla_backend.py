@@ -46,7 +46,7 @@ class CarlaRenderConfig(CarlaConfig, ServerCommand):
 
     rgb_attributes: dict[str, str] = Field(
         {"exposure_mode": "manual", "motion_blur_intensity": "0.0", "motion_blur_max_distortion": "0.0"},
-        description="attributes of the RGB camera: fixed exposure, no motion blur, and what else a blueprint has",
+        description="attributes of the blueprint of the RGB camera; default: fixed exposure and no motion blur",
     )
 
 
@@ -185,7 +185,7 @@ class CarlaRenderer(SimulatorRenderer):
             attributes = {"image_size_x": width, "image_size_y": height, "fov": f"{fov_deg:g}"}
             for key, text in (attributes | (self._cfg.rgb_attributes if name == "rgb" else {})).items():
                 if not blueprint.has_attribute(key):
-                    fix = "remove it from render.carla.rgb_attributes"
+                    fix = "remove this attribute from render.carla.rgb_attributes"
                     raise RenderError("the camera has no attribute of this name", where=self.device, got=key, fix=fix)
                 blueprint.set_attribute(key, text)
             inbox: queue.SimpleQueue = queue.SimpleQueue()

@@ -46,15 +46,16 @@ class PerturbationConfig(Config):
     rotation_probability: float = Field(0.6, ge=0, le=1, description="share of frames whose view is turned")
     pedestrian_radius_m: float = Field(2.0, ge=0, description="largest shift of the person on the ground (R_h), m")
     drone_radius_m: float = Field(3.0, ge=0, description="largest shift of the drone (R_d), m")
-    view_radius_m: float = Field(2.0, ge=0, description="how far from the person the camera may look, m")
+    view_radius_m: float = Field(2.0, ge=0, description="largest distance of the camera's aim from the person, m")
     max_view_deg: float = Field(5.0, ge=0, le=45, description="largest turn in yaw and in pitch (theta_max), degrees")
-    max_roll_deg: float = Field(0.0, ge=0, le=45, description="largest roll of a turned view, degrees; the paper: none")
-    sampling: Literal["cubic", "spherical"] = Field("spherical", description="offsets evenly in a cube or a ball")
+    max_roll_deg: float = Field(0.0, ge=0, le=45, description="largest roll of a turned view, degrees; 0 in the paper")
+    sampling: Literal["cubic", "spherical"] = Field(
+        "spherical", description="offsets are uniform in a cube or in a ball"
+    )
     min_clearance_m: float = Field(
         SAFETY_DISTANCE_M,
         ge=0,
-        description="distance that a shifted drone keeps from obstacles, m; where the plan is nearer, as far as the "
-        "plan",
+        description="distance that a shifted drone keeps from obstacles, m; where the plan is nearer, that of the plan",
     )
     frame_margin: ClassVar[float] = 0.02  # share of the image at each border that the person is kept out of
 

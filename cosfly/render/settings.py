@@ -24,17 +24,17 @@ class RenderConfig(WeatherConfig):
     backend: Literal["gl", "pyrender", "carla", "unrealcv"] = Field(
         "gl",
         description="renderer; gl is OpenGL without a window, on a GPU or the CPU; pyrender is a plain and slow "
-        "cross-check; carla asks a running CARLA 0.9.16, unrealcv a running UnrealCV, as SimWorld's",
+        "cross-check; carla uses a running CARLA 0.9.16, unrealcv a running UnrealCV, such as SimWorld",
     )
-    carla: CarlaRenderConfig = Field(CarlaRenderConfig(), description="the server of backend carla")
-    unrealcv: UnrealCvRenderConfig = Field(UnrealCvRenderConfig(), description="the server of backend unrealcv")
+    carla: CarlaRenderConfig = Field(CarlaRenderConfig(), description="server of backend carla")
+    unrealcv: UnrealCvRenderConfig = Field(UnrealCvRenderConfig(), description="server of backend unrealcv")
     width_px: int = Field(1280, ge=16, le=LONGEST_SIDE_PX, description="image width, px")
     height_px: int = Field(720, ge=16, le=LONGEST_SIDE_PX, description="image height, px")
     fovs_deg: tuple[float, ...] = Field(
         (110.0, 90.0, 60.0, 30.0),
         min_length=1,
-        description="levels of zoom: horizontal fields of view in (0, 180) degrees; each trajectory draws one for "
-        "both its tracks; a list of one fixes it",
+        description="zoom levels, as horizontal fields of view in degrees; each trajectory draws one level for both of "
+        "its tracks",
     )
     zoom: ZoomConfig = Field(ZoomConfig(), description="changes of the level within a trajectory")
     town: str | None = Field(
@@ -49,12 +49,12 @@ class RenderConfig(WeatherConfig):
         "traces, seed and settings, so that other maps and runs have other ids",
     )
     tracks: tuple[Literal["clean", "perturbed"], ...] = Field(
-        ("clean", "perturbed"), min_length=1, description="which tracks to draw: ORI and aug_001"
+        ("clean", "perturbed"), min_length=1, description="tracks to draw: clean (ORI) and perturbed (aug_001)"
     )
     perturbation: PerturbationConfig = Field(PerturbationConfig(), description="the perturbed track")
     look: Look = Field(Look(), description="sun and air of trajectories without weather")
     modalities: tuple[FrameFile, ...] = Field(
-        ("rgb", "depth", "instance"), min_length=1, description="which images to write; meta.json is always written"
+        ("rgb", "depth", "instance"), min_length=1, description="images to write; meta.json is always written"
     )
     depth_format: DepthFormat = Field(
         "png",

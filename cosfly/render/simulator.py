@@ -31,8 +31,8 @@ class ServerCommand(Config):
 
     server_command: MayDiffer[str] = Field(
         "",
-        description="starts a server, with {port} in it, as 'CarlaUE4.sh -RenderOffScreen -carla-rpc-port={port}'; it "
-        "is started again when it dies; empty: servers run already",
+        description="command that starts a server at {port}, such as 'CarlaUE4.sh -RenderOffScreen "
+        "-carla-rpc-port={port}', and again when it dies; empty: the servers already run",
     )
 
 
@@ -103,7 +103,7 @@ class SimulatorRenderer(ABC):
             raise problem
         if isinstance(problem, NoPictureError):
             raise RenderError("a camera of the simulator sent no picture", where=self.device, got=str(problem), fix=FIX)
-        raise EnvironmentMissing("the simulator does not answer any more", where=self.device, got=str(problem), fix=FIX)
+        raise EnvironmentMissing("the simulator no longer answers", where=self.device, got=str(problem), fix=FIX)
 
 
 def placement_of(body: Body, lead_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

@@ -191,7 +191,9 @@ def run(
         if fog_hides(weathers[trace.drawn_as(number).number], nearest_m):
             hidden.append(trace.path_id)
     if hidden:
-        log.warning("render: fog hides the target in all frames of %s; plan nearer, or change the weather", hidden)
+        log.warning(
+            "render: fog hides the target in all frames of %s; plan nearer to the target, or change the weather", hidden
+        )
     items = [
         Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track), len(trace.time_s[:: cfg.frame_stride]))
         for number, trace in passed.items()

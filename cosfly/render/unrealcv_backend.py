@@ -23,7 +23,7 @@ from cosfly.formats.weather import WeatherParams
 from cosfly.render.contract import NEAR_M, NO_INSTANCE, Frame, PosedPerson, far_as_sky, instance_ids
 from cosfly.render.simulator import Body, NoPictureError, ServerCommand, SimulatorRenderer, placement_of
 from cosfly.runtime.arrays import parse_array, parse_picture
-from cosfly.runtime.errors import ConfigError, InputError, RenderError
+from cosfly.runtime.errors import ConfigError, InputError, RenderError, shown
 from cosfly.simulators import unrealcv_client
 from cosfly.simulators.assets import id_of, kind_of
 from cosfly.simulators.conventions import FAR_CM, camera_rotation_deg, unreal_pose, world_pose
@@ -41,8 +41,10 @@ COLORS = 1 << 24
 class UnrealCvRenderConfig(UnrealCvConfig, ServerCommand):
     """UnrealCV as a renderer; worker i asks the server at port + i."""
 
-    coord_z_offset: float = Field(0.0, description="added to all heights, m, where the recorded altitude is off")
-    settle_delay_s: float = Field(0.1, ge=0, description="how long the engine runs after a pose, s")
+    coord_z_offset: float = Field(
+        0.0, description="offset added to all heights, m, if the heights of map and level differ"
+    )
+    settle_delay_s: float = Field(0.1, ge=0, description="time that the engine runs after a pose is set, s")
     camera: int = Field(0, ge=0, description="number of the camera, of `vget /cameras`")
     animate: bool = Field(True, description="people walk while the engine settles; false: they are only placed")
     person_asset: ClassVar[str] = "/Game/TrafficSystem/Pedestrian/Base_User_Agent.Base_User_Agent_C"
@@ -228,7 +230,7 @@ class UnrealCvRenderer(SimulatorRenderer):
         pictures = []
         for name, data in (("lit", lit), ("object_mask", mask)):
             if isinstance(data, str):
-                raise InputError("the server sent a text instead of a picture", where=name, got=repr(data)[:80])
+                raise InputError("the server sent a text instead of a picture", where=name, got=shown(data))
             pictures.append(parse_picture(data, name, flags=cv2.IMREAD_COLOR))
         raw = parse_array(depth if isinstance(depth, bytes) else depth.encode(), "depth", dtype=np.float32, ndim=2)
         for name, picture in zip(("lit", "object_mask", "depth"), (*pictures, raw), strict=True):

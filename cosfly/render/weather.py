@@ -60,11 +60,11 @@ class WeatherConfig(Config):
     )
     weather_name: str | None = Field(None, description="preset of the weather in mode fixed", examples=[*WEATHERS])
     tod_name: str | None = Field(None, description="preset of the time of day in mode fixed", examples=[*TIMES])
-    weather_pool: MayDiffer[Path | None] = Field(None, description="YAML file of weather presets instead of the 15")
-    tod_pool: MayDiffer[Path | None] = Field(None, description="YAML file of times of day instead of the 4")
+    weather_pool: MayDiffer[Path | None] = Field(None, description="YAML file that replaces the 15 weather presets")
+    tod_pool: MayDiffer[Path | None] = Field(None, description="YAML file that replaces the 4 times of day")
     weather_seed: int = Field(
         DEFAULT_SEED,
-        description="seed of random_per_path and by_weight; a negative one draws a seed, which is recorded",
+        description="seed of random_per_path and by_weight; a negative value draws a seed, which is recorded",
     )
 
     @field_validator("weather_mode", mode="before")

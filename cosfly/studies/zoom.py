@@ -118,7 +118,7 @@ def text_table(product: dict[str, Any]) -> TextTable:
         width, height, seen, quality = ("-" if mean == "-" else f"{mean} ± {std}" for mean, std in pairs)
         lens = [level["level"], f"{level['fov_deg']:g}", f"{level['focal_length_35mm_mm']:.1f}"]
         rows.append([*lens, f"{width} x {height}", seen, quality])
-    columns = ["level", "deg", "35 mm", "target px", "visibility", "IoU"]
+    columns = ["level", "field of view, deg", "35 mm equivalent, mm", "target, px", "visibility", "IoU"]
     return TextTable("Zoom (mean ± standard deviation over tracks)", columns, rows)
 
 

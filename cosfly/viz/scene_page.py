@@ -75,7 +75,7 @@ def run(
     all_drawn = [] if data is None else [read_track(folder, strict=False) for folder in find_tracks(data)]
     town_drawn = [drawn for drawn in all_drawn if town_folder(drawn.town) == town_folder(box_map.name)] or all_drawn
     if len(town_drawn) < len(all_drawn):
-        notes.append(f"{len(all_drawn) - len(town_drawn):,} tracks are of other towns")
+        notes.append(f"{len(all_drawn) - len(town_drawn):,} tracks of other towns are not shown")
     tracks += [_of_drawn(drawn) for drawn in town_drawn]
     names = list(dict.fromkeys([path.path_id for path in pedestrians] + [track.path for track in tracks]))
     shown = names[:MOST_PATHS]
