@@ -124,9 +124,11 @@ class Window:
 
 class WindowConfig(Config):
     num_frames: int = Field(5, ge=3, le=32, description="observed frames of a window, one time step apart")
-    future_frames: int = Field(5, ge=1, le=32, description="frames after the current one that give the label")
+    future_frames: int = Field(5, ge=1, le=32, description="frames after the current one that determine the label")
     stride: int = Field(1, ge=1, description="frames between the current frames of two windows; 1 takes every frame")
-    keyframes: bool = Field(False, description="only windows at which the label changes, and each tenth after one")
+    keyframes: bool = Field(
+        False, description="caption only windows at which the label changes, and every tenth after such a window"
+    )
     keyframe_stride: ClassVar[int] = 10  # windows from one keyframe to the next within a label, at most
     require_images: bool = Field(True, description="drop a window that lacks the rgb.png of an observed frame")
 
@@ -134,8 +136,10 @@ class WindowConfig(Config):
 class ImageConfig(Config):
     modalities: tuple[View, ...] = Field(("rgb", "depth", "segmentation"), min_length=1, description="views of a frame")
     layout: Layout = Field("separate", description="separate: one image per view; tiled: one per frame, side by side")
-    max_side_px: int = Field(640, ge=28, description="longest side of a view, to which pixels in texts refer")
-    depth_range_m: float = Field(DEPTH_RANGE_M, gt=0, description="depth at the dark end of the pseudo-colour")
+    max_side_px: int = Field(
+        640, ge=28, description="longest side of a view, px; pixel values in prompts refer to this size"
+    )
+    depth_range_m: float = Field(DEPTH_RANGE_M, gt=0, description="depth at the dark end of the pseudo-colour, m")
     encoding: ClassVar[Literal["jpeg", "png"]] = "jpeg"  # of the pictures in a request; a student's are PNG
 
 
@@ -143,7 +147,7 @@ class JudgeConfig(Config):
     """A language model that judges conflicts between a decision and the label; it never excuses a hard conflict."""
 
     url: str | None = Field(None, description="OpenAI-compatible endpoint of the judge; empty: no judge")
-    model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
+    model: str | None = Field(None, description="name of the model; empty: the endpoint's only model")
     concurrency: MayDiffer[int] = Field(16, ge=1, le=4096, description="most requests in flight")
     extra_body: dict[str, Any] = Field(default_factory=dict, description="further fields of the request")
 
@@ -160,17 +164,18 @@ class JudgeConfig(Config):
 
 class RepairConfig(Config):
     hard_conflict: Treatment = Field(
-        "repair", description="decision that the trajectory contradicts: repair (ask again), drop or keep"
+        "repair",
+        description="treatment of a decision that the trajectory contradicts: repair (ask again), drop or keep",
     )
     soft_conflict: Treatment = Field(
-        "keep", description="another decision than the label, without a judge: keep, repair (ask again) or drop"
+        "keep", description="treatment of a decision that differs from the label, without a judge: keep, repair or drop"
     )
     strategy: Strategy = Field(
         "anchored",
-        description="anchored: the label is given; hint: the rejected decision is named; multi_sample: asked again; "
-        "cascade: hint, multi_sample, anchored, until an answer is the label",
+        description="anchored: the new prompt gives the label; hint: it names the rejected decision; multi_sample: the "
+        "same prompt again; cascade: hint, multi_sample and anchored, until a decision is the label",
     )
-    max_asks: int = Field(3, ge=0, le=10, description="asks per rejected sample; 0 drops it at once")
+    max_asks: int = Field(3, ge=0, le=10, description="most requests per rejected sample; 0: drop it at once")
 
     def treatment_of(self, verdict: Verdict | None) -> Treatment:
         """Return the treatment of an answer with this verdict."""
@@ -182,11 +187,11 @@ class StudentConfig(Config):
 
     folder: Path | None = Field(
         None,
-        description="output of `distill train` or `merge`, to ask the teacher in the form of its training; empty: no "
-        "student",
+        description="output of `distill train` or `merge`, if the teacher is this student, for prompts as in its "
+        "training; empty: no student",
     )
     max_new_tokens: ClassVar[int] = MAX_ANSWER_TOKENS  # longest answer
-    constrained: bool = Field(False, description="hold its answers to their JSON schema")
+    constrained: bool = Field(False, description="enforce the JSON schema of the student's answers")
     run: str | None = Field(
         None, description="tree to caption, as named in the training set, if student:PATH has predictions for several"
     )
@@ -202,11 +207,11 @@ class CaptionConfig(Config):
     teacher: str = Field(
         "rules",
         description="`rules` (embedded, no model), the URL of an OpenAI-compatible endpoint, `vllm:MODEL_DIR`, "
-        "`file:PATH`, given captions, one a line, or `student:PATH`, output of `distill infer`",
+        "`file:PATH` with one caption per line, or `student:PATH`, output of `distill infer`",
     )
     writing: Writing = Field(
         "slots",
-        description="how a teacher writes. slots: it names facts, and cosfly fills in their values; prose: plain text",
+        description="form of the answers. slots: they name facts, and cosfly fills in the values; prose: plain text",
     )
     text_state: TextState = Field(
         "relative",
@@ -217,14 +222,14 @@ class CaptionConfig(Config):
         None,
         description="folder with your own prompts; `cosfly caption prompts --export DIR` writes one to begin with",
     )
-    flights: TrackChoice = Field(TrackChoice(), description="which flights of the tree")
+    flights: TrackChoice = Field(TrackChoice(), description="tracks to caption")
     window: WindowConfig = Field(WindowConfig(), description="windows")
     image: ImageConfig = Field(ImageConfig(), description="pictures in a request")
     contradicted_values: Literal["drop", "keep"] = Field(
         "drop", description="treatment of a caption with a number that contradicts the measured facts"
     )
     endpoint: EndpointConfig = Field(EndpointConfig(), description="requests to an endpoint")
-    student: StudentConfig = Field(StudentConfig(), description="a teacher that is a student")
+    student: StudentConfig = Field(StudentConfig(), description="settings of a teacher that is a student")
     vllm: MayDiffer[VllmConfig] = Field(VllmConfig(), description="the engine of teacher vllm:MODEL_DIR")
     budget: MayDiffer[BudgetConfig] = Field(BudgetConfig(), description="prices and limits of tokens and money")
     repair: RepairConfig = Field(RepairConfig(), description="regeneration of rejected samples")
@@ -234,19 +239,19 @@ class CaptionConfig(Config):
     correction_asks: ClassVar[int] = 1  # that name what was wrong with an answer of the right structure
     mirror_asks: ClassVar[int] = 2  # for the Chinese mirror, until the pair is consistent
     stop_after_dropped: MayDiffer[int] = Field(
-        50, ge=0, description="end the run when none of the first so many answered windows is accepted; 0: never"
+        50, ge=0, description="end the run if none of this number of first answers is accepted; 0: never"
     )
-    limit: MayDiffer[int | None] = Field(None, ge=1, description="caption at most this many windows; empty takes all")
+    limit: MayDiffer[int | None] = Field(None, ge=1, description="caption at most this many windows; empty: all")
 
     @model_validator(mode="after")
     def _fits_teacher(self) -> Self:
         kind = self.teacher_kind
         if kind == "rules" and self.writing != "slots":
-            raise ValueError(f"the rule teacher writes slots, got writing {self.writing!r}; choose another teacher")
-        if self.student.folder is not None and kind not in ("endpoint", "vllm"):
             raise ValueError(
-                f"student.folder needs a teacher that is asked (URL, vllm:MODEL_DIR), got {self.teacher!r}"
+                f"the rule teacher supports only writing=slots, got {self.writing!r}; choose another teacher"
             )
+        if self.student.folder is not None and kind not in ("endpoint", "vllm"):
+            raise ValueError(f"student.folder needs a model as teacher (URL or vllm:MODEL_DIR), got {self.teacher!r}")
         if kind == "endpoint":
             try:
                 check_url(self.teacher)

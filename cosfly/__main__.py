@@ -1,4 +1,4 @@
-"""The command `cosfly`, also `python -m cosfly`: hears Ctrl-C before anything heavy is imported."""
+"""The command `cosfly`, also `python -m cosfly`, which handles Ctrl-C before it imports large packages."""
 
 import os
 import signal

@@ -75,7 +75,9 @@ def test_a_budget_stops_the_run_before_it_is_passed_and_a_larger_one_goes_on(tre
     # One at a time: until an answer tells what a request takes, each one in flight counts as the longest prompt.
     few = {"concurrency": 1}
     with deciding() as server:  # each answer: 1,000 tokens in, 100 out
-        with pytest.raises(TeacherError, match=r"stopped before the budget was passed.*raise --max-cost"):
+        with pytest.raises(
+            TeacherError, match=r"captioning stopped, because the next request may exceed.*raise --max-cost"
+        ):
             run(settings(server.url, budget=budget, endpoint=few), tree, out)
         answered = len(keys_of(out))
         assert len(server.bodies) == answered  # what was sent was also kept
@@ -88,7 +90,7 @@ def test_a_budget_stops_the_run_before_it_is_passed_and_a_larger_one_goes_on(tre
         assert len(list(read_captions(out / "captions.jsonl"))) == sum(
             1 for record in kept_answers(out) if record["purpose"].startswith("mirror")
         )
-        with pytest.raises(TeacherError, match="stopped before"):  # the same budget is not spent twice
+        with pytest.raises(TeacherError, match="captioning stopped"):  # the same budget is not spent twice
             run(settings(server.url, budget=budget, endpoint=few), tree, out)
         if "max_tokens" in budget:
             assert len(server.bodies) * 1100 <= 16_000

@@ -113,7 +113,7 @@ def test_a_judges_tokens_count_in_the_budget_and_are_shown(tree, tmp_path):
             "endpoint": {"max_tokens": 64},
             "image": {"max_side_px": 32},  # pictures count in the guess of the first request
         }
-        with pytest.raises(TeacherError, match="stopped before the budget was passed"):
+        with pytest.raises(TeacherError, match="captioning stopped, because the next request may exceed"):
             run(CaptionConfig.model_validate(settings | {"budget": {"max_tokens": 10_000}}), tree, out)
         assert 0 < len(server.bodies) * 1100 <= 10_000
         whole = run(CaptionConfig.model_validate(settings), tree, out).read_bytes()

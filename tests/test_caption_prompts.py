@@ -211,7 +211,7 @@ def test_all_problems_are_told_at_once(tmp_path, caplog):
     assert "hint_en.txt: the file is missing" in told
     assert "system_en.txt" in told
     assert "mirror_user.txt:2: the prompt is empty" in told
-    with pytest.raises(ConfigError, match="no such folder"):
+    with pytest.raises(ConfigError, match="the folder of prompts does not exist"):
         own_prompts(tmp_path / "nowhere")
 
 

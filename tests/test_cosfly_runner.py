@@ -293,7 +293,7 @@ def test_twice_ends_the_process_in_one_line():
     status, said, complained = interrupted("hang")
     assert (status, said) == (130, ["asking", "ending"])
     assert (
-        complained == "error: interrupted at once; what was answered is kept: run the same command again to continue\n"
+        complained == "error: interrupted at once; recorded answers are kept; run the same command again to continue\n"
     )
 
 

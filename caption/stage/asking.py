@@ -228,7 +228,7 @@ class Asking:
                 f"{self.num_failed_in_row} windows in a row got no answer",
                 where=self.cfg.teacher,
                 got=got,
-                fix="check the server, then run the same command again: nothing answered is asked twice",
+                fix="fix the server, then run the same command again; answered windows are not asked again",
             )
 
     def _stop_if_hopeless(self, caption: Caption) -> None:

@@ -83,13 +83,13 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
         ConfigError: The captions come from a file. InputError: There is no conflict. TeacherError: The endpoint fails.
     """
     if cfg.caption_file is not None:
-        fix = "give a teacher that can be asked: rules, a URL or vllm:MODEL_DIR"
+        fix = "pass --teacher rules, a URL or vllm:MODEL_DIR"
         raise ConfigError("captions of a file cannot be regenerated", where="--teacher", got=cfg.teacher, fix=fix)
     out.mkdir(parents=True, exist_ok=True)
     refuse_links(out)
     num_windows, trials = run_until_interrupted(_try_all(cfg, vocabulary_of(cfg), data, out, seed, conflicts))
     if not trials:
-        raise InputError("no conflict to repair", where=data, got=f"{num_windows} windows without a conflict")
+        raise InputError("no first answer has a conflict to repair", where=data, got=f"{num_windows} windows")
     comparisons = list(map(compare, STRATEGIES, zip(*trials, strict=True)))
     value = {
         "schema": "cosfly.compare_strategies",
@@ -141,7 +141,7 @@ def comparison_table(comparisons: Sequence[Comparison]) -> Table:
     """Return the comparison as a table for the terminal."""
     table = Table(title=f"Regeneration of the same {comparisons[0].num_conflicts} conflicts", title_justify="left")
     table.add_column("strategy", no_wrap=True)
-    for column in ("repaired", "consistency", "naturalness", "asks each", "tokens each"):
+    for column in ("repaired", "consistency", "naturalness", "requests each", "tokens each"):
         table.add_column(column, justify="right")
     for one in comparisons:
         table.add_row(

@@ -34,7 +34,9 @@ def make_forecast(
 ) -> list[tuple[str, str]]:
     """Return the rows of a table: the cost of a run, scaled from the means of a few windows."""
     if cfg.teacher_kind != "endpoint":
-        raise ConfigError("a plan needs an endpoint", where="--plan", got=cfg.teacher, expected="--teacher URL")
+        raise ConfigError(
+            "only captions of a server can be estimated", where="--plan", got=cfg.teacher, expected="--teacher URL"
+        )
     vocabulary = vocabulary_of(cfg)
     cfg = student_settings(cfg, vocabulary)
     stage = open_stage(cfg, data, out, seed, resume)
@@ -43,7 +45,7 @@ def make_forecast(
     left = [track for track in tracks if guesses[track] and not stage.is_complete and not track.part(out).exists()]
     num_windows = sum(guesses[track] for track in left)
     if not num_windows:
-        raise InputError("no window to plan for", where=data, got=f"{len(left)} tracks to do")
+        raise InputError("no window is left to caption", where=data, got=f"{len(left)} unfinished tracks")
     chosen = [left[number * len(left) // TRIAL_WINDOWS] for number in range(TRIAL_WINDOWS)]
     windows = [w for track in dict.fromkeys(chosen) for w in islice(track.windows(cfg), chosen.count(track))]
 
@@ -58,7 +60,9 @@ def make_forecast(
     found, seconds = run_until_interrupted(ask())
     captions = [one for one in found if isinstance(one, Caption)]
     if not captions:
-        raise TeacherError("no trial window got an answer", where=cfg.teacher, got=str(found[0]) if found else None)
+        raise TeacherError(
+            "none of the trial windows got an answer", where=cfg.teacher, got=str(found[0]) if found else None
+        )
     scale = num_windows / len(captions)
     usage = sum((caption.usage for caption in captions), Usage())
     prompt, completion = scale * usage.prompt_tokens, scale * usage.completion_tokens
@@ -67,11 +71,11 @@ def make_forecast(
     num_accepted = sum(caption.status == "accepted" for caption in captions)
     num_done = sum(guesses.values()) - num_windows
     return [
-        ("windows", f"about {num_windows:,} to do" + (f", {num_done:,} done" if num_done else "")),
+        ("windows", f"about {num_windows:,} left" + (f", {num_done:,} done" if num_done else "")),
         ("trial", f"{len(captions)} windows, {num_accepted} accepted; their answers are kept"),
-        ("calls", f"{scale * sum(caption.attempts for caption in captions):,.0f}"),
+        ("requests", f"{scale * sum(caption.attempts for caption in captions):,.0f}"),
         ("tokens in", f"{prompt:,.0f}"),
         ("tokens out", f"{completion:,.0f}"),
         ("cost", cost),
-        ("time", f"{duration(scale * seconds / cfg.most_in_flight)} with {cfg.most_in_flight} in flight"),
+        ("time", f"{duration(scale * seconds / cfg.most_in_flight)} with {cfg.most_in_flight} requests in flight"),
     ]

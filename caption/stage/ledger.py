@@ -46,7 +46,7 @@ def most_common(counts: Mapping[str, int]) -> dict[str, int]:
 def explain_drops(dropped: Mapping[str, int]) -> str:
     """Return the three most common reasons with their counts and meanings."""
     reasons = list(most_common(dropped).items())[:3]
-    unknown = "docs/captions.md explains no such code"
+    unknown = "docs/captions.md does not explain this code"
     return "; ".join(f"{count} {reason} ({REASONS.get(reason, unknown)})" for reason, count in reasons)
 
 

@@ -85,7 +85,7 @@ class RunProgress:
         if self.total is not None and self.num_now:
             figures.append(f"{duration((self.total - self.num_before - self.num_now) / rate_per_s)} left")
         if troubles.num:
-            figures.append(f"{troubles.num:,} failed tries")
+            figures.append(f"{troubles.num:,} failed attempts")
         if troubles.last is not None:
             figures.append(f"no answer for {duration(troubles.silent_s)}, the last: {for_terminal(troubles.last)}")
         return ", ".join(figures)

@@ -43,7 +43,7 @@ def _mismatch(
     where, has_order = f"{caption.sample_id}: label", _has_order(caption)
     if caption.prompts and has_order != (caption.label in ORDERS):
         got = f"{caption.label}, and {'an order' if has_order else 'no order'} in the prompt"
-        return "label", where, got, "an order as label exactly if the prompt contains one"
+        return "label", where, got, "an order as the label if and only if the prompt has one"
     future = _future(shown, motion, caption, rows)
     if future is None:
         return None

@@ -20,7 +20,7 @@ VERDICTS = {  # with their meanings
     "CONSISTENT": "the decision is the label",
     "SOFT_CONFLICT": "another decision, which the trajectory does not contradict",
     "HARD_CONFLICT": "the trajectory contradicts the decision",
-    "ABSTAIN": "geometry cannot tell",
+    "ABSTAIN": "geometry cannot decide",
 }
 LANGUAGE_NAMES = {"en": "English", "zh": "Chinese"}
 STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
@@ -55,8 +55,8 @@ def _tiles(report: CaptionReport) -> list[tuple[str, int]]:
         ("accepted", windows.kept),
         ("dropped", sum(windows.dropped.values())),
         ("unanswered", sum(windows.failed.values())),
-        ("asked for again", report.repair.rejected),
-        ("asks in all", report.asks),
+        ("regenerated", report.repair.rejected),
+        ("requests", report.asks),
     ]
     if keyframes:
         tiles += [("calls saved by keyframes", keyframes.calls_saved), ("changes missed", keyframes.changes_missed)]
@@ -92,7 +92,7 @@ def _checks(report: CaptionReport) -> Rows:
     return [
         *_rows("label from", report.label_from),
         *_rows("dropped", report.windows.dropped),
-        *((f"the server, {reason}", message) for reason, message in report.refusals.items()),
+        *((f"refused by the server, {reason}", message) for reason, message in report.refusals.items()),
         *_rows("structure", report.structure),
         *_rows("languages", report.bilingual),
         ("captions with a contradicted value", f"{report.contradicted_captions:,}"),

@@ -68,7 +68,7 @@ def run(
         TeacherError: The endpoint cannot be used, a budget is used up, or windows got no answer. Answers are kept.
     """
     if cfg.teacher_kind in EMBEDDED and retry_failed:
-        what, fix = "this teacher never fails to answer", "remove the option"
+        what, fix = "this teacher answers every window, so no window has to be retried", "remove --retry-failed"
         raise ConfigError(what, where="--retry-failed", got=cfg.teacher_kind, fix=fix)
     vocabulary = vocabulary_of(cfg)
     cfg = student_settings(cfg, vocabulary)
@@ -116,26 +116,26 @@ def _finish(
     missed = [failure for failure in outcome.unanswered if failure.code != NOT_ASKED]
     if outcome.stopped:
         raise TeacherError(
-            "stopped before the budget was passed",
+            "captioning stopped, because the next request may exceed the budget",
             where=cfg.teacher,
             got=f"{outcome.stopped}; {tally.kept} windows accepted so far",
-            fix="raise --max-cost or --max-tokens and run the same command again: nothing answered is asked twice",
+            fix="raise --max-cost or --max-tokens and run the same command again; answered windows are not asked again",
         )
     if missed:
         raise TeacherError(
             f"{len(missed)} of {tally.input} windows got no answer",
             where=cfg.teacher,
             got=f"{common_causes(missed)}; the last: {missed[-1].message}",
-            fix="run the same command again (what was answered is not asked twice), or --retry-failed for these alone",
+            fix="run the same command again, or with --retry-failed for these windows only",
         )
     if outcome.unanswered or outcome.num_tracks_left:
-        log.info("caption: run again without --retry-failed for the windows that were never asked about")
+        log.info("caption: run the command without --retry-failed to caption the windows that have no answer yet")
         return
     if tally.input == 0:
         num_frames = cfg.window.num_frames + cfg.window.future_frames
         raise stage.nothing_kept(outcome.tracks, expected=f"a track of at least {num_frames} frames")
     if not tally.kept:
-        fix = f"fix what is dropped ({explain_drops(tally.dropped)}), or change the settings and choose another --out"
+        fix = f"fix the causes ({explain_drops(tally.dropped)}), or change the settings and choose another --out"
         raise stage.nothing_kept(tally, where=out / PRODUCT, fix=fix)
     outputs = [out / PRODUCT, out / REPORT, out / PAGE, *sorted((out / ANSWERS).glob("*.jsonl"))]
     outputs += keep_own_prompts(out, vocabulary)
@@ -169,7 +169,7 @@ def _has_refused(stage: StageFolder, cfg: CaptionConfig) -> bool:
     num_windows = read_manifest(stage.path).counts.input
     if cfg.limit is not None and cfg.limit < num_windows:
         raise ResumeError(
-            "the directory holds more windows than the limit allows, so it is not changed", where=stage.path,
+            "the directory contains more windows than the limit allows, so it is not changed", where=stage.path,
             got=f"{num_windows} windows", expected=f"at most {cfg.limit} (caption.limit)",
             fix="remove --limit, or raise it",
         )  # fmt: skip

@@ -61,7 +61,7 @@ def _twin_of(track: Track) -> Track | None:
     try:
         return read_twin(track)
     except VerifyError as error:
-        log.warning("caption: %s: labels without its clean twin: %s", track.flight_id, error)
+        log.warning("caption: %s: the labels do not use the clean track: %s", track.flight_id, error)
         return None
 
 

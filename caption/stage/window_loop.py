@@ -280,7 +280,9 @@ class _WindowLoop:
         parsed = parse_answer(reply.text, language, fields, reply.finish_reason)
         if parsed.reason == CONTEXT_FULL:
             asked, answered = usage.prompt_tokens, usage.completion_tokens
-            self.checks["refusal"] = f"{CONTEXT_FULL}: {asked} tokens asked and {answered} answered fill the context"
+            self.checks["refusal"] = (
+                f"{CONTEXT_FULL}: a prompt of {asked} and an answer of {answered} tokens fill the context"
+            )
         self._recovered.update(parsed.recovered)
         return parsed
 

@@ -76,17 +76,19 @@ def given_samples(answers: Answers) -> set[str]:
 def read_foreign(path: Path) -> Answers:
     """Read captions that were written elsewhere."""
     answers: Answers = {}
-    fix = "give --teacher file:PATH with one caption a line"
+    fix = "pass --teacher file:PATH, a file with one caption per line"
     for number, (_, caption) in enumerate(model_lines(path, ForeignCaption, what="foreign captions", fix=fix), 1):
         sample_id = caption.sample_id
         if f"{sample_id}/en" in answers:
-            raise InputError("a window has two captions", where=f"{path}:{number}: sample_id", got=sample_id)
+            raise InputError(
+                "the file has two captions for the same window", where=f"{path}:{number}: sample_id", got=sample_id
+            )
         more = caption.model_dump(include={"therefore"}, exclude_none=True)
         answers[f"{sample_id}/en"] = GivenAnswer(path.name, _reply(caption.en.model_dump() | more), tuple(more))
         if caption.zh is not None:
             answers[f"{sample_id}/zh"] = GivenAnswer(path.name, _reply(caption.zh.model_dump()))
     if not answers:
-        raise InputError("the file holds no caption", where=path, fix=fix)
+        raise InputError("the file contains no caption", where=path, fix=fix)
     return answers
 
 
@@ -105,11 +107,13 @@ def read_student(path: Path, run: str | None = None) -> Answers:
     chosen = [prediction for prediction in predictions if run in (None, prediction.run)]
     answers = {f"{one.window_id or one.sample_id}/{one.language}": _given(one) for one in chosen}
     if len(answers) < len(chosen):
-        fix = "name one of them: --set caption.student.run=NAME"
-        raise InputError("the predictions are for several trees that share names", where=path, got=runs, fix=fix)
+        fix = "choose one of these trees with --set caption.student.run=NAME"
+        raise InputError(
+            "the predictions are for several trees with the same track names", where=path, got=runs, fix=fix
+        )
     if not answers:
-        expected, fix = f"one of {runs}" if runs else None, "give what cosfly distill infer wrote"
-        raise InputError("the file holds no prediction", where=path, got=run, expected=expected, fix=fix)
+        expected, fix = f"one of {runs}" if runs else None, "pass the output of cosfly distill infer"
+        raise InputError("the file contains no prediction", where=path, got=run, expected=expected, fix=fix)
     return answers
 
 

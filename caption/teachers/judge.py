@@ -79,7 +79,7 @@ def parse_judgement(text: str, finish_reason: str | None = None) -> tuple[str, s
         return UNJUDGED, found.reason or ""
     verdict, reason = found.value.get("verdict"), found.value.get("reason")
     if verdict not in JUDGEMENTS:
-        return UNJUDGED, f"no such verdict: {str(verdict)[:40]}"
+        return UNJUDGED, f"unknown verdict: {str(verdict)[:40]}"
     if not isinstance(reason, str) or not reason.strip():
         return UNJUDGED, "no reason given"
     return verdict, " ".join(reason.split())
@@ -182,7 +182,7 @@ async def check_judge(cfg: JudgeConfig, vocabulary: Vocabulary, gold: list[GoldC
     num_moved = num_first = 0
     async with open_judge(cfg, vocabulary, seed) as judge:
         if judge is None:
-            raise InputError("no judge to check", where="--judge", got="nothing", expected="the URL of an endpoint")
+            raise InputError("the check needs a judge", where="--judge", expected="the URL of an endpoint")
         records = iter(await asyncio.gather(*(judge.judge(conflict, order) for conflict in gold for order in orders)))
         for conflict in gold:
             verdicts = [next(records).verdict for _ in orders]
@@ -196,9 +196,11 @@ async def check_judge(cfg: JudgeConfig, vocabulary: Vocabulary, gold: list[GoldC
 def judge_check_table(check: JudgeCheck) -> Table:
     """Return the figures as a table for the terminal."""
     table = Table("figure", "value", "meaning", title=f"Judge {check.model}", title_justify="left")
-    asks = f"of {check.confusion.total()} asks ({check.num_conflicts} cases, three orders of the options)"
+    asks = f"of {check.confusion.total()} answers ({check.num_conflicts} cases, three orders of the options)"
     table.add_row("agreement", f"{check.agreement:.1%}", f"with the gold judgement, {asks}; chance is 33.3%")
-    table.add_row("position bias", f"{check.first_share:.1%}", "took the option named first; 33.3% is without bias")
+    table.add_row(
+        "position bias", f"{check.first_share:.1%}", "answers that chose the first option; without bias 33.3%"
+    )
     table.add_row("moved", f"{check.num_moved} of {check.num_conflicts}", "cases whose verdict depends on the order")
     table.add_row("unparsable", str(check.num_unjudged), f"counted as unjudged, {asks}")
     for gold in JUDGEMENTS:

@@ -33,9 +33,9 @@ def shipped_prompts() -> dict[str, str]:
 
 def own_prompts(folder: Path) -> dict[str, str]:
     """Read a folder of prompts that replaces those that ship."""
-    export = "cosfly caption prompts --export DIR writes those that ship"
+    export = "cosfly caption prompts --export DIR writes the built-in prompts"
     if not folder.is_dir():
-        raise ConfigError("no such folder of prompts", where=folder, fix=export)
+        raise ConfigError("the folder of prompts does not exist", where=folder, fix=export)
     found, problems = dict[str, str](), list[str]()
     for path in sorted(folder.glob(f"*{SUFFIX}")):
         found[path.stem] = ""
@@ -50,7 +50,7 @@ def own_prompts(folder: Path) -> dict[str, str]:
         log.error("%s", problem)
     if problems:
         got = problems[0] + (f", and {len(problems) - 1} more" if problems[1:] else "")
-        expected = "the files and slots of those that ship"
+        expected = "the files and slots of the built-in prompts"
         fix = f"{len(problems)} to fix; {export}"
         raise ConfigError("these prompts cannot be used", where=folder, got=got, expected=expected, fix=fix)
     return found
@@ -64,14 +64,14 @@ def _problems(path: Path, text: str) -> Iterator[str]:
         return
     version, _, body = text.partition("\n")
     if not version.startswith(VERSION):
-        yield f"{path}:1: the first line must be {VERSION!r} and a version of yours"
+        yield f"{path}:1: the first line must be {VERSION!r} followed by a version of your own"
     if not body.strip():
         yield f"{path}:2: the prompt is empty"
     wrong = set(slots_of(shipped)).symmetric_difference(slots_of(text))
     if not Template(text).is_valid():
-        yield f"{path}: a $ that begins no slot; write $$ for a dollar sign"
+        yield f"{path}: a $ begins no slot; write $$ for a dollar sign"
     elif wrong:
-        yield f"{path}: slots that are missing or unknown: {', '.join(sorted(wrong))}"
+        yield f"{path}: these slots are missing or unknown: {', '.join(sorted(wrong))}"
 
 
 def slots_of(text: str) -> list[str]:
@@ -98,7 +98,7 @@ def export_prompts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
     paths = {folder / f"{name}{SUFFIX}": text for name, text in texts.items()}
     others = [path.name for path, text in paths.items() if _is_another(path, text)]
     if others:
-        what, fix = "the folder has prompts with another text", "choose another folder"
+        what, fix = "the folder already contains prompts with a different text", "choose another folder"
         raise ConfigError(what, where=folder, got=", ".join(others), fix=fix)
     for path, text in paths.items():
         write_bytes(path, text.encode())

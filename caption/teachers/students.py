@@ -49,7 +49,9 @@ def student_settings(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfi
     kinds = {(look.views, look.depth_range_m, max(look.size_px)) for look in chat_format.looks}
     if len(kinds) > 1:
         what = "the student was trained with pictures of several kinds"
-        raise ConfigError(what, where=folder, got=str(chat_format.looks)[:200])
+        raise ConfigError(
+            what, where=folder, got="; ".join(_described(look.views, look.size_px) for look in chat_format.looks)
+        )
     sampling = {name: getattr(StudentEndpointConfig(), name) for name in ("temperature", "top_p", "extra_body")}
     return cfg.model_copy(update={
         "writing": "prose",
@@ -76,8 +78,8 @@ def check_prompts(chat_format: ChatFormat, folder: Path, vocabulary: Vocabulary)
             raise ConfigError(
                 "the student was trained with another version of the prompt", where=f"{folder}: {language}",
                 got=prompt.user[:80],
-                fix="ask it with the prompts (caption.prompts, caption.text_state) and the version of cosfly that "
-                "captioned its training set, or train it again",
+                fix="use the prompts (caption.prompts, caption.text_state) and the version of cosfly that captioned "
+                "its training set, or train the student again",
             )  # fmt: skip
 
 
@@ -119,11 +121,11 @@ class TrainedStudent:
         wanted = {(look.views, look.size_px) for look in self.chat_format.looks}
         if (pictures.views, pictures.size_px) not in wanted:
             raise TeacherError(
-                "the student was trained with other pictures than this playback tree has",
+                "the pictures of this playback tree differ from those that the student was trained with",
                 where=question.window.sample_id,
                 got=_described(pictures.views, pictures.size_px),
                 expected=" or ".join(_described(*one) for one in sorted(wanted)),
-                fix="give tracks of such a camera, or train a student on pictures like these",
+                fix="pass tracks with such pictures, or train a student on pictures like these",
             )
 
     def request(self, question: Question, frames: Frames, seed: int) -> Request:

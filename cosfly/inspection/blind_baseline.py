@@ -23,8 +23,10 @@ ROUNDS = 120  # iterations of its optimiser
 PENALTY = 1e-3  # on the squares of its weights
 STANDS_MPS = 0.2  # below this speed the target stands
 TURNS_DEG = 45.0  # a larger change of heading is a turn
-DRAWN_AHEAD = "another part of the drone trajectory begins, or the target stops, starts to walk or turns by more than "
+DRAWN_AHEAD = (
+    "another part of the drone trajectory begins, or the target stops, starts to walk or turns by more than "
     f"{TURNS_DEG:g} degrees"
+)
 Decider = Callable[[np.ndarray], np.ndarray]  # pasts (n, d) -> numbers of decisions (n,)
 # A decision's number; or a column, its threshold, the rule for values up to the threshold, and the rule above it.
 Rule = int | tuple[int, float, "Rule", "Rule"]

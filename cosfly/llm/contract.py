@@ -19,7 +19,7 @@ from cosfly.formats.captions import Usage
 
 Result = TypeVar("Result")
 CountName = Literal["prompt_tokens", "completion_tokens"]
-AT_ONCE = b"error: interrupted at once; what was answered is kept: run the same command again to continue\n"
+AT_ONCE = b"error: interrupted at once; recorded answers are kept; run the same command again to continue\n"
 MOST_TOKENS = 10_000_000  # of one answer: longer than the context of any model
 STOP_AFTER_FAILURES = 20  # consecutive windows or samples without an answer after which a run ends
 

@@ -233,7 +233,7 @@ def text_tables(benchmark: dict[str, Any]) -> Iterator[TextTable]:
 
     columns = ["visibility", "efficiency", "smoothness", "safety", "mean", "95 %", "paper", "collision", "clearance"]
     shortest = f"{benchmark['shortest_mean_m']:.2f} m (paper: {PAPER_SHORTEST_M} m)"
-    yield TextTable(f"Four axes; efficiency is relative to the shortest mean length, {shortest}", ["planner", *columns], [
+    yield TextTable(f"Four axes; efficiency relative to the shortest mean, {shortest}", ["planner", *columns], [
         [
             title_of(p), *cells(row["scores"][axis] for axis in AXES_AND_MEAN),
             " to ".join(cells(row["intervals"]["mean"])), *_printed(p, "axes_mean"),
