@@ -20,7 +20,7 @@ from cosfly.formats.captions import Language, Prompt
 from cosfly.formats.frames import frame_name
 from cosfly.formats.predictions import Split
 from cosfly.geometry.splits import SPLITS
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import FileFormat, Record, read_model, validated, write_model
 from cosfly.runtime.run_dir import fingerprint
@@ -114,7 +114,9 @@ def read_training_set(dataset: Path) -> TrainingSet:
     """Read a training set's record."""
     path = dataset / RECORD
     if not path.exists():
-        raise InputError("no training set", where=dataset, got=f"no {RECORD}", fix="run cosfly distill prepare")
+        raise InputError(
+            "the folder is not a training set", where=dataset, got=f"no {RECORD}", fix="run cosfly distill prepare"
+        )
     return read_model(path, TrainingSet, RECORD_FORMAT, tree=dataset)
 
 
@@ -128,12 +130,12 @@ def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
         if run is None:
             words = "the training set was not made of this playback tree"
             expected = ", ".join(f"{tree.run}: {tree.sha256}" for tree in record.trees)
-            fix = "give the trees that it was made of as they were then, or prepare it anew from this one"
+            fix = "pass the unchanged trees of the training set, or prepare a training set from this tree"
             raise InputError(words, where=path, got=fingerprint(path), expected=expected, fix=fix)
         trees[run] = path
     if missing := [tree.run for tree in record.trees if tree.run not in trees]:
-        words, fix = "a playback tree of the training set is not given", "give --data once for each of its trees"
-        expected = f"also --data of the runs {', '.join(missing)}"
+        words, fix = "a playback tree of the training set is missing", "pass --data once for each of its trees"
+        expected = f"--data also for the runs {', '.join(missing)}"
         raise InputError(words, where=dataset, got=", ".join(map(str, data)) or "none", expected=expected, fix=fix)
     return {tree.run: trees[tree.run] for tree in record.trees}
 
@@ -199,7 +201,12 @@ class Samples(Sequence[Sample]):
         where = f"{self.path}: row {number}"
         system, user = row.pop("system"), row.pop("prompt")
         if not isinstance(system, int) or not 0 <= system < len(self._systems) or not isinstance(user, str):
-            raise InputError("no prompt", where=where, got=repr((system, user))[:80], expected=f"as {RECORD} has them")
+            raise InputError(
+                "the sample has no valid prompt",
+                where=where,
+                got=shown([system, user]),
+                expected=f"a prompt of {RECORD}",
+            )
         return validated(Sample, {**row, "prompt": Prompt(system=self._systems[system], user=user)}, where)
 
 
@@ -291,8 +298,8 @@ def _page(record: TrainingSet) -> bytes:
     return page_of(
         "Training set",
         record.samples,
-        f"No two splits share a {record.split_by}. `system` is the place of a sample's system prompt in `systems` of\n"
-        f"`{RECORD}`, `prompt` its question, `answer` what it should say; its pictures are frames `window` of the\n"
+        f"No two splits share a {record.split_by}. `system` is the index of a sample's system prompt in `systems` of\n"
+        f"`{RECORD}`, `prompt` its question, `answer` the expected answer; its pictures are frames `window` of the\n"
         "playback trees of\n"
         f"{json.dumps([tree.run for tree in record.trees], ensure_ascii=False)}, which are not part of it.\n",
     )

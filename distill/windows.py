@@ -23,7 +23,7 @@ from cosfly.formats.captions import FIELDS, Language, Prompt, read_captions
 from cosfly.formats.frames import frame_name
 from cosfly.formats.playback import Track, read_track
 from cosfly.runtime.arrays import parse_picture
-from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, nearest
+from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, nearest, shown
 from cosfly.runtime.io import check_stays_below, inside
 from cosfly.runtime.json_io import read_object, validated
 from cosfly.runtime.tables import TableRows, open_table, rows_of
@@ -82,14 +82,14 @@ def open_source(source: Path, captions: Path | None, language: Language, split: 
         if (folder / "release.json").is_file():
             return _Release(folder, language, split)
     if split is not None:
-        fix = "build one of it: cosfly release build"
+        fix = "build a release with cosfly release build, or omit split"
         raise ConfigError("only a release has splits", where=source, got=f"split={split!r}", fix=fix)
     if captions is None and (source / "render").is_dir():
         source, captions = source / "render", source / "caption/captions.jsonl"
         check_stays_below(captions, captions.parent)
     if captions is None:
-        fix = "of a playback tree give the captions too: Windows(tree, captions)"
-        raise InputError("neither a release nor a run folder", where=source, fix=fix)
+        fix = "for a playback tree, pass its captions too: Windows(tree, captions)"
+        raise InputError("the source is neither a release nor a run directory", where=source, fix=fix)
     return _Tree(source, captions, language)
 
 
@@ -147,7 +147,9 @@ def _frames_in(folder: Path) -> set[int]:
 def facts_of(flight: Track, window: Sequence[int]) -> dict[str, np.ndarray]:
     """Return FACTS of some frames of a flight."""
     if max(window) >= len(flight):
-        raise InputError("a caption of a frame that is not in its flight", where=flight.folder, got=str(max(window)))
+        raise InputError(
+            "a caption refers to a frame that its track does not have", where=flight.folder, got=str(max(window))
+        )
     at, mask = list(window), flight.target.mask_bbox
     values: dict[str, Any] = {
         "pose": np.hstack([flight.positions_m[at], flight.rotations_deg[at]]),
@@ -182,7 +184,9 @@ class _Release:
         splits = sorted({shard.split for shard in shards})
         if split is not None and split not in splits:
             near, expected = nearest(split, splits), ", ".join(splits)
-            raise ConfigError(f"no such split{near}", where=folder, got=split, expected=expected)
+            raise ConfigError(
+                f"the release has no split of this name{near}", where=folder, got=split, expected=expected
+            )
         self._names = [shard.path for shard in shards if split in (None, shard.split)]
         texts = [f"caption_{language}_{field}" for field in FIELDS]
         prompts = [f"system_{language}", f"prompt_{language}"]
@@ -200,7 +204,7 @@ class _Release:
             for number, row in enumerate(rows_of(path, light, tree=self.folder)):
                 flight = tuple(row[part] for part in PLACE)
                 if None in (*flight, row["sample_id"], row["frame_index"]):
-                    raise InputError("a frame without a name", where=f"{path}: row {number}", got=str(flight))
+                    raise InputError("the frame has no id", where=f"{path}: row {number}", got=shown(list(flight)))
                 rows.setdefault(flight, {})[row["frame_index"]] = number
                 if row[text] and row["caption_window"]:
                     captioned.append((flight, row["sample_id"], tuple(row["caption_window"])))
@@ -220,7 +224,7 @@ class _Release:
         facts = {name: _column(rows, name, members) for name, members in FACTS.items()}
         last, language = rows[-1], self.language
         if not all(isinstance(last[f"{part}_{language}"], str) for part in ("system", "prompt")):
-            raise InputError("a caption without its prompt", where=f"{self._names[shard]}: {place.sample_id}")
+            raise InputError("the caption has no prompt", where=f"{self._names[shard]}: {place.sample_id}")
         prompt = Prompt(system=last[f"system_{language}"], user=last[f"prompt_{language}"])
         width_px, height_px = (last["caption_picture_px"] or pictures[-1].shape[1::-1])[:2]
         caption = {field: last[f"caption_{language}_{field}"] or "" for field in FIELDS}
@@ -245,14 +249,14 @@ def _check_columns(path: Path, tree: Path, wanted: Sequence[str]) -> None:
     with open_table(path, tree=tree) as table:
         found = {field.name: field.type for field in table.schema_arrow}
     if wrong := ", ".join(name for name in wanted if found.get(name) != TYPES.get(name, pa.string())):
-        fix = "build the release with this version of cosfly, or get it with --modality rgb"
-        raise InputError("columns are missing or of another type", where=path, got=wrong[:200], fix=fix)
+        fix = "build the release with this version of cosfly, or download it with --modality rgb"
+        raise InputError("columns are missing or have the wrong type", where=path, got=wrong[:200], fix=fix)
 
 
 def _picture(row: Mapping[str, Any], where: str) -> np.ndarray:
     data = row["image"] and row["image"]["bytes"]
     if not data:
-        raise InputError("a frame without its picture", where=where, fix="get the release with --modality rgb")
+        raise InputError("the frame has no picture", where=where, fix="download the release with --modality rgb")
     return cv2.cvtColor(parse_picture(data, where), cv2.COLOR_BGR2RGB)
 
 
@@ -299,9 +303,13 @@ class Windows(Sequence[WindowData]):
         split: str | None = None, max_side_px: int | None = None,
     ) -> None:  # fmt: skip
         if language not in get_args(Language):
-            raise ConfigError("not a language of captions", got=str(language), expected=", ".join(get_args(Language)))
+            raise ConfigError(
+                "there are no captions in this language", got=str(language), expected=", ".join(get_args(Language))
+            )
         if max_side_px is not None and max_side_px < 1:
-            raise ConfigError("not a size of a picture", where="max_side_px", got=max_side_px, expected="1 or more")
+            raise ConfigError(
+                "the picture size is not positive", where="max_side_px", got=max_side_px, expected="1 or more"
+            )
         self.max_side_px = max_side_px
         source = Path(source) if isinstance(source, str) else source
         captions = Path(captions) if isinstance(captions, str) else captions
@@ -310,8 +318,8 @@ class Windows(Sequence[WindowData]):
         self._places = list(self._source.places(self.left_out))
         if not self._places:
             why = ", ".join(f"{reason} {count}" for reason, count in self.left_out.items()) or "no captions"
-            expected = f"accepted captions in {language!r} whose frames are there"
-            raise InputError("no window to learn from", where=source, got=why, expected=expected)
+            expected = f"accepted captions in {language!r} whose frames exist"
+            raise InputError("the source has no usable window", where=source, got=why, expected=expected)
 
     def __len__(self) -> int:
         return len(self._places)
@@ -321,7 +329,7 @@ class Windows(Sequence[WindowData]):
         read = self._source.read(place)
         sizes = {picture.shape for picture in read.pictures}
         if len(sizes) != 1:
-            raise InputError("frames of one window differ in size", where=place.sample_id, got=str(sorted(sizes)))
+            raise InputError("the frames of a window differ in size", where=place.sample_id, got=str(sorted(sizes)))
         height_px, width_px = read.pictures[0].shape[:2]
         size = scaled_size(width_px, height_px, self.max_side_px or max(read.size_px))
         frames = read.pictures

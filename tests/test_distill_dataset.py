@@ -57,7 +57,7 @@ def test_what_two_splits_share_is_found():
         ([one], [sample_of(frame=6)], "walk", walk),
         ([one], [sample_of("t2").model_copy(update={"walk": one.walk})], "walk", walk),  # another timestamp
         ([one], [sample_of("t2", town="Town01_Opt")], "town", town),
-        ([one, sample_of(frame=6).model_copy(update={"walk": "elsewhere"})], [], "walk", "of two walks"),
+        ([one, sample_of(frame=6).model_copy(update={"walk": "elsewhere"})], [], "walk", "has two pedestrian trajectories"),
         ([one, *[sample_of(language="zh")] * 2], [], "walk", "twice.*frame 4 of .*/trajectory_1/ORI, language zh"),
     ):  # fmt: skip
         with pytest.raises(VerifyError, match=words):
@@ -124,7 +124,7 @@ def test_a_student_may_get_text_alone_or_pictures_alone(asked, language):
     # Of the measured values nothing is left: the numbers are those of frames, their distance in time, and pixels.
     assert re.findall(r"\d+(?:\.\d+)?", line) == ["5", "0.5", "64", "36"]
     assert pictures.images == both.images != []
-    with pytest.raises(ValidationError, match="nothing to answer from"):
+    with pytest.raises(ValidationError, match="modalities must not be empty"):
         PrepareConfig(modalities=(), text_state=False)
 
 
@@ -208,7 +208,7 @@ def test_the_walk_of_a_flight_decides_its_split_and_not_its_name(tmp_path):
 
 
 def test_captions_that_no_record_binds_to_their_tree_are_refused(tree, captions, tmp_path):
-    with pytest.raises(VerifyError, match=r"no record says of which playback tree.*unbound=accept"):
+    with pytest.raises(VerifyError, match=r"the playback tree of these captions is not recorded.*unbound=accept"):
         stage.run(PrepareConfig(), [RunSource.of_files(tree, captions)], tmp_path / "set")
 
 

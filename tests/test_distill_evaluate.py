@@ -252,7 +252,7 @@ def test_without_a_model_the_report_says_so_and_gives_no_number(place):
     assert accuracy.keys() == {"shuffled", "constant"}  # no sample has a past
     assert (teacher["accuracy_on_labels"].value, teacher["bertscore_f1"].value) == (1, None)
     page = (place / "out" / "evaluation.md").read_text()
-    assert "BERTScore of en: not computed, no model folder" in page
+    assert "BERTScore of en: not computed, because no model folder" in page
     assert re.search(r"\| answers that parse \| 75\.00% \(.*to.*\) \| 100\.00% \|", page)
     assert len(report.examples) == 12
     again = run(CFG, place / "predictions.jsonl", place / "set", place / "again")

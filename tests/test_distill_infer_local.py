@@ -137,7 +137,7 @@ def test_a_full_memory_halves_the_batch(place, clean, tmp_path, monkeypatch, cap
     assert told(read_predictions(answer(place, tmp_path / "out", batch_size=12))) == told(read_predictions(clean))
     assert counts_of(tmp_path / "out")["failed"] == {}
     assert [size for size in sizes if size > 3] == [12, 6]  # each once: what did not fit is not tried again
-    assert (max(sizes[2:]), caplog.text.count("the memory is full")) == (3, 2)
+    assert (max(sizes[2:]), caplog.text.count("do not fit into memory")) == (3, 2)
 
 
 @pytest.mark.slow

@@ -58,9 +58,9 @@ def test_damaged_adapters_are_refused(base, adapter, tmp_path):
     stranger = name.replace("layers.0", "layers.77")
     pair = {stranger: tensors[name].clone(), stranger.replace("lora_A", "lora_B"): torch.ones(8, 4)}
     for number, (changed, words) in enumerate([
-        ({n: t for n, t in tensors.items() if n != name}, "half an update"),
-        (tensors | pair, "no layer that the adapter changes"),
-        (tensors | {name.replace(".lora_A", ".other"): torch.ones(2)}, "not a tensor of a LoRA"),
+        ({n: t for n, t in tensors.items() if n != name}, "an update of the adapter is incomplete"),
+        (tensors | pair, "lacks a layer that the adapter changes"),
+        (tensors | {name.replace(".lora_A", ".other"): torch.ones(2)}, "not of a LoRA adapter"),
         (tensors | {name: torch.ones(4, 7)}, "another shape"),
         (tensors | {name: tensors[name] * np.nan}, "not finite"),
     ]):  # fmt: skip

@@ -110,6 +110,6 @@ def test_a_template_that_writes_something_else_ends_before_the_first_step(place,
     )
     assert signed != text
     path.write_text(signed)
-    with pytest.raises(InputError, match="chat template: prompt, answer and end are not what the template writes"):
+    with pytest.raises(InputError, match="chat template: the training text differs from that of the template"):
         train.run(TrainConfig(**FAST), place / "set", [place / "tree"], folder, tmp_path / "out")
     assert "chat template" in (tmp_path / "out" / "preflight.json").read_text()

@@ -276,7 +276,7 @@ def test_a_checkpoint_of_another_student_is_refused(place, tmp_path):
     newest = newest_checkpoint(tmp_path / "out" / "checkpoints")
     assert newest is not None
     other = train.add_adapter(load(place), TrainConfig(**{**FAST, "lora_rank": 8}), 0)
-    with pytest.raises(InputError, match="checkpoint is of another student"):
+    with pytest.raises(InputError, match="checkpoint belongs to another student"):
         load_checkpoint(newest, other)
 
 

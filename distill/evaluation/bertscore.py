@@ -81,7 +81,7 @@ class Scorer:
                 device=pick_device("auto"), rescale_with_baseline=False,
             )  # fmt: skip
         except (OSError, ValueError, RuntimeError) as error:
-            raise InputError("the BERTScore model does not load", where=folder, got=str(error)[:300]) from error
+            raise InputError("the BERTScore model cannot be loaded", where=folder, got=str(error)[:300]) from error
         # Without this limit in the tokenizer's files the library overflows; two places go to the sentence marks.
         positions = read_object(folder / "config.json", what="BERTScore model").get("max_position_embeddings", 514)
         tokenizer = self._library._tokenizer
@@ -139,7 +139,9 @@ def _warn_of_foreign(language: Language, references: Sequence[str], num_tokens: 
     num_characters = sum(map(len, references))
     if language == "zh" and num_tokens > FOREIGN_TOKENS * num_characters:
         share = num_tokens / num_characters
-        log.warning("%s: %.1f tokens a Chinese character (bert-base-chinese has 1): scores say little", folder, share)
+        log.warning(
+            "%s: %.1f tokens per Chinese character (bert-base-chinese: 1), so the scores mean little", folder, share
+        )
 
 
 def check_encoder(own: LanguageMetric, folder: Path, language: Language) -> None:
@@ -152,9 +154,13 @@ def check_encoder(own: LanguageMetric, folder: Path, language: Language) -> None
     layers = config.get("num_hidden_layers") if isinstance(config, dict) else None
     where = f"bertscore.{language}"
     if not isinstance(layers, int):
-        raise InputError("not a text encoder", where=folder / "config.json", expected="num_hidden_layers")
+        expected = "the field num_hidden_layers"
+        raise InputError("the model is not a text encoder", where=folder / "config.json", expected=expected)
     if own.layer > layers:
-        raise ConfigError("the model has fewer layers", where=f"{where}.layer", got=own.layer, expected=f"<= {layers}")
+        raise ConfigError(
+            "the model does not have this layer", where=f"{where}.layer", got=own.layer, expected=f"at most {layers}"
+        )
     if "t5" in str(folder) or str(folder).startswith("scibert"):  # bert-score reads the model's family off its path
-        words, fix = "bert-score would take this path for another kind of model", "name it without 't5' or 'scibert'"
+        words = "bert-score would mistake this path for that of another kind of model"
+        fix = "rename the folder, so that its path has no 't5' and does not begin with 'scibert'"
         raise InputError(words, where=folder, fix=fix)

@@ -81,8 +81,8 @@ def run(folders: Sequence[Path], out: Path, *, seed: int = 0, resume: Resume = "
     """
     names = [folder.absolute().name for folder in folders]
     if len(set(names)) < len(names):
-        fix = "give folders of different names: they name the rows"
-        raise InputError("two evaluations have one name", got=", ".join(names), fix=fix)
+        fix = "rename one of the folders, because their names are the names of the rows"
+        raise InputError("two evaluations have the same name", got=", ".join(names), fix=fix)
     inputs = {f"evaluation/{name}": folder for name, folder in zip(names, folders, strict=True)}
     stage = StageFolder.open(out, STAGE, config=Config(), inputs=inputs, seed=seed, resume=resume)
     path = out / "comparison.md"
@@ -92,7 +92,7 @@ def run(folders: Sequence[Path], out: Path, *, seed: int = 0, resume: Resume = "
     reports = {name: read_report(folder) for name, folder in of_names.items()}
     splits = {report.split for report in reports.values()}
     if len(splits) > 1:
-        raise InputError("evaluations of one split are needed", got=", ".join(sorted(splits)))
+        raise InputError("the evaluations are of different splits", got=", ".join(sorted(splits)))
     comparison = compare(reports, of_names, seed)
     record, page = out / "comparison.json", out / "comparison.html"
     write_model(record, comparison, FileFormat("cosfly.distill_comparison", "1.0"))
@@ -112,7 +112,7 @@ def compare(reports: Names, folders: Mapping[str, Path], seed: int) -> StudentCo
         given: Any = {"resamples": RESAMPLES, "confidence": CONFIDENCE, "rng": rng}
         count, found = differences_of(scores[first], scores[second], **given)
         if not count:
-            strangers.append(f"{first} and {second} were asked no sample in common")
+            strangers.append(f"{first} and {second} have no sample in common")
         pairings.append(Pairing(first=first, second=second, samples=count, differences=found))
     someone = next(iter(reports.values())).all
     return StudentComparison(
@@ -134,7 +134,7 @@ def _check_references(first: str, one: Scores, second: str, other: Scores) -> No
     held = dict(zip(other.key, other.against, strict=True))
     differ = [key for key, digest in zip(one.key, one.against, strict=True) if held.get(key, digest) != digest]
     if differ:
-        words, fix = "two evaluations have different references", "evaluate both students on one set's test split"
+        words, fix = "two evaluations have different references", "evaluate both students on the same training set"
         got = f"{len(differ)} samples, the first {differ[0]}"
         raise InputError(words, where=f"{first} and {second}", got=got, fix=fix)
 
@@ -145,9 +145,11 @@ def _mismatches(reports: Names) -> list[str]:
     for first, second in combinations(reports, 2):
         one, other = reports[first], reports[second]
         if one.metrics != other.metrics:
-            found.append(f"BERTScore of {first} and {second}: other models, layers, versions or settings")
+            found.append(f"BERTScore of {first} and {second}: different models, layers, versions or settings")
         if one.all.samples != other.all.samples:
-            found.append(f"{first} has {one.all.samples} samples, {second} {other.all.samples}: see the pairings")
+            found.append(
+                f"{first} has {one.all.samples} samples and {second} {other.all.samples}; compare them by pairs"
+            )
     return found
 
 
@@ -189,7 +191,7 @@ def _said(pairing: Pairing) -> list[list[str]]:
         if found.value is not None:
             is_clear = found.low is not None and found.high is not None and (found.low > 0 or found.high < 0)
             first_leads = (found.value > 0) != (name in LESS_IS_BETTER)
-            better = (pairing.first if first_leads else pairing.second) if is_clear else "cannot be told"
+            better = (pairing.first if first_leads else pairing.second) if is_clear else "not clear"
             better = NOTHING if name in NEITHER else better
             rows.append([FIGURES[name], *_difference(name, found), better])
     return rows
@@ -201,19 +203,19 @@ _HEADER = ["", "difference", "interval", "p", "better"]
 def markdown_of(comparison: StudentComparison, reports: Names) -> str:
     """Return the comparison as a Markdown page."""
     header, rows = _rows(comparison, reports)
-    lines = ["# Students side by side", "", *table(header, [[for_markdown(cell) for cell in row] for row in rows]), ""]
+    lines = ["# Comparison of students", "", *table(header, [[for_markdown(cell) for cell in row] for row in rows]), ""]
     lines += [f"- {for_markdown(name)}: {for_markdown(model)}" for name, model in comparison.models.items()]
     lines += [f"- not comparable: {for_markdown(words)}" for words in comparison.not_comparable]
     for pairing in comparison.pairings:
-        title = f"## {for_markdown(pairing.first)} less {for_markdown(pairing.second)}"
+        title = f"## {for_markdown(pairing.first)} minus {for_markdown(pairing.second)}"
         lines += ["", title, "", _how(comparison, pairing), ""]
         lines += table(_HEADER, [[for_markdown(cell) for cell in row] for row in _said(pairing)])
     return "\n".join(lines) + "\n"
 
 
 def _how(comparison: StudentComparison, pairing: Pairing) -> str:
-    how = f"intervals {comparison.confidence:.0%}, {comparison.resamples} draws of walks, the same for both"
-    return f"On the {pairing.samples} samples that both were asked; {how}."
+    how = f"{comparison.confidence:.0%} intervals from {comparison.resamples} paired draws of pedestrian trajectories"
+    return f"On the {pairing.samples} samples that both students answered; {how}."
 
 
 def page_of(comparison: StudentComparison, reports: Names) -> str:
@@ -226,7 +228,7 @@ def page_of(comparison: StudentComparison, reports: Names) -> str:
         charts.append(("BERTScore, all answers", score_bars(comparison.students)))
     charts += [(f"{name}: reference against answer", heat_map(own)) for name, own in comparison.students.items()]
     pairings = [
-        {"title": f"{one.first} less {one.second}", "how": _how(comparison, one), "rows": _said(one)}
+        {"title": f"{one.first} minus {one.second}", "how": _how(comparison, one), "rows": _said(one)}
         for one in comparison.pairings
     ]
     everyone = everyone_of(comparison)

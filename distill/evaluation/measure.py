@@ -134,14 +134,14 @@ class Evaluation(Record):
 
 
 NOTES = [
-    "reference: the teacher's accepted answer; an answer that does not parse is a wrong one and scores 0 in BERTScore",
-    "a sample that got no answer is no wrong answer: it is counted under `answered` and in nothing else",
-    "intervals: whole walks are drawn with replacement: windows of a flight overlap, flights of a walk are alike",
-    "floors rule and blind: a tree of depth two and a network of one hidden layer on the exact geometry of a window's "
-    f"last {LOOKS_BACK} frames, no picture, fitted on {FITTED_ON:,} samples of train at most, the network on "
-    f"{LEAST_WINDOWS} at least; `teacher`: the reference itself",
-    f"drawn after the window: within the label's future {DRAWN_AHEAD}; no past tells that but by luck",
-    "verdicts: against what the flight did after the window, as the captions' own were made",
+    "reference: the teacher's accepted answer; an answer that does not parse is wrong and scores 0 in BERTScore",
+    "a sample without an answer is not a wrong answer: it counts under `answered` only",
+    "intervals: bootstrap over pedestrian trajectories, because windows of the same trajectory are similar",
+    "baselines rule and blind: a decision tree of depth two and a network with one hidden layer, without pictures, on "
+    f"the exact geometry of the last {LOOKS_BACK} frames of a window; fitted on up to {FITTED_ON:,} samples of train, "
+    f"the network on at least {LEAST_WINDOWS}; `teacher`: the reference itself",
+    f"drawn after the window: in the future of the label, {DRAWN_AHEAD}; the window does not show this",
+    "verdicts: from the motion after the window, by the same rules as for captions",
 ]
 
 
@@ -155,7 +155,8 @@ def pair_up(samples: Sequence[Sample], predictions: Sequence[Prediction]) -> lis
     """Return each sample that was asked its prediction, in the order of the samples."""
     by_key = {prediction.key: prediction for prediction in predictions}
     if unknown := by_key.keys() - {sample.key for sample in samples}:
-        words, fix = "a prediction is for a sample that the split does not have", "give the training set that it is of"
+        words = "the split does not have the sample of a prediction"
+        fix = "pass the training set that the predictions were made for"
         raise InputError(words, where=min(unknown), got=f"{len(unknown)} such predictions", fix=fix)
     return [(sample, by_key[sample.key]) for sample in samples if sample.key in by_key]
 
@@ -173,13 +174,13 @@ def read_judged(paths: Sequence[Path], samples: Iterable[Sample]) -> JudgedValue
     for path, caption in ((file, caption) for file in paths for caption in read_captions(file)):
         where, kind = f"{path}: {caption.sample_id}", caption.teacher.kind
         if kind != "student":
-            fix = "give what cosfly caption --teacher student:PREDICTIONS wrote"
-            raise InputError("these are no captions of a student", where=where, got=kind, fix=fix)
+            fix = "pass the output of cosfly caption --teacher student:PREDICTIONS"
+            raise InputError("the captions are not those of a student", where=where, got=kind, fix=fix)
         for language, counts in (caption.checks.values or {}).items():
             by_run = keys.get(f"{caption.sample_id}/{language}", {})
             if caption.teacher.run is None and len(by_run) > 1:
                 got, fix = ", ".join(sorted(by_run)), "caption each tree with --set caption.student.run=NAME"
-                raise InputError("several trees have a window of this name", where=where, got=got, fix=fix)
+                raise InputError("several playback trees have a window with this id", where=where, got=got, fix=fix)
             of_run = by_run.values() if caption.teacher.run is None else filter(None, [by_run.get(caption.teacher.run)])
             found |= dict.fromkeys(of_run, counts)
     return found

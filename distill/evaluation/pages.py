@@ -50,7 +50,7 @@ def metric_lines(report: Evaluation) -> list[str]:
     lines = []
     for language, metric in report.metrics.items():
         if metric is None:
-            lines.append(f"BERTScore of {language}: not computed, no model folder")
+            lines.append(f"BERTScore of {language}: not computed, because no model folder was passed")
             continue
         weights = [d[:12] for name, d in metric.sha256.items() if name.endswith((".safetensors", ".bin"))]
         words = [metric.model, f"layer {metric.layer}", "not rescaled", f"weights {', '.join(weights)}"]
@@ -62,16 +62,21 @@ def metric_lines(report: Evaluation) -> list[str]:
 
 def _notes(report: Evaluation) -> list[str]:
     speed = report.speed
-    notes = [f"intervals: {report.confidence:.0%}, {report.resamples} draws of {report.all.walks} walks", *report.notes]
+    notes = [
+        f"intervals: {report.confidence:.0%}, {report.resamples} draws of {report.all.walks} pedestrian trajectories",
+        *report.notes,
+    ]
     notes += metric_lines(report)
     if not report.judged:
-        notes.append("no values were checked: give --judged what cosfly caption --teacher student: wrote")
+        notes.append(
+            "no values were checked; to check them, pass captions of cosfly caption --teacher student:PATH as --judged"
+        )
     if speed.samples_per_s is not None:
-        notes.append(f"its last start answered for {speed.seconds:.1f} s, {speed.samples_per_s:.2f} samples/s")
+        notes.append(f"the last run of the student took {speed.seconds:.1f} s, {speed.samples_per_s:.2f} samples/s")
     if speed.latency_s is not None:
         notes.append("latency, s: " + ", ".join(f"{name} {value:.2f}" for name, value in speed.latency_s.items()))
     if report.not_asked:
-        notes.append(f"{report.not_asked} samples of the split were not asked")
+        notes.append(f"{report.not_asked} samples of the split have no prediction")
     for what, reasons in (("no answer", report.all.failed), ("unparsed", report.all.unparsed)):
         if reasons:
             notes.append(f"{what}: " + ", ".join(f"{reason} {count}" for reason, count in reasons.items()))
@@ -85,7 +90,7 @@ def _parts(report: Evaluation) -> dict[str, Measurement]:
 
 def column_name(name: str) -> str:
     """Name a column: the student, the teacher, or a floor."""
-    return name if name in (STUDENT, "teacher") else f"floor: {name}"
+    return name if name in (STUDENT, "teacher") else f"baseline: {name}"
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -107,7 +112,7 @@ def markdown_of(report: Evaluation) -> str:
     """Return the report as a Markdown page."""
     lines = [f"# {for_markdown(report.model)} on {report.split}", ""]
     for title, part in _parts(report).items():
-        lines += [f"## {title}: {part.samples} samples of {part.walks} walks", ""]
+        lines += [f"## {title}: {part.samples} samples of {part.walks} pedestrian trajectories", ""]
         lines += [*table(**figure_table(_beside(part), intervals=[STUDENT])), "", *_decisions(part), ""]
     lines += ["## How it was measured", "", *(f"- {for_markdown(note)}" for note in _notes(report))]
     return "\n".join(lines) + "\n"
@@ -149,15 +154,15 @@ def page_of(report: Evaluation, pictures: Mapping[str, Sequence[str]]) -> str:
 
 def _tiles(part: Measurement) -> list[tuple[str, str]]:
     """Return what a person asks first: how much was asked, how good the answers are, and how good those of floors."""
-    tiles = [(f"{part.samples:,}", "samples"), (f"{part.walks:,}", "walks")]
+    tiles = [(f"{part.samples:,}", "samples"), (f"{part.walks:,}", "pedestrian trajectories")]
     for figure, who, words in (
-        ("accuracy", STUDENT, "decisions right"),
-        ("accuracy", "blind", "by a network that sees no picture"),
-        ("accuracy", "rule", "by a rule on two numbers"),
-        ("accuracy", "majority", "by the most frequent decision"),
-        ("accuracy_on_labels", STUDENT, "are the geometric label"),
-        ("accuracy_on_labels", "teacher", "of the teacher's are"),
-        ("drawn_ahead", STUDENT, "may hang on what came after"),
+        ("accuracy", STUDENT, "decisions are right"),
+        ("accuracy", "blind", "right by a network without pictures"),
+        ("accuracy", "rule", "right by a rule on two numbers"),
+        ("accuracy", "majority", "right by the most frequent decision"),
+        ("accuracy_on_labels", STUDENT, "decisions are the geometric label"),
+        ("accuracy_on_labels", "teacher", "teacher's decisions are the label"),
+        ("drawn_ahead", STUDENT, "labels may depend on later draws"),
         ("parsed", STUDENT, "answers parse"),
     ):
         if who in part.who and (value := part.who[who].figures[figure].value) is not None:

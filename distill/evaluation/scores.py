@@ -187,7 +187,9 @@ def read_scores(path: Path) -> Scores:
     for group in row_groups(path):
         if wrong := [name for name in COLUMNS if group.column_names.count(name) != 1]:
             got = f"{group.column_names.count(wrong[0])} columns {wrong[0]}"
-            raise InputError("not the scores of an evaluation", where=path, got=got, expected="one")
+            raise InputError(
+                "the file is not a table of scores", where=path, got=got, expected="one column of this name"
+            )
         for name in COLUMNS:
             with arrow_errors(path):  # text that is no UTF-8 shows here
                 columns[name] += group.column(name).to_pylist()
@@ -195,7 +197,7 @@ def read_scores(path: Path) -> Scores:
         found = {name: _column_values(name, values) for name, values in columns.items()}
         return Scores(**found)
     except (TypeError, ValueError, KeyError) as error:
-        raise InputError("not the scores of an evaluation", where=path, got=str(error)[:200]) from None
+        raise InputError("the file is not a table of scores", where=path, got=str(error)[:200]) from None
 
 
 def _column_values(name: str, values: list[Any]) -> np.ndarray:
@@ -205,7 +207,7 @@ def _column_values(name: str, values: list[Any]) -> np.ndarray:
         return np.array([numbers[word] for word in values], dtype=np.int8)
     if name in _TEXT:
         if not all(isinstance(value, str) for value in values):
-            raise ValueError(f"{name}: not text")
+            raise ValueError(f"the column {name} is not text")
         return np.array(values, dtype=object)
     if name in ("answered", "unmended"):
         return np.array(values, dtype=bool)
@@ -216,25 +218,25 @@ def _column_values(name: str, values: list[Any]) -> np.ndarray:
 
 # A share or mean: of which samples (a mask), and what each gives. Macro-F1 is no mean over samples and stands apart.
 FIGURES: dict[str, str] = {
-    "answered": "samples that got an answer",
+    "answered": "samples with an answer",
     "parsed": "answers that parse",
-    "parsed_unmended": "answers that parse without mending",
+    "parsed_unmended": "answers that parse without corrections",
     "accuracy": "decision accuracy, all answers",
     "accuracy_parsed": "decision accuracy, parsed answers",
     "macro_f1": "macro-F1 over decisions",
-    "accuracy_on_labels": "decision is the geometric label",
-    "drawn_ahead": "samples whose label may hang on what was drawn after the window",
-    "accuracy_settled": "decision accuracy, the other samples",
+    "accuracy_on_labels": "decisions that are the geometric label",
+    "drawn_ahead": "samples whose label may depend on draws after the window",
+    "accuracy_settled": "decision accuracy, all other samples",
     "consistent": "true future: consistent",
     "soft_conflict": "true future: soft conflict",
     "hard_conflict": "true future: hard conflict",
-    "abstain": "true future: geometry cannot tell",
+    "abstain": "true future: geometry cannot decide",
     "bertscore_precision": "BERTScore precision",
     "bertscore_recall": "BERTScore recall",
     "bertscore_f1": "BERTScore F1",
     "bertscore_f1_parsed": "BERTScore F1, parsed answers",
     "values_matched": "values that match a measured fact",
-    "values_contradicted": "values that match none",
+    "values_contradicted": "values that match no fact",
     "tokens": "tokens of an answer",
 }
 LESS_IS_BETTER = ("hard_conflict", "values_contradicted")

@@ -94,7 +94,7 @@ def run(
     found = read_predictions(predictions)
     splits = sorted({prediction.split for prediction in found})
     if len(splits) != 1:
-        raise InputError("predictions of one split are needed", where=predictions, got=", ".join(splits) or "none")
+        raise InputError("the predictions must be of one split", where=predictions, got=", ".join(splits) or "none")
     samples = list(open_split(dataset, splits[0]))
     pairs = pair_up(samples, found)
     values = read_judged(judged, samples)

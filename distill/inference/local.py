@@ -188,11 +188,13 @@ class LocalAnswers:
         import torch
 
         if num_rows == 1:
-            fix = "lower max_new_tokens or max_pixels, or ask a server (--engine endpoint)"
-            words, where = "the accelerator's memory does not hold one sample", "distill.infer.max_new_tokens"
+            fix = "lower max_new_tokens or max_pixels, or use a server (--engine endpoint)"
+            words, where = "one sample does not fit into the memory of the accelerator", "distill.infer.max_new_tokens"
             raise ConfigError(words, where=where, got=said, fix=fix)
         self.most_rows = num_rows // 2
-        log.warning("distill.infer: the memory is full with %d samples; now %d at once", num_rows, self.most_rows)
+        log.warning(
+            "distill.infer: %d samples do not fit into memory; the batch size is now %d", num_rows, self.most_rows
+        )
         if torch.cuda.is_available():
             torch.cuda.empty_cache()
 

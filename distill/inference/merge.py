@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE
 from cosfly.runtime.config import Config
 from cosfly.runtime.console import progress_bar
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.io import atomic_folder, storage_errors
 from cosfly.runtime.json_io import read_json, read_object, validated, write_json
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
@@ -78,8 +78,10 @@ def run(model: Path, adapter: Path, out: Path, *, resume: Resume = "if-same") ->
                 advance(1)
         _mend_index(partial, num_bytes)
         if left := updates.unused():
-            fix = "give the base that it was trained on"
-            raise InputError("the base has no layer that the adapter changes", where=adapter, got=left[0], fix=fix)
+            fix = "pass the base model that the adapter was trained on as --model"
+            raise InputError(
+                "the base model lacks a layer that the adapter changes", where=adapter, got=left[0], fix=fix
+            )
     outputs = [path for path in merged.iterdir() if path.is_file()]
     tally = Tally(input=len(updates.names), kept=len(updates.names))
     stage.finish(outputs, tally)
@@ -91,8 +93,9 @@ def adapter_files(adapter: Path) -> dict[str, Path]:
     names = ("adapter_config.json", "adapter_model.safetensors")
     if not all((adapter / name).is_file() for name in names):
         if (adapter / "config.json").is_file():
-            raise InputError("whole weights already: nothing to merge", where=adapter, fix="give --model this folder")
-        raise InputError("not an adapter", where=adapter, expected=" and ".join(names))
+            what = "the folder contains a whole model, so there is nothing to merge"
+            raise InputError(what, where=adapter, fix="use this folder as the model")
+        raise InputError("the folder is not an adapter", where=adapter, expected=" and ".join(names))
     return {f"adapter/{path.name}": path for path in sorted(adapter.iterdir()) if path.is_file()}
 
 
@@ -108,12 +111,17 @@ class Updates:
         for name, tensor in tensors.items():
             layer, _, part = name.removeprefix(PREFIX).rpartition(".lora_")
             if part not in ("A.weight", "B.weight") or not name.startswith(PREFIX):
-                raise InputError("not a tensor of a LoRA adapter", where=adapter, got=name)
+                raise InputError("the file has a tensor that is not of a LoRA adapter", where=adapter, got=name)
             self._pairs.setdefault(f"{layer}.weight", [None, None])["AB".index(part[0])] = tensor
         for name, (down, up) in self._pairs.items():
             whole = down is not None and up is not None and down.ndim == up.ndim == 2
             if not whole or down.shape[0] != up.shape[1]:
-                raise InputError("half an update", where=adapter, got=name, expected="lora_A (r, n) and lora_B (m, r)")
+                raise InputError(
+                    "an update of the adapter is incomplete",
+                    where=adapter,
+                    got=name,
+                    expected="lora_A (r, n) and lora_B (m, r)",
+                )
         self.names = sorted(self._pairs)
         self._used: set[str] = set()
 
@@ -124,7 +132,7 @@ class Updates:
         """Return a weight (m, n) with its update, in float32."""
         down, up = self._pairs[name]
         if weight.shape != (found := (up.shape[0], down.shape[1])):
-            words = "an update of another shape than its layer"
+            words = "the update and its layer have different shapes"
             raise InputError(words, where=name, got=found, expected=str(tuple(weight.shape)))
         self._used.add(name)
         return weight.float() + self._scale * (up.float() @ down.float())
@@ -150,7 +158,7 @@ def _read_tensors(path: Path) -> tuple[dict[str, str] | None, dict[str, Any]]:
         with safe_open(path, framework="pt") as file:
             return file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
-        raise InputError("a damaged file of weights", where=path, got=str(error)[:200]) from error
+        raise InputError("the file of weights is damaged", where=path, got=str(error)[:200]) from error
 
 
 def _merge_shard(shard: Path, out: Path, updates: Updates) -> int:
@@ -163,7 +171,12 @@ def _merge_shard(shard: Path, out: Path, updates: Updates) -> int:
             merged = updates.add_to(name, tensors[name])
             tensors[name] = merged.to(tensors[name].dtype)
             if not torch.isfinite(tensors[name]).all():
-                raise InputError("a merged weight is not finite", where=shard, got=name, fix="see the training's loss")
+                raise InputError(
+                    "a merged weight is not finite",
+                    where=shard,
+                    got=name,
+                    fix="check in the training log that the loss is finite",
+                )
     with storage_errors(out):
         save_tensors(out, tensors, metadata)
     return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
@@ -176,5 +189,5 @@ def _mend_index(folder: Path, num_bytes: int) -> None:
         index = read_object(path, what="index of weights")
         metadata = index.get("metadata") or {}
         if not isinstance(metadata, dict):
-            raise InputError("not an object", where=f"{path}: metadata", got=str(metadata)[:80])
+            raise InputError("the field is not an object", where=f"{path}: metadata", got=shown(metadata))
         write_json(path, index | {"metadata": {**metadata, "total_size": num_bytes}})

@@ -121,7 +121,7 @@ class EngineAnswers:
         self._failed_in_row += 1
         if self._failed_in_row >= STOP_AFTER_FAILURES:
             words = f"{self._failed_in_row} samples in a row got no answer"
-            fix = "see to the server, then run the same command again: nothing answered is asked twice"
+            fix = "fix the server, then run the same command again; answered samples are not asked again"
             raise TeacherError(words, where=self.engine.where, got=str(error), fix=fix)
 
 
@@ -132,22 +132,27 @@ FEATURE_MEMORY_GB = 16.0  # for features of pictures; what has no room is comput
 class InferConfig(Config):
     """Settings of `distill infer`."""
 
-    split: Split = Field("test", description="samples to answer")
-    max_samples: int = Field(0, ge=0, description="answer only the first so many; 0: all")
-    max_new_tokens: int = Field(512, ge=1, description="longest answer, tokens; a longer one is cut and will not parse")
+    split: Split = Field("test", description="split whose samples are answered")
+    max_samples: int = Field(0, ge=0, description="answer only this number of first samples; 0: all")
+    max_new_tokens: int = Field(
+        512, ge=1, description="longest answer, tokens; a longer answer is cut and does not parse"
+    )
     engine: Literal["transformers", "endpoint", "vllm"] = Field(
-        "transformers", description="who computes: transformers or vLLM in this process, or a server at the URL --model"
+        "transformers", description="transformers or vLLM in this process, or a server (endpoint) at the URL in --model"
     )
     constrained: bool = Field(
-        False, description="hold answers to their JSON schema; their parse rate then says nothing of the student"
+        False, description="enforce the JSON schema of answers; the parse rate then says nothing about the student"
     )
-    batch_size: int = Field(8, ge=1, description="samples that transformers answers together; rounding may follow it")
-    max_pixels: int = Field(0, ge=0, description="most pixels of a picture; 0: as in training, where it is known")
+    batch_size: int = Field(
+        8, ge=1, description="samples that transformers answers together; rounding may depend on it"
+    )
+    max_pixels: int = Field(0, ge=0, description="most pixels of a picture; 0: as in training, if that is known")
     device: Device = Field("auto", description="auto, cpu or cuda for transformers; bfloat16 on cuda, float32 on a CPU")
     endpoint: StudentEndpointConfig = Field(
-        StudentEndpointConfig(), description="how endpoint and vllm are asked; max_new_tokens and constrained go before"
+        StudentEndpointConfig(),
+        description="requests of endpoint and vllm; max_new_tokens and constrained take precedence",
     )
-    vllm: MayDiffer[VllmConfig] = Field(VllmConfig(), description="the engine vllm")
+    vllm: MayDiffer[VllmConfig] = Field(VllmConfig(), description="settings of the engine vllm")
 
     @property
     def sampling(self) -> StudentEndpointConfig:
@@ -274,9 +279,9 @@ def run(
     if cfg.engine == "transformers":
         require("torch", "transformers", "peft")
     elif adapter is not None:
-        fix = "put it into the weights first (cosfly distill merge), or --engine transformers"
+        fix = "merge the adapter into its model with cosfly distill merge, or pass --engine transformers"
         where = "distill.infer.engine"
-        raise ConfigError("an adapter is read by transformers alone", where=where, got=cfg.engine, fix=fix)
+        raise ConfigError("only the engine transformers can load an adapter", where=where, got=cfg.engine, fix=fix)
     if cfg.engine == "endpoint":
         cfg, facts["server"] = _identified(cfg, str(model), out)
     else:
@@ -290,7 +295,7 @@ def run(
         return out / PREDICTIONS
     split = open_split(dataset, cfg.split)
     if not len(split):
-        fix = "--set distill.infer.split=val, or prepare more walks"
+        fix = "pass --set distill.infer.split=val, or prepare more pedestrian trajectories"
         raise InputError("the split is empty", where=dataset, got=cfg.split, fix=fix)
     samples = split[: cfg.max_samples] if cfg.max_samples else split
     results = _answer_all(cfg, Inputs(samples, trees, model, adapter), out)
@@ -307,8 +312,8 @@ def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path) -> Results:
         if type(error).__name__ != "OutOfMemoryError" or not type(error).__module__.startswith("torch"):
             raise
         got = f"{cfg.batch_size}: {str(error)[:120]}"
-    where, fix = "distill.infer.batch_size", "lower it, or max_pixels"
-    raise ConfigError("the accelerator's memory is full", where=where, got=got, fix=fix)
+    where, fix = "distill.infer.batch_size", "lower batch_size or max_pixels"
+    raise ConfigError("the memory of the accelerator is full", where=where, got=got, fix=fix)
 
 
 async def _write_answers(cfg: InferConfig, inputs: Inputs, out: Path) -> Results:

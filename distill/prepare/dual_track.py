@@ -81,11 +81,11 @@ def _page_of(record: TrackSet) -> bytes:
     runs = json.dumps([tree.run for tree in record.trees], ensure_ascii=False)
     return page_of(
         "Windows over two tracks", record.samples,
-        f"Windows of {record.observed} frames that were observed on a perturbed flight (`observed_*`), where\n"
-        f"drone and person really were in them (`clean_*`) and in the {record.predicted} frames after (`future_*`);\n"
+        f"Windows of {record.observed} frames of a perturbed track (`observed_*`), with the unperturbed poses of\n"
+        f"drone and target in them (`clean_*`) and in the {record.predicted} frames after them (`future_*`);\n"
         f"a window begins every {record.stride} frames. No two splits share a {record.split_by}.\n"
         f"Axes: {record.axes}.\n"
-        f"The pictures are frames `window` of the playback trees of {runs}, which are not part of it.\n",
+        f"The pictures are the frames `window` of the playback trees of {runs}, which are not included.\n",
     )  # fmt: skip
 
 
@@ -106,9 +106,9 @@ def read_track_samples(dataset: Path, split: Split) -> Iterator[TrackSample]:
 class DualTrackConfig(SplitConfig):
     """Settings of `distill dual-track`; defaults of tab:augmentation_params."""
 
-    observed: int = Field(5, ge=1, le=1000, description="perturbed frames that a model is given")
-    predicted: int = Field(5, ge=0, le=1000, description="frames after them to predict; 0: denoising alone")
-    stride: int = Field(3, ge=1, le=1000, description="frames from one window's begin to the next one's")
+    observed: int = Field(5, ge=1, le=1000, description="number of perturbed frames that a model observes")
+    predicted: int = Field(5, ge=0, le=1000, description="number of frames after them to predict; 0: only denoising")
+    stride: int = Field(3, ge=1, le=1000, description="number of frames between the starts of two windows")
 
     @property
     def length(self) -> int:
@@ -147,7 +147,7 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
     paired, courses, tally = _survey(stage, cfg, runs)
     walks = walks_of(courses)
     fix = "add trajectories, set a fraction to 0, or --set distill.dual_track.too_few=fill"
-    owners = cfg.assigned({flight.key for flight in paired}, walks, seed, "both tracks", fix)
+    owners = cfg.assigned({flight.key for flight in paired}, walks, seed, "pairs of tracks", fix)
     with SplitFiles(out, COLUMNS).writing() as files:
         facts = _write(files, cfg, paired, walks, {key: split for key, (_, split) in owners.items()})
     record = TrackSet(
@@ -190,7 +190,7 @@ def _survey(
     failed = Counter(failure.code for failure in failures)
     tally = Tally(input=len(paired) + dropped.total() + len(failures), kept=len(paired), dropped=dropped, failed=failed)
     if not paired:
-        raise stage.nothing_kept(tally, expected=f"a perturbed flight of {cfg.length} frames beside its clean one")
+        raise stage.nothing_kept(tally, expected=f"a perturbed track of {cfg.length} frames with its clean track")
     return paired, courses, tally
 
 

@@ -34,8 +34,11 @@ class RunSource:
     def of_run(cls, folder: Path) -> RunSource:
         """Take a run folder as `cosfly run` makes it."""
         if not (folder / "render").is_dir():
-            expected, fix = "render/ and caption/ in it", "give --data and --captions where they stand elsewhere"
-            raise InputError("not a run folder", where=folder, expected=expected, fix=fix)
+            expected, fix = (
+                "the folders render/ and caption/",
+                "pass --data and --captions if they are in other folders",
+            )
+            raise InputError("the folder is not a run directory", where=folder, expected=expected, fix=fix)
         captions = folder / "caption/captions.jsonl"
         check_stays_below(captions, captions.parent)
         return cls.of_files(folder / "render", captions)
@@ -62,8 +65,8 @@ def run_of(tree: Path) -> str:
 def check_names(runs: Sequence[str]) -> None:
     """Check that no two runs have one name."""
     if len(set(runs)) < len(runs):
-        fix = "rename the folder that one of the trees stands in"
-        raise InputError("two runs have one name", got=", ".join(runs), fix=fix)
+        fix = "rename the folder that contains one of the trees"
+        raise InputError("two runs have the same name", got=", ".join(runs), fix=fix)
 
 
 def check_sources(sources: Sequence[RunSource], unbound: Literal["refuse", "accept"]) -> None:
@@ -73,10 +76,10 @@ def check_sources(sources: Sequence[RunSource], unbound: Literal["refuse", "acce
         if (record := record_of(source.captions)) is not None and "data" in record.inputs:
             continue
         if unbound == "refuse":
-            words = "no record says of which playback tree these captions were made"
-            fix = "give the folder that cosfly caption wrote; if they are of it: --set distill.prepare.unbound=accept"
-            raise VerifyError(words, where=source.captions, got="no stage.json of cosfly caption beside them", fix=fix)
-        log.warning("%s: taken for captions of %s, which no record says", source.captions, source.data)
+            words = "the playback tree of these captions is not recorded"
+            fix = "pass the output of cosfly caption, or accept them with --set distill.prepare.unbound=accept"
+            raise VerifyError(words, where=source.captions, got="no stage.json next to the captions", fix=fix)
+        log.warning("%s: used as captions of %s, although this is not recorded", source.captions, source.data)
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,11 @@ class Flights:
         key = (source.run, *names)
         if key not in self._found:
             if bad := [name for name in names if name != Path(name).name or name in ("", ".", "..")]:
-                raise InputError("not a folder name", where=f"{source.captions}: {caption.sample_id}", got=bad[0])
+                raise InputError(
+                    "a name in the caption is not a folder name",
+                    where=f"{source.captions}: {caption.sample_id}",
+                    got=bad[0],
+                )
             self._found[key] = self._read(source, inside(source.data, "/".join(names), in_parent=True))
         return self._found[key]
 

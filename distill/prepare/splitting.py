@@ -21,19 +21,23 @@ class SplitConfig(Config):
 
     split_by: Literal["walk", "town"] = Field(
         "walk",
-        description="what splits may not share: all flights after one person on one way, or all builds of a town",
+        description="what two splits must not share: a pedestrian trajectory (walk), or a town",
     )
-    val_fraction: float = Field(0.1, ge=0, lt=1, description="share of walks (towns) for validation; 0: none")
-    test_fraction: float = Field(0.1, ge=0, lt=1, description="share of walks (towns) for the test; 0: none")
+    val_fraction: float = Field(
+        0.1, ge=0, lt=1, description="share of pedestrian trajectories (or towns) for validation; 0: none"
+    )
+    test_fraction: float = Field(
+        0.1, ge=0, lt=1, description="share of pedestrian trajectories (or towns) for the test; 0: none"
+    )
     too_few: Literal["refuse", "fill"] = Field(
         "refuse",
-        description="with fewer walks (towns) than splits: refuse, or fill train, then val, and leave the rest",
+        description="with fewer pedestrian trajectories (or towns) than splits: refuse, or fill train, then val",
     )
 
     @model_validator(mode="after")
     def _fractions_leave_something(self) -> SplitConfig:
         if self.val_fraction + self.test_fraction >= 1.0:
-            raise ValueError("val_fraction + test_fraction must stay below 1, or nothing is left to train on")
+            raise ValueError("val_fraction + test_fraction must be below 1, so that samples are left for training")
         return self
 
     @property
@@ -80,7 +84,11 @@ def check_no_leak(
             counts[split] += 1
             trajectory = f"{sample.run}/{sample.town}/{sample.trajectory}"
             if (walk := walks.setdefault(trajectory, sample.walk)) != sample.walk:
-                raise VerifyError("a trajectory is of two walks", where=sample.key, got=f"{walk} and {sample.walk}")
+                raise VerifyError(
+                    "a drone trajectory has two pedestrian trajectories",
+                    where=sample.key,
+                    got=f"{walk} and {sample.walk}",
+                )
             flight = f"{trajectory}/{sample.variant}"
             shared = [("walk", sample.walk), ("trajectory", trajectory), ("flight", flight)]
             if split_by == "town":
@@ -102,4 +110,4 @@ def _check_once(places: array[int], flights: list[str]) -> None:
     if len(twice):
         place = int(twice[0])
         got = f"frame {(place & 0xFFFFFFFF) >> 1} of {flights[place >> 32]}, language {'zh' if place & 1 else 'en'}"
-        raise VerifyError("a sample stands twice in the training set", got=got)
+        raise VerifyError("the training set contains a sample twice", got=got)

@@ -163,35 +163,37 @@ DIGITS = 4  # of a past: a tenth of a millimetre, as trees have it
 class PrepareConfig(SplitConfig):
     """Settings of `distill prepare`."""
 
-    flights: TrackChoice = Field(TrackChoice(), description="which flights of the trees")
-    languages: tuple[Language, ...] = Field(("en", "zh"), min_length=1, description="answers to learn, each as samples")
+    flights: TrackChoice = Field(TrackChoice(), description="tracks to use")
+    languages: tuple[Language, ...] = Field(
+        ("en", "zh"), min_length=1, description="languages of the answers; each gives its own samples"
+    )
     modalities: tuple[View, ...] = Field(
         ("rgb",),
-        description="pictures of each frame, in this order; middle is the middle third of rgb; none: text alone",
+        description="pictures of each frame, in this order; middle: the middle third of rgb; empty: only text",
     )
-    text_state: bool = Field(True, description="the prompt holds what was measured on frames; false: pictures alone")
+    text_state: bool = Field(True, description="the prompt contains the measured flight data; false: only pictures")
     unbound: Literal["refuse", "accept"] = Field(
         "refuse",
-        description="captions of which no record says from which tree they were made, as after copying the file",
+        description="captions whose playback tree is not recorded, such as a copied file",
     )
-    repaired: Literal["keep", "exclude"] = Field("keep", description="what happens to captions that a repair made")
+    repaired: Literal["keep", "exclude"] = Field("keep", description="treatment of regenerated captions")
     verdicts: tuple[Verdict, ...] = Field(
-        ("CONSISTENT", "SOFT_CONFLICT", "ABSTAIN"), min_length=1, description="captions of these verdicts are learnt"
+        ("CONSISTENT", "SOFT_CONFLICT", "ABSTAIN"), min_length=1, description="verdicts of the captions to use"
     )
     contradicted: Literal["keep", "exclude"] = Field(
-        "exclude", description="what happens to answers with a value that contradicts the measured facts"
+        "exclude", description="treatment of answers with a value that contradicts the measured facts"
     )
     balance: Literal["none", "decisions"] = Field(
-        "none", description="decisions: training windows of a decision beyond an equal share are dropped"
+        "none", description="decisions: drop training windows of a decision beyond an equal share"
     )
-    limit: int = Field(0, ge=0, description="windows in all splits together, of each decision its share; 0: all")
+    limit: int = Field(0, ge=0, description="number of windows in all splits, with the share of each decision; 0: all")
 
     @model_validator(mode="after")
     def _there_is_something_to_learn(self) -> PrepareConfig:
         if not self.modalities and not self.text_state:
-            raise ValueError("without pictures and text_state there is nothing to answer from")
+            raise ValueError("modalities must not be empty if text_state is false")
         if len(set(self.languages)) < len(self.languages) or len(set(self.modalities)) < len(self.modalities):
-            raise ValueError("languages and modalities may name each entry once")
+            raise ValueError("languages and modalities must not repeat an entry")
         return self
 
 
@@ -219,8 +221,9 @@ def make_sample(
     if parsed.coc is None:  # nothing may be taught that evaluation would call wrong
         return f"answer_{parsed.reason}"
     if PICTURES_MARK not in caption.prompt[language].user:
-        where, expected = f"{caption.sample_id}: prompt.{language}", f"{PICTURES_MARK} in it"
-        raise InputError("no place for the pictures", where=where, expected=expected, fix="run cosfly caption anew")
+        where, expected = f"{caption.sample_id}: prompt.{language}", f"{PICTURES_MARK} in the prompt"
+        what, fix = "the prompt has no mark for the pictures", "run cosfly caption again"
+        raise InputError(what, where=where, expected=expected, fix=fix)
     pictures = Pictures(cfg.modalities, caption.picture_px, depth_range_m=caption.depth_range_m or DEPTH_RANGE_M)
     values = (caption.checks.values or {}).get(language)
     is_noisy = caption.label_from == "perturbed"  # and so is what that future rules out
@@ -369,7 +372,7 @@ def run(
     ranks, excluded = _survey(windows, seed)
     if not ranks.flights:
         tally = Tally(input=excluded.total(), dropped=excluded)
-        raise stage.nothing_kept(tally, expected="accepted captions whose images stand below --data")
+        raise stage.nothing_kept(tally, expected="accepted captions with images below --data")
     chosen = _choose(cfg, windows, ranks, seed)
     del ranks  # of a million windows they take as much as the writing
     with TrainingSetWriter(out).writing() as writer:
@@ -459,4 +462,4 @@ def _warn(facts: Mapping[str, dict[str, Any]]) -> None:
         unseen = {name: count for name, count in facts[split]["by_decision"].items() if name not in taught}
         facts[split]["not_in_train"] = unseen
         if unseen:
-            log.warning("%s: decisions of %s that train does not have: %s", STAGE, split, unseen)
+            log.warning("%s: %s has decisions that train does not have: %s", STAGE, split, unseen)

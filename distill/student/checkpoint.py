@@ -100,7 +100,7 @@ def newest_checkpoint(folder: Path) -> Path | None:
         damaged = _damage_of(path)
         if damaged is None:
             return path
-        log.warning("%s: a damaged checkpoint is passed over (%s)", path, damaged)
+        log.warning("%s: this checkpoint is damaged and skipped (%s)", path, damaged)
     return None
 
 
@@ -108,7 +108,7 @@ def check_whole(checkpoint: Path) -> None:
     """Check that a checkpoint that is needed stands and is whole."""
     damaged = _damage_of(checkpoint)
     if damaged is not None:
-        fix = "train anew in another --out (keep=last takes the last weights instead)"
+        fix = "train again in another --out, or use the last weights with --set distill.train.keep=last"
         raise InputError("the checkpoint of the best validation is damaged", where=checkpoint, got=damaged, fix=fix)
 
 
@@ -136,7 +136,7 @@ def load_checkpoint(folder: Path, student: Student, optimizer: Any = None) -> Pr
     if shapes != wanted:
         name = next(n for n in shapes | wanted if shapes.get(n) != wanted.get(n))
         got, expected = f"{name}: {shapes.get(name)}", wanted.get(name)
-        raise InputError("the checkpoint is of another student", where=folder, got=got, expected=f"{expected}")
+        raise InputError("the checkpoint belongs to another student", where=folder, got=got, expected=f"{expected}")
     with torch.no_grad():
         for name, parameter in weights.items():
             parameter.copy_(found[name])
@@ -246,7 +246,7 @@ class AdapterFacts(BaseModel):
 
 def read_adapter_facts(adapter: Path, model: Path) -> AdapterFacts:
     """Read what stands beside an adapter, and check that it belongs to the model."""
-    path, fix = adapter / ADAPTER_FACTS, "a training that was stopped goes on: run its cosfly distill train again"
+    path, fix = adapter / ADAPTER_FACTS, "if the training was interrupted, run the same cosfly distill train again"
     facts = validated(AdapterFacts, read_json(path, what="adapter", fix=fix), path)
     if facts.base_sha256 != (found := base_digests(model)):
         got, expected = json.dumps(found)[:120], json.dumps(facts.base_sha256)[:120]

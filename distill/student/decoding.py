@@ -47,7 +47,7 @@ def record_graph(step: Callable[[], None]) -> Play | None:
     except torch.OutOfMemoryError:
         raise
     except RuntimeError as error:
-        log.warning("a step of decoding is not recorded but computed plainly: %s", str(error).splitlines()[0][:120])
+        log.warning("CUDA graphs are not used for decoding, which is slower: %s", str(error).splitlines()[0][:120])
         return None
     return graph.replay
 

@@ -70,7 +70,7 @@ def image_size(path: Path) -> tuple[int, int]:
         return width_px, height_px
     size = picture_size(path, tree=tree_of(path.parent))
     if size is None:
-        raise InputError("not an image", where=path, expected="a PNG", fix="check --data")
+        raise InputError("the file is not an image", where=path, expected="a PNG", fix="render the frame again")
     return size
 
 
@@ -82,8 +82,11 @@ def prompt_text(processor: Processor, sample: Sample, tokens_per_image: Sequence
     )
     pieces = text.split(IMAGE_TOKEN)
     if len(pieces) != len(tokens_per_image) + 1:
-        got, fix = f"{len(pieces) - 1} marks for {len(tokens_per_image)}", f"texts may not hold {IMAGE_TOKEN}"
-        raise InputError("the prompt and its images do not match", where=sample.key, got=got, fix=fix)
+        got, fix = (
+            f"{len(pieces) - 1} image tokens for {len(tokens_per_image)} images",
+            f"remove {IMAGE_TOKEN} from the text of the prompt",
+        )
+        raise InputError("the prompt has the wrong number of image tokens", where=sample.key, got=got, fix=fix)
     marks = [IMAGE_TOKEN * count for count in tokens_per_image]
     return pieces[0] + "".join(mark + piece for mark, piece in zip(marks, pieces[1:], strict=True))
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE
-from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
+from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, shown
 from cosfly.runtime.json_io import read_json
 from distill.student.kernels import fuse_norms, look_at_equal_sizes_at_once, use_kernels_for
 
@@ -128,8 +128,8 @@ def student_folder(name: str) -> Path:
     try:
         return Path(snapshot_download(name, allow_patterns=MODEL_FILES))
     except (OSError, ValueError, RuntimeError) as error:  # no network, no such repository, no permission
-        words = "no such folder, and the repository of that name cannot be loaded"
-        fix = "check name and network, or download it elsewhere and give its folder"
+        words = "the student is neither a folder nor a repository that can be loaded"
+        fix = "correct the name, or download the model elsewhere and pass its folder"
         raise InputError(words, where=name, got=str(error)[:300], fix=fix) from error
 
 
@@ -138,11 +138,13 @@ def weight_files(folder: Path) -> dict[str, Path]:
     config = read_json(folder / "config.json", what="student model (a folder with config.json)")
     found = config.get("model_type") if isinstance(config, dict) else None
     if found != MODEL_TYPE:
-        where, expected = f"{folder / 'config.json'}: model_type", f"{MODEL_TYPE!r}, as Qwen3.5, 3.6 and 3.8 have"
-        raise InputError("not a student that cosfly knows", where=where, got=repr(found), expected=expected)
+        where, expected = f"{folder / 'config.json'}: model_type", f"{MODEL_TYPE!r}, the type of Qwen3.5, 3.6 and 3.8"
+        raise InputError("the model type is not supported", where=where, got=shown(found), expected=expected)
     weights = sorted(folder.glob("*.safetensors"))
     if not weights:
-        raise InputError("no weights", where=folder, expected="*.safetensors", fix="download the whole model folder")
+        raise InputError(
+            "the folder has no weights", where=folder, expected="*.safetensors", fix="download the whole model folder"
+        )
     settings = ("config.json", "tokenizer.json", "tokenizer_config.json", "preprocessor_config.json", CHAT_FORMAT_FILE)
     files = [folder / name for name in (*settings, "chat_template.jinja")]
     return {f"model/{path.name}": path for path in (*files, *weights) if path.is_file()}
@@ -154,7 +156,7 @@ def pick_device(wanted: Device) -> str:
     import torch
 
     if wanted == "cuda" and not torch.cuda.is_available():
-        raise EnvironmentMissing("no accelerator is visible to torch", got="device=cuda", fix="set device=auto or cpu")
+        raise EnvironmentMissing("torch finds no accelerator", got="device=cuda", fix="set device=auto or device=cpu")
     return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted
 
 
@@ -203,17 +205,17 @@ def load_student(
         )
         if adapter is not None:
             if not (adapter / "adapter_model.safetensors").is_file():
-                raise InputError("not an adapter", where=adapter, expected="adapter_model.safetensors")
+                raise InputError("the folder is not an adapter", where=adapter, expected="adapter_model.safetensors")
             model = PeftModel.from_pretrained(model, adapter)
     except (OSError, RuntimeError, ValueError, SafetensorError) as error:
-        raise InputError("the student does not load", where=adapter or folder, got=str(error)[:300]) from error
+        raise InputError("the student cannot be loaded", where=adapter or folder, got=str(error)[:300]) from error
     student = Student(tokenizer, image_processor, model, device_name, computed)
     check_tokens_fit(student, folder)
     try:
         model.to(device_name)
     except torch.OutOfMemoryError as error:
         raise EnvironmentMissing(
-            "the accelerator has no room for weights", where=folder, got=str(error)[:99]
+            "the weights do not fit into the memory of the accelerator", where=folder, got=str(error)[:99]
         ) from error
     if device_name == "cuda":
         fuse_norms(student.core)
@@ -225,10 +227,12 @@ def check_tokens_fit(student: Student, folder: Path) -> None:
     """Check that tokenizer and weights are of one model."""
     known, most = len(student.tokenizer), student.core.get_input_embeddings().weight.shape[0]
     if known > most:
-        raise InputError("the tokenizer knows more tokens than the model", where=folder, got=known, expected=most)
+        raise InputError(
+            "the tokenizer has more tokens than the model", where=folder, got=known, expected=f"at most {most}"
+        )
     found, wanted = student.image_token_id, student.core.config.image_token_id
     if found != wanted:
-        words = f"the tokenizer and the model call {IMAGE_TOKEN} differently"
+        words = f"the tokenizer and the model have different ids for {IMAGE_TOKEN}"
         raise InputError(words, where=folder, got=found, expected=f"{wanted} (image_token_id in config.json)")
 
 
@@ -242,14 +246,21 @@ def load_processor(folder: Path, max_pixels: int) -> tuple[Any, Any]:
         tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
         image_processor = Qwen2VLImageProcessorPil.from_pretrained(folder, local_files_only=True)
     except (OSError, ValueError) as error:
-        raise InputError("the student's processor does not load", where=folder, got=str(error)[:300]) from error
+        raise InputError("the processor of the student cannot be loaded", where=folder, got=str(error)[:300]) from error
     if not tokenizer.chat_template:
         raise InputError("the tokenizer has no chat template", where=folder, expected="chat_template.jinja")
     if missing := set(NEEDED_TOKENS) - tokenizer.get_vocab().keys():
-        raise InputError("the tokenizer lacks tokens of chats with pictures", where=folder, expected=", ".join(missing))
+        raise InputError(
+            "the tokenizer lacks tokens for chats with pictures", where=folder, expected=", ".join(missing)
+        )
     side_px = image_processor.patch_size * image_processor.merge_size
     if max_pixels < side_px**2:
-        raise ConfigError("too small for one patch", where="max_pixels", got=max_pixels, expected=f">= {side_px**2}")
+        raise ConfigError(
+            "the value is too small for one patch",
+            where="max_pixels",
+            got=max_pixels,
+            expected=f"at least {side_px**2}",
+        )
     own = image_processor.size  # areas in pixels, in spite of the names
     largest = min(int(own["longest_edge"]), max_pixels)
     image_processor.size = {"shortest_edge": min(int(own["shortest_edge"]), largest), "longest_edge": largest}

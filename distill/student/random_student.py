@@ -51,10 +51,12 @@ class RandomStudent(Config):
     """Settings of a student of random weights."""
 
     width: int = Field(64, ge=32, multiple_of=32, description="width of the language model")
-    layers: int = Field(4, ge=4, multiple_of=4, description="its layers; three of four have linear attention")
+    layers: int = Field(
+        4, ge=4, multiple_of=4, description="layers of the language model; three of four have linear attention"
+    )
     vision_width: int = Field(32, ge=32, multiple_of=32, description="width of the vision tower")
     vision_layers: int = Field(2, ge=1, description="layers of the vision tower")
-    vocabulary: int = Field(800, ge=300, description="tokens of the tokenizer, before the special ones")
+    vocabulary: int = Field(800, ge=300, description="number of tokens of the tokenizer, without special tokens")
 
 
 PRESETS = {
@@ -71,7 +73,12 @@ def random_student_settings(name: str, given: RandomStudent) -> RandomStudent | 
     if name == RANDOM:
         return given
     if name.startswith(f"{TINY}:") and name not in PRESETS:
-        raise InputError("no such student", where="--student", got=name, expected=", ".join([*PRESETS, RANDOM]))
+        raise InputError(
+            "there is no random student of this name",
+            where="--student",
+            got=name,
+            expected=", ".join([*PRESETS, RANDOM]),
+        )
     return PRESETS.get(name)
 
 

@@ -212,14 +212,14 @@ def train_step(lesson: Lesson, optimizer: Any, ready: ReadyStep, rate: float) ->
     lesson.ranks.add_gradients(parameters)
     total, weight, answer_tokens, tokens, samples = lesson.ranks.total([own_nats, *map(float, own)])
     if not weight:
-        raise InputError("no sample of a step could be read", where=STAGE, fix="mend the pictures that the log names")
+        raise InputError("no sample of a step can be read", where=STAGE, fix="restore the pictures that the log names")
     for parameter in parameters:
         if parameter.grad is not None:
             parameter.grad /= weight
     norm = float(torch.nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM))
     if not math.isfinite(total) or not math.isfinite(norm):
         words, got = "the loss or its gradient is not finite", f"{cfg.learning_rate}"
-        fix = "lower learning_rate and choose another --out; the last checkpoint stays usable"
+        fix = "lower learning_rate and choose another --out; the last checkpoint is still usable"
         raise ConfigError(words, where="learning_rate", got=got, fix=fix)
     for group in optimizer.param_groups:
         group["lr"] = rate
@@ -240,7 +240,7 @@ def fit(lesson: Lesson, out: Path) -> Progress:
     newest = ranks.first_does(lambda: newest_checkpoint(folder))
     progress = load_checkpoint(newest, lesson.student, optimizer) if newest else Progress()
     if progress.step:
-        log.info("%s: continuing after step %d of %d", STAGE, progress.step, lesson.steps.num_steps)
+        log.info("%s: resumed after step %d of %d", STAGE, progress.step, lesson.steps.num_steps)
     ranks.first_does(partial(cut_log, out / LOG, progress.step if newest else -1))
     with _notebook(out / LOG if ranks.is_first else None) as note:
         if newest is None and (found := lesson.validate()) is not None:
@@ -254,7 +254,7 @@ def fit(lesson: Lesson, out: Path) -> Progress:
     if cfg.keep == "best" and progress.best_step not in (0, progress.step):
         ranks.first_does(partial(check_whole, best))
         load_checkpoint(best, lesson.student)
-        log.info("%s: the weights after step %d are kept, whose validation was the best", STAGE, progress.best_step)
+        log.info("%s: the weights after step %d, which have the best validation, are kept", STAGE, progress.best_step)
     return progress
 
 
@@ -275,7 +275,7 @@ def _run_steps(
             note({**record, "speed": speed})
             left_out = {key: why for part in ranks.gathered(ready.left_out) for key, why in part.items()}
             for key in left_out.keys() - progress.unreadable.keys():
-                log.warning("%s is left out: %s", key, left_out[key])
+                log.warning("the sample %s is skipped: %s", key, left_out[key])
             progress = progress.model_copy(update={"step": done, "unreadable": progress.unreadable | left_out})
             is_asked = lesson.is_validated(done)
             if is_asked and (found := lesson.validate()) is not None:
@@ -299,7 +299,12 @@ def judged(progress: Progress, found: Validation, cfg: TrainConfig) -> Progress:
         return progress.model_copy(update={"best_step": progress.step, "best_score": score, "stale": 0})
     has_ended = bool(cfg.patience) and stale >= cfg.patience
     if has_ended:
-        log.info("%s: %d validations were not better than that after step %d", STAGE, stale, progress.best_step)
+        log.info(
+            "%s: training ends, because %d validations are not better than the one after step %d",
+            STAGE,
+            stale,
+            progress.best_step,
+        )
     return progress.model_copy(update={"stale": stale, "has_ended": has_ended})
 
 

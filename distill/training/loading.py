@@ -107,8 +107,8 @@ def reader_errors() -> Iterator[None]:
     except RuntimeError as error:
         if "DataLoader worker" not in str(error):
             raise
-        fix = "run the same command again; where memory (or --shm-size) was short, lower distill.train.data_workers"
-        words, got = "a process that reads samples was ended by the system", str(error).splitlines()[0][:160]
+        fix = "run the same command again; if memory (or --shm-size) is short, lower distill.train.data_workers"
+        words, got = "the system killed a process that reads samples", str(error).splitlines()[0][:160]
         raise EnvironmentMissing(words, got=got, fix=fix) from error
 
 
@@ -269,7 +269,7 @@ class Counting:
             sample = self.samples[index]
             row = None if (token := special_token_in(self.processor, sample)) else encode_text(self.processor, sample)
             if row is None:
-                reason, detail = SPECIAL_TOKEN, f"{token} stands in a text"
+                reason, detail = SPECIAL_TOKEN, f"a text contains {token}"
             elif len(row) > self.max_tokens:
                 counts = f"{len(row.prompt_ids)} prompt + {len(row.answer_ids)} answer tokens"
                 reason, detail = TOO_LONG, f"{counts}, at most {self.max_tokens}"

@@ -86,7 +86,9 @@ def output_head(student: Student) -> Any:
     head = student.core.get_output_embeddings()
     if type(head) is not torch.nn.Linear or head.bias is not None:
         got = type(head).__name__
-        raise ConfigError("the head cannot be adapted", where="target_modules", got=got, fix="leave lm_head out")
+        raise ConfigError(
+            "the output head cannot have an adapter", where="target_modules", got=got, fix="remove lm_head"
+        )
     return head.weight
 
 

@@ -139,7 +139,7 @@ def memory_errors(cfg: TrainConfig) -> Iterator[None]:
         smaller = f"--set distill.train.batch_size={cfg.batch_size // 2}"
         less = "--set distill.train.gradient_checkpointing=true"
         advice = [smaller] * (cfg.batch_size > 1) + [less] * (not cfg.gradient_checkpointing)
-        fix = f"run it again with {' or '.join(advice) or 'a shorter max_tokens'}: it goes on from the last checkpoint"
+        fix = f"run again with {' or '.join(advice) or 'smaller max_tokens'}; training resumes from the last checkpoint"
         got = f"{cfg.batch_size}: {str(error)[:120]}"
         raise ConfigError("the memory is full", where="distill.train.batch_size", got=got, fix=fix) from error
 
@@ -179,9 +179,9 @@ def findings(
     words = f"{tokens} tokens, {answers} of them answers; the longest has {longest} of {cfg.max_tokens}"
     return [
         Precheck("samples", f"{len(census)} of {census.num_samples}; {words}"),
-        Precheck("steps", f"{steps.num_steps} of {cfg.samples_per_step} samples, {steps.steps_per_epoch} an epoch"),
+        Precheck("steps", f"{steps.num_steps} of {cfg.samples_per_step} samples, {steps.steps_per_epoch} per epoch"),
         *(
-            Precheck("left out", f"{name}: {reason} {count}, first {part.examples[reason]}", "warning")
+            Precheck("skipped", f"{name}: {reason} {count}, first {part.examples[reason]}", "warning")
             for name, part in (("train", census), ("val", validation))
             for reason, count in sorted(part.skipped.items())
         ),
@@ -202,21 +202,21 @@ def _about_decisions(census: Census, validation: Census) -> list[Precheck]:
         return [Precheck("decisions", f"no sample of {', '.join(missing)}")] if missing else []
     counts = ", ".join(f"{action} {count}" for action, count in asked.items())
     rest = ", ".join(action for action in missing if action not in asked)
-    words = f"{sum(asked.values())} of its {len(validation)} samples will be wrong: {counts}"
-    more = f"; nor does it show {rest}" if rest else ""
-    return [Precheck("decisions", f"val asks for what train never shows, and {words}{more}", "warning")]
+    words = f"val has {sum(asked.values())} of {len(validation)} samples with decisions that train lacks: {counts}"
+    more = f"; train also lacks {rest}" if rest else ""
+    return [Precheck("decisions", f"{words}{more}", "warning")]
 
 
 def _about_chat(processor: Processor, sample: Sample) -> Precheck:
     """Hold what a student is taught against what its own chat template makes of the whole chat."""
     prompt = prompt_text(processor, sample, [1] * len(sample.images))
     taught, whole = prompt + sample.answer + END_OF_ANSWER, chat_text(processor, sample)
-    thinking = "an empty thought, so it answers at once" if "<think>" in prompt else "no thoughts"
+    thinking = "an empty thought" if "<think>" in prompt else "no thoughts"
     if taught == whole:
         return Precheck("chat template", f"the student's own; {thinking}; the prompt ends with {prompt[-32:]!r}")
     at = next((i for i, pair in enumerate(zip(taught, whole, strict=False)) if len(set(pair)) > 1), len(taught))
-    words = f"at character {at} {taught[at : at + 40]!r} for {whole[at : at + 40]!r}"
-    return Precheck("chat template", f"prompt, answer and end are not what the template writes: {words}", "error")
+    words = f"at character {at}, {taught[at : at + 40]!r} instead of {whole[at : at + 40]!r}"
+    return Precheck("chat template", f"the training text differs from that of the template: {words}", "error")
 
 
 def _about_memory(cfg: TrainConfig, student: Student, census: Census, features: VisionFeatures) -> Precheck:
@@ -229,21 +229,27 @@ def _about_memory(cfg: TrainConfig, student: Student, census: Census, features: 
 def _about_features(census: Census, validation: Census, features: VisionFeatures) -> Precheck:
     pictures = dict.fromkeys([*census.pictures, *validation.pictures])
     if not pictures:
-        return Precheck("pictures", "none: the student sees texts only")
+        return Precheck("pictures", "none, the prompts are text only")
     if not features.is_frozen:
-        return Precheck("pictures", f"{len(pictures)}; the vision tower learns and looks at each whenever it is shown")
+        return Precheck(
+            "pictures", f"{len(pictures)}; the vision tower is trained, so it encodes each picture at each use"
+        )
     total = sum(features.bytes_of(picture) for picture in pictures)
     words = f"{len(pictures)}, features {total / GB:.3f} GB"
     if (rest := total - features.memory_bytes) > 0:
-        return Precheck("pictures", f"{words}; {rest / GB:.3f} GB have no room and are looked at each time", "warning")
+        return Precheck(
+            "pictures",
+            f"{words}, of which {rest / GB:.3f} GB do not fit into memory and are computed at each use",
+            "warning",
+        )
     return Precheck("pictures", words)
 
 
 def _about_kernels(student: Student) -> list[Precheck]:
     if student.device == "cpu":
-        return [Precheck("kernels", "PyTorch's, as on every CPU")]
+        return [Precheck("kernels", "PyTorch, as on every CPU")]
     return [
-        Precheck("kernels", f"{package} is missing: {what} runs as slow PyTorch code; pip install {package}", "warning")
+        Precheck("kernels", f"{package} is not installed, so {what} is slow; pip install {package}", "warning")
         for module, (package, what) in FAST_KERNELS.items()
         if importlib.util.find_spec(module) is None
     ]
@@ -256,8 +262,8 @@ def tell(found: Sequence[Precheck], path: Path) -> None:
         InputError: it has an error in it.
     """
     write_json(path, [asdict(finding) for finding in found])
-    log.info("before the first step:")
+    log.info("checks before the first step:")
     for finding in found:
         log.log(logging.INFO if finding.level == "fact" else logging.WARNING, "  %-14s %s", finding.topic, finding.text)
     if errors := [f"{finding.topic}: {finding.text}" for finding in found if finding.level == "error"]:
-        raise InputError("training cannot begin", where=path, got="; ".join(errors))
+        raise InputError("training cannot start, because a check failed", where=path, got="; ".join(errors))

@@ -110,7 +110,7 @@ def _collective(call: Callable[..., Any], *arguments: Any) -> None:
     try:
         call(*arguments)
     except RuntimeError as error:  # what torch.distributed raises of a broken connection
-        fix = "its own message says why; run the same command again: it goes on from the last checkpoint"
+        fix = "read the message of that process, then run the same command again to resume from the last checkpoint"
         got = str(error).splitlines()[0][:160]
         raise EnvironmentMissing("another process of this training has ended", got=got, fix=fix) from error
 
@@ -123,7 +123,7 @@ def is_first_process() -> bool:
 def _number(name: str, default: int) -> int:
     text = os.environ.get(name, str(default))
     if not text.isdecimal():
-        raise ConfigError("not a number", where=f"environment variable {name}", got=text[:40])
+        raise ConfigError("the value is not a whole number", where=f"environment variable {name}", got=text[:40])
     return int(text)
 
 
@@ -137,8 +137,8 @@ def joined(device: Device) -> Iterator[Ranks]:
     if name == "cuda":
         if local >= torch.cuda.device_count():
             got, where = f"{torch.cuda.device_count()} accelerators", f"process {local} of this machine"
-            fix = "start at most as many processes (--nproc-per-node), or set distill.train.device=cpu"
-            raise EnvironmentMissing("fewer accelerators than processes", where=where, got=got, fix=fix)
+            fix = "start fewer processes (--nproc-per-node), or set distill.train.device=cpu"
+            raise EnvironmentMissing("there are fewer accelerators than processes", where=where, got=got, fix=fix)
         torch.cuda.set_device(local)
     if size == 1:
         yield Ranks(0, 1, name)

@@ -34,44 +34,60 @@ class TrainConfig(Config):
     what."""
 
     method: Literal["lora", "full"] = Field(
-        "lora", description="lora: matrices beside frozen weights; full: all of them"
+        "lora", description="lora: train small matrices next to frozen weights; full: train all weights"
     )
-    train_vision: bool = Field(False, description="with method full: the vision tower learns too; no features are kept")
+    train_vision: bool = Field(
+        False, description="with method full: also train the vision tower, whose features are then not cached"
+    )
     lora_rank: int = Field(16, ge=1, description="rank of the LoRA update")
     lora_alpha: ClassVar[float] = 32.0  # the LoRA update is multiplied by alpha / rank
     target_modules: ClassVar[str] = TARGET_MODULES
     epochs: int = Field(3, ge=1, description="passes over the training split")
-    max_steps: int = Field(0, ge=0, description="stop after this many optimizer steps; 0: only by epochs")
+    max_steps: int = Field(0, ge=0, description="stop after this many optimizer steps; 0: no limit")
     samples_per_step: int = Field(16, ge=1, description="samples of an optimizer step, over all processes")
     learning_rate: float = Field(1e-4, gt=0, description="peak learning rate of AdamW")
     schedule: Literal["cosine", "constant"] = Field("cosine", description="learning rate after the warm-up")
     warmup_fraction: float = Field(0.03, ge=0, lt=1, description="share of the steps with a rising rate; 0: none")
     weight_decay: float = Field(0.0, ge=0, description="AdamW's decoupled weight decay")
-    max_pixels: int = Field(0, ge=0, description="most pixels of a picture; 0: all, as texts speak of them")
-    max_tokens: int = Field(4096, ge=16, description="longest sample with images and answer; longer ones are left out")
-    dtype: Dtype = Field("auto", description="what is computed in; auto: bfloat16 on cuda, float32 on a CPU")
-    random_student: RandomStudent = Field(RandomStudent(), description="the student of `--student random`")
+    max_pixels: int = Field(
+        0, ge=0, description="most pixels of a picture; 0: no limit, so that pixel values in texts are right"
+    )
+    max_tokens: int = Field(
+        4096, ge=16, description="longest sample with images and answer, tokens; longer samples are skipped"
+    )
+    dtype: Dtype = Field("auto", description="number type of the computation; auto: bfloat16 on cuda, float32 on a CPU")
+    random_student: RandomStudent = Field(RandomStudent(), description="size of the student of `--student random`")
 
-    validation_samples: int = Field(64, ge=0, description="samples of val, over all decisions and flights; 0: none")
+    validation_samples: int = Field(
+        64, ge=0, description="number of samples of val, spread over all decisions and tracks; 0: none"
+    )
     validate_every_steps: int = Field(0, ge=0, description="steps between validations; 0: at the end of each epoch")
-    validation_answers: bool = Field(True, description="the student answers them; false: the loss alone is measured")
+    validation_answers: bool = Field(
+        True, description="the student answers these samples; false: only the loss is measured"
+    )
     max_new_tokens: int = Field(512, ge=1, description="longest answer in validation, tokens")
-    patience: int = Field(3, ge=0, description="validations without a better one after which training ends; 0: never")
-    keep: Literal["best", "last"] = Field("best", description="the weights of the best validation, or the last")
+    patience: int = Field(
+        3, ge=0, description="number of validations without an improvement after which training ends; 0: never"
+    )
+    keep: Literal["best", "last"] = Field(
+        "best", description="weights to keep: those of the best validation, or the last"
+    )
 
-    batch_size: MayDiffer[int] = Field(1, ge=1, description="samples in one forward pass of one process")
+    batch_size: MayDiffer[int] = Field(1, ge=1, description="number of samples in one forward pass of one process")
     gradient_checkpointing: MayDiffer[bool] = Field(False, description="recompute activations: less memory, slower")
     data_workers: MayDiffer[int] = Field(
-        -1, ge=-1, description="processes that read pictures; -1: one a core, 16 at most"
+        -1, ge=-1, description="number of processes that read pictures; -1: one per core, at most 16"
     )
     save_every_steps: MayDiffer[int] = Field(50, ge=1, description="steps between checkpoints")
-    keep_checkpoints: MayDiffer[int] = Field(2, ge=1, description="newest checkpoints that stay, beside the best")
+    keep_checkpoints: MayDiffer[int] = Field(
+        2, ge=1, description="number of newest checkpoints to keep, besides the best one"
+    )
     device: MayDiffer[Device] = Field("auto", description="auto, cpu or cuda")
 
     @model_validator(mode="after")
     def _fits(self) -> TrainConfig:
         if self.train_vision and self.method != "full":
-            raise ValueError("train_vision needs method=full: adapters leave the vision tower alone")
+            raise ValueError("train_vision needs method=full, because adapters do not change the vision tower")
         return self
 
 

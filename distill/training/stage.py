@@ -44,7 +44,7 @@ def taught_by(samples: Iterable[Sample], max_pixels: int) -> ChatFormat:
         looks.add(FrameFormat(views=sample.views, size_px=sample.picture_px, depth_range_m=sample.depth_range_m))
         lengths.add(len(sample.frames))
     if len(lengths) != 1:
-        raise InputError("a training set of windows of different lengths", got=f"{sorted(lengths)} frames")
+        raise InputError("the training set has windows of different lengths", got=f"{sorted(lengths)} frames")
     ordered = sorted(looks, key=lambda look: (look.views, look.size_px, look.depth_range_m))
     return ChatFormat(
         prompts=dict(sorted(prompts.items())), num_frames=lengths.pop(), looks=ordered, max_pixels=max_pixels
@@ -64,7 +64,7 @@ def add_adapter(student: Student, cfg: TrainConfig, seed: int) -> Student:
     pattern = re.compile(cfg.target_modules)
     names = [name for name, module in student.model.named_modules() if isinstance(module, torch.nn.Linear)]
     if not any(pattern.fullmatch(name) for name in names):
-        raise ConfigError("no layer of the student matches", where="target_modules", got=cfg.target_modules)
+        raise ConfigError("no layer of the student matches the pattern", where="target_modules", got=cfg.target_modules)
     lora = LoraConfig(
         r=cfg.lora_rank,
         lora_alpha=cfg.lora_alpha,  # type: ignore[arg-type]  # a plain number; the library says int
@@ -169,7 +169,7 @@ def _lesson(
     samples, validation = open_split(dataset, "train"), open_split(dataset, "val")
     chosen = choose_over_all(validation, cfg.validation_samples, rng_for(seed, STAGE, "validation"))
     if not samples:
-        fix = "prepare it with more captions, or other fractions"
+        fix = "prepare the training set with more captions, or with other fractions"
         raise InputError("the training split is empty", where=dataset, fix=fix)
     taught = taught_by(samples, max(1, cfg.max_pixels))
     sizes_px = [*(look.size_px for look in taught.looks), *(validation[index].picture_px for index in chosen)]
@@ -194,7 +194,7 @@ def _lesson(
 
 def _nothing_to_learn(out: Path, census: Census) -> Exception:
     return StageFolder(out, STAGE, False).nothing_kept(
-        Tally(input=census.num_samples, dropped=census.skipped), expected="samples that can be learnt from"
+        Tally(input=census.num_samples, dropped=census.skipped), expected="samples that can be used for training"
     )
 
 
