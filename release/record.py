@@ -206,7 +206,7 @@ class CaptionNumbers(Strict):
     @classmethod
     def _each_column(cls, value: dict[str, Counts]) -> dict[str, Counts]:
         if set(value) != set(COUNTED):
-            raise ValueError(f"it counts by {', '.join(COUNTED)}")
+            raise ValueError(f"the keys must be {', '.join(COUNTED)}")
         return value
 
 
@@ -367,7 +367,7 @@ def read_record(path: Path) -> ReleaseRecord:
     """
     if not path.exists():
         raise InputError(
-            "there is no release", where=path, expected="the folder of a release, or of a run that has one",
-            fix="check the path, or make one: cosfly release build",
+            "the folder is not a release", where=path, expected="the folder of a release, or of a run with a release",
+            fix="correct the path, or build a release with cosfly release build",
         )  # fmt: skip
     return read_model(path, ReleaseRecord, RELEASE_FORMAT, tree=path.parent)

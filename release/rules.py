@@ -38,7 +38,7 @@ def select_frames(num_points: int, num_frames: int | None, window_frames: int, u
         two runs or more the first and the last frame are kept; one run stands in the middle.
     """
     if num_points < 0 or window_frames < 1 or (num_frames is not None and num_frames < 1):
-        raise ValueError(f"cannot choose {num_frames} of {num_points} frames for windows of {window_frames}")
+        raise ValueError(f"cannot choose {num_frames} of {num_points} frames for windows of {window_frames} frames")
     if num_frames is None or num_points <= num_frames:
         return np.arange(num_points)
     num_runs = max(1, num_frames // max(1, 0 if uniform else WINDOWS_A_RUN * (window_frames - 1)))

@@ -287,7 +287,7 @@ def test_of_a_foreign_tree_what_was_inspected_is_released_and_nothing_else(tmp_p
     before = picture.read_bytes()
     picture.write_bytes((clean / "frames_playback/frame_00004/rgb.png").read_bytes())
     source = Source("theirs", tree, captions, inspected)
-    assert failed("a", source) == ["ORI: the flight is not the one that was inspected"]
+    assert failed("a", source) == ["ORI: the track has changed since its inspection"]
     picture.write_bytes(before)
     assert failed("a", source) == []
     shutil.copy(picture, alone / "private.png")  # the same bytes, but who knows what stands there tomorrow
@@ -301,11 +301,11 @@ def test_of_a_foreign_tree_what_was_inspected_is_released_and_nothing_else(tmp_p
     one, two = value["flights"]
     one["sha256"], two["sha256"] = two["sha256"], one["sha256"]
     write_json(alone / "inspect.json", value)
-    both = [f"{track}: the flight is not the one that was inspected" for track in ("ORI", "aug_001")]
+    both = [f"{track}: the track has changed since its inspection" for track in ("ORI", "aug_001")]
     assert failed("b", replace(source, inspect=alone / "inspect.json")) == both
     one["folder"], two["folder"] = two["folder"], one["folder"]
     write_json(alone / "inspect.json", value)
-    with pytest.raises(InputError, match="the record of one flight has the folder of another"):
+    with pytest.raises(InputError, match="the record of a track has the folder of another"):
         failed("c", replace(source, inspect=alone / "inspect.json"))
 
 

@@ -57,7 +57,7 @@ def test_what_two_splits_share_is_found():
         ([one], [sample_of(frame=6)], "walk", walk),
         ([one], [sample_of("t2").model_copy(update={"walk": one.walk})], "walk", walk),  # another timestamp
         ([one], [sample_of("t2", town="Town01_Opt")], "town", town),
-        ([one, sample_of(frame=6).model_copy(update={"walk": "elsewhere"})], [], "walk", "has two pedestrian trajectories"),
+        ([one, sample_of(frame=6).model_copy(update={"walk": "elsewhere"})], [], "walk", "has two pedestrian"),
         ([one, *[sample_of(language="zh")] * 2], [], "walk", "twice.*frame 4 of .*/trajectory_1/ORI, language zh"),
     ):  # fmt: skip
         with pytest.raises(VerifyError, match=words):

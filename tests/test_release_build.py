@@ -232,19 +232,19 @@ DAMAGES = {
     "a picture that is missing": (lambda r: (first_flight(r) / FIFTH / "instance.png").unlink(), "missing or empty"),
     "1e999 in a trajectory": (not_finite, "finite number"),
     "1e999 in an annotation": (time_of_1e999, "finite number"),
-    "pictures of two sizes": (other_size, "more than one size of pictures"),
+    "pictures of two sizes": (other_size, "the tracks differ in the size of pictures"),
     "another version": (lambda r: change_json(first_flight(r) / "trajectory.json",
         lambda v: v.update(schema_version="8.0.0")), "schema_version"),
-    "a caption of no frame": (of_no_frame, "belongs to no frame"),
+    "a caption of no frame": (of_no_frame, "the frame of the caption does not exist"),
     "a caption of no flight": (caption(trajectory="trajectory_1", sample_id="trajectory_1_ORI_frame_00004"),
-        "a flight that is not there"),
+        "the track of the caption does not exist"),
     "an id of another frame": (captions_of(lambda lines: lines[0].update(sample_id=lines[1]["sample_id"])),
-        "not that of its frame"),
+        "does not match its frame"),
     "two captions of a frame": (captions_of(lambda lines: lines.append(lines[0])), "two accepted captions"),
-    "a window in the future": (caption(window=[1, 2, 3, 4, 5]), "not the window"),
+    "a window in the future": (caption(window=[1, 2, 3, 4, 5]), "the window of the caption is invalid"),
     "a future that has begun": (caption(future=[4]), "has begun"),
     "a label of no action": (caption(label="land"), "closed set"),
-    "consistent with another": (caption(label="hover", verdict="CONSISTENT"), "consistent with another label"),
+    "consistent with another": (caption(label="hover", verdict="CONSISTENT"), "the verdict is consistent, but"),
     "a caption in one language": (caption(zh=None), "lacks a language"),
     "languages that differ": (captions_of(lambda lines: lines[0]["zh"].update(flight_decision="hover")),
         "decide differently"),
@@ -265,7 +265,9 @@ def test_material_that_cannot_be_released_is_refused_by_name(copy, tmp_path, dam
 
 
 def test_captions_that_nothing_binds_to_the_tree_are_refused(few, tmp_path):
-    with pytest.raises(InputError, match=r"no record says of which tree.*release\.unbound=accept"):
+    with pytest.raises(
+        InputError, match=r"the playback tree of these captions is not recorded.*release\.unbound=accept"
+    ):
         run(split_cfg(unbound="refuse"), [source_of(few)], tmp_path / "r")
 
 
@@ -457,7 +459,7 @@ def test_runs_of_other_towns_go_into_one_release_under_ids_of_their_own(release_
     assert {(row["run"], row["town"]) for row in rows} == {(name, town) for name in towns for town in towns[name]}
     num_captions = sum(row["has_caption"] for row in rows)
     assert num_captions == record.history.captions.released > before.history.captions.released
-    with pytest.raises(InputError, match=r"two runs have one name.*different names"):
+    with pytest.raises(InputError, match=r"several runs have the same name.*different names"):
         run(CFG, [source_of(release_inputs), source_of(other)], tmp_path / "r2")
     # Of two trees in one folder each goes by its own name.
     (other / "tree").rename(other / "second")

@@ -102,7 +102,7 @@ def test_conversations_are_what_their_loaders_ask_for(run, tmp_path, format, ima
 
 
 def test_conversations_of_a_release_are_of_one_split(dataset, tmp_path):
-    with pytest.raises(InputError, match=r"captions of several splits; got train, validation; .*--split"):
+    with pytest.raises(InputError, match=r"the captions are of several splits; got train, validation; .*--split"):
         export(dataset, tmp_path / "c.json", "llava")
     assert not (tmp_path / "c.json").exists()
     export(dataset, tmp_path / "all.jsonl", "jsonl")
@@ -117,7 +117,7 @@ def test_conversations_of_a_release_are_of_one_split(dataset, tmp_path):
 
 def test_a_file_that_is_there_stays_unless_it_may_go(run, tmp_path):
     (tmp_path / "c.csv").write_text("mine")
-    with pytest.raises(StorageError, match=r"c\.csv: there is a file already; --overwrite"):
+    with pytest.raises(StorageError, match=r"c\.csv: the output file already exists; pass --overwrite"):
         export(run, tmp_path / "c.csv", "csv")
     assert (tmp_path / "c.csv").read_text() == "mine"
     told = invoke("release export", run, "--format csv --overwrite --out", tmp_path / "c.csv")

@@ -207,7 +207,7 @@ def change_record(folder: Path, change) -> None:
 )
 def test_shards_that_escape_or_have_other_names_are_refused(broken, tmp_path, path):
     change_record(broken, lambda record: record["shards"][0].update(path=path))
-    with pytest.raises(InputError, match="not a whole release"):
+    with pytest.raises(InputError, match="the release is incomplete"):
         export(config("webdataset"), broken, tmp_path / "out")
 
 
@@ -229,13 +229,13 @@ def tell_size(folder: Path, path: Path) -> None:
 
 
 @pytest.mark.parametrize(("change", "words"), [
-    (lambda rows: rows[3].update(image=None), "a frame without its picture"),
+    (lambda rows: rows[3].update(image=None), "the frame has no picture"),
     (lambda rows: rows[3]["image"].update(bytes=b"GIF89a"), "no PNG"),
-    (lambda rows: rows[3].update(depth=None), "a frame without its picture"),
+    (lambda rows: rows[3].update(depth=None), "the frame has no picture"),
     (lambda rows: rows[3]["pose"].update(x_m=float("inf")), "not finite"),
-    (lambda rows: rows[3].update(width_px=None), "without a value"),
-    (lambda rows: rows[3].update(sample_id="../../escaped"), "no name of a file"),
-    (lambda rows: rows[3].update(sample_id=rows[2]["sample_id"]), "two frames of one name"),
+    (lambda rows: rows[3].update(width_px=None), "a required value is missing"),
+    (lambda rows: rows[3].update(sample_id="../../escaped"), "is not a file name"),
+    (lambda rows: rows[3].update(sample_id=rows[2]["sample_id"]), "the sample_id of a frame is repeated"),
 ])  # fmt: skip
 def test_a_unit_that_fails_publishes_nothing(broken, tmp_path, change, words):
     rewrite(broken, change)

@@ -131,7 +131,7 @@ def test_a_release_is_shown_as_its_rows_say(built, tmp_path):
             assert found == [row["caption_en_critical_components"], row["caption_en_reasoning_trace"]]
     two = data_of(run(built, tmp_path / "two.html", ViewerConfig(flights=2, frames=1)).read_text(encoding="utf-8"))
     assert len(two["flights"]) <= 2
-    assert any("flights are shown" in note for note in two["notes"])
+    assert any("tracks are shown" in note for note in two["notes"])
 
 
 @pytest.fixture(scope="module")

@@ -76,7 +76,7 @@ def row_lists(shard: Path, columns: list[str]) -> Iterator[list[dict[str, Any]]]
             is_plain = all(pa.types.is_floating(part.type) for part in parts)  # words may be missing
             if any(part.null_count > wanted for part in (column, *(parts if is_plain else ()))):
                 where, expected = f"{shard}: {member.name}", "a value in every row"
-                raise InputError("a value is missing", where=where, got="null", expected=expected)
+                raise InputError("the column has no value in a row", where=where, got="null", expected=expected)
         with arrow_errors(shard):  # text that is no UTF-8 shows here
             rows = group.to_pylist()
         del group
@@ -89,7 +89,10 @@ def check_rows(shard: Path, rows: int) -> None:
     found = num_rows(shard)
     if found != rows:
         raise InputError(
-            "a shard of another length", where=shard, got=f"{found} rows", expected=f"{rows} rows, as release.json says"
+            "the shard has the wrong number of rows",
+            where=shard,
+            got=f"{found} rows",
+            expected=f"{rows} rows, as in release.json",
         )
 
 
@@ -98,10 +101,13 @@ def check_columns(group: pa.Table, columns: Iterable[str], shard: Path) -> None:
     for name in columns:
         found = group.schema.field(name).type if group.schema.get_field_index(name) >= 0 else None
         if found != SCHEMA.field(name).type:
-            got = "no such column" if found is None else str(found)
+            got = "no column of this name" if found is None else str(found)
             expected = str(SCHEMA.field(name).type)
             raise InputError(
-                "a shard with other columns than a release", where=f"{shard}: {name}", got=got, expected=expected
+                "the columns of the shard are not those of a release",
+                where=f"{shard}: {name}",
+                got=got,
+                expected=expected,
             )
 
 
@@ -150,7 +156,8 @@ def millionths(value: float) -> int:
 def bounded(value: float) -> float:
     """Return a value that a flight can have; raises as `Sum.add`."""
     if not -LARGEST < value < LARGEST:  # NaN is not
-        raise InputError("not a number of a flight", where="data", got=str(value), expected=f"within {LARGEST:g}")
+        expected = f"a number from {-LARGEST:g} to {LARGEST:g}"
+        raise InputError("a number of a track is out of range", where="data", got=str(value), expected=expected)
     return value
 
 

@@ -19,7 +19,7 @@ from typing import IO, Any, Literal, NamedTuple
 from cosfly.formats.captions import FIELDS, Language, Prompt, read_captions
 from cosfly.formats.frames import FILE_NAMES, frame_name
 from cosfly.formats.places import Place
-from cosfly.runtime.errors import InputError, NothingKept, StorageError
+from cosfly.runtime.errors import InputError, NothingKept, StorageError, shown
 from cosfly.runtime.io import atomic_file, check_stays_below, inside
 from cosfly.runtime.json_io import dump_json
 from cosfly.viz.frame_views import Pictures, frame_label
@@ -92,8 +92,9 @@ def read_lines(source: Path, left_out: Counter[str]) -> Iterator[CaptionLine]:
     if (source / "captions.jsonl").is_file():
         return _of_captions(source / "captions.jsonl", None, left_out)
     raise InputError(
-        "no captions here", where=source, expected="a run folder, a captions.jsonl or its folder, or a release",
-        fix="run cosfly caption first, or name its captions.jsonl",
+        "the source has no captions", where=source,
+        expected="a run directory, captions.jsonl or its folder, or a release",
+        fix="run cosfly caption first, or pass its captions.jsonl",
     )  # fmt: skip
 
 
@@ -140,8 +141,8 @@ def _of_release(folder: Path) -> Iterator[CaptionLine]:
             window = row["caption_window"]
             if not window or not set(window) <= numbers.keys() or len(row["caption_picture_px"] or ()) != 2:
                 raise InputError(
-                    "a caption without its window", where=f"{folder}: {row['sample_id']}", got=repr(window)[:80],
-                    fix="see `cosfly release verify`",
+                    "the window of the caption is incomplete", where=f"{folder}: {row['sample_id']}", got=shown(window),
+                    fix="check the release with cosfly release verify",
                 )  # fmt: skip
             place = tree_folder(flight, has_runs)
             images = [(place / frame_name(numbers[index]) / FILE_NAMES["rgb"]).as_posix() for index in window]
@@ -189,7 +190,7 @@ class CaptionTally:
 
     def __str__(self) -> str:
         reasons = ", ".join(f"{reason} {count}" for reason, count in sorted(self.left_out.items()))
-        return f"{self.written} written{f'; left out: {reasons}' if reasons else ''}"
+        return f"{self.written} written{f'; skipped: {reasons}' if reasons else ''}"
 
 
 def export(
@@ -214,15 +215,19 @@ def export(
         NothingKept: no caption can go out.
     """
     if out.exists() and not (overwrite and out.is_file()):
-        fix = "--overwrite replaces it, or choose another --out" if out.is_file() else "name a file in it"
-        raise StorageError("there is a file already" if out.is_file() else "this is a folder", where=out, fix=fix)
+        fix = "pass --overwrite to replace it, or choose another --out" if out.is_file() else "pass the path of a file"
+        raise StorageError(
+            "the output file already exists" if out.is_file() else "the output path is a folder", where=out, fix=fix
+        )
     told = CaptionTally()
     lines = _of_split(read_lines(source, told.left_out), split, format, told.left_out)
     wanted = Wanted([language for language in LANGUAGES if language in languages], shown)
     with atomic_file(out) as file:
         WRITERS[format](file, lines, wanted, told)
         if told.written == 0:
-            raise NothingKept("no caption to export", where=source, got=str(told), expected="accepted captions")
+            raise NothingKept(
+                "the source has no caption to export", where=source, got=str(told), expected="accepted captions"
+            )
     return told
 
 
@@ -237,8 +242,10 @@ def _of_split(
             continue
         first = line.split if first is None else first
         if line.split != first and format in ("sharegpt", "llava"):
-            fix = "write a file for each: --split train, --split validation, --split test"
-            raise InputError("captions of several splits", where=line.sample_id, got=f"{first}, {line.split}", fix=fix)
+            fix = "write one file per split with --split train, --split validation and --split test"
+            raise InputError(
+                "the captions are of several splits", where=line.sample_id, got=f"{first}, {line.split}", fix=fix
+            )
         yield line
 
 

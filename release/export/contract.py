@@ -33,11 +33,11 @@ FORMATS: dict[FormatName, str] = {
 class ExportConfig(Config):
     """What is made of a release."""
 
-    format: FormatName = Field(description="tree, webdataset, or lerobot (v3.0)")
+    format: FormatName = Field(description="format: tree, webdataset or lerobot (v3.0)")
     shard_mb: int = Field(
         500,
         ge=1,
-        description="size that a file of many frames should not pass by more than a row group or a flight, MB",
+        description="approximate size of a file of many frames, MB; exceeded by at most a row group or a track",
     )
 
 

@@ -271,7 +271,7 @@ def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> li
     tasks = tuple(dict.fromkeys(task_of(f.goal, one) for f in flights for one in decisions if one in f.decisions))
     if unknown := found - {*decisions}:
         raise InputError(
-            "a decision outside the closed set", where=release.folder, got=", ".join(sorted(unknown))[:200]
+            "a decision is not in the closed set of actions", where=release.folder, got=", ".join(sorted(unknown))[:200]
         )
     units: list[ExportUnit] = []
     episode = index = 0
@@ -307,9 +307,9 @@ def _fps(flights: list[ReleasedRows]) -> int:
                 wrong.append(f"{flight.name}: steps of {np.diff(time_s).min():.4f} to {np.diff(time_s).max():.4f} s")
     if wrong or len(fps) > 1:
         raise InputError(
-            "LeRobot has one whole number of frames a second",
+            "LeRobot needs the same whole number of frames per second in all tracks",
             where="time_s",
-            got="; ".join(wrong[:10]) or f"{sorted(fps)} a second",
+            got="; ".join(wrong[:10]) or f"{' and '.join(map(str, sorted(fps)))} frames per second",
         )
     return fps.pop() if fps else 2  # the paper's
 
@@ -318,10 +318,10 @@ def _size(release: Release) -> tuple[int, int]:
     sizes = release.record.numbers.frames_by.image_px
     if len(sizes) != 1:
         raise InputError(
-            "LeRobot has pictures of one size",
+            "LeRobot needs pictures of one size",
             where=release.folder,
             got=", ".join(sizes),
-            fix="build a release of each size",
+            fix="build one release per size",
         )
     width, _, height = next(iter(sizes)).replace(" ", "").partition("x")
     return int(width), int(height)

@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 
 from cosfly.formats.frames import FrameFile
 from cosfly.runtime.arrays import png_size
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.io import inside, sha256_file
 from cosfly.runtime.tables import arrow_errors, open_table, read_row_group, row_groups
 from release.columns import PICTURES, PLACE, REQUIRED, SPLIT_NAMES, SplitName, flight_spans, schema
@@ -102,13 +102,15 @@ def open_release(folder: Path) -> Release:
     wrong = []
     for shard in record.shards:
         if not SHARD_NAME.fullmatch(shard.path):
-            wrong.append(f"{shard.path!r} is no name of a shard")
+            wrong.append(f"{shard.path!r} is not the name of a shard")
         elif not (path := inside(folder, shard.path)).is_file():
             wrong.append(f"{shard.path} is missing")
         elif (size := path.stat().st_size) != shard.bytes:
-            wrong.append(f"{shard.path} has {size} bytes and not {shard.bytes}")
+            wrong.append(f"{shard.path} has {size} bytes instead of {shard.bytes}")
     if wrong:
-        raise InputError("not a whole release", where=folder, got="; ".join(wrong), fix="see `cosfly release verify`")
+        raise InputError(
+            "the release is incomplete", where=folder, got="; ".join(wrong), fix="run cosfly release verify for details"
+        )
     return Release(folder, record, sha256_file(folder / "release.json", tree=folder))
 
 
@@ -133,8 +135,8 @@ def scan(release: Release) -> list[ReleasedRows]:
             names = table.schema_arrow.names
             if differing := [m.name for m in wanted if found.get(m.name) != m.type or names.count(m.name) != 1]:
                 raise InputError(
-                    "not a shard of this version", where=path,
-                    got=f"missing, twice there or of another type: {', '.join(differing)}",
+                    "the columns of the shard are not those of this version", where=path,
+                    got=f"columns that are missing, repeated or of another type: {', '.join(differing)}",
                     fix="build the release again with this version of cosfly",
                 )  # fmt: skip
             for k in range(table.num_row_groups):
@@ -158,14 +160,18 @@ def _scan_group(flights: dict[Place, ReleasedRows], shard: str, k: int, group: A
             isinstance(part, str) and (PART.fullmatch(part) or (part == "" and n == 0)) for n, part in enumerate(place)
         ):
             raise InputError(
-                "not names of folders", where=f"{shard}: {rows['sample_id'][start]}", got=repr(place)[:200]
+                "the names of the track are not folder names",
+                where=f"{shard}: {rows['sample_id'][start]}",
+                got=shown(list(place), 200),
             )
         flight = flights.setdefault(place, ReleasedRows(*place, split_of(shard)))
         if flight.split != split_of(shard):
-            raise InputError("a flight in two splits", where=flight.name, got=f"{flight.split} and {split_of(shard)}")
+            raise InputError(
+                "the track is in two splits", where=flight.name, got=f"{flight.split} and {split_of(shard)}"
+            )
         times = rows["time_s"][start:stop]
         if None in times or None in rows["frame_index"][start:stop]:
-            raise InputError("a frame without index or time", where=f"{shard}: {flight.name}")
+            raise InputError("a frame has no index or no time", where=f"{shard}: {flight.name}")
         flight.spans.append(Span(shard, k, start, stop))
         flight.frames.append(np.array(rows["frame_index"][start:stop], dtype=np.int32))
         flight.times.append(np.array(times, dtype=np.float64))
@@ -177,7 +183,7 @@ def _scan_group(flights: dict[Place, ReleasedRows], shard: str, k: int, group: A
 def _check(flight: ReleasedRows, where: Path) -> None:
     frames, time_s = flight.frame_index, flight.time_s
     if not (np.diff(frames) > 0).all() or not (np.diff(time_s) > 0).all():
-        raise InputError("the frames of a flight do not rise", where=f"{where}: {flight.name}")
+        raise InputError("the indices and times of the frames do not increase", where=f"{where}: {flight.name}")
 
 
 def read_span(release: Release, span: Span, columns: list[str] | None = None) -> list[dict[str, Any]]:
@@ -194,11 +200,11 @@ def _check_values(group: pa.Table, where: str) -> None:
     for member in group.schema:
         column = group.column(member.name)
         if member.name in REQUIRED and column.null_count:
-            raise InputError("a row without a value that all have", where=f"{where}: {member.name}", got="null")
+            raise InputError("a required value is missing in a row", where=f"{where}: {member.name}", got="null")
         parts = column.combine_chunks().flatten() if pa.types.is_struct(member.type) else [column]
         for part in parts:
             if pa.types.is_floating(part.type) and pc.all(pc.is_finite(part)).as_py() is False:
-                raise InputError("a number that is not finite", where=f"{where}: {member.name}")
+                raise InputError("a number is not finite", where=f"{where}: {member.name}")
 
 
 def rows_of_flight(
@@ -215,8 +221,8 @@ def picture(row: dict[str, Any], file: FrameFile) -> bytes:
     data = value if file == "depth" else value and value["bytes"]
     if not data or (file != "depth" and png_size(data) is None):
         raise InputError(
-            "a frame without its picture",
+            "the frame has no picture",
             where=f"{row['sample_id']}: {PICTURES[file].name}",
-            got="none" if not data else "no PNG",
+            got="no data" if not data else "data that are not a PNG",
         )
     return data

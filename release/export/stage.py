@@ -107,10 +107,10 @@ def render_readme(record: ExportRecord) -> str:
         "---", yaml.safe_dump(front, sort_keys=True, allow_unicode=True).rstrip(), "---", "",
         f"# {for_markdown(record.release.name)}: {record.format} {record.format_version}", "",
         f"{record.frames:,} frames of the release {for_markdown(record.release.name)} "
-        f"(content {record.release.digest}), exported by {for_markdown(record.made_by)}. `export.json` says the same "
-        "to programs; `checksums.sha256` lists the files.", "",
+        f"(content {record.release.digest}), exported by {for_markdown(record.made_by)}. `export.json` has these facts "
+        "for programs; `checksums.sha256` lists the files.", "",
         "```python", record.how_to_open, "```", "",
-        "## How things are stored", "",
+        "## How data are stored", "",
         *(f"- {name}: {for_markdown(text)}" for name, text in record.codings.items()), "",
         *(f"- {for_markdown(note)}" for note in record.notes), "",
         "## Axes", "",
@@ -163,8 +163,8 @@ def run(
     if finished.tally.failed:  # nothing half is published
         raise InputError(
             "parts of the release could not be exported", where=out / "failures.jsonl", got=str(finished.tally),
-            fix="mend what that file names (`cosfly release verify`) and run the same command again: only those are "
-            "done again",
+            fix="fix what this file lists (see cosfly release verify) and run the same command again, which repeats "
+            "only these parts",
         )  # fmt: skip
     written = [result_of(kept, UnitFiles) for kept in finished.kept]
     _check_parts(parts, written)
@@ -195,6 +195,6 @@ def _check_parts(parts: Path, written: list[UnitFiles]) -> None:
     missing = [name for one in written for name in one.files if not inside(parts, name).is_file()]
     if missing:
         raise VerifyError(
-            "files that were finished before are missing", where=parts, got=", ".join(missing[:5]),
-            fix=f"remove {parts.parent} and run again",
+            "finished files are missing", where=parts, got=", ".join(missing[:5]),
+            fix=f"remove {parts.parent} and run the same command again",
         )  # fmt: skip

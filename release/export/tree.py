@@ -43,17 +43,21 @@ Row = dict[str, Any]
 
 def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[ExportUnit]:
     """Return a unit is one flight."""
-    wrong = [] if "rgb" in release.modalities else ["no colour pictures, which every frame of the layout has"]
+    wrong = [] if "rgb" in release.modalities else ["the release has no colour pictures"]
     wrong += [
-        f"{flight.name}: a town's folder begins with {TOWN}" for flight in flights if not flight.town.startswith(TOWN)
+        f"{flight.name}: the name of the town does not begin with {TOWN}"
+        for flight in flights
+        if not flight.town.startswith(TOWN)
     ]
     wrong += [
-        f"{flight.name}: a trajectory's folder begins with trajectory_"
+        f"{flight.name}: the name of the trajectory does not begin with trajectory_"
         for flight in flights
         if not flight.trajectory.startswith("trajectory_")
     ]
     if wrong:
-        raise InputError("the playback tree cannot hold this release", where=release.folder, got="; ".join(wrong[:20]))
+        raise InputError(
+            "the release cannot be written as a playback tree", where=release.folder, got="; ".join(wrong[:20])
+        )
     has_runs = len({flight.run for flight in flights}) > 1
     numbers: dict[tuple[str, str, str], int] = {}
     units = []
@@ -150,7 +154,7 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Track:
     """Return the flight that released rows are of; `number` is its trajectory's among those of the release."""
     sizes = {(r["width_px"], r["height_px"]) for r in rows}
     if len(sizes) != 1:
-        raise InputError("a flight has pictures of one size", where=placed.name, got=f"{len(sizes)} sizes")
+        raise InputError("the pictures of the track differ in size", where=placed.name, got=f"{len(sizes)} sizes")
     found = FlightRows(placed.name, rows)
     return replace(
         found.flight,

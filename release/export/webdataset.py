@@ -61,7 +61,9 @@ def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -
             for row in read_span(release, span):
                 key = row["sample_id"].replace(".", "_")  # a key ends at its first dot
                 if key in keys or not PART.fullmatch(key):
-                    raise InputError("two frames of one name, or no name of a file", where=unit.name, got=key)
+                    raise InputError(
+                        "the sample_id of a frame is repeated or is not a file name", where=unit.name, got=key
+                    )
                 keys.add(key)
                 for ending, data in members(row, release):
                     tar.addfile(_header(f"{key}.{ending}", len(data)), BytesIO(data))

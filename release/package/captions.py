@@ -107,7 +107,7 @@ def index_captions(
         if problem is None and caption.status == "accepted":
             problem = _no_caption(caption, where)
             if problem is None and key in found and found[key].has_caption[caption.frame_index]:
-                problem = InputError("a frame has two accepted captions", where=where)
+                problem = InputError("the frame has two accepted captions", where=where)
         if problem is not None:
             tell(caption.sample_id, problem)
             continue
@@ -127,17 +127,20 @@ def _no_place(
     """Return why a caption is of no frame of the tree, None if it is of one."""
     if key not in lengths and key not in others:
         return InputError(
-            "a caption of a flight that is not there", where=where, got="/".join(key),
-            expected="a flight of the tree that is released", fix="give the captions that were made from this tree",
+            "the track of the caption does not exist", where=where, got="/".join(key),
+            expected="a track of the playback tree", fix="pass the captions that were made from this tree",
         )  # fmt: skip
     if not caption.sample_id.endswith(sample_id(f"{caption.trajectory}_{caption.variant}", caption.frame_index)):
         return InputError(
-            "the id of a caption is not that of its frame", where=where, got=f"frame {caption.frame_index}"
+            "the sample_id of the caption does not match its frame", where=where, got=f"frame {caption.frame_index}"
         )
     if not 0 <= caption.frame_index < lengths.get(key, caption.frame_index + 1):
         expected = f"0 to {lengths[key] - 1}" if key in lengths else "0 or more"
         return InputError(
-            "a caption belongs to no frame", where=where, got=f"frame {caption.frame_index}", expected=expected
+            "the frame of the caption does not exist",
+            where=where,
+            got=f"frame {caption.frame_index}",
+            expected=expected,
         )
     return None
 
@@ -145,27 +148,35 @@ def _no_place(
 def _no_caption(caption: Caption, where: str) -> InputError | None:
     """Return why an accepted caption cannot be released, None if it can."""
     if caption.en is None or caption.zh is None:
-        fix = "release captions in both languages; English alone can be reported and train students"
-        return InputError("an accepted caption lacks a language", where=where, fix=fix)
+        fix = "caption the tree in both languages, which a release needs"
+        return InputError("the accepted caption lacks a language", where=where, fix=fix)
     decision = caption.en.flight_decision
     if decision != caption.zh.flight_decision:
         got = f"{decision} and {caption.zh.flight_decision}"
-        return InputError("the two languages decide differently", where=where, got=got)
+        return InputError("the two languages of the caption have different decisions", where=where, got=got)
     for name, action in (("en.flight_decision", decision), ("label", caption.label)):
         if action is not None and action not in ACTIONS:
             return not_in_set(action, f"{where}: {name}")
     if caption.verdict == "CONSISTENT" and decision != caption.label:
         return InputError(
-            "a decision is called consistent with another label", where=where, got=f"{decision}, {caption.label}"
+            "the verdict is consistent, but decision and label differ",
+            where=where,
+            got=f"decision {decision}, label {caption.label}",
         )
     window = caption.window
     if not window or window[0] < 0 or window[-1] != caption.frame_index or window != sorted(set(window)):
         expected = f"frames in order of time, the last one {caption.frame_index}"
-        return InputError("not the window of a caption", where=where, got=str(window)[:80], expected=expected)
+        return InputError("the window of the caption is invalid", where=where, got=str(window)[:80], expected=expected)
     if any(index <= caption.frame_index for index in caption.future):
-        return InputError("the future of a caption has begun", where=where, got=str(caption.future)[:80])
+        return InputError(
+            "the future of the caption does not begin after its window", where=where, got=str(caption.future)[:80]
+        )
     if any(language not in caption.prompt for language in LANGUAGES):
-        return InputError("an accepted caption lacks a prompt", where=where, got=", ".join(caption.prompt))
+        return InputError(
+            "the accepted caption lacks a prompt",
+            where=where,
+            got=f"prompts in {', '.join(caption.prompt) or 'no language'}",
+        )
     return None
 
 

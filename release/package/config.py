@@ -19,46 +19,55 @@ MB = 1024 * 1024
 class ReleaseConfig(Config):
     """What is published, and how it is cut into files."""
 
-    name: str = Field("CosFly flights", min_length=1, description="title of the data-set card")
+    name: str = Field("CosFly flights", min_length=1, description="title of the data set card")
     licence: LicenceId | None = Field(
-        None, description="licence of the data set, as the hub spells it (cc-by-4.0); null: its maps', if they agree"
+        None,
+        description="licence of the data set, as spelled on the Hugging Face Hub (cc-by-4.0); null: that of all maps",
     )
-    credits: str = Field("", description="who else must be named; the maps' own licences and credits always are")
+    credits: str = Field("", description="attribution besides that of the maps, which is always included")
     num_frames: int | None = Field(
         400,
         ge=1,
-        description="frames per flight, in runs that keep captions' windows whole; shorter ones are whole; null: all",
+        description="largest number of frames per track, in runs that keep windows of captions complete; null: all",
     )
     uniform_stride: bool = Field(
         False,
-        description="choose frames one by one, as the paper does; captions whose windows lack frames are left out",
+        description="select single frames, as in the paper; captions with incomplete windows are not released",
     )
     flights: tuple[str, ...] = Field(
         (),
-        description="patterns for the folders of flights in their trees, as Town01/trajectory_17*/ORI; empty: all",
+        description="patterns of track folders, such as Town01/trajectory_17*/ORI; empty: all",
     )
     tracks: tuple[TrackName, ...] = Field(
-        ("clean", "perturbed"), min_length=1, description="which flights of a trajectory"
+        ("clean", "perturbed"), min_length=1, description="tracks of a trajectory to release"
     )
     pairs: Pairs = Field(
         "both",
-        description="both: of two wanted tracks neither without the other; any: also flights whose twin is left out",
+        description="both: release the two tracks of a trajectory together or not at all; any: also a single track",
     )
-    include_review: bool = Field(False, description="also release flights that the inspection routed to manual review")
+    include_review: bool = Field(False, description="also release tracks that the inspection sends to review")
     unbound: str = Field(
         "refuse",
         pattern="^(refuse|accept)$",
-        description="captions of which no record says from which tree they were made: refuse or accept",
+        description="captions whose playback tree is not recorded: refuse or accept",
     )
-    split_by: SplitBy = Field("walk", description="what two splits may not share: a walk, or a town in all its builds")
-    validation_fraction: float = Field(0.1, ge=0, lt=1, description="share of walks (towns) for validation; 0: none")
-    test_fraction: float = Field(0.1, ge=0, lt=1, description="share of walks (towns) for the test; 0: none")
+    split_by: SplitBy = Field(
+        "walk", description="what two splits must not share: a pedestrian trajectory (walk), or a town"
+    )
+    validation_fraction: float = Field(
+        0.1, ge=0, lt=1, description="share of pedestrian trajectories (or towns) for validation; 0: none"
+    )
+    test_fraction: float = Field(
+        0.1, ge=0, lt=1, description="share of pedestrian trajectories (or towns) for the test; 0: none"
+    )
     split_seed: ClassVar[int] = 0  # of the division into splits
     modalities: tuple[FrameFile, ...] = Field(
         tuple(FILE_NAMES), min_length=1, description="pictures to include: rgb, depth, instance"
     )
     shard_mb: int = Field(
-        500, ge=1, description="size that a parquet file should not pass by more than one flight, MB before compression"
+        500,
+        ge=1,
+        description="approximate size of a parquet file before compression, MB; exceeded by at most one track",
     )
     row_group_mb: int = Field(
         64, ge=1, le=1024, description="size of a row group before compression, MB; viewers load one at a time"
@@ -68,13 +77,15 @@ class ReleaseConfig(Config):
     @classmethod
     def _distinct(cls, values: tuple) -> tuple:
         if len(set(values)) != len(values):
-            raise ValueError("an entry is listed twice")
+            raise ValueError("each entry may occur only once")
         return values
 
     @model_validator(mode="after")
     def _fractions_leave_something(self) -> ReleaseConfig:
         if self.validation_fraction + self.test_fraction >= 1.0:
-            raise ValueError("validation_fraction + test_fraction must stay below 1, or nothing is left to train on")
+            raise ValueError(
+                "validation_fraction + test_fraction must be below 1, so that frames are left for training"
+            )
         return self
 
     @property

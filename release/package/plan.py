@@ -49,11 +49,11 @@ class Faults:
         listed = [failure.message for failure in self.failures[:NUM_NAMED]]
         more = f" | and {len(self.failures) - NUM_NAMED} more, see {path}" if len(self.failures) > NUM_NAMED else ""
         kind = VerifyError if all(failure.code == VerifyError.code for failure in self.failures) else InputError
-        wrong = "1 thing is" if len(self.failures) == 1 else f"{len(self.failures)} things are"
+        problems = "1 problem" if len(self.failures) == 1 else f"{len(self.failures)} problems"
         raise kind(
-            f"nothing is released: {wrong} wrong with the material", where=self._stage.path,
+            f"nothing is released, because the inputs have {problems}", where=self._stage.path,
             got=" | ".join(listed) + more,
-            fix="mend them, or leave the flights out, and run the same command again: finished shards are kept",
+            fix="fix these problems or exclude the tracks, then run the same command again; finished shards are kept",
         )  # fmt: skip
 
 
@@ -91,7 +91,10 @@ def selected_bytes(flight: Surveyed, cfg: ReleaseConfig, window_frames: int, tel
             size = _size(path)
             total += 4 * math.prod(flight.size_px) if size and path.name == DEPTH_PNG else size
             if not size:
-                tell(flight.name, InputError("a frame's file is missing or empty", where=path, fix="render it again"))
+                tell(
+                    flight.name,
+                    InputError("a file of the frame is missing or empty", where=path, fix="render the track again"),
+                )
     return len(selected), total
 
 
@@ -172,16 +175,16 @@ def _no_flight(sources: list[Source], material: Material, left_out: Counter[str]
     tally = Tally(input=len(material.candidates), dropped=left_out)
     waiting = [one.source for one in material.candidates if (one.left_out or "").startswith(IN_REVIEW)]
     inspected = next((s.inspect for s in [*(sources[k] for k in waiting), *sources] if s.inspect), None)
-    choose = "choose others with release.tracks, release.pairs or release.flights"
+    choose = "choose other tracks with release.tracks, release.pairs or release.flights"
     if inspected is None:
         return stage.nothing_kept(tally, expected="a flight", fix=choose)
     folder = inspected.parent
     if waiting:
-        again = "then the same command again. Or, with another --out, take them undecided"
-        fix = f"{how_to_decide(folder)}; {again}: --set release.include_review=true"
+        again = "then run the same command again; or release them without a decision with another --out and"
+        fix = f"{how_to_decide(folder)}; {again} --set release.include_review=true"
     else:
-        fix = f"mend what {folder / 'report.html'} names and inspect again, or {choose}"
-    return stage.nothing_kept(tally, expected="an inspected flight that passed", where=folder, fix=fix)
+        fix = f"fix what {folder / 'report.html'} lists and inspect again, or {choose}"
+    return stage.nothing_kept(tally, expected="a track that the inspection accepted", where=folder, fix=fix)
 
 
 def _index(
@@ -197,8 +200,10 @@ def _index(
         for key, of_flight in captions.items():
             if len(own[key]) > 1 and of_flight.count:
                 names = ", ".join(flight.name for flight in own[key])
-                what = "captions that may be of any of several flights"
-                faults.tell(names, InputError(what, where=source.captions, got=names, fix="release their trees apart"))
+                what = "the captions fit several tracks"
+                faults.tell(
+                    names, InputError(what, where=source.captions, got=names, fix="release their trees separately")
+                )
             found |= {flight.name: of_flight for flight in own[key]}
         total = total + account
     return found, total

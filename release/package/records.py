@@ -222,8 +222,8 @@ def check_parts(parts: Sequence[tuple[Path, Shard]], out: Path) -> None:
     for path, shard in parts:
         if not path.is_file() or path.stat().st_size != shard.bytes:
             raise VerifyError(
-                "a shard that was finished before is missing or has another size", where=path,
-                expected=f"{shard.bytes} bytes", fix=f"remove {out} and run again",
+                "a finished shard is missing or has another size", where=path,
+                expected=f"{shard.bytes} bytes", fix=f"remove {out} and run the same command again",
             )  # fmt: skip
 
 

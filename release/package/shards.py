@@ -44,9 +44,11 @@ from release.rules import is_whole, select_frames
 # take.
 KIND = struct.Struct(">BBxxB")
 KINDS = ((8, 2, 0), (8, 6, 0))
-CONVERT = "convert it without loss, as Pillow's Image.open(FILE).convert('RGB').save(FILE), and inspect the tree again"
+CONVERT = (
+    "convert it without loss, for instance with Pillow: Image.open(FILE).convert('RGB').save(FILE), and inspect again"
+)
 PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
-RENDER = "render it again, or put the file back"
+RENDER = "render the track again, or restore the file"
 
 
 def check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where: Path, *, is_known: bool) -> None:
@@ -61,15 +63,15 @@ def check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where:
     found = png_size(data[:PNG_HEADER_BYTES])
     if found is None or data[-len(PNG_END) :] != PNG_END:
         got = f"{len(data)} bytes that do not {'begin' if found is None else 'end'} as a PNG"
-        raise InputError("a picture is damaged or cut short", where=where, got=got, fix=RENDER)
+        raise InputError("the picture is damaged or cut short", where=where, got=got, fix=RENDER)
     if found != size_px:
         got, expected = (f"{width} x {height} px" for width, height in (found, size_px))
-        raise InputError("a picture of another size", where=where, got=got, expected=expected, fix=RENDER)
+        raise InputError("the picture has the wrong size", where=where, got=got, expected=expected, fix=RENDER)
     bits, colour_type, interlace = KIND.unpack_from(data, PNG_HEADER_BYTES)
     if (bits, colour_type, interlace) not in KINDS:
         got = f"{bits} bits, colour type {colour_type}{', interlaced' if interlace else ''}"
         expected = "8 bits, RGB or RGBA (2 or 6), not interlaced"
-        raise InputError("a PNG of another kind", where=where, got=got, expected=expected, fix=CONVERT)
+        raise InputError("the kind of PNG is not supported", where=where, got=got, expected=expected, fix=CONVERT)
     if not is_known:
         parse_png(data, where)
 
@@ -77,11 +79,11 @@ def check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where:
 def _check_depth(values: np.ndarray, size_px: tuple[int, int], where: Path) -> None:
     if values.shape[::-1] != size_px:
         got, expected = (f"{width} x {height} px" for width, height in (values.shape[::-1], size_px))
-        raise InputError("a depth image of another size", where=where, got=got, expected=expected, fix=RENDER)
+        raise InputError("the depth image has the wrong size", where=where, got=got, expected=expected, fix=RENDER)
     low, high = float(values.min(initial=0.0)), float(values.max(initial=0.0))  # NaN if any is
     if not 0.0 <= low <= high <= SKY_DEPTH_M:
         raise InputError(
-            "a depth image holds what is no depth",
+            "the depth image has values that are not depths",
             where=where,
             got=f"{low:g} to {high:g} m",
             expected=f"0 to {SKY_DEPTH_M:g} m",
@@ -91,7 +93,7 @@ def _check_depth(values: np.ndarray, size_px: tuple[int, int], where: Path) -> N
 
 MOST_TOLD = 20  # problems of one shard: after so many the others need not be looked for
 META = "meta.json"
-ANEW = "put the file back, or inspect and caption the tree as it is now"
+ANEW = "restore the file, or inspect and caption the changed tree"
 
 
 @dataclass(frozen=True)
@@ -213,7 +215,7 @@ class _Problems:
         if self.errors:
             kind = VerifyError if all(isinstance(error, VerifyError) for error in self.errors) else InputError
             more = " or more" if len(self.errors) >= MOST_TOLD else ""
-            raise kind(f"{len(self.errors)}{more} things are wrong", got=" | ".join(map(str, self.errors)))
+            raise kind(f"the track has {len(self.errors)}{more} problems", got=" | ".join(map(str, self.errors)))
 
 
 def _digests(candidate: Candidate) -> dict[str, str]:
@@ -226,8 +228,8 @@ def _digests(candidate: Candidate) -> dict[str, str]:
     else:
         digests = folder_digests(folder)
         if digest_of(digests) != candidate.sha256:
-            got, expected = digest_of(digests), f"{candidate.sha256}, as in the inspection"
-            what = "the flight is not the one that was inspected"
+            got, expected = digest_of(digests), f"{candidate.sha256}, the digest at the inspection"
+            what = "the track has changed since its inspection"
             raise VerifyError(what, where=folder, got=got, expected=expected, fix=ANEW)
     _check_digest(folder, TRACK_FILE, None, digests)
     _check_digest(folder, TARGET_FILE, None, digests)
@@ -240,8 +242,8 @@ def _check_digest(folder: Path, name: str, data: bytes | None, digests: Mapping[
         return
     got = sha256_file(folder / name) if data is None else hashlib.sha256(data).hexdigest()
     if got != digests.get(name):
-        expected = digests.get(name, "a digest on record")
-        what = "a file is not the one that is on record"
+        expected = digests.get(name, "a recorded digest")
+        what = "the file differs from the recorded digest"
         raise VerifyError(what, where=folder / name, got=got, expected=expected, fix=ANEW)
 
 
@@ -252,6 +254,6 @@ def _read_picture(flight: Track, path: Path, file: FrameFile, tree: Path, *, is_
         is_known: its digest will be compared.
     """
     inside = tree if path.is_symlink() else None  # its folder was looked at
-    data = read_bytes(path, what="frame's file", fix="render it again", tree=inside)
+    data = read_bytes(path, what="file of the frame", fix="render the track again", tree=inside)
     check_picture(file, data, (flight.camera.width_px, flight.camera.height_px), path, is_known=is_known)
     return data

@@ -56,8 +56,9 @@ class Source:
         """Take a run folder as `cosfly run` makes it."""
         if not (folder / "render").is_dir():
             raise InputError(
-                "not a run folder", where=folder, expected="a folder with render/, caption/ and inspect/",
-                fix="give --data, --captions and --inspect where they stand elsewhere",
+                "the folder is not a run directory", where=folder,
+                expected="a folder with render/, caption/ and inspect/",
+                fix="pass --data, --captions and --inspect if they are in other folders",
             )  # fmt: skip
         captions, inspected = folder / "caption/captions.jsonl", folder / "inspect/inspect.json"
         for product in (captions, inspected):
@@ -140,9 +141,9 @@ def gather(
     name, count = Counter(source.run for source in sources).most_common(1)[0]
     if count > 1:  # rows and records know a run by its name alone
         raise InputError(
-            "two runs have one name", got=f"{count} of {name}",
-            expected="trees of different names, or in folders of different names",
-            fix="rename one of the trees, or the folder that it stands in",
+            "several runs have the same name", got=f"{count} runs with the name {name}",
+            expected="trees with different names, or in folders with different names",
+            fix="rename one of the trees, or the folder that contains it",
         )  # fmt: skip
     wanted = ("accepted", "review") if include_review else ("accepted",)
     found: list[tuple[int, Place, Path, str | None, str | None, float | None]] = []
@@ -150,10 +151,10 @@ def gather(
     for number, source in enumerate(sources):
         if not accept_unbound and record_of(source.captions) is None:
             raise InputError(
-                "no record says of which tree these captions were made", where=source.captions,
-                expected="stage.json of the stage that made them beside the captions",
-                fix="give them where `cosfly caption` wrote them; "
-                "if you know that they are of this tree, --set release.unbound=accept",
+                "the playback tree of these captions is not recorded", where=source.captions,
+                expected="stage.json next to the captions",
+                fix="pass the captions in the folder of `cosfly caption`, "
+                "or accept them for this tree with --set release.unbound=accept",
             )  # fmt: skip
         if source.inspect is None:
             for folder in find_tracks(source.data):
@@ -194,7 +195,7 @@ def _inspected_place(source: Source, flight: TrackInspection) -> Place:
     parts = Path(flight.folder).parts[-2:]
     if parts != (flight.trajectory, flight.variant)[2 - len(parts) :]:
         raise InputError(
-            "the record of one flight has the folder of another", where=source.inspect, got=flight.folder,
+            "the record of a track has the folder of another track", where=source.inspect, got=flight.folder,
             expected=f"a folder that ends in {flight.trajectory}/{flight.variant}", fix="run cosfly inspect again",
         )  # fmt: skip
     return _place(source, Path(flight.folder))
@@ -225,9 +226,9 @@ def choose_licence(licence: str | None, maps: list[tuple[str, str]]) -> str:
     chosen = licence or maps[0][1]
     if chosen == UNKNOWN_LICENCE or (licence is None and len({one for _, one in maps}) > 1):
         raise ConfigError(
-            "nobody says under which licence this may be released", where="release.licence",
+            "the licence of the release is unknown", where="release.licence",
             got=", ".join(f"{name}: {one}" for name, one in maps),
-            expected="a licence identifier as the hub spells it",
-            fix="--set release.licence=... (cc-by-4.0, apache-2.0, ...)",
+            expected="a licence identifier of the Hugging Face Hub",
+            fix="pass --set release.licence=LICENCE, such as cc-by-4.0 or apache-2.0",
         )  # fmt: skip
     return chosen

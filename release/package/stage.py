@@ -126,4 +126,6 @@ def _check_release(folder: Path) -> None:
     """See that a release is one, before it has its name."""
     report = verify(folder, level="structure")
     if not report.is_ok:
-        raise VerifyError("what was built does not verify, so it is not published", where=folder, got=str(report))
+        raise VerifyError(
+            "the release does not pass its verification, so it is not published", where=folder, got=str(report)
+        )

@@ -105,7 +105,9 @@ def look_of(flight: Track, i: int) -> np.ndarray | None:
         return None
     meta = read_meta(folder)
     if meta.index != i:
-        raise InputError("the annotation is of another frame", where=folder / "meta.json", got=f"index {meta.index}")
+        raise InputError(
+            "the annotation belongs to another frame", where=folder / "meta.json", got=f"index {meta.index}"
+        )
     return None if meta.look is None else np.array(list(meta.look.model_dump().values()))
 
 
@@ -119,7 +121,7 @@ def _check_frames(flight: Track) -> None:
         raise InputError(
             "frames are missing", where=folder, got=f"{len(missing)} of {len(flight)}, the first {missing[0]}",
             expected="a folder for each point of trajectory.json",
-            fix="render them again, or have the inspection reject the flight",
+            fix="render the track again, or reject it in the review",
         )  # fmt: skip
 
 
@@ -136,14 +138,17 @@ def keep_pairs(
     groups: dict[str, dict[str, Surveyed]] = defaultdict(dict)
     for flight in flights:
         if flight.track in groups[flight.candidate.trajectory]:
-            what, expected = "two flights of one track", "one flight of each track in a trajectory"
+            what, expected = "a trajectory has two clean or two perturbed tracks", "one track of each kind"
             tell(flight.name, InputError(what, where=flight.candidate.folder, got=flight.track, expected=expected))
         groups[flight.candidate.trajectory][flight.track] = flight
     for group in groups.values():
         lengths = {flight.num_frames for flight in group.values()}
         if len(lengths) > 1:
             got = ", ".join(f"{track} {flight.num_frames}" for track, flight in sorted(group.items()))
-            tell(next(iter(group.values())).name, InputError("twins of different lengths", got=f"{got} frames"))
+            tell(
+                next(iter(group.values())).name,
+                InputError("the two tracks of a trajectory differ in length", got=f"{got} frames"),
+            )
     if pairs == "any" or len(tracks) < 2:
         return flights, Counter()
     tracks_of: dict[int, set[TrackName]] = defaultdict(set)
@@ -166,11 +171,11 @@ def check_alike(flights: list[Surveyed], tell: Tell) -> None:
             groups[str(getattr(flight, name))].append(flight.name)
         if len(groups) > 1:
             parts = (
-                f"{value}: {len(names)} flights, as {', '.join(names[:MOST_NAMED])}"
+                f"{value}: {len(names)} tracks, such as {', '.join(names[:MOST_NAMED])}"
                 for value, names in sorted(groups.items())
             )
-            expected = "the same for all flights of a release"
-            error = InputError(f"flights of more than one {what}", got="; ".join(parts), expected=expected)
+            expected = f"the same {what} for all tracks of a release"
+            error = InputError(f"the tracks differ in the {what}", got="; ".join(parts), expected=expected)
             tell(min(groups.values(), key=len)[0], error)
 
 

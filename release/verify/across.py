@@ -64,7 +64,7 @@ def _check_splits(flights: list[Summary], by_town: bool, findings: Findings) -> 
                 groups[kind, name].add(str(flight.split))
     for (kind, name), splits in groups.items():
         if len(splits) > 1:
-            findings.error("leak", f"{kind} {name}", f"in {', '.join(sorted(splits))}", "each walk in one split")
+            findings.error("leak", f"{kind} {name}", f"in {', '.join(sorted(splits))}", f"each {kind} in one split")
 
 
 def _check_pairs(flights: Mapping[str, Summary], both: bool, findings: Findings) -> None:
@@ -75,10 +75,12 @@ def _check_pairs(flights: Mapping[str, Summary], both: bool, findings: Findings)
     for flight in flights.values():
         twin, num_tracks = flights.get(flight.pair or ""), len(tracks[flight.name.partition("/")[0]])
         if flight.pair is None and flight.split is not None and both and num_tracks > 1:
-            findings.error("pair", flight.name, "no twin", "both tracks, as settings.pairs says")
+            findings.error("pair", flight.name, "no other track", "both tracks (settings.pairs)")
         elif flight.pair is not None and (
             twin is None
             or (twin.pair, twin.trajectory) != (flight.name, flight.trajectory)
             or twin.track == flight.track
         ):
-            findings.error("pair", flight.name, flight.pair, "the other track of the trajectory, which names it too")
+            findings.error(
+                "pair", flight.name, flight.pair, "the other track of the trajectory, whose pair is this track"
+            )

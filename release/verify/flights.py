@@ -13,7 +13,7 @@ from cosfly.formats.captions import TOKENS
 from cosfly.formats.frames import LEGIBLE_CONTRAST, LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE
 from cosfly.formats.shown_captions import CaptionReader
 from cosfly.geometry.axes import BODY_FROM_CAMERA
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.worker import Item, Outcome
 from release.columns import CAPTION, CAPTION_NAMES, LANGUAGES, REQUIRED, SCALARS, TARGET_PICTURE, WINDOW
 from release.flight_rows import FlightRows, Row
@@ -50,7 +50,8 @@ def _check_camera(flight: FlightRows, findings: Findings) -> None:
     findings.judge(flight, (
         ("intrinsics", "intrinsics", told & ~is_positive, shown, "focal lengths above 0"),
         ("field_of_view", "fov_deg", told_again & ~(np.abs(fovs - fov) <= FOV_DEG),
-         lambda i: f"{fovs[i]} degrees, focal length {fx[i]} px", lambda i: f"{fov[i]:.6f}, of width and focal length"),
+         lambda i: f"{fovs[i]} degrees, focal length {fx[i]} px",
+         lambda i: f"{fov[i]:.6f} degrees, from width and focal length"),
         ("intrinsics", "intrinsics", told_again & (np.abs(fx - fy) > SQUARE * fx), shown, "square pixels"),
         ("intrinsics", "intrinsics", told_again & ~is_middle, lambda i: f"principal point ({cx[i]}, {cy[i]})",
          lambda i: f"the middle, ({width[i] / 2:g}, {height[i] / 2:g})"),
@@ -68,10 +69,10 @@ def _check_projection(flight: FlightRows, findings: Findings) -> None:
     wrong_px = has_target & ~np.isnan(flight.uv[:, 0]) & ~(off_px <= PIXEL_PX)
     wrong_m = has_target & ~np.isnan(depth_m) & ~(np.abs(depth_m - z) <= DEPTH_M)
     findings.judge(flight, (
-        ("projection", "target_uv", wrong_px, lambda i: f"{off_px[i]:.3f} px beside it",
-         f"the projected target within {PIXEL_PX} px"),
+        ("projection", "target_uv", wrong_px, lambda i: f"{off_px[i]:.3f} px from the projected target",
+         f"at most {PIXEL_PX} px"),
         ("target_depth", "target_depth_m", wrong_m, lambda i: f"{depth_m[i]:.3f} m",
-         lambda i: f"{z[i]:.3f} m, of pose and target"),
+         lambda i: f"{z[i]:.3f} m, the value from pose and target"),
     ))  # fmt: skip
 
 
@@ -102,7 +103,7 @@ def _check_boxes(flight: FlightRows, findings: Findings) -> None:
         ("box", "target_bbox", has_box & (np.abs(box - expected).max(axis=1) > BOX_PX), shown(box),
          lambda i: f"{expected[i].round(1).tolist()}, the projected box of the person"),
         ("box", "target_mask_bbox", has_box & outside, shown(mask), "inside target_bbox"),
-        ("box", "target_mask_bbox", has_mask & ~has_box, shown(mask), "null where target_bbox is"),
+        ("box", "target_mask_bbox", has_mask & ~has_box, shown(mask), "null, because target_bbox is null"),
     ))  # fmt: skip
 
 
@@ -117,13 +118,16 @@ def _check_flags(flight: FlightRows, findings: Findings) -> None:
     box_px = np.nan_to_num(flight.box[:, 3] - flight.box[:, 1])
     is_ours = not flight.is_foreign
     findings.judge(flight, (("flags", *rule) for rule in (
-        ("target_visible", visible & ~in_view, "true, and not in view", "a target that is seen is in view"),
-        ("target_in_view", in_view & ~has_target, "true, and no target", "a target where it is in view"),
-        ("target_legible", (legible != reads) & ~np.isnan(height_px), "not as the bounds say",
-         "true where visible, height, contrast and visibility are enough, else false"),
-        ("target_height_px", np.abs(height_px - box_px) > 0.01, "another height than target_bbox", "its height"),
-        ("target_bbox", (in_view != has_box) & is_ours, "null in view, or not null out of view", "a box in view alone"),
-        ("target_visible", visible & ~has_mask & is_ours, "true, and no pixel of the person", "a box of its pixels"),
+        ("target_visible", visible & ~in_view, "true, but target_in_view is false", "false for a target out of view"),
+        ("target_in_view", in_view & ~has_target, "true, but target is null", "false without a target"),
+        ("target_legible", (legible != reads) & ~np.isnan(height_px), "a value that contradicts the limits",
+         "true if the target is visible and its height, contrast and visibility are large enough, else false"),
+        ("target_height_px", np.abs(height_px - box_px) > 0.01, "a different height from target_bbox",
+         "the height of target_bbox"),
+        ("target_bbox", (in_view != has_box) & is_ours, "null in view, or a box out of view",
+         "a box if and only if the target is in view"),
+        ("target_visible", visible & ~has_mask & is_ours, "true, but target_mask_bbox is null",
+         "false without pixels of the target"),
     )))  # fmt: skip
 
 
@@ -142,7 +146,9 @@ def check_identity(flight: FlightRows, findings: Findings) -> None:
         differs = [value != column[0] and not (flight.zooms and name in ZOOMED) for value in column]
         if any(differs):
             i = differs.index(True)
-            findings.error("constant", flight.where(i, name), column[i], f"{column[0]}, as in the flight's first row")
+            findings.error(
+                "constant", flight.where(i, name), column[i], f"{column[0]}, as in the first row of the track"
+            )
     closed = {name: TOKENS if words == "actions" else words for name, words in CLOSED.items()}
     for i, row in enumerate(flight.rows):
         for name in (name for name in REQUIRED if name in row and row[name] is None):
@@ -160,19 +166,21 @@ def check_identity(flight: FlightRows, findings: Findings) -> None:
 def _check_names(flight: FlightRows, findings: Findings) -> None:
     first, index = flight.rows[0], flight.index
     if flight.name != "/".join(str(first.get(n)) for n in ("run", "town", "trajectory", "variant")):
-        findings.error("flight", flight.name, "rows of another flight", "rows of this one")
+        findings.error("flight", flight.name, "rows of another track", "rows of this track")
     for i, row in enumerate(flight.rows):
         given, number = row.get("sample_id"), row.get("frame_index") or 0
         own = f"{row.get('trajectory')}_{row.get('variant')}_frame_{number:05d}"
         expected = own if flight.given_id is None else f"{flight.given_id}_frame_{number:05d}"
         fits = str(given).endswith(own) if flight.given_id is None else given == expected
         if "sample_id" in row and not fits:
-            findings.error("sample_id", flight.where(i, "sample_id"), repr(given), f"{expected}, of its own columns")
+            findings.error(
+                "sample_id", flight.where(i, "sample_id"), repr(given), f"{expected}, from the other columns of the row"
+            )
     if (backwards := np.diff(index, prepend=-1) <= 0).any():
         k = int(np.argmax(backwards))
-        findings.error("frame_index", flight.where(k), f"{index[max(k - 1, 0) :][:2]}", "indices that grow, from 0 on")
+        findings.error("frame_index", flight.where(k), f"{index[max(k - 1, 0) :][:2]}", "increasing indices from 0")
     if (flight.time_s[1:] <= flight.time_s[:-1]).any():
-        findings.error("time", flight.where(0, "time_s"), "times that do not grow", "times that grow with the frames")
+        findings.error("time", flight.where(0, "time_s"), "times that do not increase", "increasing times")
 
 
 def _check_numbers(flight: FlightRows, i: int, name: str, value: Any, findings: Findings) -> None:
@@ -186,7 +194,7 @@ def _check_numbers(flight: FlightRows, i: int, name: str, value: Any, findings: 
             continue
         place = flight.where(i, f"{name}.{member}".rstrip("."))
         if number is None:
-            findings.error("null", place, "null", "a number: the group is there")
+            findings.error("null", place, "null", "a number, because its group is not null")
         elif not math.isfinite(number):
             findings.error("not_finite", place, number, "a finite number")
         else:
@@ -210,9 +218,9 @@ def check_captions(flight: FlightRows, window_frames: int | None, findings: Find
 
         if not row.get("has_caption"):
             if present := [name for name in CAPTION_NAMES if row.get(name) is not None]:
-                tell("caption", present[0], "a value", "null: has_caption is false")
+                tell("caption", present[0], "a value", "null, because has_caption is false")
         elif absent := [name for name in NEVER_NULL if name in row and not row[name]]:
-            tell("caption", absent[0], repr(row.get(absent[0])), "a value: has_caption is true")
+            tell("caption", absent[0], shown(row.get(absent[0])), "a value, because has_caption is true")
         else:
             _check_window(row, released, window_frames, tell)
             _check_decision(row, tell)
@@ -221,13 +229,13 @@ def check_captions(flight: FlightRows, window_frames: int | None, findings: Find
 def _check_window(row: Row, released: set[int], window_frames: int | None, tell: Callable[..., None]) -> None:
     window, index = row[WINDOW], row["frame_index"]
     if any(frame is None or frame > index for frame in window):
-        tell("window", WINDOW, window, f"nothing after frame {index}, which is the current one")
+        tell("window", WINDOW, window, f"no frame after the current frame, {index}")
     elif window != list(range(index - len(window) + 1, index + 1)):
-        tell("window", WINDOW, window, f"frames that follow each other and end with {index}")
+        tell("window", WINDOW, window, f"consecutive frames up to {index}")
     elif window_frames is not None and len(window) != window_frames:
-        tell("window", WINDOW, f"{len(window)} frames", f"{window_frames}, as settings.window_frames says")
+        tell("window", WINDOW, f"{len(window)} frames", f"{window_frames} frames (settings.window_frames)")
     elif not released.issuperset(window):
-        tell("window", WINDOW, f"frame {min(set(window) - released)} is not in the rows", "windows that are whole")
+        tell("window", WINDOW, f"frame {min(set(window) - released)} has no row", "a row for each frame of the window")
 
 
 def _check_decision(row: Row, tell: Callable[..., None]) -> None:
@@ -235,12 +243,12 @@ def _check_decision(row: Row, tell: Callable[..., None]) -> None:
     decision, label, verdict = row["decision"], row["label"], row["verdict"]
     decisions = {decision, *(row[f"caption_{language}_flight_decision"] for language in LANGUAGES)}
     if len(decisions) > 1:
-        tell("decision", "decision", sorted(decisions), "one decision in the row")
+        tell("decision", "decision", ", ".join(map(str, sorted(decisions))), "the same decision in all columns")
     if (verdict == "CONSISTENT") != (label is not None and decision == label):
         got = f"{verdict}: decision {decision}, label {label}"
-        tell("verdict", "verdict", got, "CONSISTENT exactly where the decision is the label")
+        tell("verdict", "verdict", got, "CONSISTENT if and only if the decision is the label")
     elif (verdict == "ABSTAIN" and label is not None) or (verdict == "SOFT_CONFLICT" and label is None):
-        tell("verdict", "verdict", f"{verdict}, label {label}", "ABSTAIN where there is no label, and else not")
+        tell("verdict", "verdict", f"{verdict}, label {label}", "ABSTAIN if and only if there is no label")
 
 
 Level = Literal["structure", "rows", "pixels"]
@@ -287,11 +295,11 @@ def make_worker(
             flight = flight_rows(source, entry)
             twin = flight_rows(source, clean) if clean is not None else None
             if not len(flight):
-                raise InputError("no rows", got="0")
+                raise InputError("the track has no rows", got="0 rows")
             _check_flight(flight, twin, source, entry, level, context, reader, findings)
             summary = vars(summary_of(flight))
         except InputError as error:
-            findings.error("unreadable", entry.name, f"{error.what}: {error.got}", "a flight that can be read")
+            findings.error("unreadable", entry.name, f"{error.what}: {error.got}", "a track that can be read")
         except SENSELESS as error:
             findings.error("senseless", entry.name, f"{type(error).__name__}: {error}", "rows that can be read")
         return Outcome({"findings": findings.dumped(), "summary": summary})

@@ -51,7 +51,7 @@ def decode(flight: FlightRows, i: int, files: Pictures, findings: Findings) -> D
         where = flight.where(i, PICTURES[file].name)
         try:
             if not data:
-                raise InputError("no picture", got="null" if data is None else "0 bytes")
+                raise InputError("there is no picture", got="null" if data is None else "0 bytes")
             if file == "depth":
                 found[file] = depth_values(memoryview(data), Path(where))
                 found[file].flags.writeable = False  # the compiled checks are compiled for such, once
@@ -62,7 +62,7 @@ def decode(flight: FlightRows, i: int, files: Pictures, findings: Findings) -> D
             continue
         size = found[file].shape[1::-1]
         if size != (width, height):
-            findings.error("picture", where, f"{size[0]} x {size[1]} px", f"{width} x {height} px, as the row says")
+            findings.error("picture", where, f"{size[0]} x {size[1]} px", f"{width} x {height} px, the size in the row")
             found.pop(file)
     if len(found) < len(files):
         return None
@@ -92,14 +92,18 @@ def _check_instance(flight: FlightRows, i: int, found: Survey, has_depth: bool, 
     if not np.array_equal(box, recorded, equal_nan=True):
         got = f"pixels in {box.tolist()}" if found.num_person else "no pixel of the person"
         is_null = np.isnan(recorded).any()
-        expected = "none: target_mask_bbox is null" if is_null else f"{recorded.tolist()}, target_mask_bbox"
+        expected = (
+            "no pixel, because target_mask_bbox is null" if is_null else f"{recorded.tolist()}, the target_mask_bbox"
+        )
         findings.error("mask", where, got, expected)
     if found.num_odd_person:
-        findings.error("mask", where, f"{found.num_odd_person} pixels of the person of another kind", f"kind {PERSON}")
+        findings.error(
+            "mask", where, f"{found.num_odd_person} pixels of the target with another kind", f"kind {PERSON}"
+        )
     if found.most_kind > MOST_KIND:
         findings.error("mask", where, f"kind {found.most_kind}", f"kinds of 0 to {MOST_KIND}")
     if has_depth and found.num_odd_sky:
-        got = f"{found.num_odd_sky:,} pixels are sky in one of instance and depth"
+        got = f"{found.num_odd_sky:,} pixels are sky in only one of instance and depth"
         findings.error("sky", where, got, "the same sky in both")
 
 
@@ -196,20 +200,25 @@ def check_goal(
     if goal is None or goal.frame != flight.index[i] or not instance.size:
         return
     if people is None:
-        found.error("goal", flight.where(i, "people"), "null", "what the people look like that the goal tells apart")
+        found.error("goal", flight.where(i, "people"), "null", "the appearance of the people in the frame")
         return
     if (words := words_of(goal.says, people.target)) != (told := {"en": goal.en, "zh": goal.zh}):
-        found.error("goal", flight.where(i, "goal_en"), str(told), f"{words}, of goal_says and people")
+        found.error("goal", flight.where(i, "goal_en"), str(told), f"{words}, from goal_says and people")
     picture = _picture(flight, i, decoded)
     kinds, ids = picture.kinds, picture.ids
     looks = {PERSON_ID: people.target, **people.others}
     if unknown := sorted({*np.unique(ids[kinds == KINDS["Pedestrians"]]).tolist()} - {*looks}):
-        found.error("goal", flight.where(i, "people"), f"{unknown[:4]} are seen", "all who are, by instance id")
+        found.error(
+            "goal",
+            flight.where(i, "people"),
+            f"no entry for the visible people {unknown[:4]}",
+            "an entry for each visible person, by instance id",
+        )
     if depth.size or not {*goal.says} & {"near", "far", *LANDMARKS}:
         whom = meant(goal.says, people.target, looks, picture)
         if whom != {PERSON_ID}:
             got = f"true of {', '.join(map(str, sorted(whom))) or 'nobody'}"
-            found.error("goal", flight.where(i, "goal_says"), got, f"true of the target alone, {PERSON_ID}")
+            found.error("goal", flight.where(i, "goal_says"), got, f"true of the target, {PERSON_ID}, only")
     if (shown := flight.rows[i].get(TARGET_PICTURE)) and rgb:
         where = flight.where(i, TARGET_PICTURE)
         try:
@@ -219,7 +228,7 @@ def check_goal(
             return
         expected = target_picture(of_frame, flight.mask_box[i].tolist()).astype(float)
         if pixels.shape != expected.shape or np.abs(pixels - expected).mean() > SAME_LEVELS:
-            found.error("goal", where, "another picture", "target_mask_bbox of image, with room around")
+            found.error("goal", where, "a different picture", "the part of image around target_mask_bbox")
 
 
 def _picture(flight: FlightRows, i: int, decoded: tuple[np.ndarray, np.ndarray]) -> SeenFrame:
@@ -272,7 +281,9 @@ def _check_kinds(flight: FlightRows, i: int, instance: np.ndarray, kinds: np.nda
         own, kind = code >> 8, code & 255
         if kinds[own] >= 0:
             got = f"instance {own} of kind {kind}"
-            findings.error("instance_kind", flight.where(i, "instance"), got, f"kind {kinds[own]}, as before")
+            findings.error(
+                "instance_kind", flight.where(i, "instance"), got, f"kind {kinds[own]}, as in the frames before"
+            )
         else:
             kinds[own] = kind
 
@@ -281,12 +292,14 @@ def _judge_scale(flight: FlightRows, pairs: list[Pair], findings: Findings) -> N
     """Find depth that is scaled or set off: its planes move with the camera."""
     for what, most, errors in (
         ("ground", FLAT_MOST, [pair.error_flat for *_, pair in pairs]),
-        ("what stands on it", STANDING_MOST, [pair.error_standing for *_, pair in pairs]),
+        ("objects on it", STANDING_MOST, [pair.error_standing for *_, pair in pairs]),
     ):
         known = [error for error in errors if np.isfinite(error)]
         if len(known) >= LEAST_FRAMES and (error := float(np.median(known))) > most:
-            got = f"planes of {what} that are {error:.4%} off from frame to frame"
-            findings.error("scene_depth", flight.name, got, f"at most {most:.4%}: depth in metres along the axis")
+            got = f"an error of {error:.4%} in the planes of {what} between frames"
+            findings.error(
+                "scene_depth", flight.name, got, f"at most {most:.4%}, for depth in metres along the optical axis"
+            )
 
 
 def _judge_pairs(flight: FlightRows, pairs: list[Pair], findings: Findings) -> None:
@@ -300,17 +313,17 @@ def _judge_pairs(flight: FlightRows, pairs: list[Pair], findings: Findings) -> N
 def _odd_pair(pair: Agreement, is_near: bool) -> tuple[str, str, str] | None:
     """Return code, got and expected of two frames that do not show one world, else None."""
     if pair.error > ERROR_MOST or (is_near and pair.gone > GONE_MOST):
-        off = f", planes {pair.error:.2%} off" if np.isfinite(pair.error) else ""
-        got = f"{pair.gone:.1%} of the points before what this frame or the one before draws{off}"
-        most = f"at most {GONE_MOST:.1%} and planes {ERROR_MOST:.2%} off"
-        return "scene_depth", got, f"{most}: depth, pose and camera that agree with the frame before"
+        off = f", and an error of {pair.error:.2%} in planes" if np.isfinite(pair.error) else ""
+        got = f"{pair.gone:.1%} of the points in front of the surfaces of this or the previous frame{off}"
+        most = f"at most {GONE_MOST:.1%}, and an error of at most {ERROR_MOST:.2%}"
+        return "scene_depth", got, f"{most}, for depth, pose and camera that agree with the previous frame"
     if is_near and pair.shifted:
-        got = f"a thing of {pair.shifted} points farther away than in the frame before"
-        return "scene_depth", got, "what stands still at its place"
+        got = f"an object of {pair.shifted} points that is farther away than in the previous frame"
+        return "scene_depth", got, "the same place, because it does not move"
     if pair.agree >= LEAST_AGREE and pair.same < SAME_LEAST * pair.agree:
-        got = f"{pair.same / pair.agree:.1%} of the instances of the frame before"
-        return "scene_instance", got, f"at least {SAME_LEAST:.0%} where the depth agrees"
+        got = f"{pair.same / pair.agree:.1%} of the points with the instance id of the previous frame"
+        return "scene_instance", got, f"at least {SAME_LEAST:.0%} of the points with the same depth"
     if is_near and pair.agree >= LEAST_AGREE and pair.renamed:
-        got = f"a thing of {pair.renamed} points under another id than in the frame before"
-        return "scene_instance", got, "one id for a thing"
+        got = f"an object of {pair.renamed} points with a different id from the previous frame"
+        return "scene_instance", got, "the same id for an object in all frames"
     return None

@@ -84,7 +84,7 @@ class Shards:
             try:
                 found += own.slice(begin, end - begin).to_pylist()
             except ValueError as error:
-                raise InputError("not text", where=path, got=str(error)) from None
+                raise InputError("a column is not valid text", where=path, got=str(error)) from None
         return found
 
     def pictures(self, entry: Entry) -> Iterator[Pictures]:
@@ -158,7 +158,7 @@ class TreeFlights:
         for i in range(len(flight)):
             paths = {file: frame_path(flight.frame_folder(i), FILE_NAMES[file]) for file in self.files}
             yield {
-                file: read_bytes(path, what="frame's file", tree=self.folder) if path.is_file() else None
+                file: read_bytes(path, what="file of the frame", tree=self.folder) if path.is_file() else None
                 for file, path in paths.items()
             }
 

@@ -21,7 +21,7 @@ from cosfly.formats.playback import ORIGINAL
 from cosfly.formats.shown_captions import CaptionReader
 from cosfly.geometry.splits import town_family
 from cosfly.runtime.config import Config
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.io import CHECKSUMS, open_file, read_bytes, read_checksums, sha256_file
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Failed, Kept, StageFolder, flattened
@@ -141,10 +141,12 @@ def check_card(folder: Path, record: ReleaseRecord, findings: Findings) -> None:
     try:
         croissant = render_croissant(record).encode()
         if (folder / CROISSANT).is_file() and read_bytes(folder / CROISSANT, tree=folder) != croissant:
-            findings.error("card", CROISSANT, "other words", "what release.json gives")
+            findings.error("card", CROISSANT, "a different text", "the text that release.json determines")
         wanted = render_card(record).split("\n")
     except (InputError, KeyError, ValueError, IndexError) as error:  # a record whose numbers make no card
-        findings.error("card", "README.md", f"{type(error).__name__}: {error}", "a card that release.json gives")
+        findings.error(
+            "card", "README.md", f"{type(error).__name__}: {error}", "a release.json that determines the card"
+        )
         return
     for number, (line, expected) in enumerate(itertools.zip_longest(found, wanted, fillvalue="the end"), 1):
         if line != expected:
@@ -165,7 +167,7 @@ def check_footers(folder: Path, record: ReleaseRecord, names: list[str], finding
             continue
         if not schema.equals(expected, check_metadata=True):
             wrong = ", ".join(m.name for m in schema if m not in list(expected))
-            got = wrong or "the order, or the features in the metadata"
+            got = wrong or "another order, or other features in the metadata"
             findings.error("columns", name, got, "the columns of the release")
         elif num_rows != rows[name]:
             findings.error("rows", name, num_rows, str(rows[name]))
@@ -186,7 +188,7 @@ def check_numbers(folder: Path, record: ReleaseRecord, findings: Findings) -> No
         told, again = (one.model_dump() for one in (record.ceilings, ceilings_of(folder, record)))
         for name in (n for n in told if not _is_near(told[n], again[n])):
             findings.error("number", f"release.json: ceilings.{name}", told[name], f"{again[name]}")
-    findings.facts.append(f"{len(computed):,} numbers computed again from {len(paths):,} shards")
+    findings.facts.append(f"{len(computed):,} numbers recomputed from {len(paths):,} shards")
 
 
 def _is_near(told: Any, again: Any) -> bool:
@@ -198,7 +200,7 @@ def check_flights(record: ReleaseRecord, flights: list[Summary], findings: Findi
     """Compare the record's flights with those of the rows: which frames, which split, walk and pair."""
     listed, found = {entry.flight: entry for entry in record.flights}, {flight.name: flight for flight in flights}
     for name in sorted(listed.keys() ^ found.keys()):
-        findings.error("flight", name, "only in one of release.json and the shards", "the same flights in both")
+        findings.error("flight", name, "an entry in only one of release.json and the shards", "the same tracks in both")
     for name in sorted(listed.keys() & found.keys()):
         entry, flight, asked = listed[name], found[name], record.settings
         for key in ("split", "walk", "pair"):
@@ -213,7 +215,7 @@ def check_flights(record: ReleaseRecord, flights: list[Summary], findings: Findi
             is_right = flight.frames_digest == frames_digest(rule)
         if not is_right:
             got = f"{flight.num_rows} of {available} frames"
-            findings.error("frames", name, got, f"{wanted} frames by the rule of release.json")
+            findings.error("frames", name, got, f"{wanted} frames, selected by the rule in release.json")
 
 
 ALLOWED = (".git", ".gitattributes", ".cache", ".huggingface")  # what the hub and its client put beside a data set
@@ -247,8 +249,8 @@ def check_names(folder: Path, expected: Mapping[str, int | None], findings: Find
     found: dict[str, int] = {}
     for name in files_below(folder):
         if name not in expected and name not in UNLISTED:
-            got = "an empty folder" if name.endswith("/") else "a file"
-            findings.error("unexpected", name, got, "nothing that no record knows")
+            got = "an empty folder" if name.endswith("/") else "a file that no record lists"
+            findings.error("unexpected", name, got, "only recorded files")
             continue
         try:
             with open_file(folder / name, tree=folder) as file:
@@ -275,7 +277,7 @@ def read_digests(folder: Path, findings: Findings) -> dict[str, str]:
     try:
         return read_checksums(folder)
     except InputError as error:
-        findings.error("checksum", CHECKSUMS, error.got or error.what, "lines of sha256sum")
+        findings.error("checksum", CHECKSUMS, error.got or error.what, "lines in the format of sha256sum")
         return {}
 
 
@@ -345,9 +347,17 @@ def _verify_release(folder: Path, how: _How, findings: Findings) -> None:
     check_record(record, findings)
     readable = check_footers(folder, record, good, findings)
     check_card(folder, record, findings)
-    findings.facts.append(f"structure: {len(record.shards):,} shards, {record.numbers.frames:,} frames by their record")
+    findings.facts.append(
+        f"structure: {len(record.shards):,} shards with {record.numbers.frames:,} frames in release.json"
+    )
     if how.level != "structure" and len(readable) < len(record.shards):
-        findings.add("note", "not_checked", "data", "shards that are missing or of other columns", "rows of all shards")
+        findings.add(
+            "note",
+            "not_checked",
+            "data",
+            "shards that are missing or have other columns",
+            "all shards, so that rows can be checked",
+        )
     elif how.level != "structure":
         _verify_rows(folder, record, how, findings)
     if how.level == "pixels":
@@ -359,8 +369,10 @@ def _check_lists(record: ReleaseRecord, digests: dict[str, str], findings: Findi
     listed = dict.fromkeys(set(RECORDS) - {CHECKSUMS}) | {shard.path: shard.sha256 for shard in record.shards}
     for name in sorted(listed.keys() | digests.keys()):
         if name not in listed or digests.get(name) != (listed[name] or digests.get(name, "")):
-            got = f"{digests.get(name)} there, {listed.get(name)} in release.json"
-            findings.error("checksum", f"{CHECKSUMS}: {name}", got, "one line per file, the same digest in both")
+            got = f"{shown(digests.get(name))} in {CHECKSUMS}, {shown(listed.get(name))} in release.json"
+            findings.error(
+                "checksum", f"{CHECKSUMS}: {name}", got, "one line per file, with the digest in release.json"
+            )
 
 
 def _verify_rows(folder: Path, record: ReleaseRecord, how: _How, findings: Findings) -> None:
@@ -376,11 +388,13 @@ def _verify_rows(folder: Path, record: ReleaseRecord, how: _How, findings: Findi
     split_of, splits = {shard.path: shard.split for shard in record.shards}, {one.name: one.split for one in flights}
     for name, shard in ((entry.name, part[0]) for entry in entries for part in entry.parts):
         if splits.get(name, split_of[shard]) != split_of[shard]:
-            findings.error("leak", name, f"rows of {splits[name]} in {shard}", f"{split_of[shard]}, the shard's split")
+            findings.error("leak", name, f"rows of {splits[name]} in {shard}", f"rows of {split_of[shard]}")
     try:
         check_numbers(folder, record, findings)
     except (InputError, *SENSELESS) as error:  # rows that no number comes of, which are found above
-        findings.error("number", "release.json: numbers", f"{type(error).__name__}: {error}", "numbers of the rows")
+        findings.error(
+            "number", "release.json: numbers", f"{type(error).__name__}: {error}", "rows whose numbers can be computed"
+        )
 
 
 # --- a playback tree --------------------------------------------------------------------------------------------------
@@ -392,7 +406,7 @@ def _verify_tree(folder: Path, how: _How, findings: Findings) -> None:
     except InputError as error:
         findings.error("missing", folder, f"{error.what}: {error.got}" if error.got else error.what, ANYTHING)
         return
-    findings.facts.append(f"structure: a playback tree of {len(entries):,} flights, with {', '.join(source.files)}")
+    findings.facts.append(f"structure: a playback tree of {len(entries):,} tracks, with {', '.join(source.files)}")
     if how.level != "structure":
         _check_all(source, entries, Context(), replace(how, reader=None), findings)
     for flight in (folder / entry.parts[0] for entry in entries):
@@ -425,10 +439,10 @@ def _check_all(
                 if record.result["summary"] is not None:
                     flights.append(Summary(**record.result["summary"]))
             elif isinstance(record, Failed):
-                findings.error("not_checked", record.id, record.message, "a flight that can be checked")
+                findings.error("not_checked", record.id, record.message, "a track that can be checked")
         check_across(flights, by_town=context.by_town, both=context.both, findings=findings)
     words = f"labels and verdicts {'recomputed' if how.reader is not None else 'not recomputed'}"
     pictures = f", all their {', '.join(source.files)} pictures" if how.level == "pixels" else ""
     num_rows = sum(flight.num_rows for flight in flights)
-    findings.facts.append(f"{num_rows:,} rows of {len(flights):,} flights{pictures}; {words}")
+    findings.facts.append(f"{num_rows:,} rows of {len(flights):,} tracks{pictures}; {words}")
     return flights

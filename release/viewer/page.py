@@ -80,9 +80,13 @@ SCANNED = [
 class ViewerConfig(Config):
     """How much of a release or run a page holds."""
 
-    flights: int = Field(100, ge=1, description="most tracks on a page; of more, whole trajectories, evenly spread")
-    frames: int = Field(16, ge=1, description="most frames of a track, among them one of each verdict and decision")
-    picture_px: int = Field(320, ge=32, le=1280, description="width of a colour picture, px; half of it for the others")
+    flights: int = Field(
+        100, ge=1, description="most tracks on a page; if there are more, evenly spread trajectories are shown"
+    )
+    frames: int = Field(16, ge=1, description="most frames per track, with at least one of each verdict and decision")
+    picture_px: int = Field(
+        320, ge=32, le=1280, description="width of a colour picture, px; other pictures have half of it"
+    )
 
 
 def run(folder: Path, out: Path, cfg: ViewerConfig, captions: Path | None = None) -> Path:
@@ -311,7 +315,7 @@ def _choose_tracks(tracks: Sequence[Item], groups: Sequence[Hashable], cfg: View
         if len(chosen) <= cfg.flights:
             break
     is_all = len(chosen) == len(tracks)
-    return chosen, [] if is_all else [f"{len(chosen):,} of {len(tracks):,} flights are shown"]
+    return chosen, [] if is_all else [f"{len(chosen):,} of {len(tracks):,} tracks are shown"]
 
 
 def choose_frames(frames: Sequence[int], kinds: Mapping[int, Hashable], most: int) -> list[int]:
