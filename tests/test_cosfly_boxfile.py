@@ -132,7 +132,7 @@ def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
             (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")),
              "feature 1: the coordinates of the Polygon are invalid; expected at least four points"),
             (collection(feature("Polygon", [[[0, 0], [9, "x"], [9, 9], [0, 0]]], type="Walls")),
-             "of a Polygon; expected at least four"),
+             "of the Polygon are invalid; expected at least four"),
             (collection(feature("Polygon", [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]], type="Buildings", height_m=3)),
              r"feature 1: the outline crosses itself: Self-intersection\[4\.5 4\.5\]"),
             (collection(feature("Point", [5, 5], type="Vegetation", height_m=3)),

@@ -60,7 +60,7 @@ def test_bad_overrides_and_files(tmp_path):
         with pytest.raises(ConfigError, match=words):
             load(Outer, file)
     file.write_text("seed: 3\n")  # right by itself
-    with pytest.raises(ConfigError, match=r"c\.yaml with --set: plan: not a group of settings, got 3"):
+    with pytest.raises(ConfigError, match=r"c\.yaml with --set: plan: the value is not a group of settings, got 3"):
         load(Outer, file, ["plan=3"])
     with pytest.raises(ConfigError, match=r"nowhere\.yaml.*No such file"):
         load(Outer, tmp_path / "nowhere.yaml")
@@ -76,7 +76,7 @@ def test_a_setting_that_is_not_there_is_told_its_place_or_its_neighbours():
     ):
         with pytest.raises(ConfigError, match=words):
             load(RunConfig, None, [given])
-    with pytest.raises(ConfigError, match=r"plan\.xyz: unknown setting \(there are altitude_m\)"):
+    with pytest.raises(ConfigError, match=r"plan\.xyz: unknown setting \(the settings here are altitude_m\)"):
         load(Outer, None, ["plan.xyz=3"])
     with pytest.raises(ConfigError, match=r"did you mean 'plan\.muco'"):
         explain(RunConfig(), "plan.mucco")

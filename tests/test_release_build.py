@@ -247,7 +247,7 @@ DAMAGES = {
     "consistent with another": (caption(label="hover", verdict="CONSISTENT"), "the verdict is consistent, but"),
     "a caption in one language": (caption(zh=None), "lacks a language"),
     "languages that differ": (captions_of(lambda lines: lines[0]["zh"].update(flight_decision="hover")),
-        "decide differently"),
+        "have different decisions"),
     "a frame that is no number": (caption(frame_index="x"), "frame_index"),
     "a picture of 2^64 px": (caption(picture_px=[2**64, 54]), r"picture_px\[0\]: .*got 18446744"),
     "captions of another version": (caption(schema_version="1.0"), "version that is not supported"),
