@@ -69,31 +69,32 @@ CONTRACT: dict[str, Any] = {
     "projection": "u = fx * x / z + cx, v = fy * y / z + cy for a point (x, y, z) in camera axes",
     "depth": f"z-depth along the optical axis, metres, float32; {SKY_DEPTH_M:g} sky, {INVALID_DEPTH_M:g} invalid",
     "instance": "PNG; R semantic number (CARLA 0.9.16 CityObjectLabel), G low and B high byte of the instance id",
-    "target": "hip of the tracked person; target_heading_deg, whither it walks, as yaw; null before its first step",
-    "goal": "whom to follow, in words that are true of the target and of nobody else who has a pixel in frame "
-    "goal_frame, where target_picture shows it; goal_says, what they use of people, who looks how: target, and others "
-    "by instance id; or a place: left, right, near, far, or what it stands by. Null where nothing tells the target "
-    "apart, and where the tree does not say",
-    "others": "others_in_view, other people who have a pixel in the frame; other_distance_m, from the target to the "
-    "nearest of them, other_id, over the ground; alike_id, who of them looks most like the target, and in how many of "
-    "figure, top, legs, hat and bag that one differs (alike_differences); null without any",
-    "legibility": "target_height_px, of its box in the image; target_contrast, CIE76 difference of the colours of its "
-    "pixels from those around; target_legible: visible, "
-    f"{LEGIBLE_HEIGHT_PX:g} px high, {LEGIBLE_SHARE:g} of it unhidden (visibility), contrast {LEGIBLE_CONTRAST:g}; "
-    "null where the tree does not say",
-    "offsets": "the perturbation of the frame, already contained in pose and target; where a position was shifted the "
-    "camera was aimed anew, and the rotation offset is its turn away from that aim",
-    "perturbation": "what became of the frame's two events, position (shift of drone and person) and rotation (turn of "
-    "the view): none, applied, or `fallback: ` and why the frame is as planned; null where the tree does not say",
-    "action": "of a policy: mean velocities in m/s until the next frame along the level axes of the camera's yaw "
-    "(forward, left, up), turn of the yaw in degrees/s, pitch of the camera at the next frame. It is of the planned "
-    "motion, as the label is; null at a flight's end and where the plan is not known",
-    "actions": "fives: the action in the equal parts of the step that the flight was planned in; poses_between, sixes: "
-    "the planned poses where those parts meet, empty where it was planned at the rate of its frames",
-    "waypoints": "fours: the planned places of the next 10 frames, fewer at a flight's end, x, y, z in m and yaw in "
-    "degrees; body_waypoints: forward, left, up in m and yaw, from the frame's camera along its level axes, so that "
-    "those of a perturbed frame lead back to the plan",
-    "time": "seconds; the frames of a flight are one time step apart, 0.5 s in the paper",
+    "target": "hip of the tracked person; target_heading_deg, its walking direction as yaw; null before its first step",
+    "goal": "description of the target that is true of no other person with a pixel in frame goal_frame, where "
+    "target_picture shows the target; goal_says, the terms that it uses: garments (people has the appearance of the "
+    "target, and of others by instance id) or a place (left, right, near, far, or a landmark next to the target). Null "
+    "if nothing distinguishes the target, or if the tree does not record it",
+    "others": "others_in_view, number of other people with a pixel in the frame; other_distance_m, distance over the "
+    "ground from the target to the nearest of them, other_id; alike_id, the one that looks most like the target, and "
+    "alike_differences, in how many of figure, top, legs, hat and bag it differs; null without others",
+    "legibility": "target_height_px, of its box in the image; target_contrast, CIE76 difference between the colours of "
+    "its pixels and of those around it; target_legible: visible, at least "
+    f"{LEGIBLE_HEIGHT_PX:g} px high, at least {LEGIBLE_SHARE:g} of it unhidden (visibility), contrast at least "
+    f"{LEGIBLE_CONTRAST:g}; null if the tree does not record it",
+    "offsets": "the perturbation of the frame, which pose and target include; if a position is shifted, the camera is "
+    "aimed at the person again, and the rotation offset is the turn away from that aim",
+    "perturbation": "outcome of the two events of a frame, position (shift of drone and person) and rotation (turn of "
+    "the view): none, applied, or `fallback: ` and the reason why the frame is as planned; null if the tree does not "
+    "record it",
+    "action": "for a policy: mean velocities in m/s until the next frame along the level axes of the camera's yaw "
+    "(forward, left, up), yaw rate in degrees/s, camera pitch at the next frame. It is that of the planned motion, as "
+    "the label is; null at the end of a track, and if the plan is unknown",
+    "actions": "groups of five numbers: the action in each of the equal planning steps until the next frame; "
+    "poses_between, groups of six: the planned poses between these steps, empty if frames and plan have the same rate",
+    "waypoints": "groups of four numbers: the planned positions (x, y, z in m, yaw in degrees) at the next 10 frames, "
+    "fewer at the end of a track; body_waypoints: the same as forward, left, up in m and yaw, from the camera of the "
+    "frame along its level axes, so that those of a perturbed frame lead back to the plan",
+    "time": "seconds; consecutive frames of a track are one time step apart, 0.5 s in the paper",
 }
 
 

@@ -86,7 +86,7 @@ def test_lies_about_goals_are_found(flights):
         "who looks so too": changed(flight, people=replace(flight.people, others={**others, seen: target})),
         "who is not on record": changed(flight, people=replace(flight.people, others={})),
         "no people": changed(flight, people=None) and [{**row, "people": None} for row in flight.rows],
-        "a different picture": [
+        "another picture": [
             {**row, "target_picture": row["target_picture"] and flights[-1][0].rows[0]["target_picture"]}
             for row in flight.rows
         ],

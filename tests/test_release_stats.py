@@ -62,7 +62,7 @@ def test_a_release_is_counted_again(built, tmp_path):
     ]
     assert sum(row[1] for row in tables["fovs"].values()) == numbers["frames"]
     assert tables["quality_stats"]["dropped before rendering: smoothness"] == [2]
-    assert tables["quality_stats"]["flights released"] == [numbers["flights"]]
+    assert tables["quality_stats"]["tracks released"] == [numbers["flights"]]
     lengths = [flight for flight in tables["text_lengths"].values() if flight[0] is not None]
     assert len(lengths) == 4
     assert "weather and time of day, 15 x 4" in {one.what for one in written.absent}

@@ -10,13 +10,13 @@ const LABELS = {
     title: "region of interest", fit: "Whole map", backdrop: "backdrop", grid: "planning grid", above: "map from above", picture: "picture", outer: "New polygon", hole: "New hole",
     close: "Close polygon", undo: "Undo", redo: "Redo", remove: "Remove vertex", discard: "Remove polygon", vertex: "vertex", propose: "Propose", open: "Open file", save: "Save",
     mask: "Compare mask", south: "first row is south", polygon: "polygon", holeOf: "hole", open_ring: "open", points: "points",
-    keys: "Click: vertex. Drag: move. Double click on an edge: new vertex. Wheel: zoom; right drag: pan. Keys: arrows move the vertex by a cell (Shift: ten) or pan; N, B next and last vertex; " +
-      "Space: vertex at the cross; + - zoom; Esc: choose nothing.",
+    keys: "Click: vertex. Drag: move. Double click on an edge: new vertex. Wheel: zoom; right drag: pan. Keys: arrows move the vertex by a cell (Shift: ten) or pan; N, B next and previous vertex; " +
+      "Space: vertex at the cross; + - zoom; Esc: clear the selection.",
     occupied: "occupied", margin: "safety margin", unused: "free, not used", free: "free", in_region: "in the region", walkable: "walkable", outside: "outside the map", cell: "cell",
     region: "cells in the region", walkable_cells: "walkable cells", components: "components", large: "large enough", largest: "largest", used: "cells used",
-    saved: "saved to", whole: "the whole map: no polygon is closed", few: "a polygon needs three vertices", nowhere: "a hole begins inside a closed polygon",
-    size: "the mask has another size", expected: "expected", masked: "mask", same_region: "equal to the region", same_walkable: "equal to walkable cells", here: "only here", there: "only in the mask",
-    not_saved: "close the open polygon first", drawing: "click to add vertices, then close the polygon", lost: "the editor's server does not answer: is it still running?", no_picture: "cannot be read as a picture", large_file: "the file is too large",
+    saved: "saved to", whole: "the whole map: no polygon is closed", few: "a polygon needs three vertices", nowhere: "a hole must begin inside a closed polygon",
+    size: "the mask has a different size", expected: "expected", masked: "mask", same_region: "equal to the region", same_walkable: "equal to walkable cells", here: "only here", there: "only in the mask",
+    not_saved: "close the open polygon first", drawing: "click to add vertices, then close the polygon", lost: "the server of the editor does not answer; start the editor again", no_picture: "cannot be read as a picture", large_file: "the file is too large",
   },
   zh: {
     title: "感兴趣区域", fit: "全图", backdrop: "底图", grid: "规划栅格", above: "俯视图", picture: "图片", outer: "新多边形", hole: "新孔洞",

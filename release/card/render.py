@@ -29,11 +29,11 @@ from release.record import History, ReleaseRecord, SourceRecord, shard_pattern
 # What a map is, by what made it (`maps.source`): no more than the program knows.
 MAPS = {
     "synthetic": "made by cosfly's generator from a seed; no real place",
-    "simworld": "a SimWorld world: procedural, no real place that cosfly knows of",
-    "cityjson": "a 3D city model (CityJSON), of a real place where its makers say so; the buildings are theirs, "
+    "simworld": "a procedural SimWorld world; no real place that cosfly knows of",
+    "cityjson": "a 3D city model (CityJSON), of a real place if its makers say so; buildings are from the model, "
     "surfaces and plants are drawn by cosfly",
 }
-UNKNOWN_MAP = "made elsewhere; what it shows is not known to cosfly, see its licence and credits"
+UNKNOWN_MAP = "made elsewhere, with content that is unknown to cosfly; see its licence and credits"
 FEW_WALKS = 10
 
 
@@ -79,9 +79,9 @@ def render_card(record: ReleaseRecord) -> str:
 
 FRAMES_BY = {"town": "town", "track": "track", "fov_deg": "field of view (degrees)", "image_px": "image (px)"}
 SPREADS = {
-    "frames_per_flight": "frames per flight",
-    "flight_duration_s": "duration of a flight, s",
-    "flight_length_m": "length of a flight without its perturbation, through its released frames, m",
+    "frames_per_flight": "frames per track",
+    "flight_duration_s": "duration of a track, s",
+    "flight_length_m": "length of a track without its perturbation, over its released frames, m",
     "height_over_target_m": "height over the target's hip, m",
     "distance_to_target_m": "distance to the target, m",
     "visibility": "rendered visibility of the target",
@@ -149,15 +149,15 @@ def _funnel(history: History) -> list[tuple[str, int]]:
         rows += [("trajectories planned", planned.planned)]
         rows += [(f"dropped before rendering: {reason}", count) for reason, count in planned.dropped.items()]
         rows += [("trajectories not rendered", planned.not_rendered), ("trajectories rendered", planned.rendered)]
-    rows += [("flights found", flights.found), ("of these inspected", flights.inspected)]
-    rows += [(f"flights left out: {reason}", count) for reason, count in flights.left_out.items()]
-    rows += [("flights released", flights.released), ("captions made", captions.read)]
+    rows += [("tracks found", flights.found), ("of these inspected", flights.inspected)]
+    rows += [(f"tracks not released: {reason}", count) for reason, count in flights.left_out.items()]
+    rows += [("tracks released", flights.released), ("captions made", captions.read)]
     rows += [(f"captions dropped: {reason}", count) for reason, count in captions.dropped.items()]
     return [
         *rows,
-        ("captions accepted, frame not selected", captions.frame_not_selected),
-        ("captions accepted, window not whole", captions.window_not_whole),
-        ("captions accepted, flight left out", captions.flight_left_out),
+        ("captions accepted, but frame not selected", captions.frame_not_selected),
+        ("captions accepted, but window incomplete", captions.window_not_whole),
+        ("captions accepted, but track not released", captions.flight_left_out),
         ("captions released", captions.released),
     ]
 

@@ -171,7 +171,7 @@ class Counts:
         self.labels[label] += 1
         self.confusion[label, decision] += 1
         self.verdicts[verdict, row["track"]] += 1
-        self.repairs[row["repair_strategy"] or "none: the first answer stood"] += 1
+        self.repairs[row["repair_strategy"] or "none: the first answer was accepted"] += 1
         for language in LANGUAGES:
             for name in FIELDS[:2]:
                 self.lengths[language, name].add(len(row[f"caption_{language}_{name}"] or ""))

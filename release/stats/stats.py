@@ -84,12 +84,12 @@ def tiles_of(record: ReleaseRecord, stats: Stats) -> list[tuple[str, str]]:
         ("towns", len(numbers.frames_by.town), None),
         ("captions", captions.frames_with, None),
         ("GB", round(numbers.files.bytes / 1e9, 2), None),
-        ("of the flights that were found are released", found.released, found.found),
+        ("of the tracks that were found are released", found.released, found.found),
         ("of the frames show the person", numbers.frames_target_visible, numbers.frames),
         ("of the frames show the person legibly", numbers.frames_target_legible, numbers.frames),
-        ("of the person is seen, on average", seen, None if seen is None else 1),
+        ("of the person is visible, on average", seen, None if seen is None else 1),
         ("mean smoothness score", quality["mean smoothness score S"], None),
-        ("of the decisions are those of the geometry", captions.decision_equals_label, captions.with_label),
+        ("of the decisions are the geometric label", captions.decision_equals_label, captions.with_label),
         ("values of the English captions are filled from facts", filled, None),
     ]
     return [
@@ -129,7 +129,7 @@ def markdown(stats: Stats) -> str:
         parts += [for_markdown(table.note)] if table.note else []
         parts.append(_markdown_table(table.head, table.rows))
     absent: list[list[Cell]] = [[one.what, one.paper, one.why] for one in stats.absent]
-    parts += ["## What this release cannot tell", _markdown_table(["what", "of the paper", "why"], absent)]
+    parts += ["## What this release does not show", _markdown_table(["what", "of the paper", "why"], absent)]
     parts += ["## Rules", *(for_markdown(f"{name}: {rule}.") for name, rule in stats.rules.items())]
     return "\n\n".join(parts) + "\n"
 

@@ -85,7 +85,7 @@ SHAPES: dict[str, tuple[str, str, str, Plot | None]] = {  # of each table: title
     "fovs": ("Fields of view", "tab:zoom_config, sec:exp_release", "degrees|trajectories|frames", "bars"),
     "weather": ("Weather and time of day", "tab:weather_coverage", "preset", "heat"),
     "augmentation_states": ("Perturbation", "tab:augmentation_states", "state|frames|%", "bars"),
-    "events": ("What became of each perturbation", "sec:exp_zoom", "track|event|outcome|frames", None),
+    "events": ("Outcome of each perturbation", "sec:exp_zoom", "track|event|outcome|frames", None),
     "depth": ("Depth, percentiles", "sec:step6", "pixels nearer than|m", None),
     "semantics": ("Kinds in the pictures", "sec:step6", "kind|% of pixels|% of frames", "bars"),
 }  # fmt: skip
@@ -168,8 +168,8 @@ def _release(record: ReleaseRecord, counts: Counts) -> Table:
     for when, lengths in (
         ("rendered", [one.frames_available for one in record.flights]), ("released", [one.frames for one in flights]),
     ):  # fmt: skip
-        rows += [[f"frames of a flight as {when}, least", min(lengths, default=None)]]
-        rows += [[f"frames of a flight as {when}, most", max(lengths, default=None)]]
+        rows += [[f"fewest frames of a track, {when}", min(lengths, default=None)]]
+        rows += [[f"most frames of a track, {when}", max(lengths, default=None)]]
     rows += [["time step, s", steps], *_pairs("frames of ", counts.image_px.most_common())]
     each = round(planned.planned / planned.accepted, 2) if planned and planned.accepted else None
     rows += [["captions", numbers.captions.frames_with], ["trajectories planned for one accepted", each]]
@@ -184,13 +184,13 @@ def _quality(record: ReleaseRecord, counts: Counts) -> Table:
         rows += _pairs("dropped before rendering: ", planned.dropped.items())
         rows += [["trajectories rendered", planned.rendered], ["of these accepted", planned.accepted]]
         rows += [["of these to review", planned.review], ["of these rejected", planned.rejected]]
-    rows += [["flights found", flights.found], *_pairs("flights left out: ", flights.left_out.items())]
+    rows += [["tracks found", flights.found], *_pairs("tracks not released: ", flights.left_out.items())]
     known, within, scores = smoothness(counts)
     five_ray = _five_ray(record, counts)
     below = sum(mean < FIVE_RAY_MEAN_MIN for mean in five_ray) if five_ray else None
     rows += [
-        ["flights released", flights.released],
-        ["mean five-ray visibility of clean flights, as inspected", _mean(five_ray)],
+        ["tracks released", flights.released],
+        ["mean five-ray visibility of clean tracks, from the inspection", _mean(five_ray)],
         [f"of these below {FIVE_RAY_MEAN_MIN:.0%}", below],
         ["mean RMS acceleration, m/s²", _mean(accel for accel, _ in known)],
         ["mean RMS jerk, m/s³", _mean(jerk for _, jerk in known)],
@@ -199,7 +199,7 @@ def _quality(record: ReleaseRecord, counts: Counts) -> Table:
         [f"trajectories with S below {REVIEW_BELOW:g}", sum(score < REVIEW_BELOW for score in scores)],
         ["trajectories whose motion is known", len(known)],
     ]
-    note = "The way to the release is as the record tells it. Acceleration and jerk: of the motion without "
+    note = "The funnel is that of release.json. Acceleration and jerk: of the motion without "
     return _table("quality_stats", rows, note + "perturbation, over frames in a row.")
 
 
@@ -234,14 +234,14 @@ def _dist(record: ReleaseRecord, counts: Counts) -> Table:
     known = [flight for flight in flights if flight.is_known]
     rows = [
         _spread_row("trajectory length, m", spread_of(flight.path_m for flight in known)),
-        _spread_row("altitude over the person's ground, m", _over(known, lambda flight: flight.height)),
+        _spread_row("altitude above the ground under the person, m", _over(known, lambda flight: flight.height)),
         _spread_row("target distance, m", _over(known, lambda flight: flight.distance)),
         _spread_row("rendered visibility", _over(flights, lambda flight: flight.visibility)),
-        _spread_row("five-ray visibility, as inspected", spread_of(_five_ray(record, counts))),
+        _spread_row("five-ray visibility, from the inspection", spread_of(_five_ray(record, counts))),
     ]
     note = (
-        "Means of each trajectory, as flown without perturbation: of its clean flight, else its perturbed one less the "
-        f"recorded offsets. The length is that through {sum(f.frames for f in flights):,} released frames."
+        "Means of each trajectory without perturbation: of its clean track, or of its perturbed track minus the "
+        f"recorded offsets. The length is that over {sum(f.frames for f in flights):,} released frames."
     )
     return _table("dist_stats", rows, note)
 
@@ -278,7 +278,7 @@ def _verdicts(counts: Counts) -> Table:
     own = {name: [counts.verdicts[name, track] for track in tracks] for name in names}
     total = counts.verdicts.total()
     rows: Rows = [[name, sum(each), percent(sum(each), total), *each] for name, each in own.items()]
-    note = "Of accepted captions, after repair: what the paper's figure shows is of first answers, before it."
+    note = "Of accepted captions, after repair; the figure of the paper shows first answers, before repair."
     return _table("verdicts", rows, note, tracks)
 
 
@@ -286,9 +286,9 @@ def _teachers(record: ReleaseRecord) -> Table:
     made = record.provenance
     rows = _pairs("captions of ", [(f"{teacher.kind}: {teacher.model}", teacher.captions) for teacher in made.teachers])
     rows += [["asks", made.asks], *_pairs("", [(name.replace("_", " "), count) for name, count in made.tokens.items()])]
-    rows += [["first answers that stood", made.repairs.first_answers]]
+    rows += [["accepted first answers", made.repairs.first_answers]]
     rows += _pairs("repaired by ", made.repairs.repaired_by_rung.items())
-    return _table("teachers", rows, "As the record tells it, of all captions that were read.")
+    return _table("teachers", rows, "From release.json, over all captions that were read.")
 
 
 def _lengths(counts: Counts) -> Table:
@@ -298,7 +298,7 @@ def _lengths(counts: Counts) -> Table:
             least = (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS)[name]
             title = f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}"
             rows.append([*_spread_row(title, counts.lengths[language, name].spread()), least])
-    return _table("text_lengths", rows, "Characters. The last column is the least that an answer may have.")
+    return _table("text_lengths", rows, "Characters. The last column is the smallest accepted length.")
 
 
 # --- frames -----------------------------------------------------------------------------------------------------------
@@ -332,9 +332,9 @@ def _zoom(counts: Counts) -> Table:
     here = {round(fov) for fov, _ in groups}
     missing = ", ".join(f"{name} ({fov} deg)" for fov, name in LEVEL_NAMES.items() if fov not in here)
     note = (
-        "Means over the frames that show the person, then over flights. Size: of the projected box; IoU: of it and "
-        "the box of the person's pixels. A flight of one field of view is in its row, one that zooms under "
-        '"changing", so rows are of different flights; the paper\'s study of the same flights is another matter.'
+        "Means over the frames that show the person, then over tracks. Size: of the projected box; IoU: of this box "
+        "and the box of the person's pixels. A track with one field of view is in its row, a track that zooms in "
+        '"changing", so the rows are of different tracks; the study of the paper compares the same tracks.'
     )
     return _table("zoom_eval", rows, note + (f" Not in this release: {missing}." if missing else ""))
 
@@ -375,8 +375,8 @@ def _perturbation(counts: Counts) -> list[Table]:
     if total := counts.states.total():
         order = ("unperturbed", "position only", "rotation only", "full")
         rows: Rows = _shares(((state, counts.states[state]) for state in order), total)
-        note = "Frames of perturbed flights by what of their recorded offsets is not zero: after fallbacks, so fewer "
-        tables += [_table("augmentation_states", rows, note + "are perturbed than were drawn.")]
+        note = "Frames of perturbed tracks by the kind of their recorded offsets, after fallbacks, so fewer "
+        tables += [_table("augmentation_states", rows, note + "frames are perturbed than were drawn.")]
     if counts.events:
         events: Rows = [[*names, count] for names, count in sorted(counts.events.items())]
         tables += [_table("events", events)]
@@ -401,19 +401,19 @@ def _absent(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> lis
     """Name what the paper has and this release cannot tell."""
     no_weather = all(weather is None and time is None for weather, time in counts.weather)
     table = [
-        (True, "the same flights at four fields of view", "tab:zoom_eval",
-         "needs rendering: each flight of a release has one field of view"),
+        (True, "the same tracks at four fields of view", "tab:zoom_eval",
+         "it needs rendering, because each track of a release has one field of view"),
         (True, "boxes of the maps, before and after simplification", "sec:dataset_stats",
-         "a release holds no map: see simplify_report.json"),
+         "a release contains no map; see simplify_report.json"),
         (True, "verdicts of first answers", "fig:consistency_verdict",
-         "a release holds accepted captions alone: see caption_report.json"),
+         "a release contains accepted captions only; see caption_report.json"),
         (not _five_ray(record, counts), "five-ray visibility of the planner", "tab:dist_stats, tab:quality_stats",
-         "no flight of this release was inspected against its map"),
+         "no track of this release was inspected with its map"),
         (no_weather, "weather and time of day, 15 x 4", "tab:weather_coverage",
          "no frame of this release names a preset"),
         (not counts.events, "fallbacks of the perturbation", "sec:exp_zoom",
-         "no frame of this release tells what became of it"),
+         "no frame of this release records the outcome"),
         (pixels is None, "percentiles of depth, kinds in the pictures", "sec:step6",
-         "the pictures were not looked at: --pixels"),
+         "the pictures were not read; pass --pixels"),
     ]  # fmt: skip
     return [Absent(what=what, paper=paper, why=why) for is_absent, what, paper, why in table if is_absent]
