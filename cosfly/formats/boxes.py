@@ -328,16 +328,16 @@ def read_boxes(path: Path) -> BoxMap:
         records = check_schema(value, BOXES_FORMAT, path).pop("boxes", None)
         header = validated(MapHeader, {key: field for key, field in value.items() if key not in COMPUTED}, path)
         if records is None:
-            raise InputError(MISSING, where=f"{path}: boxes", expected="a list")
+            raise InputError(MISSING, where=f"{path}: boxes", expected="a list of boxes")
         if not isinstance(records, list):
             raise InputError(
                 "the field is not a list of boxes",
                 where=f"{path}: boxes",
                 got=json_type(records),
-                expected="a list",
+                expected="a list of boxes",
             )
     if not records:
-        raise InputError("the map has no boxes", where=path, fix="check its source, or the stage that wrote it")
+        raise InputError("the map has no boxes", where=path, fix="run the stage or the export of this map again")
     boxes = validated(_Boxes, {"boxes": records}, path).boxes
     box_map = make_box_map(
         [box.center for box in boxes],
@@ -359,7 +359,7 @@ def _check_computed(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, 
     computed = {"axes": AXES, "num_boxes": len(box_map), "counts": box_map.counts()}
     for name, value in computed.items():
         if header.get(name, value) != value:
-            got, expected = str(header[name])[:200], str(value)[:200]
+            got, expected = dump_json(header[name])[:200], dump_json(value)[:200]
             raise InputError(
                 "the field disagrees with the boxes of the file", where=f"{path}: {name}", got=got, expected=expected
             )

@@ -33,7 +33,8 @@ def records(value: dict, name: str, where: Path | str) -> list[dict]:
     """Read a list of objects; raises InputError for anything else."""
     entries = value.get(name)
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise InputError("the field is missing or is not a list of objects", where=f"{where}: {name}")
+        what = "the field is missing or is not a list of objects"
+        raise InputError(what, where=f"{where}: {name}", expected="a list of objects")
     return entries
 
 

@@ -123,7 +123,7 @@ def _read_glb(data: bytes, folder: _Folder) -> dict[str, Mesh]:
         end += 8 + size
     if end > len(data):
         got = f"{len(data)} bytes"
-        raise InputError("the mesh is cut short", where=folder.path, got=got, expected=f"{end} bytes")
+        raise InputError("the mesh file is cut short", where=folder.path, got=got, expected=f"{end} bytes")
     return _read_gltf(chunks[JSON_CHUNK], folder, chunks.get(BINARY_CHUNK, b""))
 
 
@@ -184,7 +184,7 @@ def _roots(document: dict, nodes: list[dict], folder: _Folder) -> list[int]:
     else:
         roots = sorted(set(range(len(nodes))) - set(children))
     if len({*children, *roots}) < len(children) + len(roots):  # also a cycle
-        raise InputError("a node of the mesh has two parents", where=folder.path)
+        raise InputError("a node of the mesh has two parents", where=folder.path, expected="one parent for each node")
     return roots
 
 
@@ -205,7 +205,9 @@ def _flat_primitive(primitive: dict, folder: _Folder) -> dict:
     """Return a primitive with its triangles and colours only."""
     if primitive.get("mode", TRIANGLES) > STRIP:
         what = "the mesh has a fan of triangles"
-        raise InputError(what, where=folder.path, expected="single triangles or strips of triangles")
+        raise InputError(
+            what, where=folder.path, expected="triangles or strips of triangles", fix="triangulate the mesh"
+        )
     attributes = {name: k for name, k in primitive["attributes"].items() if name in ("POSITION", "COLOR_0")}
     return {key: primitive[key] for key in ("mode", "indices") if key in primitive} | {"attributes": attributes}
 

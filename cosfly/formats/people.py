@@ -130,6 +130,6 @@ def read_goal(record: Any, num_frames: int, where: str) -> Goal:
     """Read the goal of a track of `num_frames` frames from a record."""
     goal = validated(Goal, record, where)
     if goal.frame >= num_frames:
-        expected = f"0 to {num_frames - 1}"
+        expected = f"a frame from 0 to {num_frames - 1}"
         raise InputError("the track has no such frame", where=f"{where}.frame", got=str(goal.frame), expected=expected)
     return goal

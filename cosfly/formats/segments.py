@@ -90,6 +90,6 @@ def read_flown(record: dict, num_frames: int, where: str) -> tuple[tuple[Segment
         frames |= {"mission.at_frame": mission.at_frame, "mission.home_frame": mission.home_frame}
     for name, frame in frames.items():
         if frame > num_frames:
-            expected = f"0 to {num_frames}"
+            expected = f"a frame from 0 to {num_frames}"
             raise InputError("the track has no such frame", where=f"{where}: {name}", got=str(frame), expected=expected)
     return segments, mission

@@ -54,7 +54,10 @@ class VllmEngine:
         if not (folder / "config.json").is_file():
             expected = "a folder with config.json"
             raise InputError(
-                "this folder contains no model", where=folder, expected=expected, fix="pass such a folder to --teacher"
+                "this folder contains no model",
+                where=folder,
+                expected=expected,
+                fix="pass the folder of a model after vllm:",
             )
         self.folder = folder
         self.model = folder.name

@@ -68,7 +68,7 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
             where="caption.teacher",
             got=cfg.caption.teacher,
             expected=f"a teacher of the kind {' or '.join(sorted(EMBEDDED))}, and no caption.judge",
-            fix="--set caption.teacher=rules",
+            fix="pass --set caption.teacher=rules",
         )
     rows = [_measure(cfg, run_folder, out / f"workers_{count}", stage, count) for count in sorted(set(workers))]
     bench = Bench(stage=stage, cores=len(os.sched_getaffinity(0)), rows=rows)

@@ -14,7 +14,7 @@ import numpy as np
 from cosfly.geometry import kernels
 from cosfly.geometry.kernels import BoxIndex, collect_hits, distance_to_box, squared_gap
 from cosfly.planners.contract import Plan, PlanConfig, Scenario
-from cosfly.planners.line_of_sight import FOOT_LOW_M, look, make_horizon
+from cosfly.planners.line_of_sight import LOWEST_END_M, five_ray_visibility, make_horizon
 from cosfly.planners.smoothing import smooth_trajectory, unsafe
 from cosfly.runtime.compiled import njit
 
@@ -164,7 +164,7 @@ def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps, hidden):
         for c in range(places.shape[1]):
             away = np.sqrt((places[key, c, 0] - target[0]) ** 2 + (places[key, c, 1] - target[1]) ** 2)
             away_max = max(away_max, away)
-            least_slope = min(least_slope, (places[key, c, 2] - target[2] - FOOT_LOW_M) / max(away, 1.0))
+            least_slope = min(least_slope, (places[key, c, 2] - target[2] - LOWEST_END_M) / max(away, 1.0))
         horizon = make_horizon(index, target, away_max, least_slope)
         num_near = 0
         for box in range(len(aloft)):
@@ -179,7 +179,7 @@ def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps, hidden):
                     gap = min(gap, distance_to_box(aloft, near[k], x, y, z))
             gaps[key, c] = gap
             if gap >= clearance_m:
-                hidden[key, c] = 1.0 - look(index, horizon, target, x, y, z)
+                hidden[key, c] = 1.0 - five_ray_visibility(index, horizon, target, x, y, z)
 
 
 @njit(cache=True)

@@ -1,4 +1,8 @@
-"""Five-ray visibility of one target from many points: boxes sorted by direction once, so that a query tests few."""
+"""Five-ray visibility of one target from many points.
+
+`kernels.visibility` searches the boxes for each point. A planner tests thousands of points around the same target, so
+here the boxes around the target are sorted by direction once, and a point tests only those in its direction.
+"""
 
 from __future__ import annotations
 
@@ -10,66 +14,94 @@ from cosfly.geometry import kernels
 from cosfly.geometry.kernels import HALF_X, HALF_Y, HALF_Z, HIGH_X, HIGH_Y, HIGH_Z, LOW_X, LOW_Y, in_box_frame, touches
 from cosfly.runtime.compiled import int64, njit
 
-NUM_SECTORS = 128  # of the horizon round a target
+NUM_SECTORS = 128  # equal sectors of azimuth around a target
 
-# Feet of the five rays (RAY_OFFSETS_M): the lowest relative to the hip, and how far to the side.
-FOOT_LOW_M, FOOT_SIDE_M = -0.6, 0.3
+# The rays end at RAY_OFFSETS_M from the target's hip: the lowest end, and the largest shift to the side.
+LOWEST_END_M, SIDE_END_M = -0.6, 0.3
+NUM_RAYS = 5
 ALL_BLOCKED = 0b11111
-ROUNDING = 1e-6
+NO_DISTANCE_M = 1e-6  # a nearer box counts as one around the target
+SLOPE_ROUNDING = 1e-6
+ROUNDING_M = 1e-9
 
 
 class Horizon(NamedTuple):
-    """The m boxes near one target that can hide it, and by sector of directions (s = NUM_SECTORS)."""
+    """The m boxes near one target that can hide it, also by the sector in which they lie (s = NUM_SECTORS)."""
 
-    boxes: np.ndarray  # (m,)
-    near: np.ndarray  # (m,) distance in the plane, less the spread of the rays, m
-    slopes: np.ndarray  # (m,) a ray that rises more per horizontal metre passes above the box
-    counts: np.ndarray  # (s,) number of boxes that reach into the sector
-    lists: np.ndarray  # (s, m) those boxes
+    boxes: np.ndarray  # (m,) rows of the boxes in the index
+    nearest_m: np.ndarray  # (m,) horizontal distance from the nearest ray end to the box
+    slopes: np.ndarray  # (m,) a ray that rises more per horizontal metre passes above the box; inf around the target
+    counts: np.ndarray  # (s,) number of boxes in the sector
+    lists: np.ndarray  # (s, m) these boxes, as places in `boxes`
     steepest: np.ndarray  # (s,) largest of their slopes
 
 
 @njit(cache=True)
 def make_horizon(index, target, reach_m, least_slope):
-    """Sort the boxes around a target by direction, so that `look` tests the few that can hide it.
+    """Sort the boxes around a target by direction.
 
-    The horizon is valid for points within `reach_m` in the plane that rise at least `least_slope` per horizontal metre
-    above the lowest foot of the rays; boxes that cannot hide the target from there are ignored. A ray that starts at
-    height `low` or above and ends at height p_z and horizontal distance d has height low + (p_z - low) t at the share t
-    of its length. It reaches a box at horizontal distance r at t = (r - FOOT_SIDE_M) / d or later.
+    The horizon is valid for points at a horizontal distance of at most `reach_m` that rise at least `least_slope` per
+    horizontal metre above the lowest ray end. It leaves out boxes that cannot hide the target from these points.
+
+    Why a slope decides: a ray that ends at height `low_m` or above, and comes from a point at height z and horizontal
+    distance d, has at least the height low_m + (z - low_m) t at the share t of its length. It reaches a box at
+    horizontal distance r at t = (r - SIDE_END_M) / d or later.
     """
-    boxes, near, slopes, spans = _boxes_round(index, target, reach_m, least_slope)
+    boxes, nearest_m, slopes, spans_rad = _boxes_in_reach(index, target, reach_m, least_slope)
     counts = np.zeros(NUM_SECTORS, dtype=np.int64)
     lists = np.empty((NUM_SECTORS, len(boxes)), dtype=np.int64)
     steepest = np.full(NUM_SECTORS, -np.inf)
     for k in range(len(boxes)):
-        first = int(np.floor(spans[k, 0] / (2.0 * np.pi) * NUM_SECTORS))
-        last = int(np.floor(spans[k, 1] / (2.0 * np.pi) * NUM_SECTORS))
+        first = int(np.floor(spans_rad[k, 0] / (2.0 * np.pi) * NUM_SECTORS))
+        last = int(np.floor(spans_rad[k, 1] / (2.0 * np.pi) * NUM_SECTORS))
         for step in range(min(last - first + 1, NUM_SECTORS)):
             sector = (first + step) % NUM_SECTORS
             lists[sector, counts[sector]] = k
             counts[sector] += 1
             steepest[sector] = max(steepest[sector], slopes[k])
-    return Horizon(boxes, near, slopes, counts, lists, steepest)
+    return Horizon(boxes, nearest_m, slopes, counts, lists, steepest)
+
+
+@njit(cache=True, inline="always")
+def five_ray_visibility(index, horizon, target, x, y, z):
+    """Return the share of free rays to the target of a horizon from a point above it, as `kernels.visibility` does."""
+    dx, dy = x - target[0], y - target[1]
+    away_m, rise_m = np.sqrt(dx * dx + dy * dy), z - target[2] - LOWEST_END_M
+    sector = int(np.floor(np.arctan2(dy, dx) / (2.0 * np.pi) * NUM_SECTORS)) % NUM_SECTORS
+    # A slope times a distance instead of a quotient, because a point straight above has the distance 0.
+    if horizon.counts[sector] == 0 or rise_m > horizon.steepest[sector] * away_m + ROUNDING_M:
+        return 1.0
+    blocked = int64(0)
+    for place in range(horizon.counts[sector]):
+        k = horizon.lists[sector, place]
+        is_between = horizon.nearest_m[k] <= away_m + ROUNDING_M
+        if is_between and not rise_m > horizon.slopes[k] * away_m + ROUNDING_M:
+            blocked = _blocked_rays(index.rows, horizon.boxes[k], x, y, z, target, blocked)
+            if blocked == ALL_BLOCKED:
+                break
+    num_free = int64(NUM_RAYS)
+    for ray in range(NUM_RAYS):
+        num_free -= (blocked >> ray) & 1
+    return num_free / 5.0
 
 
 @njit(cache=True)
-def _boxes_round(index, target, reach_m, least_slope):
-    """Return the boxes in reach that are steep enough: number, distance, slope, and first and last azimuth (2,)."""
+def _boxes_in_reach(index, target, reach_m, least_slope):
+    """Return the boxes of a horizon: row in the index, distance, slope, and first and last azimuth (2,)."""
     boxes = np.empty(len(index.rows), dtype=np.int64)
-    near, slopes, spans = np.empty(len(boxes)), np.empty(len(boxes)), np.empty((len(boxes), 2))
+    nearest_m, slopes, spans_rad = np.empty(len(boxes)), np.empty(len(boxes)), np.empty((len(boxes), 2))
     num = 0
     if len(index.rows) == 0:
-        return boxes, near, slopes, spans
-    cell = index.grid[kernels.CELL]
+        return boxes, nearest_m, slopes, spans_rad
+    cell_m = index.grid[kernels.CELL]
     num_x = index.shape[0]
     num_y = index.shape[1]
-    first_x = min(max(int(np.floor((target[0] - reach_m - index.grid[kernels.ORIGIN_X]) / cell)), 0), num_x)
-    last_x = min(int(np.floor((target[0] + reach_m - index.grid[kernels.ORIGIN_X]) / cell)), num_x - 1)
-    first_y = min(max(int(np.floor((target[1] - reach_m - index.grid[kernels.ORIGIN_Y]) / cell)), 0), num_y)
-    last_y = min(int(np.floor((target[1] + reach_m - index.grid[kernels.ORIGIN_Y]) / cell)), num_y - 1)
+    first_x = min(max(int(np.floor((target[0] - reach_m - index.grid[kernels.ORIGIN_X]) / cell_m)), 0), num_x)
+    last_x = min(int(np.floor((target[0] + reach_m - index.grid[kernels.ORIGIN_X]) / cell_m)), num_x - 1)
+    first_y = min(max(int(np.floor((target[1] - reach_m - index.grid[kernels.ORIGIN_Y]) / cell_m)), 0), num_y)
+    last_y = min(int(np.floor((target[1] + reach_m - index.grid[kernels.ORIGIN_Y]) / cell_m)), num_y - 1)
     is_visited = np.zeros(len(index.rows), dtype=np.bool_)
-    low = target[2] + FOOT_LOW_M
+    low_m = target[2] + LOWEST_END_M
     for ix in range(first_x, last_x + 1):
         for iy in range(first_y, last_y + 1):
             for place in range(index.starts[ix * num_y + iy], index.starts[ix * num_y + iy + 1]):
@@ -77,85 +109,65 @@ def _boxes_round(index, target, reach_m, least_slope):
                 if is_visited[box]:
                     continue
                 is_visited[box] = True
-                rows = index.rows[box]
-                dx = max(rows[LOW_X] - target[0], 0.0, target[0] - rows[HIGH_X])
-                dy = max(rows[LOW_Y] - target[1], 0.0, target[1] - rows[HIGH_Y])
-                distance = np.sqrt(dx * dx + dy * dy)
-                if distance > reach_m + FOOT_SIDE_M or rows[HIGH_Z] < low:
+                row = index.rows[box]
+                dx = max(row[LOW_X] - target[0], 0.0, target[0] - row[HIGH_X])
+                dy = max(row[LOW_Y] - target[1], 0.0, target[1] - row[HIGH_Y])
+                away_m = np.sqrt(dx * dx + dy * dy)
+                if away_m > reach_m + SIDE_END_M or row[HIGH_Z] < low_m:
                     continue
-                boxes[num], near[num] = box, max(distance - FOOT_SIDE_M, 0.0)
-                slopes[num] = (rows[HIGH_Z] - low) / near[num] if near[num] > 1e-6 else np.inf
-                if slopes[num] < least_slope - ROUNDING:
+                boxes[num], nearest_m[num] = box, max(away_m - SIDE_END_M, 0.0)
+                slopes[num] = (row[HIGH_Z] - low_m) / nearest_m[num] if nearest_m[num] > NO_DISTANCE_M else np.inf
+                if slopes[num] < least_slope - SLOPE_ROUNDING:
                     continue
-                spans[num, 0], spans[num, 1] = _span(rows, target, distance)
+                spans_rad[num, 0], spans_rad[num, 1] = _azimuths_of(row, target, away_m)
                 num += 1
-    return boxes[:num], near[:num], slopes[:num], spans[:num]
+    return boxes[:num], nearest_m[:num], slopes[:num], spans_rad[:num]
 
 
 @njit(cache=True)
-def _span(rows, target, distance_m):
-    """Return the azimuths under which rays to a target may touch a box: those of its bounds, and the feet's spread."""
-    if distance_m < 1.0:
+def _azimuths_of(row, target, away_m):
+    """Return the first and last azimuth, rad, at which a ray may touch a box: the bounds of the box, and SIDE_END_M."""
+    if away_m < 1.0:
         return 0.0, 2.0 * np.pi
-    middle = np.arctan2(0.5 * (rows[LOW_Y] + rows[HIGH_Y]) - target[1], 0.5 * (rows[LOW_X] + rows[HIGH_X]) - target[0])
+    middle = np.arctan2(0.5 * (row[LOW_Y] + row[HIGH_Y]) - target[1], 0.5 * (row[LOW_X] + row[HIGH_X]) - target[0])
     left, right = 0.0, 0.0
     for corner in range(4):
-        x, y = rows[LOW_X + 3 * (corner % 2)], rows[LOW_Y + 3 * (corner // 2)]
+        x, y = row[LOW_X + 3 * (corner % 2)], row[LOW_Y + 3 * (corner // 2)]  # the high bounds are 3 columns after
         turn = np.arctan2(y - target[1], x - target[0]) - middle
         turn -= 2.0 * np.pi * np.floor((turn + np.pi) / (2.0 * np.pi))
         left, right = min(left, turn), max(right, turn)
-    spread = np.arcsin(FOOT_SIDE_M / distance_m) + 1e-9
-    return middle + left - spread, middle + right + spread
-
-
-@njit(cache=True, inline="always")
-def look(index, horizon, target, x, y, z):
-    """Return the five-ray visibility of the horizon's target from a point above it, as `kernels.visibility` does."""
-    dx, dy = x - target[0], y - target[1]
-    away, rise = np.sqrt(dx * dx + dy * dy), z - target[2] - FOOT_LOW_M
-    sector = int(np.floor(np.arctan2(dy, dx) / (2.0 * np.pi) * NUM_SECTORS)) % NUM_SECTORS
-    # In products, so that straight above needs no division; a box round the target itself is infinitely steep.
-    if horizon.counts[sector] == 0 or rise > horizon.steepest[sector] * away + 1e-9:
-        return 1.0
-    blocked = int64(0)
-    for place in range(horizon.counts[sector]):
-        k = horizon.lists[sector, place]
-        if horizon.near[k] <= away + 1e-9 and not rise > horizon.slopes[k] * away + 1e-9:
-            blocked = _blocked_rays(index.rows, horizon.boxes[k], x, y, z, target, blocked)
-            if blocked == ALL_BLOCKED:
-                break
-    num_free = int64(5)
-    for ray in range(5):
-        num_free -= (blocked >> ray) & 1
-    return num_free / 5.0
+    margin = np.arcsin(SIDE_END_M / away_m) + 1e-9
+    return middle + left - margin, middle + right + margin
 
 
 @njit(cache=True)
 def _blocked_rays(rows, box, x, y, z, target, blocked):
-    """Add to the bits of `blocked` the rays to a target that touch a box."""
-    tx, ty, tz, feet = target[0], target[1], target[2], kernels.RAY_OFFSETS_M
-    if min(x, tx - FOOT_SIDE_M) > rows[box, HIGH_X] or max(x, tx + FOOT_SIDE_M) < rows[box, LOW_X]:
+    """Return `blocked`, one bit per ray, with the bits of the rays that touch a box added."""
+    tx, ty, tz, ends_m = target[0], target[1], target[2], kernels.RAY_OFFSETS_M
+    if min(x, tx - SIDE_END_M) > rows[box, HIGH_X] or max(x, tx + SIDE_END_M) < rows[box, LOW_X]:
         return blocked
-    if min(y, ty) > rows[box, HIGH_Y] or max(y, ty) < rows[box, LOW_Y] or tz + FOOT_LOW_M > rows[box, HIGH_Z]:
+    if min(y, ty) > rows[box, HIGH_Y] or max(y, ty) < rows[box, LOW_Y] or tz + LOWEST_END_M > rows[box, HIGH_Z]:
         return blocked
     u, v, w = in_box_frame(rows, box, x, y, z)
     hip_u, hip_v, hip_w = in_box_frame(rows, box, tx, ty, tz)
-    # Every ray is within RAY_SPREAD_M of the middle one: far outside the box none is blocked (step 0), deep inside all
-    # are (step 1). One loop, because the compiler takes seconds for each test that is written out.
-    least = min(rows[box, HALF_X], rows[box, HALF_Y], rows[box, HALF_Z])
-    for step in range(7):
-        grown, a, b, c = 0.0, 0.0, 0.0, 0.0
+    # All rays are within RAY_SPREAD_M of the ray to the hip. Step 0: if that ray misses the box grown by the spread, no
+    # ray is blocked. Step 1: if it hits the box shrunk by the spread, all are. Steps 2 to 6 test each ray. It is one
+    # loop, because the compiler takes seconds for each call of `touches` that is written out.
+    thinnest_m = min(rows[box, HALF_X], rows[box, HALF_Y], rows[box, HALF_Z])
+    for step in range(2 + NUM_RAYS):
+        grown_m, end_u, end_v, end_w = 0.0, 0.0, 0.0, 0.0
         if step == 0:
-            grown = kernels.RAY_SPREAD_M
+            grown_m = kernels.RAY_SPREAD_M
         elif step == 1:
-            if least < kernels.RAY_SPREAD_M:
+            if thinnest_m < kernels.RAY_SPREAD_M:
                 continue
-            grown = -kernels.RAY_SPREAD_M
+            grown_m = -kernels.RAY_SPREAD_M
         elif (blocked >> (step - 2)) & 1:
             continue
         else:
-            a, b, c = kernels.turned(rows, box, feet[step - 2, 0], feet[step - 2, 1], feet[step - 2, 2])
-        hits = touches(rows, box, hip_u + a, hip_v + b, hip_w + c, u, v, w, grown)
+            ray = step - 2
+            end_u, end_v, end_w = kernels.turned(rows, box, ends_m[ray, 0], ends_m[ray, 1], ends_m[ray, 2])
+        hits = touches(rows, box, hip_u + end_u, hip_v + end_v, hip_w + end_w, u, v, w, grown_m)
         if step == 0 and not hits:
             return blocked
         if step == 1 and hits:

@@ -25,7 +25,7 @@ import numpy as np
 from cosfly.geometry.axes import DT_S
 from cosfly.geometry.kernels import BoxIndex, collect_hits, nearest_box
 from cosfly.planners.contract import Plan, PlanConfig, Scenario
-from cosfly.planners.line_of_sight import look, make_horizon
+from cosfly.planners.line_of_sight import five_ray_visibility, make_horizon
 from cosfly.planners.smoothing import smooth_trajectory
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import NoPathError
@@ -221,7 +221,7 @@ def _is_in_bounds(z, costs, layer):
 @njit(cache=True, inline="always")
 def _look(cell, voxels, index, horizon, target):
     x, y, z = _place(cell, voxels)
-    return look(index, horizon, target, x, y, z)
+    return five_ray_visibility(index, horizon, target, x, y, z)
 
 
 @njit(cache=True, inline="always")

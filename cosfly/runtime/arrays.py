@@ -149,7 +149,7 @@ def parse_picture(data: bytes, where: str | Path, *, flags: int = cv2.IMREAD_COL
         except cv2.error as error:
             got = str(error)
     if image is None:
-        raise InputError("the image cannot be decoded", where=where, got=got, expected="a complete PNG")
+        raise InputError("the image cannot be decoded", where=where, got=got, expected="a complete PNG file")
     return image
 
 

@@ -264,7 +264,9 @@ def _plain_name(root: Path, name: str) -> str:
         expected = f"no null character, and at most {LONGEST_NAME} bytes between two slashes"
         raise InputError("the name is not a valid file name", where=root, got=name, expected=expected)
     if os.path.isabs(plain) or plain.split(os.sep)[0] == os.pardir:
-        raise InputError("a name leads out of its folder", where=root, got=name, expected="a path inside the folder")
+        raise InputError(
+            "the file name leads out of this folder", where=root, got=name, expected="a path inside the folder"
+        )
     return plain
 
 

@@ -124,7 +124,8 @@ def _choices(text: str) -> dict[str, str]:
         found = {choice: word for word in words for choice, entry in choices.items() if word in entry["words"].split()}
         if len(found) > 1:
             got = " and ".join(repr(word) for word in found.values())
-            raise InputError(f"two words about {group} contradict each other", where="PROMPT", got=got)
+            what = f"two words about {group} contradict each other"
+            raise InputError(what, where="PROMPT", got=got, fix="use only one of these words")
         if found:
             chosen[group] = next(iter(found))
     return chosen
