@@ -61,7 +61,7 @@ def test_damaged_adapters_are_refused(base, adapter, tmp_path):
         ({n: t for n, t in tensors.items() if n != name}, "an update of the adapter is incomplete"),
         (tensors | pair, "lacks a layer that the adapter changes"),
         (tensors | {name.replace(".lora_A", ".other"): torch.ones(2)}, "not of a LoRA adapter"),
-        (tensors | {name: torch.ones(4, 7)}, "another shape"),
+        (tensors | {name: torch.ones(4, 7)}, "have different shapes"),
         (tensors | {name: tensors[name] * np.nan}, "not finite"),
     ]):  # fmt: skip
         folder = tmp_path / f"adapter_{number}"

@@ -242,7 +242,7 @@ DAMAGES = {
         "does not match its frame"),
     "two captions of a frame": (captions_of(lambda lines: lines.append(lines[0])), "two accepted captions"),
     "a window in the future": (caption(window=[1, 2, 3, 4, 5]), "the window of the caption is invalid"),
-    "a future that has begun": (caption(future=[4]), "has begun"),
+    "a future that has begun": (caption(future=[4]), "does not begin after its window"),
     "a label of no action": (caption(label="land"), "closed set"),
     "consistent with another": (caption(label="hover", verdict="CONSISTENT"), "the verdict is consistent, but"),
     "a caption in one language": (caption(zh=None), "lacks a language"),

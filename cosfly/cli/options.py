@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, cast
 import typer
 from typer import Option
 
-from cosfly.runtime.errors import ConfigError, InputError, counts_text, nearest
+from cosfly.runtime.errors import ConfigError, InputError, counts_text, nearest, plain, shown
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -167,6 +167,22 @@ class Job:
             )
 
 
+class _Root(typer.core.TyperGroup):
+    """The root command; it explains an invalid value of an option without pydantic's prefix, and with the value."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            from pydantic import ValidationError
+
+            if isinstance(error.__cause__, ValidationError):
+                detail = error.__cause__.errors()[0]
+                got = "" if detail["type"] == "value_error" else f", got {shown(detail['input'])}"
+                error.message = f"{plain(error.message)}{got}"
+            raise
+
+
 class StageGroup(typer.core.TyperGroup):
     """The command of a stage, with subcommands that do not need the stage's own options."""
 
@@ -178,6 +194,7 @@ class StageGroup(typer.core.TyperGroup):
 
 
 app = typer.Typer(
+    cls=_Root,
     help="Make data sets from 3D maps that teach a vision-language model to follow a person from the air.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,

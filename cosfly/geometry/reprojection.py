@@ -1,7 +1,7 @@
-"""Reprojection of one frame into another: points of a depth image are moved by both poses and compared there.
+"""Reprojection of one frame into another: it checks depths, instances, poses and intrinsics against each other.
 
-A static surface has the depth that the poses imply from both positions, and the same instance. So depth, masks, poses,
-intrinsics and times check each other. Colours are not used: light, weather, zoom and renderers change them.
+Points of one depth image are moved into the other camera. There a static surface has the depth that both poses imply,
+and the same instance. Colours are not compared, because light, weather, zoom and renderers change them.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import numpy as np
 
 from cosfly.runtime.compiled import njit
 
-COLUMNS, GRID_ROWS = 64, 36  # points are taken at the middle of so many cells
-NEAR_M, FAR_M = 0.3, 999.0  # beyond is the sky
+COLUMNS, GRID_ROWS = 64, 36  # the points are the middles of this grid's cells
+NEAR_M, FAR_M = 0.3, 999.0  # range of depths; the sky is farther
 LEAST_SEEN = 150  # points; a share of fewer is not reported
 LEAST_PLANES = 30  # points; the depth error of fewer is not reported
-LEAST_SHIFTED = 12  # points of a thing
-FIRM, MOVED, RENAMED = 1, 2, 3
-SHARED_ID = 65534  # of several things: docs/files.md
-MOVING = np.zeros(256, np.bool_)  # kinds of pixels that may be elsewhere in the next frame
+LEAST_SHIFTED = 12  # points of an object; fewer are not reported
+FIRM, MOVED, RENAMED = 1, 2, 3  # states of a point, see `_reproject`
+SHARED_ID = 65534  # instance id of several objects: docs/files.md
+MOVING = np.zeros(256, np.bool_)  # kinds of objects that may be elsewhere in the next frame
 MOVING[[12, 13, 14, 15, 16, 17, 18, 19, 21]] = True  # people, riders, vehicles, dynamic objects (CARLA 0.9.16)
 # Kinds of surfaces that people and cars stand on, and water. Maps have several in one plane (two roads at their
 # crossing), where a renderer's rounding decides the id pixel by pixel, so only their kind is compared.
@@ -31,44 +31,37 @@ TOLERANCE_SHARE, TOLERANCE_M = 0.02, 0.1
 
 @dataclass(frozen=True)
 class View:
-    """A frame. depth (h, w) float32 m; instance (h, w, 3) uint8 as in `instance.png`, or (0, 0, 3) where there is none;
-    rotation: world_from_camera (3, 3); position_m (3,)."""
+    """A frame."""
 
-    depth: np.ndarray
-    instance: np.ndarray
-    rotation: np.ndarray
-    position_m: np.ndarray
+    depth: np.ndarray  # (h, w) float32, m
+    instance: np.ndarray  # (h, w, 3) uint8 as in `instance.png`, or (0, 0, 3) without instances
+    rotation: np.ndarray  # (3, 3) world_from_camera
+    position_m: np.ndarray  # (3,) world
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Counts of reprojected points. seen: points within the other picture; of these, agree: with its depth, hidden:
-    behind it, through: in front of it, where nothing is. same: of those that agree, with the same instance, on flat
-    ground the same kind. planes: of those that agree, on planes; error: their median depth error, as a share of the
-    depth; error_flat, error_standing: of those on ground and of the others; NaN: too few.
-    shifted: points of one instance most of which is farther there; renamed: of one most of which has its depth there
-    and another id; 0: none. seen_back, through_back: the same of the other frame's points in this one.
-    """
+    """Numbers of points of one frame by what the other frame shows at their place."""
 
-    seen: int
-    agree: int
-    hidden: int
-    through: int
-    same: int
-    planes: int
-    error: float
-    error_flat: float
-    error_standing: float
-    shifted: int
-    renamed: int
-    seen_back: int
+    seen: int  # within the other picture; of these:
+    agree: int  # at the same depth
+    hidden: int  # behind a nearer surface
+    through: int  # in front of all surfaces, so their own surface is missing
+    same: int  # of `agree`: with the same instance, or on flat ground with the same kind
+    planes: int  # of `agree`: on planes, where the depth error is exact
+    error: float  # median depth error of `planes`, as a share of the depth; NaN: too few
+    error_flat: float  # of those on flat ground
+    error_standing: float  # of all others
+    shifted: int  # of one instance, most of which is farther away in the other frame; 0: there is none
+    renamed: int  # of one instance, most of which has the same depth but another id in the other frame; 0: none
+    seen_back: int  # `seen` of the other frame's points in this one
     through_back: int
 
     @property
     def gone(self) -> float:
-        """Return the share of points of one frame that are missing in the other frame, 0 to 1.
+        """Return the larger share of points of one frame that are missing in the other frame, 0 to 1.
 
-        In a static world it is 0 for any two frames: a point that is not visible there is hidden by something nearer.
+        In a static world it is 0: a point that is not visible in the other frame is hidden by something nearer.
         """
         counts = ((self.through, self.seen), (self.through_back, self.seen_back))
         return max((through / seen for through, seen in counts if seen >= LEAST_SEEN), default=0.0)
@@ -111,7 +104,7 @@ def median_of(values: np.ndarray) -> float:
 
 
 def _most_of_one(ids: np.ndarray, states: np.ndarray, state: int) -> int:
-    """Return the largest number of points in a state among instances with more points in that state than FIRM."""
+    """Return the largest number of points of one instance in a state, of instances with fewer FIRM points."""
     ids_in_state = ids[states == state]
     if len(ids_in_state) < LEAST_SHIFTED:
         return 0
@@ -127,11 +120,12 @@ def _reproject(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift
     """Reproject the points of frame a into frame b.
 
     Returns:
-        counts (5,); depth errors (k,) and whether each is off flat ground (k,); ids (m,) and states (m,) of points well
-        inside one instance. FIRM: the same depth and id in b; MOVED: b is farther there; RENAMED: another id in b.
+        counts (5,): seen, agree, hidden, through and same. Depth errors (k,), and whether each is off flat ground (k,).
+        Ids (m,) and states (m,) of the points well inside one instance: FIRM has the same depth and id in b; for MOVED,
+        b is farther away; RENAMED has another id in b.
     """
     height, width = depth_a.shape
-    others_height, others_width = depth_b.shape
+    height_b, width_b = depth_b.shape
     has_ids = inst_a.shape[0] > 0 and inst_b.shape[0] > 0
     counts = np.zeros(5, np.int64)
     errors = np.empty(COLUMNS * GRID_ROWS)
@@ -142,36 +136,36 @@ def _reproject(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift
         v = int((j + 0.5) * height / GRID_ROWS)
         for i in range(COLUMNS):
             u = int((i + 0.5) * width / COLUMNS)
-            d = float(depth_a[v, u])
+            depth_m = float(depth_a[v, u])
             own = _code(inst_a, v, u) if has_ids else 0
-            if not (d > 0.0 and d < FAR_M) or moving[own & 255]:
+            if not (depth_m > 0.0 and depth_m < FAR_M) or moving[own & 255]:
                 continue
-            s, t, z = _reprojected(u, v, d, intrinsics, others, turn, shift)
-            if not (s > 1.5 and t > 1.5 and s < others_width - 2.5 and t < others_height - 2.5):
+            u_b, v_b, z = _reprojected(u, v, depth_m, intrinsics, others, turn, shift)
+            if not (u_b > 1.5 and v_b > 1.5 and u_b < width_b - 2.5 and v_b < height_b - 2.5):
                 continue
-            column, row, is_flat = int(s), int(t), flat[own & 255]
-            best, least, is_through, is_same, is_free, is_whole, is_one = _around(
-                depth_b, inst_b, row, column, z, own, has_ids, moving, flat
+            is_flat = flat[own & 255]
+            off_m, farther_m, is_through, is_same, is_free, is_whole, is_one = _around(
+                depth_b, inst_b, int(v_b), int(u_b), z, own, has_ids, moving, flat
             )
             if not is_free:
                 continue
             counts[0] += 1
-            is_there = best <= TOLERANCE_SHARE * z + TOLERANCE_M
+            agrees = off_m <= TOLERANCE_SHARE * z + TOLERANCE_M
             state = 0
-            if is_there and is_whole:
+            if agrees and is_whole:
                 state = FIRM
-            elif is_there and is_one and not is_flat:
+            elif agrees and is_one and not is_flat:
                 state = RENAMED
             # Farther on all sides: a nearer point may be another side of the same instance, which hides this one.
-            elif not is_there and has_ids and (is_through or (is_whole and least > 0.0)):
+            elif not agrees and has_ids and (is_through or (is_whole and farther_m > 0.0)):
                 state = MOVED
             if state > 0:
                 ids[num_ids], states[num_ids] = own >> 8, state
                 num_ids += 1
-            if is_there:
+            if agrees:
                 counts[1] += 1
                 counts[4] += is_same
-                error = _error_on_plane(depth_b, s, t, z)
+                error = _error_on_plane(depth_b, u_b, v_b, z)
                 if not np.isnan(error):
                     errors[num_errors] = error
                     standing[num_errors] = has_ids and not is_flat
@@ -203,15 +197,28 @@ def _code(instance, y, x):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _around(depth, instance, row, column, z, own, has_ids, moving, flat):  # type: ignore[no-untyped-def]
-    """Compare nine pixels with a point at depth z, of the instance `own`. Return the least distance in depth, the
-    least depth beyond it, and whether the point is nearer than all, one shows its instance (or kind of flat ground),
-    none shows a moving kind, all show its instance, and all show one instance."""
-    best, least, is_through, is_same, is_free, is_whole, is_one = 1e9, 1e9, True, not has_ids, True, has_ids, has_ids
+    """Compare the nine pixels around a place with a point at depth z, m, of the instance `own`.
+
+    Returns:
+        off_m: the least difference in depth. farther_m: how much farther than the point the nearest pixel is.
+        is_through: the point is clearly nearer than all pixels. is_same: one pixel shows its instance, or its kind of
+        flat ground. is_free: no pixel shows a moving kind. is_whole: all pixels show its instance. is_one: all pixels
+        show one instance.
+    """
+    off_m, farther_m, is_through, is_same, is_free, is_whole, is_one = (
+        1e9,
+        1e9,
+        True,
+        not has_ids,
+        True,
+        has_ids,
+        has_ids,
+    )
     for y in range(row - 1, row + 2):
         for x in range(column - 1, column + 2):
-            off = float(depth[y, x]) - z
-            best, least = min(best, abs(off)), min(least, off)
-            is_through &= off > 0.05 * z + 0.3
+            difference_m = float(depth[y, x]) - z
+            off_m, farther_m = min(off_m, abs(difference_m)), min(farther_m, difference_m)
+            is_through &= difference_m > 0.05 * z + 0.3
             if has_ids:
                 code = _code(instance, y, x)
                 kind = code & 255
@@ -219,17 +226,17 @@ def _around(depth, instance, row, column, z, own, has_ids, moving, flat):  # typ
                 is_same |= code == own or (kind == own & 255 and flat[kind])
                 is_whole &= code == own
                 is_one &= code == _code(instance, row, column)
-    return best, least, is_through, is_same, is_free, is_whole, is_one
+    return off_m, farther_m, is_through, is_same, is_free, is_whole, is_one
 
 
 @njit(cache=True, nogil=True)
-def _error_on_plane(depth, s, t, z):  # type: ignore[no-untyped-def]
-    """Return the error of the depth between four pixels against z, as a share of it; NaN where they are not one plane.
+def _error_on_plane(depth, u, v, z):  # type: ignore[no-untyped-def]
+    """Return the error of the depth at a place, px, against z, as a share of z; NaN if its four pixels are not a plane.
 
-    On a plane 1 / depth is linear in the picture, so that between four pixels it is exact.
+    On a plane 1 / depth is linear in the picture, so its interpolation between four pixels is exact.
     """
-    x, y = int(np.floor(s - 0.5)), int(np.floor(t - 0.5))
-    a, b = s - 0.5 - x, t - 0.5 - y
+    x, y = int(np.floor(u - 0.5)), int(np.floor(v - 0.5))
+    a, b = u - 0.5 - x, v - 0.5 - y
     d00, d01, d10, d11 = float(depth[y, x]), float(depth[y, x + 1]), float(depth[y + 1, x]), float(depth[y + 1, x + 1])
     if min(d00, d01, d10, d11) <= 0.0:  # invalid
         return np.nan
