@@ -25,36 +25,29 @@ from cosfly.viz.topview import captioned_grid, draw_text
 TILE_PX = (320, 180)
 NUM_RGB_TILES = 4
 MOST_ROWS = 12  # tracks on one sheet
-SHEET_BYTES = 2_000_000
-GIF_BYTES = 4_000_000
 GIF_WIDTH_PX = 480
 GIF_FRAME_MS = 250  # twice as fast as the paper's 0.5 s
-MOST_GIF_FRAMES, FEWEST_GIF_FRAMES = 60, 4
+MOST_GIF_FRAMES = 60
 BOX_COLOR = (255, 214, 10)
 
 
 def contact_sheet(tree: Path, out_png: Path, choice: TrackChoice = ALL_TRACKS) -> None:
-    """Read a playback tree and write a PNG below 2 MB: a few RGB frames, a depth image and a mask of each track."""
+    """Read a playback tree and write a PNG: a few RGB frames, a depth image and a mask of each track."""
     folders = find_tracks(tree, choice)
     rows = [_row(read_track(folder, strict=False)) for folder in folders[:MOST_ROWS]]
     heading = np.full((26, rows[0].shape[1], 3), 60, np.uint8)
     shown = "" if len(folders) <= MOST_ROWS else f", the first {MOST_ROWS} shown"
     draw_text(heading, f"{len(folders)} tracks{shown}", 8, 18, 0.5, (255, 255, 255))
-    write_bytes(out_png, _png_below(np.vstack([heading, *rows]), SHEET_BYTES))
+    write_bytes(out_png, _small_png(np.vstack([heading, *rows])))
 
 
 def preview_gif(
     tree: Path, out_gif: Path, choice: TrackChoice = ALL_TRACKS, frames_per_s: float = 1000 / GIF_FRAME_MS
 ) -> None:
-    """Read a playback tree and write its first clean track as an animation below 4 MB, with the target's box."""
+    """Read a playback tree and write its first clean track as an animation, with the target's box."""
     track, frames = _first_clean(tree, choice, "rgb.png")
-    num = MOST_GIF_FRAMES
-    while True:
-        data = _gif([_preview(track, frames[i]) for i in spread(len(frames), num)], round(1000 / frames_per_s))
-        if len(data) < GIF_BYTES or num <= FEWEST_GIF_FRAMES:
-            break
-        num = max(FEWEST_GIF_FRAMES, int(num * 0.9 * GIF_BYTES / len(data)))
-    write_bytes(out_gif, data)
+    pictures = [_preview(track, frames[i]) for i in spread(len(frames), MOST_GIF_FRAMES)]
+    write_bytes(out_gif, _gif(pictures, round(1000 / frames_per_s)))
 
 
 def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map: BoxMap | None = None) -> str:
@@ -173,14 +166,8 @@ def _gif(frames: list[Image.Image], frame_ms: int) -> bytes:
     return buffer.getvalue()
 
 
-def _png_below(rgb: np.ndarray, most_bytes: int) -> bytes:
-    """Encode a picture with a palette, scaled down until it is small enough."""
-    scale = 1.0
-    while True:
-        size = (round(rgb.shape[1] * scale), round(rgb.shape[0] * scale))
-        picture = Image.fromarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA) if scale < 1.0 else rgb)
-        buffer = io.BytesIO()
-        picture.quantize(256, dither=Image.Dither.NONE).save(buffer, format="PNG", optimize=True)
-        if buffer.tell() < most_bytes or size[0] < 64:
-            return buffer.getvalue()
-        scale *= 0.85
+def _small_png(rgb: np.ndarray) -> bytes:
+    """Encode a picture with a palette of 256 colours."""
+    buffer = io.BytesIO()
+    Image.fromarray(rgb).quantize(256, dither=Image.Dither.NONE).save(buffer, format="PNG", optimize=True)
+    return buffer.getvalue()
