@@ -20,7 +20,7 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.tables import rows_of
 from release.columns import PLACE, POINT
 from release.record import read_record
-from release.viewer.page import ViewerConfig, run
+from release.viewer.page import run
 from specimens import make_playback_tree
 
 NUM_POINTS = 24
@@ -69,7 +69,7 @@ def run_folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def page(run_folder, tmp_path_factory) -> Path:
-    return run(run_folder, tmp_path_factory.mktemp("page") / "viewer.html", ViewerConfig(frames=12, picture_px=64))
+    return run(run_folder, tmp_path_factory.mktemp("page") / "viewer.html", most_frames=12, picture_px=64)
 
 
 def data_of(text: str) -> dict:
@@ -110,7 +110,7 @@ def test_the_page_asks_for_nothing_and_names_its_script(page):
 
 def test_a_release_is_shown_as_its_rows_say(built, tmp_path):
     record = read_record(built / "release.json")
-    page = run(built.parent, tmp_path / "page.html", ViewerConfig(frames=3, picture_px=32))
+    page = run(built.parent, tmp_path / "page.html", most_frames=3, picture_px=32)
     data = data_of(page.read_text(encoding="utf-8"))
     assert data["kind"] == "release"
     assert {flight["name"]: (flight["split"], flight["num_frames"]) for flight in data["flights"]} == {
@@ -129,7 +129,7 @@ def test_a_release_is_shown_as_its_rows_say(built, tmp_path):
             assert caption["verdict"] == row["verdict"]
             found = [sentence["text"] for sentence in caption["texts"]["en"]]
             assert found == [row["caption_en_critical_components"], row["caption_en_reasoning_trace"]]
-    two = data_of(run(built, tmp_path / "two.html", ViewerConfig(flights=2, frames=1)).read_text(encoding="utf-8"))
+    two = data_of(run(built, tmp_path / "two.html", most_tracks=2, most_frames=1).read_text(encoding="utf-8"))
     assert len(two["flights"]) <= 2
     assert any("tracks are shown" in note for note in two["notes"])
 

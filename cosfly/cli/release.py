@@ -139,7 +139,7 @@ def view(
         else:
             gallery.preview_gif(source, out, choice)
     else:
-        from release.viewer.page import ViewerConfig, run
+        from release.viewer.page import run
 
-        run(source, out, ViewerConfig(picture_px=picture_px), captions)
+        run(source, out, captions, picture_px=picture_px)
     typer.echo(f"{out}: {out.stat().st_size / 1e6:,.1f} MB")

@@ -35,7 +35,6 @@ from cosfly.runtime.json_io import read_object, validated, write_json
 from cosfly.runtime.run_dir import Manifest, Resume, hold_folder, read_manifest
 from cosfly.viz.gallery import contact_sheet
 from release.package.sources import Source, choose_licence
-from release.viewer.page import ViewerConfig
 from release.viewer.page import run as write_viewer
 
 log = logging.getLogger(__name__)
@@ -213,7 +212,7 @@ def _run_town(cfg: RunConfig, out: Path, town_stages: list[Stage]) -> list[Stage
         is_shown = RunTotals.of(out).stages == _rows(results) and (out / "viewer.html").exists()
         if (out / "render/manifest.json").exists() and not is_shown:
             contact_sheet(out / "render", out / "contact_sheet.png")
-            write_viewer(out, out / "viewer.html", ViewerConfig())
+            write_viewer(out, out / "viewer.html")
         _save_summary(results, out)
     return results
 

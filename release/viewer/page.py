@@ -14,7 +14,6 @@ from typing import Any, NamedTuple, TypeVar
 import cv2
 import numpy as np
 import pyarrow as pa
-from pydantic import Field
 
 from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.formats.captions import Caption, Coc, read_captions
@@ -26,7 +25,6 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.answer_text import sentences_of
 from cosfly.runtime.arrays import parse_picture
-from cosfly.runtime.config import Config
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import for_terminal
@@ -77,26 +75,21 @@ SCANNED = [
 ]  # fmt: skip
 
 
-class ViewerConfig(Config):
-    """How much of a release or run a page holds."""
-
-    flights: int = Field(
-        100, ge=1, description="most tracks on a page; if there are more, evenly spread trajectories are shown"
-    )
-    frames: int = Field(16, ge=1, description="most frames per track, with at least one of each verdict and decision")
-    picture_px: int = Field(
-        320, ge=32, le=1280, description="width of a colour picture, px; other pictures have half of it"
-    )
-
-
-def run(folder: Path, out: Path, cfg: ViewerConfig, captions: Path | None = None) -> Path:
+def run(
+    folder: Path, out: Path, captions: Path | None = None, *, picture_px: int = 320, most_tracks: int = 100,
+    most_frames: int = 16,
+) -> Path:  # fmt: skip
     """Read a release (or the folder around it), a run or a playback tree; write one page and return its path.
 
     Args:
         captions: `captions.jsonl` of a playback tree; a run has its own.
+        picture_px: Width of a colour picture; the others have half of it.
+        most_tracks: Of more, whole trajectories are shown, evenly spread.
+        most_frames: Of a track, among them one of each verdict and decision.
     """
     dataset = next((place for place in (folder, folder / "dataset") if (place / "release.json").exists()), None)
-    data = _show_run(folder, cfg, captions) if dataset is None else _show_release(dataset, cfg)
+    limits = most_tracks, most_frames, picture_px
+    data = _show_run(folder, captions, *limits) if dataset is None else _show_release(dataset, *limits)
     script, style = scripts("tools.js", "canvas.js", "viewer.js"), scripts("viewer.css")
     values = {"title": data["title"], "notes": data["notes"], "data": _printable(data)}
     write_bytes(out, page("cosfly/viz/templates/viewer.html", style=style, script=script, **values).encode())
@@ -129,10 +122,10 @@ class _ScannedRow(NamedTuple):
     stored: tuple[Path, int]
 
 
-def _show_release(dataset: Path, cfg: ViewerConfig) -> dict[str, Any]:
+def _show_release(dataset: Path, most_tracks: int, most_frames: int, picture_px: int) -> dict[str, Any]:
     record = read_record(dataset / "release.json")
     names = [flight.flight for flight in record.flights]
-    chosen, notes = _choose_tracks(names, [name.rpartition("/")[0] for name in names], cfg)
+    chosen, notes = _choose_tracks(names, [name.rpartition("/")[0] for name in names], most_tracks)
     notes.append("a release has no map: the tracks are drawn without one")
     tracks: dict[Place, dict[str, Any]] = {}
     scanned: dict[Place, dict[int, _ScannedRow]] = defaultdict(dict)
@@ -142,14 +135,14 @@ def _show_release(dataset: Path, cfg: ViewerConfig) -> dict[str, Any]:
     frames: dict[Place, list[int]] = {}
     for place, rows in scanned.items():
         kinds = {index: row.kind for index, row in rows.items() if row.kind is not None}
-        frames[place] = choose_frames(sorted(rows), kinds, cfg.frames)
+        frames[place] = choose_frames(sorted(rows), kinds, most_frames)
         fovs, places_m = {row.fov_deg for row in rows.values()}, [rows[index].places_m for index in sorted(rows)]
         tracks[place] |= _track(place, np.array(places_m), (min(fovs), max(fovs)), len(kinds))
     wanted: dict[Path, set[int]] = defaultdict(set)
     for place, indices in frames.items():
         for path, group in (scanned[place][index].stored for index in indices):
             wanted[path].add(group)
-    _add_frames(tracks, frames, _release_rows(dataset, record, frames, wanted), cfg.picture_px)
+    _add_frames(tracks, frames, _release_rows(dataset, record, frames, wanted), picture_px)
     return {"title": record.name, "kind": "release", "notes": notes, "maps": {}, "flights": list(tracks.values())}
 
 
@@ -235,10 +228,12 @@ def find_trees(folder: Path, captions: Path | None = None) -> list[Tree]:
     return trees or [Tree("", folder, captions)]
 
 
-def _show_run(folder: Path, cfg: ViewerConfig, captions: Path | None) -> dict[str, Any]:
+def _show_run(
+    folder: Path, captions: Path | None, most_tracks: int, most_frames: int, picture_px: int
+) -> dict[str, Any]:
     trees = find_trees(folder, captions)
     found = {tree.place(place_of(path)): (tree, path) for tree in trees for path in find_tracks(tree.data)}
-    chosen, notes = _choose_tracks(list(found), [place[:-1] for place in found], cfg)
+    chosen, notes = _choose_tracks(list(found), [place[:-1] for place in found], most_tracks)
     kinds: dict[Place, dict[int, tuple]] = {place: {} for place in chosen}
     for place, caption in _captions(trees):
         if place in kinds:
@@ -254,14 +249,14 @@ def _show_run(folder: Path, cfg: ViewerConfig, captions: Path | None) -> dict[st
         except InputError as error:
             notes.append(f"not shown: {path.parent.name}/{path.name}: {error.what}")
             continue
-        frames[place] = choose_frames(range(len(track)), kinds[place], cfg.frames)
+        frames[place] = choose_frames(range(len(track)), kinds[place], most_frames)
         names = tree.run, track.town, track.trajectory, track.variant
         places_m = np.hstack([track.positions_m[:, :2], track.targets_m[:, :2]])
         tracks[place] = _track(names, places_m, track.fovs_deg, len(kinds[place]))
         kind = "clean" if track.is_original else "perturbed"
         tracks[place] |= {"town": track.town, "track": kind, "split": None, "result": results.get(place)}
     rows = _run_rows({place: found[place][1] for place in frames}, frames, trees)
-    _add_frames(tracks, frames, rows, cfg.picture_px)
+    _add_frames(tracks, frames, rows, picture_px)
     shown = list(tracks.values())
     title = folder.absolute().name
     return {"title": title, "kind": "run", "notes": notes, "maps": _maps(trees, shown), "flights": shown}
@@ -303,7 +298,7 @@ def _maps(trees: list[Tree], tracks: list[dict[str, Any]]) -> dict[str, list[dic
 # --- tracks, frames and captions on the page --------------------------------------------------------------------------
 
 
-def _choose_tracks(tracks: Sequence[Item], groups: Sequence[Hashable], cfg: ViewerConfig) -> tuple[list[Item], list]:
+def _choose_tracks(tracks: Sequence[Item], groups: Sequence[Hashable], most: int) -> tuple[list[Item], list]:
     """Choose whole groups (the tracks of a trajectory), spread evenly, as many as fit, and one at least; return their
     tracks, and a note if there are others."""
     by_group: dict[Hashable, list[Item]] = defaultdict(list)
@@ -312,7 +307,7 @@ def _choose_tracks(tracks: Sequence[Item], groups: Sequence[Hashable], cfg: View
     named, chosen = list(by_group.values()), list(tracks)
     for count in range(len(named), 0, -1):
         chosen = [track for k in spread(len(named), count) for track in named[k]]
-        if len(chosen) <= cfg.flights:
+        if len(chosen) <= most:
             break
     is_all = len(chosen) == len(tracks)
     return chosen, [] if is_all else [f"{len(chosen):,} of {len(tracks):,} tracks are shown"]
