@@ -158,9 +158,7 @@ def check_page(page: str, honest: str) -> None:
 def test_the_page_of_an_inspection_shows_forged_records(inspection):
     honest = read_inspection(inspection)
     false = forged(Inspection, honest, 8)
-    check_page(
-        report_html(HOSTILE, false, {}, page_mb=25.0), (inspection.parent / "report.html").read_text(encoding="utf-8")
-    )
+    check_page(report_html(HOSTILE, false, {}), (inspection.parent / "report.html").read_text(encoding="utf-8"))
 
 
 def test_the_page_of_a_captioning_run_shows_forged_captions(tree, tmp_path):

@@ -55,9 +55,8 @@ TREE_ACTION = ("forward_mps", "right_mps", "up_mps", "yaw_rate_degps", "gimbal_p
 TREE_ACTION_SIGNS = np.array([1.0, -1.0, 1.0, -1.0, 1.0])  # left becomes right, counter-clockwise clockwise
 LEGIBILITY = ("height_px", "contrast", "legible")  # fields of a point's target, measured in cosfly/render/camera.py
 EVENTS = ("position", "rotation")  # events of a perturbed frame; docs/files.md lists their outcomes
-# States of the frames of a perturbed track, and the shares of the paper. Each event has a probability of 0.6
-# (tab:augmentation_states). Index: 1 if the position is perturbed, plus 2 if the rotation is.
-STATES = {"unperturbed": 0.16, "position only": 0.24, "rotation only": 0.24, "full": 0.36}
+# States of the frames of a perturbed track. Index: 1 if the position is perturbed, plus 2 if the rotation is.
+STATES = ("unperturbed", "position only", "rotation only", "full")
 DATASET_FORMAT = "cosfly_playback"  # marks tracks that cosfly made
 # Keys under which a file may store the names of weather presets; neither the paper nor a public file defines one.
 WEATHER_KEYS = {
@@ -249,14 +248,13 @@ class Track:
     def states(self) -> list[str | None]:
         """State of each frame after fallbacks, one of STATES; None if unknown."""
         offsets = self.perturbation
-        names = list(STATES)
         states = list[str | None]()
         for i in range(len(self)):
             point = self._point(i, "perturbation")
             positions = np.stack([offsets.drone_m[i], offsets.target_m[i]])
             is_shifted = _was_moved(positions, point.get("drone_position"))
             is_turned = _was_moved(offsets.rotation_deg[i : i + 1], point.get("drone_rotation"))
-            states.append(None if is_shifted is None or is_turned is None else names[is_shifted + 2 * is_turned])
+            states.append(None if is_shifted is None or is_turned is None else STATES[is_shifted + 2 * is_turned])
         return states
 
     @property

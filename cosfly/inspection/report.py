@@ -13,13 +13,13 @@ from pydantic import BaseModel, Field
 
 from cosfly.formats.inspection import RESULTS, Inspection
 from cosfly.formats.issues import Issue, sort_key
-from cosfly.formats.playback import STATES, Track
+from cosfly.formats.playback import Track
 from cosfly.runtime.io import read_text
 from cosfly.viz.frame_views import thumbnail
 from cosfly.viz.page import page
 
 STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
-MB = 1_000_000
+MOST_SHOWN = 400  # tracks with pictures, 0.06 MB each
 
 # column title, metric, format
 COLUMNS = (
@@ -59,30 +59,16 @@ def frames_of_issues(issues: Sequence[Issue], num_frames: int) -> list[int]:
     return list(frames)
 
 
-def report_html(
-    name: str, inspection: Inspection, pictures: Mapping[str, Sequence[ReportPicture]], page_mb: float
-) -> str:
+def report_html(name: str, inspection: Inspection, pictures: Mapping[str, Sequence[ReportPicture]]) -> str:
     """Return the page, with the tracks that need a decision first.
 
     Args:
         name: Name of the run.
-        pictures: By track folder. More than `page_mb` of them are omitted, those of the last tracks.
+        pictures: By track folder; only those of the first MOST_SHOWN tracks are shown.
     """
     tracks = sorted(inspection.flights, key=lambda track: (-RESULTS.index(track.result), track.folder))
-    room = page_mb * MB
-    shown = dict[str, Sequence[ReportPicture]]()
-    for folder in (track.folder for track in tracks if track.folder in pictures):
-        room -= sum(len(picture.jpeg or "") for picture in pictures[folder])
-        if room >= 0:
-            shown[folder] = pictures[folder]
-    counts = {
-        state: sum(int(track.metrics.get(f"frames_{state.replace(' ', '_')}") or 0) for track in tracks)
-        for state in STATES
-    }
-    total = sum(counts.values())
+    shown = {track.folder: pictures[track.folder] for track in tracks[:MOST_SHOWN] if track.folder in pictures}
     return page(
         "cosfly/inspection/report.html", title=name, style=STYLE, inspection=inspection, results=RESULTS,
-        columns=COLUMNS, tracks=tracks, shown=shown, num_without_pictures=len(pictures) - len(shown), page_mb=page_mb,
-        states=[(name, counts[name], f"{counts[name] / max(total, 1):.1%}", f"{STATES[name]:.0%}") for name in STATES],
-        num_perturbable=total,
+        columns=COLUMNS, tracks=tracks, shown=shown, num_without_pictures=len(pictures) - len(shown),
     )  # fmt: skip

@@ -33,7 +33,6 @@ JUMP_GONE_MAX = 0.02  # share of static surface that is missing in the next or p
 MASK_VISIBILITY_MIN = 0.5  # a frame at least this visible must show pedestrian pixels at the target's box
 FLAT_PAIRS_MIN = 0.99  # share of equal neighbours in a surface of one colour; renders of three maps have at most 0.95
 THUMBNAIL_PX = 240  # width of the pictures in report.html
-PAGE_MB = 25.0  # size of report.html beyond which tracks have no pictures, accepted ones first; a track takes 0.06
 
 
 class InspectConfig(Config):

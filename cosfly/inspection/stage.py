@@ -26,7 +26,7 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.tracks import find_tracks
 from cosfly.inspection.report import ReportPicture, report_html
-from cosfly.inspection.settings import PAGE_MB, InspectConfig
+from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.track import InspectedTrack, inspect_track, trace_id
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import write_bytes
@@ -92,7 +92,7 @@ def run(
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="inspect: frames")
     inspection, pictures = assemble(finished, planned, cfg, data)
     write_inspection(product, inspection)
-    write_bytes(out / "report.html", report_html(run_name(out), inspection, pictures, PAGE_MB).encode())
+    write_bytes(out / "report.html", report_html(run_name(out), inspection, pictures).encode())
     stage.finish([product, out / "report.html"], finished.tally, funnel=inspection.funnel.model_dump(mode="json"))
     _log_review(inspection.funnel.flights, out)
     return product

@@ -5,7 +5,6 @@ The rendered poses are measured against the map, because the poses of a perturbe
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +16,7 @@ from cosfly.formats.frames import LEGIBLE_HEIGHT_PX
 from cosfly.formats.inspection import Result, TrackInspection
 from cosfly.formats.issues import Report
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
-from cosfly.formats.playback import STATES, Track, read_track
+from cosfly.formats.playback import Track, read_track
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.tracks import read_twin
 from cosfly.geometry.axes import project, step_s, world_from_camera, wrap_deg
@@ -86,9 +85,6 @@ def inspect_track(
     if obstacles is not None:
         check_surroundings(track, obstacles, cfg, report, metrics)
     check_shifts(track, report, metrics)
-    if not track.is_original:
-        counts = Counter(track.states)
-        metrics.update({f"frames_{state.replace(' ', '_')}": counts[state] for state in STATES})
     check_motion(track, report)
     check_projection(track, report)
     check_recorded(folder, root, recorded, report)
