@@ -65,9 +65,6 @@ def run(
 
     Args:
         folders: Name and folder; with the name "" the folder is named after its student.
-
-    Raises:
-        InputError: Two folders of one name contain the same episode.
     """
     students: dict[str, StudentFolders] = {}
     for name, folder in folders:

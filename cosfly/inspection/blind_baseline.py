@@ -143,12 +143,7 @@ def fit_deciders(table: np.ndarray, labels: np.ndarray, rng: np.random.Generator
 
 
 def fit_rule(table: np.ndarray, labels: np.ndarray, depth: int = 2) -> Rule:
-    """Fit a decision tree with the threshold of the least Gini impurity at each node.
-
-    Args:
-        table: (n, d) pasts.
-        labels: (n,) numbers of decisions.
-    """
+    """Fit a decision tree, as `fit_network`, with the threshold of the least Gini impurity at each node."""
     counts = np.bincount(labels)
     if depth == 0 or (counts > 0).sum() < 2:
         return int(counts.argmax())

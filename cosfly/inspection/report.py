@@ -60,12 +60,7 @@ def frames_of_issues(issues: Sequence[Issue], num_frames: int) -> list[int]:
 
 
 def report_html(name: str, inspection: Inspection, pictures: Mapping[str, Sequence[ReportPicture]]) -> str:
-    """Return the page, with the tracks that need a decision first.
-
-    Args:
-        name: Name of the run.
-        pictures: By track folder; only those of the first MOST_SHOWN tracks are shown.
-    """
+    """Return the page, with the tracks that need a decision first. pictures: by track folder."""
     tracks = sorted(inspection.flights, key=lambda track: (-RESULTS.index(track.result), track.folder))
     shown = {track.folder: pictures[track.folder] for track in tracks[:MOST_SHOWN] if track.folder in pictures}
     return page(

@@ -105,12 +105,7 @@ def read_paper() -> Paper:
 def run(
     cfg: RunConfig, folder: Path, out: Path, *, pedestrians: int = 20, seed: int = 0, resume: Resume, **pool: Any
 ) -> Path:
-    """Read a run directory; write `reproduction.html` and `reproduction.json`, and return the page.
-
-    Args:
-        pedestrians: Number of pedestrians that planners are measured on.
-        pool: `workers` and `watch` of stages.
-    """
+    """Read a run directory; write `reproduction.html` and `reproduction.json`, and return the page."""
     done = [stage.name for stage in summarize(folder).stages if stage.state == "complete"]
     if missing := [name for name in STAGES if name not in done]:
         fix = f"complete the run: cosfly run {folder}"

@@ -107,9 +107,6 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "
 
     With several towns each town has its own run directory below `out`, and one `release` is made of all. Every stage is
     complete or resumable at any moment. The run ends with `contact_sheet.png`, `viewer.html` and `summary.json`.
-
-    Args:
-        until: The last stage to run.
     """
     out = cfg.opened(out)
     num_stages = STAGES.index(until) + 1

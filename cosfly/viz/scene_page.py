@@ -63,11 +63,7 @@ def run(
     data: Path | None = None,
     picture_px: int = 320,
 ) -> Path:
-    """Read a map, pedestrian trajectories, drone trajectories of planners and a playback tree; write one page.
-
-    Args:
-        picture_px: Width of the pictures of frames.
-    """
+    """Read a map, pedestrian trajectories, drone trajectories of planners and a playback tree; write one page."""
     box_map = read_boxes(map_)
     notes = list[str]()
     pedestrians = [] if paths is None else read_paths(paths)
