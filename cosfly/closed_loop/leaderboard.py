@@ -5,16 +5,16 @@ A table contains only students with the same episodes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from cosfly.closed_loop.measures import MEASURES, SHARES, figures_of, score_measured
+from cosfly.closed_loop.measures import MEASURES, SHARES, figures_of
 from cosfly.closed_loop.settings import BASELINES
 from cosfly.formats.episodes import Figure, Score, read_score
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import sha256_bytes, write_bytes
+from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, Record, write_model
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.runtime.seeding import rng_for
@@ -24,7 +24,7 @@ from distill.evaluation.pages import COLORS, STYLE, bars, shown_as
 Role = Literal["student", "floor", "ceiling"]
 RANKED_BY = ("success", "in_view")
 HEADLINE = ("success", "in_view", "tracked_frames", "kept_s", "lost", "crashed")
-BOARD_FORMAT = FileFormat("cosfly.leaderboard", "1.0", "leaderboard")
+BOARD_FORMAT = FileFormat("cosfly.leaderboard", "2.0", "leaderboard")
 
 
 class LeaderboardConfig(Config):
@@ -45,7 +45,7 @@ class Standing(Record):
 class StudentTable(Record):
     """Students with the same episodes."""
 
-    episodes: tuple[str, ...]  # digest of the episodes of each folder
+    episodes_sha256: str
     standings: tuple[Standing, ...]
 
 
@@ -53,9 +53,6 @@ class Leaderboard(Record):
     """`leaderboard.json`."""
 
     tables: tuple[StudentTable, ...]
-
-
-StudentFolders = dict[Path, Score]  # the folders of one student
 
 
 def run(
@@ -66,21 +63,8 @@ def run(
     Args:
         folders: Name and folder; with the name "" the folder is named after its student.
     """
-    students: dict[str, StudentFolders] = {}
-    for name, folder in folders:
-        score = read_score(folder)
-        student = name or score.student
-        scores = students.setdefault(student, {})
-        earlier = {(flight.town, flight.episode) for other in scores.values() for flight in other.flights}
-        for flight in score.flights:
-            if (flight.town, flight.episode) in earlier:
-                raise InputError(
-                    "two folders of the same student contain the same episode",
-                    where=f"{student}: {folder}",
-                    got=f"{flight.town}, {flight.episode}",
-                    fix="give each folder its own name: NAME=DIR",
-                )
-        scores[folder] = score
+    scores = [read_score(folder) for _, folder in folders]
+    students = [(name or score.student, score) for (name, _), score in zip(folders, scores, strict=True)]
     inputs = {f"{number}/{name}": folder for number, (name, folder) in enumerate(folders)}
     stage = StageFolder.open(out, "leaderboard", config=cfg, inputs=inputs, seed=seed, resume=resume)
     path = out / "leaderboard.html"
@@ -93,42 +77,25 @@ def run(
     return path
 
 
-def tables_of(students: Mapping[str, StudentFolders], cfg: LeaderboardConfig, seed: int) -> list[StudentTable]:
+def tables_of(students: Sequence[tuple[str, Score]], cfg: LeaderboardConfig, seed: int) -> list[StudentTable]:
     """Return one table for each set of episodes, sorted by success, or by round."""
-    groups: dict[tuple[str, ...], list[Standing]] = {}
-    for name, folders in students.items():
-        scores = list(folders.values())
-        digests = tuple(sorted(score.episodes_sha256 for score in scores))
-        merged = _merged_score(scores, digests, seed)
-        group = groups.setdefault(digests, [])
+    groups: dict[str, list[Standing]] = {}
+    for name, score in students:
+        group = groups.setdefault(score.episodes_sha256, [])
+        if name in (standing.name for standing in group):
+            fix = "give each folder a name of its own: NAME=DIR"
+            raise InputError("two students of one table have the same name", where="leaderboard", got=name, fix=fix)
         gain = None
         if cfg.rounds and group:
-            gain = figures_of(merged.flights, rng_for(seed, "leaderboard", "gains"), group[-1].score.flights)
-        role: Role = "ceiling" if merged.engine == "planner" else "student"
-        if merged.engine in BASELINES:
+            gain = figures_of(score.flights, rng_for(seed, "leaderboard", "gains"), group[-1].score.flights)
+        role: Role = "ceiling" if score.engine == "planner" else "student"
+        if score.engine in BASELINES:
             role = "floor"
-        group.append(Standing(name=name, role=role, score=merged, gain=gain))
+        group.append(Standing(name=name, role=role, score=score, gain=gain))
     if not cfg.rounds:
         for group in groups.values():
             group.sort(key=lambda row: [row.score.figures[name].value or 0.0 for name in RANKED_BY], reverse=True)
-    return [StudentTable(episodes=digests, standings=tuple(group)) for digests, group in groups.items()]
-
-
-def _merged_score(scores: list[Score], digests: tuple[str, ...], seed: int) -> Score:
-    """Return the score of one student over all its folders; `trained_on` is known only if all of them know it."""
-    first = scores[0]
-    trained_on = None
-    if all(score.trained_on is not None for score in scores):
-        trained_on = sorted({town for score in scores for town in score.trained_on or ()})
-    return score_measured(
-        [flight for score in scores for flight in score.flights],
-        seed,
-        student=first.student,
-        engine=first.engine,
-        episodes_sha256=sha256_bytes(" ".join(digests).encode()),
-        list_sha256=first.list_sha256 if len(scores) == 1 else None,
-        trained_on=trained_on,
-    )
+    return [StudentTable(episodes_sha256=digest, standings=tuple(group)) for digest, group in groups.items()]
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from itertools import groupby, pairwise
-from typing import Any
 
 import numpy as np
 
@@ -150,26 +149,18 @@ def score_episodes(records: Iterable[Episode], *, trained_on: Sequence[str] | No
     for episode in records:
         measured.append(measure(episode, trained_on))
         digests.append(episode_digest(episode))
-    return score_measured(
-        sorted(measured, key=lambda score: (score.town, score.episode)),
-        seed,
-        episodes_sha256=sha256_bytes(dump_json(sorted(digests)).encode()),
-        trained_on=trained_on,
-        student=episode.student or None,
-        engine=episode.engine or None,
-        list_sha256=episode.list_sha256,
-    )
-
-
-def score_measured(measured: Sequence[EpisodeScore], seed: int, **fields: Any) -> Score:
-    """Score measured episodes, of one map or several. fields: those of Score that are not computed here."""
+    measured.sort(key=lambda score: (score.town, score.episode))
     by: dict[str, dict[str, dict[str, Figure]]] = {kind: {} for kind in GROUPS}
     for kind, groups in by.items():
         for name in sorted({score.groups[kind] for score in measured}):
             group = [score for score in measured if score.groups[kind] == name]
             groups[name] = figures_of(group, rng_for(seed, "score", "draws"))
     figures = figures_of(measured, rng_for(seed, "score", "draws"))
-    return Score(**fields, confidence=CONFIDENCE, resamples=RESAMPLES, figures=figures, by=by, flights=tuple(measured))
+    return Score(
+        episodes_sha256=sha256_bytes(dump_json(sorted(digests)).encode()), trained_on=trained_on,
+        student=episode.student, engine=episode.engine, list_sha256=episode.list_sha256,
+        confidence=CONFIDENCE, resamples=RESAMPLES, figures=figures, by=by, flights=tuple(measured),
+    )  # fmt: skip
 
 
 def figures_of(
