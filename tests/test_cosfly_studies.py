@@ -1,4 +1,4 @@
-"""Studies: depth and zoom."""
+"""Studies: depth, the beam of TA*+Smooth, and zoom."""
 
 import json
 
@@ -6,13 +6,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from specimens_planning import CANYON, town_of, walk_along
 from test_cosfly_render import needs_gl
 from test_cosfly_zoom import IN_THE_WALL
 from test_renderers_contract import circling, write_inputs
 from typer.testing import CliRunner
 
 from cosfly.cli import app
+from cosfly.formats.boxes import write_boxes
+from cosfly.formats.pedestrian_paths import write_paths
+from cosfly.planners.contract import PlanConfig
 from cosfly.runtime.run_dir import read_manifest
+from cosfly.studies import beam
+from cosfly.studies.beam import FIGURES, PAPER_BEAM, Planned
 from cosfly.studies.depth import BITS, quantised, study_of
 from cosfly.studies.zoom import enlarged_fov_deg, tree_of
 
@@ -49,6 +55,34 @@ def test_codes_are_within_half_a_step(bits, seed):
     step = (float(truth.max()) - float(truth.min())) / (2**bits - 1)
     assert np.abs(values - truth).max() <= step / 2 * 1.0001 + 1e-6
     assert (codes.min(), codes.max()) == (0, 2**bits - 1)
+
+
+def planned(value, reason=None):
+    return Planned(figures=None if value is None else dict.fromkeys(FIGURES, value), reason=reason)
+
+
+def test_differences_are_those_of_the_walks_that_both_fly():
+    many = {
+        PAPER_BEAM: [planned(1.0), planned(5.0), planned(None, "no_path")],
+        64: [planned(3.0), planned(None, "no_path"), planned(9.0)],
+    }
+    rows = beam.summarize(many, np.random.default_rng(0))
+    assert rows[64]["figures"]["length_m"] == {"mean": 3.0, "difference": 2.0, "low": 2.0, "high": 2.0}
+    assert rows[64]["kept"] == 2
+    nobody = beam.summarize({PAPER_BEAM: [planned(None, "no_path")]}, np.random.default_rng(0))
+    assert nobody[PAPER_BEAM] == {"walks": 1, "kept": 0, "figures": {}}
+
+
+@pytest.mark.slow
+def test_the_study_of_beams_twice_gives_the_same_bytes(tmp_path):
+    write_boxes(tmp_path / "map.json", town_of(*CANYON))
+    write_paths(tmp_path / "path.json", [walk_along("path_00000", [(0, 0), (30, 0)])], {})
+    one, two = (
+        beam.run(PlanConfig(), tmp_path / "map.json", tmp_path / "path.json", tmp_path / out, workers=1)
+        for out in ("one", "two")
+    )
+    assert one.read_bytes() == two.read_bytes()
+    assert json.loads(one.read_text())["beams"]["2048"]["kept"] == 1
 
 
 LEVELS = [110.0, 60.0, 30.0]

@@ -1,7 +1,7 @@
 """`cosfly reproduce`: the paper's tables and figures from one run, next to the paper's own, on one page.
 
-Figures that the run recorded are read from its stages. The others are measured again in folders below `out`: planners
-and zoom are stages that resume after a kill; depth, weather and single pictures are computed each time.
+Figures that the run recorded are read from its stages. The others are measured again in folders below `out`: planners,
+TA*'s beam and zoom are stages that resume after a kill; depth, weather and single pictures are computed each time.
 `paper.yaml` lists the place of each figure (see `figure_places`), the paper's value, the reason for a difference, and
 what is not reproduced.
 """
@@ -36,7 +36,7 @@ from cosfly.runtime.events import read_events
 from cosfly.runtime.io import read_bytes, write_bytes
 from cosfly.runtime.json_io import FileFormat, read_object, write_json
 from cosfly.runtime.run_dir import Manifest, Resume, read_manifest
-from cosfly.studies import depth, weather, zoom
+from cosfly.studies import beam, depth, weather, zoom
 from cosfly.viz.frame_views import small_jpeg
 from cosfly.viz.gallery import four_panels
 from cosfly.viz.page import page, run_name
@@ -298,6 +298,7 @@ def measure(
     plan = cfg.plan.model_copy(update={"styles": {FOLLOW: 1.0}})
     compared = build(compare.CompareConfig, plan.model_dump() | {"planners": PLANNERS}, "planners")
     compare.run(compared, simplified, paths, out / "compare", **options)
+    beam.run(plan, simplified, paths, out / "beam", **options)
     if "release" in done:
         release_stats(folder / "release/dataset", out / "release", pixels=0)
     if "render" not in done:
