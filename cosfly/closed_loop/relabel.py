@@ -145,8 +145,6 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
         indices = tuple(moment.index for moment in after[1:])
         future = FutureMotion(indices, time_s, positions_m, yaw_deg, targets_m, visible, speed_mps)
         reasons = _reasons(record, i, future)
-        if relabel.mistakes_only and not reasons:
-            return Outcome(drop_reason="no_mistake")
         poses = simulation.poses
         source = {"student": record.student, "round": relabel.round}
         trace = flown_trace(

@@ -62,7 +62,6 @@ class RelabelConfig(Config):
     future_frames: int = Field(
         10, ge=5, le=100, description="number of frames that the planner adds after those of the student"
     )
-    mistakes_only: bool = Field(False, description="skip decisions that were no mistakes, which makes students worse")
     round: int = Field(1, ge=1, description="round of DAgger, recorded in the output")
 
 
