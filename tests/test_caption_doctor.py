@@ -88,13 +88,13 @@ def test_a_sound_endpoint_passes_every_check():
 
 # defect, the finding it must show in, its state, words of the detail
 DEFECTS = [
-    ({"obeys_schema": False}, "JSON schema", "warning", "accepted and ignored"),
+    ({"obeys_schema": False}, "JSON schema", "warning", "accepted but ignored"),
     ({"refuses_schema": True}, "JSON schema", "warning", "refused"),
     ({"max_images": 5}, "image input", "unusable", "At most 5 image(s)"),
     ({"max_images": 5, "status": 200}, "image input", "unusable", "--limit-mm-per-prompt"),
-    ({"sees_images": 0}, "image input", "unusable", "accepted and ignored"),
-    ({"counts": False}, "image input", "warning", "without token usage"),
-    ({"thinks": True}, "thinking", "warning", "switch it off"),
+    ({"sees_images": 0}, "image input", "unusable", "accepted but ignored"),
+    ({"counts": False}, "image input", "warning", "token usage is not reported"),
+    ({"thinks": True}, "thinking", "warning", "switch thinking off"),
     ({"context": 5000}, "context length", "unusable", "context length is 5000"),
     ({"context": 5000}, "context length", "unusable", "--max-model-len"),
     ({"context": 6000, "shortens": True}, "context length", "unusable", "more than 6000"),

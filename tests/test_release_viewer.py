@@ -166,7 +166,7 @@ def test_the_page_opens_offline_and_shows_pictures_map_and_captions(tab, page):
     assert tab.run("[...document.images].length") == 3
     found = tab.run("Promise.all([...document.images].map((one) => one.decode().then(() => one.naturalWidth)))")
     assert found == [64, 32, 32]
-    assert "2 boxes, 3 ways" in tab.run("document.getElementById('plan').getAttribute('aria-label')")
+    assert "2 boxes, 3 trajectories" in tab.run("document.getElementById('plan').getAttribute('aria-label')")
     assert [url for url in tab.requests if not url.startswith(("data:", "about:"))] == [page.absolute().as_uri()]
     assert tab.said == []
     for name in ("--person", "--clean", "--perturbed", "--house"):  # both tracks, the person and a house are on the map

@@ -128,12 +128,14 @@ class _Examination:
         if not probe.text:
             empty = "an empty answer"
             if probe.thoughts:
-                empty = f"{probe.thoughts} characters of thinking and no answer: {NO_THINKING}"
+                empty = f"{probe.thoughts} characters of thinking and no answer; switch thinking off with {NO_THINKING}"
             self._add("answers", "unusable", probe.detail or empty)
             return False
         self._add("answers", "ok", f"{probe.text[:40]!r}")
         if probe.thoughts or "<think" in probe.text:
-            self._add("thinking", "warning", f"switch it off: {NO_THINKING}")
+            self._add(
+                "thinking", "warning", f"the model thinks before it answers; switch thinking off with {NO_THINKING}"
+            )
         else:
             self._add("thinking", "ok", "off")
         return True
@@ -142,17 +144,17 @@ class _Examination:
         probe = await self._ask([_user("Hello! How are you today?")], 256, ODD_SCHEMA)
         if probe.reply is None:
             self.takes_schema &= not probe.refuses_schema
-            self._add("JSON schema", "warning", f"refused ({probe.detail}); answers are parsed from plain text")
+            self._add("JSON schema", "warning", f"refused ({probe.detail}), so answers are parsed from plain text")
             return
         try:
             is_applied = parse_json(probe.text) == {"animal": ODD_WORD, "legs": 7}
         except ValueError:
             is_applied = False
         if is_applied:
-            self._add("JSON schema", "ok", "applied: the answer had a shape that the model would not choose")
+            self._add("JSON schema", "ok", "applied: the answer has the unusual shape of the schema")
         else:
-            got = f"accepted and ignored: asked for {{animal: {ODD_WORD}}}, got {probe.text[:40]!r}"
-            effect = "answers are parsed from plain text, an anchored decision is not enforced"
+            got = f"accepted but ignored: asked for {{animal: {ODD_WORD}}}, got {probe.text[:40]!r}"
+            effect = "so answers are parsed from plain text, and an anchored decision is not enforced"
             self._add("JSON schema", "warning", f"{got}; {effect}")
 
     async def _takes_images(self) -> bool:
@@ -160,18 +162,22 @@ class _Examination:
         count, limit = self.cfg.num_images, self.cfg.endpoint.max_tokens
         probe = await self._ask([_user(READY, self._pictures())], limit)
         if probe.reply is None:
-            self._add("image input", "unusable", f"{count} of a prompt refused: {probe.detail}")
+            self._add("image input", "unusable", f"a prompt with {count} pictures is refused: {probe.detail}")
             return False
         without = await self._ask([_user(READY)], limit)
         if probe.prompt_tokens is None or without.prompt_tokens is None:
-            detail = "accepted; without token usage it is unknown whether the model sees them"
-            self._add("image input", "warning", f"{count} in a prompt {detail}")
+            detail = "but it is unknown whether the model sees them, because token usage is not reported"
+            self._add("image input", "warning", f"{count} pictures in a prompt are accepted, {detail}")
             return True
         tokens = probe.prompt_tokens - without.prompt_tokens
         if tokens < count:
-            self._add("image input", "unusable", f"{count} in a prompt accepted and ignored: {tokens} tokens more")
+            self._add(
+                "image input",
+                "unusable",
+                f"{count} pictures in a prompt are accepted but ignored: they add {tokens} tokens",
+            )
             return False
-        self._add("image input", "ok", f"{count} in a prompt, {tokens} tokens")
+        self._add("image input", "ok", f"{count} pictures in a prompt, {tokens} tokens")
         return True
 
     async def _try_context(self) -> None:
@@ -179,10 +185,10 @@ class _Examination:
         limit, context = self.cfg.endpoint.max_tokens, self.client.context
         messages = largest_messages(self.cfg, self.vocabulary, self._pictures())
         probe = await self._ask(messages, limit, answer_schema(more=THEREFORE) if self.takes_schema else None)
-        used, known = probe.prompt_tokens, f" of {context} that the model holds" if context else ""
+        used, known = probe.prompt_tokens, f" of the context of {context}" if context else ""
         detail = f"{used or 'unknown'} tokens of the largest prompt and {limit} for the answer"
         if probe.reply is None:
-            self._add("context length", "unusable", f"the largest prompt{known} refused: {probe.detail}")
+            self._add("context length", "unusable", f"the largest prompt is refused: {probe.detail}")
         elif context and used is not None and used + limit > context:
             self._add("context length", "unusable", f"{detail}, more than {context}: {MEANINGS['too_long'].fix}")
         else:

@@ -86,7 +86,7 @@ function drawFilters() {
     select.addEventListener("change", () => { state[name] = select.value; update(); });
     return [make("label", {}, make("span", {}, title), select)];
   });
-  const search = make("input", { type: "search", name: "q", value: state.q, placeholder: "words of a caption, a flight, a style" });
+  const search = make("input", { type: "search", name: "q", value: state.q, placeholder: "words of a caption, a track, a style" });
   search.addEventListener("input", () => { state.q = search.value; update(); });
   const clear = make("button", { type: "button" }, "clear");
   clear.addEventListener("click", () => { for (const [name] of FACETS) state[name] = ""; state.q = ""; drawFilters(); update(); });
@@ -96,8 +96,8 @@ function drawFilters() {
 function drawLead() {
   const frames = data.flights.reduce((sum, flight) => sum + flight.num_frames, 0);
   const captions = data.flights.reduce((sum, flight) => sum + flight.num_captions, 0);
-  byId("lead").textContent = `A ${data.kind}: ${data.flights.length} flights with ${frames.toLocaleString("en")} frames and ` +
-    `${captions.toLocaleString("en")} captions; ${samples.length.toLocaleString("en")} frames are shown here. Keys: \u2190 \u2192 frame, \u2191 \u2193 flight.`;
+  byId("lead").textContent = `A ${data.kind}: ${data.flights.length} tracks with ${frames.toLocaleString("en")} frames and ` +
+    `${captions.toLocaleString("en")} captions; ${samples.length.toLocaleString("en")} frames are shown here. Keys: \u2190 \u2192 frame, \u2191 \u2193 track.`;
 }
 
 function drawFlights() {
@@ -158,7 +158,7 @@ function drawMap(sample) {
   const flight = data.flights[state.flight], both = flight ? data.flights.filter((one) => one.group === flight.group && one !== flight) : [];
   const points = flight ? [flight, ...both].flatMap((one) => [...one.drone_path, ...one.target_path]) : [];
   byId("plan").hidden = !points.length;
-  if (!points.length) { show("key", make("span", { class: "nothing" }, flight ? "No place is known." : "")); return; }
+  if (!points.length) { show("key", make("span", { class: "nothing" }, flight ? "No position is known." : "")); return; }
   const xs = points.map((point) => point[0]), ys = points.map((point) => point[1]), margin = 12;
   const bounds = [Math.min(...xs) - margin, Math.min(...ys) - margin, Math.max(...xs) + margin, Math.max(...ys) + margin], side = Math.max(bounds[2] - bounds[0], bounds[3] - bounds[1]);
   const boxes = data.maps[flight.map] || [], color = colorOf, ownColor = color(`--${flight.track}`);
@@ -175,7 +175,7 @@ function drawMap(sample) {
     if (frame.target) map.dot(frame.target, 5, color("--person"), color("--card"));
     map.dot([x, y], 5, ownColor, color("--card"));
   };
-  byId("plan").setAttribute("aria-label", `map from above, north up: ${boxes.length} boxes, ${both.length + 2} ways`);
+  byId("plan").setAttribute("aria-label", `map from above, north up: ${boxes.length} boxes, ${both.length + 2} trajectories`);
   if (map.flight === flight) map.redraw();
   else { Object.assign(map, { flight, bounds, moved: false }); map.resize(); }
   const key = [[flight.track, `drone, ${flight.track}`], ...both.map((one) => [`other ${one.track}`, `drone, ${one.track}`]), ["target", "person"]];
