@@ -20,61 +20,52 @@ from cosfly.render.gl.shapes import BUILDING_COLORS, PLAIN_COLORS, TILE_COLORS, 
 from cosfly.render.surfaces import Solids, Triangles, are_solids, drape, is_draped, layers_of, solids_of
 
 # --- solids -----------------------------------------------------------------------------------------------------------
-# Buildings get walls with storeys and windows, flat roofs, and tiles on sloping roofs; a mesh with colours of its own
-# gets plain paint. The shader draws patterns in the axes of a part, so each plane of a building is a part.
+# The triangles of meshes. Buildings get walls with storeys and windows, flat roofs, and tiles on sloping roofs; meshes
+# with colours of their own get plain paint. The shader draws patterns in the axes of a part, so each plane of a
+# building is a part.
 
 STEEP = 0.35  # largest z of a wall's normal
 FLAT = 0.94  # least z of a flat roof's normal
-# Surfaces that are this near to one plane are one wall.
-SAME_ANGLE_RAD = np.radians(1.0)
-SAME_PLACE_M = 0.1
-THINNEST_M = 0.01
+SAME_ANGLE_RAD, SAME_PLACE_M = np.radians(1.0), 0.1  # surfaces that differ by less are one plane
+THINNEST_M = 0.01  # half size of a flat part
 
 
 def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.ndarray) -> Loose:
-    """Return the triangles of solids, both sides, for the shader. ids: (n,) instance ids of the map's boxes."""
+    """Return the triangles of solids for the shader, which draws both of their sides.
+
+    ids: (n,) instance ids of the map's boxes.
+    """
     if not len(solids):
         return Loose({}, {}, np.zeros((0, 3)), np.zeros(0))
-    normals = solids.normals
     kinds = box_map.kinds[solids.rows]
+    seeds = seeds_of(box_map.ids[solids.rows])
+    normals = solids.normals
     is_house = (kinds == KINDS["Buildings"]) & np.isnan(solids.colors).any(axis=1)
     is_wall = is_house & (np.abs(normals[:, 2]) < STEEP)
     is_flat = is_house & (np.abs(normals[:, 2]) > FLAT)
     materials = np.where(is_house, np.where(is_wall | is_flat, parts.FACADE, parts.TILES), parts.PLAIN)
-    axes, planes = _planes(box_map, solids, is_wall, is_flat, is_house)
-    firsts = np.searchsorted(solids.things, np.arange(solids.things[-1] + 2))[:-1]
-    low = np.minimum.reduceat(solids.corners_m.min(axis=1), firsts)
-    high = np.maximum.reduceat(solids.corners_m.max(axis=1), firsts)
-    middles = (low + high)[solids.things] / 2.0
-    local = np.einsum("kij,kcj->kci", axes, solids.corners_m - middles[:, None])
-    begins = np.full((planes.max() + 1, 3), np.inf)
-    ends = -begins
-    np.minimum.at(begins, planes, local.min(axis=1))
-    np.maximum.at(ends, planes, local.max(axis=1))
-    center = ((begins + ends) / 2.0)[planes]
-    half = np.maximum((ends - begins) / 2.0, THINNEST_M)[planes]
-    seeds = seeds_of(box_map.ids[solids.rows])
-    paint = solids.colors
-    for material, palette in ((parts.FACADE, BUILDING_COLORS), (parts.TILES, TILE_COLORS), (parts.PLAIN, PLAIN_COLORS)):
-        picked = palette[(contract.chance(seeds, 0) * len(palette)).astype(int)]
-        paint = np.where(np.isnan(paint) & (materials == material)[:, None], picked, paint)
+    axes, part_numbers = _planes(box_map, solids, is_wall, is_flat, is_house)
+    low_m, high_m = _bounds_of_things(solids)
+    middles_m = (low_m + high_m)[solids.things] / 2.0
+    # Corners in the axes of their part, from the middle of their thing; center and half: bounds of the parts there.
+    local_m = np.einsum("kij,kcj->kci", axes, solids.corners_m - middles_m[:, None])
+    centers_m, halves_m = (bound[part_numbers] for bound in _bounds_of_parts(local_m, part_numbers))
     vertices = np.zeros((len(solids), 3), LOOSE_VERTEX)
-    vertices["position"] = (local - center[:, None]) / half[:, None]
+    vertices["position"] = (local_m - centers_m[:, None]) / halves_m[:, None]
     for name, values in {
-        "normal": np.einsum("kij,kj->ki", axes, normals) * half,
-        "center": np.einsum("kji,kj->ki", axes, center) + middles - origin_m,
-        "half": half,
+        "normal": np.einsum("kij,kj->ki", axes, normals) * halves_m,
+        "center": np.einsum("kji,kj->ki", axes, centers_m) + middles_m - origin_m,
+        "half": halves_m,
         "quaternion": Rotation.from_matrix(axes.transpose(0, 2, 1)).as_quat(),
-        "color": np.column_stack([paint, seeds * 0.999]),
+        "color": np.column_stack([_painted(solids.colors, materials, seeds), seeds * 0.999]),
         "tag": parts.tags(kinds, materials, ids[solids.rows]),
     }.items():
         vertices[name] = values[:, None]
     vertices["bias"] = LAYER_STEP * STANDING_LAYER
-    backs = vertices[:, ::-1].copy()
-    backs["normal"] *= -1.0
-    vertices = np.concatenate([vertices, backs])
-    things = np.tile(solids.things, 2)
-    materials = np.tile(materials, 2)
+    back_sides = vertices[:, ::-1].copy()
+    back_sides["normal"] *= -1.0
+    vertices = np.concatenate([vertices, back_sides])
+    materials, things = np.tile(materials, 2), np.tile(solids.things, 2)
     rows_of = {
         int(material): np.lexsort((things, materials != material))[: np.count_nonzero(materials == material)]
         for material in np.unique(materials)
@@ -82,9 +73,34 @@ def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.
     return Loose(
         {material: vertices[rows].reshape(-1) for material, rows in rows_of.items()},
         {material: things[rows] for material, rows in rows_of.items()},
-        (low + high) / 2.0 - origin_m,
-        np.linalg.norm(high - low, axis=1) / 2.0,
+        (low_m + high_m) / 2.0 - origin_m,
+        np.linalg.norm(high_m - low_m, axis=1) / 2.0,
     )
+
+
+def _bounds_of_things(solids: Solids) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest corner of each placed mesh, (n, 3) each, world."""
+    first_rows = np.searchsorted(solids.things, np.arange(solids.things[-1] + 2))[:-1]
+    low_m = np.minimum.reduceat(solids.corners_m.min(axis=1), first_rows)
+    high_m = np.maximum.reduceat(solids.corners_m.max(axis=1), first_rows)
+    return low_m, high_m
+
+
+def _bounds_of_parts(local_m: np.ndarray, part_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return centre and half size of each part, (p, 3) each, from the corners (k, 3, 3) of its triangles."""
+    low_m = np.full((part_numbers.max() + 1, 3), np.inf)
+    high_m = -low_m
+    np.minimum.at(low_m, part_numbers, local_m.min(axis=1))
+    np.maximum.at(high_m, part_numbers, local_m.max(axis=1))
+    return (low_m + high_m) / 2.0, np.maximum((high_m - low_m) / 2.0, THINNEST_M)
+
+
+def _painted(colors: np.ndarray, materials: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """Return the colours of triangles, (k, 3) linear RGB; those without one get one of their material's palette."""
+    for material, palette in ((parts.FACADE, BUILDING_COLORS), (parts.TILES, TILE_COLORS), (parts.PLAIN, PLAIN_COLORS)):
+        picked = palette[(contract.chance(seeds, 0) * len(palette)).astype(int)]
+        colors = np.where(np.isnan(colors) & (materials == material)[:, None], picked, colors)
+    return colors
 
 
 def _planes(
@@ -92,8 +108,8 @@ def _planes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the axes of the part of each triangle, (k, 3, 3) part_from_world, and the number of that part, (k,).
 
-    A wall: x along it, y out, z up. A slope: x along its eaves, y out, z up the slope. A flat roof: turned like its
-    house's largest wall, z up. Other things: the axes of the box.
+    Axes of a wall: x along it, y out, z up. Of a slope: x along its eaves, y out, z up the slope. Of a flat roof: those
+    of the main direction of its house's walls, z up. Of other things: those of the box.
     """
     normals = solids.normals
     things = solids.things
@@ -105,7 +121,7 @@ def _planes(
     out = np.stack([np.cos(yaw) * np.cos(rise), np.sin(yaw) * np.cos(rise), np.sin(rise)], axis=1)
     along = np.stack([np.sin(yaw), -np.cos(yaw), zero], axis=1)
     axes = np.stack([along, out, np.cross(along, out)], axis=1)
-    # The main direction of each thing's walls, by area, in steps of SAME_ANGLE_RAD within a quarter turn.
+    # The main direction of the walls of each house, by area, in steps of SAME_ANGLE_RAD within a quarter turn.
     quarter = round(np.pi / 2 / SAME_ANGLE_RAD)
     edges = solids.corners_m[:, 1:] - solids.corners_m[:, :1]
     areas = np.zeros((int(things[-1]) + 1, quarter))
