@@ -132,5 +132,5 @@ def test_another_version_of_the_prompt_is_refused(place, tmp_path):
     folder = taught_otherwise(place, tmp_path / "mission", prompts={"en": mission})
     assert student_settings(settings("http://127.0.0.1:1/v1", folder), VOCABULARY).endpoint.temperature == 0.0
     folder = taught_otherwise(place, tmp_path / "zh", prompts={"zh": taught["prompts"]["zh"]})
-    with pytest.raises(ConfigError, match="trained without English"):
+    with pytest.raises(ConfigError, match="not trained with English"):
         student_settings(settings("http://127.0.0.1:1/v1", folder), VOCABULARY)

@@ -89,7 +89,12 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
     refuse_links(out)
     num_windows, trials = run_until_interrupted(_try_all(cfg, vocabulary_of(cfg), data, out, seed, conflicts))
     if not trials:
-        raise InputError("no first answer has a conflict to repair", where=data, got=f"{num_windows} windows")
+        raise InputError(
+            "no first answer has a conflict to repair",
+            where=data,
+            got=f"{num_windows} windows",
+            fix="pass another --teacher",
+        )
     comparisons = list(map(compare, STRATEGIES, zip(*trials, strict=True)))
     value = {
         "schema": "cosfly.compare_strategies",

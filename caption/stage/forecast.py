@@ -35,7 +35,7 @@ def make_forecast(
     """Return the rows of a table: the cost of a run, scaled from the means of a few windows."""
     if cfg.teacher_kind != "endpoint":
         raise ConfigError(
-            "only captions of a server can be estimated", where="--plan", got=cfg.teacher, expected="--teacher URL"
+            "an estimate needs a server as the teacher", where="--plan", got=cfg.teacher, expected="--teacher URL"
         )
     vocabulary = vocabulary_of(cfg)
     cfg = student_settings(cfg, vocabulary)

@@ -33,7 +33,7 @@ def shipped_prompts() -> dict[str, str]:
 
 def own_prompts(folder: Path) -> dict[str, str]:
     """Read a folder of prompts that replaces those that ship."""
-    export = "cosfly caption prompts --export DIR writes the built-in prompts"
+    export = "run cosfly caption prompts --export DIR to write the built-in prompts"
     if not folder.is_dir():
         raise ConfigError("the folder of prompts does not exist", where=folder, fix=export)
     found, problems = dict[str, str](), list[str]()

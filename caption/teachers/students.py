@@ -71,7 +71,9 @@ def student_settings(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfi
 def check_prompts(chat_format: ChatFormat, folder: Path, vocabulary: Vocabulary) -> None:
     """Check that prompts are written today as they were in the student's training."""
     if "en" not in chat_format.prompts:
-        raise ConfigError("the student was trained without English", where=folder, got=", ".join(chat_format.prompts))
+        raise ConfigError(
+            "the student was not trained with English answers", where=folder, got=", ".join(chat_format.prompts)
+        )
     for language, prompt in chat_format.prompts.items():
         is_same = prompt.system == student_prompt(language, vocabulary)
         if not (is_same and _is_of_template(prompt.user, language, chat_format, vocabulary)):

@@ -92,7 +92,11 @@ def run(folders: Sequence[Path], out: Path, *, seed: int = 0, resume: Resume = "
     reports = {name: read_report(folder) for name, folder in of_names.items()}
     splits = {report.split for report in reports.values()}
     if len(splits) > 1:
-        raise InputError("the evaluations are of different splits", got=", ".join(sorted(splits)))
+        raise InputError(
+            "the evaluations are of different splits",
+            got=", ".join(sorted(splits)),
+            fix="pass evaluations of one split",
+        )
     comparison = compare(reports, of_names, seed)
     record, page = out / "comparison.json", out / "comparison.html"
     write_model(record, comparison, FileFormat("cosfly.distill_comparison", "1.0"))

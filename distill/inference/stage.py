@@ -311,7 +311,7 @@ def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path) -> Results:
     except Exception as error:  # torch's class has no name here until torch is loaded; all others go on
         if type(error).__name__ != "OutOfMemoryError" or not type(error).__module__.startswith("torch"):
             raise
-        got = f"{cfg.batch_size}: {str(error)[:120]}"
+        got = f"batch_size {cfg.batch_size}: {str(error)[:120]}"
     where, fix = "distill.infer.batch_size", "lower batch_size or max_pixels"
     raise ConfigError("the memory of the accelerator is full", where=where, got=got, fix=fix)
 

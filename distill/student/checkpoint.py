@@ -250,5 +250,6 @@ def read_adapter_facts(adapter: Path, model: Path) -> AdapterFacts:
     facts = validated(AdapterFacts, read_json(path, what="adapter", fix=fix), path)
     if facts.base_sha256 != (found := base_digests(model)):
         got, expected = json.dumps(found)[:120], json.dumps(facts.base_sha256)[:120]
-        raise InputError("the adapter was trained on another model", where=path, got=got, expected=expected)
+        fix = "pass the base model of this adapter"
+        raise InputError("the adapter was trained on another model", where=path, got=got, expected=expected, fix=fix)
     return facts

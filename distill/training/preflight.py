@@ -140,7 +140,7 @@ def memory_errors(cfg: TrainConfig) -> Iterator[None]:
         less = "--set distill.train.gradient_checkpointing=true"
         advice = [smaller] * (cfg.batch_size > 1) + [less] * (not cfg.gradient_checkpointing)
         fix = f"run again with {' or '.join(advice) or 'smaller max_tokens'}; training resumes from the last checkpoint"
-        got = f"{cfg.batch_size}: {str(error)[:120]}"
+        got = f"batch_size {cfg.batch_size}: {str(error)[:120]}"
         raise ConfigError("the memory is full", where="distill.train.batch_size", got=got, fix=fix) from error
 
 
