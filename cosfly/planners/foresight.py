@@ -151,7 +151,7 @@ def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) ->
 
 
 @njit(cache=True)
-def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps, hidden):
+def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps_m, hidden):
     """Write the distance of each place to the nearest box, at most `reach_m`, and the hidden share of the target.
 
     Both are (m, c); places nearer than `clearance_m` keep their `hidden`. aloft: rows of the boxes of `index` within
@@ -160,33 +160,33 @@ def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps, hidden):
     near = np.empty(len(aloft), dtype=np.int64)
     for key in range(len(places)):
         target = targets[key]
-        away_max, least_slope = 0.0, np.inf
+        farthest_m, least_slope = 0.0, np.inf
         for c in range(places.shape[1]):
-            away = np.sqrt((places[key, c, 0] - target[0]) ** 2 + (places[key, c, 1] - target[1]) ** 2)
-            away_max = max(away_max, away)
-            least_slope = min(least_slope, (places[key, c, 2] - target[2] - LOWEST_END_M) / max(away, 1.0))
-        horizon = make_horizon(index, target, away_max, least_slope)
+            away_m = np.sqrt((places[key, c, 0] - target[0]) ** 2 + (places[key, c, 1] - target[1]) ** 2)
+            farthest_m = max(farthest_m, away_m)
+            least_slope = min(least_slope, (places[key, c, 2] - target[2] - LOWEST_END_M) / max(away_m, 1.0))
+        horizon = make_horizon(index, target, farthest_m, least_slope)
         num_near = 0
         for box in range(len(aloft)):
-            if squared_gap(aloft, box, target[0], target[1], aloft[box, kernels.LOW_Z]) <= (away_max + reach_m) ** 2:
+            if squared_gap(aloft, box, target[0], target[1], aloft[box, kernels.LOW_Z]) <= (farthest_m + reach_m) ** 2:
                 near[num_near] = box
                 num_near += 1
         for c in range(places.shape[1]):
             x, y, z = places[key, c, 0], places[key, c, 1], places[key, c, 2]
-            gap = reach_m
+            gap_m = reach_m
             for k in range(num_near):
-                if gap >= clearance_m and squared_gap(aloft, near[k], x, y, z) < gap * gap:
-                    gap = min(gap, distance_to_box(aloft, near[k], x, y, z))
-            gaps[key, c] = gap
-            if gap >= clearance_m:
+                if gap_m >= clearance_m and squared_gap(aloft, near[k], x, y, z) < gap_m * gap_m:
+                    gap_m = min(gap_m, distance_to_box(aloft, near[k], x, y, z))
+            gaps_m[key, c] = gap_m
+            if gap_m >= clearance_m:
                 hidden[key, c] = 1.0 - five_ray_visibility(index, horizon, target, x, y, z)
 
 
 @njit(cache=True)
-def _cheapest(places, place_costs, gaps, longest_m, index, clearance_m, links, num_azimuths, max_turn, way_cost):
+def _cheapest(places, place_costs, gaps_m, longest_m, index, clearance_m, links, num_azimuths, max_turn, way_cost):
     """Return the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
-    places: (m, c, 3), c = rings * azimuths. place_costs: (m, c). gaps: (m, c) m. longest_m: (m,) longest move into each
+    places: (m, c, 3), c = rings * azimuths. place_costs: (m, c). gaps_m: (m, c). longest_m: (m,) longest move into each
     key frame. links: (rings, r) previous rings, the first -1 ends the list.
     """
     num_keys, num_places = len(places), places.shape[1]
@@ -195,7 +195,7 @@ def _cheapest(places, place_costs, gaps, longest_m, index, clearance_m, links, n
     came_from = np.full((num_keys, num_places), -1, dtype=np.int64)
     for key in range(num_keys):
         for c in range(num_places):
-            if gaps[key, c] < clearance_m:
+            if gaps_m[key, c] < clearance_m:
                 continue
             if key == 0:
                 cost[key, c] = place_costs[key, c]
@@ -209,20 +209,20 @@ def _cheapest(places, place_costs, gaps, longest_m, index, clearance_m, links, n
                 for link in range(links.shape[1]):
                     if links[ring, link] < 0:
                         break
-                    b = links[ring, link] * num_azimuths + column
-                    if cost[key - 1, b] >= best:
+                    before = links[ring, link] * num_azimuths + column
+                    if cost[key - 1, before] >= best:
                         continue
-                    u, v, w = places[key - 1, b, 0], places[key - 1, b, 1], places[key - 1, b, 2]
-                    length = np.sqrt((x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2)
-                    guess = cost[key - 1, b] + way_cost * length
-                    if guess >= best or length > longest_m[key]:
+                    x0, y0, z0 = places[key - 1, before, 0], places[key - 1, before, 1], places[key - 1, before, 2]
+                    length_m = np.sqrt((x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2)
+                    guess = cost[key - 1, before] + way_cost * length_m
+                    if guess >= best or length_m > longest_m[key]:
                         continue
                     # Distance changes by at most a metre per metre: with more clearance at both ends the line is free.
-                    is_close = gaps[key, c] + gaps[key - 1, b] - length < 2.0 * clearance_m
-                    if is_close and collect_hits(index, u, v, w, x, y, z, clearance_m, first_hit) > 0:
+                    is_close = gaps_m[key, c] + gaps_m[key - 1, before] - length_m < 2.0 * clearance_m
+                    if is_close and collect_hits(index, x0, y0, z0, x, y, z, clearance_m, first_hit) > 0:
                         continue
                     best = guess
-                    came_from[key, c] = b
+                    came_from[key, c] = before
             cost[key, c] = best + place_costs[key, c]
     return cheapest_way(cost, came_from)
 

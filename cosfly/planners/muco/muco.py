@@ -83,10 +83,10 @@ def _rings(distances_m: np.ndarray, preferred_m: np.ndarray, greatest_m: np.ndar
 
 
 @njit(cache=True)
-def _search(places, targets, times, extra, keeps_sight, index, clearance_m, speed_max_mps):
+def _search(places, targets, times_s, extra, keeps_sight, index, clearance_m, speed_max_mps):
     """Return the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
-    places: (m, c, 3), c = rings * azimuths. targets: (m, 3). times: (m,) s. extra: (rings, azimuths) cost of a place
+    places: (m, c, 3), c = rings * azimuths. targets: (m, 3). times_s: (m,). extra: (rings, azimuths) cost of a place
     apart from visibility. keeps_sight: (m,) bool, whether visibility counts.
     """
     num_keys, num_places, num_azimuths = len(places), places.shape[1], extra.shape[1]
@@ -102,39 +102,39 @@ def _search(places, targets, times, extra, keeps_sight, index, clearance_m, spee
             gap, _ = nearest_box(index, p[0], p[1], p[2], clearance_m)
             place_cost[c] = np.inf
             if gap >= clearance_m:
-                seen = 1.0
+                visible_share = 1.0
                 if keeps_sight[key]:
                     count = collect_hits(index, hip[0], hip[1], hip[2], p[0], p[1], p[2], RAY_SPREAD_M, blockers)
-                    seen = free_rays(index, blockers, count, p[0], p[1], p[2], hip)
-                place_cost[c] = extra[c // num_azimuths, c % num_azimuths] + 1.0 - seen
+                    visible_share = free_rays(index, blockers, count, p[0], p[1], p[2], hip)
+                place_cost[c] = extra[c // num_azimuths, c % num_azimuths] + 1.0 - visible_share
         if key == 0:
             for c in range(num_places):
                 cost[0, c] = place_cost[c]
             continue
-        seconds = times[key] - times[key - 1]
+        step_s = times_s[key] - times_s[key - 1]
         for c in range(num_places):
             if place_cost[c] == np.inf:
                 continue
             p = places[key, c]
-            for b in range(num_places):
-                turn = abs(c % num_azimuths - b % num_azimuths)
-                guesses[b] = np.inf
-                if cost[key - 1, b] == np.inf or min(turn, num_azimuths - turn) > MAX_TURN:
+            for before in range(num_places):
+                turn = abs(c % num_azimuths - before % num_azimuths)
+                guesses[before] = np.inf
+                if cost[key - 1, before] == np.inf or min(turn, num_azimuths - turn) > MAX_TURN:
                     continue
-                q = places[key - 1, b]
-                speed = np.sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2) / seconds
-                if speed <= 0.9 * speed_max_mps:
-                    guesses[b] = cost[key - 1, b] + MOVE_COST * (speed / MOVE_SCALE_MPS) ** 2
+                q = places[key - 1, before]
+                speed_mps = np.sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2) / step_s
+                if speed_mps <= 0.9 * speed_max_mps:
+                    guesses[before] = cost[key - 1, before] + MOVE_COST * (speed_mps / MOVE_SCALE_MPS) ** 2
             while True:  # the cheapest predecessor whose segment is free; most often the first
-                b = int(np.argmin(guesses))
-                if guesses[b] == np.inf:
+                before = int(np.argmin(guesses))
+                if guesses[before] == np.inf:
                     break
-                q = places[key - 1, b]
+                q = places[key - 1, before]
                 if collect_hits(index, q[0], q[1], q[2], p[0], p[1], p[2], clearance_m, first_hit) == 0:
-                    cost[key, c] = guesses[b] + place_cost[c]
-                    came_from[key, c] = b
+                    cost[key, c] = guesses[before] + place_cost[c]
+                    came_from[key, c] = before
                     break
-                guesses[b] = np.inf
+                guesses[before] = np.inf
     return cheapest_way(cost, came_from)
 
 
