@@ -131,8 +131,8 @@ def test_the_plan_is_what_the_run_then_takes(tree, tmp_path):
         run(cfg, tree, tmp_path / "out")
         asked = len(server.bodies)
     report = report_of(tmp_path / "out")
-    assert rows["windows"] == f"about {report['windows']['input']} to do"
-    assert rows["calls"] == str(asked) == "10"
+    assert rows["windows"] == f"about {report['windows']['input']} left"
+    assert rows["requests"] == str(asked) == "10"
     assert rows["tokens in"] == f"{report['tokens']['prompt_tokens']:,}" == "10,000"
     assert rows["tokens out"] == f"{report['tokens']['completion_tokens']:,}" == "1,000"
     assert rows["cost"] == "0.03"
