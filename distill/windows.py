@@ -22,10 +22,10 @@ from pydantic import BaseModel
 from cosfly.formats.captions import FIELDS, Language, Prompt, read_captions
 from cosfly.formats.frames import frame_name
 from cosfly.formats.playback import Track, read_track
-from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, nearest, shown
 from cosfly.runtime.io import check_stays_below, inside
 from cosfly.runtime.json_io import read_object, validated
+from cosfly.runtime.png import colours_of
 from cosfly.runtime.tables import TableRows, open_table, rows_of
 from cosfly.viz.frame_views import VIEW_FILES, Pictures, read_view, scaled_size
 
@@ -257,7 +257,7 @@ def _picture(row: Mapping[str, Any], where: str) -> np.ndarray:
     data = row["image"] and row["image"]["bytes"]
     if not data:
         raise InputError("the frame has no picture", where=where, fix="download the release with --modality rgb")
-    return cv2.cvtColor(parse_picture(data, where), cv2.COLOR_BGR2RGB)
+    return colours_of(data, where)
 
 
 def _column(rows: Sequence[Mapping[str, Any]], name: str, members: tuple[str, ...]) -> np.ndarray:

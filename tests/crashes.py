@@ -26,7 +26,7 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
-from cosfly.runtime import local_transport
+from cosfly.runtime import worker
 from cosfly.runtime.errors import CosflyError
 from cosfly.runtime.events import EVENTS
 from cosfly.runtime.run_dir import checked_inputs, recorded_digests
@@ -186,7 +186,7 @@ def _be_child(work: Callable[[], object], watch: _Watch, voice: int) -> None:
         os.dup2(voice, 1)
         os.dup2(voice, 2)
         sys.stdout = sys.stderr = os.fdopen(voice, "w", buffering=1, closefd=False)
-        local_transport.multiprocessing = _Forking()  # type: ignore[assignment]
+        worker.multiprocessing = _Forking()  # type: ignore[assignment]
         watch.begin()
         work()
         code = 0

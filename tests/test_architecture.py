@@ -152,12 +152,12 @@ READING = {
 }
 GATE = (
     *(f"cosfly.runtime.{name}" for name in ("io", "json_io", "arrays", "tables", "model_json", "config")),
-    *("cosfly.formats.geojson", "cosfly.formats.meshes"),
+    "cosfly.formats.meshes",
 )
 ALLOWED_TO_READ = {
     ("cosfly.runtime.ray_engine", "loads"),  # what a worker says, as `multiprocessing` reads it from a pipe
     ("cosfly.runtime.events", "read_bytes"),  # /proc, whose files have no size
-    ("cosfly.formats.png", "decompress"),  # of a picture, up to the size that its header gives
+    ("cosfly.runtime.png", "decompress"),  # of a picture, up to the size that its header gives
     ("cosfly.llm.protocol", "loads"),  # the reply, of a bounded size
     ("distill.student.random_student", "loads"),  # what the tokenizer's own library gives
     ("distill.student.checkpoint", "load_file"),  # tensors, whose checksums were compared

@@ -17,7 +17,7 @@ from cosfly.geometry.grid import blocks_walking, empty_grid, lies_off_ground, su
 from cosfly.geometry.kernels import index_boxes, obstacle_index, signed_distances
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson import CityJsonConfig
-from cosfly.maps.derived_ground import CREDITS, NEAR_M, PAVEMENT_M, with_derived_ground
+from cosfly.maps.footprints import CREDITS, NEAR_M, PAVEMENT_M, with_derived_ground
 from cosfly.maps.stage import MapsConfig, load_map, run
 from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground

@@ -88,19 +88,6 @@ def in_a_composite(model: Model) -> Model:
     return model
 
 
-def with_a_template(model: Model) -> Model:
-    """The second house is an instance of a template of half its size, from its own low corner."""
-    model = copy.deepcopy(model)
-    _, shell = prism(0.0, 0.0, 0.0)
-    corners = [[x, y, z] for z in (0.0, 3.0) for x, y in ((0.0, 0.0), (5.0, 0.0), (5.0, 3.0), (0.0, 3.0))]
-    template = {"type": "Solid", "lod": "1.2", "boundaries": [shell]}
-    model["geometry-templates"] = {"templates": [template], "vertices-templates": corners}
-    matrix = [2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1]
-    instance = {"type": "GeometryInstance", "template": 0, "boundaries": [8], "transformationMatrix": matrix}
-    model["CityObjects"]["other"]["geometry"] = [instance]
-    return model
-
-
 def sequence(model: Model, end: str = "\n", start: str = "") -> bytes:
     """A text sequence: first the document without objects, then features with vertices of their own."""
     head = {key: value for key, value in model.items() if key not in ("CityObjects", "vertices")}
@@ -128,7 +115,6 @@ def _renumbered(value: list | int, used: list[int]) -> list | int:
 FORMS: dict[str, Callable[[Model], bytes]] = {
     "2.0 printed over many lines": lambda m: json.dumps(m, indent=2).encode(),
     "2.0 with an outline": lambda m: document(with_an_outline(m)),
-    "2.0 with a template": lambda m: document(with_a_template(m)),
     "1.1 with a group": lambda m: document(v11_with_a_group(m)),
     "1.1 gzipped, a composite": lambda m: gzip.compress(document(in_a_composite(m)), mtime=0),
     "1.1.3": lambda m: document(copy.deepcopy(m) | {"version": "1.1.3"}),

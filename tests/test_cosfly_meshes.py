@@ -13,7 +13,7 @@ import trimesh
 from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.formats.frames import Look
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.meshes import MESHES_FILE, Mesh, Meshes, MeshRef, read_meshes, write_meshes
+from cosfly.formats.meshes import MESHES_FILE, Meshes, MeshRef, read_meshes, write_meshes
 from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps import cityjson
 from cosfly.maps.cityjson import CityJsonConfig, solid_mesh
@@ -46,66 +46,54 @@ def sorted_rows(corners: np.ndarray) -> np.ndarray:
 
 
 def two_things() -> trimesh.Scene:
-    """A turned, stretched ball below a node that is itself moved, and a mirrored red box."""
+    """A turned, stretched ball below a node that is itself moved, and a mirrored box."""
     scene = trimesh.Scene()
     turn = trimesh.transformations.rotation_matrix(0.7, (1, 2, 3), (0.5, 0, 0))
     ball, box = trimesh.creation.icosphere(subdivisions=1), trimesh.creation.box((1.0, 2.0, 3.0))
-    box.visual = trimesh.visual.TextureVisuals(
-        material=trimesh.visual.material.PBRMaterial(baseColorFactor=(255, 0, 0, 255))
-    )
     scene.add_geometry(ball, node_name="ball", transform=turn @ np.diag([1.0, 2.0, 0.5, 1.0]))
     scene.add_geometry(box, node_name="box", transform=np.diag([-1.0, 1.0, 1.0, 1.0]))
     return scene
 
 
-@pytest.mark.parametrize("suffix", ["glb", "gltf"])
-def test_nodes_of_gltf_stand_where_they_were_put(tmp_path: Path, suffix: str) -> None:
-    path, theirs = tmp_path / f"things.{suffix}", two_things()
+def test_nodes_of_gltf_stand_where_they_were_put(tmp_path: Path) -> None:
+    path, theirs = tmp_path / "things.glb", two_things()
     theirs.export(path)
-    assert suffix == "glb" or list(tmp_path.glob("*.bin")), "the case of a file beside it"
     found = read_meshes(path, tree=tmp_path)
     assert set(found) == {"ball", "box"}
     for name, mesh in found.items():
         transform, geometry = theirs.graph[name]
         corners = trimesh.transform_points(theirs.geometry[geometry].triangles.reshape(-1, 3), transform) @ UP.T
         expected = corners.reshape(-1, 3, 3)
-        assert mesh.corners_m.shape == expected.shape
+        assert mesh.shape == expected.shape
         if name == "box":  # mirrored: turned round to face out again
             expected = expected[:, ::-1]
-            assert trimesh.Trimesh(**trimesh.triangles.to_kwargs(mesh.corners_m)).volume > 0
-        np.testing.assert_allclose(sorted_rows(mesh.corners_m), sorted_rows(expected), atol=2e-5)
-    np.testing.assert_allclose(found["box"].colors, [[1.0, 0.0, 0.0]] * 12)
-    assert np.isnan(found["ball"].colors).all()
+            assert trimesh.Trimesh(**trimesh.triangles.to_kwargs(mesh)).volume > 0
+        np.testing.assert_allclose(sorted_rows(mesh), sorted_rows(expected), atol=2e-5)
 
 
-def test_obj_is_read_as_trimesh_reads_it_with_its_colours(tmp_path: Path) -> None:
-    (tmp_path / "paint.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl wood\nKd 1 1 1\nmap_Kd wood.png\n")
-    text = "mtllib paint.mtl\no shed\nv 0 0 0\nv 2 0 0\nv 2 3 0\nv 0 3 0\n# a comment\nv 1 1 4\nusemtl red\nf 1 4 3 2\n"
+def test_obj_is_read_as_trimesh_reads_it_without_its_materials(tmp_path: Path) -> None:
+    text = (
+        "mtllib missing.mtl\no shed\nv 0 0 0\nv 2 0 0\nv 2 3 0\nv 0 3 0\n# a comment\nv 1 1 4\nusemtl red\nf 1 4 3 2\n"
+    )
     text += "usemtl wood\nf 1//1 2//1 5\nf 2/2 3/1 5/2\no lid\nusemtl red\nf 3 4 5\nf 4 1 5\n"
     (tmp_path / "shed.obj").write_text(text)
     found = read_meshes(tmp_path / "shed.obj", tree=tmp_path)
     (mesh,) = found.values()
-    ours = mesh.corners_m
     theirs = trimesh.load_mesh(tmp_path / "shed.obj", skip_materials=True, process=False)
-    np.testing.assert_allclose(sorted_rows(ours), sorted_rows(np.asarray(theirs.triangles)))
-    is_red = (mesh.colors == [1, 0, 0]).all(axis=1)
-    assert is_red.sum() == 4
-    assert np.isnan(mesh.colors[~is_red]).all(), "a picture has the colours of the wood"
+    np.testing.assert_allclose(sorted_rows(mesh), sorted_rows(np.asarray(theirs.triangles)))
 
 
 def test_what_is_written_trimesh_opens_and_we_read_again(tmp_path: Path) -> None:
     far = np.array([4_000.25, -9_000.5, 12.0])  # single precision alone would be worth a millimetre here
     ball = np.asarray(trimesh.creation.icosphere(subdivisions=2).triangles) + far
-    colors = np.where(np.arange(len(ball))[:, None] < 10, [0.1, 0.2, 0.3], np.nan)
-    write_meshes(tmp_path / "m.glb", {"ball": Mesh(ball, colors)})
+    write_meshes(tmp_path / "m.glb", {"ball": ball})
     (mesh,) = read_meshes(tmp_path / "m.glb", tree=tmp_path).values()
-    np.testing.assert_allclose(sorted_rows(mesh.corners_m), sorted_rows(ball), atol=1e-5)
-    assert int((~np.isnan(mesh.colors)).all(axis=1).sum()) == 10
+    np.testing.assert_allclose(sorted_rows(mesh), sorted_rows(ball), atol=1e-5)
     theirs = trimesh.load_scene(tmp_path / "m.glb").to_mesh()
     np.testing.assert_allclose(
         np.sort((theirs.bounds @ UP.T), axis=0), np.stack([ball.min((0, 1)), ball.max((0, 1))]), atol=1e-2
     )
-    write_meshes(tmp_path / "n.glb", {"ball": Mesh(ball, colors)})
+    write_meshes(tmp_path / "n.glb", {"ball": ball})
     assert (tmp_path / "m.glb").read_bytes() == (tmp_path / "n.glb").read_bytes()
 
 
@@ -144,28 +132,20 @@ HOSTILE = {
     ),
     "loop.glb": (one_triangle(FLAT, nodes=[{"mesh": 0, "children": [0]}], scenes=[{"nodes": [0]}]), "two parents"),
     "packed.glb": (one_triangle(FLAT, extensionsRequired=["EXT_meshopt_compression"]), "plain glTF"),
-    "out.glb": (one_triangle(FLAT, buffers=[{"byteLength": 36, "uri": "../secret.bin"}]), "outside of its folder"),
-    "encoded.glb": (
-        one_triangle(FLAT, buffers=[{"byteLength": 36, "uri": "%2e%2e/secret.bin"}]),
-        "outside of its folder",
-    ),
-    "web.glb": (one_triangle(FLAT, buffers=[{"byteLength": 36, "uri": "http://host/x.bin"}]), "outside of its folder"),
+    "out.glb": (one_triangle(FLAT, buffers=[{"byteLength": 36, "uri": "../secret.bin"}]), "outside of the file"),
     "index.glb": (one_triangle(FLAT, nodes=[{"mesh": 7}]), "cannot be parsed"),
     "short.glb": (one_triangle(FLAT)[:-10], "cut short"),
     "other.glb": (b"not a mesh at all, whatever its name says", "not a binary glTF"),
-    "deep.gltf": (b'{"asset": {}, "nodes": ' + b"[" * 90 + b"]" * 90 + b"}", "deep"),
+    "deep.glb": (glb({"nodes": [json.loads("[" * 90 + "]" * 90)]}), "deep"),
     "nan.obj": (b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "finite"),
     "corner.obj": (b"v 0 0 0\nv 1 0 0\nf 1 2 9\n", "cannot be parsed"),
     "from_end.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n", "negative vertex indices"),
-    "library.obj": (b"mtllib ../secret.mtl\n", "outside of its folder"),
-    "absolute.obj": (b"mtllib /etc/passwd\n", "outside of its folder"),
     "nothing.obj": (b"# nothing\n", "no triangles"),
 }
 
 
 def test_a_hostile_mesh_is_a_clear_error(tmp_path: Path, subtests) -> None:
     (tmp_path / "secret.bin").write_bytes(struct.pack("<9f", *FLAT))
-    (tmp_path / "secret.mtl").write_text("newmtl x\n")
     (tmp_path / "maps").mkdir()
     for name, (data, words) in HOSTILE.items():
         (tmp_path / "maps" / name).write_bytes(data)
@@ -251,14 +231,10 @@ def test_a_solid_is_drawn_as_its_finest_surfaces_and_kept_out_of_as_boxes(tmp_pa
 
 
 def scene_map(folder: Path) -> BoxMap:
-    """A ball in a turned box and another that tells colours, a house for two boxes, a road, a plain wall."""
+    """A ball in a turned box, a cone in another, a house for two boxes, a road, a plain wall."""
     trimesh.creation.icosphere(subdivisions=2).export(folder / "ball.obj")
-    red = trimesh.creation.cone(1.0, 2.0, sections=8)
-    red.visual = trimesh.visual.TextureVisuals(
-        material=trimesh.visual.material.PBRMaterial(baseColorFactor=(200, 10, 10, 255))
-    )
     (folder / "models").mkdir(exist_ok=True)
-    red.export(folder / "models/cone.glb")
+    trimesh.creation.cone(1.0, 2.0, sections=8).export(folder / "models/cone.glb")
     house = solid_mesh([[np.array([ROOF[i] for i in ring], dtype=float)] for (ring,) in FACES], 0.0)
     assert house is not None
     write_meshes(folder / "house.glb", {"house": house, "unused": house})
@@ -362,8 +338,6 @@ def test_boxes_of_ones_own_bring_their_meshes_along(tmp_path: Path) -> None:
     (tmp_path / "mine/models/cone.glb").symlink_to(cone)
     with pytest.raises(InputError, match="leads out of its folder"):
         make_map(cfg, tmp_path / "linked")
-    again = make_map(cfg, tmp_path / "linked", follow_links=True)
-    assert (again.parent / MESHES_FILE).read_bytes() == (product.parent / MESHES_FILE).read_bytes()
     (tmp_path / "mine/models/cone.glb").unlink()
     with pytest.raises(InputError, match=r"cone\.glb: cannot read the mesh"):
         solids_of(read_boxes(tmp_path / "mine/boxes_3d.json"))

@@ -20,9 +20,9 @@ from cosfly.geometry.ground import Ground
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.bystanders import bystanders_of, gaps_m
-from cosfly.pedestrians.crossings import costs_of, count_on_road
 from cosfly.pedestrians.lanes import lanes_of
 from cosfly.pedestrians.stage import PedestriansConfig, WalkableGround, make_pedestrian, run, walkable_ground
+from cosfly.pedestrians.walkable import costs_of, count_on_road
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load, shipped
 from cosfly.runtime.errors import InputError

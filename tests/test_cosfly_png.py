@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from PIL import Image
 from specimens_png import png_around
 
-from cosfly.formats.png import areas_png, colours_png, floats_of, floats_png, parse_png
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.png import areas_png, colours_png, floats_of, floats_png, parse_png
 
 KIND_OF = {1: 0, 2: 4, 3: 2, 4: 6}
 

@@ -62,7 +62,7 @@ WORLD = {"base_map": "x", "nodes": [{
 }]}  # fmt: skip
 READERS = {
     "boxes": Reader("boxes_3d.json", read_boxes),
-    "region": Reader("roi.geojson", read_roi),
+    "region": Reader("roi_polygon.json", read_roi),
     "boxes, GeoJSON": Reader("own.geojson", lambda path: boxfile.load(boxfile.BoxesConfig(path=path))),
     "table of boxes": Reader("own.csv", lambda path: boxfile.load(boxfile.BoxesConfig(path=path))),
     "city model": Reader("city.json", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
@@ -93,7 +93,8 @@ def specimens(tmp_path_factory: pytest.TempPathFactory) -> Path:
         [KINDS["Buildings"], KINDS["Walls"]], header=MapHeader(name="street"),
     ))  # fmt: skip
     for name, value in (
-        ("roi.geojson", HOUSE["geometry"]), ("city.json", CITY), ("world.json", WORLD),
+        ("roi_polygon.json", {"points_world": [[0, 0], [9, 0], [9, 9]], "holes": [[[1, 1], [2, 1], [2, 2]]]}),
+        ("city.json", CITY), ("world.json", WORLD),
         ("own.geojson", {"type": "FeatureCollection", "features": [HOUSE]}),
     ):  # fmt: skip
         write_json(root / name, value)

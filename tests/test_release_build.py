@@ -30,9 +30,9 @@ from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback import read_track
 from cosfly.formats.town import write_town_map
 from cosfly.formats.tracks import find_tracks
-from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.errors import ConfigError, InputError, VerifyError
 from cosfly.runtime.json_io import read_json
+from cosfly.runtime.png import colours_of
 from release.card.render import render_card
 from release.package.config import ReleaseConfig
 from release.package.plan import plan_shards
@@ -179,7 +179,7 @@ def interlaced(pixels: np.ndarray) -> bytes:
 def other_kind(frame_file: str, kind: str):
     def change(root: Path) -> None:
         path = first_flight(root) / "frames_playback/frame_00005" / frame_file
-        picture = Image.fromarray(parse_picture(path.read_bytes(), path)[..., ::-1])
+        picture = Image.fromarray(colours_of(path.read_bytes(), path))
         if kind == "interlaced":
             path.write_bytes(interlaced(np.asarray(picture)))
         elif kind == "16 bits":

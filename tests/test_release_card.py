@@ -14,7 +14,7 @@ from specimens_release import rows_by_id
 from specimens_rows import make_row
 from tables import each
 
-from cosfly.runtime.arrays import parse_picture
+from cosfly.runtime.png import colours_of
 from release.card.croissant import CROISSANT
 from release.card.numbers import RowCounts
 from release.card.render import first_split, render_card
@@ -86,7 +86,7 @@ def test_mlcroissant_loads_every_row(dataset):
     assert {row["frames/split"].decode() for row in found} == {"train", "validation"}
     for one in found[::9]:
         row = rows[one["frames/sample_id"].decode()]
-        assert (np.asarray(one["frames/image"]) == parse_picture(row["image"]["bytes"], "x")[..., ::-1]).all()
+        assert (np.asarray(one["frames/image"]) == colours_of(row["image"]["bytes"], "x")).all()
         assert np.load(io.BytesIO(one["frames/depth"])).tobytes() == np.load(io.BytesIO(row["depth"])).tobytes()
         assert (one["frames/pose/x_m"], one["frames/time_s"]) == (row["pose"]["x_m"], row["time_s"])
         text = one["frames/caption_zh_reasoning_trace"]

@@ -20,11 +20,11 @@ from tables import each
 from cosfly.formats.playback import read_track
 from cosfly.formats.town import read_town_map
 from cosfly.formats.tracks import find_tracks
-from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.config import build as build_config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import CHECKSUMS, read_checksums, sha256_file
 from cosfly.runtime.json_io import read_model
+from cosfly.runtime.png import colours_of
 from release.columns import POSE
 from release.export.contract import FORMATS, ExportConfig
 from release.export.lerobot import runs_of, states
@@ -117,7 +117,7 @@ def test_webdataset_opens_it(dataset, tmp_path):
     samples = list(wds.WebDataset(shards, shardshuffle=False).decode("rgb8"))
     assert [sample["__key__"] for sample in samples] == list(rows)
     sample, row = samples[3], list(rows.values())[3]
-    assert (sample["rgb.png"] == parse_picture(row["image"]["bytes"], "x")[..., ::-1]).all()
+    assert (sample["rgb.png"] == colours_of(row["image"]["bytes"], "x")).all()
     assert (sample["depth.npy"] == np.load(io.BytesIO(row["depth"]))).all()
     assert sample["json"]["pose"] == row["pose"]
 
@@ -275,7 +275,7 @@ def test_lerobot_opens_it(tmp_path):
         assert item["sample_id"] == row["sample_id"]
         assert item["observation.depth"] == sha256(np.load(io.BytesIO(row["depth"])))
         for name, column in (("rgb", "image"), ("instance", "instance")):
-            assert item[f"observation.images.{name}"] == sha256(parse_picture(row[column]["bytes"], "x")[..., ::-1])
+            assert item[f"observation.images.{name}"] == sha256(colours_of(row[column]["bytes"], "x"))
         pose = np.array([row["pose"][member] for member in POSE])
         assert item["pose"] == pose.astype(np.float32).tolist()
         if row["action"] is not None:

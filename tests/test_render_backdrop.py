@@ -9,9 +9,9 @@ import pytest
 from simulator_serving import as_client, serving
 from test_renderers_contract import street
 
-from cosfly.formats.backdrop import Backdrop
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.formats.kinds import KINDS
+from cosfly.formats.roi import Backdrop
 from cosfly.geometry.axes import box_corners
 from cosfly.render.backdrop import draw_backdrop
 from cosfly.render.settings import RenderConfig

@@ -55,7 +55,7 @@ def world(
 @command("cosfly maps --source synthetic --out maps", "maps", "town seed resume", source=SOURCE)
 def maps(job: Job, out: options.Out) -> None:
     """Make boxes_3d.json, a map of boxes, from a map source (step 1)."""
-    job.run("cosfly.maps.stage", job.cfg.maps, out, follow_links=job.cfg.follow_links)
+    job.run("cosfly.maps.stage", job.cfg.maps, out)
 
 
 @command("cosfly maps roi-backdrop --map boxes_3d.json --out above.png", "render", backend=BACKEND)
@@ -98,15 +98,6 @@ def edit(
     server = job.call("cosfly.pedestrians.roi_editor:open_editor", map_, job.cfg.pedestrians, roi, port, backdrop)
     typer.echo(f"open {server.address}")
     server.serve()
-
-
-@command("cosfly roi propose simplify/step2_simplified.json --out roi_polygon.json", "pedestrians", "town")
-def propose(
-    job: Job, map_: options.MapArgument, out: Annotated[Path, Option(help="Region to write: roi_polygon.json.")]
-) -> None:
-    """Write the outline of the walkable ground as a first region, to edit with `cosfly roi edit`."""
-    typer.echo(job.call("cosfly.pedestrians.roi_editor:run_propose", map_, job.cfg.pedestrians, out))
-    typer.echo(out)
 
 
 @command("cosfly plan --map simplified.json --paths pedestrians/path.json --out plan", "plan", STAGE)

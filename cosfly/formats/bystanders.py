@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.formats.columns import as_columns, column, columns, read_items, records, rounded, text_id, write_items
-from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.json_io import FileFormat
@@ -47,10 +46,6 @@ class Bystander:
     @property
     def build(self) -> Build:
         return BUILDS[self.kind]
-
-    @property
-    def kind_number(self) -> int:
-        return KINDS[self.kind]
 
     @property
     def centers_m(self) -> np.ndarray:

@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import cv2
 import numpy as np
 from pydantic import Field, PlainSerializer, PlainValidator
 
@@ -21,13 +20,13 @@ from cosfly.formats.columns import ANGLES, POSE, XYZ, numbers
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.people import People
 from cosfly.formats.places import tree_of_track
-from cosfly.formats.png import areas_png, colours_png, floats_of, floats_png
 from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import mirror_poses
-from cosfly.runtime.arrays import PNG_SIGNATURE, parse_array, read_picture
+from cosfly.runtime.arrays import parse_array
 from cosfly.runtime.config import Config
 from cosfly.runtime.io import read_bytes
 from cosfly.runtime.json_io import FileFormat, Record, dump_json, read_model
+from cosfly.runtime.png import PNG_SIGNATURE, areas_png, colours_png, floats_of, floats_png, read_picture
 
 FRAMES_DIR = "frames_playback"
 FrameFile = Literal["rgb", "depth", "instance"]
@@ -303,14 +302,13 @@ def tree_of(frame: Path) -> Path:
 
 def read_rgb(frame: Path) -> np.ndarray:
     """Read `rgb.png` of a frame folder, (h, w, 3) uint8 RGB without alpha."""
-    return cv2.cvtColor(read_picture(frame / "rgb.png", tree=tree_of(frame)), cv2.COLOR_BGR2RGB)
+    return read_picture(frame / "rgb.png", tree=tree_of(frame))
 
 
 def read_instance(frame: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read `instance.png` of a frame folder: semantic kinds (h, w) uint8 and instance ids (h, w) uint16."""
-    bgr = read_picture(frame / "instance.png", tree=tree_of(frame))
-    # OpenCV loads B, G, R: R is the semantic tag, G the low and B the high byte of the id.
-    return bgr[..., 2], bgr[..., 1].astype(np.uint16) | (bgr[..., 0].astype(np.uint16) << 8)
+    kinds, low_bytes, high_bytes = np.moveaxis(read_picture(frame / "instance.png", tree=tree_of(frame)), 2, 0)
+    return kinds, low_bytes.astype(np.uint16) | high_bytes.astype(np.uint16) << 8
 
 
 def read_depth(frame: Path) -> np.ndarray:

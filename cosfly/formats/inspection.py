@@ -173,29 +173,19 @@ def read_decisions(inspected: Path) -> dict[str, Decision]:
                 fix=f"move {REVIEW} away and {fix}",
             )
         decisions[decision.folder] = decision
-    if journal.is_cut_short:
-        log.warning("%s: the last decision was cut short by a kill and does not count; decide it again", path)
-    if num_damaged := journal.num_damaged - journal.is_cut_short:
-        fix = "restore the file, or move it away and decide again with cosfly inspect review"
-        raise InputError(
-            "decisions in this file were changed", where=path, got=f"{num_damaged} lines with a wrong checksum", fix=fix
-        )
+    if journal.num_damaged:
+        log.warning("%s: %d damaged lines do not count; decide these tracks again", path, journal.num_damaged)
     return decisions
-
-
-def _queue(inspected: Path) -> tuple[list[str], dict[str, Decision]]:
-    """Return the folders of the tracks in review, and the decisions on all tracks."""
-    return _folders_in_review(read_inspection(inspected).flights), read_decisions(inspected)
-
-
-def _folders_in_review(tracks: Iterable[TrackInspection]) -> list[str]:
-    return [track.folder for track in tracks if track.result == "review"]
 
 
 def undecided(inspected: Path) -> list[str]:
     """Return the folders of the tracks in review without a decision."""
-    queue, decisions = _queue(inspected)
-    return [folder for folder in queue if folder not in decisions]
+    decisions = read_decisions(inspected)
+    return [folder for folder in _in_review(read_inspection(inspected).flights) if folder not in decisions]
+
+
+def _in_review(tracks: Iterable[TrackInspection]) -> list[str]:
+    return [track.folder for track in tracks if track.result == "review"]
 
 
 def how_to_decide(folder: Path) -> str:
@@ -208,16 +198,13 @@ def how_to_decide(folder: Path) -> str:
 
 def summary(inspected: Path) -> str:
     """Return the state of the review in one line, with the names of open tracks."""
-    queue, decisions = _queue(inspected)
-    verdicts = [decisions[folder].verdict for folder in queue if folder in decisions]
-    waiting = [folder for folder in queue if folder not in decisions]
-    counts = f"{verdicts.count('accepted')} accepted, {verdicts.count('rejected')} rejected, {len(waiting)} open"
-    text = f"{len(queue)} tracks in review: {counts}"
-    if num_others := len(decisions.keys() - set(queue)):
-        text += f"; {num_others} other tracks rejected"
-    if waiting:
-        text += f" ({', '.join(waiting[:3])}{', ...' if len(waiting) > 3 else ''})"
-    return text
+    decisions = read_decisions(inspected)
+    folders = _in_review(read_inspection(inspected).flights)
+    counts = Counter(decisions[folder].verdict if folder in decisions else "open" for folder in folders)
+    text = ", ".join(f"{counts[state]} {state}" for state in ("accepted", "rejected", "open"))
+    waiting = [folder for folder in folders if folder not in decisions]
+    names = f" ({', '.join(waiting[:3])}{', ...' if len(waiting) > 3 else ''})" if waiting else ""
+    return f"{len(folders)} tracks in review: {text}{names}"
 
 
 def read_settled(inspected: Path) -> Inspection:
@@ -273,6 +260,6 @@ def _chosen(choice: Choice, tracks: list[TrackInspection], inspected: Path) -> l
     results = ("review",) if choice.verdict == "accepted" else ("review", "accepted")
     chosen = tracks_of_name or [track for track in of_trajectory if track.result in results] or of_trajectory
     if not chosen:
-        expected = f"the folder of a track or of a trajectory, such as {', '.join(_folders_in_review(tracks)[:3])}"
+        expected = f"the folder of a track or of a trajectory, such as {', '.join(_in_review(tracks)[:3])}"
         raise InputError("the inspection has no such track", where=inspected, got=choice.folder, expected=expected)
     return chosen

@@ -1,45 +1,27 @@
-"""Appearance of people and the goal, `people` and `goal` of `trajectory.json`: the wardrobe in words and colours."""
+"""Appearance of people and the goal, `people` and `goal` of `trajectory.json`: the wardrobe of `wardrobe.yaml`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
 
 from cosfly.formats.captions import Language
+from cosfly.runtime.config import read_yaml
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import validated
 
 Words = dict[Language, str]
 
-# Words and linear RGB for a renderer. The colours are far enough apart to be recognized in any daylight.
+_WARDROBE = read_yaml(Path(__file__).with_name("wardrobe.yaml"))
 COLORS: dict[str, tuple[Words, tuple[float, float, float]]] = {
-    "red": ({"en": "red", "zh": "红色"}, (0.55, 0.02, 0.02)),
-    "orange": ({"en": "orange", "zh": "橙色"}, (0.75, 0.21, 0.01)),
-    "yellow": ({"en": "yellow", "zh": "黄色"}, (0.75, 0.55, 0.02)),
-    "green": ({"en": "green", "zh": "绿色"}, (0.02, 0.28, 0.06)),
-    "blue": ({"en": "blue", "zh": "蓝色"}, (0.02, 0.10, 0.50)),
-    "purple": ({"en": "purple", "zh": "紫色"}, (0.22, 0.03, 0.34)),
-    "pink": ({"en": "pink", "zh": "粉色"}, (0.75, 0.24, 0.38)),
-    "brown": ({"en": "brown", "zh": "棕色"}, (0.16, 0.07, 0.03)),
-    "white": ({"en": "white", "zh": "白色"}, (0.75, 0.75, 0.72)),
-    "grey": ({"en": "grey", "zh": "灰色"}, (0.18, 0.18, 0.19)),
-    "black": ({"en": "black", "zh": "黑色"}, (0.012, 0.012, 0.014)),
+    name: ({"en": row["en"], "zh": row["zh"]}, tuple(row["rgb"])) for name, row in _WARDROBE["colors"].items()
 }
-
-# Slot -> (name, English, Chinese) of its garments. "" is none: a bare head, no bag.
-_WORN = (
-    ("top", (("t_shirt", "T-shirt", "T恤"), ("jacket", "jacket", "夹克"), ("coat", "long coat", "长大衣"))),
-    ("legs", (("trousers", "trousers", "长裤"), ("shorts", "shorts", "短裤"), ("skirt", "skirt", "裙子"))),
-    ("hat", (("", "", ""), ("cap", "cap", "鸭舌帽"), ("brim", "wide hat", "宽檐帽"))),
-    ("bag", (("", "", ""), ("backpack", "backpack", "背包"), ("shoulder", "shoulder bag", "挎包"))),
-)
-GARMENTS: dict[str, dict[str, Words]] = {
-    slot: {name: {"en": en, "zh": zh} for name, en, zh in garments} for slot, garments in _WORN
-}
-FIGURES: dict[str, Words] = {"woman": {"en": "woman", "zh": "女子"}, "man": {"en": "man", "zh": "男子"}}
+GARMENTS: dict[str, dict[str, Words]] = _WARDROBE["garments"]  # slot -> name -> words; the name "" is none
+FIGURES: dict[str, Words] = _WARDROBE["figures"]
 EMPTY_SHARE = {"hat": 0.6, "bag": 0.4}  # share of people without one
 HAIR = ("brown", "grey", "black")  # no hat has these colours: from the air it would look like hair
 
@@ -105,8 +87,8 @@ def _rows(name: str, record: dict) -> tuple[str, ...]:
 
 
 GARMENT_TERMS = ("top", "legs", "bag", "hat")
-PLACE_TERMS = ("left", "right", "near", "far", "Vegetation", "Poles", "Car", "TrafficLight", "Fences", "Buildings")
-GOAL_TERMS = ("figure", *GARMENT_TERMS, *PLACE_TERMS)  # the terms that a goal may use, in the order of its words
+# The terms that a goal may use, in the order of its words.
+GOAL_TERMS = ("figure", *GARMENT_TERMS, "left", "right", "near", "far")
 
 
 @dataclass(frozen=True)

@@ -38,10 +38,10 @@ from cosfly.formats.segments import FOLLOW, Mission, Segment, flown_as_json, mir
 from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import mirror_poses, step_s
 from cosfly.geometry.motion import PlannedMotion, without_perturbation
-from cosfly.runtime.arrays import check_pixels
 from cosfly.runtime.errors import InputError, json_type, shown
 from cosfly.runtime.io import read_bytes
 from cosfly.runtime.json_io import MISSING, read_object, validated, write_json
+from cosfly.runtime.png import check_pixels
 
 Value = TypeVar("Value")
 
@@ -58,11 +58,6 @@ EVENTS = ("position", "rotation")  # events of a perturbed frame; docs/files.md 
 # States of the frames of a perturbed track. Index: 1 if the position is perturbed, plus 2 if the rotation is.
 STATES = ("unperturbed", "position only", "rotation only", "full")
 DATASET_FORMAT = "cosfly_playback"  # marks tracks that cosfly made
-# Keys under which a file may store the names of weather presets; neither the paper nor a public file defines one.
-WEATHER_KEYS = {
-    "weather": ("weather_name", "weather", "preset", "name"),
-    "time_of_day": ("tod_name", "time_of_day", "tod"),
-}
 HEADING_FRAMES = 2  # a heading points from the position this many frames before to that as many frames after
 STANDS_M = 0.1  # a target that moves less between these two frames is standing
 
@@ -212,11 +207,10 @@ class Track:
     @property
     def weather(self) -> dict[str, str | None]:
         """Names of the presets of weather and time of day; None if the file has none."""
-        value = self.raw.get("weather")
-        record = {"weather": value} if isinstance(value, str) else object_of(self.raw, "weather")
-        texts = {key: text for key, text in record.items() if isinstance(text, str)}
+        record = self.weather_record
         return {
-            preset: next((texts[key] for key in keys if key in texts), None) for preset, keys in WEATHER_KEYS.items()
+            "weather": None if record is None else record.weather_name,
+            "time_of_day": None if record is None else record.tod_name,
         }
 
     @cached_property

@@ -1,25 +1,25 @@
-"""`roi_polygon.json`, where pedestrians may walk: the paper's form, ours with holes, and GeoJSON in metres."""
+"""`roi_polygon.json`, where pedestrians may walk: the paper's form, and ours with holes; and the picture under it."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import shapely
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from shapely.geometry.base import BaseGeometry
 
 from cosfly.formats.boxes import AXES, BoxMap
-from cosfly.formats.columns import numbers
-from cosfly.formats.geojson import Feature, features_of, is_geojson
+from cosfly.formats.columns import LARGEST, numbers
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import over_limit, read_bytes
-from cosfly.runtime.json_io import parse_document, validated, write_json
+from cosfly.runtime.io import over_limit, read_bytes, write_bytes
+from cosfly.runtime.json_io import FileFormat, Record, parse_document, read_model, validated, write_json, write_model
+from cosfly.runtime.png import read_picture
 
 WHAT = "region of interest"
+BACKDROP_FORMAT = FileFormat("cosfly.backdrop", "1.0", "world frame of a picture")
 MOST_VERTICES = 100_000  # of a region; to see that a spiky ring does not cross itself takes 8 s then
-SMALLEST_M = 1.0  # of a region; one that was drawn in degrees is smaller
 
 
 class RoiPolygon(BaseModel):
@@ -73,17 +73,14 @@ def write_roi(path: Path, roi: Roi) -> None:
     write_json(path, {**fields, "closed": True, **points}, indent=None)
 
 
-def read_roi(path: Path, most_vertices: int = MOST_VERTICES) -> Roi:
-    """Read a region of interest of at most so many vertices in all its rings; raises as `parse_roi`."""
-    return parse_roi(read_bytes(path, what=WHAT), path, most_vertices)
+def read_roi(path: Path) -> Roi:
+    """Read a region of interest; raises as `parse_roi`."""
+    return parse_roi(read_bytes(path, what=WHAT), path)
 
 
-def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Roi:
+def parse_roi(data: bytes, path: Path) -> Roi:
     """Return the region of interest of a file's bytes."""
-    value = parse_document(data, path)
-    if is_geojson(value):
-        value = {"polygons": _polygons_of(features_of(value, path), path)}
-    roi = validated(Roi, value, path)
+    roi = validated(Roi, parse_document(data, path), path)
     if not roi.closed:
         fix = "close the polygon in the editor"
         raise InputError("the polygon is not closed", where=f"{path}: closed", got="false", expected="true", fix=fix)
@@ -91,8 +88,8 @@ def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Ro
         raise InputError("the file has no polygon", where=f"{path}: points_world", expected="at least three points")
     rings = [(k, ring) for k, polygon in enumerate(roi.rings()) for ring in (polygon.points_world, *polygon.holes)]
     num_vertices = sum(len(ring) for _, ring in rings)
-    if num_vertices > most_vertices:
-        raise over_limit(path, f"{num_vertices:,} vertices", f"{most_vertices:,}", "simplify its rings")
+    if num_vertices > MOST_VERTICES:
+        raise over_limit(path, f"{num_vertices:,} vertices", f"{MOST_VERTICES:,}", "simplify its rings")
     for number, ring in rings:
         where = f"{path}: polygon {number}"
         if len(ring) < 3 or numbers(ring, None, 2) is None:
@@ -106,22 +103,43 @@ def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Ro
     return roi
 
 
-def _polygons_of(features: list[Feature], path: Path) -> list[dict[str, Any]]:
-    """Convert GeoJSON, whose rings repeat their first point, to `RoiPolygon` records; InputError lists all problems."""
-    problems: list[str] = []
-    polygons: list[dict[str, Any]] = []
-    for feature in features:
-        if feature.problem:
-            problems.append(f"{feature.where}: {feature.problem}")
-        for rings in feature.parts:
-            spread = np.ptp(rings[0], axis=0).max()
-            if len(rings[0]) < 4 or spread < SMALLEST_M:
-                problems.append(
-                    f"{feature.where}: {len(rings[0])} points within {spread:.3g} m are too few or too close"
-                )
-            points, *holes = (ring[:-1].tolist() for ring in rings)
-            polygons.append({"points_world": points, "holes": holes})
-    if problems:
-        expected = "polygons in world metres, x east and y north, not in longitude and latitude"
-        raise InputError.of_all(problems, where=path, expected=expected)
-    return polygons
+# --- the backdrop: a picture of a map from above (PNG) with its world frame (JSON), on which a region is drawn -------
+
+
+class WorldFrame(Record):
+    """Position of a picture, north up: the world place of its top left corner, and the side of a pixel, m."""
+
+    west_m: float = Field(ge=-LARGEST, le=LARGEST)
+    north_m: float = Field(ge=-LARGEST, le=LARGEST)
+    metres_per_px: float = Field(gt=0, le=1000)
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """picture: (height, width, 3) uint8 RGB."""
+
+    picture: np.ndarray
+    world: WorldFrame
+
+    @classmethod
+    def read(cls, path: Path) -> Backdrop:
+        """Read a picture and its world frame, the file of the same name that ends in `.json`."""
+        return cls(read_picture(path), read_model(path.with_suffix(".json"), WorldFrame, BACKDROP_FORMAT))
+
+    def frame(self) -> dict[str, float]:
+        """Return west, north, width and height, m."""
+        height, width = (side * self.world.metres_per_px for side in self.picture.shape[:2])
+        return {"west": self.world.west_m, "north": self.world.north_m, "width": width, "height": height}
+
+    def covers(self, box_map: BoxMap) -> bool:
+        """Return whether any of the map lies in the picture."""
+        (low, high), frame = box_map.bounds(), self.frame()
+        is_beside = frame["west"] > high[0] or frame["west"] + frame["width"] < low[0]
+        return not (is_beside or frame["north"] < low[1] or frame["north"] - frame["height"] > high[1])
+
+
+def write_backdrop(path: Path, png: bytes, world: WorldFrame) -> None:
+    """Write a picture and its frame, the frame first, so that no picture lacks one."""
+    path.unlink(missing_ok=True)  # which may lie elsewhere
+    write_model(path.with_suffix(".json"), world, BACKDROP_FORMAT)
+    write_bytes(path, png)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from pathlib import Path
 
 import numpy as np
@@ -48,24 +47,18 @@ def find_tracks(root: Path, choice: TrackChoice = ALL_TRACKS) -> list[Path]:
 
 
 def track_of(folder: Path) -> TrackName:
-    """Return the kind of a track from its folder's name or its file; an unreadable track counts as perturbed."""
-    if folder.name == ORIGINAL:
-        return "clean"
-    if re.fullmatch(r"aug_\d+", folder.name):
-        return "perturbed"
-    try:
-        return "clean" if read_track(folder, strict=False).is_original else "perturbed"
-    except InputError:
-        return "perturbed"
+    """Return the kind of a track from its folder's name."""
+    return "clean" if folder.name == ORIGINAL else "perturbed"
 
 
 def read_twin(track: Track) -> Track | None:
     """Read the clean twin of a perturbed track; None without one, VerifyError if the two do not belong together."""
     if track.is_original or track.folder is None:
         return None
-    twin = _clean_sibling(track, type(track.folder)(os.path.abspath(track.folder)))
-    if twin is None:
+    folder = Path(os.path.abspath(track.folder)).with_name(ORIGINAL)
+    if not (folder / "trajectory.json").exists():
         return None
+    twin = read_track(folder, strict=False)
     has_same_times = len(twin) == len(track) and np.abs(twin.time_s - track.time_s).max() < TWIN_TOLERANCE_S
     if not twin.is_original:
         raise VerifyError(
@@ -82,17 +75,6 @@ def read_twin(track: Track) -> Track | None:
             expected=_time_span(track),
         )
     return twin
-
-
-def _clean_sibling(track: Track, folder: Path) -> Track | None:
-    """Return the track in the folder `ORI` next to a track's folder, or else the first clean one next to it."""
-    original = folder.parent / ORIGINAL
-    if original != folder and (original / "trajectory.json").exists():
-        return read_track(original, strict=False)
-    for path in sorted(folder.parent.glob("[!.]*/trajectory.json")):
-        if path.parent != folder and (sibling := read_track(path.parent, strict=False)).is_original:
-            return sibling
-    return None
 
 
 def _time_span(track: Track) -> str:

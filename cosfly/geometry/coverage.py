@@ -1,7 +1,7 @@
 """Coverage of tracks: counts of frames by height, distance, direction, size, occlusion, style, pace and more.
 
 A student cannot learn situations that its data lack. The bins are fixed, so that the counts of tracks, runs and
-releases add up. Pages compare them with those of `cosfly run showcase` (`default_coverage.json`).
+releases add up.
 """
 
 from __future__ import annotations
@@ -9,15 +9,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 from pydantic import Field, field_validator
 
-from cosfly.runtime.json_io import Record, read_json, validated
-
-DEFAULT = Path(__file__).with_name("default_coverage.json")
+from cosfly.runtime.json_io import Record
 
 
 @dataclass(frozen=True)
@@ -57,15 +53,10 @@ AXES = {
 }
 
 NAMED = ("styles", "paces", "labels", "weathers", "times_of_day")
-COUNTED = (*NAMED, "skies")
-PAIR = " | "  # between the two names of a pair
 
 
 class Coverage(Record):
-    """Numbers of frames by bin of each axis, and by style, pace, label (of captions), weather and time of day.
-
-    skies: by both of the last two, such as "heavy_rain | night".
-    """
+    """Numbers of frames by bin of each axis, and by style, pace, label (of captions), weather and time of day."""
 
     frames: int = 0
     bins: dict[str, list[int]] = Field({})
@@ -74,7 +65,6 @@ class Coverage(Record):
     labels: dict[str, int] = Field({})
     weathers: dict[str, int] = Field({})
     times_of_day: dict[str, int] = Field({})
-    skies: dict[str, int] = Field({})
 
     @field_validator("bins")
     @classmethod
@@ -89,15 +79,14 @@ class Coverage(Record):
     @classmethod
     def of(
         cls, seen: np.ndarray, hip_height_m: float, styles: Iterable[str], paces: Iterable[str],
-        labels: Iterable[str] = (), skies: Iterable[tuple[str | None, str | None]] = (),
+        labels: Iterable[str] = (), weathers: Iterable[str] = (), times: Iterable[str] = (),
     ) -> Coverage:  # fmt: skip
         """Count frames.
 
         Args:
             seen: (n, 6) from the hip of the target to the drone (x, y, z, m), the target's heading (degrees), its
                 height (px) and its visible share; NaN where unknown.
-            styles, paces: one per frame. labels: one per frame with a label. skies: weather and time of day per
-                frame, None where unknown.
+            styles, paces: one per frame. labels, weathers, times: one per frame that has one.
         """
         offsets_m = seen[:, :3]
         heading_deg, height_px, visibility = seen[:, 3:].T
@@ -105,12 +94,8 @@ class Coverage(Record):
         distance_m = np.linalg.norm(offsets_m, axis=1)
         values = (offsets_m[:, 2] + hip_height_m, distance_m, azimuth_deg, height_px, visibility)
         bins = {name: axis.counts(column) for (name, axis), column in zip(AXES.items(), values, strict=True)}
-        pairs = list(skies)
-        weathers = [weather for weather, _ in pairs if weather is not None]
-        times = [time for _, time in pairs if time is not None]
-        both = [PAIR.join((weather, time)) for weather, time in pairs if weather is not None and time is not None]
-        counts = [dict(sorted(Counter(names).items())) for names in (styles, paces, labels, weathers, times, both)]
-        return cls(frames=sum(counts[0].values()), bins=bins, **dict(zip(COUNTED, counts, strict=True)))
+        counts = [dict(sorted(Counter(names).items())) for names in (styles, paces, labels, weathers, times)]
+        return cls(frames=sum(counts[0].values()), bins=bins, **dict(zip(NAMED, counts, strict=True)))
 
     @classmethod
     def total(cls, parts: Iterable[Coverage]) -> Coverage:
@@ -118,7 +103,7 @@ class Coverage(Record):
         parts = list(parts)
         all_bins = [part.bins for part in parts if part.bins]
         bins = {name: np.sum([part_bins[name] for part_bins in all_bins], axis=0).tolist() for name in AXES if all_bins}
-        counters = {name: sum((Counter(getattr(part, name)) for part in parts), Counter()) for name in COUNTED}
+        counters = {name: sum((Counter(getattr(part, name)) for part in parts), Counter()) for name in NAMED}
         counts = {name: dict(sorted(counter.items())) for name, counter in counters.items()}
         return cls(frames=sum(part.frames for part in parts), bins=bins, **counts)
 
@@ -136,9 +121,3 @@ def azimuths_deg(offsets_m: np.ndarray, headings_deg: np.ndarray) -> np.ndarray:
     """
     bearing = np.degrees(np.arctan2(offsets_m[:, 1], offsets_m[:, 0]))
     return (bearing - headings_deg + 180.0) % 360.0 - 180.0
-
-
-@cache
-def default_coverage() -> Coverage:
-    """Return the coverage of the default run (`configs/showcase.yaml`), which is part of the package."""
-    return validated(Coverage, read_json(DEFAULT), DEFAULT)

@@ -1,7 +1,7 @@
 """A goal in words: the shortest description that, of all people in a picture, only the target satisfies.
 
-A description is a tuple of slots of clothing and relations (SIDES, LANDMARKS). It is measured: clothing comes from the
-records, positions from ids, kinds and depth of the picture. `meant` computes from the same data whom a goal describes.
+A description is a tuple of slots of clothing and relations (SIDES). It is measured: clothing comes from the records,
+positions from ids and depth of the picture. `meant` computes from the same data whom a goal describes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import numpy as np
 
 from cosfly.formats.captions import Language
 from cosfly.formats.frames import PERSON_ID
-from cosfly.formats.kinds import KINDS
 from cosfly.formats.people import COLORS, FIGURES, GARMENTS, Appearance, Words
 
 # Slots of clothing, large ones first: Chinese verb for wearing it; English and Chinese words for an empty slot.
@@ -26,29 +25,17 @@ SIDES = {
     "left": ("leftmost", "最左边的", 1.0, 0.05), "right": ("rightmost", "最右边的", -1.0, 0.05),
     "near": ("nearest", "离镜头最近的", 1.0, 1.0), "far": ("farthest", "离镜头最远的", -1.0, 1.0),
 }  # fmt: skip
-# Things that people stand by: words; least height of its visible pixels above the person's middle, m, which excludes
-# plants other than trees.
-LANDMARKS = {
-    "Vegetation": ("tree", "树", 1.0), "Poles": ("post", "杆子", -np.inf), "Car": ("car", "汽车", -np.inf),
-    "TrafficLight": ("traffic light", "红绿灯", -np.inf), "Fences": ("fence", "栅栏", -np.inf),
-    "Buildings": ("building", "建筑", -np.inf),
-}  # fmt: skip
 PICTURE_PX = 160  # least longer side of a target picture
 ROOM_SHARE, ROOM_PX = 0.25, 8  # room around the person in it, the larger of both: share of the box's longer side, px
 _WITH = (("in", ("top", "legs")), ("with", ("bag", "hat")))
-BY_M = 4.0  # a person at most this far from a thing stands by it
-BY_MARGIN_M = 2.0  # others must be this much farther from it than the target
 
 
 @dataclass(frozen=True)
 class SeenFrame:
-    """A frame in numbers. kinds, ids, depth: (h, w), m; intrinsic: (3, 3) px; rotation: (3, 3), world from camera."""
+    """A frame in numbers: the instance ids and the depth, (h, w) m, of its pixels."""
 
-    kinds: np.ndarray
     ids: np.ndarray
     depth: np.ndarray
-    intrinsic: np.ndarray
-    rotation: np.ndarray
 
     def column_share(self, number: int) -> float:
         """Return the mean column of a person's pixels as a share of the picture's width."""
@@ -58,30 +45,13 @@ class SeenFrame:
         """Return the median depth of a person's pixels, m."""
         return float(np.median(self.depth[self.ids == number]))
 
-    def place_m(self, number: int) -> np.ndarray:
-        """Return the median place of a person's pixels, (3,) m, from the camera along the world axes."""
-        return np.median(self._points_m(self.ids == number), axis=0)
-
-    def distance_m(self, number: int, kind: str) -> float:
-        """Return the distance over ground from a person to visible pixels of a kind, m; infinity without any."""
-        x, y, z = self.place_m(number)
-        points = self._points_m(self.kinds == KINDS[kind])
-        points = points[points[:, 2] >= z + LANDMARKS[kind][2]]
-        return float(np.hypot(points[:, 0] - x, points[:, 1] - y).min(initial=np.inf))
-
-    def _points_m(self, mask: np.ndarray) -> np.ndarray:
-        """Return the points of pixels, (n, 3) m, from the camera along the world axes."""
-        rows, columns = np.nonzero(mask)
-        rays = np.column_stack([columns + 0.5, rows + 0.5, np.ones(len(rows))]) @ np.linalg.inv(self.intrinsic).T
-        return (rays * self.depth[mask][:, None]) @ self.rotation.T
-
 
 def meant(says: Iterable[str], looks: Appearance, people: Mapping[int, Appearance], picture: SeenFrame) -> set[int]:
     """Return the instance ids of the people that a description fits.
 
     says: the description. looks: appearance for its slots. people: appearance by instance id.
     """
-    slots = {*says} - {*SIDES, *LANDMARKS}
+    slots = {*says} - {*SIDES}
     fitting = {
         number
         for number, person in people.items()
@@ -94,8 +64,6 @@ def meant(says: Iterable[str], looks: Appearance, people: Mapping[int, Appearanc
 
 def _excess(relation: str, numbers: Collection[int], picture: SeenFrame) -> dict[int, float]:
     """Return how far each person is from fulfilling a relation, m or shares of the width; 0 or less where it holds."""
-    if relation in LANDMARKS:
-        return {number: picture.distance_m(number, relation) - BY_M for number in numbers}
     measure = picture.depth_m if relation in ("near", "far") else picture.column_share
     sign = SIDES[relation][2]
     values = {number: sign * measure(number) for number in numbers}
@@ -131,11 +99,10 @@ def find_says(
                 best_rivals = confused
     if best_says is None or not best_rivals:
         return best_says
-    for relation in (*SIDES, *LANDMARKS):
+    for relation, (_, _, _, margin) in SIDES.items():
         excess = _excess(relation, {PERSON_ID, *best_rivals}, picture)
         target_excess = excess.pop(PERSON_ID)
-        margin = SIDES[relation][3] if relation in SIDES else BY_MARGIN_M
-        if target_excess <= 0.0 and min(excess.values()) >= max(target_excess + margin, 1e-9):
+        if target_excess <= 0.0 and min(excess.values()) >= margin:
             return (*best_says, relation)
     return None
 
@@ -158,7 +125,6 @@ def words_of(says: Sequence[str], looks: Appearance) -> Words:
     """Return the description in both languages."""
     noun = FIGURES[looks.figure] if "figure" in says else {"en": "person", "zh": "行人"}
     side_en, side_zh, *_ = next((SIDES[name] for name in says if name in SIDES), ("", ""))
-    mark_en, mark_zh, *_ = next((LANDMARKS[name] for name in says if name in LANDMARKS), ("", ""))
 
     def worn(slot: str, language: Language) -> str:
         verb, *bare = SLOTS[slot]
@@ -172,9 +138,6 @@ def words_of(says: Sequence[str], looks: Appearance) -> Words:
     phrases = [f"{word} {' and '.join(garments)}" for word, garments in lists if garments]
     en = " ".join(filter(None, ("the", side_en, noun["en"], *phrases)))
     phrases_zh = [worn(slot, "zh") for slot in SLOTS if slot in says]
-    if mark_en:
-        en += f", by a {mark_en}"
-        phrases_zh.insert(0, f"在{mark_zh}旁边")
     return {"en": en, "zh": f"{side_zh}{'、'.join(phrases_zh)}的{noun['zh']}"}
 
 

@@ -39,9 +39,10 @@ from cosfly.geometry.reprojection import LEAST_SEEN, Agreement, View, compare_vi
 from cosfly.geometry.trajectory_metrics import CLEARANCE_TOLERANCE_M
 from cosfly.inspection import settings as limits
 from cosfly.inspection.pixels import NUM_IDS, Picture, PixelFigures, measure_pixels, unpack
-from cosfly.runtime.arrays import array_header, picture_size
+from cosfly.runtime.arrays import array_header
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import CHECKSUMS, read_bytes, read_checksums, sha256_bytes, sha256_file
+from cosfly.runtime.png import picture_size
 from cosfly.runtime.worker import advance
 
 # --- files ------------------------------------------------------------------------------------------------------------

@@ -14,9 +14,9 @@ import numpy as np
 
 from cosfly.formats.frames import DEPTH_NPY, INVALID_DEPTH_M, SKY_DEPTH_M, depth_values, public_name
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.png import colours_of
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.png import colours_of
 
 NO_DEPTH = np.empty((0, 0), np.float32)
 NO_DEPTH.flags.writeable = False

@@ -19,19 +19,19 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import shapely
+import shapely.errors
 from pydantic import Field, field_validator
-from shapely.geometry import Polygon
+from shapely.geometry import Polygon, shape
 
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource, read_boxes
 from cosfly.formats.columns import LARGEST
-from cosfly.formats.geojson import read_features
 from cosfly.formats.kinds import GROUND_KINDS, KINDS, SURFACE_KINDS
 from cosfly.maps.boxlist import BoxList, origin_m, required
-from cosfly.maps.derived_ground import with_derived_ground
-from cosfly.maps.footprints import CUT_SHARES, Rectangle, cover
+from cosfly.maps.footprints import CUT_SHARES, Rectangle, cover, with_derived_ground
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, InputError, nearest
 from cosfly.runtime.io import read_text
+from cosfly.runtime.json_io import read_json
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +39,9 @@ NUMBERS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_deg")
 COLUMNS = ("type", "id", "name", *NUMBERS)
 PLACE = ("x_m", "y_m", "length_m", "width_m")  # every table has them; and height_m, except of surfaces
 TYPES = [kind for kind in KINDS if kind != "NONE"]
+GEOMETRIES = ("Point", "Polygon", "MultiPolygon")  # of GeoJSON
+LARGEST_PLACE = 1e9  # absolute value of a coordinate of GeoJSON
+MOST_NAME = 40  # characters of a name in messages
 SLAB_M = 0.3  # thickness of a surface without a height: its top is the ground
 FAR_M = 10_000.0  # a map with its middle farther from the origin is moved there
 OUTLINE_FILL, OUTLINE_PIECE_M = 0.9, 3.0  # share of its boxes that an outline fills; shortest piece that is cut
@@ -81,11 +84,11 @@ class BoxesConfig(Config):
 
 
 class _Row(NamedTuple):
-    """One row of a table or one part of a feature; `problem` is empty if it could be read."""
+    """One row of a table, a feature or one part of it; `problem` is empty if it could be read."""
 
     where: str
     values: Mapping[str, Any]
-    outline: Polygon | None = None
+    outline: Any = None  # a geometry of shapely
     problem: str = ""
 
 
@@ -200,21 +203,53 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
 
 
 def _feature_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
-    features = read_features(path, what="map")
-    names = dict.fromkeys(name for feature in features for name in feature.properties)
+    value = read_json(path, what="map")
+    if not isinstance(value, dict) or value.get("type") not in ("FeatureCollection", "Feature", *GEOMETRIES):
+        expected = "FeatureCollection, Feature, Polygon or MultiPolygon"
+        raise InputError("this file is not GeoJSON", where=f"{path}: type", expected=expected)
+    items = value.get("features") if value["type"] == "FeatureCollection" else [value]
+    if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
+        raise InputError(
+            "the file has no list of features", where=f"{path}: features", expected="a list of Feature objects"
+        )
+    features = [_feature(item, number) for number, item in enumerate(items, 1)]
+    names = dict.fromkeys(name for feature in features for name in feature.values)
     yield from (_Row("", {}, problem=problem) for problem in _unknown(list(names), cfg))
-    rings = [ring for feature in features for part in feature.parts for ring in part]
-    project = _to_metres(cfg, np.concatenate(rings), path) if rings else None
+    places = shapely.get_coordinates([feature.outline for feature in features])
+    project = _to_metres(cfg, places, path) if len(places) else None
     for feature in features:
-        row = {k: value for k, value in feature.properties.items() if value is not None and k in COLUMNS}
+        row = {k: value for k, value in feature.values.items() if value is not None and k in COLUMNS}
         if feature.problem or project is None:
-            yield _Row(feature.where, row, problem=feature.problem)
+            yield feature._replace(values=row)
             continue
-        for outer, *holes in ([project(ring) for ring in part] for part in feature.parts):
-            if len(outer) == 1:
-                yield _Row(feature.where, {**row, "x_m": outer[0, 0], "y_m": outer[0, 1]})
+        for part in shapely.get_parts(shapely.transform(feature.outline, project)):
+            if isinstance(part, Polygon):
+                yield _Row(feature.where, row, part)
             else:
-                yield _Row(feature.where, row, Polygon(outer, holes))
+                yield _Row(feature.where, {**row, "x_m": part.x, "y_m": part.y})
+
+
+def _feature(item: dict[str, Any], number: int) -> _Row:
+    """Return a Feature or a bare geometry with its properties; `number` counts from 1."""
+    properties = item["properties"] if isinstance(item.get("properties"), dict) else {}
+    where = f"feature {number}"
+    names = (properties.get("name"), item.get("id"), properties.get("id"))
+    if name := next((str(value)[:MOST_NAME] for value in names if value not in (None, "")), None):
+        where += f" ({name})"
+    geometry = item.get("geometry") if item.get("type") == "Feature" else item
+    kind = geometry.get("type") if isinstance(geometry, dict) else None
+    if kind not in GEOMETRIES:
+        problem = f"the geometry {str(kind)[:MOST_NAME]} is not supported; expected one of {', '.join(GEOMETRIES)}"
+        return _Row(where, properties, problem=problem)
+    try:
+        outline = shapely.force_2d(shape(geometry))
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError, shapely.errors.ShapelyError):
+        outline = Polygon()
+    places = shapely.get_coordinates(outline)
+    if len(places) == 0 or not (np.abs(places) <= LARGEST_PLACE).all():  # NaN fails
+        problem = f"the coordinates of the {kind} are invalid; expected [x, y], at least four points in a ring"
+        return _Row(where, properties, problem=problem)
+    return _Row(where, properties, outline)
 
 
 def _to_metres(cfg: BoxesConfig, places: np.ndarray, path: Path) -> Callable[[np.ndarray], np.ndarray]:

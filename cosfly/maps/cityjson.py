@@ -19,12 +19,20 @@ from pydantic import Field
 from shapely.geometry import Polygon
 
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, GroundGrid, LicenceId, MapHeader, MapSource
-from cosfly.formats.meshes import MESHES_FILE, Mesh, Meshes, MeshRef
+from cosfly.formats.meshes import MESHES_FILE, Meshes, MeshRef
 from cosfly.geometry.ground import Ground
 from cosfly.maps.boxlist import BoxList, origin_m, required
 from cosfly.maps.cityjson_file import CityObject, Surface, read_model
-from cosfly.maps.derived_ground import with_derived_ground
-from cosfly.maps.footprints import CUT_SHARES, Rectangle, check_outline, cover, polygons_of, rectangle_polygon, united
+from cosfly.maps.footprints import (
+    CUT_SHARES,
+    Rectangle,
+    check_outline,
+    cover,
+    polygons_of,
+    rectangle_polygon,
+    united,
+    with_derived_ground,
+)
 from cosfly.runtime.config import Config
 
 log = logging.getLogger(__name__)
@@ -101,7 +109,7 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     boxes = BoxList()
     solid_rows = list[int]()
     mesh_refs = dict[int, MeshRef]()
-    meshes = dict[str, Mesh]()
+    meshes = dict[str, np.ndarray]()
     footprint_m2 = boxes_m2 = covered_m2 = 0.0  # of buildings
     for item in objects:
         footprint = footprints[item.object_id]
@@ -189,7 +197,7 @@ def _pieces(footprint: Any, tolerance_m: float, **rules: Any) -> Iterator[Rectan
 
 def _add_solid(
     boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint: Any, ground: Ground
-) -> tuple[Any, Mesh | None]:
+) -> tuple[Any, np.ndarray | None]:
     """Add a building as upright boxes from its lowest ground (or below it) to its top.
 
     A box is as high as the mesh in it, so that planners know its spires. Return the union of the outlines of the boxes,
@@ -207,8 +215,8 @@ def _add_solid(
     return united(outlines), mesh
 
 
-def solid_mesh(surfaces: list[Surface], foot_m: float) -> Mesh | None:
-    """Return the triangles of surfaces; None if none has an area.
+def solid_mesh(surfaces: list[Surface], foot_m: float) -> np.ndarray | None:
+    """Return the triangles of surfaces, (k, 3, 3) m; None if none has an area.
 
     The foot is lowered to `foot_m`, so that no house floats over ground that a map made flat.
     """
@@ -220,9 +228,7 @@ def solid_mesh(surfaces: list[Surface], foot_m: float) -> Mesh | None:
             ring[ring[:, 2] <= lowest + FOOT_M, 2] = min(lowest, foot_m)
         parts.append(_triangles_of(rings))
     corners = np.concatenate(parts)
-    if not len(corners):
-        return None
-    return Mesh(corners, np.full((len(corners), 3), np.nan))
+    return corners if len(corners) else None
 
 
 def _add_wall(boxes: BoxList, item: CityObject, footprint: Any, *, is_flat: bool) -> None:
@@ -233,14 +239,14 @@ def _add_wall(boxes: BoxList, item: CityObject, footprint: Any, *, is_flat: bool
         boxes.add(item.rule.kind, piece.center, piece.size, low, high, piece.yaw_deg)
 
 
-def _top_within(mesh: Mesh, rectangle: Rectangle, default: float) -> float:
+def _top_within(mesh: np.ndarray, rectangle: Rectangle, default: float) -> float:
     """Return the height of the highest triangle over a rectangle; `default` if there is none."""
     yaw = np.radians(rectangle.yaw_deg)
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-    flat = (mesh.corners_m[..., :2] - rectangle.center) @ axes.T
+    flat = (mesh[..., :2] - rectangle.center) @ axes.T
     half = np.array(rectangle.size) / 2.0 - EDGE_M
     over = ((flat.min(axis=1) < half) & (flat.max(axis=1) > -half)).all(axis=1)
-    return float(mesh.corners_m[over, :, 2].max()) if over.any() else default
+    return float(mesh[over, :, 2].max()) if over.any() else default
 
 
 def _triangles_of(rings: Surface) -> np.ndarray:
@@ -357,7 +363,8 @@ def ground_of(objects: list[CityObject]) -> Ground:
         origin = "terrain and streets"
     else:
         solids = [item for item in objects if item.rule.form == "solid"] or objects
-        samples = np.array([_foot(item.corners()) for item in solids])
+        ends = [(item.corners().min(axis=0), item.corners().max(axis=0)) for item in solids]
+        samples = np.array([[*(low + high)[:2] / 2, low[2]] for low, high in ends])
         origin = "the bases of buildings"
     low, high = np.percentile(samples[:, 2], RISE_SHARES)
     if high - low <= FLAT_WITHIN_M:
@@ -370,12 +377,6 @@ def ground_of(objects: list[CityObject]) -> Ground:
         "the ground rises by %.1f m; its heights are sampled every %g m from %s", high - low, ground.cell_m, origin
     )
     return GroundGrid.of(ground).ground()
-
-
-def _foot(corners: np.ndarray) -> list[float]:
-    """Return the middle of an object's bounds at the height of its lowest corner, (3,) m."""
-    middle = (corners[:, :2].min(axis=0) + corners[:, :2].max(axis=0)) / 2
-    return [*middle, corners[:, 2].min()]
 
 
 def _gridded(samples: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ground:

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import AliasPath, BaseModel, Field, FiniteFloat
 
 from cosfly.formats.columns import numbers
+from cosfly.runtime.config import read_yaml
 from cosfly.runtime.errors import InputError, counts_text, json_type, shown
 from cosfly.runtime.io import over_limit, read_unpacked
 from cosfly.runtime.json_io import parse_document, parse_json, validated
@@ -33,7 +34,7 @@ Surface = list[np.ndarray]  # rings of (n, 3) m: the outline, then the holes
 
 
 class ObjectRule(NamedTuple):
-    """The kind and form of objects of a CityJSON type; a rule with an attribute needs a matching value too."""
+    """The kind and form of objects of a CityJSON type: a row of `cityjson_rules.yaml`."""
 
     type: str
     kind: str
@@ -47,28 +48,7 @@ class ObjectRule(NamedTuple):
         return fnmatchcase(item.type.removeprefix("+"), self.type) and fnmatchcase(value, self.value)
 
 
-# The first rule that matches decides. Attribute values are those of the Dutch register BGT, as 3dfier writes them.
-RULES = (
-    ObjectRule("Building*", "Buildings", "solid"),
-    ObjectRule("Bridge*", "Bridge", "surface"),
-    ObjectRule("Tunnel*", "Other", "surface"),
-    ObjectRule("Road", "Sidewalks", "surface", "function", "voet*"),
-    ObjectRule("Road", "Roads", "surface"),
-    ObjectRule("TransportSquare", "Sidewalks", "surface"),
-    ObjectRule("Railway", "RailTrack", "surface"),
-    ObjectRule("Water*", "Water", "surface"),
-    ObjectRule("LandUse", "Ground", "surface", "bgt_fysiekvoorkomen", "*verharding"),
-    ObjectRule("LandUse", "Terrain", "surface"),
-    ObjectRule("PlantCover", "Terrain", "green"),
-    ObjectRule("SolitaryVegetationObject", "Vegetation", "solid"),
-    ObjectRule("TINRelief", "Terrain", "surface"),
-    # The edge of a quay is flush with the street.
-    ObjectRule("GenericCityObject", "Walls", "surface", "bgt_type", "kademuur"),
-    ObjectRule("*GenericCityObject", "Walls", "wall", "bgt_type", "muur"),
-    ObjectRule("*GenericCityObject", "Static", "wall"),
-    ObjectRule("CityFurniture", "Static", "solid"),
-    ObjectRule("OtherConstruction", "Static", "solid"),
-)
+RULES = [ObjectRule(**fields) for fields in read_yaml(Path(__file__).with_name("cityjson_rules.yaml"))["rules"]]
 
 
 class CityObject(NamedTuple):
@@ -109,8 +89,6 @@ class _Geometry(BaseModel):
     type: str
     lod: Any = 0
     boundaries: list[Any] = []
-    template: int = -1
-    transformationMatrix: list[FiniteFloat] = Field([], max_length=16)
 
     @property
     def level(self) -> float:
@@ -118,11 +96,6 @@ class _Geometry(BaseModel):
             return float(self.lod)
         except (TypeError, ValueError):
             return 0.0
-
-
-class _Templates(BaseModel):
-    templates: list[_Geometry] = []
-    vertices: list[Any] = Field([], alias="vertices-templates")
 
 
 class _Object(BaseModel):
@@ -142,15 +115,6 @@ class _Part(BaseModel):
 class _Document(_Part):
     scale: Vector = Field(validation_alias=AliasPath("transform", "scale"))
     translate: Vector = Field(validation_alias=AliasPath("transform", "translate"))
-    templates: _Templates = Field(_Templates(), alias="geometry-templates")
-
-
-class _Vertices(NamedTuple):
-    """Vertices of a part, the templates of the document and their vertices, (n, 3) m."""
-
-    part_vertices: np.ndarray
-    templates: list[_Geometry]
-    template_vertices: np.ndarray
 
 
 class _Dropped(Exception):
@@ -160,14 +124,12 @@ class _Dropped(Exception):
 def read_model(path: Path) -> CityModel:
     """Read a CityJSON file or text sequence, plain or gzipped; coordinates stay the file's."""
     version, head, features = _read_parts(path)
-    template_vertices = _vectors(head.templates.vertices, f"{path}: geometry-templates.vertices-templates")
     objects = dict[str, CityObject]()
     seen_ids = set[str]()
     num_objects = 0
     dropped = dict.fromkeys(("unmapped_type", "group", "no_geometry", "outline_of_parts", "repeated_id"), 0)
     for where, part in [(str(path), head), *features] if head.objects else features:
-        part_vertices = _vectors(part.vertices, f"{where}: vertices") * head.scale + head.translate
-        vertices = _Vertices(part_vertices, head.templates.templates, template_vertices)
+        vertices = _vectors(part.vertices, f"{where}: vertices") * head.scale + head.translate
         num_objects += len(part.objects)
         for object_id, item in part.objects.items():
             reason = ""
@@ -241,29 +203,7 @@ def _vectors(values: list[Any], where: str) -> np.ndarray:
     return vectors
 
 
-class _Candidate(NamedTuple):
-    """A geometry with its vertices, (n, 3) m, and its place in the file."""
-
-    geometry: _Geometry
-    vertices: np.ndarray
-    where: str
-
-    @property
-    def level(self) -> float:
-        return self.geometry.level
-
-    def surfaces(self) -> list[Surface]:
-        """Return the surfaces; for a solid those of its outer shell."""
-        where = f"{self.where}.boundaries"
-        boundaries = self.geometry.boundaries
-        if (nesting := NESTING[self.geometry.type]) > 0:
-            solids = boundaries if nesting == 2 else [boundaries]
-            outer_shells = [shell for solid in solids for shell in _require_list(solid, where)[:1]]
-            boundaries = [surface for shell in outer_shells for surface in _require_list(shell, where)]
-        return [_rings(surface, self.vertices, f"{where} surface {k}") for k, surface in enumerate(boundaries)]
-
-
-def _city_object(object_id: str, item: _Object, part: _Part, vertices: _Vertices, where: str) -> CityObject:
+def _city_object(object_id: str, item: _Object, part: _Part, vertices: np.ndarray, where: str) -> CityObject:
     """Return an object; raise _Dropped if it is not used."""
     if item.type == "CityObjectGroup":  # its members are objects themselves
         raise _Dropped("group")
@@ -271,51 +211,36 @@ def _city_object(object_id: str, item: _Object, part: _Part, vertices: _Vertices
     if rule is None:
         log.warning("%s: dropped, because cosfly has no rule for the type %s", object_id, item.type)
         raise _Dropped("unmapped_type")
-    candidates = [
-        _resolve_instance(geometry, vertices, f"{where}.geometry[{k}]") for k, geometry in enumerate(item.geometry)
-    ]
-    usable = [candidate for candidate in candidates if candidate.geometry.type in NESTING]
+    usable = [k for k, geometry in enumerate(item.geometry) if geometry.type in NESTING]
     if not usable:
         raise _Dropped("no_geometry")
-    coarsest = min(usable, key=lambda candidate: (candidate.level < 1, candidate.level))  # level 0 has no height
-    finest = max(usable, key=lambda candidate: candidate.level)
-    surfaces = coarsest.surfaces()
+
+    def level(k: int) -> float:
+        return item.geometry[k].level
+
+    def surfaces_of(k: int) -> list[Surface]:
+        return _surfaces(item.geometry[k], vertices, f"{where}.geometry[{k}].boundaries")
+
+    coarsest = min(usable, key=lambda k: (level(k) < 1, level(k)))  # level 0 has no height
+    finest = max(usable, key=level)
+    surfaces = surfaces_of(coarsest)
     if not surfaces:
         raise _Dropped("no_geometry")
     if rule.form != "solid":
         return CityObject(object_id, rule, surfaces, [])
-    if coarsest.level < 1 and any(child in part.objects for child in item.children or []):
+    if level(coarsest) < 1 and any(child in part.objects for child in item.children or []):
         raise _Dropped("outline_of_parts")  # its parts have the walls; the outline would hide their courtyards
-    return CityObject(object_id, rule, surfaces, surfaces if finest is coarsest else finest.surfaces())
+    return CityObject(object_id, rule, surfaces, surfaces if finest == coarsest else surfaces_of(finest))
 
 
-def _resolve_instance(geometry: _Geometry, vertices: _Vertices, where: str) -> _Candidate:
-    """Return a geometry with its vertices; an instance becomes its template with moved vertices."""
-    if geometry.type != "GeometryInstance":
-        return _Candidate(geometry, vertices.part_vertices, where)
-    anchor = geometry.boundaries[0] if len(geometry.boundaries) == 1 else None
-    if not 0 <= geometry.template < len(vertices.templates):
-        raise InputError(
-            "the geometry refers to a template that does not exist",
-            where=f"{where}.template",
-            got=str(geometry.template)[:40],
-            expected=f"an index below {len(vertices.templates)}",
-        )
-    if type(anchor) is not int or not 0 <= anchor < len(vertices.part_vertices):
-        raise InputError(
-            "the instance must have exactly one reference point",
-            where=f"{where}.boundaries",
-            got=shown(geometry.boundaries),
-            expected="the index of one vertex",
-        )
-    if len(geometry.transformationMatrix) != 16:
-        expected = "16 finite numbers, row by row"
-        raise InputError(
-            "the matrix of the instance has the wrong length", where=f"{where}.transformationMatrix", expected=expected
-        )
-    matrix = np.array(geometry.transformationMatrix).reshape(4, 4)
-    corners = vertices.template_vertices @ matrix[:3, :3].T + matrix[:3, 3] + vertices.part_vertices[anchor]
-    return _Candidate(vertices.templates[geometry.template], corners, where)
+def _surfaces(geometry: _Geometry, vertices: np.ndarray, where: str) -> list[Surface]:
+    """Return the surfaces of a geometry; for a solid those of its outer shell."""
+    boundaries = geometry.boundaries
+    if (nesting := NESTING[geometry.type]) > 0:
+        solids = boundaries if nesting == 2 else [boundaries]
+        outer_shells = [shell for solid in solids for shell in _require_list(solid, where)[:1]]
+        boundaries = [surface for shell in outer_shells for surface in _require_list(shell, where)]
+    return [_rings(surface, vertices, f"{where} surface {k}") for k, surface in enumerate(boundaries)]
 
 
 def _require_list(value: Any, where: str) -> list:

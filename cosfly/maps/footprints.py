@@ -1,8 +1,13 @@
-"""Polygons to oriented rectangles: a polygon is cut in two until the rectangle around each piece is nearly full."""
+"""Polygons to oriented rectangles: a polygon is cut in two until the rectangle around each piece is nearly full.
+
+With them `with_derived_ground` lays ground into a map of buildings without streets. The map's header counts its boxes
+(`derived_ground`), and its credits, that every release repeats, say so.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +16,10 @@ from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from cosfly.formats.boxes import BoxMap
+from cosfly.formats.kinds import KINDS, PAVED_KINDS
 from cosfly.geometry.axes import box_corners
+from cosfly.geometry.grid import blocks_walking
+from cosfly.maps.boxlist import BoxList
 from cosfly.runtime.io import over_limit
 
 MIN_AREA_M2 = 0.02  # smaller pieces are rounding errors of a cut
@@ -160,3 +168,47 @@ def num_crossings(polygon: Polygon) -> int:
 def united(polygons: list[Polygon]) -> BaseGeometry:
     """Merge polygons that may be invalid."""
     return shapely.union_all(shapely.make_valid(np.array(polygons, dtype=object))) if polygons else MultiPolygon()
+
+
+# --- derived ground: pavement along facades, asphalt between near buildings, lawn elsewhere ---------------------------
+
+PAVEMENT_M = 2.5  # pedestrians keep half a metre from walls
+NEAR_M = 25.0  # asphalt lies between facades up to this far apart
+NARROW_M = 4.0  # narrower asphalt is a leftover of corners
+VERGE_M = 10.0  # of lawn around the map
+GROUND_SLAB_M, LAWN_TOP_M = 0.3, -0.1  # asphalt and pavement lie in the ground's plane
+CREDITS = "Streets, pavements and lawn are derived by cosfly from the buildings, not mapped."
+
+
+def with_derived_ground(box_map: BoxMap) -> BoxMap:
+    """Return a map with derived ground; the same map if it has streets, pavements or squares, or no buildings."""
+    standing = box_map.select(blocks_walking(box_map) & (box_map.kinds == KINDS["Buildings"]))
+    if len(standing) == 0 or box_map.is_any_of(PAVED_KINDS).any():
+        return box_map
+    boxes = BoxList()
+    if not (box_map.kinds == KINDS["Terrain"]).any():
+        low, high = box_map.bounds()
+        boxes.span("Terrain", low[:2] - VERGE_M, high[:2] + VERGE_M, LAWN_TOP_M - GROUND_SLAB_M, LAWN_TOP_M)
+    houses = [
+        Rectangle((center[0], center[1]), (2 * half[0], 2 * half[1]), turn[1])
+        for center, half, turn in zip(standing.centers, standing.half_extents, standing.rotations_deg, strict=True)
+    ]
+    built = united([rectangle_polygon(house) for house in houses])
+    between = shapely.buffer(shapely.buffer(built, NEAR_M / 2), -NEAR_M / 2)
+    free = shapely.difference(between, shapely.buffer(built, PAVEMENT_M, join_style="mitre"))
+    streets = shapely.buffer(shapely.buffer(free, -NARROW_M / 2), NARROW_M / 2 + 0.5).simplify(0.5)
+    for polygon in polygons_of(streets):
+        for piece in cover(polygon, min_fill=0.9, min_size_m=6.0, max_size_m=60.0):
+            boxes.add("Roads", piece.center, piece.size, -GROUND_SLAB_M, 0.0, piece.yaw_deg)
+    for house in houses:  # one slab under each, so that pavements have the facades' directions and no seams
+        size = house.size[0] + 2 * PAVEMENT_M, house.size[1] + 2 * PAVEMENT_M
+        boxes.add("Sidewalks", house.center, size, -GROUND_SLAB_M, 0.0, house.yaw_deg)
+    derived = boxes.box_map()
+    derived.centers[:, 2] += box_map.ground.height_at(derived.centers)
+    derived.ids[:] = np.setdiff1d(np.arange(1, len(box_map) + len(derived) + 1), box_map.ids)[: len(derived)]
+    header = box_map.header
+    update = {
+        "derived_ground": len(derived), "added_boxes": header.added_boxes + len(derived),
+        "credits": f"{header.credits.rstrip('. ')}. {CREDITS}".removeprefix(". "),
+    }  # fmt: skip
+    return replace(box_map.joined(derived), header=header.model_copy(update=update))

@@ -1,9 +1,9 @@
 """A SimWorld city: the world file of its generator, with the table of asset sizes.
 
 The file has Unreal's axes: centimetres, left-handed, yaw clockwise. A box stands on the node's location; its size is
-the full size in the table times the node's scale. The table lacks sizes of street furniture (source `default`: ASSETS),
-and the world lacks widths of roads (source `road`: from the objects along them). A world that holds its own surfaces,
-such as those of `cosfly world`, gets none added. `header.extent_sources` counts the sources of sizes.
+the full size in the table times the node's scale. The table lacks sizes of street furniture (source `default`, from
+`assets.yaml`), and the world lacks widths of roads (source `road`: from the objects along them). A world that holds its
+own surfaces, such as those of `cosfly world`, gets none added. `header.extent_sources` counts the sources of sizes.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ ROAD_SHARE_OF_FRONT = 0.43  # half width of the carriageway / distance of the fr
 DEFAULT_FRONT_M = 27.0  # usual distance of fronts in the generator, for roads without buildings
 DASH_M, DASH_STEP_M, DASH_WIDTH_M = 3.0, 9.0, 0.16  # of the paint on a centre line
 MAP_MARGIN_M = 10.0
-ROAD_PIECES = "BP_Road*"  # of ASSETS: pieces without a size
+ROAD_PIECES = "BP_Road*"  # of `assets.yaml`: pieces without a size
 SURFACE_NODE = "Sidewalks_C"  # only worlds with their own surfaces have it
 
 
@@ -200,7 +200,7 @@ def _check_unknown(cfg: SimWorldConfig, node: _Node, what: str) -> None:
     if cfg.unknown == "error":
         fix = "add a table with its size to maps.simworld.sizes"
         if what == "kind":
-            fix = "add the asset to ASSETS in cosfly/simulators/assets.py"
+            fix = "add the asset to cosfly/simulators/assets.yaml"
         raise InputError(
             f"the asset has no {what}", where=f"{cfg.world}: {node.id}.instance_name", got=node.instance_name,
             fix=f"{fix}, or drop such assets with --set maps.simworld.unknown=drop",
@@ -210,8 +210,8 @@ def _check_unknown(cfg: SimWorldConfig, node: _Node, what: str) -> None:
 
 def _add_node(boxes: BoxList, node: _Node, asset: Asset, size_cm: np.ndarray, stand_m: float, world: Path) -> str:
     """Add one object; return the source of its extent."""
-    is_placeholder = asset.default_size_m is not None and bool((size_cm == PLACEHOLDER_CM).all())
-    size = np.array(asset.default_size_m) if is_placeholder else size_cm * M_PER_CM
+    is_placeholder = asset.size_m is not None and bool((size_cm == PLACEHOLDER_CM).all())
+    size = np.array(asset.size_m) if is_placeholder else size_cm * M_PER_CM
     size = size * node.scale.array()
     if not LEAST_M <= size.min() <= size.max() <= LARGEST:
         raise InputError(

@@ -20,7 +20,7 @@ from pydantic import Field, model_validator
 from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.maps.boxlist import BoxList, Pair
 from cosfly.maps.town_blocks import BLOCKS, ORDINARY_LOTS, ROAD_TOP_M, SLAB_M, WATER_TOP_M, Lots, Plot, Range, point
-from cosfly.runtime.config import Config
+from cosfly.runtime.config import Config, read_yaml
 from cosfly.runtime.errors import nearest
 from cosfly.runtime.seeding import rng_for
 
@@ -66,42 +66,7 @@ class TownPlan:
         return side * (1.0 - self.unevenness) / (1.0 + self.unevenness)
 
 
-# Towns of different plan, density and height, so that results of one can be checked in another.
-PRESETS = {
-    "small_town": TownPlan(),
-    "grid": TownPlan(
-        size_m=330.0, num_blocks=4, street_m=18.0, boulevard_m=26.0, parked_share=0.6,
-        blocks={"courtyard": 0.6, "towers": 0.2, "square": 0.1, "park": 0.1},
-    ),
-    "old_town": TownPlan(
-        size_m=270.0, num_blocks=4, street_m=12.0, boulevard_m=15.0, unevenness=0.12, parked_share=0.1, tree_share=0.3,
-        blocks={"lanes": 0.75, "square": 0.15, "market": 0.1},
-    ),
-    "towers": TownPlan(
-        size_m=340.0, num_blocks=3, street_m=26.0, boulevard_m=40.0, unevenness=0.1, parked_share=0.4,
-        blocks={"skyscrapers": 0.55, "towers": 0.25, "square": 0.2},
-    ),
-    "park": TownPlan(
-        size_m=320.0, num_blocks=3, street_m=16.0, boulevard_m=26.0, unevenness=0.2, parked_share=0.2,
-        blocks={"park": 0.45, "meadow": 0.35, "houses": 0.2},
-    ),
-    "campus": TownPlan(
-        size_m=310.0, num_blocks=3, street_m=15.0, boulevard_m=28.0, unevenness=0.15, parked_share=0.15,
-        blocks={"campus": 0.6, "meadow": 0.2, "square": 0.2},
-    ),
-    "village": TownPlan(
-        size_m=300.0, num_blocks=3, street_m=13.0, boulevard_m=16.0, unevenness=0.3, parked_share=0.1, tree_share=0.4,
-        blocks={"farm": 0.45, "houses": 0.35, "meadow": 0.2},
-    ),
-    "river": TownPlan(
-        size_m=320.0, num_blocks=4, street_m=16.0, boulevard_m=26.0, river_m=46.0, unevenness=0.1, parked_share=0.4,
-        blocks={"courtyard": 0.45, "houses": 0.2, "park": 0.2, "square": 0.15},
-    ),
-    "market": TownPlan(
-        size_m=280.0, num_blocks=3, street_m=18.0, boulevard_m=30.0, unevenness=0.1, parked_share=0.2,
-        blocks={"market": 0.45, "courtyard": 0.35, "lanes": 0.2},
-    ),
-}  # fmt: skip
+PRESETS = {name: TownPlan(**fields) for name, fields in read_yaml(Path(__file__).with_name("towns.yaml")).items()}
 
 
 class SyntheticConfig(Config):

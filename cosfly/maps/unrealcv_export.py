@@ -176,7 +176,7 @@ def _box(
         return None, "default"
     asset = asset_of(item.class_name)
     size_cm = sizes.get(item.class_name)
-    plausible_m = (asset and asset.default_size_m) or (CUBE_M,) * 3
+    plausible_m = (asset and asset.size_m) or (CUBE_M,) * 3
     size_m = np.array(plausible_m) if size_cm is None else size_cm / CM_PER_M
     half = size_m * (item.scale or (1.0,) * 3) / 2
     foot, rotation_deg = world_pose([*(part / cfg.coord_scale for part in item.location), *turn])

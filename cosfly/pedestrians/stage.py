@@ -25,10 +25,17 @@ from cosfly.formats.roi import read_roi
 from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.astar import route_cost
 from cosfly.pedestrians.bystanders import bystanders_of
-from cosfly.pedestrians.crossings import CROSSING, ROAD, count_on_road
 from cosfly.pedestrians.lanes import Lane, lanes_of
 from cosfly.pedestrians.speed_model import PACES, TimedRoute, speeds_at, take_pace
-from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, timed, walkable_ground
+from cosfly.pedestrians.walkable import (
+    CROSSING,
+    ROAD,
+    PedestriansConfig,
+    WalkableGround,
+    count_on_road,
+    timed,
+    walkable_ground,
+)
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import FileFormat, write_json

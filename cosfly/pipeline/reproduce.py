@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 from pydantic import BaseModel, Field
 
 import cosfly
@@ -29,12 +28,12 @@ from cosfly.pipeline.runs import summarize
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners import compare
 from cosfly.render.settings import RenderConfig
-from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.config import build, read_yaml
 from cosfly.runtime.errors import InputError, json_type
 from cosfly.runtime.events import read_events
 from cosfly.runtime.io import read_bytes, write_bytes
 from cosfly.runtime.json_io import FileFormat, read_object, write_json
+from cosfly.runtime.png import read_picture
 from cosfly.runtime.run_dir import Manifest, Resume, read_manifest
 from cosfly.studies import beam, depth, weather, zoom
 from cosfly.viz.frame_views import small_jpeg
@@ -251,7 +250,7 @@ def _cell(value: Any) -> Cell:
 def _jpeg(path: Path) -> str:
     if path.suffix == ".jpg":
         return base64.b64encode(read_bytes(path)).decode("ascii")
-    picture = cv2.cvtColor(read_picture(path), cv2.COLOR_BGR2RGB)
+    picture = read_picture(path)
     return small_jpeg(picture, min(WIDTH_PX, picture.shape[1]))
 
 

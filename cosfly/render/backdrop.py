@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.formats.backdrop import WorldFrame, write_backdrop
 from cosfly.formats.boxes import BoxMap, check_ground, read_boxes
+from cosfly.formats.roi import WorldFrame, write_backdrop
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of
-from cosfly.runtime.arrays import LONGEST_SIDE_PX
 from cosfly.runtime.errors import ConfigError
+from cosfly.runtime.png import LONGEST_SIDE_PX
 from cosfly.viz.topview import TopView, png_bytes
 
 HEIGHT_M = 400.0  # of the camera over the ground

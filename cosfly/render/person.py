@@ -9,6 +9,7 @@ import numpy as np
 
 from cosfly.formats.bystanders import Bystander
 from cosfly.formats.frames import BystanderMeta, BystandersMeta, tree_yaw
+from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.people import COLORS, EMPTY_SHARE, FIGURES, GARMENTS, HAIR, Appearance, People
 from cosfly.geometry.axes import headings_of, rotation_matrices, rotation_matrix
@@ -140,7 +141,7 @@ class DressedBystanders:
             others=[
                 BystanderMeta(
                     instance_id=other_id(number),
-                    semantic_id=other.kind_number,
+                    semantic_id=KINDS[other.kind],
                     world_location=other.centers_m[i],
                     yaw=tree_yaw(float(np.degrees(other.headings_rad[i]))),
                     half_extents_m=other.build.half_extents_m,

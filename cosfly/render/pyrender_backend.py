@@ -188,9 +188,8 @@ def _all_boxes(box_map: BoxMap, origin: np.ndarray, num_others: int) -> tuple[np
         repeated = (np.repeat(values[rows], len(mesh.faces), axis=0) for values in (paint, tags))
         pieces.append((corners[:, mesh.faces].reshape(-1, 3, 3), *repeated))
     placed = solids_of(box_map)
-    paint = np.where(np.isnan(placed.colors), table[kinds][placed.rows], placed.colors)
     for sides in (placed.corners_m, placed.corners_m[:, ::-1]):  # seen from both
-        pieces.append((sides - origin, paint, tags[placed.rows]))
+        pieces.append((sides - origin, table[kinds][placed.rows], tags[placed.rows]))
     if not box_map.ground.is_flat:
         draped = drape(box_map)  # the last row, BARE_GROUND, is the plane's
         pieces.append((draped.corners_m - origin, table[kinds][draped.rows], tags[draped.rows]))

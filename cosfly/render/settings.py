@@ -13,7 +13,7 @@ from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.perturbation import PerturbationConfig
 from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
 from cosfly.render.weather import WeatherConfig
-from cosfly.runtime.arrays import LONGEST_SIDE_PX
+from cosfly.runtime.png import LONGEST_SIDE_PX
 
 SIMULATORS = ("carla", "unrealcv")
 

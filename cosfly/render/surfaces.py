@@ -152,10 +152,8 @@ def _tiers(box_map: BoxMap, layers: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Solids(Triangles):
-    """Triangles of meshes: colors (k, 3) linear RGB, NaN for that of the kind; things (k,) ascending, a number for each
-    placed mesh."""
+    """Triangles of meshes. things: (k,) ascending, a number for each placed mesh."""
 
-    colors: np.ndarray
     things: np.ndarray
 
 
@@ -167,7 +165,6 @@ def are_solids(box_map: BoxMap) -> np.ndarray:
 def solids_of(box_map: BoxMap) -> Solids:
     """Place the meshes of a map: each in its box, or once in the world for all boxes that name it."""
     corners = [np.zeros((0, 3, 3))]
-    colors = [np.zeros((0, 3))]
     rows = []
     counts = []
     meshes = box_map.meshes.resolved()
@@ -180,15 +177,12 @@ def solids_of(box_map: BoxMap) -> Solids:
         mesh = meshes[ref]
         if ref.fit == "world":
             placed.add(ref)
-            corners.append(mesh.corners_m)
+            corners.append(mesh)
         else:
-            low, high = mesh.corners_m.min(axis=(0, 1)), mesh.corners_m.max(axis=(0, 1))
+            low, high = mesh.min(axis=(0, 1)), mesh.max(axis=(0, 1))
             stretch = 2.0 * box_map.half_extents[row] / np.where(high > low, high - low, 1.0)
-            corners.append((mesh.corners_m - (low + high) / 2.0) * stretch @ turns[row].T + box_map.centers[row])
-        colors.append(mesh.colors)
+            corners.append((mesh - (low + high) / 2.0) * stretch @ turns[row].T + box_map.centers[row])
         rows.append(row)
         counts.append(len(mesh))
     things = np.repeat(np.arange(len(counts)), counts)
-    return Solids(
-        np.concatenate(corners), np.repeat(np.array(rows, dtype=np.int64), counts), np.concatenate(colors), things
-    )
+    return Solids(np.concatenate(corners), np.repeat(np.array(rows, dtype=np.int64), counts), things)

@@ -315,21 +315,16 @@ def _with_goal(track: Track, renderer: Renderer, script: TrackScript, threshold:
             dressed = replace(script, clothes=replace(script.clothes, looks=looks))
             return draw_frame(renderer, dressed, i, poses, threshold)[0]
 
-        rotation = world_from_camera(poses.positions_m[i], poses.rotations_deg[i])[:3, :3]
-        if goal := find_goal(people, i, draw, script.cameras[i].intrinsic, rotation):
+        if goal := find_goal(people, i, draw):
             return replace(track, goal=goal)
         advance()
     return replace(track, raw=track.raw | {"goal": {"absent": "not_told_apart" if legible else "never_legible"}})
 
 
-def find_goal(
-    people: People, i: int, draw: Callable[[Appearance], Frame], intrinsic: np.ndarray, rotation: np.ndarray
-) -> Goal | None:
+def find_goal(people: People, i: int, draw: Callable[[Appearance], Frame]) -> Goal | None:
     """Find the words that distinguish the target of frame i from the bystanders that have a pixel in it.
 
-    Args:
-        draw: Draws the frame with a target of that appearance. intrinsic: (3, 3) px. rotation: (3, 3), world from
-            camera.
+    draw: Draws the frame with a target of that appearance.
     """
     looks = people.target
     frame = draw(looks)
@@ -346,8 +341,7 @@ def find_goal(
             other = otherwise(looks, slot)
         return differs(replace(looks, **{name: getattr(other, name) for name in (slot, f"{slot}_color")}))
 
-    seen = SeenFrame(frame.kinds, frame.ids, frame.depth, intrinsic, rotation)
-    says = find_says({PERSON_ID: looks, **people.others}, seen, distinguishes)
+    says = find_says({PERSON_ID: looks, **people.others}, SeenFrame(frame.ids, frame.depth), distinguishes)
     return None if says is None else Goal(i, **words_of(says, looks), says=says)
 
 

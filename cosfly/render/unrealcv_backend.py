@@ -13,7 +13,6 @@ import time
 import weakref
 from typing import ClassVar
 
-import cv2
 import numpy as np
 from pydantic import Field
 
@@ -22,8 +21,9 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import WeatherParams
 from cosfly.render.contract import NEAR_M, NO_INSTANCE, Frame, PosedPerson, far_as_sky, instance_ids
 from cosfly.render.simulator import Body, NoPictureError, ServerCommand, SimulatorRenderer, placement_of
-from cosfly.runtime.arrays import parse_array, parse_picture
+from cosfly.runtime.arrays import parse_array
 from cosfly.runtime.errors import ConfigError, InputError, RenderError, shown
+from cosfly.runtime.png import colours_of
 from cosfly.simulators import unrealcv_client
 from cosfly.simulators.assets import id_of, kind_of
 from cosfly.simulators.conventions import FAR_CM, camera_rotation_deg, unreal_pose, world_pose
@@ -231,7 +231,7 @@ class UnrealCvRenderer(SimulatorRenderer):
         for name, data in (("lit", lit), ("object_mask", mask)):
             if isinstance(data, str):
                 raise InputError("the server sent a text instead of a picture", where=name, got=shown(data))
-            pictures.append(parse_picture(data, name, flags=cv2.IMREAD_COLOR))
+            pictures.append(colours_of(data, name))
         raw = parse_array(depth if isinstance(depth, bytes) else depth.encode(), "depth", dtype=np.float32, ndim=2)
         for name, picture in zip(("lit", "object_mask", "depth"), (*pictures, raw), strict=True):
             if picture.shape[:2] != (height_px, width_px):
@@ -242,7 +242,7 @@ class UnrealCvRenderer(SimulatorRenderer):
                     expected=f"{width_px} x {height_px} px",
                     fix="set render.width_px and render.height_px to the size that the server sends",
                 )
-        colors = pictures[1].astype(np.int64) @ [1, 1 << 8, 1 << 16]  # blue, green, red
+        colors = pictures[1].astype(np.int64) @ [1 << 16, 1 << 8, 1]
         kinds = self._kinds[colors]
         ids = self._ids[colors]
         depth_m = raw / np.float32(self._cfg.coord_scale)
@@ -251,7 +251,7 @@ class UnrealCvRenderer(SimulatorRenderer):
         depth_m[is_sky] = SKY_DEPTH_M
         kinds[is_sky] = KINDS["Sky"]
         ids[is_sky] = NO_INSTANCE
-        return far_as_sky(Frame(np.ascontiguousarray(pictures[0][..., ::-1]), depth_m, kinds, ids))
+        return far_as_sky(Frame(pictures[0], depth_m, kinds, ids))
 
     # --- people and cars ----------------------------------------------------------------------------------------------
 

@@ -24,21 +24,19 @@ class Journal:
 
     `append` returns when the line is on the disk, or with `sync=False` when the system holds it, which survives a kill
     of this process; `sync` then waits for the disk. `read` skips lines that a kill cut short or that were damaged and
-    counts them in `num_damaged`; their items are done again. `is_cut_short`: The last damaged line has no end, as after
-    a kill. `line_num`, `line_byte`: Number and first byte of the line that was read last.
+    counts them in `num_damaged`; their items are done again. `line_num`, `line_byte`: Number and first byte of the line
+    that was read last.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.num_damaged = self.line_num = self.line_byte = 0
-        self.is_cut_short = False
         self._file: Any = None
         self._lock = threading.Lock()
 
     def read(self) -> Iterator[dict]:
         """Yield the records in order; damaged lines are skipped."""
         self.num_damaged = 0
-        self.is_cut_short = False
         if not self.path.exists():
             return
         end = 0
@@ -49,7 +47,6 @@ class Journal:
             record = _record_of(line)
             if record is None:
                 self.num_damaged += 1
-                self.is_cut_short = not line.endswith(b"\n")
             else:
                 yield record
 

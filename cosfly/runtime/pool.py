@@ -21,10 +21,9 @@ from cosfly.runtime.errors import CosflyError, EnvironmentMissing
 from cosfly.runtime.events import EventLog
 from cosfly.runtime.io import remove_partials
 from cosfly.runtime.journal import Journal
-from cosfly.runtime.local_transport import LocalTransport
 from cosfly.runtime.ray_engine import ALL_ROOM, Cluster
 from cosfly.runtime.run_dir import Failed, ItemRecord, Kept, StageFolder, Tally, read_item, write_failures
-from cosfly.runtime.worker import Item, Start, Work, attempt
+from cosfly.runtime.worker import Item, LocalTransport, Start, Work, attempt
 from cosfly.runtime.worker_pool import RUN_AGAIN, Transport, Watch, WorkerPool
 
 __all__ = ["ItemOutcomes", "Watch", "run_items"]
@@ -62,9 +61,9 @@ def run_items(
     """Run all items that the stage's journal does not hold yet.
 
     An item whose work raises is recorded as failed. A fatal CosflyError (full disk, no GL) stops the stage; finished
-    items stay. If a worker dies (out of memory, kill) or stalls, its item is tried twice more, the last time alone. An
-    item that stalls in each try has failed. If its worker dies in each try, the stage finishes the other items and
-    stops incomplete. A later run takes kept and dropped items from the journal and tries failed ones again.
+    items stay. If a worker dies (out of memory, kill) or stalls, its item is tried twice more. An item that stalls in
+    each try has failed. If its worker dies in each try, the stage finishes the others and stops incomplete. A later run
+    takes kept and dropped items from the journal and tries failed ones again.
 
     Args:
         make_worker: Module-level function; `make_worker(*worker_args)` returns the work function, once per process.

@@ -195,7 +195,7 @@ def _host() -> type:
                 return node, None, {"what": what, "got": got, "expected": version, "fix": fix}
             from cosfly.runtime.errors import InputError
             from cosfly.runtime.io import sha256_file
-            from cosfly.runtime.local_transport import LocalTransport
+            from cosfly.runtime.worker import LocalTransport
 
             try:
                 os.chdir(cwd)

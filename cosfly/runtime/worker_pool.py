@@ -19,10 +19,9 @@ from dataclasses import dataclass, field, replace
 
 from cosfly.runtime.errors import CosflyError, EnvironmentMissing
 from cosfly.runtime.events import LOSSES, EventLog, Loss
-from cosfly.runtime.local_transport import LocalTransport
 from cosfly.runtime.ray_engine import RayConfig, RayTransport
 from cosfly.runtime.run_dir import Failed, ItemRecord
-from cosfly.runtime.worker import Heartbeat, Item, Message, Start
+from cosfly.runtime.worker import Heartbeat, Item, LocalTransport, Message, Start
 
 log = logging.getLogger(__name__)
 
@@ -112,7 +111,6 @@ class WorkerPool:
     _num_done: int = 0
     _seconds: deque[float] = field(default_factory=lambda: deque(maxlen=ITEMS_REMEMBERED))
     _todo: deque[_Attempt] = field(default_factory=deque)
-    _alone: deque[_Attempt] = field(default_factory=deque)  # last attempts, which run one at a time
     _workers: dict[int, _Worker] = field(default_factory=dict)  # by index
     _lost: set[int] = field(default_factory=set)  # indices of lost workers that are not replaced yet
     _messages: queue.SimpleQueue[tuple[_Worker, Message | None]] = field(default_factory=queue.SimpleQueue)
@@ -125,7 +123,7 @@ class WorkerPool:
         next_check_s = next_probe_s + self.watch.check_s
         patience_s = 0.0
         try:
-            while self._todo or self._alone or self._busy():
+            while self._todo or self._busy():
                 self._hand_out()
                 yield from self._handle_message(min(next_check_s, next_probe_s))
                 now_s = time.monotonic()
@@ -151,38 +149,16 @@ class WorkerPool:
         """Assign an item to every free worker, and start missing workers."""
         for index in range(self.num_workers):
             worker = self._workers.get(index)
-            if worker is None and self._needs_worker():
-                worker = self._start(index)
+            if worker is None and len(self._workers) - len(self._busy()) < len(self._todo):
+                worker = self._start(index)  # more attempts can begin now than workers are free or starting
             if worker is None or worker.attempt is not None or worker.transport.pid is None:
                 continue
             if not worker.is_logged:
                 worker.is_logged = True
                 self.events.write("restarted" if index in self._lost else "worker_started", **worker.event_fields)
                 self._lost.discard(index)
-            if (attempt := self._next_attempt(worker)) is not None:
-                worker.assign(attempt)
-
-    def _needs_worker(self) -> bool:
-        """Return whether more attempts can begin now than workers are free, including those that still start."""
-        busy = self._busy()
-        num_free = len(self._workers) - len(busy)
-        if self._todo:
-            return num_free < len(self._todo)
-        return bool(self._alone) and not busy and num_free == 0
-
-    def _next_attempt(self, worker: _Worker) -> _Attempt | None:
-        """Return the next attempt for a worker.
-
-        A last attempt runs while no other worker exists, because the memory may not suffice for two.
-        """
-        if self._todo:
-            return self._todo.popleft()
-        if self._alone and not self._busy():
-            for other in list(self._workers.values()):
-                if other is not worker:
-                    self._stop(other, PATIENCE_S)
-            return self._alone.popleft()
-        return None
+            if self._todo:
+                worker.assign(self._todo.popleft())
 
     def _start(self, index: int) -> _Worker:
         transport = self.start_transport(self.watch.heartbeat_s, logging.getLogger().level, index)
@@ -326,8 +302,7 @@ class WorkerPool:
             yield attempt.item_index, Failed(id=item_id, code=code, message=message)
             return
         log.warning("%s: %s; cosfly tries the item again", item_id, LOSSES[loss])
-        attempts = self._alone if num_tries == self.watch.retries else self._todo
-        attempts.append(replace(attempt, number=num_tries))
+        self._todo.append(replace(attempt, number=num_tries))
         self.events.write("retried", item=item_id, attempt=num_tries)
 
 

@@ -15,9 +15,9 @@ from cosfly.formats.places import ALL_TRACKS, TrackChoice
 from cosfly.formats.playback import Track, read_track
 from cosfly.formats.town import read_instance_ids
 from cosfly.formats.tracks import find_tracks
-from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import inside, write_bytes
+from cosfly.runtime.png import read_picture
 from cosfly.viz.frame_views import DEPTH_RANGE_M, VIEW_FILES, read_view, spread
 from cosfly.viz.overlay import Overlay
 from cosfly.viz.topview import captioned_grid, draw_text
@@ -64,7 +64,7 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
     meta = read_meta(folder)
     rgb = read_rgb(folder)
     if (folder / DEBUG_FILE).exists():
-        debug = cv2.cvtColor(read_picture(folder / DEBUG_FILE, tree=tree), cv2.COLOR_BGR2RGB)
+        debug = read_picture(folder / DEBUG_FILE, tree=tree)
     elif box_map is not None:
         ids = read_instance_ids(folder.parents[3]).of_boxes(box_map)
         debug = Overlay(box_map, ids).draw(rgb, read_instance(folder)[1], meta)

@@ -251,8 +251,8 @@ def _planted(town: Town, count: int, rng: np.random.Generator) -> BoxMap:
 def _asset_tables() -> dict[str, dict[str, Size]]:
     """Return the assets that boxes of a kind may get, and their full sizes, m."""
     furniture: dict[str, Size] = {
-        {"BP_Trash_bin_*": "BP_Trash_bin_a_C"}.get(asset.pattern, asset.pattern.replace("*", "")): asset.default_size_m
-        for asset in ASSETS if asset.default_size_m is not None and asset.kind == "Static"
+        {"BP_Trash_bin_*": "BP_Trash_bin_a_C"}.get(asset.pattern, asset.pattern.replace("*", "")): tuple(asset.size_m)
+        for asset in ASSETS if asset.size_m is not None and asset.kind == "Static"
     }  # fmt: skip
     buildings, trees = (
         {name: size for name, size in assets().items() if name.startswith(start)}

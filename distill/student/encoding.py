@@ -17,9 +17,10 @@ from PIL import Image
 
 from cosfly.formats.frames import tree_of
 from cosfly.llm.student_chat import IMAGE_PART, chat_messages
-from cosfly.runtime.arrays import array_header, picture_size
+from cosfly.runtime.arrays import array_header
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import inside
+from cosfly.runtime.png import picture_size
 from distill.schema import Sample
 from distill.student.model import END_OF_TURN, IMAGE_TOKEN, Processor, Student
 

@@ -39,7 +39,7 @@ MILLION = 1_000_000
 LARGEST = 1e9  # of a value: beyond any town, flight and picture
 # Columns of yes and no whose frames are counted.
 FLAGS = ("is_perturbed", "target_in_view", "target_visible", "target_legible", "has_caption")
-COVERED = ("style", "pace", "label")
+COVERED = ("style", "pace", "label", "weather", "time_of_day")
 COLUMNS = [
     "sample_id", *PLACE, "track", "style", "pace", "weather", "time_of_day", "frame_index", "time_s", "width_px",
     "height_px", "fov_deg", "pose", "drone_offset", "target",
@@ -223,10 +223,9 @@ class RowCounts:
                 names += [row[column]] if row[column] is not None else []
         if rows:
             values = np.array(seen, dtype=np.float64)
-            weathers, times = ([r[k] and preset_token(r[k]) for r in rows] for k in ("weather", "time_of_day"))
+            weathers, times = ([*map(preset_token, named[column])] for column in ("weather", "time_of_day"))
             styles, paces, labels = (named[column] for column in ("style", "pace", "label"))
-            skies = zip(weathers, times, strict=True)
-            part = Coverage.of(values, TARGET_HEIGHT_M, styles, paces, labels, skies)
+            part = Coverage.of(values, TARGET_HEIGHT_M, styles, paces, labels, weathers, times)
             self.coverage = Coverage.total([self.coverage, part]) if self.rows else part
         self.rows += len(rows)
 

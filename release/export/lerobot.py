@@ -27,10 +27,11 @@ from cosfly.formats.captions import TOKENS
 from cosfly.formats.frames import FrameFile
 from cosfly.geometry.axes import step_s
 from cosfly.geometry.motion import ACTION, PlannedMotion
-from cosfly.runtime.arrays import parse_array, parse_picture
+from cosfly.runtime.arrays import parse_array
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file
 from cosfly.runtime.json_io import dump_json
+from cosfly.runtime.png import colours_of
 from cosfly.runtime.worker import advance
 from release.columns import BOX, CAPTION_FIELDS, PICTURES, POINT, POSE, SPLIT_NAMES
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
@@ -436,7 +437,7 @@ def _pixels(release: Release, row: dict[str, Any], file: FrameFile) -> np.ndarra
     where = row["sample_id"]
     if file == "depth":
         return thinned(parse_array(picture(row, "depth"), where, dtype=np.float32, ndim=2))
-    return thinned(parse_picture(picture(row, file), where)[..., ::-1])
+    return thinned(colours_of(picture(row, file), where))
 
 
 def _column(values: Any, feature: LeRobotFeature) -> Any:

@@ -15,9 +15,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cosfly.formats.frames import FrameFile
-from cosfly.runtime.arrays import png_size
 from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.io import inside, sha256_file
+from cosfly.runtime.png import png_size
 from cosfly.runtime.tables import arrow_errors, open_table, read_row_group, row_groups
 from release.columns import PICTURES, PLACE, REQUIRED, SPLIT_NAMES, SplitName, flight_spans, schema
 from release.record import ReleaseRecord, read_record, release_folder

@@ -26,10 +26,9 @@ from cosfly.formats.frames import (
     tree_of,
 )
 from cosfly.formats.playback import TARGET_FILE, Track
-from cosfly.formats.png import parse_png
-from cosfly.runtime.arrays import PNG_HEADER_BYTES, png_size
 from cosfly.runtime.errors import CosflyError, InputError, VerifyError
 from cosfly.runtime.io import CHECKSUMS, atomic_file, check_stays_below, read_bytes, read_checksums, sha256_file
+from cosfly.runtime.png import PNG_HEADER_BYTES, parse_png, png_size
 from cosfly.runtime.run_dir import TRACK_FILE, digest_of, folder_digests
 from cosfly.runtime.worker import advance
 from release import columns

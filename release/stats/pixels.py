@@ -9,14 +9,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.formats.kinds import KIND_NAMES
-from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.png import colours_of
 from cosfly.runtime.tables import arrow_errors, open_table, row_groups
 from cosfly.viz.frame_views import small_jpeg
 from release.card.numbers import check_columns
@@ -81,7 +80,7 @@ def look_at(dataset: Path, record: ReleaseRecord, most: int) -> Pixels:
                 if file == "depth":
                     pixels.add_depth(depth_values(cell or b"", Path(where)))
                 else:
-                    pixels.add_kinds(parse_picture((cell or {}).get("bytes") or b"", where)[..., 2])
+                    pixels.add_kinds(colours_of((cell or {}).get("bytes") or b"", where)[..., 0])
             advance(1)
     return pixels
 
@@ -94,9 +93,7 @@ def middle_picture(dataset: Path, record: ReleaseRecord) -> str | None:
     for row in _rows(dataset, record, ["rgb"], {total // 2}):
         with contextlib.suppress(InputError):
             data = (row[PICTURES["rgb"].name] or {}).get("bytes") or b""
-            return small_jpeg(
-                cv2.cvtColor(parse_picture(data, row["sample_id"]), cv2.COLOR_BGR2RGB), PICTURE_PX, JPEG_QUALITY
-            )
+            return small_jpeg(colours_of(data, row["sample_id"]), PICTURE_PX, JPEG_QUALITY)
     return None
 
 

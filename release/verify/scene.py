@@ -13,9 +13,8 @@ import numpy as np
 from cosfly.formats.frames import PERSON_ID, SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
-from cosfly.formats.png import colours_of
 from cosfly.geometry.axes import BODY_FROM_CAMERA
-from cosfly.geometry.goals import LANDMARKS, SeenFrame, meant, target_picture, words_of
+from cosfly.geometry.goals import SeenFrame, meant, target_picture, words_of
 from cosfly.geometry.reprojection import (
     COLUMNS,
     GRID_ROWS,
@@ -28,8 +27,9 @@ from cosfly.geometry.reprojection import (
 )
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.png import colours_of
 from cosfly.runtime.worker import advance
-from release.columns import PICTURES, TARGET_PICTURE, matrices_of
+from release.columns import PICTURES, TARGET_PICTURE
 from release.flight_rows import FlightRows
 from release.verify.findings import Findings
 from release.verify.sources import Pictures
@@ -204,18 +204,13 @@ def check_goal(
         return
     if (words := words_of(goal.says, people.target)) != (told := {"en": goal.en, "zh": goal.zh}):
         found.error("goal", flight.where(i, "goal_en"), str(told), f"{words}, from goal_says and people")
-    picture = _picture(flight, i, decoded)
-    kinds, ids = picture.kinds, picture.ids
+    ids = instance[..., 1] | instance[..., 2].astype(np.uint16) << 8
     looks = {PERSON_ID: people.target, **people.others}
-    if unknown := sorted({*np.unique(ids[kinds == KINDS["Pedestrians"]]).tolist()} - {*looks}):
-        found.error(
-            "goal",
-            flight.where(i, "people"),
-            f"no entry for the visible people {unknown[:4]}",
-            "an entry for each visible person, by instance id",
-        )
-    if depth.size or not {*goal.says} & {"near", "far", *LANDMARKS}:
-        whom = meant(goal.says, people.target, looks, picture)
+    if unknown := sorted({*np.unique(ids[instance[..., 0] == KINDS["Pedestrians"]]).tolist()} - {*looks}):
+        got = f"no entry for the visible people {unknown[:4]}"
+        found.error("goal", flight.where(i, "people"), got, "an entry for each visible person, by instance id")
+    if depth.size or not {*goal.says} & {"near", "far"}:
+        whom = meant(goal.says, people.target, looks, SeenFrame(ids, depth))
         if whom != {PERSON_ID}:
             got = f"true of {', '.join(map(str, sorted(whom))) or 'nobody'}"
             found.error("goal", flight.where(i, "goal_says"), got, f"true of the target, {PERSON_ID}, only")
@@ -229,13 +224,6 @@ def check_goal(
         expected = target_picture(of_frame, flight.mask_box[i].tolist()).astype(float)
         if pixels.shape != expected.shape or np.abs(pixels - expected).mean() > SAME_LEVELS:
             found.error("goal", where, "a different picture", "the part of image around target_mask_bbox")
-
-
-def _picture(flight: FlightRows, i: int, decoded: tuple[np.ndarray, np.ndarray]) -> SeenFrame:
-    depth, instance = decoded
-    matrix, rotation = matrices_of(flight.intrinsics[i : i + 1])[0], flight.rotations[i] @ BODY_FROM_CAMERA
-    ids = instance[..., 1] | instance[..., 2].astype(np.uint16) << 8
-    return SeenFrame(instance[..., 0], ids, depth, matrix, rotation)
 
 
 LEAST_AGREE = 100  # points, for a share to mean something

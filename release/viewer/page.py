@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-import cv2
 import numpy as np
 import pyarrow as pa
 
@@ -24,11 +23,11 @@ from cosfly.formats.places import folder_name, place_of, town_folder
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.answer_text import sentences_of
-from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.io import write_bytes
+from cosfly.runtime.png import colours_of
 from cosfly.runtime.tables import arrow_errors, row_groups
 from cosfly.viz.frame_views import (
     VIEW_FILES,
@@ -192,11 +191,11 @@ def _picture(row: Mapping[str, Any], file: FrameFile) -> np.ndarray:
     where, cell = f"{row['sample_id']}: {PICTURES[file].name}", row[PICTURES[file].name]
     if file == "depth":
         return depth_colors(depth_values(cell or b"", Path(where)))
-    coded = parse_picture((cell or {}).get("bytes") or b"", where)
+    rgb = colours_of((cell or {}).get("bytes") or b"", where)
     if file == "rgb":
-        return cv2.cvtColor(coded, cv2.COLOR_BGR2RGB)
-    # Blue is the high byte of the id, green the low one, red the kind.
-    return segmentation_colors(coded[..., 2], coded[..., 1].astype(np.uint16) | coded[..., 0].astype(np.uint16) << 8)
+        return rgb
+    # Red is the kind, green the low byte of the id, blue the high one.
+    return segmentation_colors(rgb[..., 0], rgb[..., 1].astype(np.uint16) | rgb[..., 2].astype(np.uint16) << 8)
 
 
 # --- a run or a playback tree -----------------------------------------------------------------------------------------

@@ -40,7 +40,7 @@ def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.
     kinds = box_map.kinds[solids.rows]
     seeds = seeds_of(box_map.ids[solids.rows])
     normals = solids.normals
-    is_house = (kinds == KINDS["Buildings"]) & np.isnan(solids.colors).any(axis=1)
+    is_house = kinds == KINDS["Buildings"]
     is_wall = is_house & (np.abs(normals[:, 2]) < STEEP)
     is_flat = is_house & (np.abs(normals[:, 2]) > FLAT)
     materials = np.where(is_house, np.where(is_wall | is_flat, parts.FACADE, parts.TILES), parts.PLAIN)
@@ -57,7 +57,7 @@ def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.
         "center": np.einsum("kji,kj->ki", axes, centers_m) + middles_m - origin_m,
         "half": halves_m,
         "quaternion": Rotation.from_matrix(axes.transpose(0, 2, 1)).as_quat(),
-        "color": np.column_stack([_painted(solids.colors, materials, seeds), seeds * 0.999]),
+        "color": np.column_stack([_painted(materials, seeds), seeds * 0.999]),
         "tag": parts.tags(kinds, materials, ids[solids.rows]),
     }.items():
         vertices[name] = values[:, None]
@@ -95,11 +95,12 @@ def _bounds_of_parts(local_m: np.ndarray, part_numbers: np.ndarray) -> tuple[np.
     return (low_m + high_m) / 2.0, np.maximum((high_m - low_m) / 2.0, THINNEST_M)
 
 
-def _painted(colors: np.ndarray, materials: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """Return the colours of triangles, (k, 3) linear RGB; those without one get one of their material's palette."""
+def _painted(materials: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """Return the colours of triangles from the palettes of their materials, (k, 3) linear RGB."""
+    colors = np.zeros((len(materials), 3))
     for material, palette in ((parts.FACADE, BUILDING_COLORS), (parts.TILES, TILE_COLORS), (parts.PLAIN, PLAIN_COLORS)):
         picked = palette[(contract.chance(seeds, 0) * len(palette)).astype(int)]
-        colors = np.where(np.isnan(colors) & (materials == material)[:, None], picked, colors)
+        colors = np.where((materials == material)[:, None], picked, colors)
     return colors
 
 

@@ -1,6 +1,7 @@
-"""PNG of playback trees and releases: 8 bits, grey to RGBA, not interlaced (RFC 2083).
+"""PNG, the only picture format of a data set: 8 bits, grey to RGBA, not interlaced (RFC 2083).
 
-Reading checks the checksums of chunks and stream and the number of bytes, and never unpacks more than the header says.
+Reading refuses a large picture before it allocates memory, checks the checksums of chunks and stream and the number of
+bytes, and never unpacks more than the header says.
 Writing filters each kind of picture in its own way. Colours: the difference of each byte to the average of its left and
 upper neighbours. Instance masks: no filter. Depth: the four channels of a pixel are the bytes of a float32, lowest
 first, and each row is stored as the difference to the row above.
@@ -9,15 +10,19 @@ first, and each row is stored as the difference to the row above.
 from __future__ import annotations
 
 import struct
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from isal import isal_zlib as zlib
 
-from cosfly.runtime.arrays import PNG_SIGNATURE, check_pixels
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.io import disk_errors, open_file, over_limit, read_bytes
 
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_HEADER_BYTES = 24  # signature, length and name of the first chunk, width, height
+LONGEST_SIDE_PX = 8192  # of a picture that `render` draws; pictures up to this square are read, twice an 8K picture
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # by colour type; palettes are not supported
 CHUNK = struct.Struct(">I4s")  # length and name
 NUMBER = struct.Struct(">I")
@@ -26,6 +31,32 @@ NONE, SUB, UP, AVERAGE, PAETH = range(5)  # filters
 LEVEL = 1  # of compression, the fastest
 FIRST = 16  # bytes that are packed first and flushed
 UNPACK_ERROR: Any = zlib.error  # in the stub it is not a class
+
+
+def check_pixels(num_pixels: float, where: str | Path, got: str) -> None:
+    """Raise InputError if a picture or array has more pixels than are read."""
+    if num_pixels > LONGEST_SIDE_PX**2:
+        limit = f"{LONGEST_SIDE_PX} x {LONGEST_SIDE_PX} px"
+        raise over_limit(where, got, limit, "scale the pictures down or crop them")
+
+
+def png_size(data: bytes) -> tuple[int, int] | None:
+    """Return (width, height) in px from the first bytes of a PNG; None for other bytes."""
+    if len(data) < PNG_HEADER_BYTES or not data.startswith(PNG_SIGNATURE) or data[12:16] != b"IHDR":
+        return None
+    width, height = struct.unpack_from(">II", data, 16)
+    return width, height
+
+
+def picture_size(path: Path, *, tree: Path | None = None) -> tuple[int, int] | None:
+    """Return (width, height) in px from the header of a PNG file; None for another file."""
+    with open_file(path, what="image", tree=tree) as file, disk_errors(path, "image"):
+        return png_size(file.read(PNG_HEADER_BYTES))
+
+
+def read_picture(path: Path, *, tree: Path | None = None) -> np.ndarray:
+    """Read a PNG file of colours, (h, w, 3) uint8 RGB, without alpha."""
+    return colours_of(read_bytes(path, what="image", tree=tree), path)
 
 
 class Png(NamedTuple):
