@@ -84,43 +84,23 @@ def clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:
         raise ValueError(f"mins and maxs must have the shape (n, 3), got {mins.shape} and {maxs.shape}")
     if not gap_m >= 0:
         raise ValueError(f"gap_m must not be negative, got {gap_m}")
-    if len(mins) == 0:
-        return np.empty(0, dtype=np.int64)
-    axis = int(np.argmax(maxs.max(axis=0)[:2] - mins.min(axis=0)[:2]))  # sweep along the longer side: fewer meet
-    order = np.argsort(mins[:, axis], kind="stable")
-    return _sweep_clusters(mins, maxs, order, axis, gap_m + 1e-9)  # micrometre files: 2.000000 m apart still counts
+    # Imported here, because every command reads the settings of this module.
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    first, second = _near_pairs(mins, maxs, gap_m + 1e-9)  # micrometre files: 2.000000 m apart still counts
+    near = coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(len(mins), len(mins)))
+    _, labels = connected_components(near, directed=False)
+    return np.unique(labels, return_index=True)[1][labels]
 
 
-@njit(cache=True)
-def _root(parent, row):  # pragma: no cover (compiled)
-    while parent[row] != row:
-        parent[row] = parent[parent[row]]
-        row = parent[row]
-    return row
-
-
-@njit(cache=True)
-def _sweep_clusters(mins, maxs, order, axis, gap_m):  # pragma: no cover (compiled)
-    """Return the lowest row of each box's cluster, by union-find over the pairs that a sweep along one axis meets."""
-    parent = np.arange(len(order))
-    for i in range(len(order)):
-        a = order[i]
-        reach = maxs[a, axis] + gap_m
-        for j in range(i + 1, len(order)):
-            b = order[j]
-            if mins[b, axis] > reach:
-                break
-            near = True
-            for k in range(3):
-                if mins[b, k] - maxs[a, k] > gap_m or mins[a, k] - maxs[b, k] > gap_m:
-                    near = False
-                    break
-            if near:
-                root_a, root_b = _root(parent, a), _root(parent, b)
-                parent[max(root_a, root_b)] = min(root_a, root_b)
-    for row in range(len(parent)):
-        parent[row] = _root(parent, row)
-    return parent
+def _near_pairs(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pairs of boxes, (n, 3) m, with gaps of at most `gap_m` on every axis, in both orders."""
+    reach_m = gap_m + 1e-3  # more than rounding
+    grown = shapely.box(*(mins[:, :2] - reach_m).T, *(maxs[:, :2] + reach_m).T)
+    first, second = shapely.STRtree(grown).query(shapely.box(*mins[:, :2].T, *maxs[:, :2].T))
+    is_near = ((mins[second] - maxs[first] <= gap_m) & (mins[first] - maxs[second] <= gap_m)).all(axis=1)
+    return first[is_near], second[is_near]
 
 
 @njit(cache=True)
@@ -414,42 +394,20 @@ def prune_nested(box_map: BoxMap, tolerance_m: float) -> BoxMap:
     rank[np.lexsort((box_map.ids, -np.prod(box_map.half_extents, axis=1)))] = np.arange(len(box_map))
     is_tilted = (box_map.rotations_deg[:, [0, 2]] != 0).any(axis=1)
     yaw = np.radians(box_map.rotations_deg[:, 1])
+    most_m = tolerance_m + 1e-9
     for kind in np.unique(box_map.kinds):
         rows = np.flatnonzero(box_map.kinds == kind)
-        axis = int(np.argmax(maxs[rows].max(axis=0)[:2] - mins[rows].min(axis=0)[:2]))
-        order = rows[np.argsort(mins[rows, axis], kind="stable")]
-        _sweep_nested(
-            mins, maxs, box_map.centers, box_map.half_extents, np.cos(yaw), np.sin(yaw), is_tilted, rank, order, axis,
-            tolerance_m + 1e-9, keep,
-        )  # fmt: skip
+        inner, outer = (rows[pairs] for pairs in _near_pairs(mins[rows], maxs[rows], most_m))
+        may_hold = (rank[outer] < rank[inner]) & ~is_tilted[outer]
+        may_hold &= ((mins[inner] >= mins[outer] - most_m) & (maxs[inner] <= maxs[outer] + most_m)).all(axis=1)
+        inner, outer = inner[may_hold], outer[may_hold]
+        is_inside = np.ones(len(inner), dtype=bool)
+        cos, sin = np.cos(yaw[outer]), np.sin(yaw[outer])
+        half = box_map.half_extents[outer] + most_m
+        for x in (mins[inner, 0], maxs[inner, 0]):
+            for y in (mins[inner, 1], maxs[inner, 1]):
+                dx, dy = x - box_map.centers[outer, 0], y - box_map.centers[outer, 1]
+                is_inside &= np.abs(dx * cos + dy * sin) <= half[:, 0]
+                is_inside &= np.abs(dy * cos - dx * sin) <= half[:, 1]
+        keep[inner[is_inside]] = False
     return box_map.select(keep)
-
-
-@njit(cache=True)
-def _sweep_nested(
-    mins, maxs, centers, halves, cos, sin, is_tilted, rank, order, axis, tolerance, keep
-):  # pragma: no cover (compiled)
-    for i in range(len(order)):
-        a = order[i]
-        reach = maxs[a, axis] + tolerance
-        for j in range(i + 1, len(order)):
-            b = order[j]
-            if mins[b, axis] > reach:
-                break
-            outer, inner = (a, b) if rank[a] < rank[b] else (b, a)
-            if is_tilted[outer] or not keep[inner]:
-                continue
-            inside = True
-            for k in range(3):
-                if mins[inner, k] < mins[outer, k] - tolerance or maxs[inner, k] > maxs[outer, k] + tolerance:
-                    inside = False
-                    break
-            if not inside:
-                continue
-            for x in (mins[inner, 0], maxs[inner, 0]):
-                for y in (mins[inner, 1], maxs[inner, 1]):
-                    dx, dy = x - centers[outer, 0], y - centers[outer, 1]
-                    along, across = abs(dx * cos[outer] + dy * sin[outer]), abs(dy * cos[outer] - dx * sin[outer])
-                    inside &= along <= halves[outer, 0] + tolerance and across <= halves[outer, 1] + tolerance
-            if inside:
-                keep[inner] = False
