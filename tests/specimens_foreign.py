@@ -24,14 +24,13 @@ def write_foreign_tree(
     *,
     towns: tuple[str, ...] = ("Town01",),
     trajectories: tuple[str, ...] = ("trajectory_1777083733",),
-    variants: tuple[str, str] = ("ORI", "aug_001"),
     num_points: int = 16,
     files: tuple[str, ...] = ("rgb.png", "depth.npy", "instance.png"),
 ) -> Path:
     """Write every trajectory into every town, clean and perturbed, and give the root."""
     for k, (town, trajectory) in enumerate((t, j) for t in towns for j in trajectories):
-        for variant in variants:
-            is_clean = variant == variants[0]
+        for variant in ("ORI", "aug_001"):
+            is_clean = variant == "ORI"
             folder = root / town / trajectory / variant
             poses, people = _motion(num_points, k, is_clean)
             points = [_point(i, poses, people, 7.5, is_clean) for i in range(num_points)]
