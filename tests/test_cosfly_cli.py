@@ -89,6 +89,7 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
             ("run", "quickstart", "--out", "stage", "--dry-run"),
             ("stage: the output directory is the folder of a stage", "another --out"),
         ),
+        (("--log-file", "no/log.txt", "config", "show"), ("cannot write the log file",)),
     ):
         with subtests.test(words=words):
             status, line = answer(capfd, monkeypatch, *words)
