@@ -1,7 +1,7 @@
 """Coverage of tracks: counts of frames by height, distance, direction, size, occlusion, style, pace and more.
 
 A student cannot learn situations that its data lack. The bins are fixed, so that the counts of tracks, runs and
-releases add up.
+releases add up. Pages compare them with those of `cosfly run showcase` (`default_coverage.json`).
 """
 
 from __future__ import annotations
@@ -9,11 +9,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 from pydantic import Field, field_validator
 
-from cosfly.runtime.json_io import Record
+from cosfly.runtime.json_io import Record, read_json, validated
+
+DEFAULT = Path(__file__).with_name("default_coverage.json")
 
 
 @dataclass(frozen=True)
@@ -121,3 +125,9 @@ def azimuths_deg(offsets_m: np.ndarray, headings_deg: np.ndarray) -> np.ndarray:
     """
     bearing = np.degrees(np.arctan2(offsets_m[:, 1], offsets_m[:, 0]))
     return (bearing - headings_deg + 180.0) % 360.0 - 180.0
+
+
+@cache
+def default_coverage() -> Coverage:
+    """Return the coverage of the default run (`configs/showcase.yaml`), which is part of the package."""
+    return validated(Coverage, read_json(DEFAULT), DEFAULT)

@@ -1,8 +1,8 @@
-"""The coverage of a release in tables."""
+"""The coverage of a release in tables, next to that of the default run."""
 
 from __future__ import annotations
 
-from cosfly.geometry.coverage import AXES, NAMED, Coverage
+from cosfly.geometry.coverage import AXES, NAMED, Coverage, default_coverage
 from cosfly.viz.page import fragment
 
 
@@ -12,18 +12,26 @@ def coverage_html(coverage: Coverage) -> str:
     return fragment("cosfly/viz/templates/coverage.html", ranges=ranges(coverage), names=names)
 
 
-def ranges(coverage: Coverage) -> list[tuple[str, str]]:
-    """Return a row for each axis: title, and range of 5 % to 95 % of the frames."""
+def ranges(coverage: Coverage) -> list[tuple[str, str, str]]:
+    """Return a row for each axis: title, range of 5 % to 95 % of the frames, that range for the default run."""
+    default = default_coverage()
     titles = [f"{axis.title}, {axis.unit}".rstrip(", ") for axis in AXES.values()]
-    return [(title, _range(coverage, name)) for title, name in zip(titles, AXES, strict=True)]
+    return [(title, _range(coverage, name), _range(default, name)) for title, name in zip(titles, AXES, strict=True)]
 
 
-def shares(coverage: Coverage, kind: str) -> list[tuple[str, int, str]]:
-    """Return a row for each name of a kind of NAMED: name, frames, share."""
+def shares(coverage: Coverage, kind: str) -> list[tuple[str, int, str, str]]:
+    """Return a row for each name of a kind of NAMED: name, frames, share, share in the default run."""
     counts = getattr(coverage, kind)
-    total = sum(counts.values())
-    names = sorted(counts, key=lambda name: (-counts[name], name))
-    return [(name, counts[name], f"{100.0 * counts[name] / total:.1f} %") for name in names]
+    default_counts = getattr(default_coverage(), kind)
+    if not counts:
+        return []
+    names = sorted({*counts, *default_counts}, key=lambda name: (-counts.get(name, 0), name))
+
+    def share(table: dict[str, int], name: str) -> str:
+        total = sum(table.values())
+        return f"{100.0 * table.get(name, 0) / total:.1f} %" if total else "-"
+
+    return [(name, counts.get(name, 0), share(counts, name), share(default_counts, name)) for name in names]
 
 
 def _range(coverage: Coverage, name: str) -> str:
