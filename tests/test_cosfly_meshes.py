@@ -338,6 +338,8 @@ def test_boxes_of_ones_own_bring_their_meshes_along(tmp_path: Path) -> None:
     (tmp_path / "mine/models/cone.glb").symlink_to(cone)
     with pytest.raises(InputError, match="leads out of its folder"):
         make_map(cfg, tmp_path / "linked")
+    again = make_map(cfg, tmp_path / "linked", follow_links=True)
+    assert (again.parent / MESHES_FILE).read_bytes() == (product.parent / MESHES_FILE).read_bytes()
     (tmp_path / "mine/models/cone.glb").unlink()
     with pytest.raises(InputError, match=r"cone\.glb: cannot read the mesh"):
         solids_of(read_boxes(tmp_path / "mine/boxes_3d.json"))

@@ -18,7 +18,9 @@ from pydantic import BaseModel
 from shapely.geometry import Polygon
 from specimens_png import png_around
 from tables import each
+from typer.testing import CliRunner
 
+from cosfly.cli import app
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.frames import depth_bytes, read_depth, rgb_bytes
 from cosfly.maps import cityjson
@@ -27,10 +29,11 @@ from cosfly.runtime import arrays, json_io, png, tables
 from cosfly.runtime import io as files
 from cosfly.runtime.config import Config, apply_overrides, build, read_yaml
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError
-from cosfly.runtime.io import inside, read_text
+from cosfly.runtime.io import LinkedPath, inside, read_text
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.run_dir import StageFolder, read_failures
 from release.record import RELEASE_FORMAT, read_record
+from specimens import make_playback_tree
 
 
 class _Dated(Config):
@@ -236,13 +239,25 @@ def _frame(tree: Path) -> Path:
     return frame
 
 
-def test_a_link_out_of_the_tree_is_refused(tmp_path):
+def test_a_link_out_of_the_tree_is_refused_unless_the_tree_is_trusted(tmp_path):
     private = tmp_path / "private.npy"
     private.write_bytes(depth_bytes(np.zeros((4, 4), np.float32)))
     frame = _frame(tmp_path / "tree")
     (frame / "depth.npy").symlink_to(private)
-    with pytest.raises(InputError, match=r"a link leads out of its folder; got .*private\.npy"):
+    with pytest.raises(
+        InputError, match=r"a link leads out of its folder; got .*private\.npy; .*--set follow_links=true"
+    ):
         read_depth(frame)
+    assert read_depth(LinkedPath(frame)).shape == (4, 4)
+
+
+def test_one_command_follows_links_and_the_next_in_this_process_does_not(tmp_path):
+    tree = make_playback_tree(tmp_path / "data/tree", 1, 4, with_augmented=False)
+    (picture,) = tree.rglob("frame_00001/rgb.png")
+    picture.symlink_to(picture.rename(tmp_path / "rgb.png"))
+    words = ["view", str(tree), "--out", str(tmp_path / "out.png")]
+    assert CliRunner().invoke(app, [*words, "--set", "follow_links=true"]).exit_code == 0
+    assert "leads out" in str(CliRunner().invoke(app, words).exception)
 
 
 def test_links_within_a_tree_and_to_a_tree_are_followed(tmp_path):
@@ -267,6 +282,7 @@ def test_a_flight_behind_a_link_is_read_inside_the_folder_of_its_tree_and_refuse
     outside = _linked_flight(tmp_path / "other/tree", tmp_path / "elsewhere")
     with pytest.raises(InputError, match="leads out"):
         read_depth(outside)
+    assert read_depth(LinkedPath(outside)).shape == (4, 4)
 
 
 def test_nothing_in_a_linked_flight_leads_out_of_it(tmp_path):
@@ -297,6 +313,8 @@ def test_files_are_found_through_links_that_stay_beside_their_tree(tmp_path, cap
 
     assert found(tree) == ["Town01/a/ORI", "Town02/b/ORI"]
     assert "far: skipped, because this link leads to" in caplog.text
+    assert "--set follow_links=true" in caplog.text
+    assert found(LinkedPath(tree)) == ["Town01/a/ORI", "Town01/far/ORI", "Town02/b/ORI"]
 
 
 def test_the_cache_of_the_hub_is_one_tree(tmp_path):

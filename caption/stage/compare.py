@@ -28,6 +28,7 @@ from cosfly.formats.captions import Coc
 from cosfly.llm.answers import AnswerBook
 from cosfly.llm.contract import NoAnswer, run_until_interrupted
 from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.io import refuse_links
 from cosfly.runtime.json_io import write_json
 
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
@@ -85,6 +86,7 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
         fix = "pass --teacher rules, a URL or vllm:MODEL_DIR"
         raise ConfigError("captions of a file cannot be regenerated", where="--teacher", got=cfg.teacher, fix=fix)
     out.mkdir(parents=True, exist_ok=True)
+    refuse_links(out)
     num_windows, trials = run_until_interrupted(_try_all(cfg, vocabulary_of(cfg), data, out, seed, conflicts))
     if not trials:
         raise InputError(

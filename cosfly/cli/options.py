@@ -138,7 +138,7 @@ class Job:
             return data
         for candidate in (Path("render"), Path()):
             if (candidate / "manifest.json").exists() and candidate.resolve().name == "render":
-                return [candidate]
+                return [self.cfg.opened(candidate)]
         raise InputError(
             "the command has no playback tree to read",
             where=Path.cwd(),
@@ -248,7 +248,7 @@ def command(
             if "town" in listed:
                 cfg = _town_of(cfg, values["town"])
             job = Job(cfg, values.get("resume", "if-same"), settings)
-            function(job, **{name: values[name] for name in own_names})
+            function(job, **{name: _opened(cfg, values[name]) for name in own_names})
 
         called.__signature__ = Signature([  # type: ignore[attr-defined]
             Parameter("context", Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context),
@@ -274,6 +274,13 @@ def _set_by_options(options: Mapping[str, SettingOption], values: Mapping[str, A
             continue
         settings[option.setting] = option.values.get(value, value) if isinstance(value, str) else value
     return settings
+
+
+def _opened(cfg: RunConfig, value: Any) -> Any:
+    """Return a path, or a list of paths, whose links are followed if the settings say so."""
+    if isinstance(value, list):
+        return [_opened(cfg, item) for item in value]
+    return cfg.opened(value) if isinstance(value, Path) else value
 
 
 def resolve(

@@ -55,7 +55,7 @@ def world(
 @command("cosfly maps --source synthetic --out maps", "maps", "town seed resume", source=SOURCE)
 def maps(job: Job, out: options.Out) -> None:
     """Make boxes_3d.json, a map of boxes, from a map source (step 1)."""
-    job.run("cosfly.maps.stage", job.cfg.maps, out)
+    job.run("cosfly.maps.stage", job.cfg.maps, out, follow_links=job.cfg.follow_links)
 
 
 @command("cosfly maps roi-backdrop --map boxes_3d.json --out above.png", "render", backend=BACKEND)

@@ -78,7 +78,7 @@ def tree_of_track(folder: Path) -> Path:
     tree = parents[min(2, len(parents) - 1)]
     real, root = real_path(folder), real_path(tree)
     is_beside = not is_below(real, root) and is_below(real, os.path.dirname(root))
-    return Path(real) if is_beside else tree
+    return type(tree)(real) if is_beside else tree
 
 
 # --- ids --------------------------------------------------------------------------------------------------------------

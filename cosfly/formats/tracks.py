@@ -55,7 +55,7 @@ def read_twin(track: Track) -> Track | None:
     """Read the clean twin of a perturbed track; None without one, VerifyError if the two do not belong together."""
     if track.is_original or track.folder is None:
         return None
-    folder = Path(os.path.abspath(track.folder)).with_name(ORIGINAL)
+    folder = type(track.folder)(os.path.abspath(track.folder)).with_name(ORIGINAL)
     if not (folder / "trajectory.json").exists():
         return None
     twin = read_track(folder, strict=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +21,7 @@ from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig
 from cosfly.runtime.config import Config
-from cosfly.runtime.io import write_bytes
+from cosfly.runtime.io import LinkedPath, write_bytes
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.viz.topview import TopView, draw_map, png_bytes
 
@@ -58,19 +59,25 @@ class MapsConfig(Config):
         return {name: value for name, value in super().recorded().items() if name not in others}
 
 
-def load_map(cfg: MapsConfig, *, seed: int = 0) -> BoxMap:
-    """Read or build the map of the chosen source; its meshes are read when they are drawn."""
-    return SOURCES[cfg.source](getattr(cfg, cfg.source), seed)
+def load_map(cfg: MapsConfig, *, seed: int = 0, follow_links: bool = False) -> BoxMap:
+    """Read or build the map of the chosen source; its meshes are read when they are drawn.
+
+    follow_links: also read meshes through links that lead out of the map's folder.
+    """
+    box_map = SOURCES[cfg.source](getattr(cfg, cfg.source), seed)
+    if not follow_links or box_map.meshes.folder is None:
+        return box_map
+    return replace(box_map, meshes=replace(box_map.meshes, folder=LinkedPath(box_map.meshes.folder)))
 
 
-def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
+def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same", follow_links: bool = False) -> Path:
     """Read the source's files, if it has any; write `boxes_3d.json` and the overview `map.png`."""
     inputs = getattr(cfg, cfg.source).inputs()
     stage = StageFolder.open(out, "maps", config=cfg, inputs=inputs, seed=seed, resume=resume)
     product = out / "boxes_3d.json"
     if stage.is_complete:
         return product
-    box_map = load_map(cfg, seed=seed)
+    box_map = load_map(cfg, seed=seed, follow_links=follow_links)
     check_ground(box_map, next(iter(inputs.values()), product))
     write_boxes(product, box_map)
     outputs = [product, out / "map.png"] + [out / MESHES_FILE] * bool(box_map.meshes.refs)

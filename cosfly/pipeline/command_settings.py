@@ -14,6 +14,7 @@ from typing import Any, Literal
 from pydantic import Field, create_model, model_validator
 
 from cosfly.runtime.config import Config
+from cosfly.runtime.io import LinkedPath
 from cosfly.runtime.pool import Watch
 from cosfly.runtime.ray_engine import ALL_ROOM, RayConfig
 
@@ -52,12 +53,17 @@ class CommandConfig(Config):
     )
     max_failed: int = Field(0, ge=0, description="failed items that are accepted; with more, the command exits with 1")
     roi: Path | None = Field(None, description="region for the pedestrians (roi_polygon.json); none: the whole map")
+    follow_links: bool = Field(False, description="follow symbolic links out of the run, tree, release or meshes")
     towns: dict[str, dict[str, Any]] = Field(
         {},
         description="towns of one data set, by name, with the settings that differ from the shared ones; each town is "
         "a run in a folder of its name, and one release contains all. `maps` of a town replaces the shared section. "
         "Empty: one town",
     )
+
+    def opened(self, path: Path) -> Path:
+        """Return a path of a command as one whose links are followed, if the settings say so."""
+        return LinkedPath(path) if self.follow_links else path
 
     @model_validator(mode="after")
     def _address_is_used(self) -> CommandConfig:

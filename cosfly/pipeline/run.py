@@ -30,7 +30,7 @@ from cosfly.pipeline.command_settings import worker_options
 from cosfly.pipeline.runs import STAGES
 from cosfly.pipeline.settings import RunConfig, run_checks
 from cosfly.runtime.errors import ConfigError, InputError, ResumeError
-from cosfly.runtime.io import write_bytes
+from cosfly.runtime.io import refuse_link, write_bytes
 from cosfly.runtime.json_io import read_object, validated, write_json
 from cosfly.runtime.run_dir import Manifest, Resume, hold_folder, read_manifest
 from cosfly.viz.gallery import contact_sheet
@@ -85,7 +85,7 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
         return Stage(name, partial(run, getattr(cfg, name), *inputs, (into or out) / name, resume=resume, **options))
 
     return [
-        stage("maps", cosfly.maps.stage.run, seed=seed),
+        stage("maps", cosfly.maps.stage.run, seed=seed, follow_links=cfg.follow_links),
         stage("simplify", cosfly.simplify.stage.run, boxes),
         stage("pedestrians", cosfly.pedestrians.stage.run, simplified, roi=cfg.roi, seed=seed, **pool),
         stage("plan", cosfly.planners.stage.run, simplified, paths, seed=seed, **pool),
@@ -108,11 +108,14 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "
     With several towns each town has its own run directory below `out`, and one `release` is made of all. Every stage is
     complete or resumable at any moment. The run ends with `contact_sheet.png`, `viewer.html` and `summary.json`.
     """
+    out = cfg.opened(out)
     num_stages = STAGES.index(until) + 1
     check_out(out)
     towns = check(cfg)
     if not towns:
         return _run_town(cfg, out, stages(cfg, out, resume=resume)[:num_stages])
+    for name in (*towns, "release"):
+        refuse_link(out / name)
     with _run_directory(cfg, out):
         results = []
         for number, (name, town) in enumerate(towns.items(), 1):
@@ -198,6 +201,8 @@ def _check_files(cfg: RunConfig) -> None:
 
 def _run_town(cfg: RunConfig, out: Path, town_stages: list[Stage]) -> list[StageResult]:
     """Run the stages of one town."""
+    for stage in town_stages:
+        refuse_link(out / stage.name)
     with _run_directory(cfg, out):
         results = [_run_stage(stage, out, f"{k}/{len(town_stages)}") for k, stage in enumerate(town_stages, 1)]
         # summary.json is written after the pictures, so they are up to date if it has these very stages.

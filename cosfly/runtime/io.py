@@ -18,7 +18,7 @@ import shutil
 import stat
 import zlib
 from collections.abc import Iterator, Mapping
-from pathlib import Path
+from pathlib import Path, PosixPath
 from typing import IO
 
 from cosfly.runtime.errors import InputError, StorageError
@@ -38,6 +38,13 @@ CHECKSUMS = "checksums.sha256"
 DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EIO})
 NO_SUCH_PLACE = frozenset({errno.ENOENT, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP})
+
+
+class LinkedPath(PosixPath):
+    """A directory or file that the user trusts: all links below it are followed.
+
+    Every path derived from it is a LinkedPath too, also in another process, so readers need no option.
+    """
 
 
 def over_limit(where: object, got: str, expected: str, fix: str) -> InputError:
@@ -168,7 +175,8 @@ def sha256_bytes(data: bytes) -> str:
 def files_named(tree: Path, name: str) -> list[Path]:
     """Return the files with a name below a tree, sorted; skip hidden entries and the folders below a match.
 
-    A linked directory is entered if it is inside the tree's parent directory; others are logged.
+    A linked directory is entered if it is inside the tree's parent directory, or anywhere with `follow_links`; others
+    are logged.
     """
     matches = list[Path]()
     root = os.path.realpath(tree)
@@ -186,8 +194,12 @@ def files_named(tree: Path, name: str) -> list[Path]:
                 waiting.append((folder / entry.name, above))
             elif entry.is_symlink() and os.path.isdir(entry.path):  # isdir is false for a link to itself
                 real = os.path.realpath(entry.path)
-                if not is_below(real, parent):
-                    log.warning("%s: skipped, because this link leads to %s", entry.path, real)
+                if not (isinstance(tree, LinkedPath) or is_below(real, parent)):
+                    log.warning(
+                        "%s: skipped, because this link leads to %s; pass --set follow_links=true to follow it",
+                        entry.path,
+                        real,
+                    )
                 elif real not in above and real != parent:  # a link to a folder above would be followed forever
                     waiting.append((folder / entry.name, (*above, real)))
     return sorted(matches)
@@ -202,6 +214,8 @@ def check_stays_below(path: Path, tree: Path, *, in_parent: bool = False) -> Non
     The tree itself may be a link. In the cache of the hub's client, where a snapshot's files are links to blobs, the
     blobs are part of the tree.
     """
+    if isinstance(tree, LinkedPath):
+        return
     try:
         real, root = real_path(path), real_path(tree)
     except ValueError as error:  # a NUL in a name
@@ -213,7 +227,7 @@ def check_stays_below(path: Path, tree: Path, *, in_parent: bool = False) -> Non
             where=path,
             got=real,
             expected=f"a file below {tree}",
-            fix="replace the link by what it leads to",
+            fix="if you trust the link, pass --set follow_links=true",
         )
 
 
@@ -256,6 +270,27 @@ def _plain_name(root: Path, name: str) -> str:
     return plain
 
 
+def refuse_link(path: Path) -> None:
+    """Refuse to write to a link, which may lead anywhere."""
+    if path.is_symlink():
+        raise StorageError(
+            "this path is a link, and cosfly does not write through links",
+            where=path,
+            got=f"a link to {os.readlink(path)}",
+            fix="remove the link, or replace it by its target; only the folder of --out itself may be a link",
+        )
+
+
+def refuse_links(folder: Path) -> None:
+    """Refuse to write into a folder that contains a link at any depth; the folder itself may be a link."""
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_symlink():
+                refuse_link(Path(entry.path))
+            elif entry.is_dir():
+                refuse_links(Path(entry.path))
+
+
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
@@ -294,12 +329,14 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     with _renamed(path) as partial:
         partial.mkdir()
         yield partial
-        _remove(path)
+        if path.exists():
+            shutil.rmtree(path)
 
 
 @contextlib.contextmanager
 def _renamed(path: Path) -> Iterator[Path]:
     """Remove temporary files of killed processes, yield a temporary name, and rename that file or folder at the end."""
+    refuse_link(path)
     begin, end = f".{path.name}.", ".partial"
     partial = path.with_name(f"{begin}{os.getpid()}{end}")
     with storage_errors(path):
