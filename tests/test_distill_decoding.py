@@ -1,23 +1,21 @@
 """distill: greedy decoding against the library's own `generate`, token by token, on a random student in float32."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from later import torch, transformers
 from PIL import Image
+from specimens_students import features_of
 
-torch = pytest.importorskip("torch", reason="needs the extra distill")
-pytest.importorskip("peft", reason="needs the extra distill")
-
-from specimens_students import features_of  # noqa: E402
-from transformers import LogitsProcessor, LogitsProcessorList  # noqa: E402
-
-from distill.student import decoding  # noqa: E402
-from distill.student.decoding import Completion  # noqa: E402
-from distill.student.encoding import EncodedSample, prompt_batch  # noqa: E402
-from distill.student.model import IMAGE_TOKEN, Student, load_student  # noqa: E402
-from distill.student.random_student import make_tiny_student  # noqa: E402
+from distill.student import decoding
+from distill.student.decoding import Completion
+from distill.student.encoding import EncodedSample, prompt_batch
+from distill.student.model import IMAGE_TOKEN, Student, load_student
+from distill.student.random_student import make_tiny_student
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -31,7 +29,7 @@ def student(tmp_path_factory) -> Student:
 
 
 @pytest.fixture(scope="module")
-def rows(student) -> list["Asked"]:
+def rows(student) -> list[Asked]:
     """Prompts of 1 to 140 tokens with 0 to 5 pictures of two sizes."""
     rng = np.random.default_rng(4)
     return [make_row(student, rng, *size) for size in [(5, 2), (40, 1), (120, 5), (17, 3), (1, 0), (60, 0), (2, 1)]]
@@ -115,7 +113,7 @@ class EvenTokens:
         self.counts[row] += 1
 
 
-class Even(LogitsProcessor):
+class Even:
     def __init__(self, end: int, num_prompt: int) -> None:
         self.end, self.num_prompt = end, num_prompt
 
@@ -132,6 +130,6 @@ def test_a_constraint_decides_what_may_come(student, rows):
     own = replace(student)
     own.__dict__["end_token_id"] = 44  # even, so that it comes now and then
     end, num_prompt = own.end_token_id, max(len(row.prompt_ids) for row in rows)
-    even = LogitsProcessorList([Even(end, num_prompt)])
+    even = transformers.LogitsProcessorList([Even(end, num_prompt)])
     found = decode(own, rows, max_tokens=MOST, constraint=EvenTokens(end, len(rows)))
     assert found == generated(own, rows, logits_processor=even) != decode(own, rows, max_tokens=MOST)

@@ -1,5 +1,7 @@
 """Students that answer in this process: batches, pictures, kills, full memory, constrained answers."""
 
+from __future__ import annotations
+
 import json
 import shutil
 from pathlib import Path
@@ -7,25 +9,22 @@ from typing import Any
 
 import pytest
 from commands import invoke
+from later import torch
 from specimens_distill import ADAPTER_PIXELS, make_adapter, make_captions, prepared
 from specimens_students import features_of, inputs_of
+from teacher_server import kept_answers
 
-torch = pytest.importorskip("torch", reason="needs the extra distill")
-pytest.importorskip("peft", reason="needs the extra distill")
-
-from teacher_server import kept_answers  # noqa: E402
-
-from cosfly.formats.predictions import Prediction, read_predictions  # noqa: E402
-from cosfly.llm.student_chat import CHAT_FORMAT_FILE  # noqa: E402
-from distill.inference import merge  # noqa: E402
-from distill.inference import stage as infer  # noqa: E402
-from distill.schema import Sample, open_split, resolve_trees  # noqa: E402
-from distill.student.checkpoint import ADAPTER_FACTS  # noqa: E402
-from distill.student.decoding import decode  # noqa: E402
-from distill.student.encoding import encode_text  # noqa: E402
-from distill.student.model import load_student  # noqa: E402
-from distill.student.random_student import make_tiny_student  # noqa: E402
-from specimens import make_playback_tree  # noqa: E402
+from cosfly.formats.predictions import Prediction, read_predictions
+from cosfly.llm.student_chat import CHAT_FORMAT_FILE
+from distill.inference import merge
+from distill.inference import stage as infer
+from distill.schema import Sample, open_split, resolve_trees
+from distill.student.checkpoint import ADAPTER_FACTS
+from distill.student.decoding import decode
+from distill.student.encoding import encode_text
+from distill.student.model import load_student
+from distill.student.random_student import make_tiny_student
+from specimens import make_playback_tree
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

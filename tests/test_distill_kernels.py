@@ -1,20 +1,17 @@
 """distill: faster code for parts of a student against the library's, and which code is chosen when."""
 
+from __future__ import annotations
+
 import pytest
+from later import qwen, torch
 from tables import each
 
-torch = pytest.importorskip("torch", reason="needs the extra distill")
-pytest.importorskip("transformers", reason="needs the extra distill")
-
-from transformers.models.qwen3_5 import modeling_qwen3_5 as library  # noqa: E402
-from transformers.models.qwen3_5.configuration_qwen3_5 import Qwen3_5VisionConfig  # noqa: E402
-
-from distill.student import kernels  # noqa: E402
+from distill.student import kernels
 
 
 def norms(dtype) -> torch.nn.ModuleDict:
     torch.manual_seed(0)
-    found = torch.nn.ModuleDict({"plain": library.Qwen3_5RMSNorm(48), "gated": library.Qwen3_5RMSNormGated(48)})
+    found = torch.nn.ModuleDict({"plain": qwen.Qwen3_5RMSNorm(48), "gated": qwen.Qwen3_5RMSNormGated(48)})
     with torch.no_grad():
         for parameter in found.parameters():
             parameter.add_(0.3 * torch.randn(48))
@@ -32,10 +29,10 @@ def computed(found: torch.nn.ModuleDict, dtype, autocast: bool) -> list[torch.Te
 
 
 @pytest.mark.parametrize(("dtype", "autocast", "tolerance"), [
-    (torch.float32, False, 1e-5), (torch.float32, True, 1e-5),
-    (torch.bfloat16, False, 0.03), (torch.bfloat16, True, 0.03),
+    ("float32", False, 1e-5), ("float32", True, 1e-5), ("bfloat16", False, 0.03), ("bfloat16", True, 0.03),
 ])  # fmt: skip
 def test_fused_norms_are_the_librarys_with_their_gradients(dtype, autocast, tolerance):
+    dtype = getattr(torch, dtype)
     plain, fused = norms(dtype), norms(dtype)
     kernels.fuse_norms(fused)
     assert {type(module).__name__ for module in fused.values()} == {"FusedNorm", "FusedGatedNorm"}
@@ -47,10 +44,10 @@ def test_fused_norms_are_the_librarys_with_their_gradients(dtype, autocast, tole
 
 @each("grids", [[[1, 4, 6]] * 5, [[1, 4, 6], [1, 2, 8], [1, 4, 6]]])
 def test_a_tower_attends_to_pictures_of_one_size_at_once_and_gives_the_same(grids):
-    cfg = Qwen3_5VisionConfig(depth=2, hidden_size=32, intermediate_size=64, num_heads=2, out_hidden_size=48)
+    cfg = qwen.Qwen3_5VisionConfig(depth=2, hidden_size=32, intermediate_size=64, num_heads=2, out_hidden_size=48)
     cfg._attn_implementation = "sdpa"
     torch.manual_seed(0)
-    towers = [library.Qwen3_5VisionModel(cfg), library.Qwen3_5VisionModel(cfg)]
+    towers = [qwen.Qwen3_5VisionModel(cfg), qwen.Qwen3_5VisionModel(cfg)]
     towers[1].load_state_dict(towers[0].state_dict())
     kernels.look_at_equal_sizes_at_once(towers[1])
     assert type(towers[1].blocks[0].attn).__name__ == "JoinedAttention"

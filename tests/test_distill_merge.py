@@ -6,18 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from later import safetensors, torch
+from specimens_distill import make_adapter
 
-torch = pytest.importorskip("torch", reason="needs the extra distill")
-pytest.importorskip("peft", reason="needs the extra distill")
-
-from safetensors.torch import load_file, save_file  # noqa: E402
-from specimens_distill import make_adapter  # noqa: E402
-
-from cosfly.runtime.errors import InputError  # noqa: E402
-from cosfly.runtime.json_io import write_json  # noqa: E402
-from distill.inference import merge  # noqa: E402
-from distill.student.model import load_student  # noqa: E402
-from distill.student.random_student import make_tiny_student  # noqa: E402
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.json_io import write_json
+from distill.inference import merge
+from distill.student.model import load_student
+from distill.student.random_student import make_tiny_student
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -41,19 +37,19 @@ def adapter(base, tmp_path_factory) -> Path:
 def test_merged_as_peft_merges(base, tmp_path, changes):
     folder = make_adapter(base, tmp_path / "adapter", **changes)
     expected = load_student(base, device="cpu", max_pixels=PIXELS, adapter=folder).model.merge_and_unload().state_dict()
-    found = load_file(merge.run(base, folder, tmp_path / "out") / "model.safetensors")
-    before = load_file(base / "model.safetensors")
+    found = safetensors.load_file(merge.run(base, folder, tmp_path / "out") / "model.safetensors")
+    before = safetensors.load_file(base / "model.safetensors")
     changed = {name for name in found if not torch.equal(found[name], before[name])}
     assert changed
     assert not any("visual" in name for name in changed)
     for name, tensor in found.items():
         torch.testing.assert_close(tensor, expected[name], rtol=1e-6, atol=1e-6)
     manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
-    assert manifest["counts"]["kept"] == len(load_file(folder / "adapter_model.safetensors")) // 2
+    assert manifest["counts"]["kept"] == len(safetensors.load_file(folder / "adapter_model.safetensors")) // 2
 
 
 def test_damaged_adapters_are_refused(base, adapter, tmp_path):
-    tensors = load_file(adapter / "adapter_model.safetensors")
+    tensors = safetensors.load_file(adapter / "adapter_model.safetensors")
     name = sorted(tensors)[0]
     stranger = name.replace("layers.0", "layers.77")
     pair = {stranger: tensors[name].clone(), stranger.replace("lora_A", "lora_B"): torch.ones(8, 4)}
@@ -66,7 +62,7 @@ def test_damaged_adapters_are_refused(base, adapter, tmp_path):
     ]):  # fmt: skip
         folder = tmp_path / f"adapter_{number}"
         shutil.copytree(adapter, folder)
-        save_file(changed, folder / "adapter_model.safetensors")
+        safetensors.save_file(changed, folder / "adapter_model.safetensors")
         with pytest.raises(InputError, match=words):
             merge.run(base, folder, tmp_path / f"out_{number}")
         assert [path.name for path in (tmp_path / f"out_{number}").iterdir() if path.is_dir()] == []

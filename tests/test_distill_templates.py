@@ -6,11 +6,8 @@ otherwise, takes thoughts from their own field alone, and begins its system text
 is off.
 """
 
+import later  # noqa: F401  # skips without torch
 import pytest
-
-pytest.importorskip("torch", reason="needs the extra distill")
-pytest.importorskip("peft", reason="needs the extra distill")
-
 from specimens_students import FAST, load, samples_of
 
 from cosfly.runtime.errors import InputError

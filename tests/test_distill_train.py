@@ -9,14 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from later import safetensors, torch
 from processes import is_running, wait_until
 from specimens_distill import write_set
-
-torch = pytest.importorskip("torch", reason="needs the extra distill")
-pytest.importorskip("peft", reason="needs the extra distill")
-
-from safetensors.torch import load_file  # noqa: E402
-from specimens_students import (  # noqa: E402
+from specimens_students import (
     FAST,
     MAX_PIXELS,
     TWELVE,
@@ -30,16 +26,16 @@ from specimens_students import (  # noqa: E402
     trees_of,
 )
 
-from cosfly.formats.predictions import read_predictions  # noqa: E402
-from cosfly.runtime.errors import ConfigError, InputError  # noqa: E402
-from distill.inference import stage as infer  # noqa: E402
-from distill.student import model as student  # noqa: E402
-from distill.student.checkpoint import Progress, load_checkpoint, newest_checkpoint  # noqa: E402
-from distill.student.encoding import IGNORED, encode_text, load_pictures, padded  # noqa: E402
-from distill.training import fit  # noqa: E402
-from distill.training import stage as train  # noqa: E402
-from distill.training.fit import Validation, judged  # noqa: E402
-from distill.training.settings import Steps, TrainConfig  # noqa: E402
+from cosfly.formats.predictions import read_predictions
+from cosfly.runtime.errors import ConfigError, InputError
+from distill.inference import stage as infer
+from distill.student import model as student
+from distill.student.checkpoint import Progress, load_checkpoint, newest_checkpoint
+from distill.student.encoding import IGNORED, encode_text, load_pictures, padded
+from distill.training import fit
+from distill.training import stage as train
+from distill.training.fit import Validation, judged
+from distill.training.settings import Steps, TrainConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -211,8 +207,8 @@ def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path, monkeyp
     assert (manifest["best_step"], manifest["steps"]) == (2, 4)
     assert [r["validation"]["loss"] for r in log_of(out, "validation")] == [4.0, 3.0, 1.0, 2.0, 1.5]
     best, last = (out / "checkpoints" / f"step_{step:08d}" / "weights.safetensors" for step in (2, 4))
-    kept, newest = load_file(best), load_file(last)
-    product = load_file(out / "adapter" / "adapter_model.safetensors")
+    kept, newest = safetensors.load_file(best), safetensors.load_file(last)
+    product = safetensors.load_file(out / "adapter" / "adapter_model.safetensors")
     product = {name.replace(".weight", ".default.weight"): tensor for name, tensor in product.items()}
     assert product.keys() == kept.keys()
     assert all(torch.equal(tensor, kept[name]) for name, tensor in product.items())
@@ -236,7 +232,8 @@ def test_bfloat16_computes_with_float32_weights_that_learn(place, tmp_path):
     assert found == pytest.approx(wanted, rel=0.02)
     assert found != wanted
     newest = sorted((tmp_path / "bfloat16" / "checkpoints").iterdir())[-1]
-    assert {tensor.dtype for tensor in load_file(newest / "weights.safetensors").values()} == {torch.float32}
+    weights = safetensors.load_file(newest / "weights.safetensors")
+    assert {tensor.dtype for tensor in weights.values()} == {torch.float32}
 
 
 def test_the_best_is_who_decides_best_and_patience_ends():

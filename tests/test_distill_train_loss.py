@@ -1,22 +1,21 @@
 """distill."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from later import torch
+from specimens_students import FAST, features_of, inputs_of, load, losses_of, run, samples_of, trees_of
 
-torch = pytest.importorskip("torch", reason="needs the extra distill")
-pytest.importorskip("peft", reason="needs the extra distill")
-
-from specimens_students import FAST, features_of, inputs_of, load, losses_of, run, samples_of, trees_of  # noqa: E402
-
-from distill.student.encoding import EncodedSample, encode_text, padded  # noqa: E402
-from distill.student.model import Student  # noqa: E402
-from distill.training import fit  # noqa: E402
-from distill.training import stage as train  # noqa: E402
-from distill.training.loss import answer_loss, chunked_loss  # noqa: E402
-from distill.training.settings import TrainConfig  # noqa: E402
+from distill.student.encoding import EncodedSample, encode_text, padded
+from distill.student.model import Student
+from distill.training import fit
+from distill.training import stage as train
+from distill.training.loss import answer_loss, chunked_loss
+from distill.training.settings import TrainConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

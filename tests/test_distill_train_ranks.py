@@ -10,16 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from later import safetensors
+from simulator_serving import free_port
+from specimens_students import TWELVE, log_of, losses_of
 
-torch = pytest.importorskip("torch", reason="needs the extra distill")
-pytest.importorskip("peft", reason="needs the extra distill")
-
-from safetensors.torch import load_file  # noqa: E402
-from simulator_serving import free_port  # noqa: E402
-from specimens_students import TWELVE, log_of, losses_of  # noqa: E402
-
-from cosfly.runtime.errors import ConfigError, InputError  # noqa: E402
-from distill.training.ranks import Ranks, joined  # noqa: E402
+from cosfly.runtime.errors import ConfigError, InputError
+from distill.training.ranks import Ranks, joined
 
 # A usual rate: with one that makes a student learn in 12 steps, rounding grows beyond 1e-5 within few of them.
 SETTINGS = {**TWELVE, "learning_rate": 1e-3, "validation_answers": True, "max_new_tokens": 4}
@@ -84,7 +80,9 @@ def test_two_processes_give_what_one_gives(place, alone, tmp_path):
     for mine, other in zip(log_of(tmp_path / "out", "validation"), log_of(alone, "validation"), strict=True):
         found, wanted = ({n: v for n, v in each["validation"].items() if v is not None} for each in (mine, other))
         assert found == pytest.approx(wanted, rel=1e-5)
-    adapters = [load_file(out / "adapter" / "adapter_model.safetensors") for out in (tmp_path / "out", alone)]
+    adapters = [
+        safetensors.load_file(out / "adapter" / "adapter_model.safetensors") for out in (tmp_path / "out", alone)
+    ]
     for name, tensor in adapters[0].items():
         assert np.allclose(tensor, adapters[1][name], atol=1e-4), name
     manifests = [json.loads((out / "manifest.json").read_text()) for out in (tmp_path / "out", alone)]
