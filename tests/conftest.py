@@ -142,6 +142,14 @@ def built(release_inputs, built_once) -> Path:
     return built_once("built", lambda root: build(release_inputs, root / "release")) / "release" / "dataset"
 
 
+@pytest.fixture(scope="session")
+def small_run(built_once) -> Path:
+    """A whole run of two walks, clean and perturbed, of 30 and 43 frames; tests copy what they change of it."""
+    from specimens_release import SMALL_RUN, run_here
+
+    return built_once("small_run", lambda root: run_here(SMALL_RUN, root / "run")) / "run"
+
+
 @pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:
     """PyTorch in one thread: sums then do not depend on the machine, and a tiny model is faster so."""

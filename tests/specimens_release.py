@@ -135,6 +135,12 @@ def all_bytes(folder: Path) -> dict[str, bytes]:
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
+SMALL_RUN = [
+    "pedestrians.num_paths=2", "pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25", "render.width_px=256",
+    "render.height_px=144", "render.fovs_deg=[60, 90]", "caption.window.stride=2", "workers=1",
+]  # fmt: skip
+
+
 def run_here(told: list[str], out: Path) -> Path:
     """Go the whole way from a map to a release in this process: workers take longer to start than a few flights."""
     with mock.patch.object(pipeline, "worker_options", return_value={"workers": 0}):

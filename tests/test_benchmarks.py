@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 from browser import NAMES as BROWSERS
-from test_pipeline_tiny import make_tiny_run
 
 FOLDER = Path(__file__).parent / "benchmarks"
 SMALL_TOWN = """
@@ -58,12 +57,12 @@ bench.TURNS, bench.census_town = 1, lambda name, seed: load(SyntheticConfig(), s
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case[0]} {case[1].partition(' ')[0]}")
-def test_a_benchmark_prints_its_figures(case, built_once, tmp_path):
+def test_a_benchmark_prints_its_figures(case, request, tmp_path):
     name, words, figures, before = (*case, "")[:4]
     if name == "bench_pages" and not any(map(shutil.which, BROWSERS)):
         pytest.skip("there is no Chromium on this machine")
     if "RUN" in words:
-        words = words.replace("RUN", str(built_once("tiny_run", make_tiny_run) / "run"))
+        words = words.replace("RUN", str(request.getfixturevalue("small_run")))
     arguments = [f"{name}.py", *words.replace("OUT", str(tmp_path / "out")).split()]
     program = f"import sys, {name} as bench\n{before}\nsys.argv = {arguments!r}\nbench.main()\n"
     paths = [str(FOLDER), str(FOLDER.parent), str(FOLDER.parents[1])]

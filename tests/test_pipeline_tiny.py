@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from specimens_release import run_here
+from specimens_release import SMALL_RUN
 from typer.testing import CliRunner
 
 from cosfly.cli import app
@@ -24,25 +24,11 @@ from cosfly.runtime.json_io import read_json, write_json
 from cosfly.runtime.run_dir import read_failures
 from release.verify.verify import verify
 
-TINY = [
-    "pedestrians.num_paths=2", "pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25", "render.width_px=160",
-    "render.height_px=90", "render.fovs_deg=[60]", "caption.window.stride=4", "workers=1",
-]  # fmt: skip
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")
 
 
 def tiny(**changes) -> RunConfig:
-    return load(RunConfig, None, [*TINY, *(f"{key}={value}" for key, value in changes.items())])
-
-
-@pytest.fixture(scope="module")
-def base(built_once):
-    """One undisturbed run; tests copy what they need of it."""
-    return built_once("tiny_run", make_tiny_run) / "run"
-
-
-def make_tiny_run(root: Path) -> None:
-    run_here(TINY, root / "run")
+    return load(RunConfig, None, [*SMALL_RUN, *(f"{key}={value}" for key, value in changes.items())])
 
 
 def products(folder: Path) -> dict[str, str]:
@@ -50,10 +36,10 @@ def products(folder: Path) -> dict[str, str]:
     return {entry["path"]: entry["sha256"] for entry in read_json(folder / "manifest.json")["outputs"]}
 
 
-def begin(base: Path, out: Path, stage: str) -> Path:
+def begin(small_run: Path, out: Path, stage: str) -> Path:
     for name in STAGES[: STAGES.index(stage)]:
-        shutil.copytree(base / name, out / name)
-    shutil.copy(base / "run.yaml", out)
+        shutil.copytree(small_run / name, out / name)
+    shutil.copy(small_run / "run.yaml", out)
     return out
 
 
@@ -62,23 +48,23 @@ def work(cfg: RunConfig, out: Path, stage: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_licence_of_the_map_reaches_the_card(base):
-    card = (base / "release/dataset/README.md").read_text(encoding="utf-8")
+def test_the_licence_of_the_map_reaches_the_card(small_run):
+    card = (small_run / "release/dataset/README.md").read_text(encoding="utf-8")
     assert "license: apache-2.0\n" in card
     assert "Map of Town_SynthTown: SynthTown, licence apache-2.0." in card
 
 
-def test_every_stage_is_complete_and_adds_up(base):
+def test_every_stage_is_complete_and_adds_up(small_run):
     for stage in STAGES:
-        manifest = read_json(base / stage / "manifest.json")
+        manifest = read_json(small_run / stage / "manifest.json")
         counts = manifest["counts"]
         assert counts["kept"] + sum(counts["dropped"].values()) + sum(counts["failed"].values()) == counts["input"], (
             stage
         )
-        assert products(base / stage), stage
-    assert read_json(base / "summary.json")["peak_memory_mb"] > 10
+        assert products(small_run / stage), stage
+    assert read_json(small_run / "summary.json")["peak_memory_mb"] > 10
     for picture in ("contact_sheet.png", "viewer.html"):
-        assert (base / picture).stat().st_size > 10_000
+        assert (small_run / picture).stat().st_size > 10_000
 
 
 def test_a_run_goes_on_by_its_folder_or_its_settings_whatever_is_begun(tmp_path, monkeypatch):
@@ -96,55 +82,57 @@ def test_a_run_goes_on_by_its_folder_or_its_settings_whatever_is_begun(tmp_path,
         assert asked[-2:] == [run, tmp_path / "new"]
 
 
-def test_a_dry_run_writes_nothing(base):
-    beside = base.parent / "other"
+def test_a_dry_run_writes_nothing(small_run):
+    beside = small_run.parent / "other"
     one, three = ({row.name: row for row in estimate(tiny(**{"pedestrians.num_paths": n}), beside)} for n in (2, 6))
     assert three["render"].count == 3 * one["render"].count
     assert three["caption"].count == 3 * one["caption"].count
-    shown = CliRunner().invoke(app, ["run", str(base), "--out", str(beside), "--dry-run"])
+    shown = CliRunner().invoke(app, ["run", str(small_run), "--out", str(beside), "--dry-run"])
     assert shown.exit_code == 0, shown.output
     assert "total: about" in shown.output
     assert not beside.exists()
 
 
-def test_a_finished_run_costs_nothing_more_and_a_half_finished_one_the_rest(base, tmp_path):
-    assert all(row.is_done and row.seconds == 0 for row in estimate(tiny(), base))
-    half = begin(base, tmp_path / "run", "inspect")
+def test_a_finished_run_costs_nothing_more_and_a_half_finished_one_the_rest(small_run, tmp_path):
+    assert all(row.is_done and row.seconds == 0 for row in estimate(tiny(), small_run))
+    half = begin(small_run, tmp_path / "run", "inspect")
     rows = estimate(tiny(), half)
     assert [row.name for row in rows if not row.is_done] == ["inspect", "caption", "release"]
-    exact = sum(flight["num_frames"] for flight in read_json(base / "render/manifest.json")["flights"])
+    exact = sum(flight["num_frames"] for flight in read_json(small_run / "render/manifest.json")["flights"])
     assert rows[-1].count == exact
 
 
-def test_two_walks_give_two_flights_on_two_tracks_with_captions(base):
-    flights = [read_track(folder) for folder in find_tracks(base / "render")]
+def test_two_walks_give_two_flights_on_two_tracks_with_captions(small_run):
+    flights = [read_track(folder) for folder in find_tracks(small_run / "render")]
     assert sorted(flight.variant for flight in flights) == ["ORI", "ORI", "aug_001", "aug_001"]
     assert all(flight.missing_frames() == [] for flight in flights)
-    captions = list(read_captions(base / "caption/captions.jsonl"))
+    captions = list(read_captions(small_run / "caption/captions.jsonl"))
     accepted = [c for c in captions if c.status == "accepted"]
     assert len(accepted) > 10
     assert all(c.en and c.zh and c.en.flight_decision == c.zh.flight_decision for c in accepted)
     assert [c.sample_id for c in captions] == sorted(c.sample_id for c in captions)
 
 
-def test_every_file_of_a_run_stands_in_the_files_page(base):
+def test_every_file_of_a_run_stands_in_the_files_page(small_run):
     page = (Path(__file__).parents[1] / "docs/files.md").read_text(encoding="utf-8")
-    names = {path.name for path in base.rglob("*") if path.is_file()}
+    names = {path.name for path in small_run.rglob("*") if path.is_file()}
     assert len(names) > 30
     assert sorted(name for name in names if name not in page and not name.endswith(".parquet")) == []
 
 
-def test_running_again_changes_nothing(base):
+def test_running_again_changes_nothing(small_run):
     before = {
-        p: p.stat().st_mtime_ns for p in base.rglob("*") if p.is_file() and p.name not in ("run.yaml", "summary.json")
+        p: p.stat().st_mtime_ns
+        for p in small_run.rglob("*")
+        if p.is_file() and p.name not in ("run.yaml", "summary.json")
     }
-    results = pipeline.run(tiny(), base)
+    results = pipeline.run(tiny(), small_run)
     assert all(result.was_complete for result in results)
     assert {p: p.stat().st_mtime_ns for p in before} == before
 
 
-def test_other_settings_are_refused_by_name_and_nothing_is_touched(base, tmp_path, caplog):
-    out = begin(base, tmp_path / "run", "plan")
+def test_other_settings_are_refused_by_name_and_nothing_is_touched(small_run, tmp_path, caplog):
+    out = begin(small_run, tmp_path / "run", "plan")
     before = (out / "run.yaml").read_bytes()
     caplog.set_level("INFO")
     with pytest.raises(ResumeError, match=r"num_paths was 2, is 1"):
@@ -199,8 +187,8 @@ def changed(paths: list[Path], change: str) -> Iterator[Path]:
         paths[0].write_bytes(data)
 
 
-def test_a_changed_file_is_refused_by_the_stages_that_read_it(base, tmp_path_factory):
-    tampered = shutil.copytree(base, tmp_path_factory.mktemp("tampered") / "run")
+def test_a_changed_file_is_refused_by_the_stages_that_read_it(small_run, tmp_path_factory):
+    tampered = shutil.copytree(small_run, tmp_path_factory.mktemp("tampered") / "run")
     kinds = kinds_of(tampered)
     cases = [(kind, stage) for kind, stages in REFUSED_BY.items() for stage in stages]
     for (kind, stage), change in zip(cases, itertools.cycle(CHANGES)):
@@ -209,8 +197,8 @@ def test_a_changed_file_is_refused_by_the_stages_that_read_it(base, tmp_path_fac
 
 
 @pytest.mark.slow
-def test_no_changed_picture_reaches_a_release(base, tmp_path):
-    out = begin(base, tmp_path / "run", "release")
+def test_no_changed_picture_reaches_a_release(small_run, tmp_path):
+    out = begin(small_run, tmp_path / "run", "release")
     flights = find_tracks(out / "render")
     for flight, name in zip(flights[:3], PICTURES, strict=True):
         frames = flight / "frames_playback"
@@ -226,12 +214,13 @@ def test_no_changed_picture_reaches_a_release(base, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", ["pedestrians", "plan", "render", "inspect", "caption", "release"])
-def test_two_workers_give_the_same_products(base, tmp_path, stage):
-    out = begin(base, tmp_path / "run", stage)
+def test_two_workers_give_the_same_products(small_run, tmp_path, stage):
+    out = begin(small_run, tmp_path / "run", stage)
     work(tiny(workers=2), out, stage)
-    assert products(out / stage) == products(base / stage)
+    assert products(out / stage) == products(small_run / stage)
 
 
+OF_TOWNS = ("render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]", "caption.window.stride=4")
 TOWNS = """
 towns={
   one: {maps: {synthetic: {size_m: 150, num_blocks: 1}}},
@@ -242,7 +231,7 @@ towns={
 @pytest.fixture(scope="module")
 def towns(tmp_path_factory):
     out = tmp_path_factory.mktemp("towns") / "run"
-    pipeline.run(load(RunConfig, None, [*TINY, TOWNS.strip()]), out)
+    pipeline.run(load(RunConfig, None, [*SMALL_RUN, *OF_TOWNS, TOWNS.strip()]), out)
     return out
 
 

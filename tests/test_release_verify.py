@@ -18,7 +18,6 @@ from release_lies import LIES, at, captioned, change, everything, put
 from release_tampering import errors_in, forge, read_all, set_depth
 from specimens_foreign import hub_snapshot, write_foreign_tree
 from specimens_png import png_around
-from specimens_release import run_here
 from tables import each
 
 from caption.stage.released import read_released
@@ -35,26 +34,12 @@ from release.package.sources import Source
 from release.rules import split_groups
 from release.verify.verify import verify
 
-TINY = [
-    "pedestrians.num_paths=4", "pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25", "render.width_px=256",
-    "render.height_px=144", "render.fovs_deg=[60, 90]", "caption.window.stride=2", "workers=1",
-]  # fmt: skip
-
 
 @pytest.fixture(scope="module")
-def honest_run(built_once) -> Path:
-    return built_once("honest_run", lambda root: run_here(TINY, root / "run")) / "run"
-
-
-@pytest.fixture(scope="module")
-def honest(honest_run, built_once) -> Path:
+def honest(small_run, built_once) -> Path:
     """A small release of what the whole way makes: two walks, both tracks, twenty frames each."""
-    return built_once("honest", lambda root: released(honest_run, root / "release")) / "release" / "dataset"
-
-
-def released(run: Path, out: Path, **settings) -> Path:
-    cfg = ReleaseConfig(**{"num_frames": 20, "licence": "cc-by-4.0", **settings})
-    return package.run(cfg, [Source.of_run(run)], out)
+    cfg = ReleaseConfig(num_frames=20, licence="cc-by-4.0")
+    return built_once("honest", lambda root: package.run(cfg, [Source.of_run(small_run)], root / "r")) / "r" / "dataset"
 
 
 @pytest.fixture
@@ -96,8 +81,8 @@ def test_a_snapshot_of_the_hubs_cache_passes(honest, tmp_path):
     assert errors_in(hub_snapshot(honest, tmp_path)) == {}
 
 
-def test_trees_pass_ours_and_the_public_layout(honest_run, tmp_path):
-    assert errors_in(honest_run / "render") == {}
+def test_trees_pass_ours_and_the_public_layout(small_run, tmp_path):
+    assert errors_in(small_run / "render") == {}
     assert errors_in(write_foreign_tree(tmp_path / "public")) == {}
 
 
