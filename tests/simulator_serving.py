@@ -5,6 +5,7 @@ import random
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -54,3 +55,24 @@ def as_client(function: Callable[..., Any], *arguments: Any) -> Any:
     """Run a function in a process of its own; BrokenProcessPool where it crashes."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         return pool.submit(function, *arguments).result(timeout=120)
+
+
+AS_FOUND = (False, 0, 5.0)
+
+
+def carla_settings(port: int, awaited: tuple | None = None) -> tuple:
+    """Return whether a server of ours is synchronous, how many actors it has, and its clouds.
+
+    With `awaited` the server has a minute to come to that.
+    """
+    import carla
+
+    client = carla.Client("127.0.0.1", port)
+    client.set_timeout(20.0)
+    world, until_s = client.get_world(), time.monotonic() + 60.0
+    while True:
+        actors = world.get_actors(list(range(200, 300)))
+        found = world.get_settings().synchronous_mode, len(actors), world.get_weather().cloudiness
+        if awaited in (None, found) or time.monotonic() > until_s:
+            return found
+        time.sleep(0.1)

@@ -6,7 +6,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from simulator_serving import as_client, serving
+from simulator_serving import AS_FOUND, as_client, carla_settings, serving
 from test_renderers_contract import street
 
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
@@ -45,8 +45,6 @@ def test_the_ground_lies_where_the_world_has_it(ground_z_m, yaw_deg):
 @pytest.mark.slow
 def test_carla_gives_the_same_picture_by_the_same_way(tmp_path):
     pytest.importorskip("carla")
-    from test_render_carla import found_settings
-
     boxes = tmp_path / "boxes_3d.json"
     write_boxes(boxes, street())
     pictures = []
@@ -58,7 +56,7 @@ def test_carla_gives_the_same_picture_by_the_same_way(tmp_path):
             above = Backdrop.read(out)
             assert above.frame() == {"west": -30.0, "north": 30.0, "width": 70.0, "height": 60.0}
             pictures.append(above.picture.astype(int))
-        assert as_client(found_settings, port) == (False, 0, 5.0), "the server is left as it was found"
+        assert as_client(carla_settings, port) == AS_FOUND, "the server is left as it was found"
     assert pictures[0].std() > 20
     ours, theirs = (picture[..., 2].reshape(-1) for picture in pictures)
     assert np.corrcoef(ours, theirs)[0, 1] > 0.95, "in blue, which the server's haze and shadows change least"
