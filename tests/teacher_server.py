@@ -7,7 +7,6 @@ request by a function (number of the request, body) -> name or None.
 import contextlib
 import json
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -60,7 +59,6 @@ class TeacherServer:
         fault: Fault | None = None,
         *,
         models: tuple[str, ...] = (MODEL,),
-        delay_s: float = 0.0,
         decision: Callable[[dict], str] | None = None,
         respond: Callable[[dict], tuple[int, dict] | Sent | Wild | None] | None = None,
         model_facts: dict | None = None,
@@ -72,7 +70,7 @@ class TeacherServer:
             model_facts: what the list of models says about each, beside its name.
             list_models: gives what is sent in place of that list; None: the list.
         """
-        self.fault, self.models, self.delay_s = fault or (lambda number, body: None), models, delay_s
+        self.fault, self.models = fault or (lambda number, body: None), models
         self.decision = decision or (lambda body: TOKENS[body.get("seed", 0) % len(TOKENS)])
         self.respond, self.model_facts, self.list_models = respond, model_facts or {}, list_models
         self.text: Callable[[dict], str] | None = None  # answers with any text at all, for instance a judge's
@@ -167,7 +165,6 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
 
         def _complete(self, number: int, body: dict) -> None:
             fault = server.fault(number, body)
-            time.sleep(server.delay_s)
             responded = server.respond(body) if server.respond is not None else None
             if responded is not None:
                 self._send_anything(responded)

@@ -5,7 +5,6 @@ import logging
 import os
 import re
 import sys
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -13,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from crashes import contents, differences
-from processes import QUICK
+from processes import QUICK, wait_until
 from teacher_server import TeacherServer
 from toy_workers import items_of, make_faulty, make_talking_worker, stage_in
 
@@ -101,8 +100,7 @@ def make(names: str, *settings: str) -> None:
 @contextlib.contextmanager
 def meanwhile(folder: Path, num_done: int, do: Callable[[], object]) -> Iterator[None]:
     def wait() -> None:
-        while sum(event.event == "item_done" for event in read_events(folder)) < num_done:
-            time.sleep(0.01)
+        wait_until(lambda: sum(event.event == "item_done" for event in read_events(folder)) >= num_done, 300.0)
         do()
 
     with ThreadPoolExecutor(1) as aside:
