@@ -12,6 +12,9 @@ SLOW ?=
 LINT := $(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
 
+# Hundreds of processes start in the tests: each would compile every module again.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: quickstart test lint format site audit sbom lock clean
 
 quickstart: $(VENV)/.installed  ## Map to release on the embedded synthetic town
