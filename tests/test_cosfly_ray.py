@@ -156,7 +156,11 @@ def test_where_no_cluster_answers_one_line_says_so(tmp_path, monkeypatch):
     )
     with TeacherServer() as server:
         address = server.url.removeprefix("http://").partition("/")[0]
-        refused(tmp_path, "no Ray cluster answers; got no answer of a gRPC server", Watch(RayConfig(address=address)))
+        refused(
+            tmp_path,
+            "no Ray cluster answers at this address; got no answer of a gRPC server",
+            Watch(RayConfig(address=address)),
+        )
         monkeypatch.setenv("RAY_ADDRESS", address)
         refused(tmp_path, f"{address}: no Ray cluster answers", Watch(RayConfig()))
     monkeypatch.setitem(sys.modules, "ray", None)

@@ -230,7 +230,7 @@ def tell_size(folder: Path, path: Path) -> None:
 
 @pytest.mark.parametrize(("change", "words"), [
     (lambda rows: rows[3].update(image=None), "the frame has no picture"),
-    (lambda rows: rows[3]["image"].update(bytes=b"GIF89a"), "no PNG"),
+    (lambda rows: rows[3]["image"].update(bytes=b"GIF89a"), "not a PNG"),
     (lambda rows: rows[3].update(depth=None), "the frame has no picture"),
     (lambda rows: rows[3]["pose"].update(x_m=float("inf")), "not finite"),
     (lambda rows: rows[3].update(width_px=None), "a required value is missing"),
