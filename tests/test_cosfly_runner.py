@@ -163,7 +163,8 @@ def test_an_item_that_never_ends_has_failed_and_the_others_are_done(tmp_path, ca
     assert [record.id for record in finished.kept] == ["i1", "i2"]
     assert finished.tally.model_dump()["failed"] == {"timed_out": 1}
     failure = next(record for record in finished.records if isinstance(record, Failed))
-    assert "finished no step within its time limit, 3 times" in failure.message
+    assert failure.message.startswith("i0: 3 attempts failed")
+    assert "finished no step within its time limit" in failure.message
     assert caplog.text.count("cosfly tries the item again") >= 2
     assert not list((tmp_path / "s").glob(".*.partial"))
 

@@ -207,7 +207,7 @@ def test_no_changed_picture_reaches_a_release(small_run, tmp_path):
         work(tiny(), out, "release")
     failures = " ".join(failure.message for failure in read_failures(out / "release/failures.jsonl"))
     assert failures.count("differs from the recorded digest") == 3
-    assert all(f"frame_00000/{name}: a file" in failures for name in PICTURES)
+    assert all(f"frame_00000/{name}: the file" in failures for name in PICTURES)
     assert not (out / "release/dataset").exists()
     assert not (out / "release/manifest.json").exists()
 

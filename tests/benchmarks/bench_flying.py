@@ -16,11 +16,11 @@ import time
 from pathlib import Path
 
 from caption.schema import CaptionConfig
-from cosfly import load_map
 from cosfly.closed_loop import stage
 from cosfly.closed_loop.settings import FlyConfig
 from cosfly.formats.boxes import write_boxes
 from cosfly.formats.captions import TOKENS
+from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.pedestrians import stage as pedestrians
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners.contract import PlanConfig
@@ -70,7 +70,7 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
-        box_map = load_map(seed=SEED)
+        box_map = load_map(MapsConfig(), seed=SEED)
         write_boxes(root / "boxes_3d.json", box_map)
         write_boxes(root / "step2_simplified.json", simplify(box_map, SimplifyConfig()).box_map)
         walks = PedestriansConfig(num_paths=asked.flights, min_distance_m=140, max_distance_m=220, ground="paved")
