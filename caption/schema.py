@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -21,7 +21,6 @@ from cosfly.formats.predictions import PREDICTIONS
 from cosfly.llm.answers import BudgetConfig
 from cosfly.llm.client import EndpointConfig
 from cosfly.llm.protocol import check_url
-from cosfly.llm.student_chat import MAX_ANSWER_TOKENS
 from cosfly.llm.vllm_engine import VllmConfig
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.viz.frame_views import DEPTH_RANGE_M, Layout, View
@@ -129,7 +128,6 @@ class WindowConfig(Config):
     keyframes: bool = Field(
         False, description="caption only windows at which the label changes, and every tenth after such a window"
     )
-    keyframe_stride: ClassVar[int] = 10  # windows from one keyframe to the next within a label, at most
     require_images: bool = Field(True, description="drop a window that lacks the rgb.png of an observed frame")
 
 
@@ -140,7 +138,6 @@ class ImageConfig(Config):
         640, ge=28, description="longest side of a view, px; pixel values in prompts refer to this size"
     )
     depth_range_m: float = Field(DEPTH_RANGE_M, gt=0, description="depth at the dark end of the pseudo-colour, m")
-    encoding: ClassVar[Literal["jpeg", "png"]] = "jpeg"  # of the pictures in a request; a student's are PNG
 
 
 class JudgeConfig(Config):
@@ -190,7 +187,6 @@ class StudentConfig(Config):
         description="output of `distill train` or `merge`, if the teacher is this student, for prompts as in its "
         "training; empty: no student",
     )
-    max_new_tokens: ClassVar[int] = MAX_ANSWER_TOKENS  # longest answer
     constrained: bool = Field(False, description="enforce the JSON schema of the student's answers")
     run: str | None = Field(
         None, description="tree to caption, as named in the training set, if student:PATH has predictions for several"
@@ -234,10 +230,6 @@ class CaptionConfig(Config):
     budget: MayDiffer[BudgetConfig] = Field(BudgetConfig(), description="prices and limits of tokens and money")
     repair: RepairConfig = Field(RepairConfig(), description="regeneration of rejected samples")
     judge: JudgeConfig = Field(JudgeConfig(), description="an optional judge of conflicts")
-    # Most requests for one text; 1, 0 and 1 for a student, which gives the same answer again.
-    structure_asks: ClassVar[int] = 3  # until an answer has the right structure
-    correction_asks: ClassVar[int] = 1  # that name what was wrong with an answer of the right structure
-    mirror_asks: ClassVar[int] = 2  # for the Chinese mirror, until the pair is consistent
     stop_after_dropped: MayDiffer[int] = Field(
         50, ge=0, description="end the run if none of this number of first answers is accepted; 0: never"
     )

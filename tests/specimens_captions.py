@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 from teacher_server import TeacherServer
 
-from caption.answer_formats.contract import Draft, way_of
+from caption.answer_formats.contract import Draft
+from caption.answer_formats.formats import FORMATS
 from caption.schema import CaptionConfig
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.rules import write_templates
 from caption.verification.facts import Facts
 from cosfly.formats.captions import Coc
-from cosfly.llm.answer_text import Parsed
 
 VOCABULARY = vocabulary_of(CaptionConfig())  # what ships
-WAY = way_of("slots", VOCABULARY)
+SLOTS = FORMATS["slots"]
 
 
 def make_facts(**measured) -> Facts:
@@ -57,9 +57,9 @@ def write_answers(facts: Facts, rng: np.random.Generator, decision: str | None =
     if answers is None:
         return None
     english, chinese = (Coc(**answer) for answer in answers)
-    first = WAY.read(Parsed(english, therefore=english.flight_decision), facts)
+    first = SLOTS.read(english, facts)
     assert isinstance(first, Draft), first
-    second = WAY.read_mirror(Parsed(chinese), first, facts)
+    second = SLOTS.read_mirror(chinese, first, facts, True)
     assert isinstance(second, Draft), second
     return first.coc, second.coc
 

@@ -10,12 +10,12 @@ from tables import each
 
 from caption.schema import FutureMotion
 from caption.verification.actions import TABLE, Thresholds, measure
+from cosfly.formats.captions import TOKENS, verdict_on
 
 THRESHOLDS = Thresholds()
 
 MIRRORED = {
-    token: token.replace("left", "right") if "left" in token else token.replace("right", "left")
-    for token in TABLE.shown
+    token: token.replace("left", "right") if "left" in token else token.replace("right", "left") for token in TOKENS
 }
 
 
@@ -127,7 +127,8 @@ HARD = [  # the opposite, then what is plainly not there
 @each(("decision", "motion"), HARD)
 def test_contradiction_of_each_action(decision, motion):
     measured = measure(future(**motion))
-    assert TABLE.verdict_of(decision, measured, TABLE.label_of(measured)) == "HARD_CONFLICT"
+    label = TABLE.label_of(measured)
+    assert verdict_on(decision, label, TABLE.contradicted_by(measured, label)) == "HARD_CONFLICT"
 
 
 coordinate = st.floats(-6.0, 6.0, allow_nan=False, width=32)
@@ -148,7 +149,8 @@ def futures(draw) -> FutureMotion:
 
 def judged(motion) -> tuple[str | None, dict[str, str]]:
     label = TABLE.label_of(motion)
-    return label, {token: TABLE.verdict_of(token, motion, label) for token in TABLE.shown}
+    contradicted = TABLE.contradicted_by(motion, label)
+    return label, {token: verdict_on(token, label, contradicted) for token in TOKENS}
 
 
 def is_near_a_threshold(motion) -> bool:
@@ -159,9 +161,9 @@ def is_near_a_threshold(motion) -> bool:
     numbers += [abs(motion.left_m) - abs(motion.forward_m)]
     if any(abs(abs(number) - limit) < 1e-6 for number in numbers for limit in limits if limit or number):
         return True
-    for group in TABLE.implied:
-        shown = [TABLE.shown[token][0](motion) for token, _ in group]
-        implied = [size(motion) for _, size in group]
+    for group in TABLE.groups:
+        shown = [rule.shown(motion) for rule in group.values()]
+        implied = [rule.implied(motion) for rule in group.values()]
         ranks = sorted(size for size in implied if size >= 0.99)
         if any(
             abs(size - limit) < 1e-6
@@ -205,5 +207,5 @@ def test_what_is_implied_is_never_contradicted(drawn):
     motion = measure(drawn)
     label = TABLE.label_of(motion)
     if label is not None:
-        assert not TABLE.is_contradicted(label, motion)
-        assert TABLE.shown[label][0](motion) >= 1.0
+        assert label not in TABLE.contradicted_by(motion, None)
+        assert TABLE.rules[label].shown(motion) >= 1.0

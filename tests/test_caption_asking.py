@@ -98,7 +98,7 @@ def test_a_budget_stops_the_run_before_it_is_passed_and_a_larger_one_goes_on(tre
     assert len(server.bodies) == 44
 
 
-def test_the_quarantine_is_replayed_alone(tree, tmp_path, whole):
+def test_the_quarantine_is_asked_about_again(tree, tmp_path, whole):
     out = tmp_path / "out"
     bad: set[int] = set()
     state = {"on": True}
@@ -109,7 +109,9 @@ def test_the_quarantine_is_replayed_alone(tree, tmp_path, whole):
         return "500" if state["on"] and body["seed"] in bad else None
 
     with deciding(fault=fault) as server:
-        with pytest.raises(TeacherError, match=r"3 of 22 windows got no answer.*http_500 3.*--retry-failed"):
+        with pytest.raises(
+            TeacherError, match=r"3 of 22 windows got no answer.*http_500 3.*run the same command again"
+        ):
             run(settings(server.url), tree, out)
         held = [json.loads(line) for line in (out / "quarantine.jsonl").read_text().splitlines()]
         assert [record["code"] for record in held] == ["http_500"] * 3

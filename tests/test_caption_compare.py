@@ -8,7 +8,7 @@ from specimens_captions import VOCABULARY
 from tables import each
 
 from caption.schema import CaptionConfig, RepairConfig, WindowConfig
-from caption.stage.compare import compare, comparison_table
+from caption.stage.compare import compare, comparison_rows
 from caption.stage.window_loop import Trial, caption_window, try_strategy
 from caption.stage.windows import cut_windows
 from caption.teachers.teacher import RuleTeacher
@@ -93,5 +93,5 @@ def test_a_comparison_by_hand():
     assert (found.asks_per_conflict, found.tokens_per_conflict, found.naturalness) == (2.0, 200.0, 0.625)
     nothing = compare("hint", trials[2:])
     assert (nothing.repaired, nothing.consistency, nothing.naturalness) == (0, 0.0, None)
-    cells = [list(column.cells) for column in comparison_table([found, nothing]).columns]
-    assert cells[:4] == [["hint", "hint"], ["2", "0"], ["33.3 %", "0.0 %"], ["62.5 %", "-"]]
+    rows = comparison_rows([found, nothing])
+    assert [row[:4] for row in rows] == [("hint", "2", "33.3 %", "62.5 %"), ("hint", "0", "0.0 %", "-")]

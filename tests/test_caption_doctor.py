@@ -11,8 +11,7 @@ from tables import each
 from teacher_server import ENGLISH, TeacherServer, refusal
 
 from caption.schema import CaptionConfig
-from caption.stage.forecast import make_forecast
-from caption.stage.stage import run
+from caption.stage.stage import make_forecast, run
 from caption.teachers.doctor import ODD_WORD, Finding, examine_endpoint
 
 TOKENS_PER_IMAGE, CONTEXT = 220, 8192

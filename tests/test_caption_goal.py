@@ -6,19 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from caption.answer_formats.contract import way_of
+from caption.answer_formats.formats import FORMATS
 from caption.schema import WindowConfig
 from caption.stage.windows import cut_windows
-from caption.teachers.prompt_files import shipped_prompts
+from caption.teachers.prompt_files import Vocabulary, shipped_prompts
 from caption.teachers.prompts import user_prompts
 from caption.verification.facts import measure_facts
-from caption.verification.references import find_fact, parse_reference
-from caption.verification.vocabulary import Vocabulary
+from caption.verification.references import look_up, parse_reference
 from cosfly.formats.captions import Coc, Prompt
 from cosfly.formats.people import Goal
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
-from cosfly.llm.answer_text import Parsed
 from specimens import make_playback_tree
 
 GOAL = Goal(0, "the woman in the red jacket", "穿红色夹克的女子", ("figure", "top"))
@@ -65,17 +63,17 @@ def test_without_other_people_a_prompt_is_as_it_was(flight, vocabulary):
 
 def test_what_is_said_of_others_is_judged_by_the_geometry(flight):
     facts = measure_facts(in_company(flight))
-    found = {name: find_fact(parse_reference(name), facts) for name in ("others_in_view@t2", "other_distance@t3")}
+    found = {name: look_up(parse_reference(name), facts) for name in ("others_in_view@t2", "other_distance@t3")}
     assert [(fact.value, fact.unit) for fact in found.values()] == [(2, "people"), (2.3, "m")]
-    assert [find_fact(parse_reference(f"alike_differences@t{i}"), facts).value for i in (1, 4)] == [2, 1]
-    assert find_fact(parse_reference("other_distance@t0"), facts) == "unknown_fact"
+    assert [look_up(parse_reference(f"alike_differences@t{i}"), facts).value for i in (1, 4)] == [2, 1]
+    assert look_up(parse_reference("other_distance@t0"), facts) == "unknown_fact"
 
 
 def test_slots_of_other_people_are_filled(flight, vocabulary):
-    facts, way = measure_facts(in_company(flight)), way_of("slots", vocabulary)
+    facts, slots = measure_facts(in_company(flight)), FORMATS["slots"]
     text = "In view are {others_in_view}, the nearest {other_distance} away, with {alike_differences} that differ."
-    draft = way.read(Parsed(Coc(critical_components=text, reasoning_trace="So be it.", flight_decision="hover")), facts)
+    draft = slots.read(Coc(critical_components=text, reasoning_trace="So be it.", flight_decision="hover"), facts)
     assert draft.coc.critical_components == (
         "In view are 3 other people, the nearest 2.5 m away, with 1 of the items of appearance that differ."
     )
-    assert "{others_in_view} 3 other people" in way.table(facts)
+    assert "{others_in_view} 3 other people" in slots.table(facts)

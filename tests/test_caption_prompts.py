@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from commands import invoke
 
-from caption.answer_formats.contract import Draft, way_of
+from caption.answer_formats.contract import Draft
+from caption.answer_formats.formats import FORMATS
 from caption.schema import CaptionConfig, ObservedWindow, observed_frames
 from caption.stage.stage import run
 from caption.teachers.prompt_files import (
@@ -22,7 +23,7 @@ from caption.teachers.prompt_files import (
 )
 from caption.teachers.prompts import user_prompts
 from caption.verification.facts import measure_facts
-from caption.verification.references import Fact, find_fact, parse_reference
+from caption.verification.references import Fact, look_up, parse_reference
 from cosfly.formats.captions import OWN_PROMPTS, PICTURES_MARK, Prompt, read_captions
 from cosfly.llm.answer_text import parse_answer
 from cosfly.runtime.errors import ConfigError, ResumeError
@@ -118,7 +119,7 @@ def test_a_change_is_the_fact_of_its_slot():
     ):
         reference = parse_reference(slot)
         assert reference is not None
-        fact = find_fact(reference, facts)
+        fact = look_up(reference, facts)
         assert isinstance(fact, Fact)
         assert [float(change) for change in re.findall(r"change ([+-]?[\d.]+) ", lines[line])] == [fact.value]
 
@@ -158,10 +159,10 @@ def test_the_questions_of_both_languages_have_the_same_slots():
 
 
 def test_the_example_of_the_slots_prompt_is_accepted():
-    way = way_of("slots", RELATIVE)
-    [example] = [line for line in RELATIVE.templates[way.system].template.splitlines() if line.startswith('{"')]
+    slots = FORMATS["slots"]
+    [example] = [line for line in RELATIVE.templates[slots.system].template.splitlines() if line.startswith('{"')]
     answer = parse_answer(example, more=("therefore",))
-    draft = way.read(answer, measure_facts(make_window(turn_deg=1.0)))
+    draft = slots.read(answer.coc, measure_facts(make_window(turn_deg=1.0)))
     assert isinstance(draft, Draft), draft
     assert "now 18.1 m" in draft.coc.reasoning_trace
     assert draft.num_filled == 7

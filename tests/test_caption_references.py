@@ -28,7 +28,6 @@ FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0))
     ("min:speed@t2-t4", Fact(2.5, "mps", 2)),
     ("speed@t0", Fact(2.0, "mps", 2)),
     ("mean:target_speed", Fact(1.6, "mps", 2)),
-    ("speed_ratio", Fact(1.72, "times", 2)),
     ("change:target_heading", "unknown_fact"),
     ("side:yaw", Fact("left")),
     ("side:offset_x", Fact("left")),

@@ -11,19 +11,19 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_captions import GAP, WAY, report_of, saying, settings
+from specimens_captions import GAP, SLOTS, report_of, saying, settings
 from tables import each
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror
 
 from caption.answer_formats.contract import Draft, Refused
 from caption.answer_formats.slots import Filler, fact_table
-from caption.answer_formats.templates import read_sentence
+from caption.answer_formats.templates import InvalidSlot, read_sentence
 from caption.schema import WindowConfig
 from caption.stage.stage import run
 from caption.stage.windows import cut_windows
 from caption.verification.facts import Facts, measure_facts
+from caption.verification.values import check_values
 from cosfly.formats.captions import Coc, Language, read_captions
-from cosfly.llm.answer_text import Parsed
 from cosfly.runtime.errors import NothingKept
 from specimens import make_flight
 
@@ -33,8 +33,10 @@ FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, -6.0, -10.0), offset_x_
 def filled(
     text: str, language: Language = "en", facts: Facts = FACTS, decision: str = "yaw_right_to_follow"
 ) -> str | Refused:
-    sentence = read_sentence(text, language, len(facts))
-    return sentence if isinstance(sentence, Refused) else Filler(facts, decision, language).fill(sentence)
+    try:
+        return Filler(facts, decision, language).fill(read_sentence(text, language, len(facts)))
+    except InvalidSlot as error:
+        return Refused("invalid_slot", str(error))
 
 
 @each(("template", "text"), [
@@ -114,8 +116,8 @@ def windows_of(num_flights: int) -> list[Facts]:
 SERIES = {  # slot -> field, digits, unit in both languages
     "speed": ("speed_mps", 2, "m/s", "米/秒"), "altitude": ("altitude_m", 1, "m", "米"), "pitch": ("pitch_deg", 1, "deg",
         "度"),
-    "yaw": ("yaw_deg", 1, "deg", "度"), "distance": ("distance_m", 1, "m", "米"), "slant": ("slant_m", 1, "m", "米"),
-    "box_width": ("box_width_px", 0, "px", "像素"), "offset_x": ("offset_x_px", 0, "px", "像素"),
+    "yaw": ("yaw_deg", 1, "deg", "度"), "distance": ("distance_m", 1, "m", "米"),
+    "box_height": ("box_height_px", 0, "px", "像素"), "offset_x": ("offset_x_px", 0, "px", "像素"),
     "travelled": ("travelled_m", 1, "m", "米"), "bearing": ("bearing_deg", 1, "deg", "度"),
 }  # fmt: skip
 WINDOWS = windows_of(4)
@@ -169,9 +171,9 @@ def test_the_numbers_of_both_languages_are_the_facts(facts, chosen):
 def drafts(english: str, chinese: str) -> Draft | Refused:
     en = Coc(critical_components="The walker is {visibility}.", reasoning_trace=english, flight_decision="hover")
     zh = Coc(critical_components="行人{visibility}。", reasoning_trace=chinese, flight_decision="hover")
-    first = WAY.read(Parsed(en, therefore="hover"), FACTS)
+    first = SLOTS.read(en, FACTS)
     assert isinstance(first, Draft), first
-    return WAY.read_mirror(Parsed(zh), first, FACTS)
+    return SLOTS.read_mirror(zh, first, FACTS, True)
 
 
 @each(("english", "chinese", "reason"), [
@@ -179,7 +181,7 @@ def drafts(english: str, chinese: str) -> Draft | Refused:
     ("With {distance} the gap {trend:distance}.", "距离{trend:distance}，为 {distance}。", None),  # another order
     ("The gap is {distance}. It should {decision}.", "距离为 {distance}，应{decision}。", "sentences"),
     ("The gap {trend:distance} to {distance}.", "距离为 {distance}。", "slots"),
-    ("The gap is {distance}.", "距离为 {slant}。", "slots"),
+    ("The gap is {distance}.", "距离为 {altitude}。", "slots"),
     ("The gap is {distance@t0}.", "距离为 {distance}。", "slots"),
     ("The gap is {distance}.", "The gap is {distance}。", "script"),
     ("The gap is {distance}.", "距离为 {distanse}。", "invalid_slot"),
@@ -196,8 +198,8 @@ def test_the_mirror_holds_the_same_slots_sentence_by_sentence(english, chinese, 
 def test_numbers_outside_slots_are_compared_with_the_facts():
     def checked(reasons: str):
         coc = Coc(critical_components="The target is {visibility}.", reasoning_trace=reasons, flight_decision="hover")
-        draft = WAY.read(Parsed(coc, therefore="hover"), FACTS)
-        return WAY.check(draft, FACTS, "en").counts.model_dump().values()
+        draft = SLOTS.read(coc, FACTS)
+        return check_values(draft.outside, FACTS, "en", draft.num_filled).counts.model_dump().values()
 
     assert list(checked("The gap of {distance} {trend:distance}, so {decision}.")) == [3, 0, 0]
     assert list(checked("The gap was 19.5 m at t1.")) == [1, 1, 0]

@@ -13,7 +13,7 @@ from tables import each
 from caption.schema import WindowConfig
 from caption.stage.windows import cut_windows
 from caption.verification.facts import Facts, measure_facts
-from caption.verification.mirror import check_mirror, track_numbers
+from caption.verification.mirror import check_mirror
 from caption.verification.values import check_values
 from cosfly.formats.captions import ACTIONS, TOKENS, Coc, Language
 from cosfly.llm.answer_text import sentences_of
@@ -53,7 +53,6 @@ PAPER_FACTS = make_facts(
     box_height_px=(59,) * 5, offset_x_px=(0,) * 5, offset_y_px=(0,) * 5, visibility=("visible",) * 5, width_px=1280,
     height_px=720,
 )  # fmt: skip
-FLIGHT = track_numbers(PAPER_FACTS)
 
 
 def contradictions_of(coc: Coc, facts: Facts, language: Language) -> list[str]:
@@ -61,7 +60,7 @@ def contradictions_of(coc: Coc, facts: Facts, language: Language) -> list[str]:
 
 
 def test_the_papers_own_sample_passes_both_checks():
-    assert check_mirror(PAPER_EN, PAPER_ZH, FLIGHT) is None
+    assert check_mirror(PAPER_EN, PAPER_ZH, PAPER_FACTS) is None
     assert contradictions_of(PAPER_EN, PAPER_FACTS, "en") == contradictions_of(PAPER_ZH, PAPER_FACTS, "zh") == []
 
 
@@ -93,7 +92,7 @@ def pair(en: str, zh: str) -> tuple[Coc, Coc]:
     ("over 5 frames", "在五帧中", None),
 ])  # fmt: skip
 def test_mirror_check(en, zh, reason):
-    assert check_mirror(*pair(en, zh), {}) == reason
+    assert check_mirror(*pair(en, zh), make_facts()) == reason
 
 
 @each(("text", "is_contradicted"), [
@@ -149,7 +148,7 @@ def clean_captions(num_flights: int) -> list[tuple[Facts, Coc, Coc]]:
 def test_rule_captions_are_one_record_in_two_languages():
     captions = clean_captions(6)
     for facts, en, zh in captions:
-        assert check_mirror(en, zh, track_numbers(facts)) is None
+        assert check_mirror(en, zh, facts) is None
     # A digit of the Chinese text altered to a value that nothing measured is caught.
     with_numbers = [row for row in captions if re.search(r"\d+\.\d+", row[2].critical_components)]
     assert len(with_numbers) >= 40
@@ -157,7 +156,7 @@ def test_rule_captions_are_one_record_in_two_languages():
         number = re.search(r"\d+\.\d+", zh.critical_components)
         changed = f"{float(number.group()) + 137.77:.2f}"
         bad = zh.model_copy(update={"critical_components": zh.critical_components.replace(number.group(), changed)})
-        assert check_mirror(en, bad, track_numbers(facts)) == "number"
+        assert check_mirror(en, bad, facts) == "number"
 
 
 @each("decision", TOKENS)
@@ -169,5 +168,5 @@ def test_the_rule_teacher_justifies_any_given_decision_without_contradiction(dec
         english, chinese = answers
         assert english.flight_decision == chinese.flight_decision == decision
         assert contradictions_of(english, facts, "en") == contradictions_of(chinese, facts, "zh") == []
-        assert check_mirror(english, chinese, track_numbers(facts)) is None
+        assert check_mirror(english, chinese, facts) is None
         assert ACTIONS[decision].zh in chinese.reasoning_trace

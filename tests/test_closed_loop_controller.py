@@ -62,7 +62,7 @@ def test_a_decision_that_is_flown_for_its_horizon_shows_what_its_own_rule_asks_f
     if token in ("break_off", "return_to_home"):  # orders of a mission; who leaves without one leaves the person
         assert motion.approach_m <= -Thresholds().approach_m
         return
-    shown, _ = TABLE.shown[token]
+    shown = TABLE.rules[token].shown
     assert shown(motion) >= 1.0, (token, shown(motion), motion)
 
 

@@ -4,6 +4,7 @@ import asyncio
 import base64
 import io
 import re
+from functools import partial
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from caption.teachers.teacher import RuleTeacher
 from cosfly.formats.captions import PICTURES_MARK, Language
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
+from cosfly.llm.student_chat import encoded_image
 from distill.inference.stage import InferConfig, make_request
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample
@@ -73,7 +75,7 @@ def window(tree) -> Window:
 
 def ask(window: Window, cfg: ImageConfig) -> tuple[dict[Language, str], list[np.ndarray]]:
     question = make_question(window.observed, cfg, "prose", VOCABULARY)
-    messages, _ = question_messages(question, FrameEncoder(cfg))
+    messages, _ = question_messages(question, FrameEncoder(partial(encoded_image, encoding="png")).encode)
     assert messages[1]["content"][-1]["text"] == question.asked["en"].user
     return {language: prompt.user for language, prompt in question.asked.items()}, sent_pictures(messages)
 
@@ -81,9 +83,7 @@ def ask(window: Window, cfg: ImageConfig) -> tuple[dict[Language, str], list[np.
 def test_a_teacher_is_told_what_it_is_shown(window):
     middle = [(("middle",), "separate", 640), (("rgb", "middle", "depth"), "tiled", 40)]
     for views, layout, max_side_px in [*SHAPES, *middle]:
-        cfg = ImageConfig(modalities=views, layout=layout, max_side_px=max_side_px).model_copy(
-            update={"encoding": "png"}
-        )
+        cfg = ImageConfig(modalities=views, layout=layout, max_side_px=max_side_px)
         told, pictures = ask(window, cfg)
         for language, text in told.items():
             assert told_views(text, language) == views
@@ -98,7 +98,6 @@ def test_a_teacher_is_told_what_it_is_shown(window):
 def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, window, views, layout, max_side_px):
     image = {"layout": layout, "max_side_px": max_side_px, "depth_range_m": 40.0}
     cfg = CaptionConfig.model_validate({"image": image, "window": {"require_images": True}})
-    cfg = cfg.model_copy(update={"image": cfg.image.model_copy(update={"encoding": "png"})})
     caption = asyncio.run(caption_window(window, RuleTeacher(0), cfg, VOCABULARY))
     _, shown = ask(window, cfg.image)
     if layout == "tiled":

@@ -21,6 +21,7 @@ from specimens_distill import make_captions, prepared
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror, kept_answers
 
 from caption.schema import CaptionConfig
+from caption.stage import window_loop
 from caption.stage.stage import run
 from caption.teachers import teacher
 from caption.teachers.teacher import make_engine
@@ -151,7 +152,8 @@ def test_an_engine_is_closed_whatever_came_of_its_start():
 def test_the_engine_of_the_recipe_captions_a_flight(tree, tmp_path: Path, monkeypatch):
     engine = PlainEngine()
     monkeypatch.setattr(teacher, "make_engine", lambda cfg, troubles: engine)
-    cfg = settings("http://plain").model_copy(update={"mirror_asks": 1})
+    monkeypatch.setattr(window_loop, "MIRROR_ASKS", 1)
+    cfg = settings("http://plain")
     captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
     assert len(captions) == 5
     for caption in captions:

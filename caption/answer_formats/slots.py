@@ -7,117 +7,78 @@ numbers are compared with the facts as those of prose.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from functools import cache, lru_cache
+from collections.abc import Iterable
 
-from caption.answer_formats.contract import INVALID_SLOT, Draft, Refused, WayOfWriting
-from caption.answer_formats.templates import SLOT_MARK, TURNS, Sentence, Slot, read_sentence
+from caption.answer_formats.contract import Draft, Refused
+from caption.answer_formats.templates import InvalidSlot, Sentence, Slot, read_sentence, read_slot
 from caption.verification.facts import Facts
-from caption.verification.glossary import load_glossary
+from caption.verification.glossary import form_of, swapped_opposite, written_unit
 from caption.verification.mirror import TEXTS, lacking
-from caption.verification.references import QUANTITIES, Fact, Missing, look_up
-from caption.verification.values import ValueCheck, check_values
-from cosfly.formats.captions import ACTIONS, Coc, Language, Template, Writing
-from cosfly.llm.answer_text import Parsed, cut_sentences
+from caption.verification.references import QUANTITIES, TURNS, Fact, Missing, look_up
+from cosfly.formats.captions import ACTIONS, Coc, Language, Template
+from cosfly.llm.answer_text import cut_sentences
 
+INVALID_SLOT = "invalid_slot"  # a reason
 MAX_COMPLAINTS = 6  # named at once
 
 
-class Slots(WayOfWriting):
-    """The teacher writes templates."""
-
-    name: Writing = "slots"
-    system = "system_slots_en"
-    mirror_system = "mirror_slots_system"
-
-    def table(self, facts: Facts) -> str:
-        return fact_table(facts)
-
-    def read(self, answer: Parsed, facts: Facts) -> Draft | Refused:
-        assert answer.coc is not None
-        return _fill(answer.coc, Filler(facts, answer.coc.flight_decision, "en"), answer.therefore)
-
-    def read_mirror(self, answer: Parsed, english: Draft, facts: Facts) -> Draft | Refused:
-        assert answer.coc is not None
-        assert english.template is not None
-        if answer.coc.flight_decision != english.coc.flight_decision:
-            return Refused("decision", f'"flight_decision" must stay {english.coc.flight_decision}.')
-        problem = _compare(english.template, answer.coc, facts)
-        if problem is not None:
-            return problem
-        draft = _fill(answer.coc, Filler(facts, answer.coc.flight_decision, "zh"))
-        if isinstance(draft, Refused):
-            return draft
-        missing = lacking(_terms(english.template, facts), draft.coc)
-        return Refused("glossary", missing, draft) if missing else draft
-
-    def check(self, draft: Draft, facts: Facts, language: Language) -> ValueCheck:
-        return check_values(draft.outside, facts, language, draft.num_filled)
-
-
-@lru_cache(maxsize=64)  # an English text is read again when its mirror is compared with it
-def read_text(text: str, language: Language, num_frames: int) -> tuple[Sentence | Refused, ...]:
-    """Read the sentences of a text."""
-    return tuple([read_sentence(part, language, num_frames) for part in cut_sentences(text)])
-
-
-def _fill(written: Coc, filler: Filler, therefore: str | None = None) -> Draft | Refused:
+def fill_answer(written: Coc, facts: Facts, language: Language = "en") -> Draft | Refused:
     """Fill the templates of an answer, or report all faults of their sentences."""
-    problems: list[Refused] = []
-    outside: list[str] = []
+    filler = Filler(facts, written.flight_decision, language)
+    problems: list[str] = []
+    sentences: list[Sentence] = []
     texts: dict[str, str] = {}
-    num_filled = 0
     for name in TEXTS:
-        filled: list[str] = []
-        for number, sentence in enumerate(read_text(getattr(written, name), filler.language, len(filler.facts)), 1):
-            plain = sentence if isinstance(sentence, Refused) else filler.fill(sentence)
-            if isinstance(plain, Refused):
-                problems.append(Refused(plain.reason, f"{name}, sentence {number}: {plain.complaint}."))
-            elif isinstance(sentence, Sentence):
-                filled.append(plain)
-                outside.append(sentence.outside)
-                num_filled += sentence.num_values
-        texts[name] = "".join(filled)
+        filled = ""
+        for number, part in enumerate(cut_sentences(getattr(written, name)), 1):
+            try:
+                sentence = read_sentence(part, language, len(facts))
+                filled += filler.fill(sentence)
+                sentences.append(sentence)
+            except InvalidSlot as error:
+                problems.append(f"{name}, sentence {number}: {error}.")
+        texts[name] = filled
     if problems:
-        return Refused(problems[0].reason, " ".join(problem.complaint for problem in problems[:MAX_COMPLAINTS]))
+        return Refused(INVALID_SLOT, " ".join(problems[:MAX_COMPLAINTS]))
     template = Template(critical_components=written.critical_components, reasoning_trace=written.reasoning_trace)
     coc = Coc(**texts, flight_decision=written.flight_decision)
-    return Draft(coc, therefore, template, tuple(outside), num_filled)
+    outside = tuple([sentence.outside for sentence in sentences])
+    return Draft(coc, outside, template, sum([sentence.num_values for sentence in sentences]))
 
 
-def _terms(english: Template, facts: Facts) -> list[tuple[str, str]]:
-    """Return the glossary's terms of an English template, slots aside: these are filled in from the glossary."""
-    found: list[tuple[str, str]] = []
-    for name in TEXTS:
-        for sentence in read_text(getattr(english, name), "en", len(facts)):
-            assert isinstance(sentence, Sentence)  # else there is no English draft
-            found += sentence.terms
-    return list(dict.fromkeys(found))  # in their order, so that a complaint is the same in every run
+def fill_mirror(written: Coc, english: Draft, facts: Facts, is_translated: bool = True) -> Draft | Refused:
+    """Make the Chinese draft, and compare it with the English one, whose translation it always is."""
+    assert english.template is not None
+    if written.flight_decision != english.coc.flight_decision:
+        return Refused("decision", f'"flight_decision" must stay {english.coc.flight_decision}.')
+    draft = _compare(english.template, written, facts) or fill_answer(written, facts, "zh")
+    if isinstance(draft, Refused):
+        return draft
+    swapped = swapped_opposite("".join(english.outside), "".join(draft.outside))
+    if swapped:
+        return Refused(f"polarity_{swapped}", f"the Chinese text swaps an opposite of the English one ({swapped}).")
+    missing = lacking("".join(english.outside), draft.coc)
+    return Refused("glossary", missing, draft) if missing else draft
 
 
 def _compare(english: Template, chinese: Coc, facts: Facts) -> Refused | None:
-    """Compare the Chinese template with the English one: the same slots in each sentence, no opposite swapped outside
-    them, each in its script."""
-    glossary = load_glossary()
+    """Compare the Chinese template with the English one: the same slots in each sentence, each in its script."""
     for name in TEXTS:
-        sentences_en = read_text(getattr(english, name), "en", len(facts))
-        sentences_zh = read_text(getattr(chinese, name), "zh", len(facts))
-        if len(sentences_en) != len(sentences_zh):
-            counts = f"{len(sentences_en)} sentences in English and {len(sentences_zh)} in Chinese"
+        parts_en, parts_zh = cut_sentences(getattr(english, name)), cut_sentences(getattr(chinese, name))
+        if len(parts_en) != len(parts_zh):
+            counts = f"{len(parts_en)} sentences in English and {len(parts_zh)} in Chinese"
             return Refused("sentences", f"{name} has {counts}; write one for each.")
-        for number, (mine, other) in enumerate(zip(sentences_en, sentences_zh, strict=True), 1):
-            assert isinstance(mine, Sentence)  # else there is no English draft
-            if isinstance(other, Refused):
-                return Refused(other.reason, f"{name}, sentence {number}: {other.complaint}.")
-            if mine.names != other.names:
-                names = "; ".join(f"{{{slot}}}" for slot in mine.names) or "none"
-                return Refused("slots", f"{name}, sentence {number} must hold these slots and no other: {names}.")
-            if not other.is_in_script:
+        for number, (mine, other) in enumerate(zip(parts_en, parts_zh, strict=True), 1):
+            names = read_sentence(mine, "en", len(facts)).names
+            try:
+                sentence = read_sentence(other, "zh", len(facts))
+            except InvalidSlot as error:
+                return Refused(INVALID_SLOT, f"{name}, sentence {number}: {error}.")
+            if names != sentence.names:
+                listed = "; ".join(f"{{{slot}}}" for slot in names) or "none"
+                return Refused("slots", f"{name}, sentence {number} must hold these slots and no other: {listed}.")
+            if not sentence.is_in_script:
                 return Refused("script", f"{name}, sentence {number} is not written in Chinese.")
-    texts = ["".join(getattr(text, name) for name in TEXTS) for text in (english, chinese)]
-    swapped = glossary.swapped(*[re.sub(r"\{[^{}]*\}", SLOT_MARK, text) for text in texts])
-    if swapped:
-        return Refused(f"polarity_{swapped}", f"the Chinese text swaps an opposite of the English one ({swapped}).")
     return None
 
 
@@ -142,25 +103,23 @@ _WORDS = (
 
 def fact_table(facts: Facts) -> str:
     """Return the facts of a window with the names of their slots, as they are filled in; unknown facts are omitted."""
-    last = len(facts) - 1
+    filler, last = Filler(facts, "", "en"), len(facts) - 1
+
+    def listed(names: Iterable[str]) -> str:
+        return "; ".join(f"{{{name}}} {text}" for name in names if (text := filler.text_of(name)))
+
     lines = []
     for name in _SERIES:
-        values = dict(facts_of(facts, [f"{name}@t{i}" for i in range(last + 1)]))
-        if not values:
+        values = [filler.text_of(f"{name}@t{i}") for i in range(last + 1)]
+        if not any(values):
             continue
-        unit = " " + load_glossary().written_units["en"][QUANTITIES[name].unit]
-        series = ", ".join(values.get(f"{name}@t{i}", "-").removesuffix(unit) for i in range(last + 1))
-        more = [f"change:{name}", f"trend:{name}"] if name in _SPANNED else []
-        lines.append(f"{{{name}@t0}} to {{{name}@t{last}}}: {series}{unit}{_listed(facts, more, '; ')}")
-    seen = ", ".join(text for _, text in facts_of(facts, [f"visibility@t{i}" for i in range(last + 1)]))
-    lines.append(f"{{visibility@t0}} to {{visibility@t{last}}}: {seen}")
-    lines += [_listed(facts, names) for names in (_NOW, _WORDS)]
+        unit = f" {written_unit(QUANTITIES[name].unit, 'en')}"
+        series = ", ".join([(value or "-").removesuffix(unit) for value in values])
+        more = listed([f"change:{name}", f"trend:{name}"] if name in _SPANNED else [])
+        lines.append(f"{{{name}@t0}} to {{{name}@t{last}}}: {series}{unit}" + (f"; {more}" if more else ""))
+    seen = ", ".join([filler.text_of(f"visibility@t{i}") for i in range(last + 1)])
+    lines += [f"{{visibility@t0}} to {{visibility@t{last}}}: {seen}", listed(_NOW), listed(_WORDS)]
     return "Table of facts (- is not known; {decision} is a slot too):\n" + "\n".join(lines)
-
-
-def _listed(facts: Facts, names: Sequence[str], before: str = "") -> str:
-    listed = "; ".join(f"{{{name}}} {text}" for name, text in facts_of(facts, names))
-    return before + listed if listed else ""
 
 
 # --- filling ----------------------------------------------------------------------------------------------------------
@@ -168,11 +127,6 @@ def _listed(facts: Facts, names: Sequence[str], before: str = "") -> str:
 _DIGITS = ("%.0f", "%.1f", "%.2f")
 _NEITHER = ("straight", "centred")
 _VOWEL = re.compile(r"[aeio]|8|1[18]\b")
-_MISSING = {
-    "unknown_fact": "is not known in this window; leave it out",
-    "unobserved_frame": "names a frame that was not observed",
-    "unknown_reference": "cannot be measured",
-}
 
 
 class Filler:
@@ -180,44 +134,46 @@ class Filler:
 
     def __init__(self, facts: Facts, decision: str, language: Language) -> None:
         self.facts, self.decision, self.language = facts, decision, language
-        self._forms = _word_forms(language)
-        self._units = load_glossary().written_units[language]
 
-    def fill(self, sentence: Sentence) -> str | Refused:
-        """Return the plain text of a sentence."""
-        values = []
-        for slot in sentence.slots:
-            value = self._write(slot)
-            if isinstance(value, Refused):
-                return value
-            values.append(value)
-        filled = sentence.pattern % tuple(values)
+    def fill(self, sentence: Sentence) -> str:
+        """Return the plain text of a sentence; InvalidSlot: a fact is not known or does not fit."""
+        filled = sentence.pattern % tuple([self._write(slot) for slot in sentence.slots])
         return filled[0].upper() + filled[1:] if sentence.pattern.startswith("%s") else filled
 
-    def _write(self, slot: Slot) -> str | Refused:
+    def text_of(self, name: str) -> str:
+        """Return how a slot with this name is filled in as a verb, or before what is compared; "" if not known."""
+        try:
+            return self._write(read_slot(name, "it ", " it", self.language))
+        except InvalidSlot:
+            return ""
+
+    def _write(self, slot: Slot) -> str:
         fact = self._decision(slot) if slot.reference is None else look_up(slot.reference, self.facts)
         if isinstance(fact, str):
-            frames = f"; frames are t0 to t{len(self.facts) - 1}" if fact == "unobserved_frame" else ""
-            return Refused(INVALID_SLOT, f"{{{slot.name}}} {_MISSING[fact]}{frames}")
+            fault = "is not known in this window; leave it out"
+            if fact == "unobserved_frame":
+                fault = f"names a frame that was not observed; frames are t0 to t{len(self.facts) - 1}"
+            raise InvalidSlot(f"{{{slot.name}}} {fault}")
         value, unit, digits = fact
         if value in _NEITHER and slot.is_paired:
             value = self._side_of_number(slot) or value
         if value in _NEITHER and slot.needs_side:
             fix = f"it is {value} here, neither side: leave this slot out, or write `is {{{slot.name}}}`"
-            return Refused(INVALID_SLOT, f"{{{slot.name}}}: {fix}")
+            raise InvalidSlot(f"{{{slot.name}}}: {fix}")
         if not isinstance(value, str):
             word = _DIGITS[digits] % (abs(value) if slot.is_paired else value)
-            word += f"{'' if unit == 'percent' else ' '}{self._units[unit]}"
         elif unit:  # a box
-            word = f"{value if self.language == 'en' else value.replace('x', '×')} {self._units[unit]}"
+            word = value if self.language == "en" else value.replace("x", "×")
         else:
-            forms = self._forms[value]
-            word = forms[min(slot.form, len(forms) - 1)]
+            word = form_of(value, slot.form, self.language)
+        if unit:
+            word += f"{'' if unit == 'percent' else ' '}{written_unit(unit, self.language)}"
         return f"{slot.article}{'n' if _VOWEL.match(word) else ''} {word}" if slot.article else word
 
     def _decision(self, slot: Slot) -> Fact | Missing:
         if slot.name == "decision":
-            return Fact(self.decision)
+            action = ACTIONS[self.decision]
+            return Fact(action.en if self.language == "en" else action.zh)
         side = next((side for side in ("left", "right") if side in self.decision), None)
         return "unknown_fact" if side is None else Fact(side)
 
@@ -228,22 +184,4 @@ class Filler:
         number = look_up(slot.reference._replace(aspect="change" if quantity in TURNS else ""), self.facts)
         if not isinstance(number, Fact) or isinstance(number.value, str) or not number.value:
             return None
-        return QUANTITIES[quantity].sides[0 if number.value > 0 else 1]
-
-
-@cache
-def _word_forms(language: Language) -> dict[str, tuple[str, ...]]:
-    """Return the forms of every word that fills a slot: those of the glossary, and decisions."""
-    decisions = {token: (action.en if language == "en" else action.zh,) for token, action in ACTIONS.items()}
-    return decisions | load_glossary().slot_words(language)
-
-
-def facts_of(facts: Facts, names: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Return (name, how it is filled in) of the slots among these whose fact is known."""
-    filler = Filler(facts, "", "en")
-    for name in names:
-        sentence = read_sentence(f"it {{{name}}} it", "en", len(facts))
-        assert isinstance(sentence, Sentence)
-        text = filler.fill(sentence)
-        if isinstance(text, str):
-            yield name, text[3:-3]
+        return QUANTITIES[quantity].side_of(number.value, 0.0)

@@ -14,36 +14,35 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from typing import Literal
 
-from caption.answer_formats.contract import INVALID_SLOT, Refused
-from caption.verification.glossary import load_glossary
+from caption.verification.glossary import form_after, is_negated, spellings, written_unit
 from caption.verification.references import (
-    MOTIONS,
-    NO_ASPECT,
     QUANTITIES,
     RATE_UNITS,
+    RELATIONS,
+    TURNS,
+    WORDS,
     Reference,
     has_sides,
     parse_reference,
-)
-from caption.verification.vocabulary import terms_in
+)  # fmt: skip
 from cosfly.formats.captions import Language
 from cosfly.llm.answer_text import is_in_script
 from cosfly.runtime.errors import nearest
 
 SLOT_MARK = "\ufffc"  # replaces a slot in the text without slots
-TURNS = {"yaw": "yaw", "heading": "yaw", "target_heading": "target_heading"}  # quantity -> whose side a change has
 _BRACES = re.compile(r"\{([^{}]*)\}")
 _ARTICLE = re.compile(r"\b([Aa])n?\s+$")
-_WORD_ASPECTS = ("trend", "side", "comparison", "compared")
+_VERBS = ("target_motion", "drone_motion", "walking")
 _ALIASES = {
     "compare:drone_speed,target_speed": "comparison:speed",
     "compare:target_speed,drone_speed": "compared:speed",
     "side:target": "side:offset_x",
 }
 
-Form = Literal[0, 1, 2, 3]  # of the glossary's slot words: verb, after "is", after "has", after "to"
+
+class InvalidSlot(ValueError):
+    """A sentence that cannot be filled: the fault and what is allowed, for its writer."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +51,7 @@ class Slot:
 
     Args:
         name: what is looked up, the same for every form of a word. reference: None for the decision.
+        form: of the glossary's slot words: verb, after "is", after "has", after "to".
         needs_side: "straight" or "centred" does not fit here.
         is_paired: another slot of the sentence has the same direction: a number is written without its sign, and a side
             is that of the number, however small.
@@ -60,14 +60,14 @@ class Slot:
 
     name: str
     reference: Reference | None
-    form: Form = 0
+    form: int = 0
     needs_side: bool = False
     is_paired: bool = False
     article: str = ""
 
     @property
     def is_word(self) -> bool:
-        return self.reference is None or self.reference.aspect in _WORD_ASPECTS or self.reference.quantity in NO_ASPECT
+        return self.reference is None or self.reference.aspect in RELATIONS or self.reference.quantity in WORDS
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,6 @@ class Sentence:
     Args:
         pattern: its text for `%`, with a place for each slot. outside: its text, with SLOT_MARK for each slot.
         names: of the slots, sorted. num_values: slots that are filled with a value, the decision aside.
-        terms: of the glossary, in English, with their translations.
     """
 
     pattern: str
@@ -86,33 +85,25 @@ class Sentence:
     names: tuple[str, ...]
     is_in_script: bool
     num_values: int
-    terms: tuple[tuple[str, str], ...]
 
 
 @lru_cache(maxsize=32768)  # neighbouring windows share most sentences
-def read_sentence(text: str, language: Language, num_frames: int) -> Sentence | Refused:
-    """Read a sentence, or return why it cannot be filled in any window of so many frames."""
+def read_sentence(text: str, language: Language, num_frames: int) -> Sentence:
+    """Read a sentence; InvalidSlot: it cannot be filled in any window of so many frames."""
     parts = _BRACES.split(text)
     texts, names = parts[::2], parts[1::2]
     if any("{" in part or "}" in part for part in texts):
-        return Refused(INVALID_SLOT, "a brace is not closed or not opened")
+        raise InvalidSlot("a brace is not closed or not opened")
     slots: list[Slot] = []
     for number, written in enumerate(names):
         before, after = "".join(texts[: number + 1]), texts[number + 1]
-        slot = _read_slot(written, texts[number], after, language)
-        if slot is None:
-            return _unknown(written)
-        if load_glossary().is_negated(before.lower(), len(before), language):
-            return Refused(INVALID_SLOT, f"{{{written}}}: a slot is a fact and always true: do not negate it")
-        remainder = _without_repetition(slot, after, language)
-        if isinstance(remainder, Refused):
-            return remainder
-        texts[number + 1] = remainder
+        slot = read_slot(written, texts[number], after, language)
+        if is_negated(before.lower(), len(before), language):
+            raise InvalidSlot(f"{{{written}}}: a slot is a fact and always true: do not negate it")
+        texts[number + 1] = _without_repetition(slot, after, language)
         slots.append(slot)
     outside = SLOT_MARK.join(texts)
     paired = _paired(slots, num_frames)
-    if isinstance(paired, Refused):
-        return paired
     if language == "zh":  # a space before a number, none behind its unit
         texts[1:] = [re.sub(r"^ +(?=[\u4e00-\u9fff])", "", part) for part in texts[1:]]
     else:
@@ -124,33 +115,28 @@ def read_sentence(text: str, language: Language, num_frames: int) -> Sentence | 
         names=tuple(sorted(slot.name for slot in slots)),
         is_in_script=is_in_script(outside, language),
         num_values=sum(slot.reference is not None for slot in slots),
-        terms=terms_in(outside) if language == "en" else (),
     )
 
 
-def _read_slot(written: str, before: str, after: str, language: Language) -> Slot | None:
+def read_slot(written: str, before: str, after: str, language: Language) -> Slot:
+    """Read a slot between these texts; InvalidSlot: it names nothing."""
     name = re.sub(r"\s+", "", written.lower()).replace("–", "-")
     name = _ALIASES.get(name, name)
     if name in ("decision", "side:decision"):
         return Slot(name, None, needs_side=name == "side:decision")
     reference = parse_reference(name)
     if reference is None:
-        return None
-    if reference.aspect in ("comparison", "compared"):
-        return Slot(str(reference), reference, 0 if _is_compared_with(after, language) else 1)
-    if reference.aspect == "side":
-        if reference.quantity == "yaw" and reference.first is not None and reference.last is None:
-            reference = reference._replace(first=0, last=reference.first)  # a yaw is counted from t0, and so its side
-        return Slot(str(reference), reference, needs_side=_needs_side(before, after, language))
-    if reference.aspect == "trend" or reference.quantity in (*MOTIONS, "walking"):
-        return Slot(str(reference), reference, _form_after(before))
-    return Slot(str(reference), reference)
-
-
-def _unknown(written: str) -> Refused:
-    bare = written.partition(":")[2] or written
-    near = nearest(bare.partition("@")[0].strip(), [*QUANTITIES, *NO_ASPECT, "decision", "comparison:speed"])
-    return Refused(INVALID_SLOT, f"there is no slot {{{written}}}{near}; use the names of the table of facts")
+        bare = (written.partition(":")[2] or written).partition("@")[0].strip()
+        near = nearest(bare, [*QUANTITIES, *WORDS, "decision", "comparison:speed"])
+        raise InvalidSlot(f"there is no slot {{{written}}}{near}; use the names of the table of facts")
+    form, aspect = 0, reference.aspect
+    if aspect in ("comparison", "compared"):
+        form = 0 if _is_compared_with(after, language) else 1
+    elif aspect == "trend" or reference.quantity in _VERBS:
+        form = form_after(before)
+    elif aspect == "side" and reference.quantity == "yaw" and reference.first is not None and reference.last is None:
+        reference = reference._replace(first=0, last=reference.first)  # a yaw is counted from t0, and so its side
+    return Slot(str(reference), reference, form, aspect == "side" and _needs_side(before, after, language))
 
 
 def _with_article(slot: Slot, texts: list[str], number: int) -> Slot:
@@ -165,72 +151,49 @@ def _with_article(slot: Slot, texts: list[str], number: int) -> Slot:
 # --- numbers and words of one direction -------------------------------------------------------------------------------
 
 
-def _paired(slots: list[Slot], num_frames: int) -> list[Slot] | Refused:
+def _paired(slots: list[Slot], num_frames: int) -> list[Slot]:
     """Mark numbers and words that state one direction, so that one says what the other leaves out.
 
     A number next to a direction of other frames is refused, since it could be the opposite one.
     """
     directions = [_direction_of(slot, num_frames) for slot in slots]
-    words = {direction for slot, direction in zip(slots, directions, strict=True) if slot.is_word and direction}
-    numbers = {direction for slot, direction in zip(slots, directions, strict=True) if not slot.is_word and direction}
-    paired = []
+    words, numbers = (
+        {direction for slot, direction in zip(slots, directions, strict=True) if direction and slot.is_word == is_word}
+        for is_word in (True, False)
+    )
     for slot, direction in zip(slots, directions, strict=True):
-        is_named = direction is not None and direction[0] in {name for name, _ in words}
+        is_named = direction is not None and direction[0] in {name for name, *_ in words}
         if not slot.is_word and is_named and direction not in words:
             fix = "a side or a trend in its sentence is of other frames; name the same frames in both slots"
-            return Refused(INVALID_SLOT, f"{{{slot.name}}}: {fix}")
-        is_paired = direction in (numbers if slot.is_word else words)
-        paired.append(replace(slot, is_paired=is_paired))
-    return paired
+            raise InvalidSlot(f"{{{slot.name}}}: {fix}")
+    return [
+        replace(slot, is_paired=direction in (numbers if slot.is_word else words))
+        for slot, direction in zip(slots, directions, strict=True)
+    ]
 
 
-def _direction_of(slot: Slot, num_frames: int) -> tuple[str, tuple[int, int]] | None:
+def _direction_of(slot: Slot, num_frames: int) -> tuple[str, int, int] | None:
     """Return the direction that a word states, or that the sign of a number means, and its frames; None without one."""
     reference = slot.reference
-    if reference is None or reference.quantity in NO_ASPECT:
+    if reference is None or reference.quantity in WORDS:
         return None
     name, aspect, first, last = reference
     end = num_frames - 1
-    span = (0 if first is None else first, end if last is None else last)
-    if aspect == "comparison" or name == "speed_difference":
-        return "comparison", (0, end)
-    if aspect in ("change", "rate", "growth") and (name in TURNS or not QUANTITIES[name].sides):
-        return f"side:{TURNS[name]}" if name in TURNS else f"trend:{name}", span
-    if aspect == "trend" and not QUANTITIES[name].sides:
-        return f"trend:{name}", span
-    if aspect == "side" and name in TURNS:
-        return f"side:{TURNS[name]}", span
+    start, at = 0 if first is None else first, end if first is None else first
+    if aspect == "comparison":
+        return "comparison", 0, end
     if name == "yaw" and not aspect:
-        return "side:yaw", (0, end if first is None else first)
-    if aspect == "side" or (not aspect and has_sides(name)):
-        at = end if first is None else first
-        return f"side:{name}", (at, at)
-    return None
+        return "side:yaw", 0, at
+    if name in TURNS and aspect in ("change", "rate", "growth", "side"):
+        return f"side:{name}", start, end if last is None else last
+    if not QUANTITIES[name].sides and aspect in ("change", "rate", "growth", "trend"):
+        return f"trend:{name}", start, end if last is None else last
+    return (f"side:{name}", at, at) if aspect == "side" or (not aspect and has_sides(name)) else None
 
 
 # --- words around a slot ----------------------------------------------------------------------------------------------
 
-_ADVERBS = (
-    r"(?:\s+(?:now|still|also|currently|clearly|slowly|steadily|slightly|gently|only|just|already|both|gradually"
-    r"|again))*\s*$"
-)
-_BE = re.compile(
-    r"(?:\b(?:is|are|was|were|be|been|being|keeps?|kept|remains?|stays?|seems?|appears?|looks?|an?|the|its|their|by|of)"
-    r"|'s)" + _ADVERBS + r"|\bwith\b[^,;.]*$|^\s*$",
-    re.IGNORECASE,
-)
-_HAS = re.compile(r"\b(?:has|have|had|having)" + _ADVERBS, re.IGNORECASE)
-_TO = re.compile(r"\b(?:to|will|would|should|must|can|could|may|might|does|did|do)" + _ADVERBS, re.IGNORECASE)
 _ZH_COMPARED = ("目标", "行人", "其", "它", "他", "她", "对方", "该", "被", "人", "步行", "无人机", "本机")
-
-
-def _form_after(before: str) -> Form:
-    """Return the form of an English verb after these words; Chinese has one."""
-    if _HAS.search(before):
-        return 2
-    if _TO.search(before):
-        return 3
-    return 1 if _BE.search(before) else 0
 
 
 def _needs_side(before: str, after: str, language: Language) -> bool:
@@ -247,10 +210,10 @@ def _is_compared_with(after: str, language: Language) -> bool:
     return after.startswith(_ZH_COMPARED) if language == "zh" else bool(after) and after[0] not in ",.;:)!?"
 
 
-def _without_repetition(slot: Slot, after: str, language: Language) -> str | Refused:
+def _without_repetition(slot: Slot, after: str, language: Language) -> str:
     """Remove what a slot brings itself: the unit of a number, the "than" of a comparison."""
     reference = slot.reference
-    if reference is None or reference.aspect in ("side", "trend") or reference.quantity in NO_ASPECT:
+    if reference is None or reference.aspect in ("side", "trend") or reference.quantity in WORDS:
         return after
     if reference.aspect in ("comparison", "compared"):
         return re.sub(r"^\s+(?:than|as)\b", "", after) if language == "en" else after
@@ -259,14 +222,14 @@ def _without_repetition(slot: Slot, after: str, language: Language) -> str | Ref
         return after
     unit = QUANTITIES[reference.quantity].unit
     unit = {"growth": "percent", "rate": RATE_UNITS.get(unit, unit)}.get(reference.aspect, unit)
-    if load_glossary().spellings(language)[match[1].lower()] != unit:
-        fix = f"its unit is {load_glossary().written_units[language][unit]} and stands in the slot"
-        return Refused(INVALID_SLOT, f"{{{slot.name}}}{match[0]}: {fix}")
+    if spellings(language)[match[1].lower()] != unit:
+        fix = f"its unit is {written_unit(unit, language)} and stands in the slot"
+        raise InvalidSlot(f"{{{slot.name}}}{match[0]}: {fix}")
     return after[match.end() :]
 
 
 @cache
 def _unit_pattern(language: Language) -> re.Pattern[str]:
-    spellings = sorted(load_glossary().spellings(language), key=len, reverse=True)
-    options = "|".join(re.escape(s) + (r"(?![A-Za-z/])" if s[-1].isalpha() and s.isascii() else "") for s in spellings)
+    known = sorted(spellings(language), key=len, reverse=True)
+    options = "|".join(re.escape(s) + (r"(?![A-Za-z/])" if s[-1].isalpha() and s.isascii() else "") for s in known)
     return re.compile(rf"[\s-]*({options})", re.IGNORECASE)

@@ -9,24 +9,24 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from caption.schema import CaptionConfig, Window
 from caption.stage.ledger import explain_drops, most_common
-from caption.stage.progress import show_progress
 from caption.stage.tracks import TrackInput
 from caption.stage.window_loop import caption_window
 from caption.teachers.judge import open_judge
+from caption.teachers.prompt_files import Vocabulary
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
-from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import Caption, Usage, read_captions, write_captions
-from cosfly.formats.places import flight_of
-from cosfly.llm.answers import AnswerBook, BudgetSpent
+from cosfly.llm.answers import AnswerBook, Budget, BudgetSpent
 from cosfly.llm.contract import STOP_AFTER_FAILURES, NoAnswer, Troubles
-from cosfly.runtime.console import SECONDS_BETWEEN_LINES
+from cosfly.runtime.console import SECONDS_BETWEEN_LINES, Advance, duration, progress_bar
 from cosfly.runtime.errors import CosflyError, InputError, TeacherError
+from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.run_dir import Failed, StageFolder, Tally, read_failures, write_failures
 
 log = logging.getLogger(__name__)
@@ -42,13 +42,12 @@ WAITING_WINDOWS = 16
 class AskingOutcome:
     """The outcome of a run.
 
-    unanswered: Windows without an answer. num_tracks_left: Tracks that were not begun. stopped: Why the run stopped
-    early. judge_usage: Of all runs into the directory.
+    unanswered: Windows without an answer. stopped: Why the run stopped before it asked about all of them.
+    judge_usage: Of all runs into the directory.
     """
 
     tracks: Tally = field(default_factory=Tally)
     unanswered: list[Failed] = field(default_factory=list)
-    num_tracks_left: int = 0
     stopped: str | None = None
     judge_usage: Usage | None = None
 
@@ -57,28 +56,14 @@ class Asking:
     """One run of a teacher over tracks."""
 
     def __init__(
-        self,
-        stage: StageFolder,
-        cfg: CaptionConfig,
-        vocabulary: Vocabulary,
-        seed: int,
-        *,
-        retry_failed: bool = False,
-        was_complete: bool = False,
+        self, stage: StageFolder, cfg: CaptionConfig, vocabulary: Vocabulary, seed: int, *, retry_failed: bool = False
     ) -> None:
-        """
-        Args:
-            retry_failed: Ask only about the windows in quarantine.
-            was_complete: The directory was complete before `retry_failed`, so that every track has been asked.
-        """
         self.stage, self.cfg, self.vocabulary, self.seed = stage, cfg, vocabulary, seed
         self.outcome = AskingOutcome()
         self.failures: list[Failed] = []  # tracks that cannot be read
         self.quarantine = read_quarantine(stage.path)
-        self.only = frozenset(self.quarantine) if retry_failed else None
-        self.tracks_to_retry: set[str] | None = None
-        if self.only is not None and not was_complete:
-            self.tracks_to_retry = {flight_of(sample_id) for sample_id in self.only}
+        # An answer that had filled the context is asked for again.
+        self.retried = frozenset(self.quarantine) if retry_failed else frozenset[str]()
         most_in_flight = max(cfg.most_in_flight, cfg.judge.concurrency if cfg.judge.url else 0)
         self.slots = asyncio.Semaphore(most_in_flight + WAITING_WINDOWS)  # one for each window in work
         self.num_failed_in_row = 0
@@ -97,20 +82,22 @@ class Asking:
                 self.books = (answers, judgements)
                 budget = first_budget(self.cfg, answers.totals, judgements.totals)
                 total = None if self.cfg.window.keyframes else sum(guesses)
-                with show_progress(total, budget, troubles) as self.progress:
+                with progress_bar("caption", total) as advance:
+                    self.progress = RunProgress(advance, total, budget, troubles)
                     async with (
-                        open_teacher(self.cfg, answers, self.seed, budget, self.only, troubles) as teacher,
+                        open_teacher(self.cfg, answers, self.seed, budget, self.retried, troubles) as teacher,
                         open_judge(self.cfg.judge, self.vocabulary, self.seed, judgements, budget, troubles) as judge,
                     ):
                         self.judge = judge
                         await self._ask_all(tracks, guesses, teacher)
+                if self.progress.num_now or troubles.num:
+                    log.info("caption: %s", self.progress.figures())
                 if judgements.totals:
                     self.outcome.judge_usage = Usage(**{name: judgements.totals[name] for name in Usage.model_fields})
         finally:
             windows = [failure for failure in self.outcome.unanswered if failure.code != NOT_ASKED]
             write_failures(path / FAILURES, self.failures + windows)
             write_failures(path / QUARANTINE, self.quarantine.values())
-        self.outcome.tracks.input = len(tracks) - self.outcome.num_tracks_left
         return self.outcome
 
     async def _show_progress(self) -> None:
@@ -126,15 +113,13 @@ class Asking:
             async with asyncio.TaskGroup() as tasks:  # an error in one task cancels the others
                 for track, guess in zip(tracks, guesses, strict=True):
                     part = track.part(self.stage.path)
-                    is_for_later = self.tracks_to_retry is not None and track.name not in self.tracks_to_retry
                     if part.exists():
                         if self.dropped is not None and any(one.status == "accepted" for one in read_captions(part)):
                             self.dropped = None
+                        self.outcome.tracks.input += 1
                         self.outcome.tracks.kept += 1
                         self.progress.skip(guess)
-                    elif self.outcome.stopped or (is_for_later and guess):
-                        self.outcome.num_tracks_left += 1
-                    else:
+                    elif not self.outcome.stopped:
                         await self._ask_track(track, teacher, tasks)
         except BaseExceptionGroup as errors:
             raise errors.exceptions[0] from None
@@ -144,6 +129,7 @@ class Asking:
     async def _ask_track(self, track: TrackInput, teacher: Teacher, tasks: asyncio.TaskGroup) -> None:
         """Begin the windows of a track; another task writes it after the last of them."""
         tally = self.outcome.tracks
+        tally.input += 1
         windows: list[asyncio.Task[Caption | None]] = []
         is_cut = False
         try:
@@ -185,29 +171,27 @@ class Asking:
             caption = await caption_window(window, teacher, self.cfg, self.vocabulary, self.judge)
         except BudgetSpent as error:
             self.outcome.stopped = self.outcome.stopped or error.what
-            self._record_gap(Failed(id=sample_id, code=NOT_ASKED, message=error.what))
-        except NoAnswer as error:
-            self._record_gap(Failed(id=sample_id, code=error.cause, message=str(error)))
-        except CosflyError as error:
-            if error.fatal:
+            self.outcome.unanswered.append(Failed(id=sample_id, code=NOT_ASKED, message=error.what))
+        except (NoAnswer, CosflyError) as error:
+            if isinstance(error, CosflyError) and error.fatal:
                 raise
-            self._record_gap(Failed(id=sample_id, code=error.code, message=str(error)))
+            code = error.cause if isinstance(error, NoAnswer) else error.code
+            self._record_gap(Failed(id=sample_id, code=code, message=str(error)))
         else:
             self._record_refusal(caption)
             self._stop_if_hopeless(caption)
-            self.progress.finish(caption)
+            self.progress.add(caption)
             return caption
         finally:
             self.slots.release()
         return None
 
     def _record_gap(self, failure: Failed) -> None:
-        """Record a window without an answer; those that were not asked are no failures."""
+        """Record a window without an answer."""
         self.outcome.unanswered.append(failure)
-        if failure.code != NOT_ASKED:
-            self.quarantine[failure.id] = failure
-            self.progress.miss()
-            self._count_failure(f"{common_causes(self.outcome.unanswered)}; the last: {failure.message}")
+        self.quarantine[failure.id] = failure
+        self.progress.add(None)
+        self._count_failure(f"{common_causes(self.outcome.unanswered)}; the last: {failure.message}")
 
     def _record_refusal(self, caption: Caption) -> None:
         """Keep a window that the server refused, or that did not fit its context, for `--retry-failed`."""
@@ -259,3 +243,67 @@ def common_causes(failures: list[Failed]) -> str:
     """Return the three most common causes with their counts."""
     causes = most_common(Counter(failure.code for failure in failures))
     return ", ".join(f"{cause} {count}" for cause, count in list(causes.items())[:3])
+
+
+# --- progress ---------------------------------------------------------------------------------------------------------
+
+
+class RunProgress:
+    """Counts the outcomes of windows and moves the progress bar."""
+
+    def __init__(self, advance: Advance, total: int | None, budget: Budget, troubles: Troubles) -> None:
+        self._advance, self.total, self.budget, self.troubles = advance, total, budget, troubles
+        self.num_before = self.num_accepted = self.num_repaired = self.num_unanswered = 0
+        self.dropped: Counter[str] = Counter()
+        self._start_s = time.monotonic()
+        self._tokens_before = Counter(budget.totals)
+        self._spent_before = budget.spent
+
+    def skip(self, num_windows: int) -> None:
+        """Count windows of an earlier run."""
+        self.num_before += num_windows
+        self.show(num_windows)
+
+    def add(self, caption: Caption | None) -> None:
+        """Count a caption, None for a window without an answer."""
+        if caption is None:
+            self.num_unanswered += 1
+        elif caption.status == "accepted":
+            self.num_accepted += 1
+            self.num_repaired += caption.repair is not None
+        else:
+            self.dropped[str(caption.drop_reason)] += 1
+        self.show(1)
+
+    def show(self, num_windows: int = 0) -> None:
+        """Move the progress bar by so many windows, and update its text."""
+        self._advance(num_windows, self.figures())
+
+    @property
+    def num_now(self) -> int:
+        """Windows that this run finished, with or without success."""
+        return self.num_accepted + self.dropped.total() + self.num_unanswered
+
+    def figures(self) -> str:
+        """Return the figures of the run as a text."""
+        budget, troubles = self.budget, self.troubles
+        tokens = Counter(budget.totals)
+        tokens.subtract(self._tokens_before)
+        reasons = ", ".join(f"{reason} {count}" for reason, count in self.dropped.most_common(4))
+        rate_per_s = self.num_now / max(time.monotonic() - self._start_s, 1e-9)
+        figures = [
+            f"accepted {self.num_accepted:,} (repaired {self.num_repaired:,})",
+            f"dropped {self.dropped.total():,}" + (f" ({reasons})" if reasons else ""),
+            f"no answer {self.num_unanswered:,}",
+            f"tokens {tokens['prompt_tokens']:,} in {tokens['completion_tokens']:,} out",
+            f"{rate_per_s:.2f} windows/s",
+        ]
+        if budget.cfg.price_prompt or budget.cfg.price_completion:
+            figures.append(f"cost {budget.spent - self._spent_before:.2f}")
+        if self.total is not None and self.num_now:
+            figures.append(f"{duration((self.total - self.num_before - self.num_now) / rate_per_s)} left")
+        if troubles.num:
+            figures.append(f"{troubles.num:,} failed attempts")
+        if troubles.last is not None:
+            figures.append(f"no answer for {duration(troubles.silent_s)}, the last: {for_terminal(troubles.last)}")
+        return ", ".join(figures)

@@ -7,23 +7,21 @@ none of it.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from difflib import SequenceMatcher
 from pathlib import Path
 from statistics import fmean
 from typing import get_args
 
-from rich.table import Table
-
 from caption.schema import CaptionConfig, Strategy, Window
 from caption.stage.asking import ANSWERS
 from caption.stage.tracks import find_inputs
 from caption.stage.window_loop import Trial, try_strategy
-from caption.teachers.prompt_files import vocabulary_of
+from caption.teachers.prompt_files import Vocabulary, vocabulary_of
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
-from caption.verification.vocabulary import Vocabulary
 from cosfly.formats.captions import Coc
 from cosfly.llm.answers import AnswerBook
 from cosfly.llm.contract import NoAnswer, run_until_interrupted
@@ -89,12 +87,8 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
     refuse_links(out)
     num_windows, trials = run_until_interrupted(_try_all(cfg, vocabulary_of(cfg), data, out, seed, conflicts))
     if not trials:
-        raise InputError(
-            "no first answer has a conflict to repair",
-            where=data,
-            got=f"{num_windows} windows",
-            fix="pass another --teacher",
-        )
+        what, fix = "no first answer has a conflict to repair", "pass another --teacher"
+        raise InputError(what, where=data, got=f"{num_windows} windows", fix=fix)
     comparisons = list(map(compare, STRATEGIES, zip(*trials, strict=True)))
     value = {
         "schema": "cosfly.compare_strategies",
@@ -113,9 +107,10 @@ async def _try_all(
     """Return the number of windows asked about, and for each of at most `most` conflicts a trial of each strategy."""
     trials: list[list[Trial]] = []
     num_windows = 0
+    every = itertools.chain.from_iterable(track.windows(cfg) for track in find_inputs(cfg, data)[0])
+    windows = (window for window in every if window.problem is None)
     with AnswerBook(out / ANSWERS) as book:  # the first answer is asked for once for all strategies
         async with open_teacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
-            windows = iter(_windows(cfg, data))
             while len(trials) < most and (batch := list(itertools.islice(windows, cfg.most_in_flight))):
                 num_windows += len(batch)
                 found = await asyncio.gather(*(_try_each(window, teacher, cfg, vocabulary) for window in batch))
@@ -126,30 +121,22 @@ async def _try_all(
 async def _try_each(window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary) -> list[Trial] | None:
     """Return a trial of each strategy; None if the free answer is not in conflict or an answer is missing."""
     found: list[Trial] = []
-    for strategy in STRATEGIES:
-        try:
+    with contextlib.suppress(NoAnswer):
+        for strategy in STRATEGIES:
             trial = await try_strategy(window, teacher, cfg, vocabulary, strategy)
-        except NoAnswer:
-            return None
-        if trial is None:
-            return None
-        found.append(trial)
-    return found
+            if trial is None:
+                break
+            found.append(trial)
+    return found if len(found) == len(STRATEGIES) else None
 
 
-def _windows(cfg: CaptionConfig, data: Path) -> Iterable[Window]:
-    for track in find_inputs(cfg, data)[0]:
-        yield from (window for window in track.windows(cfg) if window.problem is None)
+COLUMNS = ("strategy", "repaired", "consistency", "naturalness", "requests each", "tokens each")
 
 
-def comparison_table(comparisons: Sequence[Comparison]) -> Table:
-    """Return the comparison as a table for the terminal."""
-    table = Table(title=f"Regeneration of the same {comparisons[0].num_conflicts} conflicts", title_justify="left")
-    table.add_column("strategy", no_wrap=True)
-    for column in ("repaired", "consistency", "naturalness", "requests each", "tokens each"):
-        table.add_column(column, justify="right")
-    for one in comparisons:
-        table.add_row(
+def comparison_rows(comparisons: Sequence[Comparison]) -> list[tuple[str, ...]]:
+    """Return the rows of a table of these COLUMNS."""
+    return [
+        (
             one.strategy,
             str(one.repaired),
             f"{100 * one.consistency:.1f} %",
@@ -157,4 +144,5 @@ def comparison_table(comparisons: Sequence[Comparison]) -> Table:
             f"{one.asks_per_conflict:.2f}",
             f"{one.tokens_per_conflict:.0f}",
         )
-    return table
+        for one in comparisons
+    ]

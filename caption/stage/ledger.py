@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import insort
 from collections import Counter
 from collections.abc import Mapping
 from itertools import zip_longest
@@ -46,8 +45,7 @@ def most_common(counts: Mapping[str, int]) -> dict[str, int]:
 def explain_drops(dropped: Mapping[str, int]) -> str:
     """Return the three most common reasons with their counts and meanings."""
     reasons = list(most_common(dropped).items())[:3]
-    unknown = "docs/captions.md does not explain this code"
-    return "; ".join(f"{count} {reason} ({REASONS.get(reason, unknown)})" for reason, count in reasons)
+    return "; ".join(f"{count} {reason} ({REASONS[reason]})" for reason, count in reasons)
 
 
 # --- the report -------------------------------------------------------------------------------------------------------
@@ -201,18 +199,17 @@ class SampleCards:
     """Samples captions of every kind for the page: those of the smallest hash, in whatever order they come."""
 
     def __init__(self) -> None:
-        self._kinds: dict[str, list[tuple[tuple[str, str], Caption]]] = {}
+        self._kinds: dict[str, list[tuple[str, str, Caption]]] = {}
 
     def add(self, caption: Caption) -> None:
         kind = "dropped" if caption.status == "dropped" else "repaired" if caption.repair else str(caption.verdict)
         cards = self._kinds.setdefault(kind, [])
-        key = (sha256_bytes(caption.sample_id.encode())[:16], caption.sample_id)
-        if len(cards) < NUM_CARDS or key < cards[-1][0]:
-            insort(cards, (key, caption), key=itemgetter(0))
-            del cards[NUM_CARDS:]
+        cards.append((sha256_bytes(caption.sample_id.encode())[:16], caption.sample_id, caption))
+        cards.sort(key=itemgetter(0, 1))
+        del cards[NUM_CARDS:]
 
     def chosen(self) -> list[Caption]:
         """Return up to NUM_CARDS captions, the kinds in turn, sorted by id."""
         turns = zip_longest(*(self._kinds[kind] for kind in sorted(self._kinds)))
-        captions = [card[1] for turn in turns for card in turn if card is not None]
+        captions = [card[2] for turn in turns for card in turn if card is not None]
         return sorted(captions[:NUM_CARDS], key=lambda caption: caption.sample_id)

@@ -6,15 +6,17 @@ frames are released.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 
 from caption.schema import FutureMotion
 from caption.stage.windows import LabelMotion, cut_future, label_motion
-from caption.teachers.prompts import mission_lines
 from caption.verification.actions import TABLE, ActionTable, Motion, Thresholds, measure
-from cosfly.formats.captions import ORDERS
+from caption.verification.glossary import prompt_line
+from cosfly.formats.captions import ORDERS, verdict_on
+from cosfly.formats.segments import MISSION_KINDS
 from cosfly.formats.shown_captions import Mismatch, ReleasedTrack, ShownCaption
 
 NUDGE = 1e-9  # of a threshold: rounding error of subtracting the offsets again
@@ -28,19 +30,12 @@ def read_released(shown: ReleasedTrack) -> list[Mismatch]:
     return [mismatch for mismatch in found if mismatch is not None]
 
 
-def _has_order(caption: ShownCaption) -> bool:
-    """Return whether a prompt ends with the line of an order."""
-    endings = {
-        language: tuple("\n" + line for line in mission_lines(language).values()) for language in caption.prompts
-    }
-    return any(text.endswith(endings[language]) for language, text in caption.prompts.items())
-
-
 def _mismatch(
     shown: ReleasedTrack, motion: LabelMotion, caption: ShownCaption, rows: dict[int, int]
 ) -> Mismatch | None:
     """Compare label and verdict with the frames after the window, if these are released."""
-    where, has_order = f"{caption.sample_id}: label", _has_order(caption)
+    where, lines = f"{caption.sample_id}: label", itertools.product(caption.prompts.items(), MISSION_KINDS)
+    has_order = any(text.endswith("\n" + prompt_line(kind, language)) for (language, text), kind in lines)
     if caption.prompts and has_order != (caption.label in ORDERS):
         got = f"{caption.label}, and {'an order' if has_order else 'no order'} in the prompt"
         return "label", where, got, "an order as the label if and only if the prompt has one"
@@ -51,7 +46,7 @@ def _mismatch(
     label = TABLE.label_of(measured)
     if label != caption.label and caption.label not in _nearly(measured):
         return "label", where, str(caption.label), f"{label}, by the frames after the window"
-    verdict = TABLE.verdict_of(caption.decision, measured, caption.label)
+    verdict = verdict_on(caption.decision, caption.label, TABLE.contradicted_by(measured, caption.label))
     if caption.verdict is None or verdict == caption.verdict:
         return None
     got = f"{caption.verdict} for {caption.decision} (label {caption.label})"

@@ -9,27 +9,28 @@ from __future__ import annotations
 import asyncio
 import logging
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 
 from caption.schema import CaptionConfig, Window
-from caption.stage.asking import ANSWERS, NOT_ASKED, Asking, AskingOutcome, common_causes, read_quarantine
+from caption.stage.asking import ANSWERS, Asking, AskingOutcome, common_causes, read_quarantine
 from caption.stage.ledger import CaptionReport, SampleCards, explain_drops
 from caption.stage.report import page_html
 from caption.stage.tracks import PARTS, TrackInput, find_inputs, parts_of, restore_parts
-from caption.stage.window_loop import caption_prepared, prepare
-from caption.teachers.foreign import given_samples, read_given
-from caption.teachers.prompt_files import PROMPTS, keep_own_prompts, vocabulary_of
+from caption.stage.window_loop import caption_prepared, caption_window, prepare
+from caption.teachers.foreign import read_given
+from caption.teachers.prompt_files import PROMPTS, Vocabulary, keep_own_prompts, vocabulary_of
 from caption.teachers.students import student_settings
-from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
+from caption.teachers.teacher import EMBEDDED, embedded_teacher, first_budget, open_teacher
 from caption.verification.glossary import GLOSSARY_FILE
-from caption.verification.vocabulary import Vocabulary
-from cosfly.formats.captions import caption_lines, line_of, write_caption_lines
+from cosfly.formats.captions import Caption, Usage, caption_lines, line_of, write_caption_lines
 from cosfly.formats.places import flight_of
+from cosfly.llm.answers import AnswerBook
 from cosfly.llm.contract import run_until_interrupted
 from cosfly.llm.student_chat import student_files
-from cosfly.runtime.errors import ConfigError, ResumeError, TeacherError
+from cosfly.runtime.console import duration
+from cosfly.runtime.errors import ConfigError, InputError, ResumeError, TeacherError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import write_json
 from cosfly.runtime.pool import Watch, run_items
@@ -41,6 +42,7 @@ log = logging.getLogger(__name__)
 
 PRODUCT, REPORT, PAGE = "captions.jsonl", "caption_report.json", "report.html"
 PACKAGE_FILES = {"glossary": GLOSSARY_FILE}  # a directory never mixes captions of two glossaries or two prompts
+TRIAL_WINDOWS = 6  # of a plan
 WINDOWS_AT_ONCE = 128  # prepared together for an embedded teacher
 
 
@@ -60,7 +62,7 @@ def run(
     Args:
         data: Playback tree, ours or of the public layout.
         workers: Processes of an embedded teacher without a judge; a model takes `endpoint.concurrency` requests.
-        retry_failed: Ask only about the windows in `quarantine.jsonl`: without an answer, or refused by the server.
+        retry_failed: Ask again about the windows that the server refused, which are in `quarantine.jsonl`.
 
     Raises:
         InputError: There is no track. NothingKept: No track is long enough, or no window got a caption.
@@ -72,10 +74,9 @@ def run(
         raise ConfigError(what, where="--retry-failed", got=cfg.teacher_kind, fix=fix)
     vocabulary = vocabulary_of(cfg)
     cfg = student_settings(cfg, vocabulary)
-    unused = set[str]() if cfg.caption_file is None else given_samples(read_given(cfg))
+    unused = set[str]() if cfg.caption_file is None else {sample_id for sample_id, _ in read_given(cfg)}
     stage = open_stage(cfg, data, out, seed, resume)
-    was_complete = stage.is_complete and not _has_more(stage, cfg)
-    if was_complete and not (retry_failed and _has_refused(stage, cfg)):
+    if stage.is_complete and not _has_more(stage, cfg, retry_failed):
         if read_manifest(out).facts.get("limit") is None:
             shutil.rmtree(out / PARTS, ignore_errors=True)  # the process was killed before it removed them
         return out / PRODUCT
@@ -92,7 +93,7 @@ def run(
             for track in tracks:
                 if track.name in names:
                     track.part(stage.path).unlink(missing_ok=True)
-        asking = Asking(stage, cfg, vocabulary, seed, retry_failed=retry_failed, was_complete=was_complete)
+        asking = Asking(stage, cfg, vocabulary, seed, retry_failed=retry_failed)
         outcome = run_until_interrupted(asking.run(tracks))
     report, cards = _merge(stage, parts_of(stage.path, tracks, bool(outcome.unanswered)), unused)
     report.finish(outcome.tracks, len(outcome.unanswered), outcome.judge_usage)
@@ -113,7 +114,6 @@ def _finish(
 ) -> None:
     """Finish the stage if every window has an outcome; TeacherError if one should have got an answer."""
     out = stage.path
-    missed = [failure for failure in outcome.unanswered if failure.code != NOT_ASKED]
     if outcome.stopped:
         raise TeacherError(
             "captioning stopped, because the next request may exceed the budget",
@@ -121,16 +121,14 @@ def _finish(
             got=f"{outcome.stopped}; {tally.kept} windows accepted so far",
             fix="raise --max-cost or --max-tokens and run the same command again; answered windows are not asked again",
         )
+    missed = outcome.unanswered
     if missed:
         raise TeacherError(
             f"{len(missed)} of {tally.input} windows got no answer",
             where=cfg.teacher,
             got=f"{common_causes(missed)}; the last: {missed[-1].message}",
-            fix="run the same command again, or with --retry-failed for these windows only",
+            fix="run the same command again; answered windows are not asked again",
         )
-    if outcome.unanswered or outcome.num_tracks_left:
-        log.info("caption: run the command without --retry-failed to caption the windows that have no answer yet")
-        return
     if tally.input == 0:
         num_frames = cfg.window.num_frames + cfg.window.future_frames
         raise stage.nothing_kept(outcome.tracks, expected=f"a track of at least {num_frames} frames")
@@ -153,24 +151,21 @@ def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Res
     return StageFolder.open(out, "caption", config=cfg, inputs=inputs, seed=seed, resume=resume, package_files=files)
 
 
-def _has_more(stage: StageFolder, cfg: CaptionConfig) -> bool:
-    """Reopen a complete directory whose limit was smaller than the one now; return whether it was."""
-    limit = read_manifest(stage.path).facts.get("limit")
-    if limit is None or (cfg.limit is not None and cfg.limit <= limit):
-        return False
-    stage.reopen()
-    return True
+def _has_more(stage: StageFolder, cfg: CaptionConfig, retry_failed: bool) -> bool:
+    """Reopen a complete directory whose limit was smaller, or whose refused windows are asked about again.
 
-
-def _has_refused(stage: StageFolder, cfg: CaptionConfig) -> bool:
-    """Reopen a complete directory in which the server refused windows; return whether it did."""
-    if not read_quarantine(stage.path):
+    Returns:
+        Whether it was reopened.
+    """
+    manifest, refused = read_manifest(stage.path), read_quarantine(stage.path) if retry_failed else {}
+    limit = manifest.facts.get("limit")
+    is_larger = limit is not None and (cfg.limit is None or cfg.limit > limit)
+    if not (is_larger or refused):
         return False
-    num_windows = read_manifest(stage.path).counts.input
-    if cfg.limit is not None and cfg.limit < num_windows:
+    if not is_larger and cfg.limit is not None and cfg.limit < manifest.counts.input:
         raise ResumeError(
             "the directory contains more windows than the limit allows, so it is not changed", where=stage.path,
-            got=f"{num_windows} windows", expected=f"at most {cfg.limit} (caption.limit)",
+            got=f"{manifest.counts.input} windows", expected=f"at most {cfg.limit} (caption.limit)",
             fix="remove --limit, or raise it",
         )  # fmt: skip
     stage.reopen()
@@ -197,6 +192,63 @@ def _merge(stage: StageFolder, parts: list[Path], unused: set[str]) -> tuple[Cap
     return report, cards
 
 
+# --- a plan -----------------------------------------------------------------------------------------------------------
+
+
+def make_forecast(
+    cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, resume: Resume = "if-same"
+) -> list[tuple[str, str]]:
+    """Return the rows of a table: calls, tokens, time and money of a run, scaled from the means of a few windows.
+
+    The trial windows are real ones, spread over the tracks. Their answers stay in the journal, so the run does not ask
+    for them again.
+    """
+    if cfg.teacher_kind != "endpoint":
+        what = "an estimate needs a server as the teacher"
+        raise ConfigError(what, where="--plan", got=cfg.teacher, expected="--teacher URL")
+    vocabulary = vocabulary_of(cfg)
+    cfg = student_settings(cfg, vocabulary)
+    stage = open_stage(cfg, data, out, seed, resume)
+    tracks, _ = find_inputs(cfg, data)
+    guesses = {track: track.guess_num_windows(cfg.window) for track in tracks}
+    left = [track for track in tracks if guesses[track] and not stage.is_complete and not track.part(out).exists()]
+    num_windows = sum(guesses[track] for track in left)
+    if not num_windows:
+        raise InputError("no window is left to caption", where=data, got=f"{len(left)} unfinished tracks")
+    chosen = [left[number * len(left) // TRIAL_WINDOWS] for number in range(TRIAL_WINDOWS)]
+    windows = [w for track in dict.fromkeys(chosen) for w in islice(track.windows(cfg), chosen.count(track))]
+
+    async def ask() -> tuple[list[Caption | BaseException], float]:
+        with AnswerBook(out / ANSWERS) as book:
+            async with open_teacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
+                asked = [caption_window(window, teacher, cfg, vocabulary) for window in windows]
+                found = await asyncio.gather(*asked, return_exceptions=True)
+            ids = [one.sample_id for one in found if isinstance(one, Caption)]
+            return found, sum(book.latency_s(flight_of(sample_id), sample_id) for sample_id in ids)
+
+    found, seconds = run_until_interrupted(ask())
+    captions = [one for one in found if isinstance(one, Caption)]
+    if not captions:
+        what, got = "none of the trial windows got an answer", str(found[0]) if found else None
+        raise TeacherError(what, where=cfg.teacher, got=got)
+    scale = num_windows / len(captions)
+    usage = sum((caption.usage for caption in captions), Usage())
+    prompt, completion = scale * usage.prompt_tokens, scale * usage.completion_tokens
+    is_priced = cfg.budget.price_prompt or cfg.budget.price_completion
+    cost = f"{cfg.budget.cost(prompt, completion):,.2f}" if is_priced else "no prices set (budget.price_prompt)"
+    num_accepted = sum(caption.status == "accepted" for caption in captions)
+    num_done = sum(guesses.values()) - num_windows
+    return [
+        ("windows", f"about {num_windows:,} left" + (f", {num_done:,} done" if num_done else "")),
+        ("trial", f"{len(captions)} windows, {num_accepted} accepted; their answers are kept"),
+        ("requests", f"{scale * sum(caption.attempts for caption in captions):,.0f}"),
+        ("tokens in", f"{prompt:,.0f}"),
+        ("tokens out", f"{completion:,.0f}"),
+        ("cost", cost),
+        ("time", f"{duration(scale * seconds / cfg.most_in_flight)} with {cfg.most_in_flight} requests in flight"),
+    ]
+
+
 # --- embedded teachers ------------------------------------------------------------------------------------------------
 
 
@@ -204,25 +256,21 @@ def make_worker(cfg: CaptionConfig, vocabulary: Vocabulary, stage_path: Path, se
     """Return the function that captions one track in a process."""
     teacher = embedded_teacher(cfg, seed)
 
+    async def caption_in_order(windows: Iterator[Window]) -> list[bytes]:
+        """Return the lines of captions; a line takes far less time in garbage collection than a caption."""
+        lines: list[bytes] = []
+        while batch := list(islice(windows, WINDOWS_AT_ONCE)):
+            for prepared in prepare(batch, teacher, cfg, vocabulary):
+                lines.append(line_of(await caption_prepared(prepared, teacher, cfg)))
+                advance()
+        return lines
+
     def work(item: Item) -> Outcome:
         track: TrackInput = item.payload
-        lines = asyncio.run(_caption_in_order(track.windows(cfg), teacher, cfg, vocabulary))
+        lines = asyncio.run(caption_in_order(track.windows(cfg)))
         if not lines:
             return Outcome({}, drop_reason="too_short")
         write_caption_lines(track.part(stage_path), lines)
         return Outcome({"windows": len(lines)})
 
     return work
-
-
-async def _caption_in_order(
-    windows: Iterable[Window], teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary
-) -> list[bytes]:
-    """Return the lines of the captions of windows; a line takes far less time in garbage collection than a caption."""
-    lines: list[bytes] = []
-    rest = iter(windows)
-    while batch := list(islice(rest, WINDOWS_AT_ONCE)):
-        for prepared in prepare(batch, teacher, cfg, vocabulary):
-            lines.append(line_of(await caption_prepared(prepared, teacher, cfg)))
-            advance()
-    return lines

@@ -8,29 +8,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from caption.answer_formats.contract import Draft, Refused, refuse_decision
+from caption.answer_formats.contract import Draft, Refused
 from caption.schema import CaptionConfig, Strategy, Window
 from caption.stage.ledger import REASONS
 from caption.teachers.foreign import Terms
 from caption.teachers.judge import Conflict, Judge
+from caption.teachers.prompt_files import Vocabulary
 from caption.teachers.prompts import Correction, Question, make_question, prompt_hash
 from caption.teachers.teacher import Teacher
-from caption.verification.actions import TABLE, Motion, measure
-from caption.verification.mirror import check_translation
-from caption.verification.values import measured_lines
-from caption.verification.vocabulary import Vocabulary
+from caption.verification.actions import TABLE, measure
+from caption.verification.values import check_values, measured_lines
 from cosfly.formats.captions import (
     ACTIONS,
     Caption,
     Checks,
     Coc,
-    JudgeRecord,
     Language,
     RepairRecord,
     Usage,
     Verdict,
+    verdict_on,
 )
 from cosfly.llm.answer_text import Parsed, parse_answer
 from cosfly.llm.contract import NoAnswer, Reply
@@ -38,6 +37,10 @@ from cosfly.runtime.errors import InputError, RenderError
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.model_json import CONTEXT_FULL
 
+# Most requests for one text, of a teacher that does not give the same answer again.
+STRUCTURE_ASKS = 3  # until an answer has the right structure
+CORRECTION_ASKS = 1  # that name what was wrong with an answer of the right structure
+MIRROR_ASKS = 2  # for the Chinese mirror, until the pair is consistent
 MAX_COMPLAINTS = 8  # named at once
 CONTRADICTED = "contradicted_value"
 
@@ -49,7 +52,6 @@ class PreparedWindow(NamedTuple):
     terms: Terms
     question: Question
     prompt_hash: str
-    motion: Motion
     label: str | None
     contradicted: list[str]
 
@@ -66,7 +68,7 @@ def prepare(
     motions = [measure(window.future) for window in windows]
     labels = [TABLE.label_of(motion) for motion in motions]
     contradicted = [TABLE.contradicted_by(m, label) for m, label in zip(motions, labels, strict=True)]
-    return list(map(PreparedWindow, windows, terms, questions, hashes, motions, labels, contradicted))
+    return list(map(PreparedWindow, windows, terms, questions, hashes, labels, contradicted))
 
 
 async def caption_window(
@@ -96,11 +98,11 @@ async def caption_prepared(
             reason = error.cause
             if reason not in REASONS:
                 reason = "refused"
-                loop.checks["refusal"] = str(error)
+                loop.checks.refusal = str(error)
         except (InputError, RenderError) as error:  # a picture that cannot be read or encoded
             reason = "unusable_frame"
-            loop.checks["frame"] = error.what
-    return loop.record(reason)
+            loop.checks.frame = error.what
+    return loop.finish(reason)
 
 
 @dataclass(frozen=True)
@@ -122,52 +124,41 @@ async def try_strategy(
     [prepared] = prepare([window], teacher, cfg, vocabulary)
     loop = _WindowLoop(teacher, cfg.model_copy(update={"repair": repair}), prepared)
     reason = await loop.ask_freely(prepared.question)
-    if reason is not None or repair.treatment_of(loop.verdict) == "keep" or loop.label is None:
+    if reason is not None or repair.treatment_of(loop.caption.verdict) == "keep" or prepared.label is None:
         return None
-    assert loop.english is not None
-    first, num_asks, tokens = loop.english.coc, loop.asks, loop.usage.total
+    first, num_asks, tokens = loop.english.coc, loop.caption.attempts, loop.caption.usage.total
     try:
         reason = await loop.regenerate(prepared.question)
     except NoAnswer as error:  # a teacher without a reason for the label has not repaired the conflict
         if not error.is_final:
             raise
         reason = error.cause
-    last = loop.english.coc if reason is None else None
-    return Trial(first, last, loop.verdict, loop.asks - num_asks, loop.usage.total - tokens)
+    last, caption = loop.english.coc if reason is None else None, loop.caption
+    return Trial(first, last, caption.verdict, caption.attempts - num_asks, caption.usage.total - tokens)
 
 
 class _WindowLoop:
-    """The asks of one window and their results."""
+    """The asks of one window and their results.
+
+    caption: Its record so far. drafts: The answers that were accepted; a Chinese one may have been refused.
+    answered: The question that the English one answers.
+    """
 
     def __init__(
         self, teacher: Teacher, cfg: CaptionConfig, prepared: PreparedWindow, judge: Judge | None = None
     ) -> None:
-        once = {"structure_asks": 1, "correction_asks": 0, "mirror_asks": 1}
-        self.terms = prepared.terms
-        self.cfg = cfg.model_copy(update=once) if self.terms.is_given else cfg
-        self.teacher, self.prepared, self.judge = teacher, prepared, judge
-        self.label, self.way = prepared.label, prepared.question.way
-        self.english: Draft | None = None
-        self.chinese: Draft | None = None
-        self.answered: Question | None = None  # the question that `english` answers
-        self.verdict: Verdict | None = None
-        self.judgement: JudgeRecord | None = None
-        self.repair: RepairRecord | None = None
-        self.checks: dict[str, Any] = {"keyframe": prepared.window.keyframe, "contradicted": prepared.contradicted}
-        self.usage = Usage()
-        self.asks = 0
-        self.structured: str | None = None
+        self.teacher, self.cfg, self.judge = teacher, cfg, judge
+        window, self.terms, self.answered, prompt_hash, self.label, self.contradicted = prepared
+        asks = (1, 0, 1) if self.terms.is_fixed else (STRUCTURE_ASKS, CORRECTION_ASKS, MIRROR_ASKS)
+        self.structure_asks, self.correction_asks, self.mirror_asks = asks
+        self.format = self.answered.format
+        self.drafts: dict[Language, Draft] = {}
+        self._structured: str | None = None
         self._recovered: set[str] = set()
         self._refused: list[str] = []
-
-    def record(self, reason: str | None) -> Caption:
-        """Return the record of the window. reason: To drop it."""
-        window, question = self.prepared.window, self.prepared.question
-        observed, pictures, teacher = window.observed, question.pictures, self.teacher.record
-        if teacher.structured != self.structured:
-            teacher = teacher.model_copy(update={"structured": self.structured})
-        drafts = self._drafts()
-        return Caption(
+        self.checks = Checks(keyframe=window.keyframe, contradicted=self.contradicted)
+        observed, pictures = window.observed, self.answered.pictures
+        self.caption = Caption(
             sample_id=observed.sample_id,
             town=observed.town,
             trajectory=observed.trajectory,
@@ -175,51 +166,49 @@ class _WindowLoop:
             frame_index=observed.indices[-1],
             window=list(observed.indices),
             future=list(window.future.indices),
-            prompt={"en": question.prompts["en"], "zh": question.prompts["zh"]},
-            prompt_hash=self.prepared.prompt_hash,
+            prompt={"en": self.answered.prompts["en"], "zh": self.answered.prompts["zh"]},
+            prompt_hash=prompt_hash,
             picture_px=pictures.size_px,
             depth_range_m=pictures.depth_range_m if "depth" in pictures.views else None,
-            teacher=teacher,
-            usage=self.usage,
-            attempts=self.asks,
+            teacher=teacher.record,
+            usage=Usage(),
+            attempts=0,
             writing=self.terms.writing,
-            therefore=self.english.therefore if self.english else None,
-            en=self.english.coc if self.english else None,
-            zh=self.chinese.coc if self.chinese else None,
-            slots={language: draft.template for language, draft in drafts.items() if draft.template} or None,
             label_from=window.future.label_from,
             label=self.label,
-            verdict=self.verdict,
-            judge=self.judgement,
-            repair=self.repair,
-            checks=Checks(**self.checks),
-            status="accepted" if reason is None else "dropped",
-            drop_reason=reason,
+            checks=self.checks,
+            status="dropped",
         )
 
-    def _drafts(self) -> dict[Language, Draft]:
-        drafts: dict[Language, Draft | None] = {"en": self.english, "zh": self.chinese}
-        return {language: draft for language, draft in drafts.items() if draft is not None}
+    @property
+    def english(self) -> Draft:
+        return self.drafts["en"]
+
+    def finish(self, reason: str | None) -> Caption:
+        """Return the record of the window. reason: To drop it."""
+        caption, english, chinese = self.caption, self.drafts.get("en"), self.drafts.get("zh")
+        if caption.teacher.structured != self._structured:
+            caption.teacher = caption.teacher.model_copy(update={"structured": self._structured})
+        if english is not None:
+            caption.en, caption.therefore = english.coc, english.therefore
+        caption.zh = chinese.coc if chinese else None
+        caption.slots = {language: draft.template for language, draft in self.drafts.items() if draft.template} or None
+        caption.status, caption.drop_reason = "accepted" if reason is None else "dropped", reason
+        return caption
 
     async def run(self, question: Question) -> str | None:
         """Ask, verify, regenerate and translate; return the reason to drop the window, None to accept it."""
-        reason = await self._attempt(question)
-        if reason == CONTRADICTED and self.cfg.correction_asks:  # once more, with the measured values
-            assert self.english is not None
-            assert self.answered is not None  # anchored, perhaps
+        reason, checks = await self._attempt(question), self.checks
+        if reason == CONTRADICTED and self.correction_asks:  # once more, with the measured values
             self._refused.append(reason)
-            problems = self.checks["contradictions"][:MAX_COMPLAINTS]
+            problems = (checks.contradictions or [])[:MAX_COMPLAINTS]
             measured = measured_lines(question.facts, problems)
             complaint = f"It contradicts the measured facts: {'; '.join(problems)}. Measured: {measured}."
-            correction = Correction(dump_json(self.english.written), complaint, self.cfg.correction_asks + 1)
-            self.english = self.chinese = self.verdict = None
-            for name in ("values", "contradictions"):  # they are of the refused answer
-                self.checks.pop(name, None)
-            reason = await self._attempt(replace(self.answered, correction=correction))
-        if self._recovered:
-            self.checks["recovered"] = sorted(self._recovered)
-        if self._refused:
-            self.checks["refused"] = self._refused
+            correction = Correction(dump_json(self.english.written), complaint, self.correction_asks + 1)
+            self.drafts.clear()  # and what is recorded of the refused answer
+            self.caption.verdict = checks.values = checks.contradictions = None
+            reason = await self._attempt(replace(self.answered, correction=correction))  # anchored, perhaps
+        checks.recovered, checks.refused = sorted(self._recovered) or None, self._refused or None
         return reason
 
     async def _attempt(self, question: Question) -> str | None:
@@ -227,8 +216,8 @@ class _WindowLoop:
         if reason is None and self.terms.has_mirror:
             reason = await self._mirror()
         elif reason is None:
-            self.checks["bilingual"] = "no_chinese"
-        if reason is None or (self.terms.is_given and self.english is not None):
+            self.checks.bilingual = "no_chinese"
+        if reason is None or (self.terms.is_given and self.drafts):
             contradicted = self._check_values(question)  # given captions are checked even if they are dropped
             reason = reason or contradicted
         return reason
@@ -238,24 +227,24 @@ class _WindowLoop:
     async def ask_freely(self, question: Question) -> str | None:
         """Ask until an answer is accepted; return the reason to drop the window if none is."""
         refused = Refused("", "")
-        for ask in range(self.cfg.structure_asks):
+        for ask in range(self.structure_asks):
             asked = replace(question, ask=ask) if ask else question
             answer = await self._answer(asked)
             if isinstance(answer, Draft):
                 self._accept(answer, asked)
-                self.checks["structure"] = "ok"
+                self.checks.structure = "ok"
                 return None
             refused = answer
             if refused.complaint or refused.reason == CONTEXT_FULL:
-                self.checks["structure"] = "ok" if refused.complaint else refused.reason
+                self.checks.structure = "ok" if refused.complaint else refused.reason
                 return refused.reason  # the corrections did not help, or there is no room for an answer
-        self.checks["structure"] = refused.reason
+        self.checks.structure = refused.reason
         return "structure"
 
     async def _answer(self, question: Question) -> Draft | Refused:
         """Ask, and ask for a correction while the content is refused. A wrong structure has no complaint."""
         earlier = question.correction.number if question.correction else 0
-        for number in range(self.cfg.correction_asks + 1):
+        for number in range(self.correction_asks + 1):
             reply = await self.teacher.ask(question)
             answer = self._draft(reply, question)
             if isinstance(answer, Draft) or not answer.complaint:
@@ -268,37 +257,44 @@ class _WindowLoop:
         parsed = self._read(reply, "en")
         if parsed.coc is None:
             return Refused(parsed.reason or "", "")
-        refused = refuse_decision(parsed) if "therefore" in self.terms.fields else None
-        return refused or self.way.read(parsed, question.facts)
+        decision, therefore = parsed.coc.flight_decision, parsed.therefore
+        if "therefore" in self.terms.fields and decision != therefore:
+            complaint = (
+                f'"therefore" says {therefore} and "flight_decision" says {decision}: both name the one action that '
+                "your reasoning leads to. Let the reasoning lead to the decision."
+            )
+            return Refused("decision_mismatch", complaint)
+        draft = self.format.read(parsed.coc, question.facts)
+        return replace(draft, therefore=therefore) if isinstance(draft, Draft) else draft
 
     def _read(self, reply: Reply, language: Language) -> Parsed:
-        self.asks += 1
         usage = reply.usage or Usage()
-        self.usage += usage
-        self.structured = reply.structured
+        self.caption.attempts += 1
+        self.caption.usage += usage
+        self._structured = reply.structured
         fields = self.terms.fields if language == "en" else ()
         parsed = parse_answer(reply.text, language, fields, reply.finish_reason)
         if parsed.reason == CONTEXT_FULL:
             asked, answered = usage.prompt_tokens, usage.completion_tokens
-            self.checks["refusal"] = (
+            self.checks.refusal = (
                 f"{CONTEXT_FULL}: a prompt of {asked} and an answer of {answered} tokens fill the context"
             )
         self._recovered.update(parsed.recovered)
         return parsed
 
     def _accept(self, draft: Draft, question: Question) -> None:
-        self.english, self.answered = draft, question
-        self.verdict = self._verdict_of(draft)
+        self.drafts["en"], self.answered = draft, question
+        self.caption.verdict = self._verdict_of(draft)
 
     def _verdict_of(self, draft: Draft) -> Verdict:
-        return TABLE.verdict_of(draft.coc.flight_decision, self.prepared.motion, self.label)
+        return verdict_on(draft.coc.flight_decision, self.label, self.contradicted)
 
     # --- regeneration ---
 
     async def _treat_verdict(self, question: Question) -> str | None:
         """Keep, regenerate or drop the answer according to its verdict; return the reason to drop the window."""
-        treatment = self.cfg.repair.treatment_of(self.verdict)
-        if self.judge is not None and self.verdict in ("HARD_CONFLICT", "SOFT_CONFLICT"):
+        treatment = self.cfg.repair.treatment_of(self.caption.verdict)
+        if self.judge is not None and self.caption.verdict in ("HARD_CONFLICT", "SOFT_CONFLICT"):
             treatment = "repair" if await self._is_rejected(question, self.judge) else "keep"
         if treatment == "keep":
             return None
@@ -312,39 +308,36 @@ class _WindowLoop:
         A hard conflict stays one whatever the judge says. A soft one is kept only if the judge accepts it. A label that
         the judge would put in place of the decision replaces it only if the text does not state another decision.
         """
-        assert self.english is not None
         english = self.english.coc
         flight_data = question.prompts["en"].told(replace(question.pictures, views=()).sentence("en")).user
-        self.judgement = await judge.judge(
-            Conflict(sample_id=question.window.sample_id, flight_data=flight_data, answer=english, label=self.label)
+        conflict = Conflict(
+            sample_id=question.window.sample_id, flight_data=flight_data, answer=english, label=self.label
         )
-        verdict = self.judgement.verdict
-        if verdict == "ACCEPT_ALTERNATIVE":
-            if self.verdict == "HARD_CONFLICT":
-                self.judgement.overruled_by = "geometry"
-            return self.verdict == "HARD_CONFLICT"
-        if verdict != "FIX_LABEL" or self.label is None:
+        self.caption.judge = judgement = await judge.judge(conflict)
+        if judgement.verdict == "ACCEPT_ALTERNATIVE":
+            if self.caption.verdict == "HARD_CONFLICT":
+                judgement.overruled_by = "geometry"
+            return self.caption.verdict == "HARD_CONFLICT"
+        if judgement.verdict != "FIX_LABEL" or self.label is None:
             return True
         if ACTIONS[english.flight_decision].en in english.reasoning_trace.lower():
-            self.judgement.overruled_by = "text"
+            judgement.overruled_by = "text"
             return True
-        self.repair = self._begin_repair("fix_label", self.english)
-        self.repair.outcome = "repaired"
-        self.repair.rung = "fix_label"
+        repair = self._begin_repair("fix_label")
+        repair.outcome, repair.rung = "repaired", "fix_label"
         fixed = english.model_copy(update={"flight_decision": self.label})
         self._accept(replace(self.english, coc=fixed), question)
         return False
 
-    def _begin_repair(self, strategy: str, english: Draft) -> RepairRecord:
-        decision = english.coc.flight_decision
-        return RepairRecord(strategy=strategy, first_decision=decision, first_verdict=self.verdict)
+    def _begin_repair(self, strategy: str) -> RepairRecord:
+        first, verdict = self.english.coc.flight_decision, self.caption.verdict
+        self.caption.repair = repair = RepairRecord(strategy=strategy, first_decision=first, first_verdict=verdict)
+        return repair
 
     async def regenerate(self, question: Question) -> str | None:
         """Ask again by the chosen strategy until an answer is no longer rejected (sec:appendix_e, four strategies)."""
-        assert self.english is not None
-        rejected = self.english.coc.flight_decision
-        cfg = self.cfg.repair
-        self.repair = repair = self._begin_repair(cfg.strategy, self.english)
+        rejected, cfg = self.english.coc.flight_decision, self.cfg.repair
+        repair = self._begin_repair(cfg.strategy)
         rungs: list[str] = [cfg.strategy] * cfg.max_asks
         if cfg.strategy == "cascade":  # from the freest to the surest
             rungs = ["hint", "multi_sample", *["anchored"] * cfg.max_asks][: cfg.max_asks]
@@ -358,7 +351,7 @@ class _WindowLoop:
             elif rung == "hint":
                 asked = replace(question, rejected=rejected, ask=ask)
             else:
-                asked = replace(question, ask=self.cfg.structure_asks + ask)  # the same under another sampling seed
+                asked = replace(question, ask=self.structure_asks + ask)  # the same under another sampling seed
             answer = await self._answer(asked)
             if isinstance(answer, Refused):
                 if answer.reason == CONTEXT_FULL:
@@ -372,8 +365,7 @@ class _WindowLoop:
                 is_accepted = is_accepted and verdict == "CONSISTENT"
             if is_accepted:
                 self._accept(answer, asked)
-                repair.outcome = "repaired"
-                repair.rung = rung
+                repair.outcome, repair.rung = "repaired", rung
                 return None
         return "regeneration_failed"
 
@@ -381,40 +373,34 @@ class _WindowLoop:
 
     async def _mirror(self) -> str | None:
         """Ask for the Chinese text until the pair is consistent; return the reason to drop the window."""
-        assert self.english is not None
-        assert self.answered is not None
         complaint: str | None = None
-        for ask in range(self.cfg.mirror_asks):
+        for ask in range(self.mirror_asks):
             reply = await self.teacher.mirror(self.answered, self.english, ask, complaint)
             parsed = self._read(reply, "zh")
-            answer: Draft | Refused = Refused(f"structure_{parsed.reason}", "", self.chinese)
+            answer: Draft | Refused = Refused(f"structure_{parsed.reason}", "", self.drafts.get("zh"))
             if parsed.coc is not None:
-                answer = self._compare(self.english, self.way.read_mirror(parsed, self.english, self.answered.facts))
+                facts, is_translated = self.answered.facts, not self.terms.is_fixed
+                answer = self.format.read_mirror(parsed.coc, self.english, facts, is_translated)
+            draft = answer if isinstance(answer, Draft) else answer.draft
+            self.drafts.pop("zh", None)
+            if draft is not None:
+                self.drafts["zh"] = draft
             if isinstance(answer, Draft):
-                self.chinese = answer
-                self.checks["bilingual"] = "ok"
+                self.checks.bilingual = "ok"
                 return None
-            self.chinese = answer.draft
-            self.checks["bilingual"] = answer.reason
+            self.checks.bilingual = answer.reason
             complaint = answer.complaint
             if parsed.reason == CONTEXT_FULL:
                 break
         return "bilingual"
 
-    def _compare(self, english: Draft, chinese: Draft | Refused) -> Draft | Refused:
-        """Compare a translation with its source. Templates are compared already; a given text translates nothing."""
-        is_translated = self.terms.is_translated and not self.terms.is_given
-        if isinstance(chinese, Refused) or chinese.template is not None or not is_translated:
-            return chinese
-        found = check_translation(english.coc, chinese.coc)
-        return Refused(*found, chinese) if found else chinese
-
     def _check_values(self, question: Question) -> str | None:
         """Record the values of both languages; return the reason to drop the window."""
         checks = {
-            language: self.way.check(draft, question.facts, language) for language, draft in self._drafts().items()
+            language: check_values(draft.outside, question.facts, language, draft.num_filled)
+            for language, draft in self.drafts.items()
         }
         contradictions = [f"{language} {text}" for language, check in checks.items() for text in check.contradictions]
-        self.checks["values"] = {language: check.counts for language, check in checks.items()}
-        self.checks["contradictions"] = contradictions or None
+        self.checks.values = {language: check.counts for language, check in checks.items()}
+        self.checks.contradictions = contradictions or None
         return CONTRADICTED if contradictions and self.cfg.contradicted_values == "drop" else None

@@ -21,6 +21,8 @@ from cosfly.formats.places import sample_id
 from cosfly.formats.playback import Track
 from cosfly.formats.segments import Mission
 
+KEYFRAME_STRIDE = 10  # windows from one keyframe to the next within a label, at most
+
 
 def current_frames(num_points: int, cfg: WindowConfig) -> range:
     """Return the indices that have a whole past and a whole future."""
@@ -41,7 +43,7 @@ def cut_windows(track: Track, cfg: WindowConfig, twin: Track | None = None) -> I
     keyframes: list[KeyframeRecord | None] = [None] * len(currents)
     if cfg.keyframes:
         futures = (cut_future(track, motion, i, cfg.future_frames) for i in currents)
-        chosen = choose_keyframes([TABLE.label_of(measure(future)) for future in futures], cfg.keyframe_stride)
+        chosen = choose_keyframes([TABLE.label_of(measure(future)) for future in futures], KEYFRAME_STRIDE)
         currents, keyframes = [currents[i] for i in chosen], list(chosen.values())
     for current, keyframe in zip(currents, keyframes, strict=True):
         observed = _observe(track, frames, slice(current - cfg.num_frames + 1, current + 1), folders, files)
@@ -52,12 +54,7 @@ def cut_windows(track: Track, cfg: WindowConfig, twin: Track | None = None) -> I
 
 
 def choose_keyframes(labels: list[str | None], stride: int) -> dict[int, KeyframeRecord]:
-    """Choose the first window, those at which the label changes, and each `stride`-th after a chosen one.
-
-    Returns:
-        Index -> {reason: start, change or stride; skipped: windows until the next chosen one; missed: label changes
-        among them, 0 because each change is chosen}.
-    """
+    """Choose the first window, those at which the label changes, and each `stride`-th after a chosen one; by index."""
     chosen: dict[int, KeyframeRecord] = {}
     last = -1
     for i, label in enumerate(labels):
@@ -65,7 +62,7 @@ def choose_keyframes(labels: list[str | None], stride: int) -> dict[int, Keyfram
         if reason is None:
             chosen[last].skipped += 1
         else:
-            chosen[i] = KeyframeRecord(reason=reason, skipped=0, missed=0)
+            chosen[i] = KeyframeRecord(reason=reason, skipped=0, missed=0)  # each change of the label is chosen
             last = i
     return chosen
 

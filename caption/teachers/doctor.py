@@ -7,6 +7,7 @@ answer or in the count of tokens.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -16,24 +17,17 @@ import numpy as np
 
 from caption.answer_formats.contract import THEREFORE
 from caption.schema import CaptionConfig, ObservedFrame, ObservedWindow
-from caption.teachers.images import encode_image
-from caption.teachers.prompts import (
-    MAX_RETURNED_CHARACTERS,
-    Correction,
-    correction_messages,
-    make_question,
-    teacher_prompt,
-    text_of,
-)
-from caption.verification.vocabulary import Vocabulary
+from caption.teachers.prompt_files import Vocabulary
+from caption.teachers.prompts import MAX_RETURNED_CHARACTERS, Correction, make_question, question_messages
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Reply
 from cosfly.llm.protocol import BadReply, read_body, thoughts_of
 from cosfly.llm.refusals import MEANINGS, RefusedRequest
+from cosfly.llm.student_chat import EncodedImage, encoded_image
 from cosfly.runtime.errors import TeacherError
 from cosfly.runtime.json_io import parse_json
-from cosfly.viz.frame_views import VIEW_FILES
+from cosfly.viz.frame_views import VIEW_FILES, Pictures
 
 State = Literal["ok", "warning", "unusable"]
 
@@ -87,7 +81,8 @@ class _Probe:
 
 class _Examination:
     def __init__(self, client: ChatClient, cfg: CaptionConfig, vocabulary: Vocabulary) -> None:
-        self.client, self.cfg, self.vocabulary = client, cfg, vocabulary
+        self.client, self.cfg = client, cfg
+        self.largest = largest_messages(cfg, vocabulary)
         self.takes_schema = cfg.endpoint.json_schema
         self.findings: list[Finding] = []
 
@@ -126,31 +121,24 @@ class _Examination:
     async def _answers(self) -> bool:
         probe = await self._ask([_user(READY)], self.cfg.endpoint.max_tokens)
         if not probe.text:
-            empty = "an empty answer"
-            if probe.thoughts:
-                empty = f"{probe.thoughts} characters of thinking and no answer; switch thinking off with {NO_THINKING}"
-            self._add("answers", "unusable", probe.detail or empty)
+            empty = f"{probe.thoughts} characters of thinking and no answer; switch thinking off with {NO_THINKING}"
+            self._add("answers", "unusable", probe.detail or (empty if probe.thoughts else "an empty answer"))
             return False
         self._add("answers", "ok", f"{probe.text[:40]!r}")
-        if probe.thoughts or "<think" in probe.text:
-            self._add(
-                "thinking", "warning", f"the model thinks before it answers; switch thinking off with {NO_THINKING}"
-            )
-        else:
-            self._add("thinking", "ok", "off")
+        is_off = not probe.thoughts and "<think" not in probe.text
+        fix = f"the model thinks before it answers; switch thinking off with {NO_THINKING}"
+        self._add("thinking", "ok" if is_off else "warning", "off" if is_off else fix)
         return True
 
     async def _try_schema(self) -> None:
         probe = await self._ask([_user("Hello! How are you today?")], 256, ODD_SCHEMA)
+        answer: object = None
+        with contextlib.suppress(ValueError):
+            answer = parse_json(probe.text)
         if probe.reply is None:
             self.takes_schema &= not probe.refuses_schema
             self._add("JSON schema", "warning", f"refused ({probe.detail}), so answers are parsed from plain text")
-            return
-        try:
-            is_applied = parse_json(probe.text) == {"animal": ODD_WORD, "legs": 7}
-        except ValueError:
-            is_applied = False
-        if is_applied:
+        elif answer == {"animal": ODD_WORD, "legs": 7}:
             self._add("JSON schema", "ok", "applied: the answer has the unusual shape of the schema")
         else:
             got = f"accepted but ignored: asked for {{animal: {ODD_WORD}}}, got {probe.text[:40]!r}"
@@ -159,32 +147,28 @@ class _Examination:
 
     async def _takes_images(self) -> bool:
         """Send as many pictures as a prompt of ours holds."""
-        count, limit = self.cfg.num_images, self.cfg.endpoint.max_tokens
-        probe = await self._ask([_user(READY, self._pictures())], limit)
+        limit = self.cfg.endpoint.max_tokens
+        pictures = [part for part in self.largest[1]["content"] if part["type"] == "image_url"]
+        probe, tokens = await self._ask([_user(READY, pictures)], limit), None
+        count = f"{len(pictures)} pictures in a prompt"
+        if probe.prompt_tokens is not None:
+            without = (await self._ask([_user(READY)], limit)).prompt_tokens
+            tokens = None if without is None else probe.prompt_tokens - without
         if probe.reply is None:
-            self._add("image input", "unusable", f"a prompt with {count} pictures is refused: {probe.detail}")
-            return False
-        without = await self._ask([_user(READY)], limit)
-        if probe.prompt_tokens is None or without.prompt_tokens is None:
+            self._add("image input", "unusable", f"a prompt with {len(pictures)} pictures is refused: {probe.detail}")
+        elif tokens is None:
             detail = "but it is unknown whether the model sees them, because token usage is not reported"
-            self._add("image input", "warning", f"{count} pictures in a prompt are accepted, {detail}")
-            return True
-        tokens = probe.prompt_tokens - without.prompt_tokens
-        if tokens < count:
-            self._add(
-                "image input",
-                "unusable",
-                f"{count} pictures in a prompt are accepted but ignored: they add {tokens} tokens",
-            )
-            return False
-        self._add("image input", "ok", f"{count} pictures in a prompt, {tokens} tokens")
-        return True
+            self._add("image input", "warning", f"{count} are accepted, {detail}")
+        elif tokens < len(pictures):
+            self._add("image input", "unusable", f"{count} are accepted but ignored: they add {tokens} tokens")
+        else:
+            self._add("image input", "ok", f"{count}, {tokens} tokens")
+        return self.findings[-1].state != "unusable"
 
     async def _try_context(self) -> None:
         """Send a prompt as long as ours get, with our answer limit and schema."""
         limit, context = self.cfg.endpoint.max_tokens, self.client.context
-        messages = largest_messages(self.cfg, self.vocabulary, self._pictures())
-        probe = await self._ask(messages, limit, answer_schema(more=THEREFORE) if self.takes_schema else None)
+        probe = await self._ask(self.largest, limit, answer_schema(more=THEREFORE) if self.takes_schema else None)
         used, known = probe.prompt_tokens, f" of the context of {context}" if context else ""
         detail = f"{used or 'unknown'} tokens of the largest prompt and {limit} for the answer"
         if probe.reply is None:
@@ -194,40 +178,37 @@ class _Examination:
         else:
             self._add("context length", "ok", f"{detail}{known}")
 
-    def _pictures(self) -> list[dict]:
-        """Return pictures of the number and size of a prompt of ours, each another."""
-        image = self.cfg.image
-        width = image.max_side_px * (len(image.modalities) if image.layout == "tiled" else 1)
-        size = (image.max_side_px * 9 // 16, width, 3)
-        count = self.cfg.num_images
-        pictures = [encode_image(np.full(size, 200 * number // count, np.uint8), image) for number in range(count)]
-        return [{"type": "image_url", "image_url": {"url": picture.url}} for picture in pictures]
 
-
-def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary, pictures: list[dict]) -> list[dict]:
-    """Return messages as long as ours get: a made-up window whose numbers have many digits."""
-    count = cfg.window.num_frames
-    far_m = (-12345.67, -12345.67, -12345.67)
+def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary) -> list[dict]:
+    """Return messages as long as ours get: a made-up window of plain pictures whose numbers have many digits."""
+    far_m, rotation_deg = (-12345.67, -12345.67, -12345.67), (-123.4, -123.4, -123.4)
     box_px = (1200.0, 600.0, 1260.0, 700.0)
-    frame = ObservedFrame(0.0, far_m, (-123.4, -123.4, -123.4), far_m, (1234.5, 654.3), box_px, True, True, 0.5)
+    frame = ObservedFrame(0.0, far_m, rotation_deg, far_m, (1234.5, 654.3), box_px, True, True, 0.5)
+    count = cfg.window.num_frames
     window = ObservedWindow(
-        sample_id="doctor_ORI_frame_00004",
-        town="doctor",
-        trajectory="doctor",
-        variant="ORI",
-        indices=tuple(range(count)),
-        width_px=1280,
-        height_px=720,
+        sample_id="doctor_ORI_frame_00004", town="doctor", trajectory="doctor", variant="ORI",
+        indices=tuple(range(count)), width_px=1280, height_px=720,
         frames=tuple(replace(frame, time_s=0.5 * i, target_m=(i - 12245.67, -12245.67, 0.0)) for i in range(count)),
-        frame_folders=(Path("frame"),) * count,
+        frame_folders=tuple(Path(str(i)) for i in range(count)),
         frame_files=(frozenset(VIEW_FILES.values()),) * count,
-    )
-    question = make_question(window, cfg.image, cfg.writing, vocabulary)
-    messages = [{"role": "system", "content": teacher_prompt(question.way)}, _user(text_of(question), pictures)]
-    if not cfg.correction_asks:
-        return messages
+    )  # fmt: skip
     refused = "Nothing has to change. " * (MAX_RETURNED_CHARACTERS // 23)
-    return messages + correction_messages(Correction(refused, refused[:MAX_COMPLAINT], 1), vocabulary)
+    question = replace(
+        make_question(window, cfg.image, cfg.writing, vocabulary),
+        correction=Correction(refused, refused[:MAX_COMPLAINT], 1),
+    )
+
+    def draw(folder: Path, pictures: Pictures) -> list[EncodedImage]:
+        """Draw the pictures of a frame, each in another grey, so that a server takes none for another."""
+        num_views, (width_px, height_px) = len(pictures.views), pictures.size_px
+        shape = (height_px, width_px * (num_views if pictures.layout == "tiled" else 1), 3)
+        greys = [
+            (num_views * int(folder.name) + view) % 256
+            for view in range(1 if pictures.layout == "tiled" else num_views)
+        ]
+        return [encoded_image(np.full(shape, grey, np.uint8)) for grey in greys]
+
+    return question_messages(question, draw)[0]
 
 
 def _user(text: str, pictures: list[dict] | None = None) -> dict:

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import base64
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from caption.schema import ImageConfig, ObservedWindow
 from cosfly.llm.student_chat import EncodedImage
-from cosfly.runtime.io import sha256_bytes
-from cosfly.viz.frame_views import VIEW_FILES, Pictures, encode_picture, scaled_size
+from cosfly.viz.frame_views import VIEW_FILES, Pictures, scaled_size
 
 CACHE_FRAMES = 256  # encoded frames in memory, for the windows that share them
-JPEG_QUALITY = 90
 
 
-class FrameSource(Protocol):
-    """A source of the pictures of a frame: read from its folder, or drawn."""
-
-    def encode(self, frame: Path, pictures: Pictures) -> list[EncodedImage]: ...
+EncodeFrame = Callable[[Path, Pictures], list[EncodedImage]]  # the pictures of a frame, by its folder
 
 
 def pictures_of(window: ObservedWindow, cfg: ImageConfig) -> Pictures:
@@ -41,12 +34,8 @@ def pictures_of(window: ObservedWindow, cfg: ImageConfig) -> Pictures:
 class FrameEncoder:
     """Reads and encodes frames on any thread, each once; keeps the last CACHE_FRAMES of them."""
 
-    def __init__(self, cfg: ImageConfig, encode: Callable[[np.ndarray], EncodedImage] | None = None) -> None:
-        """
-        Args:
-            encode: Encodes one picture; None encodes it as the settings say.
-        """
-        self._encode = encode or (lambda rgb: encode_image(rgb, cfg))
+    def __init__(self, encode: Callable[[np.ndarray], EncodedImage]) -> None:
+        self._encode = encode
         self._cache: OrderedDict[tuple[Path, Pictures], Future[list[EncodedImage]]] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -65,14 +54,3 @@ class FrameEncoder:
             except Exception as error:
                 future.set_exception(error)
         return future.result()
-
-    def encode_window(self, window: ObservedWindow, pictures: Pictures) -> list[list[EncodedImage]]:
-        """Return the pictures of each frame of a window."""
-        return [self.encode(frame, pictures) if pictures.views else [] for frame in window.frame_folders]
-
-
-def encode_image(rgb: np.ndarray, cfg: ImageConfig) -> EncodedImage:
-    """Encode a picture, (h, w, 3) uint8 RGB, as the data URL of a request, with the sha256 of its bytes."""
-    data = encode_picture(rgb, cfg.encoding, JPEG_QUALITY)
-    url = f"data:image/{cfg.encoding};base64,{base64.b64encode(data).decode('ascii')}"
-    return EncodedImage(url, sha256_bytes(data))

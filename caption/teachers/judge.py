@@ -14,16 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
-from rich.table import Table
-
 from caption.schema import JudgeConfig, Judgement
-from caption.verification.vocabulary import Vocabulary
+from caption.teachers.prompt_files import Vocabulary
 from cosfly.formats.captions import Coc, JudgeRecord
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook, Budget, KeptAnswers
 from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.contract import NoAnswer, Request, Troubles, started
-from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import read_unpacked
 from cosfly.runtime.json_io import Record, dump_json, parse_document, validated
 from cosfly.runtime.model_json import find_object
@@ -174,15 +171,29 @@ class JudgeCheck:
         """Share of the readable answers that took the option named first; 1/3 is without bias."""
         return self.num_first / max(1, self.confusion.total() - self.num_unjudged)
 
+    def rows(self) -> list[tuple[str, str, str]]:
+        """Return the figures as rows of a table: figure, value, meaning."""
+        asks = f"of {self.confusion.total()} answers ({self.num_conflicts} cases, three orders of the options)"
+        rows = [
+            ("agreement", f"{self.agreement:.1%}", f"with the gold judgement, {asks}; chance is 33.3%"),
+            ("position bias", f"{self.first_share:.1%}", "answers that chose the first option; without bias 33.3%"),
+            ("moved", f"{self.num_moved} of {self.num_conflicts}", "cases whose verdict depends on the order"),
+            ("unparsable", str(self.num_unjudged), f"counted as unjudged, {asks}"),
+        ]
+        for gold in JUDGEMENTS:
+            counts = {name: self.confusion[gold, name] for name in (*JUDGEMENTS, UNJUDGED)}
+            row = ", ".join(f"{name} {count}" for name, count in counts.items())
+            rows.append((f"gold {gold}", str(sum(counts.values())), row))
+        return rows
+
 
 async def check_judge(cfg: JudgeConfig, vocabulary: Vocabulary, gold: list[GoldConflict], seed: int = 0) -> JudgeCheck:
-    """Measure a judge; TeacherError if the endpoint cannot be used."""
+    """Measure the judge of the settings; TeacherError if the endpoint cannot be used."""
     orders = [(*JUDGEMENTS[i:], *JUDGEMENTS[:i]) for i in range(len(JUDGEMENTS))]
     confusion: Counter[tuple[str, str]] = Counter()
     num_moved = num_first = 0
     async with open_judge(cfg, vocabulary, seed) as judge:
-        if judge is None:
-            raise InputError("the check needs a judge", where="--judge", expected="the URL of an endpoint")
+        assert judge is not None  # the settings name one
         records = iter(await asyncio.gather(*(judge.judge(conflict, order) for conflict in gold for order in orders)))
         for conflict in gold:
             verdicts = [next(records).verdict for _ in orders]
@@ -191,20 +202,3 @@ async def check_judge(cfg: JudgeConfig, vocabulary: Vocabulary, gold: list[GoldC
             num_first += sum(verdict == order[0] for verdict, order in zip(verdicts, orders, strict=True))
         model = f"{judge.kept.engine.model} at {judge.kept.engine.where}"
     return JudgeCheck(model, len(gold), num_moved, num_first, confusion)
-
-
-def judge_check_table(check: JudgeCheck) -> Table:
-    """Return the figures as a table for the terminal."""
-    table = Table("figure", "value", "meaning", title=f"Judge {check.model}", title_justify="left")
-    asks = f"of {check.confusion.total()} answers ({check.num_conflicts} cases, three orders of the options)"
-    table.add_row("agreement", f"{check.agreement:.1%}", f"with the gold judgement, {asks}; chance is 33.3%")
-    table.add_row(
-        "position bias", f"{check.first_share:.1%}", "answers that chose the first option; without bias 33.3%"
-    )
-    table.add_row("moved", f"{check.num_moved} of {check.num_conflicts}", "cases whose verdict depends on the order")
-    table.add_row("unparsable", str(check.num_unjudged), f"counted as unjudged, {asks}")
-    for gold in JUDGEMENTS:
-        counts = {name: check.confusion[gold, name] for name in (*JUDGEMENTS, UNJUDGED)}
-        row = ", ".join(f"{name} {count}" for name, count in counts.items())
-        table.add_row(f"gold {gold}", str(sum(counts.values())), row)
-    return table

@@ -9,12 +9,12 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterator, Mapping
-from functools import cache, lru_cache
+from dataclasses import dataclass
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from string import Template
 
-from caption.schema import CaptionConfig
-from caption.verification.vocabulary import Vocabulary
+from caption.schema import CaptionConfig, TextState
 from cosfly.formats.captions import OWN_PROMPTS
 from cosfly.runtime.errors import ConfigError, InputError, nearest
 from cosfly.runtime.io import read_text, refuse_links, storage_errors, write_bytes
@@ -23,6 +23,29 @@ log = logging.getLogger(__name__)
 
 PROMPTS = Path(__file__).with_name("prompts")
 SUFFIX, VERSION = ".txt", "# version: "
+
+
+@dataclass(frozen=True, eq=False)
+class Vocabulary:
+    """The prompts of a run.
+
+    Hashed by identity, so that caches of its prompts are fast.
+
+    Args:
+        prompts: name of a prompt file -> its text, with its version line.
+        text_state: which flight data the questions contain.
+    """
+
+    prompts: Mapping[str, str]
+    text_state: TextState = "relative"
+
+    @cached_property
+    def templates(self) -> dict[str, Template]:
+        """The prompts without their version lines; `user_en` and `user_zh` are those of the text state."""
+        templates = {name: Template(text.partition("\n")[2].rstrip("\n")) for name, text in self.prompts.items()}
+        if self.text_state == "paper":
+            templates |= {f"user_{language}": templates[f"user_paper_{language}"] for language in ("en", "zh")}
+        return templates
 
 
 @cache
@@ -96,17 +119,14 @@ def export_prompts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
         folder.mkdir(parents=True, exist_ok=True)
     refuse_links(folder)
     paths = {folder / f"{name}{SUFFIX}": text for name, text in texts.items()}
-    others = [path.name for path, text in paths.items() if _is_another(path, text)]
+    kept = [path for path in paths if path.exists()]
+    others = [path.name for path in kept if not path.is_file() or read_text(path) != paths[path]]
     if others:
         what, fix = "the folder already contains prompts with a different text", "choose another folder"
         raise ConfigError(what, where=folder, got=", ".join(others), fix=fix)
     for path, text in paths.items():
         write_bytes(path, text.encode())
     return list(paths)
-
-
-def _is_another(path: Path, text: str) -> bool:
-    return path.exists() and not (path.is_file() and read_text(path) == text)
 
 
 def vocabulary_of(cfg: CaptionConfig) -> Vocabulary:

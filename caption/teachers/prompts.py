@@ -5,22 +5,23 @@ Nothing here reads the future. Every caption records the hash of its question.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
-from caption.answer_formats.contract import Draft, WayOfWriting, way_of
-from caption.schema import ImageConfig, ObservedFrame, ObservedWindow, TextState
-from caption.teachers.images import FrameSource, pictures_of
-from caption.teachers.prompt_files import prompt_format
+from caption.answer_formats.contract import Draft
+from caption.answer_formats.formats import FORMATS, AnswerFormat
+from caption.schema import ImageConfig, ObservedWindow
+from caption.teachers.images import EncodeFrame, pictures_of
+from caption.teachers.prompt_files import Vocabulary, prompt_format
 from caption.verification.facts import Facts, Series, measure_facts
-from caption.verification.glossary import load_glossary
-from caption.verification.references import Fact, Reference, look_up
-from caption.verification.vocabulary import Vocabulary
+from caption.verification.glossary import LANGUAGES, form_of, prompt_line, translations, written_unit
+from caption.verification.references import QUANTITIES, Fact, Reference, look_up
 from cosfly.formats.captions import ACTIONS, GOAL_WORDS, PICTURES_MARK, TOKENS, Language, Prompt, Writing
-from cosfly.formats.segments import MISSION_KINDS
+from cosfly.llm.student_chat import EncodedImage, chat_messages
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import dump_json
-from cosfly.viz.frame_views import Pictures, frame_label
+from cosfly.viz.frame_views import Pictures
 
 MAX_RETURNED_CHARACTERS = 6000  # of a refused answer that is returned to its teacher
 
@@ -50,7 +51,8 @@ class Question:
     facts: Facts
     prompts: dict[Language, Prompt]
     pictures: Pictures
-    way: WayOfWriting
+    writing: Writing
+    vocabulary: Vocabulary
     decision: str | None = None
     rejected: str | None = None
     ask: int = 0
@@ -63,55 +65,55 @@ class Question:
         return f"{kind}/{self.ask}" + (f"/correction_{self.correction.number}" if self.correction else "")
 
     @property
+    def format(self) -> AnswerFormat:
+        return FORMATS[self.writing]
+
+    @property
     def asked(self) -> dict[Language, Prompt]:
         return {language: prompt.told(self.pictures.sentence(language)) for language, prompt in self.prompts.items()}
 
 
 @lru_cache
-def _with_actions(name: str, vocabulary: Vocabulary) -> str:
+def system_prompt(name: str, vocabulary: Vocabulary) -> str:
+    """Return a system prompt: `system_en` and `system_zh` are those of students, which captions record."""
     return vocabulary.templates[name].substitute(actions=", ".join(TOKENS))
 
 
-def student_prompt(language: Language, vocabulary: Vocabulary) -> str:
-    """Return the system prompt that a student is trained with, and that captions record."""
-    return _with_actions(f"system_{language}", vocabulary)
-
-
-def teacher_prompt(way: WayOfWriting, decision: str | None = None) -> str:
+def teacher_prompt(question: Question) -> str:
     """Return the system prompt of a teacher; a decision is a constraint (the anchored strategy of sec:appendix_e)."""
-    prompt = _with_actions(way.system, way.vocabulary)
-    return prompt if decision is None else f"{prompt}\n{decision_words(decision, way.vocabulary)}"
+    return system_prompt(question.format.system, question.vocabulary) + regeneration_lines(question)
 
 
-def decision_words(decision: str, vocabulary: Vocabulary) -> str:
-    """Return the sentences that constrain an answer to a decision."""
-    words = ACTIONS[decision].en
-    return vocabulary.templates["anchored_en"].substitute(decision=decision, decision_words=words)
-
-
-def build_prompts(window: ObservedWindow, facts: Facts, vocabulary: Vocabulary) -> dict[Language, Prompt]:
-    """Return the prompts of a window in both languages, with a mark for the sentence about the pictures."""
-    users = user_prompts(window, facts, vocabulary)
-    return {
-        language: Prompt(system=student_prompt(language, vocabulary), user=user) for language, user in users.items()
-    }
+def regeneration_lines(question: Question) -> str:
+    """Return what a regeneration adds to the system prompt: the decision, or the rejected one."""
+    lines, templates = "", question.vocabulary.templates
+    if question.decision is not None:
+        words = ACTIONS[question.decision].en
+        lines += "\n" + templates["anchored_en"].substitute(decision=question.decision, decision_words=words)
+    if question.rejected is not None:
+        lines += "\n" + templates["hint_en"].substitute(rejected=question.rejected)
+    return lines
 
 
 def user_prompts(window: ObservedWindow, facts: Facts, vocabulary: Vocabulary) -> dict[Language, str]:
-    """Return the questions without the system prompt, which is the same for all windows."""
-    numbers = _numbers(window, facts, vocabulary.text_state)
-    languages: tuple[Language, Language] = ("en", "zh")
-    return {language: _user_prompt(numbers, window, facts, language, vocabulary) for language in languages}
-
-
-def mission_lines(language: Language) -> dict[str, str]:
-    """Return the last line of a prompt by the kind of the mission's order."""
-    return _MISSION[language]
+    """Return the questions of a window, with a mark for the sentence about the pictures, without system prompts."""
+    is_paper = vocabulary.text_state == "paper"
+    numbers = {} if is_paper else _relative_state(facts)
+    numbers |= {"num_frames": str(len(facts)), "step_s": f"{facts.step_s:g}", "pictures": PICTURES_MARK}
+    users: dict[Language, str] = {}
+    for language in LANGUAGES:
+        seen = [form_of(word, 0, language) for word in facts.visibility]
+        words = {"visibility_before": ", ".join(seen[:-1]), "visibility": seen[-1]}
+        if is_paper:
+            words = _paper_state(window, facts, language) | {"visibility": ", ".join(seen)}
+        question = prompt_format(f"user_{language}", vocabulary) % (numbers | words)
+        users[language] = "\n".join([question, *_further_lines(window, facts, language)])
+    return users
 
 
 def prompt_hash(question: Question) -> str:
-    """Return the hash of the free question and its system prompts."""
-    standing = _standing_hash(*[prompt.system for prompt in question.prompts.values()], teacher_prompt(question.way))
+    """Return the hash of a free question and its system prompts."""
+    standing = _standing_hash(*[prompt.system for prompt in question.prompts.values()], teacher_prompt(question))
     users = [
         prompt.user.replace(PICTURES_MARK, question.pictures.sentence(language))
         for language, prompt in question.prompts.items()
@@ -125,83 +127,42 @@ def _standing_hash(*texts: str) -> str:
     return sha256_bytes("\x00".join(texts).encode())
 
 
-def _user_prompt(
-    numbers: dict[str, str], window: ObservedWindow, facts: Facts, language: Language, vocabulary: Vocabulary
-) -> str:
-    unknown, unit = _WORDS_OF_NUMBERS[language]
-    glossary = load_glossary()
-    own = {"pictures": PICTURES_MARK}
-    visibility = [glossary.visibility(word, language) for word in facts.visibility]
-    if vocabulary.text_state == "paper":
-        speed = _mean_step_speed(facts)
-        own |= {
-            "visibility": ", ".join(visibility),
-            "target_speed": unknown if speed is None else f"{speed:.2f}{unit}",
-            "target": "; ".join([place or unknown for place in _target_texts(window, facts)]),
-        }
-    else:
-        own |= {"visibility_before": ", ".join(visibility[:-1]), "visibility": visibility[-1]}
-    lines = [prompt_format(f"user_{language}", vocabulary) % (numbers | own), *_company_lines(window, facts, language)]
+def _further_lines(window: ObservedWindow, facts: Facts, language: Language) -> Iterator[str]:
+    """Yield the lines about the goal and the other people, of tracks with other people, and about the mission."""
+    if window.goal:
+        yield GOAL_WORDS[language] % window.goal[language]
+    if None not in facts.others_in_view:
+        away = ["-" if one is None else f"{one:.1f}" for one in facts.other_distance_m]
+        alike = ["-" if one is None else str(one) for one in facts.alike_differences]
+        told = (map(str, facts.others_in_view), away, alike)
+        yield prompt_line("others", language) % tuple(", ".join(one) for one in told)
     if window.mission is not None:
-        lines.append(_MISSION[language][window.mission])
-    return "\n".join(lines)
+        yield prompt_line(window.mission, language)
 
 
-def _company_lines(window: ObservedWindow, facts: Facts, language: Language) -> list[str]:
-    """Return the lines about the goal and the other people, of tracks with other people."""
-    lines = [GOAL_WORDS[language] % window.goal[language]] if window.goal else []
-    if None in facts.others_in_view:
-        return lines
-    away = ["-" if one is None else f"{one:.1f}" for one in facts.other_distance_m]
-    alike = ["-" if one is None else str(one) for one in facts.alike_differences]
-    told = (map(str, facts.others_in_view), away, alike)
-    return [*lines, _OTHERS[language] % tuple(", ".join(one) for one in told)]
+# The size in pixels depends on the zoom, which differs between tracks and says nothing about the motion.
+_BOX_GROWTH = Reference("box_height", "growth")
+_SERIES = ("ahead", "distance", "bearing", "offset_x", "offset_y", "target_speed", "speed", "yaw", "altitude")
+_VELOCITY = ("forward_speed", "sideways_speed", "climb_speed")
+_TARGET_VELOCITY = ("target_forward_speed", "target_sideways_speed")
 
 
-_OTHERS: dict[Language, str] = {
-    "en": "Other people in view: [%s]; from the target to the nearest: [%s] m; the most alike differs from it in [%s] "
-    "of the items of appearance.",
-    "zh": "视野内其他行人数：[%s]；其中最近者距目标：[%s] 米；外观与目标最相近者有 [%s] 项不同。",
-}
-
-
-# The state of the mission, from the frame on at which the drone knows it; the decision that follows is not named.
-_MISSION: dict[Language, dict[str, str]] = {
-    "en": {
-        "geofence": "Mission: the border of the permitted area is reached; the pursuit may not go on.",
-        "battery": "Mission: the battery is down to the reserve for the way home.",
-        "time_over": "Mission: the time of the mission is over.",
-    },
-    "zh": {
-        "geofence": "任务状态：已到达允许飞行区域的边界，不得继续跟踪。",
-        "battery": "任务状态：电池电量已降至返航储备。",
-        "time_over": "任务状态：任务时间已到。",
-    },
-}
-assert all(set(told) == set(MISSION_KINDS) for told in _MISSION.values())
-
-_WORDS_OF_NUMBERS: dict[Language, tuple[str, str]] = {"en": ("unknown", " m/s"), "zh": ("未知", " 米/秒")}
-
-
-def _numbers(window: ObservedWindow, facts: Facts, text_state: TextState) -> dict[str, str]:
-    """Return the numbers of a prompt, which are the same in both languages."""
-    numbers = {"num_frames": str(len(facts)), "step_s": f"{facts.step_s:g}"}
-    return numbers | (_paper_numbers(window, facts) if text_state == "paper" else _relative_numbers(facts))
-
-
-def _relative_numbers(facts: Facts) -> dict[str, str]:
+def _relative_state(facts: Facts) -> dict[str, str]:
     """Return the earlier values, the current value and the change of every series, and the velocities.
 
     The change is that of the slot `{change:...}`: from the first frame at which the value is known.
     """
+    left, above = ([place and place[axis] for place in facts.place_m] for axis in (1, 2))
+    series: dict[str, tuple[Series, int]] = {"left": (left, 1), "above": (above, 1)}
+    series |= {name: (QUANTITIES[name].read(facts), QUANTITIES[name].digits) for name in _SERIES}
     numbers = dict[str, str]()
-    for name, (series, form) in _series(facts).items():
-        texts = ["-" if value is None else form % value for value in series]
-        known = [value for value in series if value is not None]
+    for name, (values, digits) in series.items():
+        form = f"%.{digits}f"
+        texts = ["-" if value is None else form % value for value in values]
+        known = [value for value in values if value is not None]
+        is_known = values[-1] is not None and len(known) > 1
         numbers[f"{name}_before"], numbers[name] = ", ".join(texts[:-1]), texts[-1]
-        numbers[f"{name}_change"] = (
-            "-" if series[-1] is None or len(known) < 2 else _signed(form % (known[-1] - known[0]))
-        )
+        numbers[f"{name}_change"] = _signed(form % (known[-1] - known[0])) if is_known else "-"
     velocities: dict[str, float | None] = dict(zip(_VELOCITY, facts.velocity_mps, strict=True))
     velocities |= zip(_TARGET_VELOCITY, facts.target_velocity_mps or (None, None), strict=True)
     numbers |= {name: "-" if speed is None else f"{speed:.2f}" for name, speed in velocities.items()}
@@ -215,104 +176,69 @@ def _signed(number: str) -> str:
     return "0" if not number.strip("-0.") else number if number[0] == "-" else f"+{number}"
 
 
-# The size in pixels depends on the zoom, which differs between tracks and says nothing about the motion.
-_BOX_GROWTH = Reference("box_height", "growth")
-_VELOCITY = ("forward_speed", "sideways_speed", "climb_speed")
-_TARGET_VELOCITY = ("target_forward_speed", "target_sideways_speed")
-
-
-def _series(facts: Facts) -> dict[str, tuple[Series, str]]:
-    """Return the series of the relative state, each with its format."""
-    ahead, left, above = ([place and place[axis] for place in facts.place_m] for axis in range(3))
-    return {
-        "ahead": (ahead, "%.1f"), "left": (left, "%.1f"), "above": (above, "%.1f"),
-        "distance": (facts.distance_m, "%.1f"), "bearing": (facts.bearing_deg, "%.1f"),
-        "offset_x": (facts.offset_x_px, "%d"), "offset_y": (facts.offset_y_px, "%d"),
-        "target_speed": (facts.target_speeds_mps, "%.2f"), "speed": (facts.speed_mps, "%.2f"),
-        "yaw": (facts.yaw_deg, "%.1f"), "altitude": (facts.altitude_m, "%.1f"),
-    }  # fmt: skip
-
-
-def _paper_numbers(window: ObservedWindow, facts: Facts) -> dict[str, str]:
+def _paper_state(window: ObservedWindow, facts: Facts, language: Language) -> dict[str, str]:
+    """Return what the paper's sample states: series of the drone, its poses, the target's mean speed and positions."""
+    unknown = prompt_line("unknown", language)
+    speeds = [speed for speed in facts.target_step_speeds_mps if speed is not None]
+    positions = [
+        "(" + ", ".join([f"{axis_m:z.2f}" for axis_m in frame.target_m]) + ")" if place else unknown
+        for frame, place in zip(window.frames, facts.place_m, strict=True)
+    ]
+    poses = [(*frame.position_m, *frame.rotation_deg) for frame in window.frames]
     return {
         # The oldest frame has no earlier one in the window: 0.0 by definition, as in the paper's sample.
         "speed": ", ".join(["0.0" if v is None else f"{v:.2f}" for v in facts.step_speeds_mps]),
         "altitude": ", ".join([f"{v:.1f}" for v in facts.altitude_m]),
         "yaw": ", ".join([f"{v:.1f}" for v in facts.yaw_deg]),
-        "pose": "; ".join([_pose_text(frame) for frame in window.frames]),
+        "pose": "; ".join(
+            [
+                f"({x:z.2f}, {y:z.2f}, {z:z.2f}; {pitch:z.1f}, {yaw:z.1f}, {roll:z.1f})"
+                for x, y, z, pitch, yaw, roll in poses
+            ]
+        ),
+        "target_speed": f"{sum(speeds) / len(speeds):.2f} {written_unit('mps', language)}" if speeds else unknown,
+        "target": "; ".join(positions),
     }
-
-
-def _mean_step_speed(facts: Facts) -> float | None:
-    speeds = [speed for speed in facts.target_step_speeds_mps if speed is not None]
-    return sum(speeds) / len(speeds) if speeds else None
-
-
-# Five windows of a track share a frame, and both languages its text.
-@lru_cache(maxsize=64)
-def _pose_text(frame: ObservedFrame) -> str:
-    (x, y, z), (pitch, yaw, roll) = frame.position_m, frame.rotation_deg
-    return f"({x:z.2f}, {y:z.2f}, {z:z.2f}; {pitch:z.1f}, {yaw:z.1f}, {roll:z.1f})"
-
-
-def _target_texts(window: ObservedWindow, facts: Facts) -> list[str]:
-    """Return the target's position at each frame, "" where the target is not seen."""
-    return [
-        "(" + ", ".join([f"{axis_m:z.2f}" for axis_m in frame.target_m]) + ")" if place else ""
-        for frame, place in zip(window.frames, facts.place_m, strict=True)
-    ]
 
 
 # --- requests ---------------------------------------------------------------------------------------------------------
 
 
-def question_messages(question: Question, encoder: FrameSource) -> tuple[list[dict], list[str]]:
+def question_messages(question: Question, encode: EncodeFrame) -> tuple[list[dict], list[str]]:
     """Return the chat messages of a question and the digests of its pictures.
 
     The pictures come first, oldest first, each frame under its name, then the flight data: windows of one flight share
     the system prompt as a prefix and four of five frames as identical pictures.
     """
-    content: list[dict] = []
-    digests: list[str] = []
-    if question.pictures.views:
-        for number, folder in enumerate(question.window.frame_folders):
-            content.append({"type": "text", "text": frame_label(number)})
-            for image in encoder.encode(folder, question.pictures):
-                content.append({"type": "image_url", "image_url": {"url": image.url}})
-                digests.append(image.digest)
-    content.append({"type": "text", "text": text_of(question)})
-    system, templates = teacher_prompt(question.way, question.decision), question.way.vocabulary.templates
-    if question.rejected is not None:
-        system += "\n" + templates["hint_en"].substitute(rejected=question.rejected)
-    messages: list[dict] = [{"role": "system", "content": system}, {"role": "user", "content": content}]
-    return messages + correction_messages(question.correction, question.way.vocabulary), digests
+    frames = encode_frames(question, encode)
+    parts = [[{"type": "image_url", "image_url": {"url": image.url}} for image in images] for images in frames]
+    table = question.format.table(question.facts)
+    text = question.asked["en"].user + ("\n" + table if table else "")
+    messages = chat_messages(Prompt(system=teacher_prompt(question), user=text), parts)
+    if question.correction is not None:
+        complaint = question.vocabulary.templates["correction_en"].substitute(complaint=question.correction.complaint)
+        messages += [
+            {"role": "assistant", "content": question.correction.answer[:MAX_RETURNED_CHARACTERS]},
+            {"role": "user", "content": [{"type": "text", "text": complaint}]},
+        ]
+    return messages, [image.digest for images in frames for image in images]
 
 
-def text_of(question: Question) -> str:
-    """Return the text of a question: the flight data, and the table that its answer format adds."""
-    table = question.way.table(question.facts)
-    return question.asked["en"].user + ("\n" + table if table else "")
+def encode_frames(question: Question, encode: EncodeFrame) -> list[list[EncodedImage]]:
+    """Return the pictures of each frame of a question."""
+    pictures = question.pictures
+    return [encode(frame, pictures) if pictures.views else [] for frame in question.window.frame_folders]
 
 
-def correction_messages(correction: Correction | None, vocabulary: Vocabulary) -> list[dict]:
-    """Return the messages after a question whose answer was refused: the answer, and what is wrong with it."""
-    if correction is None:
-        return []
-    text = vocabulary.templates["correction_en"].substitute(complaint=correction.complaint)
-    return [
-        {"role": "assistant", "content": correction.answer[:MAX_RETURNED_CHARACTERS]},
-        {"role": "user", "content": [{"type": "text", "text": text}]},
-    ]
-
-
-def mirror_messages(english: Draft, way: WayOfWriting, complaint: str | None = None) -> list[dict]:
+def mirror_messages(question: Question, english: Draft, complaint: str | None = None) -> list[dict]:
     """Return the chat messages that ask for the Chinese mirror of an English answer.
 
     Args:
         complaint: what is wrong with an earlier one.
     """
-    templates = way.vocabulary.templates
-    system = templates[way.mirror_system].substitute(glossary=way.vocabulary.quoted())
+    templates = question.vocabulary.templates
+    glossary = "\n".join(f"{en} = {zh}" for en, zh in translations())
+    system = templates[question.format.mirror_system].substitute(glossary=glossary)
     if complaint:
         system += "\n" + templates["correction_en"].substitute(complaint=complaint)
     user = templates["mirror_user"].substitute(english=dump_json(english.written))
@@ -323,5 +249,8 @@ def make_question(window: ObservedWindow, image: ImageConfig, writing: Writing, 
     """Return the free question of a window. Its pixels are those of the pictures that are sent."""
     pictures = pictures_of(window, image)
     facts = measure_facts(window, pictures.size_px)
-    prompts = build_prompts(window, facts, vocabulary)
-    return Question(window, facts, prompts, pictures, way_of(writing, vocabulary))
+    prompts = {
+        language: Prompt(system=system_prompt(f"system_{language}", vocabulary), user=user)
+        for language, user in user_prompts(window, facts, vocabulary).items()
+    }
+    return Question(window, facts, prompts, pictures, writing, vocabulary)

@@ -8,22 +8,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
-import numpy as np
-
-from caption.answer_formats.contract import Draft
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import Terms
-from caption.teachers.prompts import Question, decision_words, student_prompt
-from caption.verification.vocabulary import Vocabulary
+from caption.teachers.images import EncodeFrame
+from caption.teachers.prompt_files import Vocabulary
+from caption.teachers.prompts import Question, encode_frames, regeneration_lines, system_prompt
 from cosfly.formats.captions import Language
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.contract import Request
 from cosfly.llm.student_chat import (
-    IMAGE_ENCODING,
+    MAX_ANSWER_TOKENS,
     ChatFormat,
-    EncodedImage,
     StudentEndpointConfig,
     picture_to_send,
     read_chat_format,
@@ -31,8 +29,6 @@ from cosfly.llm.student_chat import (
 )
 from cosfly.runtime.errors import ConfigError, TeacherError
 from cosfly.viz.frame_views import Pictures
-
-Frames = Sequence[Sequence[EncodedImage]]  # pictures of each frame, oldest first
 
 
 def student_settings(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:
@@ -49,33 +45,29 @@ def student_settings(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfi
     kinds = {(look.views, look.depth_range_m, max(look.size_px)) for look in chat_format.looks}
     if len(kinds) > 1:
         what = "the student was trained with pictures of several kinds"
-        raise ConfigError(
-            what, where=folder, got="; ".join(_described(look.views, look.size_px) for look in chat_format.looks)
-        )
+        got = "; ".join(_described(look.views, look.size_px) for look in chat_format.looks)
+        raise ConfigError(what, where=folder, got=got)
     sampling = {name: getattr(StudentEndpointConfig(), name) for name in ("temperature", "top_p", "extra_body")}
     return cfg.model_copy(update={
         "writing": "prose",
         "window": cfg.window.model_copy(update={"num_frames": chat_format.num_frames}),
         "image": cfg.image.model_copy(update={
             "modalities": first.views, "layout": "separate", "max_side_px": max(first.size_px),
-            "depth_range_m": first.depth_range_m, "encoding": IMAGE_ENCODING,
+            "depth_range_m": first.depth_range_m,
         }),
         "endpoint": cfg.endpoint.model_copy(update={
-            **sampling, "max_tokens": cfg.student.max_new_tokens, "json_schema": cfg.student.constrained,
+            **sampling, "max_tokens": MAX_ANSWER_TOKENS, "json_schema": cfg.student.constrained,
         }),
-        # A student gives the same answer again, and its training has no corrections.
-        "structure_asks": 1, "correction_asks": 0, "mirror_asks": 1,
     })  # fmt: skip
 
 
 def check_prompts(chat_format: ChatFormat, folder: Path, vocabulary: Vocabulary) -> None:
     """Check that prompts are written today as they were in the student's training."""
     if "en" not in chat_format.prompts:
-        raise ConfigError(
-            "the student was not trained with English answers", where=folder, got=", ".join(chat_format.prompts)
-        )
+        what = "the student was not trained with English answers"
+        raise ConfigError(what, where=folder, got=", ".join(chat_format.prompts))
     for language, prompt in chat_format.prompts.items():
-        is_same = prompt.system == student_prompt(language, vocabulary)
+        is_same = prompt.system == system_prompt(f"system_{language}", vocabulary)
         if not (is_same and _is_of_template(prompt.user, language, chat_format, vocabulary)):
             raise ConfigError(
                 "the student was trained with another version of the prompt", where=f"{folder}: {language}",
@@ -93,32 +85,30 @@ def _is_of_template(user: str, language: Language, chat_format: ChatFormat, voca
         "num_frames": str(chat_format.num_frames),
         "pictures": "|".join(re.escape(one.sentence(language)) for one in pictures),
     }
-    slots = template.get_identifiers()
-    pattern = re.escape(template.substitute({slot: f"\0{slot}\0" for slot in slots}))
-    for slot in slots:
-        pattern = pattern.replace(f"\0{slot}\0", f"(?:{known.get(slot, '.+?')})")
+    pattern = re.escape(template.substitute({slot: f"\0{slot}\0" for slot in template.get_identifiers()}))
+    pattern = re.sub("\0(.+?)\0", lambda slot: f"(?:{known.get(slot[1], '.+?')})", pattern)
     return re.fullmatch(pattern + r"(\n.+)?", user) is not None  # the line of a mission may follow
 
 
 class TrainedStudent:
-    """Makes the requests to a student, in the form of its training."""
+    """Makes the requests to a student, in the form of its training, from the settings of `student_settings`."""
 
     def __init__(self, cfg: CaptionConfig) -> None:
-        """
-        Args:
-            cfg: Settings as returned by `student_settings`.
-        """
         assert cfg.student.folder is not None
         self.chat_format = read_chat_format(cfg.student.folder)
         self._sampling = cfg.endpoint
-        self.terms = Terms("prose", has_mirror="zh" in self.chat_format.prompts, is_translated=False)
+        self.encode = partial(picture_to_send, max_pixels=self.chat_format.max_pixels)
+        self.terms = Terms("prose", is_fixed=True, has_mirror="zh" in self.chat_format.prompts)
 
-    def encode(self, rgb: np.ndarray) -> EncodedImage:
-        """Encode a picture as in the student's training."""
-        return picture_to_send(rgb, self.chat_format.max_pixels)
+    def request(
+        self, question: Question, language: Language, decision: str | None, encode: EncodeFrame, seed: int
+    ) -> Request:
+        """Return the request in one language: a student translates nothing. A regeneration adds its sentences to the
+        English one, which the training did not have.
 
-    def check(self, question: Question) -> None:
-        """Check that a window has pictures like those of the training: its views, and the size of its camera."""
+        Raises:
+            TeacherError: The window has other pictures than those of the training.
+        """
         pictures = question.pictures
         wanted = {(look.views, look.size_px) for look in self.chat_format.looks}
         if (pictures.views, pictures.size_px) not in wanted:
@@ -129,25 +119,10 @@ class TrainedStudent:
                 expected=" or ".join(_described(*one) for one in sorted(wanted)),
                 fix="pass tracks with such pictures, or train a student on pictures like these",
             )
-
-    def request(self, question: Question, frames: Frames, seed: int) -> Request:
-        """Return the English request. A regeneration adds its sentences, which the training did not have."""
-        vocabulary, prompt = question.way.vocabulary, question.asked["en"]
-        system = prompt.system
-        if question.decision is not None:
-            system += "\n" + decision_words(question.decision, vocabulary)
-        if question.rejected is not None:
-            system += "\n" + vocabulary.templates["hint_en"].substitute(rejected=question.rejected)
-        prompt = prompt.model_copy(update={"system": system})
-        return student_request(prompt, frames, answer_schema(question.decision), self._sampling, seed)
-
-    def mirror_request(self, question: Question, english: Draft, frames: Frames, seed: int) -> Request:
-        """Return the Chinese request, about the same window: a student translates nothing.
-
-        If the English decision was given, the Chinese answer must have the same one.
-        """
-        schema = answer_schema(english.coc.flight_decision if question.decision else None, "zh")
-        return student_request(question.asked["zh"], frames, schema, self._sampling, seed)
+        prompt, more = question.asked[language], regeneration_lines(question) if language == "en" else ""
+        prompt = prompt.model_copy(update={"system": prompt.system + more})
+        frames = encode_frames(question, encode)
+        return student_request(prompt, frames, answer_schema(decision, language), self._sampling, seed)
 
 
 def _described(views: Sequence[str], size_px: tuple[int, int]) -> str:

@@ -1,7 +1,8 @@
 """Teachers: what answers a `Question`.
 
-`RuleTeacher` is embedded and deterministic. `AskingTeacher` asks a language model through an engine (cosfly/llm); every
-answer is journaled before it is used.
+`RuleTeacher` is embedded and deterministic, `GivenTeacher` reads a file. `AskingTeacher` asks a language model through
+an engine (cosfly/llm); every answer is journaled before it is used. `ask` answers in English, `mirror` gives the
+Chinese of an English answer; its complaint says what was wrong with the last one.
 """
 
 from __future__ import annotations
@@ -9,12 +10,12 @@ from __future__ import annotations
 import asyncio
 import os
 from collections import Counter
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractAsyncContextManager, nullcontext
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from pydantic_core import to_json
 
@@ -25,33 +26,19 @@ from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import Question, mirror_messages, question_messages
 from caption.teachers.rules import MODEL, write_templates
 from caption.teachers.students import TrainedStudent
-from cosfly.formats.captions import TeacherRecord, TeacherSettings
+from cosfly.formats.captions import Language, TeacherRecord, TeacherSettings
 from cosfly.formats.places import flight_of
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.answers import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, AnswerBook, Budget, KeptAnswers
 from cosfly.llm.client import ChatClient
-from cosfly.llm.contract import Engine, NoAnswer, Reply, Request, Troubles
+from cosfly.llm.contract import Engine, NoAnswer, Reply, Request, Troubles, started
+from cosfly.llm.student_chat import encoded_image
 from cosfly.llm.vllm_engine import VllmEngine
 from cosfly.runtime.seeding import random_bytes, rng_for
 
 ENCODING_THREADS = 4
 Result = TypeVar("Result")
 EMBEDDED = ("rules", "file", "student")  # kinds of teacher that answer at once, in the process
-
-
-class Teacher(Protocol):
-    """What answers. `ask` answers in English, `mirror` gives the Chinese of an English answer.
-
-    complaint: What was wrong with the last Chinese answer.
-    """
-
-    record: TeacherRecord
-
-    def terms(self, sample_id: str) -> Terms: ...
-
-    async def ask(self, question: Question) -> Reply: ...
-
-    async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply: ...
 
 
 class RuleTeacher:
@@ -61,8 +48,6 @@ class RuleTeacher:
         self.seed = seed
         settings = TeacherSettings(seed=seed)
         self.record = TeacherRecord(kind="rules", model=MODEL, settings=settings, structured="native")
-        self._last_key = ""
-        self._last: tuple[dict[str, str], dict[str, str]] | None = None
 
     def terms(self, sample_id: str) -> Terms:
         return Terms("slots", tuple(THEREFORE))
@@ -70,13 +55,13 @@ class RuleTeacher:
     def _answers(self, question: Question) -> tuple[dict[str, str], dict[str, str]]:
         """Return the English and the Chinese answer; a correction does not change them."""
         key = f"{question.window.sample_id}/{replace(question, correction=None).purpose}"
-        if key != self._last_key:
+        found = question.facts.found
+        if key not in found:
             draws = random_bytes(self.seed, "caption", key)
-            self._last = write_templates(question.facts, draws, question.decision)
-            self._last_key = key
-        if self._last is None:
+            found[key] = write_templates(question.facts, draws, question.decision)
+        if found[key] is None:
             raise NoAnswer("no_reason", f"no observed fact supports {question.decision}", is_final=True)
-        return self._last
+        return found[key]  # type: ignore[no-any-return]
 
     async def ask(self, question: Question) -> Reply:
         english, _ = self._answers(question)
@@ -92,81 +77,61 @@ def _native(answer: dict[str, str]) -> Reply:
 
 
 class AskingTeacher:
-    """Asks a language model. Use as an async context manager; its engine is started on entry."""
+    """Asks a language model; threads read and encode its pictures. Made by `open_teacher`."""
 
-    def __init__(
-        self,
-        cfg: CaptionConfig,
-        book: AnswerBook,
-        seed: int,
-        budget: Budget,
-        only: frozenset[str] | None = None,
-        troubles: Troubles | None = None,
-    ) -> None:
-        self.cfg, self.seed = cfg, seed
-        self.engine = make_engine(cfg, troubles)
-        self.kept = KeptAnswers(self.engine, book, budget, only)
+    def __init__(self, cfg: CaptionConfig, seed: int, kept: KeptAnswers, threads: Executor) -> None:
+        self.cfg, self.seed, self.kept, self._threads = cfg, seed, kept, threads
         self.student = None if cfg.student.folder is None else TrainedStudent(cfg)
-        self.encoder = FrameEncoder(cfg.image, self.student.encode if self.student else None)
-        self._threads = ThreadPoolExecutor(min(ENCODING_THREADS, os.cpu_count() or 1), "encode")
-
-    async def __aenter__(self) -> AskingTeacher:
-        try:
-            await self.engine.start()
-        except BaseException:
-            await self.__aexit__()
-            raise
+        self.encoder = FrameEncoder(self.student.encode if self.student else encoded_image)
         names = ("temperature", "top_p", "max_tokens", "extra_body")
-        sampling = {name: getattr(self.cfg.endpoint, name) for name in names}
-        settings = TeacherSettings(**sampling, seed=self.seed)
-        kind = "student" if self.student else self.engine.kind
-        self.record = TeacherRecord(kind=kind, model=self.engine.model, settings=settings)
-        return self
-
-    async def __aexit__(self, *exc: object) -> None:
-        self._threads.shutdown(wait=False, cancel_futures=True)
-        await self.engine.close()
+        settings = TeacherSettings(**{name: getattr(cfg.endpoint, name) for name in names}, seed=seed)
+        kind = "student" if self.student else kept.engine.kind
+        self.record = TeacherRecord(kind=kind, model=kept.engine.model, settings=settings)
 
     def terms(self, sample_id: str) -> Terms:
         return self.student.terms if self.student else Terms(self.cfg.writing, tuple(THEREFORE))
 
     async def ask(self, question: Question) -> Reply:
         if self.student is not None:
-            self.student.check(question)
-            frames = await self._in_thread(self.encoder.encode_window, question.window, question.pictures)
-            request = self.student.request(question, frames, question.ask)
-        else:
-            messages, digests = await self._in_thread(question_messages, question, self.encoder)
-            schema = answer_schema(question.decision, more=THEREFORE)
-            request = self._request(question, question.purpose, messages, digests, schema)
-        return await self._kept_answer(question, request, question.purpose)
+            return await self._ask_student(question, "en", question.decision, question.purpose, question.ask)
+        messages, digests = await self._in_thread(question_messages, question, self.encoder.encode)
+        schema = answer_schema(question.decision, more=THEREFORE)
+        return await self._ask_teacher(question, question.purpose, messages, digests, schema)
 
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply:
-        purpose = f"mirror/{ask}"
-        if self.student is not None:
-            frames = await self._in_thread(self.encoder.encode_window, question.window, question.pictures)
-            request = self.student.mirror_request(question, english, frames, ask)
-        else:
-            messages = mirror_messages(english, question.way, complaint)
-            schema = answer_schema(english.coc.flight_decision, "zh")
-            request = self._request(question, purpose, messages, [], schema)
+        purpose, decision = f"mirror/{ask}", english.coc.flight_decision
+        if self.student is not None:  # about the same window; its own decision, unless the English one was given
+            given = decision if question.decision else None
+            return await self._ask_student(question, "zh", given, purpose, ask)
+        messages = mirror_messages(question, english, complaint)
+        return await self._ask_teacher(question, purpose, messages, [], answer_schema(decision, "zh"))
+
+    async def _ask_teacher(
+        self, question: Question, purpose: str, messages: list[dict], digests: list[str], schema: dict
+    ) -> Reply:
+        """Ask with a sampling seed that is the same in every run, and another for every ask of a window."""
+        item = f"{question.window.sample_id}/{purpose}"
+        seed = int(rng_for(self.seed, "teacher", item).integers(1 << 31))
+        return await self._kept_answer(question, self.cfg.endpoint.request(messages, digests, schema, seed), purpose)
+
+    async def _ask_student(
+        self, question: Question, language: Language, decision: str | None, purpose: str, seed: int
+    ) -> Reply:
+        assert self.student is not None
+        make, encode = self.student.request, self.encoder.encode
+        request = await self._in_thread(make, question, language, decision, encode, seed)
         return await self._kept_answer(question, request, purpose)
 
     async def _in_thread(self, function: Callable[..., Result], *args: Any) -> Result:
         """Call a function that reads and encodes pictures without blocking the other windows."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *args)
 
-    def _request(
-        self, question: Question, purpose: str, messages: list[dict], digests: list[str], schema: dict
-    ) -> Request:
-        """Return a request; its sampling seed is the same in every run, and another for every ask of a window."""
-        item = f"{question.window.sample_id}/{purpose}"
-        seed = int(rng_for(self.seed, "teacher", item).integers(1 << 31))
-        return self.cfg.endpoint.request(messages, digests, schema, seed)
-
     async def _kept_answer(self, question: Question, request: Request, purpose: str) -> Reply:
         sample_id = question.window.sample_id
         return await self.kept.ask(request, flight_of(sample_id), sample_id, purpose)
+
+
+Teacher = RuleTeacher | GivenTeacher | AskingTeacher
 
 
 def first_budget(cfg: CaptionConfig, *counts: Counter[str]) -> Budget:
@@ -193,15 +158,23 @@ def make_engine(cfg: CaptionConfig, troubles: Troubles | None = None) -> Engine:
     return VllmEngine(folder, cfg.vllm, cfg.endpoint, num_images=cfg.num_images, settings="caption")
 
 
-def open_teacher(
+@asynccontextmanager
+async def open_teacher(
     cfg: CaptionConfig,
     book: AnswerBook,
     seed: int,
     budget: Budget,
-    only: frozenset[str] | None = None,
+    retried: frozenset[str] = frozenset(),
     troubles: Troubles | None = None,
-) -> AbstractAsyncContextManager[Teacher]:
-    """Return the teacher that the settings name; it is ready inside `async with`."""
+) -> AsyncIterator[Teacher]:
+    """Connect to the teacher that the settings name."""
     if cfg.teacher_kind in EMBEDDED:
-        return nullcontext(embedded_teacher(cfg, seed))
-    return AskingTeacher(cfg, book, seed, budget, only, troubles)
+        yield embedded_teacher(cfg, seed)
+        return
+    engine = make_engine(cfg, troubles)
+    async with started(engine):
+        threads = ThreadPoolExecutor(min(ENCODING_THREADS, os.cpu_count() or 1), "encode")
+        try:
+            yield AskingTeacher(cfg, seed, KeptAnswers(engine, book, budget, retried), threads)
+        finally:
+            threads.shutdown(wait=False, cancel_futures=True)

@@ -1,6 +1,6 @@
 """The actions against geometry: how much of each a motion shows, in units of its own threshold.
 
-The first group of `implied` in which an action reaches 1 gives the label: in it the action of which there is most. A
+The first group of rules in which an action reaches 1 gives the label: in it the action of which there is most. A
 decision of which the future shows next to nothing is contradicted. `break_off` and `return_to_home` are orders of a
 mission: its metadata give them, geometry never does. Signs: left, up and forward are positive.
 """
@@ -11,9 +11,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 from caption.schema import FutureMotion
-from cosfly.formats.captions import TOKENS, Verdict
+from cosfly.formats.captions import TOKENS
 
 
 @dataclass(frozen=True)
@@ -102,52 +103,62 @@ def _holds(fact: bool) -> float:
     return 1.0 if fact else -1.0
 
 
-def _shown(t: Thresholds) -> dict[str, tuple[Measure, float]]:
-    """Return how much of each action a motion shows, negative for its opposite, and what it must not fall below: less
-    contradicts it."""
+class Rule(NamedTuple):
+    """How much there is of an action in a motion.
 
-    def leaves(token: str) -> Measure:
+    implied: What makes it the label, from 1 on. shown: What speaks for it, negative for its opposite. least: Less
+    shown than this contradicts it.
+    """
+
+    implied: Measure
+    shown: Measure
+    least: float
+
+
+def _rules(t: Thresholds) -> tuple[dict[str, Rule], ...]:
+    """Return the rules in groups in order of precedence: orders, states, a manoeuvre that has the following ones as
+    its parts, these, and the neutral one."""
+
+    def rule(implied: Measure, shown: Measure | None = None, least: float = t.absent_share) -> Rule:
+        return Rule(implied, shown or implied, least)
+
+    def order(token: str) -> Rule:
         """Return the rule of an order: it was given, or the motion at least leaves the person."""
-        return lambda m: _holds(
-            m.order == token or not m.visible_now or m.visible_share < 1.0 or not m.approach_m > -t.approach_m
+        return rule(
+            lambda m: _holds(m.order == token),
+            lambda m: _holds(
+                m.order == token or not m.visible_now or m.visible_share < 1.0 or not m.approach_m > -t.approach_m
+            ),
         )
 
-    sizes: dict[str, Measure] = {
-        "track_straight": lambda m: _holds(abs(m.yaw_deg) < t.hard_turn_deg and m.forward_m > -t.forward_m),
-        "yaw_left_to_follow": lambda m: m.yaw_deg / t.yaw_deg,
-        "yaw_right_to_follow": lambda m: -m.yaw_deg / t.yaw_deg,
-        "circle_left": lambda m: _least(m.left_m / t.lateral_m, m.sweep_deg / t.circle_deg),
-        "circle_right": lambda m: _least(-m.left_m / t.lateral_m, -m.sweep_deg / t.circle_deg),
-        "ascend": lambda m: m.altitude_m / t.altitude_m,
-        "descend": lambda m: -m.altitude_m / t.altitude_m,
-        "move_forward": lambda m: m.forward_m / t.forward_m,
-        "move_backward": lambda m: -m.forward_m / t.forward_m,
-        "strafe_left": lambda m: m.left_m / t.lateral_m,
-        "strafe_right": lambda m: -m.left_m / t.lateral_m,
-        "slow_down": lambda m: -m.speed_change_mps / t.speed_change_mps,
-        "speed_up": lambda m: m.speed_change_mps / t.speed_change_mps,
-        "search_to_reacquire_target": lambda m: _holds(not (m.visible_now and m.visible_share >= 1.0)),
-        "hover": lambda m: _holds(m.mean_speed_mps < t.moving_mps),
-        "break_off": leaves("break_off"),
-        "return_to_home": leaves("return_to_home"),
-    }
-    # A turn that was not flown is the paper's example of a soft conflict: only a turn to the other side is a hard one.
-    limits = {"yaw_left_to_follow": -1.0, "yaw_right_to_follow": -1.0}
-    return {token: (sizes[token], limits.get(token, t.absent_share)) for token in TOKENS}
+    def circle(side: int) -> Rule:
+        def shown(m: Motion) -> float:
+            return _least(m.left_m / (side * t.lateral_m), m.sweep_deg / (side * t.circle_deg))
 
+        def implied(m: Motion) -> float:
+            # The target moves less than the drone: to follow it through a bend is no circle.
+            is_round = abs(m.approach_m) < t.approach_m and m.target_path_m < 0.5 * abs(m.left_m)
+            return shown(m) if is_round else 0.0
 
-def _implied(t: Thresholds) -> tuple[tuple[tuple[str, Measure], ...], ...]:
-    """Return how much there is of what makes each action the label, from 1 on, in groups in order of precedence:
-    orders, states, a manoeuvre that has the following ones as its parts, these, and the neutral one."""
+        return rule(implied, shown)
 
-    def is_round(m: Motion) -> bool:
-        """Return whether the target moves less than the drone: to follow it through a bend is no circle."""
-        return abs(m.approach_m) < t.approach_m and m.target_path_m < 0.5 * abs(m.left_m)
+    def turn(side: int) -> Rule:
+        # One that was not flown is the paper's example of a soft conflict: only a turn to the other side is a hard one.
+        return rule(lambda m: m.yaw_deg / (side * t.yaw_deg), least=-1.0)
 
-    def circles(side: int) -> Measure:
-        return lambda m: (
-            _least(m.left_m / (side * t.lateral_m), m.sweep_deg / (side * t.circle_deg)) if is_round(m) else 0.0
-        )
+    def strafe(side: int) -> Rule:
+        """Return the rule of a shift to one side. A drone that swings round the person shifts to one side and turns to
+        the other to keep its aim. That is one motion, a turn to follow: which of its parts is more thresholds tells
+        only the distance (1 m is 3 degrees at 19 m)."""
+
+        def shown(m: Motion) -> float:
+            return m.left_m / (side * t.lateral_m)
+
+        def implied(m: Motion) -> float:
+            is_shift = abs(m.left_m) > abs(m.forward_m) and side * m.yaw_deg > -t.yaw_deg
+            return shown(m) if is_shift else 0.0
+
+        return rule(implied, shown)
 
     def closes_in(m: Motion) -> float:
         """Measure the drone's own part of a gap that closes."""
@@ -160,73 +171,58 @@ def _implied(t: Thresholds) -> tuple[tuple[tuple[str, Measure], ...], ...]:
             return 0.0
         return _least(-m.forward_m / t.forward_m, -m.closing_m / t.forward_m)
 
-    def strafes(side: int) -> Measure:
-        """Return a drone that swings round the person shifts to one side and turns to the other to keep its aim.
-        That is one
-        motion, a turn to follow: which of its parts is more thresholds tells only the distance (1 m is 3 degrees at
-        19 m)."""
-        return lambda m: (
-            m.left_m / (side * t.lateral_m)
-            if abs(m.left_m) > abs(m.forward_m) and side * m.yaw_deg > -t.yaw_deg
-            else 0.0
-        )
-
     return (
-        (
-            ("break_off", lambda m: _holds(m.order == "break_off")),
-            ("return_to_home", lambda m: _holds(m.order == "return_to_home")),
-        ),
-        (("search_to_reacquire_target", lambda m: _holds(not m.visible_now)),),
-        (("hover", lambda m: _holds(m.mean_speed_mps < t.hover_mps and abs(m.yaw_deg) < t.yaw_deg)),),
-        (("circle_left", circles(1)), ("circle_right", circles(-1))),
-        (
-            ("yaw_left_to_follow", lambda m: m.yaw_deg / t.yaw_deg),
-            ("yaw_right_to_follow", lambda m: -m.yaw_deg / t.yaw_deg),
-            ("ascend", lambda m: m.altitude_m / t.altitude_m),
-            ("descend", lambda m: -m.altitude_m / t.altitude_m),
-            # Who leaves a hover backwards, sideways or upwards gains speed too, but not on the way.
-            ("speed_up", lambda m: m.forward_gain_mps / t.speed_change_mps),
-            ("slow_down", lambda m: -m.speed_change_mps / t.speed_change_mps),
-            ("strafe_left", strafes(1)),
-            ("strafe_right", strafes(-1)),
-            ("move_backward", backs_off),
-            ("move_forward", closes_in),
-        ),
-        (("track_straight", lambda m: m.forward_m / t.forward_m),),
-    )
+        {"break_off": order("break_off"), "return_to_home": order("return_to_home")},
+        {"search_to_reacquire_target": rule(
+            lambda m: _holds(not m.visible_now), lambda m: _holds(not (m.visible_now and m.visible_share >= 1.0))
+        )},
+        {"hover": rule(
+            lambda m: _holds(m.mean_speed_mps < t.hover_mps and abs(m.yaw_deg) < t.yaw_deg),
+            lambda m: _holds(m.mean_speed_mps < t.moving_mps),
+        )},
+        {"circle_left": circle(1), "circle_right": circle(-1)},
+        {
+            "yaw_left_to_follow": turn(1),
+            "yaw_right_to_follow": turn(-1),
+            "ascend": rule(lambda m: m.altitude_m / t.altitude_m),
+            "descend": rule(lambda m: -m.altitude_m / t.altitude_m),
+            # A drone that leaves a hover backwards, sideways or upwards gains speed too, but not on the way.
+            "speed_up": rule(
+                lambda m: m.forward_gain_mps / t.speed_change_mps, lambda m: m.speed_change_mps / t.speed_change_mps
+            ),
+            "slow_down": rule(lambda m: -m.speed_change_mps / t.speed_change_mps),
+            "strafe_left": strafe(1),
+            "strafe_right": strafe(-1),
+            "move_backward": rule(backs_off, lambda m: -m.forward_m / t.forward_m),
+            "move_forward": rule(closes_in, lambda m: m.forward_m / t.forward_m),
+        },
+        {"track_straight": rule(
+            lambda m: m.forward_m / t.forward_m,
+            lambda m: _holds(abs(m.yaw_deg) < t.hard_turn_deg and m.forward_m > -t.forward_m),
+        )},
+    )  # fmt: skip
 
 
 class ActionTable:
-    """The rules of all actions with their thresholds put in: see `_implied` and `_shown`."""
+    """The rules of all actions with their thresholds put in."""
 
     def __init__(self, thresholds: Thresholds = Thresholds()) -> None:
-        self.implied, self.shown = _implied(thresholds), _shown(thresholds)
+        self.groups = _rules(thresholds)
+        found = {token: rule for group in self.groups for token, rule in group.items()}
+        self.rules = {token: found[token] for token in TOKENS}
 
     def label_of(self, motion: Motion) -> str | None:
         """Return the ground-truth decision, None where neither an order nor geometry tells."""
-        for group in self.implied:
-            sizes = [(size(motion), token) for token, size in group]
-            found = [pair for pair in sizes if pair[0] >= 1.0]
+        for group in self.groups:
+            sizes = {token: rule.implied(motion) for token, rule in group.items()}
+            found = [token for token, size in sizes.items() if size >= 1.0]
             if found:
-                return max(found, key=lambda pair: pair[0])[1]  # the earlier one of two equal ones
+                return max(found, key=sizes.__getitem__)  # the earlier one of two equal ones
         return None
 
-    def is_contradicted(self, decision: str, motion: Motion) -> bool:
-        """Return whether a motion shows too little of a decision, or its opposite."""
-        shown, limit = self.shown[decision]
-        return shown(motion) < limit
-
-    def verdict_of(self, decision: str, motion: Motion, label: str | None) -> Verdict:
-        """Compare a decision with the actual future (the three classes of sec:appendix_e, and ABSTAIN)."""
-        if decision == label:
-            return "CONSISTENT"
-        if self.is_contradicted(decision, motion):
-            return "HARD_CONFLICT"
-        return "ABSTAIN" if label is None else "SOFT_CONFLICT"
-
     def contradicted_by(self, motion: Motion, label: str | None) -> list[str]:
-        """Return the decisions that the actual future contradicts: what a guess would have run into."""
-        return [token for token, (size, limit) in self.shown.items() if token != label and size(motion) < limit]
+        """Return the decisions of which the actual future shows too little, or the opposite."""
+        return [token for token, rule in self.rules.items() if token != label and rule.shown(motion) < rule.least]
 
 
 TABLE = ActionTable()

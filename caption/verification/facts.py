@@ -26,6 +26,11 @@ PARTLY_BELOW = 0.7  # rendered score under which a visible person counts as part
 SMOOTHED_OVER = 2  # frames before and after one that its velocity is fitted to
 SMOOTH_M, SMOOTH_DEG = 0.15, 1.0  # a track that deviates by more from a parabola is perturbed
 LEAST_SEEN = 3  # frames at which the target is seen, for a velocity of it
+# What each frame tells by itself.
+BY_FRAME = (
+    "altitude_m", "pitch_deg", "heading_deg", "distance_m", "slant_m", "height_over_target_m", "bearing_deg",
+    "depression_deg", "box_width_px", "box_height_px", "offset_x_px", "offset_y_px", "visibility",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -103,8 +108,7 @@ class Facts:
 
     @property
     def is_legible_now(self) -> bool:
-        """Return whether a person could see the target in the picture. Statements about its appearance depend on
-        this."""
+        """Return whether a person could see the target in the picture; it decides what may be said of its looks."""
         return self.visibility[-1] in ("visible", "partly_occluded")
 
     @cached_property
@@ -123,12 +127,10 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
     picture_px = picture_px or camera_px
     frames = window.frames
     count = len(frames)
-    altitude, pitch, heading, *measured, visibility = zip(
-        *[_measure_frame(frame, camera_px, picture_px) for frame in frames], strict=True
-    )
-    distance, slant, height, bearing, depression, box_width, box_height, offset_x, offset_y = measured
+    measured = zip(*[_measure_frame(frame, camera_px, picture_px) for frame in frames], strict=True)
+    by_frame: dict[str, Any] = dict(zip(BY_FRAME, measured, strict=True))
     xs, ys, zs = zip(*[frame.position_m for frame in frames], strict=True)
-    seen = tuple([distance_m is not None for distance_m in distance])
+    seen = tuple([distance_m is not None for distance_m in by_frame["distance_m"]])
     step_s = (frames[-1].time_s - frames[0].time_s) / (count - 1)
     turns_deg = [wrapped(after.rotation_deg[1] - before.rotation_deg[1]) for before, after in pairwise(frames)]
     yaw_deg = [0.0, *accumulate(turns_deg)]
@@ -142,32 +144,20 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
         speed_mps=_rounded([math.hypot(*velocity) for velocity in velocities], 2),
         velocity_mps=(_round(v_x * cos + v_y * sin, 2), _round(v_y * cos - v_x * sin, 2), _round(v_z, 2)),
         mean_speed_mps=_round(math.hypot(v_x, v_y, v_z), 2),
-        altitude_m=altitude,
         climb_mps=_rounded([velocity[2] for velocity in velocities], 2),
         yaw_deg=tuple([_round(angle, 1) for angle in yaw_deg]),
         yaw_rate_dps=_rounded(_velocities((yaw_deg,), is_known, step_s, SMOOTH_DEG)[1][0], 1),
-        heading_deg=heading,
-        pitch_deg=pitch,
         travelled_m=(0.0, *[_round(way, 1) for way in accumulate(steps_m)]),
         displacement_m=tuple([_round(math.dist(frames[0].position_m, frame.position_m), 1) for frame in frames]),
+        **by_frame,
         **_measure_target(frames, seen, step_s, cos, sin),
-        distance_m=distance,
-        slant_m=slant,
-        height_over_target_m=height,
-        bearing_deg=bearing,
-        depression_deg=depression,
-        box_width_px=box_width,
-        box_height_px=box_height,
-        offset_x_px=offset_x,
-        offset_y_px=offset_y,
-        visibility=visibility,
         width_px=picture_px[0],
         height_px=picture_px[1],
         step_s=round(step_s, 3),
         mission=window.mission,
-        others_in_view=_whole([frame.others_in_view for frame in frames]),
+        others_in_view=_rounded([frame.others_in_view for frame in frames], None),
         other_distance_m=_rounded([frame.other_distance_m for frame in frames], 1),
-        alike_differences=_whole([frame.alike_differences for frame in frames]),
+        alike_differences=_rounded([frame.alike_differences for frame in frames], None),
         step_speeds_mps=(None, *_rounded([step_m / step_s for step_m in steps_m], 2)),
     )
 
@@ -192,21 +182,13 @@ def _measure_target(
         for i in range(1, len(frames))
     ]
     first = seen.index(True) if any(seen) else 0
-    travelled = [math.hypot(x - xs[first], y - ys[first]) for x, y in zip(xs, ys, strict=True)]
-    motion: dict[str, Any] = {
-        "place_m": tuple(places),
-        "target_step_speeds_mps": (None, *_rounded(steps_mps, 2)),
-        "target_travelled_m": tuple(
-            [_round(way, 1) if is_seen else None for way, is_seen in zip(travelled, seen, strict=True)]
-        ),
-    }
-    nothing = (None,) * len(frames)
-    if sum(seen) < LEAST_SEEN:
-        return motion | {
-            "target_speeds_mps": nothing, "target_headings_deg": nothing,
-            "target_velocity_mps": None, "target_speed_mps": None, "target_turn_deg": None,
-        }  # fmt: skip
-    (v_x, v_y), local = _velocities((xs, ys), seen, step_s, SMOOTH_M)
+    travelled = [
+        math.hypot(x - xs[first], y - ys[first]) if is_seen else math.nan
+        for x, y, is_seen in zip(xs, ys, seen, strict=True)
+    ]
+    (v_x, v_y), local = (math.nan, math.nan), [[math.nan] * len(frames)] * 2
+    if sum(seen) >= LEAST_SEEN:
+        (v_x, v_y), local = _velocities((xs, ys), seen, step_s, SMOOTH_M)
     velocities = list(zip(*local, strict=True))
     speeds = [math.hypot(*velocity) for velocity in velocities]
     headings = [
@@ -214,44 +196,41 @@ def _measure_target(
         for (x, y), speed in zip(velocities, speeds, strict=True)
     ]
     known = [heading for heading in headings if heading == heading]
-    return motion | {
+    velocity = (_round(v_x * cos + v_y * sin, 2), _round(v_y * cos - v_x * sin, 2))
+    [speed] = _rounded([math.hypot(v_x, v_y)], 2)
+    return {
+        "place_m": tuple(places),
+        "target_step_speeds_mps": (None, *_rounded(steps_mps, 2)),
+        "target_travelled_m": _rounded(travelled, 1),
         "target_speeds_mps": _rounded(speeds, 2),
         "target_headings_deg": _rounded(headings, 1),
-        "target_velocity_mps": (_round(v_x * cos + v_y * sin, 2), _round(v_y * cos - v_x * sin, 2)),
-        "target_speed_mps": _round(math.hypot(v_x, v_y), 2),
+        "target_velocity_mps": None if speed is None else velocity,
+        "target_speed_mps": speed,
         # The heading of someone who stands is noise.
-        "target_turn_deg": _round(wrapped(known[-1] - known[0]), 1) if len(known) == sum(seen) else None,
+        "target_turn_deg": _round(wrapped(known[-1] - known[0]), 1) if known and len(known) == sum(seen) else None,
     }
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """Weights that turn a series into slopes per step and deviations, for the frames at which it is known.
-
-    whole: (n,) of the straight line through all known frames; local: (n, n) of that through the neighbours of each
-    frame; residuals: (n, n) deviations from the parabola that fits best. Rows of unknown frames are NaN or skipped.
-    """
-
-    whole: tuple[float, ...]
-    local: tuple[tuple[float, ...], ...]
-    residuals: tuple[tuple[float, ...], ...]
+Weights = tuple[float, ...]  # of the values of a series; rows of frames that are not known are NaN or skipped
 
 
 @lru_cache(maxsize=256)
-def _fit_of(known: tuple[bool, ...]) -> _Fit:
+def _fit_of(known: tuple[bool, ...]) -> tuple[Weights, tuple[Weights, ...], tuple[Weights, ...]]:
+    """Return weights for the frames at which a series is known.
+
+    They turn it into the slope per step of the straight line through all of them, into that of the line through the
+    neighbours of each frame, and into the deviations from the parabola that fits best.
+    """
     frames = [i for i, is_known in enumerate(known) if is_known]
     basis = np.vander(np.array(frames) - np.mean(frames), 3)
     residuals = np.zeros((len(frames), len(known)))
     residuals[:, frames] = np.eye(len(frames)) - basis @ np.linalg.pinv(basis)
     near = [[i for i in frames if abs(i - at) <= SMOOTHED_OVER] if known[at] else [] for at in range(len(known))]
-    return _Fit(
-        _line_weights(frames, len(known)),
-        tuple(_line_weights(neighbours, len(known)) for neighbours in near),
-        tuple(map(tuple, residuals.tolist())),
-    )
+    local = tuple(_line_weights(neighbours, len(known)) for neighbours in near)
+    return _line_weights(frames, len(known)), local, tuple(map(tuple, residuals.tolist()))
 
 
-def _line_weights(frames: Sequence[int], count: int) -> tuple[float, ...]:
+def _line_weights(frames: Sequence[int], count: int) -> Weights:
     """Return the weights whose sum with a series is the slope, per step, of the line through some of its frames."""
     if len(frames) < 2:
         return (math.nan,) * count
@@ -260,7 +239,7 @@ def _line_weights(frames: Sequence[int], count: int) -> tuple[float, ...]:
     return tuple((i - middle) / norm if i in frames else 0.0 for i in range(count))
 
 
-def _weighted(weights: Sequence[float], values: Sequence[float]) -> float:
+def _weighted(weights: Weights, values: Sequence[float]) -> float:
     return sum(map(mul, weights, values))
 
 
@@ -273,24 +252,19 @@ def _velocities(
         smooth: the largest root mean square deviation from a parabola, in units of the axes, at which neighbouring
             frames tell the velocity; beyond it every frame has that of the whole window.
     """
-    fit = _fit_of(known)
+    line, lines, residuals = _fit_of(known)
     if not all(known):  # a weight of 0 does not hide NaN
         axes = [[value if is_known else 0.0 for value, is_known in zip(axis, known, strict=True)] for axis in axes]
-    whole = [_weighted(fit.whole, axis) / step_s for axis in axes]
-    squares = sum([_weighted(row, axis) ** 2 for axis in axes for row in fit.residuals])
-    if squares > smooth * smooth * len(fit.residuals):
+    whole = [_weighted(line, axis) / step_s for axis in axes]
+    squares = sum([_weighted(row, axis) ** 2 for axis in axes for row in residuals])
+    if squares > smooth * smooth * len(residuals):
         return whole, [[slope if is_known else math.nan for is_known in known] for slope in whole]
-    return whole, [[_weighted(row, axis) / step_s for row in fit.local] for axis in axes]
+    return whole, [[_weighted(row, axis) / step_s for row in lines] for axis in axes]
 
 
 @lru_cache(maxsize=64)  # five windows of a track share a frame
 def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px: tuple[int, int]) -> tuple[Any, ...]:
-    """Measure one frame.
-
-    Returns:
-        altitude, pitch, heading, distance, slant, height over the target, bearing, depression, width and height of the
-        box, offset of its centre to the right and down, the word for visibility: as the facts have them.
-    """
+    """Measure one frame; return BY_FRAME."""
     (x, y, z), (u, v, w), (pitch, heading, _) = frame.position_m, frame.target_m, frame.rotation_deg
     drone = (_round(z, 1), _round(pitch, 1), _round(wrapped(heading), 1))
     word = _word(frame)
@@ -302,25 +276,16 @@ def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px:
     slant = math.hypot(distance, away_z)
     bearing = wrapped(math.degrees(math.atan2(away_y, away_x)) - heading)
     depression = math.degrees(math.atan2(-away_z, distance))
-    return (
-        *drone,
-        *_rounded((distance, slant, -away_z, bearing, depression), 1),
-        *_measure_picture(frame, camera_px, picture_px),
-        word,
-    )
-
-
-def _measure_picture(
-    frame: ObservedFrame, camera_px: tuple[int, int], picture_px: tuple[int, int]
-) -> tuple[int | None, ...]:
-    """Measure the target in the picture: width and height of its box, offset of its centre to the right and down."""
-    (width_px, height_px), (u, v) = picture_px, frame.target_uv
-    x_scale, y_scale = width_px / camera_px[0], height_px / camera_px[1]
+    x_scale, y_scale = picture_px[0] / camera_px[0], picture_px[1] / camera_px[1]
     left, top, right, bottom = frame.target_bbox
     left, top, right, bottom = left * x_scale, top * y_scale, right * x_scale, bottom * y_scale
     # The centre of the box is where the person is seen; uv (the hip) replaces it where a tree has no box.
-    u, v = (u * x_scale, v * y_scale) if left != left else ((left + right) / 2.0, (top + bottom) / 2.0)
-    return _whole([right - left, bottom - top, u - width_px / 2.0, v - height_px / 2.0])
+    centre_x, centre_y = (left + right) / 2.0, (top + bottom) / 2.0
+    if left != left:
+        centre_x, centre_y = frame.target_uv[0] * x_scale, frame.target_uv[1] * y_scale
+    offsets = (centre_x - picture_px[0] / 2.0, centre_y - picture_px[1] / 2.0)
+    in_space = _rounded((distance, slant, -away_z, bearing, depression), 1)
+    return (*drone, *in_space, *_rounded((right - left, bottom - top, *offsets), None), word)
 
 
 def wrapped(angle_deg: float) -> float:
@@ -332,12 +297,9 @@ def _round(value: float, digits: int) -> float:
     return round(value, digits) + 0.0  # no negative zero
 
 
-def _rounded(values: Iterable[float], digits: int) -> tuple[float | None, ...]:
-    return tuple([None if v != v else round(v, digits) + 0.0 for v in values])  # NaN is not equal to itself
-
-
-def _whole(values: Sequence[float]) -> tuple[int | None, ...]:
-    return tuple([None if v != v else round(v) for v in values])
+def _rounded(values: Iterable[float], digits: int | None) -> tuple[Any, ...]:
+    """Return values, as integers without `digits`, and None where they are NaN, which is not equal to itself."""
+    return tuple([None if v != v else round(v, digits) + 0 for v in values])
 
 
 def _word(frame: ObservedFrame) -> VisibilityWord:

@@ -7,44 +7,14 @@ from collections import Counter
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from pydantic import Field
-
-from cosfly.formats.captions import Language
-from cosfly.runtime.config import Config, build, read_yaml
+from cosfly.formats.captions import ACTIONS, Language
+from cosfly.runtime.config import read_yaml
 
 GLOSSARY_FILE = Path(__file__).with_name("glossary.yaml")
 LANGUAGES: tuple[Language, Language] = ("en", "zh")
 VISIBILITY = ("visible", "partly_occluded", "illegible", "occluded", "out_of_view")
-
-
-class Words(Config):
-    en: list[str] = Field(description="English")
-    zh: list[str] = Field(description="Chinese")
-
-    def __getitem__(self, language: Language) -> list[str]:
-        return self.en if language == "en" else self.zh
-
-
-class _Factors(Config):
-    en: dict[str, dict[str | int | float, str]] = Field(description="unit -> factor to it -> English spellings")
-    zh: dict[str, dict[str | int | float, str]] = Field(description="and Chinese")
-
-
-class GlossaryFile(Config):
-    schema_: str = Field(alias="schema", description="cosfly.glossary")
-    schema_version: str = Field(description="version of this layout")
-    slots: dict[str, Words] = Field(description="word -> forms that a slot is filled with")
-    opposites: dict[str, dict[str, Words]] = Field(description="name -> its two sides with their spellings")
-    negations: Words = Field(description="words that reverse what follows")
-    not_opposites: Words = Field(description="spellings that contain an opposite but do not mean it")
-    quantities: dict[str, Words] = Field(description="quantity -> patterns that name it")
-    subjects: dict[str, Words] = Field(description="drone and target -> patterns that name them")
-    comparatives: Words = Field(description="patterns of clauses that compare two quantities")
-    hypothetical: Words = Field(description="patterns of clauses whose numbers are not compared")
-    units: dict[str, Words] = Field(description="unit -> spellings, the first is written")
-    written_units: _Factors = Field(description="every way a unit is written in running text")
 
 
 class Unit(NamedTuple):
@@ -54,79 +24,84 @@ class Unit(NamedTuple):
     factor: float
 
 
-class Glossary:
-    """The glossary with its patterns compiled."""
-
-    def __init__(self, file: GlossaryFile) -> None:
-        self.file = file
-        self.written_units = {one: {unit: words[one][0] for unit, words in file.units.items()} for one in LANGUAGES}
-        self._opposites = {one: _opposites(file, one) for one in LANGUAGES}
-        self._terms = {one: term_pattern([*self._opposites[one], *file.not_opposites[one]], one) for one in LANGUAGES}
-
-    def slot_words(self, language: Language) -> dict[str, tuple[str, ...]]:
-        """Return the forms of each word that a slot is filled with."""
-        return {word: tuple(forms[language]) for word, forms in self.file.slots.items()}
-
-    def visibility(self, word: str, language: Language) -> str:
-        return self.file.slots[word][language][0]
-
-    def spellings(self, language: Language) -> dict[str, str]:
-        """Return every spelling of a unit and the unit."""
-        return {spelling: unit for unit, words in self.file.units.items() for spelling in words[language]}
-
-    def opposites(self, text: str, language: Language) -> list[tuple[str, int]]:
-        """Find opposites in a text: (name, +1 or -1), negations applied."""
-        text = text.lower() if language == "en" else text
-        found = []
-        for match in self._terms[language].finditer(text):
-            if match.group() in self._opposites[language]:
-                name, sign = self._opposites[language][match.group()]
-                found.append((name, -sign if self.is_negated(text, match.start(), language) else sign))
-        return found
-
-    def swapped(self, english: str, chinese: str) -> str | None:
-        """Return the name of an opposite of which one side is lost and the other one gained in the translation."""
-        counts_en, counts_zh = Counter(self.opposites(english, "en")), Counter(self.opposites(chinese, "zh"))
-        for name in sorted({name for name, _ in counts_en.keys() | counts_zh.keys()}):
-            for sign in (1, -1):
-                is_lost = counts_zh[name, sign] < counts_en[name, sign]
-                if is_lost and counts_zh[name, -sign] > counts_en[name, -sign]:
-                    return name
-        return None
-
-    def is_negated(self, text: str, start: int, language: Language) -> bool:
-        """Return whether a negation stands just before a place of a text (English in small letters)."""
-        if language == "zh":
-            return text[max(0, start - 4) : start].endswith(tuple(self.file.negations.zh))
-        words = re.findall(r"[a-z']+", re.split(r"[.,;:]", text[max(0, start - 24) : start])[-1])
-        return bool(set(self.file.negations.en).intersection(words[-2:]))
-
-    def pairs(self) -> list[tuple[str, str]]:
-        """Return the words of visibility and the units, English and Chinese, as they are written."""
-        seen = [(self.visibility(word, "en"), self.visibility(word, "zh")) for word in VISIBILITY]
-        return seen + [(words.en[0], words.zh[0]) for words in self.file.units.values()]
+@cache
+def _glossary() -> dict[str, Any]:
+    return read_yaml(GLOSSARY_FILE)
 
 
-def _opposites(file: GlossaryFile, language: Language) -> dict[str, tuple[str, int]]:
-    """Return the spellings of opposites: word -> its name, and 1 for the first of the two sides, -1 for the other."""
-    return {
-        word: (name, sign)
-        for name, sides in file.opposites.items()
-        for words, sign in zip(sides.values(), (1, -1), strict=True)
-        for word in words[language]
-    }
+# --- words that are written -------------------------------------------------------------------------------------------
 
 
-def term_pattern(words: Iterable[str], language: Language) -> re.Pattern[str]:
-    """Return the pattern of any of some words, the longest first."""
-    options = "|".join(re.escape(word) for word in sorted(words, key=len, reverse=True))
-    return re.compile(rf"(?<![a-z_])(?:{options})(?![a-z_])" if language == "en" else options)
+def form_of(word: str, form: int, language: Language) -> str:
+    """Return a word of the facts as it is written; text that is no such word stays as it is."""
+    if word not in _glossary()["slots"]:
+        return word
+    forms = _glossary()["slots"][word][language]
+    return str(forms[min(form, len(forms) - 1)])
+
+
+def form_after(before: str) -> int:
+    """Return the form of an English verb after these words; Chinese has one."""
+    return next((form for form, pattern in _before_forms().items() if pattern.search(before)), 0)
 
 
 @cache
-def load_glossary() -> Glossary:
-    """Read the glossary."""
-    return Glossary(build(GlossaryFile, read_yaml(GLOSSARY_FILE), GLOSSARY_FILE))
+def _before_forms() -> dict[int, re.Pattern[str]]:
+    words = _glossary()["before_forms"]
+    adverbs = rf"(?:\s+(?:{'|'.join(words['adverbs'])}))*\s*$"
+    patterns = {form: "|".join(words["patterns"][form]) for form in (2, 3, 1)}
+    return {form: re.compile(pattern.replace("ADVERBS", adverbs), re.IGNORECASE) for form, pattern in patterns.items()}
+
+
+def written_unit(unit: str, language: Language) -> str:
+    return str(_glossary()["units"][unit][language][0])
+
+
+def prompt_line(name: str, language: Language) -> str:
+    return str(_glossary()["prompt_lines"][name][language])
+
+
+def translations() -> list[tuple[str, str]]:
+    """Return the English and Chinese of all that has a fixed translation: actions, visibility, units, terms."""
+    seen = [(form_of(word, 0, "en"), form_of(word, 0, "zh")) for word in VISIBILITY]
+    units = [(written_unit(unit, "en"), written_unit(unit, "zh")) for unit in _glossary()["units"]]
+    return [*_names().items(), *seen, *units, *_glossary()["terms"].items()]
+
+
+def terms_in(english: str) -> dict[str, str]:
+    """Return the names of actions and the terms of an English text with their translations."""
+    pattern, known = _terms()
+    return {match.group(): known[match.group()] for match in pattern.finditer(english.lower())}
+
+
+@cache
+def _terms() -> tuple[re.Pattern[str], dict[str, str]]:
+    known = _names() | _glossary()["terms"]
+    return _any_of(known, "en"), known
+
+
+def _names() -> dict[str, str]:
+    return {action.en: action.zh for action in ACTIONS.values()}
+
+
+# --- words that are read ----------------------------------------------------------------------------------------------
+
+
+@cache
+def spellings(language: Language) -> dict[str, str]:
+    """Return the spellings of a unit that may stand behind a slot, and the unit."""
+    return {spelling: unit for unit, words in _glossary()["units"].items() for spelling in words[language]}
+
+
+@cache
+def written_units(language: Language) -> dict[str, Unit]:
+    """Return every spelling of a unit in running text, foreign ones too."""
+    units: dict[str, Unit] = {}
+    for name, factors in _glossary()["written_units"][language].items():
+        for factor, written in factors.items():
+            for spelling in filter(None, map(str.strip, written.split(","))):
+                units.setdefault(spelling, Unit(name, float(factor)))
+    return units
 
 
 @cache
@@ -136,17 +111,77 @@ def mentions(kind: str, name: str, language: Language) -> re.Pattern[str]:
     Args:
         kind: a list of patterns. name: of a quantity or subject, "" of the other lists.
     """
-    words = getattr(load_glossary().file, kind)
+    words = _glossary()[kind]
     options = "|".join((words[name] if name else words)[language])
     return re.compile(rf"\b(?:{options})\b" if language == "en" else f"(?:{options})", re.IGNORECASE)
 
 
+def mentioned(kind: str, text: str, language: Language) -> list[str]:
+    """Return the quantities or subjects that a text names."""
+    return [name for name in _glossary()[kind] if mentions(kind, name, language).search(text)]
+
+
+def stands_at(kind: str, before: str, after: str, language: Language) -> bool:
+    """Return whether a word for "more", "less" or "about" stands before or behind a number."""
+    ahead, behind = _around(kind, language)
+    return bool(ahead.search(before) or behind.match(after))
+
+
 @cache
-def written_units(language: Language) -> dict[str, Unit]:
-    """Return every spelling of a unit in running text, foreign ones too."""
-    units: dict[str, Unit] = {}
-    for name, factors in getattr(load_glossary().file.written_units, language).items():
-        for factor, spellings in factors.items():
-            for spelling in filter(None, map(str.strip, spellings.split(","))):
-                units.setdefault(spelling, Unit(name, float(factor)))
-    return units
+def _around(kind: str, language: Language) -> tuple[re.Pattern[str], re.Pattern[str]]:
+    ahead, behind = ("|".join(_glossary()["around_numbers"][kind][side][language]) for side in ("before", "behind"))
+    return re.compile(rf"(?:{ahead})\s*$", re.IGNORECASE), re.compile(rf"\s*(?:{behind})", re.IGNORECASE)
+
+
+@cache
+def ends_of_clauses(language: Language) -> re.Pattern[str]:
+    return re.compile("|".join(_glossary()["ends_of_clauses"][language]), re.IGNORECASE)
+
+
+def is_negated(text: str, start: int, language: Language) -> bool:
+    """Return whether a negation stands just before a place of a text (English in small letters)."""
+    negations = _glossary()["negations"][language]
+    if language == "zh":
+        return text[max(0, start - 4) : start].endswith(tuple(negations))
+    words = re.findall(r"[a-z']+", re.split(r"[.,;:]", text[max(0, start - 24) : start])[-1])
+    return bool(set(negations).intersection(words[-2:]))
+
+
+def swapped_opposite(english: str, chinese: str) -> str | None:
+    """Return the name of an opposite of which one side is lost and the other one gained in the translation."""
+    counts_en, counts_zh = count_opposites(english, "en"), count_opposites(chinese, "zh")
+    for name in sorted({name for name, _ in counts_en.keys() | counts_zh.keys()}):
+        for sign in (1, -1):
+            is_lost = counts_zh[name, sign] < counts_en[name, sign]
+            if is_lost and counts_zh[name, -sign] > counts_en[name, -sign]:
+                return name
+    return None
+
+
+def count_opposites(text: str, language: Language) -> Counter[tuple[str, int]]:
+    """Count the opposites of a text: (name, 1 for the first of its two sides, -1 for the other), negations applied."""
+    (pattern, opposites), counts = _opposites(language), Counter[tuple[str, int]]()
+    text = text.lower() if language == "en" else text
+    for match in pattern.finditer(text):
+        if match.group() in opposites:
+            name, sign = opposites[match.group()]
+            counts[name, -sign if is_negated(text, match.start(), language) else sign] += 1
+    return counts
+
+
+@cache
+def _opposites(language: Language) -> tuple[re.Pattern[str], dict[str, tuple[str, int]]]:
+    """Return the pattern of opposites, and of what looks like one; spelling -> its opposite and side."""
+    opposites = {
+        word: (name, sign)
+        for name, sides in _glossary()["opposites"].items()
+        for words, sign in zip(sides.values(), (1, -1), strict=True)
+        for word in words[language]
+    }
+    return _any_of([*opposites, *_glossary()["not_opposites"][language]], language), opposites
+
+
+def _any_of(words: Iterable[str], language: Language) -> re.Pattern[str]:
+    """Return the pattern of any of some words, the longest first."""
+    options = "|".join(re.escape(word) for word in sorted(words, key=len, reverse=True))
+    return re.compile(rf"(?<![a-z_])(?:{options})(?![a-z_])" if language == "en" else options)

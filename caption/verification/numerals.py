@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
-from caption.verification.glossary import Unit, written_units
+from caption.verification.glossary import Unit, stands_at, written_units
 from cosfly.formats.captions import Language
 
 _NO_UNIT = Unit("", 1.0)
@@ -82,26 +82,6 @@ def chinese_number(text: str) -> float:
 
 # --- in a text --------------------------------------------------------------------------------------------------------
 
-_MORE: dict[Language, tuple[str, str]] = {
-    "en": (
-        r"(?:more than|over|above|at least|upwards of|beyond|exceed\w*|just over|>)\s*$",
-        r"\s*(?:or more|plus\b|\+)",
-    ),
-    "zh": (r"(?:超过|至少|逾|大于|不止|高于|略多于|>)\s*$", r"\s*(?:以上|多|有余|出头)"),
-}
-_LESS: dict[Language, tuple[str, str]] = {
-    "en": (
-        r"(?:less than|under|below|at most|up to|within|nearly|almost|close to|not quite|short of|just under|<)\s*$",
-        r"\s*or less",
-    ),
-    "zh": (r"(?:不到|不足|将近|接近|近|至多|小于|低于|<)\s*$", r"\s*(?:以内|以下|之内)"),
-}
-_ABOUT = re.compile(
-    r"(?:about|around|some|roughly|approximately|approx\.?|ca\.?|circa|nearly|almost|close to|just (?:under|over)|near"
-    r"|~|≈|约|大约|大概|将近|接近|近)\s*$",
-    re.IGNORECASE,
-)
-_OR_SO = re.compile(r"\s*(?:or so|or thereabouts|give or take|左右|上下)")
 _HOURLY = re.compile(r"(?:时速|每小时)[^，。；]{0,4}$")
 _SQUARED = re.compile(r"\s?(?:²|\^2|\*\*2|/s\b)")  # an acceleration
 _DIGITS = r"(?:(?<![A-Za-z0-9_.])|(?<=\d[x×]))[-+−]?\d+(?:\.\d+)?(?!\d)"
@@ -144,37 +124,29 @@ def read_numerals(text: str, language: Language) -> list[Numeral]:
             unit = {"m": "mps", "deg": "dps"}[unit]
         if language == "zh" and (unit, factor) == ("m", 1000.0) and _HOURLY.search(before):  # 时速 26 公里
             unit, factor = "mps", 1 / 3.6
-        numeral = _numeral(match, unit, factor, language)
-        if numeral is not None:
-            is_about = bool(_ABOUT.search(before) or _OR_SO.match(after))
-            bound = _bound_of(before, after, language)
-            found.append(replace(numeral, start=match.start(), bound=bound, is_about=is_about))
+        number = _number_of(match, unit, language)
+        if number is None:
+            continue
+        bounds = [bound for kind, bound in (("more", 1), ("less", -1)) if stands_at(kind, before, after, language)]
+        found.append(Numeral(
+            match.group().strip(), number[0] * factor, unit, number[1], factor, bound=bounds[0] if bounds else 0,
+            is_about=stands_at("about", before, after, language), start=match.start(),
+            is_in_digits=match["digits"] is not None,
+        ))  # fmt: skip
     return found
 
 
-def _bound_of(before: str, after: str, language: Language) -> int:
-    for (ahead, behind), bound in ((_MORE[language], 1), (_LESS[language], -1)):
-        if re.search(ahead, before, re.IGNORECASE) or re.match(behind, after):
-            return bound
-    return 0
-
-
-def _numeral(match: re.Match[str], unit: str, factor: float, language: Language) -> Numeral | None:
+def _number_of(match: re.Match[str], unit: str, language: Language) -> tuple[float, int] | None:
+    """Return the value and its digits after the point; None of a count, and of "every metre", 一米."""
     groups = {name: text for name, text in match.groupdict().items() if text is not None}
-    text = match.group().strip()
     half = 0.5 if {"and_half", "word_half"} & groups.keys() else 0.0
     if "digits" in groups:
         written = groups["digits"].replace("−", "-")
         digits = len(written.partition(".")[2])
         value = abs(float(written)) + half
-        if not unit and digits == 0 and value < 10 and not half and written[0] not in "+-":
-            return None  # a count
-        return Numeral(text, value * factor, unit, digits, factor)
+        is_count = not unit and digits == 0 and value < 10 and not half and written[0] not in "+-"
+        return None if is_count else (value, digits)
     if "word" not in groups:
-        return Numeral(text, 0.5 * factor, unit, 1, factor, is_in_digits=False)
-    word = groups["word"]
-    value = half + (english_number(word) if language == "en" else chinese_number(word))
-    if value == 1.0:
-        return None  # "every metre", 一米: no measurement
-    digits = len(f"{value:.2f}".rstrip("0").partition(".")[2])
-    return Numeral(text, value * factor, unit, digits, factor, is_in_digits=False)
+        return 0.5, 1
+    value = half + (english_number(groups["word"]) if language == "en" else chinese_number(groups["word"]))
+    return None if value == 1.0 else (value, len(f"{value:.2f}".rstrip("0").partition(".")[2]))

@@ -24,7 +24,7 @@ from typing import Literal, NamedTuple
 
 from caption.verification.facts import STANDING_MPS, Facts, Series, wrapped
 
-Missing = Literal["unknown_reference", "unobserved_frame", "unknown_fact"]
+Missing = Literal["unobserved_frame", "unknown_fact"]
 HOVERING_MPS = 0.3  # slower than this the drone hovers
 CENTRED_SHARE = 0.02  # of the picture's width: nearer than this to the middle counts as centred
 MATCHING_MPS, MATCHING_SHARE = 0.1, 0.1  # speeds that differ by less match
@@ -52,13 +52,13 @@ class Quantity:
     steady_share: float = 0.0
     sides: tuple[str, str, str] | tuple[()] = ()
 
-    def allowed_spread(self, values: Sequence[float]) -> float:
-        return max(self.steady, self.steady_share * max(map(abs, values)))
+    def side_of(self, value: float, dead_band: float) -> str:
+        positive, negative, between = self.sides or ("", "", "")
+        return between if abs(value) < dead_band else positive if value > 0 else negative
 
 
-TURNS = ("left", "right", "straight")
-TURNING = ("yaw", "heading", "target_heading")  # whose side is that of a change
-ANGLES = frozenset({"heading", "target_heading"})  # whose differences are turns
+LEFT_RIGHT = ("left", "right", "straight")
+TURNS = ("yaw", "target_heading")  # whose side is that of a change
 
 
 def _now(read: Callable[[Facts], float | None]) -> Callable[[Facts], Series]:
@@ -66,44 +66,30 @@ def _now(read: Callable[[Facts], float | None]) -> Callable[[Facts], Series]:
     return lambda f: (*(None,) * (len(f) - 1), read(f))
 
 
-def _difference(f: Facts) -> float | None:
-    return None if f.target_speed_mps is None else round(f.mean_speed_mps - f.target_speed_mps, 2) + 0.0
-
-
-def _ratio(f: Facts) -> float | None:
-    return round(f.mean_speed_mps / f.target_speed_mps, 2) if f.target_speed_mps else None
-
-
-def _of_target(axis: int) -> Callable[[Facts], float | None]:
-    return lambda f: None if f.target_velocity_mps is None else f.target_velocity_mps[axis]
-
+_UNKNOWN = (None, None)
 
 QUANTITIES: dict[str, Quantity] = {
     "speed": Quantity(attrgetter("speed_mps"), "mps", 2, 0.3),
     "forward_speed": Quantity(_now(lambda f: f.velocity_mps[0]), "mps", 2, 0.3),
-    "sideways_speed": Quantity(_now(lambda f: f.velocity_mps[1]), "mps", 2, 0.3, sides=TURNS),
+    "sideways_speed": Quantity(_now(lambda f: f.velocity_mps[1]), "mps", 2, 0.3, sides=LEFT_RIGHT),
     "climb_rate": Quantity(attrgetter("climb_mps"), "mps", 2, 0.3),
     "altitude": Quantity(attrgetter("altitude_m"), "m", 1, 0.5),
-    "yaw": Quantity(attrgetter("yaw_deg"), "deg", 1, 1.0, sides=TURNS),
-    "heading": Quantity(attrgetter("heading_deg"), "deg", 1, 1.0, sides=TURNS),
-    "yaw_rate": Quantity(attrgetter("yaw_rate_dps"), "dps", 1, 2.0, sides=TURNS),
+    "yaw": Quantity(attrgetter("yaw_deg"), "deg", 1, 1.0, sides=LEFT_RIGHT),
+    "yaw_rate": Quantity(attrgetter("yaw_rate_dps"), "dps", 1, 2.0, sides=LEFT_RIGHT),
     "pitch": Quantity(attrgetter("pitch_deg"), "deg", 1, 1.0),
     "travelled": Quantity(attrgetter("travelled_m"), "m", 1, 0.5),
-    "displacement": Quantity(attrgetter("displacement_m"), "m", 1, 0.5),
     "ahead": Quantity(lambda f: [place and place[0] for place in f.place_m], "m", 1, 0.5),
     "distance": Quantity(attrgetter("distance_m"), "m", 1, 0.5),
-    "slant": Quantity(attrgetter("slant_m"), "m", 1, 0.5),
     "height_over_target": Quantity(attrgetter("height_over_target_m"), "m", 1, 0.5),
     "target_speed": Quantity(attrgetter("target_speeds_mps"), "mps", 2, 0.3),
-    "target_forward_speed": Quantity(_now(_of_target(0)), "mps", 2, 0.3),
-    "target_sideways_speed": Quantity(_now(_of_target(1)), "mps", 2, 0.3, sides=TURNS),
-    "target_heading": Quantity(attrgetter("target_headings_deg"), "deg", 1, 10.0, sides=TURNS),
+    "target_forward_speed": Quantity(_now(lambda f: (f.target_velocity_mps or _UNKNOWN)[0]), "mps", 2, 0.3),
+    "target_sideways_speed": Quantity(
+        _now(lambda f: (f.target_velocity_mps or _UNKNOWN)[1]), "mps", 2, 0.3, sides=LEFT_RIGHT
+    ),
+    "target_heading": Quantity(attrgetter("target_headings_deg"), "deg", 1, 10.0, sides=LEFT_RIGHT),
     "target_travelled": Quantity(attrgetter("target_travelled_m"), "m", 1, 0.5),
-    "speed_difference": Quantity(_now(_difference), "mps", 2, 0.3),
-    "speed_ratio": Quantity(_now(_ratio), "times", 2, 0.1, 0.1),
-    "bearing": Quantity(attrgetter("bearing_deg"), "deg", 1, 1.0, sides=TURNS),
+    "bearing": Quantity(attrgetter("bearing_deg"), "deg", 1, 1.0, sides=LEFT_RIGHT),
     "depression": Quantity(attrgetter("depression_deg"), "deg", 1, 1.0),
-    "box_width": Quantity(attrgetter("box_width_px"), "px", 0, 2.0, 0.08),
     "box_height": Quantity(attrgetter("box_height_px"), "px", 0, 2.0, 0.08),
     "others_in_view": Quantity(attrgetter("others_in_view"), "people", 0, 0.0),
     "other_distance": Quantity(attrgetter("other_distance_m"), "m", 1, 0.5),
@@ -111,13 +97,11 @@ QUANTITIES: dict[str, Quantity] = {
     "offset_x": Quantity(attrgetter("offset_x_px"), "px", 0, 5.0, sides=("right", "left", "centred")),
     "offset_y": Quantity(attrgetter("offset_y_px"), "px", 0, 5.0, sides=("below", "above", "centred")),
 }
-MOTIONS = {"target_motion": ("standing", "walking"), "drone_motion": ("hovering", "moving")}
-_STILL_MPS = {"target_motion": STANDING_MPS, "drone_motion": HOVERING_MPS}
-ASPECTS = ("change", "rate", "growth", "mean", "min", "max", "trend", "side", "comparison", "compared")
+WORDS = ("visibility", "framing", "walking", "box", "target_motion", "drone_motion")
+RELATIONS = ("trend", "side", "comparison", "compared")  # aspects that are words
+ASPECTS = ("change", "rate", "growth", "mean", "min", "max", *RELATIONS)
 RATE_UNITS = {"m": "mps", "deg": "dps"}
 _REVERSED = {"increasing": "decreasing", "decreasing": "increasing"}
-_TURNED = {"faster": "slower", "slower": "faster"}  # of the target against the drone
-NO_ASPECT = ("visibility", "framing", "walking", "box", *MOTIONS)
 
 
 class Reference(NamedTuple):
@@ -142,125 +126,153 @@ class Fact(NamedTuple):
     digits: int = 0
 
 
-_REFERENCE = re.compile(r"(?:([a-z]+):)?([a-z_]+)(?:@t(\d{1,2})(?:\s*[-–]\s*t(\d{1,2}))?)?")
-
-
 @lru_cache(maxsize=4096)
 def parse_reference(text: str) -> Reference | None:
     """Read a reference; None where it names nothing that can be measured."""
-    match = _REFERENCE.fullmatch(text.strip())
+    match = re.fullmatch(r"(?:([a-z]+):)?([a-z_]+)(?:@t(\d{1,2})(?:\s*[-–]\s*t(\d{1,2}))?)?", text.strip())
     if match is None:
         return None
-    aspect, quantity = match[1] or "", match[2]
+    aspect, name = match[1] or "", match[2]
     first, last = (None if digits is None else int(digits) for digits in (match[3], match[4]))
-    if quantity in NO_ASPECT:
-        is_known = not aspect and last is None
-    elif aspect in ("comparison", "compared"):
-        first = last = None  # of the whole window
-        is_known = quantity == "speed"
-    elif quantity not in QUANTITIES or (aspect and aspect not in ASPECTS):
+    if aspect in ("comparison", "compared"):
+        return Reference(name, aspect) if name == "speed" else None  # of the whole window
+    if last is not None and (not aspect or (first is not None and first > last)):
         return None
+    quantity = QUANTITIES.get(name)
+    if quantity is None:
+        is_known = name in WORDS and not aspect
+    elif aspect in ("side", "rate"):
+        is_known = bool(quantity.sides) if aspect == "side" else quantity.unit in RATE_UNITS
     else:
-        is_known = (bool(aspect) or last is None) and (aspect != "side" or bool(QUANTITIES[quantity].sides))
-        is_known = is_known and (aspect != "rate" or QUANTITIES[quantity].unit in RATE_UNITS)
-    if not is_known or (first is not None and last is not None and first > last):
-        return None
-    return Reference(quantity, aspect, first, last)
+        is_known = aspect in ("", *ASPECTS)
+    return Reference(name, aspect, first, last) if is_known else None
 
 
 # --- what is true -----------------------------------------------------------------------------------------------------
 
+_NOW = -1  # the current frame; of a motion, the whole window
+
 
 def look_up(reference: Reference, facts: Facts) -> Fact | Missing:
     """Return the fact at an address, or why there is none."""
-    found = facts.found.get(reference)
+    found: Fact | Missing | None = facts.found.get(reference)
     if found is None:
-        found = facts.found[reference] = find_fact(reference, facts)
+        found = facts.found[reference] = _find(reference, facts)
     return found
 
 
-def find_fact(reference: Reference, facts: Facts) -> Fact | Missing:
-    """Look a fact up without keeping it; for a caller that keeps it under a name of its own."""
+def _find(reference: Reference, facts: Facts) -> Fact | Missing:
     name, aspect, first, last = reference
-    count = len(facts)
-    if (first is not None and first >= count) or (last is not None and last >= count):
+    if max(first or 0, last or 0) >= len(facts):
         return "unobserved_frame"
-    at = count - 1 if first is None else first
-    if name in QUANTITIES and not aspect:
-        quantity = QUANTITIES[name]
-        value = quantity.read(facts)[at]
-        return "unknown_fact" if value is None else Fact(value, quantity.unit, quantity.digits)
-    if name == "visibility":
-        return Fact(facts.visibility[at])
-    if name in MOTIONS:
-        return _motion(name, facts, at if first is not None else None)
-    if name == "framing":
-        return _framing(facts, at)
-    if name == "walking":
-        return _walking(facts, at)
-    if name == "box":
-        width, height = facts.box_width_px[at], facts.box_height_px[at]
-        return "unknown_fact" if width is None or height is None else Fact(f"{width} x {height}", "px")
+    at = _NOW if first is None else first
+    value: float | str | None
+    if name in WORDS or aspect in RELATIONS:
+        value = _relation(reference, facts, at) if aspect else _word(name, facts, at)
+        return "unknown_fact" if value is None else Fact(value, "px" if name == "box" else "")
+    quantity = QUANTITIES[name]
+    unit, digits = quantity.unit, quantity.digits
+    value = _over_span(reference, facts) if aspect else quantity.read(facts)[at]
+    if value is None:
+        return "unknown_fact"
+    if aspect == "rate":
+        unit = RATE_UNITS[unit]
+    elif aspect == "growth":
+        unit, digits = "percent", 0
+    return Fact(round(value, digits) + 0.0 if aspect else value, unit, digits)
+
+
+def _word(name: str, f: Facts, at: int) -> str | None:
+    """Return the word for a frame; `walking`: towards the drone, away from it or across its line of sight."""
+    match name:
+        case "visibility":
+            return f.visibility[at]
+        case "framing":
+            x, y = f.offset_x_px[at], f.offset_y_px[at]
+            if x is None or y is None:
+                return None
+            return "centred" if max(abs(x), abs(y)) < _centred_px(f) else "off_centre"
+        case "box":
+            width, height = f.box_width_px[at], f.box_height_px[at]
+            return None if width is None or height is None else f"{width} x {height}"
+        case "walking":
+            course, bearing = f.target_headings_deg[at], f.bearing_deg[at]
+            if course is None or bearing is None:
+                return None
+            off_deg = abs(wrapped(course - f.heading_deg[at] - bearing))
+            return "away" if off_deg < ACROSS_DEG else "towards" if off_deg > 180.0 - ACROSS_DEG else "across"
+        case "target_motion":
+            speed = f.target_speed_mps if at == _NOW else f.target_speeds_mps[at]
+            return None if speed is None else "standing" if speed < STANDING_MPS else "walking"
+        case _:
+            speed = f.mean_speed_mps if at == _NOW else f.speed_mps[at]
+            return None if speed is None else "hovering" if speed < HOVERING_MPS else "moving"
+
+
+def _relation(reference: Reference, facts: Facts, at: int) -> str | None:
+    """Return the word of a comparison, of a side at a frame, or of a turn's side or a trend over a span."""
+    name, aspect, *_ = reference
+    quantity, ours, theirs = QUANTITIES[name], facts.mean_speed_mps, facts.target_speed_mps
     if aspect in ("comparison", "compared"):
-        return _comparison(facts, aspect)
-    return _over_span(reference, facts)
+        if theirs is None or abs(ours - theirs) <= max(MATCHING_MPS, MATCHING_SHARE * theirs):
+            return None if theirs is None else "matching"
+        return "faster" if (ours > theirs) == (aspect == "comparison") else "slower"
+    values = _span(reference, facts)
+    if aspect == "side":
+        is_offset = name in ("offset_x", "offset_y")
+        value = _change(name, values) if name in TURNS else quantity.read(facts)[at]
+        return None if value is None else quantity.side_of(value, _centred_px(facts) if is_offset else quantity.steady)
+    if len(values) < 2:
+        return None
+    trend = trend_of(quantity, values)
+    if has_sides(name) and trend in _REVERSED and min(values) < 0:
+        # Of the size: an offset to the left that shrinks is no increase.
+        return _REVERSED[trend] if max(values) <= 0 else None
+    return trend
 
 
-def span_of(reference: Reference, facts: Facts) -> list[float] | None:
-    """Return the known values of a reference's span; None where an end that it names, or the last, is not known."""
+def _over_span(reference: Reference, facts: Facts) -> float | None:
+    """Return a number over a span, not rounded."""
+    name, aspect, first, last = reference
+    whole = {"speed": facts.mean_speed_mps, "target_speed": facts.target_speed_mps}
+    if aspect == "mean" and name in whole and first is last is None:
+        return whole[name]  # of the straight line through all positions, not of its jitter
+    values = _span(reference, facts)
+    if values and aspect in ("mean", "min", "max"):
+        return {"mean": sum(values) / len(values), "min": min(values), "max": max(values)}[aspect]
+    change = _change(name, values)
+    if change is None or aspect == "change":
+        return change
+    if aspect == "rate":
+        return change / (facts.step_s * (len(values) - 1))
+    return 100.0 * change / abs(values[0]) if values[0] else None
+
+
+def _span(reference: Reference, facts: Facts) -> list[float]:
+    """Return the known values of a reference's span; none where an end that it names, or the last, is not known."""
     series = QUANTITIES[reference.quantity].read(facts)
     start = 0 if reference.first is None else reference.first
     end = len(series) - 1 if reference.last is None else reference.last
     if (reference.first is not None and series[start] is None) or series[end] is None:
-        return None
+        return []
     return [value for value in series[start : end + 1] if value is not None]
 
 
-def _over_span(reference: Reference, facts: Facts) -> Fact | Missing:
-    quantity, aspect = QUANTITIES[reference.quantity], reference.aspect
-    if aspect == "side" and reference.quantity not in TURNING:
-        value = quantity.read(facts)[-1 if reference.first is None else reference.first]
-        return "unknown_fact" if value is None else Fact(_side(quantity, value, dead_band_of(reference, facts)))
-    whole = {"speed": facts.mean_speed_mps, "target_speed": facts.target_speed_mps}
-    if aspect == "mean" and reference.quantity in whole and reference.first is None and reference.last is None:
-        mean = whole[reference.quantity]  # of the straight line through all positions, not of its jitter
-        return "unknown_fact" if mean is None else Fact(mean, quantity.unit, quantity.digits)
-    values = span_of(reference, facts)
-    if not values or (len(values) < 2 and aspect not in ("mean", "min", "max")):
-        return "unknown_fact"
-    if aspect == "trend":
-        trend = trend_of(quantity, values)
-        if has_sides(reference.quantity) and trend in _REVERSED and min(values) < 0:
-            # Of the size: an offset to the left that shrinks is no increase.
-            return Fact(_REVERSED[trend]) if max(values) <= 0 else "unknown_fact"
-        return Fact(trend)
+def _change(name: str, values: Sequence[float]) -> float | None:
+    if len(values) < 2:
+        return None
     change = values[-1] - values[0]
-    if reference.quantity in ANGLES:
-        change = wrapped(change)
-    if aspect == "side":
-        return Fact(_side(quantity, change, quantity.steady))
-    unit, digits = quantity.unit, quantity.digits
-    match aspect:
-        case "mean":
-            number = sum(values) / len(values)
-        case "min":
-            number = min(values)
-        case "max":
-            number = max(values)
-        case "rate":
-            number, unit = change / (facts.step_s * (len(values) - 1)), RATE_UNITS[unit]
-        case "growth":
-            if not values[0]:
-                return "unknown_fact"
-            number, unit, digits = 100.0 * change / abs(values[0]), "percent", 0
-        case _:
-            number = change
-    return Fact(round(number, digits) + 0.0, unit, digits)
+    return wrapped(change) if name == "target_heading" else change
 
 
-def has_sides(quantity: str) -> bool:
+def _centred_px(facts: Facts) -> float:
+    """Return how far from the middle of the picture something still counts as centred."""
+    return max(2.0, CENTRED_SHARE * facts.width_px)
+
+
+def has_sides(name: str) -> bool:
     """Return whether the sign of a quantity says on which side of something it is."""
-    return bool(QUANTITIES[quantity].sides) and quantity not in ANGLES
+    return bool(QUANTITIES[name].sides) and name != "target_heading"
 
 
 def trend_of(quantity: Quantity, values: Sequence[float]) -> str:
@@ -269,7 +281,7 @@ def trend_of(quantity: Quantity, values: Sequence[float]) -> str:
     A course is a trend where the straight line that fits it best changes by more than the steady band and by
     CLEAR_RATIO times the deviation from it.
     """
-    band = quantity.allowed_spread(values)
+    band = max(quantity.steady, quantity.steady_share * max(map(abs, values)))
     if max(values) - min(values) <= band:
         return "steady"
     count = len(values)
@@ -282,52 +294,3 @@ def trend_of(quantity: Quantity, values: Sequence[float]) -> str:
     if change * fitted > 0 and (goes_one_way or abs(fitted) >= max(band, CLEAR_RATIO * deviation)):
         return "increasing" if change > 0 else "decreasing"
     return "mixed"
-
-
-def dead_band_of(reference: Reference, facts: Facts) -> float:
-    """Return how far a quantity may be off and still be steady or centred, in its unit."""
-    if reference.quantity in ("offset_x", "offset_y"):
-        return max(2.0, CENTRED_SHARE * facts.width_px)
-    return QUANTITIES[reference.quantity].steady
-
-
-def _side(quantity: Quantity, value: float, dead_band: float) -> str:
-    positive, negative, between = quantity.sides or ("", "", "")
-    return between if abs(value) < dead_band else positive if value > 0 else negative
-
-
-def _framing(facts: Facts, at: int) -> Fact | Missing:
-    x, y = facts.offset_x_px[at], facts.offset_y_px[at]
-    if x is None or y is None:
-        return "unknown_fact"
-    is_centred = max(abs(x), abs(y)) < max(2.0, CENTRED_SHARE * facts.width_px)
-    return Fact("centred" if is_centred else "off_centre")
-
-
-def _walking(facts: Facts, at: int) -> Fact | Missing:
-    """Return whether the target walks towards the drone, away from it or across its line of sight."""
-    course, bearing = facts.target_headings_deg[at], facts.bearing_deg[at]
-    if course is None or bearing is None:
-        return "unknown_fact"
-    off_deg = abs(wrapped(course - facts.heading_deg[at] - bearing))
-    return Fact("away" if off_deg < ACROSS_DEG else "towards" if off_deg > 180.0 - ACROSS_DEG else "across")
-
-
-def _motion(name: str, facts: Facts, at: int | None) -> Fact | Missing:
-    """Return whether something moves: over the whole window, or at a frame."""
-    if name == "drone_motion":
-        speed = facts.mean_speed_mps if at is None else facts.speed_mps[at]
-    else:
-        speed = facts.target_speed_mps if at is None else facts.target_speeds_mps[at]
-    still, moving = MOTIONS[name]
-    return "unknown_fact" if speed is None else Fact(still if speed < _STILL_MPS[name] else moving)
-
-
-def _comparison(facts: Facts, aspect: str) -> Fact | Missing:
-    ours, theirs = facts.mean_speed_mps, facts.target_speed_mps
-    if theirs is None:
-        return "unknown_fact"
-    word = "faster" if ours > theirs else "slower"
-    if abs(ours - theirs) <= max(MATCHING_MPS, MATCHING_SHARE * theirs):
-        word = "matching"
-    return Fact(word if aspect == "comparison" else _TURNED.get(word, word))

@@ -14,22 +14,17 @@ from functools import cache
 from itertools import combinations
 
 from caption.verification.facts import Facts, Series, wrapped
-from caption.verification.glossary import load_glossary, mentions
+from caption.verification.glossary import ends_of_clauses, mentioned, mentions
 from caption.verification.numerals import Numeral, read_numerals
 from cosfly.formats.captions import Language, ValueCounts
 
 LONGEST = 500  # characters of a sentence that is read; a model that repeats itself ends none
 SHOWN = 80  # characters of a clause in a message
-MEASURED = ("m", "mps", "deg", "dps", "px")
 ABOUT_SHARE = 0.08  # by which an approximate number may miss its fact
 ABOUT_LEAST = {"m": 0.5, "mps": 0.1, "deg": 2.0, "dps": 1.0, "px": 4.0}
 BOUND_SHARE = 0.3  # "more than 20 m" is matched by 20 to 26 m
 FOREIGN_SHARE = 0.03  # of a number in another unit than ours, which its writer has converted
-DIGITS = {"m": 1, "mps": 2, "deg": 1, "dps": 1, "px": 0}  # digits with which facts are printed
-_BETWEEN: dict[Language, str] = {
-    "en": r"[,;:()]|\.\s|\s[-–—]\s|\b(?:and|but|while|whereas|whilst|although|though|versus|vs\.?|against|with|which|who)\b",
-    "zh": r"[，；：。、（）]|而|但|并且|同时|相比|相对",
-}
+DIGITS = {"m": 1, "mps": 2, "deg": 1, "dps": 1, "px": 0}  # with which facts are printed; other units are not compared
 
 
 @dataclass(frozen=True)
@@ -61,10 +56,10 @@ def check_values(sentences: Sequence[str], facts: Facts, language: Language, fil
             continue
         for numeral in read_numerals(sentence, language):
             clause = _clause_around(sentence, numeral, language)
-            if numeral.unit not in MEASURED or is_hypothetical.search(clause):
+            if numeral.unit not in DIGITS or is_hypothetical.search(clause):
                 continue
             name = named_quantity(clause, numeral, language)
-            if _is_picture_size(numeral, facts) or _matches_any(numeral, _pool_of(name, numeral.unit, facts)):
+            if _matches_any(numeral, name, facts):
                 matched += 1
             else:
                 of = name.replace("_", " ") if name else "quantity"
@@ -87,17 +82,13 @@ def _may_hold_numbers(language: Language) -> re.Pattern[str]:
 def _clause_around(sentence: str, numeral: Numeral, language: Language) -> str:
     """Return the clause of a sentence in which a number stands."""
     start, end = 0, len(sentence)
-    for match in re.finditer(_BETWEEN[language], sentence, re.IGNORECASE):
+    for match in ends_of_clauses(language).finditer(sentence):
         if match.end() <= numeral.start:
             start = match.end()
         elif match.start() >= numeral.start + len(numeral.text):
             end = match.start()
             break
     return sentence[start:end]
-
-
-# Unit -> the quantities that a clause may name.
-_NAMES = {"m": ("altitude", "distance"), "px": ("box", "offset"), "deg": ("yaw",)}
 
 
 def named_quantity(clause: str, numeral: Numeral, language: Language) -> str:
@@ -107,22 +98,16 @@ def named_quantity(clause: str, numeral: Numeral, language: Language) -> str:
     may give a difference.
     """
     if numeral.unit == "mps":
-        before = clause[: max(0, clause.find(numeral.text))]
-        named = [name for name in ("drone", "target") if mentions("subjects", name, language).search(clause)]
+        named, before = mentioned("subjects", clause, language), clause[: max(0, clause.find(numeral.text))]
         if len(named) != 1 or not mentions("subjects", named[0], language).search(before):
             return ""
         compares = mentions("comparatives", "", language).search(clause) or len(read_numerals(clause, language)) > 1
         return "" if compares else named[0]
-    quantities = load_glossary().file.quantities
-    named = [name for name in quantities if mentions("quantities", name, language).search(clause)]
-    return named[0] if len(named) == 1 and named[0] in _NAMES.get(numeral.unit, ()) else ""
+    named = mentioned("quantities", clause, language)
+    return named[0] if len(named) == 1 and (numeral.unit, named[0]) in _SERIES else ""
 
 
 # --- what a number may be ---------------------------------------------------------------------------------------------
-
-
-def _components(vectors: Sequence[Sequence[float] | None], axis: int) -> Series:
-    return [None if vector is None else vector[axis] for vector in vectors]
 
 
 # (unit, quantity that a clause names) -> its series. "" has the series of its unit that no quantity has.
@@ -130,9 +115,9 @@ _SERIES: dict[tuple[str, str], Callable[[Facts], tuple[Series, ...]]] = {
     ("m", "altitude"): lambda f: (f.altitude_m, f.height_over_target_m),
     ("m", "distance"): lambda f: (
         f.distance_m, f.slant_m, f.travelled_m, f.displacement_m, f.target_travelled_m, f.other_distance_m,
-        _components(f.place_m, 0),
+        [place and place[0] for place in f.place_m],
     ),
-    ("m", ""): lambda f: (_components(f.place_m, 1),),
+    ("m", ""): lambda f: ([place and place[1] for place in f.place_m],),
     ("mps", "drone"): lambda f: (
         f.speed_mps, f.step_speeds_mps, f.climb_mps, (f.mean_speed_mps,), *[(speed,) for speed in f.velocity_mps],
     ),
@@ -157,13 +142,8 @@ def _series_of(name: str, unit: str, facts: Facts) -> list[Series]:
 
 def _pool_of(name: str, unit: str, facts: Facts) -> tuple[set[float], set[float]]:
     """Return what a number may be: the facts as printed, and means, differences and rates of them."""
-    key = ("pool", name, unit)
-    if key not in facts.found:
-        facts.found[key] = _make_pool(name, unit, facts)
-    return facts.found[key]
-
-
-def _make_pool(name: str, unit: str, facts: Facts) -> tuple[set[float], set[float]]:
+    if ("pool", name, unit) in facts.found:
+        return facts.found["pool", name, unit]  # type: ignore[no-any-return]
     exact: set[float] = set()
     derived: set[float] = set()
     for series in _series_of(name, unit, facts):
@@ -181,6 +161,7 @@ def _make_pool(name: str, unit: str, facts: Facts) -> tuple[set[float], set[floa
                 derived.add(abs(b - a) / ((j - i) * facts.step_s))
     if not name:
         derived.update(_differences(unit, facts))
+    facts.found["pool", name, unit] = (exact, derived)
     return exact, derived
 
 
@@ -201,14 +182,12 @@ def _differences(unit: str, facts: Facts) -> Iterator[float]:
                 yield abs(wrapped(b - a)) if unit == "deg" else abs(b - a)
 
 
-def _is_picture_size(numeral: Numeral, facts: Facts) -> bool:
-    sizes = (facts.width_px, facts.height_px, facts.width_px / 2, facts.height_px / 2)
-    return numeral.unit == "px" and numeral.value in sizes
-
-
-def _matches_any(numeral: Numeral, pool: tuple[set[float], set[float]]) -> bool:
-    exact, derived = pool
+def _matches_any(numeral: Numeral, name: str, facts: Facts) -> bool:
+    size = (facts.width_px, facts.height_px)
+    if numeral.unit == "px" and numeral.value in (*size, size[0] / 2, size[1] / 2):
+        return True
     printed = 10.0 ** -DIGITS[numeral.unit]
+    exact, derived = _pool_of(name, numeral.unit, facts)
     return any(_matches(numeral, fact, 0.5 * printed) for fact in exact) or any(
         _matches(numeral, fact, printed) for fact in derived
     )
@@ -243,9 +222,7 @@ def measured_lines(facts: Facts, contradictions: Sequence[str]) -> str:
         "offset": ("offset to the right of the image centre", facts.offset_x_px, "px"),
     }
     named = [name for name in lines if any(f"measured {name} " in text for text in contradictions)] or list(lines)
-    texts = []
-    for name in named:
-        label, series, unit = lines[name]
-        values = ", ".join("-" if value is None else f"{value:g}" for value in series)
-        texts.append(f"{label}: {values} {unit}")
-    return "; ".join(texts)
+    return "; ".join(
+        f"{label}: {', '.join('-' if value is None else f'{value:g}' for value in series)} {unit}"
+        for label, series, unit in map(lines.__getitem__, named)
+    )

@@ -48,7 +48,7 @@ def caption(
         bool, Option("--plan", help="Caption a few windows and estimate time and cost of the rest.")
     ] = False,
     retry_failed: Annotated[
-        bool, Option("--retry-failed", help="Caption only the windows in quarantine.jsonl.")
+        bool, Option("--retry-failed", help="Caption the windows in quarantine.jsonl again.")
     ] = False,
     check: Annotated[bool, Option(help="Test the server before the first request of a directory.")] = True,
 ) -> None:
@@ -60,7 +60,7 @@ def caption(
     if check and cfg.teacher_kind == "endpoint" and not is_student and not (target / "answers").exists():
         _examine_endpoint(cfg.teacher, cfg)
     if plan_only:
-        forecast = job.call("caption.stage.forecast:make_forecast", cfg, tree, target)
+        forecast = job.call("caption.stage.stage:make_forecast", cfg, tree, target)
         options.print_table((), forecast, "What this run will take")
     else:
         job.run("caption.stage.stage", cfg, tree, target, retry_failed=retry_failed)
@@ -101,15 +101,15 @@ def judge_check(job: Job, url: Annotated[str, Argument(help="URL of the judge's 
     """Measure a judge on a small gold set: agreement, position bias, unparsable answers."""
     import asyncio
 
-    from caption.teachers.judge import check_judge, gold_conflicts, judge_check_table
+    from caption.teachers.judge import check_judge, gold_conflicts
     from caption.teachers.prompt_files import vocabulary_of
     from cosfly.runtime.config import build
-    from cosfly.runtime.console import console
 
     cfg = job.cfg.caption
     judge = build(type(cfg.judge), cfg.judge.model_dump() | {"url": url}, "caption.judge")
     report = asyncio.run(check_judge(judge, vocabulary_of(cfg), gold_conflicts(), job.cfg.seed))
-    console.print(judge_check_table(report))
+    head = ("figure", "value", "meaning")
+    options.print_table(head, report.rows(), f"Judge {report.model}", left=head)
 
 
 @command(
@@ -127,8 +127,8 @@ def compare_strategies(
     conflicts: Annotated[int, Option(min=1, help="Stop after this number of conflicts.")] = 50,
 ) -> None:
     """Compare hint, multi_sample, anchored and cascade on the same conflicts: consistency, text, requests, tokens."""
-    from caption.stage.compare import comparison_table
-    from cosfly.runtime.console import console
+    from caption.stage.compare import COLUMNS, comparison_rows
 
-    comparison = job.call("caption.stage.compare", job.cfg.caption, job.tree(data), out, conflicts=conflicts)
-    console.print(comparison_table(comparison))
+    comparisons = job.call("caption.stage.compare", job.cfg.caption, job.tree(data), out, conflicts=conflicts)
+    title = f"Regeneration of the same {comparisons[0].num_conflicts} conflicts"
+    options.print_table(COLUMNS, comparison_rows(comparisons), title)

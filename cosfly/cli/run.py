@@ -43,8 +43,8 @@ def run(
 
 
 def _print_estimate(cfg: RunConfig, out: Path) -> None:
-    from caption.stage.progress import duration
     from cosfly.pipeline import runs
+    from cosfly.runtime.console import duration
 
     rows = runs.estimate(cfg, out)
     cells = []

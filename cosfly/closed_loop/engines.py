@@ -153,8 +153,8 @@ class PromptedEngine:
         self._open(cfg, infer, seed)
 
     def _open(self, cfg: FlyConfig, infer: InferConfig, seed: int) -> None:
-        opened = open_teacher(self.cfg, self._book, seed, first_budget(self.cfg, self._book.totals))
-        self._teacher = self._runner.run(opened.__aenter__())
+        self._opened = open_teacher(self.cfg, self._book, seed, first_budget(self.cfg, self._book.totals))
+        self._teacher = self._runner.run(self._opened.__aenter__())  # open as long as the engine
         self.name = self._teacher.record.model
 
     def decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:
@@ -185,7 +185,7 @@ class PromptedEngine:
         if parsed.coc is None:
             answer: Answer = "invalid" if parsed.reason == NO_SET else "unreadable"
             return EngineDecision(answer, None, text[:MOST_WORDS], answer_s)
-        draft = question.way.read(parsed, question.facts)
+        draft = question.format.read(parsed.coc, question.facts)
         coc = draft.coc if isinstance(draft, Draft) else parsed.coc
         words = f"{coc.critical_components} {coc.reasoning_trace}"[:MOST_WORDS]
         return EngineDecision("ok", parsed.coc.flight_decision, words, answer_s)

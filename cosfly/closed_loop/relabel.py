@@ -181,6 +181,6 @@ def _reasons(record: Episode, i: int, future: FutureMotion) -> list[str]:
         reasons.append("nearly_lost")
     action = record.frames[i].action
     motion = measure(future)
-    if action is not None and TABLE.verdict_of(action, motion, TABLE.label_of(motion)) == "HARD_CONFLICT":
+    if action in TABLE.contradicted_by(motion, TABLE.label_of(motion)):
         reasons.append("hard_conflict")
     return reasons

@@ -23,7 +23,7 @@ from weakref import WeakValueDictionary
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cosfly.formats.captions import Usage
-from cosfly.llm.contract import MOST_TOKENS, CountName, Engine, NoAnswer, Reply, Request
+from cosfly.llm.contract import MOST_TOKENS, CountName, Engine, Reply, Request
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import CosflyError, TeacherError
 from cosfly.runtime.io import sha256_bytes
@@ -276,17 +276,21 @@ class KeptAnswers:
     """An engine with a journal and a budget: recorded answers are reused, new ones are recorded."""
 
     def __init__(
-        self, engine: Engine, book: AnswerBook | None, budget: Budget | None = None, only: frozenset[str] | None = None
+        self,
+        engine: Engine,
+        book: AnswerBook | None,
+        budget: Budget | None = None,
+        retried: frozenset[str] = frozenset(),
     ) -> None:
         """
         Args:
             book: None records nothing. budget: None sets no limit.
-            only: Ids of the samples for which the engine may be asked; None: all. Others get recorded answers only.
+            retried: Ids of the samples that are asked again where a recorded answer had filled the context.
         """
         self.engine = engine
         self.book = book
         self.budget = budget
-        self.only = only
+        self.retried = retried
         self._asking: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()  # by key, held during a request
 
     async def ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
@@ -297,11 +301,9 @@ class KeptAnswers:
         # Equal requests wait for each other, so that the second takes the answer of the first.
         async with self._asking.setdefault(key, asyncio.Lock()):
             recorded = None if self.book is None else self.book.get(track, key)
-            is_retried = self.only is not None and sample_id in self.only  # the context may be larger now
+            is_retried = sample_id in self.retried  # the context may be larger now
             if recorded is not None and not (is_retried and recorded.finish_reason == CONTEXT_FULL):
                 return recorded.reply
-            if self.only is not None and not is_retried:
-                raise NoAnswer("not_asked", "this run sends requests for other windows only")
             async with self.budget.request(num_pictures) if self.budget else contextlib.nullcontext():
                 start_s = time.monotonic()
                 reply = await engine.answer(request)

@@ -21,6 +21,7 @@ from cosfly.runtime.json_io import FileFormat, read_model, write_model
 from cosfly.viz.frame_views import View, encode_picture, frame_label
 
 IMAGE_ENCODING: Literal["png"] = "png"
+JPEG_QUALITY = 90
 IMAGE_PART: dict[str, Any] = {"type": "image"}  # a picture in the input of a chat template
 MAX_ANSWER_TOKENS = 512  # 1.5 times the longest answer in training
 
@@ -64,8 +65,13 @@ def picture_to_send(rgb: np.ndarray, max_pixels: int) -> EncodedImage:
     if max_pixels and scale < 1.0:
         size = (max(1, int(width_px * scale)), max(1, int(height_px * scale)))
         rgb = np.asarray(Image.fromarray(rgb).resize(size, Image.Resampling.BICUBIC))
-    data = encode_picture(rgb, IMAGE_ENCODING, 0)
-    url = f"data:image/{IMAGE_ENCODING};base64,{base64.b64encode(data).decode('ascii')}"
+    return encoded_image(rgb, IMAGE_ENCODING)
+
+
+def encoded_image(rgb: np.ndarray, encoding: Literal["jpeg", "png"] = "jpeg") -> EncodedImage:
+    """Encode a picture, (h, w, 3) uint8 RGB; a teacher gets JPEG."""
+    data = encode_picture(rgb, encoding, JPEG_QUALITY)
+    url = f"data:image/{encoding};base64,{base64.b64encode(data).decode('ascii')}"
     return EncodedImage(url, sha256_bytes(data))
 
 

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from caption.stage.progress import duration
 from cosfly.formats.inspection import undecided
 from cosfly.formats.pedestrian_paths import read_paths, walk_id
 from cosfly.formats.traces import read_traces
@@ -20,6 +19,7 @@ from cosfly.maps.stage import load_map
 from cosfly.pipeline.settings import RunConfig
 from cosfly.render.weather import dark_trajectories
 from cosfly.runtime.config import load
+from cosfly.runtime.console import duration
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.run_dir import StageFolder, Tally, is_held, read_manifest
 

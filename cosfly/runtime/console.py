@@ -108,3 +108,12 @@ def progress_bar(label: str, total: int | None, done: int = 0) -> Iterator[Advan
             log.info("%s: %d%s%s", label, position, of_all, f", {words}" if words else "")
 
     yield advance
+
+
+def duration(seconds: float) -> str:
+    """Return a time in its usual unit: 42 s, 7 min, 3.4 h, 2.1 days."""
+    if seconds < 90:
+        return f"{max(seconds, 0):.0f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h" if seconds < 172_800 else f"{seconds / 86_400:.1f} days"
