@@ -8,7 +8,16 @@ import pytest
 from caption.schema import WindowConfig
 from caption.stage.windows import cut_windows
 from caption.teachers.rule_decisions import is_shaken
-from caption.teachers.rules import FAMILIES, decide, sentences, write_templates
+from caption.teachers.rules import (
+    FAMILIES,
+    STRIKING_TOPICS,
+    TOPICS,
+    TOPICS_HIDDEN,
+    TOPICS_ORDERED,
+    decide,
+    sentences,
+    write_templates,
+)
 from caption.verification.facts import measure_facts
 from caption.verification.glossary import count_opposites, terms_in
 from caption.verification.references import Fact, look_up, parse_reference
@@ -84,4 +93,5 @@ def test_each_decision_has_a_family_and_each_family_sentences():
     assert len({english for english, _ in PAIRS}) >= 60
     for name, family in FAMILIES.items():
         assert sentences()["reasons"][name]
-        assert {*family.deciding, *family.more} <= sentences()["facts"].keys()
+        assert sentences()["consequences"][family.why]
+    assert {*TOPICS, *TOPICS_HIDDEN, *TOPICS_ORDERED, *STRIKING_TOPICS} == sentences()["facts"].keys()

@@ -121,8 +121,8 @@ def test_another_version_of_the_prompt_is_refused(place, tmp_path):
     english = taught["prompts"]["en"]
     for number, changed in enumerate([
         {"system": english["system"] + " Be brief.", "user": english["user"]},
-        {"system": english["system"], "user": english["user"].replace("Drone altitude:", "Height:")},
-        {"system": english["system"], "user": english["user"].replace("5 observed", "7 observed")},
+        {"system": english["system"], "user": english["user"].replace("Altitude:", "Height:")},
+        {"system": english["system"], "user": english["user"].replace("5 frames", "7 frames")},
         {"system": english["system"], "user": english["user"].replace("2 pictures", "3 pictures")},
     ]):  # fmt: skip
         folder = taught_otherwise(place, tmp_path / f"{number}", prompts=taught["prompts"] | {"en": changed})

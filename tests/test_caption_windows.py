@@ -153,24 +153,24 @@ def test_facts_of_a_hand_made_window(tree):
     assert (facts.offset_x_px[2:], facts.offset_y_px[2:]) == ((30, None, None), (10, None, None))
     assert facts.visibility == ("visible", "visible", "partly_occluded", "occluded", "out_of_view")
     prompt = make_question(window, ImageConfig(), "prose", VOCABULARY).prompts["en"].user
-    assert "Drone speed: 2.24, 2.24, 2.24, 2.24, now 2.24 m/s; change 0 m/s." in prompt
-    assert "Drone yaw since the first frame, to the left (minus: right): 0.0, 1.0, 2.0, 3.0, now 4.0 deg" in prompt
-    assert "visible, visible, partly occluded, occluded, now out of view." in prompt
+    assert "speed 2.24 2.24 2.24 2.24 2.24 m/s" in prompt
+    assert "Turn to the left: 2.0 deg/s; yaw 0.0 1.0 2.0 3.0 4.0 deg" in prompt
+    assert "visible, visible, partly occluded, occluded, out of view\n" in prompt
     chinese = make_question(window, ImageConfig(), "prose", VOCABULARY).prompts["zh"].user
-    assert "可见, 可见, 部分遮挡, 被遮挡，当前在视野外。" in chinese
-    assert "observed frames, 0.5 s apart," in prompt
+    assert "可见, 可见, 部分遮挡, 被遮挡, 在视野外\n" in chinese
+    assert "5 frames, 0.5 s apart," in prompt
     # Who is not hidden and cannot be made out is told as that; a tree that does not say so changes nothing.
     dim = dataclasses.replace(window, frames=tuple(dataclasses.replace(f, legible=False) for f in window.frames))
     words = ("illegible", "illegible", "illegible", "occluded", "out_of_view")
     assert measure_facts(dim) == dataclasses.replace(facts, visibility=words)
     told = make_question(dim, ImageConfig(), "prose", VOCABULARY).prompts
-    assert "hard to make out, hard to make out, hard to make out, occluded, now out of view." in told["en"].user
-    assert "难以辨认, 难以辨认, 难以辨认, 被遮挡，当前在视野外。" in told["zh"].user
+    assert "hard to make out, hard to make out, hard to make out, occluded, out of view\n" in told["en"].user
+    assert "难以辨认, 难以辨认, 难以辨认, 被遮挡, 在视野外\n" in told["zh"].user
     frames = tuple(dataclasses.replace(frame, time_s=0.5 * frame.time_s) for frame in window.frames)
     halved = dataclasses.replace(window, frames=frames)
     doubled = make_question(halved, ImageConfig(), "prose", VOCABULARY).prompts
-    assert "observed frames, 0.25 s apart," in doubled["en"].user
-    assert "Drone speed: 4.47, 4.47, 4.47, 4.47, now 4.47 m/s" in doubled["en"].user
+    assert "5 frames, 0.25 s apart," in doubled["en"].user
+    assert "speed 4.47 4.47 4.47 4.47 4.47 m/s" in doubled["en"].user
 
 
 NUM_POINTS = 160

@@ -14,7 +14,7 @@ from caption.answer_formats.formats import FORMATS, AnswerFormat
 from caption.schema import ImageConfig, ObservedWindow
 from caption.teachers.images import EncodeFrame, pictures_of
 from caption.teachers.prompt_files import Vocabulary, prompt_format
-from caption.verification.facts import Facts, Series, measure_facts
+from caption.verification.facts import Facts, measure_facts
 from caption.verification.glossary import LANGUAGES, form_of, prompt_line, translations, written_unit
 from caption.verification.references import QUANTITIES, Fact, Reference, look_up
 from cosfly.formats.captions import ACTIONS, GOAL_WORDS, PICTURES_MARK, TOKENS, Language, Prompt, Writing
@@ -102,10 +102,8 @@ def user_prompts(window: ObservedWindow, facts: Facts, vocabulary: Vocabulary) -
     numbers |= {"num_frames": str(len(facts)), "step_s": f"{facts.step_s:g}", "pictures": PICTURES_MARK}
     users: dict[Language, str] = {}
     for language in LANGUAGES:
-        seen = [form_of(word, 0, language) for word in facts.visibility]
-        words = {"visibility_before": ", ".join(seen[:-1]), "visibility": seen[-1]}
-        if is_paper:
-            words = _paper_state(window, facts, language) | {"visibility": ", ".join(seen)}
+        words = _paper_state(window, facts, language) if is_paper else {}
+        words["visibility"] = ", ".join([form_of(word, 0, language) for word in facts.visibility])
         question = prompt_format(f"user_{language}", vocabulary) % (numbers | words)
         users[language] = "\n".join([question, *_further_lines(window, facts, language)])
     return users
@@ -140,35 +138,37 @@ def _further_lines(window: ObservedWindow, facts: Facts, language: Language) -> 
         yield prompt_line(window.mission, language)
 
 
+_SERIES = ("distance", "bearing", "target_speed", "speed", "yaw", "altitude")
+_CURRENT = (
+    "ahead", "offset_x", "offset_y", "yaw_rate", "forward_speed", "sideways_speed", "target_forward_speed",
+    "target_sideways_speed",
+)  # fmt: skip
 # The size in pixels depends on the zoom, which differs between tracks and says nothing about the motion.
-_BOX_GROWTH = Reference("box_height", "growth")
-_SERIES = ("ahead", "distance", "bearing", "offset_x", "offset_y", "target_speed", "speed", "yaw", "altitude")
-_VELOCITY = ("forward_speed", "sideways_speed", "climb_speed")
-_TARGET_VELOCITY = ("target_forward_speed", "target_sideways_speed")
+_CHANGES = (Reference("distance", "change"), Reference("altitude", "change"), Reference("box_height", "growth"))
 
 
 def _relative_state(facts: Facts) -> dict[str, str]:
-    """Return the earlier values, the current value and the change of every series, and the velocities.
+    """Return the series with a value for each frame, what holds now or for the whole window, and three changes.
 
-    The change is that of the slot `{change:...}`: from the first frame at which the value is known.
+    A change is that of the slot `{change:...}`. The text is short on purpose: from the same windows a small student
+    learns less the longer its prompts are.
     """
-    left, above = ([place and place[axis] for place in facts.place_m] for axis in (1, 2))
-    series: dict[str, tuple[Series, int]] = {"left": (left, 1), "above": (above, 1)}
-    series |= {name: (QUANTITIES[name].read(facts), QUANTITIES[name].digits) for name in _SERIES}
-    numbers = dict[str, str]()
-    for name, (values, digits) in series.items():
-        form = f"%.{digits}f"
-        texts = ["-" if value is None else form % value for value in values]
-        known = [value for value in values if value is not None]
-        is_known = values[-1] is not None and len(known) > 1
-        numbers[f"{name}_before"], numbers[name] = ", ".join(texts[:-1]), texts[-1]
-        numbers[f"{name}_change"] = _signed(form % (known[-1] - known[0])) if is_known else "-"
-    velocities: dict[str, float | None] = dict(zip(_VELOCITY, facts.velocity_mps, strict=True))
-    velocities |= zip(_TARGET_VELOCITY, facts.target_velocity_mps or (None, None), strict=True)
-    numbers |= {name: "-" if speed is None else f"{speed:.2f}" for name, speed in velocities.items()}
-    growth = look_up(_BOX_GROWTH, facts)
-    numbers["box_growth"] = _signed(f"{growth.value:.0f}") if isinstance(growth, Fact) else "-"
-    return numbers | {"yaw_rate": f"{facts.yaw_rate_dps[-1]:.1f}"}
+    texts = {
+        name: [_written(value, QUANTITIES[name].digits) for value in QUANTITIES[name].read(facts)]
+        for name in (*_SERIES, *_CURRENT)
+    }
+    numbers = {name: " ".join(texts[name]) for name in _SERIES} | {name: texts[name][-1] for name in _CURRENT}
+    _, left, above = facts.place_m[-1] or (None, None, None)
+    numbers |= {"left": _written(left, 1), "above": _written(above, 1), "climb_speed": f"{facts.velocity_mps[2]:.2f}"}
+    for change in _CHANGES:
+        fact = look_up(change, facts)
+        name = f"{change.quantity}_{change.aspect}"
+        numbers[name] = _signed(f"{fact.value:.{fact.digits}f}") if isinstance(fact, Fact) else "-"
+    return numbers
+
+
+def _written(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def _signed(number: str) -> str:

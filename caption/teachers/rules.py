@@ -21,7 +21,7 @@ from caption.verification.references import Fact, look_up, parse_reference
 from cosfly.formats.segments import MISSION_KINDS
 from cosfly.runtime.config import read_yaml
 
-MODEL = "rules-8"  # its name in the records; counts changes of decisions and wording
+MODEL = "rules-9"  # its name in the records; counts changes of decisions and wording
 Both = tuple[str, str]  # English, Chinese
 Condition = Callable[[Facts, int], bool]  # of the facts and the side of the decision: 1 left, -1 right, 0 neither
 
@@ -32,10 +32,16 @@ SMALL_SHARE, LARGE_SHARE = 0.04, 0.4  # of the picture's height
 STEEP_DEG = 55.0
 NEAR_M, COMING_M = 3.0, 6.0  # from the target to a bystander at its side, to one on the way to it
 MOST_DIFFERENCES = 1  # in appearance, of a person who is similar
-SLOW_MPS, SLIDING_MPS, CRAWLING_MPS = 0.3, 0.5, 0.7
+SLOW_MPS, SLIDING_MPS, CRAWLING_MPS, DRIFTING_MPS = 0.3, 0.5, 0.7, 0.1
+TURNING_DPS, CLIMBING_MPS = 1.0, 0.2  # slower turns and climbs are not worth a sentence
 SIDES = (("left", "right"), ("left",), ("right",))  # by the side of the decision
 HIDDEN = ("occluded", "out_of_view")
 CLOSE_M = 30.0  # a target that comes nearer than this leaves the drone little room
+# Topics of critical_components: what decisions rest on where the target is visible, hidden, and under an order.
+TOPICS = ("heading", "height", "drone", "motion")
+TOPICS_HIDDEN = ("view", "cover", "last", "drone", "height")
+TOPICS_ORDERED = ("order", "view", "drone", "motion", "height")
+STRIKING_TOPICS = ("view", "cover", "people", "place", "gap", "size")  # the first that holds is named as well
 STRIKING = ("off_centre",)  # conditions for which a reason to fly straight on has to account
 
 
@@ -118,10 +124,6 @@ def is_close(f: Facts) -> bool:
     return (f.distance_m[-1] or math.inf) <= CLOSE_M
 
 
-def retreats(f: Facts, side: int) -> bool:
-    return f.velocity_mps[0] <= -SLIDING_MPS and not is_shaken(f)
-
-
 def sets_off(f: Facts, side: int) -> bool:
     return hurries(f, side) and (f.target_speeds_mps[0] or 0.0) < SLOW_MPS
 
@@ -195,37 +197,28 @@ def bystander_closes(f: Facts, side: int) -> bool:
 
 @dataclass(frozen=True)
 class Family:
-    """Decisions that are argued alike: their topics are those of `facts` in rule_sentences.yaml.
-
-    Attributes:
-        tokens: one decision, or the same to the left and to the right.
-        deciding: topics on which the decision rests. more: others that may matter. why: its consequences.
-    """
+    """Decisions that are argued alike. tokens: one, or the same to the left and to the right. why: its consequences."""
 
     tokens: tuple[str, ...]
-    deciding: tuple[str, ...]
-    more: tuple[str, ...]
     why: str = "others"
 
 
 FAMILIES = {
-    "straight": Family(("track_straight",), ("people", "cover"), ("motion", "place", "gap", "pace", "course"), "straight"),
-    "yaw": Family(
-        ("yaw_left_to_follow", "yaw_right_to_follow"), ("heading", "people", "cover"), ("motion", "place", "gap", "view"), "yaw"
-    ),
-    "circle": Family(("circle_left", "circle_right"), ("drone", "motion"), ("heading", "gap", "place")),
-    "strafe": Family(("strafe_left", "strafe_right"), ("drone", "motion"), ("course", "gap", "place")),
-    "ascend": Family(("ascend",), ("height", "cover"), ("motion", "size", "gap", "place")),
-    "descend": Family(("descend",), ("height", "size"), ("motion", "view", "gap", "place")),
-    "forward": Family(("move_forward",), ("gap", "size"), ("motion", "view", "place", "drone")),
-    "backward": Family(("move_backward",), ("drone", "gap", "motion"), ("size", "view", "place")),
-    "speed_up": Family(("speed_up",), ("pace", "motion"), ("gap", "place", "view", "drone")),
-    "slow_down": Family(("slow_down",), ("pace", "motion"), ("gap", "place", "view", "drone")),
-    "hover": Family(("hover",), ("drone",), ("motion", "place", "gap", "view", "people"), "hover"),
-    "search": Family(("search_to_reacquire_target",), ("view", "cover", "last"), ("drone", "motion"), "lost"),
-    "break_off": Family(("break_off",), ("order",), ("view", "drone", "gap", "motion"), "order"),
-    "home": Family(("return_to_home",), ("order",), ("view", "drone", "gap", "motion"), "order"),
-}  # fmt: skip
+    "straight": Family(("track_straight",), "straight"),
+    "yaw": Family(("yaw_left_to_follow", "yaw_right_to_follow"), "yaw"),
+    "circle": Family(("circle_left", "circle_right")),
+    "strafe": Family(("strafe_left", "strafe_right")),
+    "ascend": Family(("ascend",)),
+    "descend": Family(("descend",)),
+    "forward": Family(("move_forward",)),
+    "backward": Family(("move_backward",)),
+    "speed_up": Family(("speed_up",)),
+    "slow_down": Family(("slow_down",)),
+    "hover": Family(("hover",), "hover"),
+    "search": Family(("search_to_reacquire_target",), "lost"),
+    "break_off": Family(("break_off",), "order"),
+    "home": Family(("return_to_home",), "order"),
+}
 FAMILY_OF = {token: name for name, family in FAMILIES.items() for token in family.tokens}
 
 
@@ -244,8 +237,7 @@ CONDITIONS: dict[str, Condition] = {
     "stands": says("target_motion", "standing", is_walk_known),
     "sets_off": sets_off, "turns": turns, "crosses": crosses, "comes": comes, "walks_away": walks_away, "walks": walks,
     "slows": says("trend:target_speed", "decreasing", is_walk_known_at_first),
-    "hurries": hurries,
-    "centred": centred, "off_centre": off_centre, "near_border": near_border, "sight_swings": sight_swings,
+    "hurries": hurries, "off_centre": off_centre, "near_border": near_border, "sight_swings": sight_swings,
     "swings_through_jitter": lambda f, side: is_shaken(f) and sight_swings(f, side),
     "on_axis": lambda f, side: centred(f, side) and not sight_swings(f, 0),
     "gap_steady": says("trend:distance", "steady"),
@@ -253,13 +245,16 @@ CONDITIONS: dict[str, Condition] = {
     "pace_matched": says("comparison:speed", "matching", is_smooth, walks, walks_evenly),
     "outrun": says("comparison:speed", "slower", is_smooth, walks, walks_evenly, gap_moves),
     "overtakes": says("comparison:speed", "faster", is_smooth, walks, walks_evenly, gap_moves),
-    "nose_steady": says("side:yaw", "straight", is_smooth),
     "nose_turns": nose_turns,
     "drone_hovers": says("drone_motion", "hovering", lambda f, side: (f.speed_mps[-1] or 0.0) < SLOW_MPS),
     "drone_brakes": says("trend:speed", "decreasing", is_smooth, is_crawling),
     "drone_crawls": lambda f, side: is_smooth(f, side) and is_crawling(f, side),
     "drone_flies": says("drone_motion", "moving"),
-    "slides": slides, "retreats": retreats,
+    "slides": slides, "retreats": lambda f, side: f.velocity_mps[0] <= -max(SLIDING_MPS, abs(f.velocity_mps[1])),
+    "turning": lambda f, side: abs(f.yaw_rate_dps[-1] or 0.0) >= TURNING_DPS,
+    "climbing": lambda f, side: (f.climb_mps[-1] or 0.0) >= CLIMBING_MPS,
+    "sinking": lambda f, side: (f.climb_mps[-1] or 0.0) <= -CLIMBING_MPS,
+    "drone_drifts": lambda f, side: abs(f.velocity_mps[1]) >= DRIFTING_MPS,
     "comes_near": lambda f, side: comes(f, side) and is_close(f),
     "gap_closes_near": lambda f, side: gap_closes(f, side) and is_close(f),
     "goes_along": lambda f, side: slides(f, side) and walks(f, side) and side * _walk_aside_mps(f) >= SLOW_MPS,
@@ -299,9 +294,7 @@ class Group:
 
 
 # Numbers that the shaking of a perturbed track changes more than the motion does.
-_JITTERS = re.compile(
-    r"\{(?:change:|yaw|mean:speed|mean:target|target_|speed|sideways_|(?:altitude|distance|box_height)@)"
-)
+_JITTERS = re.compile(r"\{(?:change:|yaw\}|mean:speed|mean:target|target_|(?:altitude|distance|box_height)@)")
 
 
 @cache
@@ -358,7 +351,7 @@ def write_templates(
     reasons = list(choose.holding(sentences()["reasons"][name], side))
     if not reasons:
         return None
-    components, trace = _critical_components(choose, name, side), _reasoning_trace(choose, name, reasons)
+    components, trace = _critical_components(choose), _reasoning_trace(choose, name, reasons)
     texts = [(" ".join([en for en, _ in both]), "".join([zh for _, zh in both])) for both in (components, trace)]
     english, chinese = [
         {"critical_components": critical, "reasoning_trace": reasoning, "flight_decision": token}
@@ -367,14 +360,17 @@ def write_templates(
     return english, chinese
 
 
-def _critical_components(choose: Chooser, name: str, side: int) -> list[Both]:
-    """Return the facts on which a decision rests: those that decide it, and others up to three or four."""
-    family, found, num = FAMILIES[name], list[Group](), 3 + choose.below(2)
-    others = list(family.more)
-    for topic in (*family.deciding, *[others.pop(choose.below(len(others))) for _ in family.more]):
-        if len(found) < num:
-            holding = choose.holding(sentences()["facts"][topic], side if topic in ("heading", "place") else 0)
-            found += islice(holding, 1)
+def _critical_components(choose: Chooser) -> list[Both]:
+    """Return the facts on which a decision rests, in no fixed order.
+
+    They do not depend on the decision: what tells one manoeuvre from another is how the nose turns, how the drone
+    climbs and moves, and how the target moves. A student that writes them has read what it needs before it decides.
+    """
+    topics = TOPICS_ORDERED if choose.facts.mission else TOPICS if choose.facts.is_visible_now else TOPICS_HIDDEN
+    found = [group for topic in topics for group in islice(choose.holding(sentences()["facts"][topic], 0), 1)]
+    if topics is TOPICS:
+        striking = (group for topic in STRIKING_TOPICS for group in choose.holding(sentences()["facts"][topic], 0))
+        found += islice(striking, 1)
     return [choose.sentence(found.pop(choose.below(len(found)))) for _ in tuple(found)]
 
 

@@ -71,8 +71,10 @@ _UNKNOWN = (None, None)
 QUANTITIES: dict[str, Quantity] = {
     "speed": Quantity(attrgetter("speed_mps"), "mps", 2, 0.3),
     "forward_speed": Quantity(_now(lambda f: f.velocity_mps[0]), "mps", 2, 0.3),
+    "backward_speed": Quantity(_now(lambda f: 0.0 - f.velocity_mps[0]), "mps", 2, 0.3),
     "sideways_speed": Quantity(_now(lambda f: f.velocity_mps[1]), "mps", 2, 0.3, sides=LEFT_RIGHT),
     "climb_rate": Quantity(attrgetter("climb_mps"), "mps", 2, 0.3),
+    "sink_rate": Quantity(lambda f: [climb and -climb for climb in f.climb_mps], "mps", 2, 0.3),
     "altitude": Quantity(attrgetter("altitude_m"), "m", 1, 0.5),
     "yaw": Quantity(attrgetter("yaw_deg"), "deg", 1, 1.0, sides=LEFT_RIGHT),
     "yaw_rate": Quantity(attrgetter("yaw_rate_dps"), "dps", 1, 2.0, sides=LEFT_RIGHT),
