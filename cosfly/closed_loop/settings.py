@@ -118,7 +118,9 @@ class FlyConfig(Config):
         if self.engine not in ENGINES:
             raise ValueError(f"student {self.student!r} does not exist{nearest(self.student, ENGINES)}; use {KINDS}")
         if self.adapter is not None and self.engine != "transformers":
-            raise ValueError(f"adapter needs student transformers:MODEL_DIR, but the student is {self.student!r}")
+            raise ValueError(
+                f"the setting adapter works only with student=transformers:MODEL_DIR, but student is {self.student!r}"
+            )
         return self
 
     def recorded(self) -> dict[str, Any]:

@@ -40,7 +40,7 @@ Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 def _licence_id(text: str) -> str:
     if not re.fullmatch(r"[a-z0-9][a-z0-9.+-]*", text):
         raise ValueError(
-            "use a licence identifier such as cc-by-4.0 or apache-2.0, and put other text into the setting credits"
+            f"{text[:40]!r} is not a licence identifier such as cc-by-4.0 or apache-2.0; put other text into `credits`"
         )
     return text
 

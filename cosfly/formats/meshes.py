@@ -115,9 +115,12 @@ def _read_gltf(text: bytes, binary: bytes, path: Path) -> dict[str, np.ndarray]:
     counts = [*(a["count"] for a in accessors), *(view["byteLength"] for view in views)]
     most = int(MOST_NUMBERS + FILE_MB * MB)
     if min(counts, default=0) < 0 or sum(counts) > most:
-        expected = f"counts of at least 0 and a sum of at most {most:,}"
+        expected = f"no negative number, and at most {most:,} values and bytes in all"
         raise InputError(
-            "the counts of the mesh are negative or too large", where=path, got=f"{sum(counts):,}", expected=expected
+            "the mesh file declares a negative number of values, or too many",
+            where=path,
+            got=f"{sum(counts):,}",
+            expected=expected,
         )
     plain_document = {
         "asset": {"version": "2.0"}, "scenes": [{"nodes": roots}], "accessors": accessors, "bufferViews": views,

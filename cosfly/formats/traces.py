@@ -51,7 +51,7 @@ class Excerpt:
         if record is None:
             return None
         if not isinstance(record, dict) or record.get("number") not in range(MOST_TRAJECTORIES):
-            expected = f"an object with id, number (below {MOST_TRAJECTORIES}) and before"
+            expected = f"an object with the keys `id`, `number` (0 to {MOST_TRAJECTORIES - 1}) and `before` (positions)"
             raise InputError("the field does not describe a part of a trajectory", where=where, expected=expected)
         return cls(text_id(record, where), int(record["number"]), column(record, "before", where, None, 3))
 

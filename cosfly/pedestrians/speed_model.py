@@ -58,7 +58,9 @@ class TimedRoute:
         lengths_m = np.linalg.norm(np.diff(self.polyline_m, axis=0), axis=1)
         means_mps = 0.5 * (self.speeds_mps[1:] + self.speeds_mps[:-1])
         if not (means_mps > 0).all():
-            raise ValueError("the speed is 0 at both ends of a piece, so its end is never reached")
+            raise ValueError(
+                "the speed is 0 at both ends of a segment of the route, so the pedestrian never reaches its end"
+            )
         return np.concatenate([[0.0], np.cumsum(lengths_m / means_mps)])
 
     def resample(self, step_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -80,7 +80,7 @@ class FigureReader:
                     values = [FUNCTIONS[name](value) if value else None for value in values for name in names]
             except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
                 expected = (
-                    f"a value that {functions} can be applied to" if functions else "an object or a list at each `*`"
+                    f"a value that {functions} accepts" if functions else "an object or a list where the key has `*`"
                 )
                 raise InputError(
                     "cannot read this value from the file",

@@ -192,7 +192,9 @@ class PlanConfig(Config):
         for name, style_ranges in ranges.items():
             if name not in ROWS:
                 choices = ", ".join(ROWS)
-                raise ValueError(f"style {name!r} has no ranges to set{nearest(name, ROWS)}; choose from {choices}")
+                raise ValueError(
+                    f"no style with adjustable ranges is called {name!r}{nearest(name, ROWS)}; choose from {choices}"
+                )
             with_ranges(ROWS[name], style_ranges)
         return ranges
 

@@ -100,7 +100,7 @@ class RenderConfig(WeatherConfig):
             raise ValueError(f"backend {self.backend} cannot draw weather; use gl or carla, or weather_mode off")
         if self.weather_mode != "off" and self.look != Look():
             fix = "remove look (--set 'render.look={}'), or set weather_mode to off"
-            raise ValueError(f"look cannot be combined with weather; {fix}")
+            raise ValueError(f"the setting look cannot be combined with weather_mode {self.weather_mode}; {fix}")
         return self
 
     @field_validator("tracks", "modalities")

@@ -51,7 +51,7 @@ def drape(box_map: BoxMap) -> Triangles:
     """Return the triangles of the ground and of the surfaces on it, for a map with sloping ground."""
     ground = box_map.ground
     if ground.is_flat:
-        raise ValueError("the ground of the map is flat; triangles exist only for sloping ground")
+        raise ValueError("the ground of this map is flat, so it has no triangle mesh")
     bare = ground.triangles(GROUND_PLANE_HALF_M)
     shape = np.array(ground.heights_m.shape[::-1]) + 1  # cells along x and y, those beyond the border too
     cells_x = int(shape[0])

@@ -144,9 +144,9 @@ def read_pools(cfg: WeatherConfig) -> Pools:
         kinds = pools.pairs_by_kind()
         if missing := [kind for kind, share in cfg.sky_shares.items() if share and kind not in kinds]:
             raise ConfigError(
-                f"the pools have no preset for these kinds of sky, which have a share: {', '.join(missing)}",
+                f"kinds of sky with a share have no preset in the weather and time pools: {', '.join(missing)}",
                 where="render.sky_shares",
-                fix="remove the share, or add presets of this kind to the pools",
+                fix="remove their shares, or add presets of these kinds to the pools",
             )
     return pools
 

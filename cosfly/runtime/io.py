@@ -261,7 +261,7 @@ def _plain_name(root: Path, name: str) -> str:
     """Return a normalized name without `..`; a link may still lead out."""
     plain = os.path.normpath(name)
     if "\0" in name or max(len(part.encode("utf-8", "surrogatepass")) for part in plain.split(os.sep)) > LONGEST_NAME:
-        expected = f"no null character, and at most {LONGEST_NAME} bytes between two slashes"
+        expected = f"no null character, and at most {LONGEST_NAME} bytes in the name of each folder and file"
         raise InputError("the name is not a valid file name", where=root, got=name, expected=expected)
     if os.path.isabs(plain) or plain.split(os.sep)[0] == os.pardir:
         raise InputError(

@@ -578,7 +578,8 @@ def _check_finished(path: Path) -> None:
                 where=path,
                 got=f"no {name} in {folder}",
                 expected="a finished stage",
-                fix="run that stage again; to use its files as they are, copy them to an empty folder",
+                fix="run that stage again; to use its files without this check, copy them to an empty folder, and pass "
+                "that folder",
             )
     name = os.path.relpath(path, folder)
     problems = list[str]()
