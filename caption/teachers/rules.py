@@ -239,7 +239,7 @@ CONDITIONS: dict[str, Condition] = {
     "slows": says("trend:target_speed", "decreasing", is_walk_known_at_first),
     "hurries": hurries, "off_centre": off_centre, "near_border": near_border, "sight_swings": sight_swings,
     "swings_through_jitter": lambda f, side: is_shaken(f) and sight_swings(f, side),
-    "on_axis": lambda f, side: centred(f, side) and not sight_swings(f, 0),
+    "on_axis": lambda f, side: centred(f, side) and not sight_swings(f, 0) and abs(f.yaw_rate_dps[-1] or 0.0) < TURNING_DPS,
     "gap_steady": says("trend:distance", "steady"),
     "gap_opens": gap_opens, "gap_closes": gap_closes, "gap_scatters": gap_scatters,
     "pace_matched": says("comparison:speed", "matching", is_smooth, walks, walks_evenly),
