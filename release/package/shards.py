@@ -92,7 +92,7 @@ def _check_depth(values: np.ndarray, size_px: tuple[int, int], where: Path) -> N
 
 MOST_TOLD = 20  # problems of one shard: after so many the others need not be looked for
 META = "meta.json"
-ANEW = "restore the file, or inspect and caption the changed tree"
+RESTORE = "restore the file, or inspect and caption the changed tree"
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ def _digests(candidate: Candidate) -> dict[str, str]:
         if digest_of(digests) != candidate.sha256:
             got, expected = digest_of(digests), f"{candidate.sha256}, the digest at the inspection"
             what = "the track has changed since its inspection"
-            raise VerifyError(what, where=folder, got=got, expected=expected, fix=ANEW)
+            raise VerifyError(what, where=folder, got=got, expected=expected, fix=RESTORE)
     _check_digest(folder, TRACK_FILE, None, digests)
     _check_digest(folder, TARGET_FILE, None, digests)
     return digests
@@ -243,7 +243,7 @@ def _check_digest(folder: Path, name: str, data: bytes | None, digests: Mapping[
     if got != digests.get(name):
         expected = digests.get(name, "a recorded digest")
         what = "the file differs from the recorded digest"
-        raise VerifyError(what, where=folder / name, got=got, expected=expected, fix=ANEW)
+        raise VerifyError(what, where=folder / name, got=got, expected=expected, fix=RESTORE)
 
 
 def _read_picture(flight: Track, path: Path, file: FrameFile, tree: Path, *, is_known: bool) -> bytes:
