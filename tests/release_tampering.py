@@ -17,9 +17,9 @@ from caption.stage.released import read_released
 from cosfly.formats.frames import depth_bytes
 from cosfly.runtime.io import sha256_file
 from release import columns
+from release.build.records import write_records
+from release.build.rows import open_writer
 from release.card.numbers import compute_numbers
-from release.package.records import write_records
-from release.package.rows import open_writer
 from release.record import (
     ReleasedFlight,
     ReleaseRecord,

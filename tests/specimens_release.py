@@ -23,10 +23,10 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
+from release.build.config import ReleaseConfig
+from release.build.sources import Source
+from release.build.stage import run
 from release.export.source import open_release, read_span, scan
-from release.package.config import ReleaseConfig
-from release.package.sources import Source
-from release.package.stage import run
 from specimens import make_playback_tree
 
 NUM_POINTS = 12

@@ -198,7 +198,7 @@ def test_the_rules_can_fail(monkeypatch, tmp_path):
         bad.write_text(text)
         monkeypatch.setitem(SOURCES, "cosfly.runtime.journal", bad)
 
-    put("import torch\nimport release.package.stage\n")
+    put("import torch\nimport release.build.stage\n")
     with pytest.raises(AssertionError, match=r"cosfly\.runtime\.journal"):
         test_imports_point_one_way()
     with pytest.raises(AssertionError):

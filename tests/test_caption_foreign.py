@@ -18,8 +18,8 @@ from cosfly.inspection.settings import InspectConfig
 from cosfly.runtime.errors import InputError
 from distill.inference import stage as infer
 from distill.schema import open_split
-from release.package import stage as package
-from release.package.sources import Source
+from release.build import stage as package
+from release.build.sources import Source
 from release.record import read_record
 from release.verify.verify import verify
 from specimens import make_playback_tree

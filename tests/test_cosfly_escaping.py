@@ -176,9 +176,9 @@ markdown = MarkdownIt("commonmark", {"html": True}).enable("table")
 
 
 def test_a_card_shows_forged_texts(tree, inspection, tmp_path):
-    from release.package.config import ReleaseConfig
-    from release.package.sources import Source
-    from release.package.stage import run
+    from release.build.config import ReleaseConfig
+    from release.build.sources import Source
+    from release.build.stage import run
 
     captions = caption(CaptionConfig(), tree, tmp_path / "caption")
     folder = run(ReleaseConfig(licence="mit"), [Source.of_files(tree, captions, inspection)], tmp_path / "release")

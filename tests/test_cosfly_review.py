@@ -15,7 +15,7 @@ from cosfly.formats.traces import write_traces
 from cosfly.formats.tracks import find_tracks
 from cosfly.inspection.stage import run
 from cosfly.runtime.io import sha256_file
-from release.package.sources import Source, gather
+from release.build.sources import Source, gather
 from specimens import make_playback_tree
 
 QUEUE = CFG.model_copy(update={"smoothness_min": 1.0})  # the plan of every flight is less smooth than that

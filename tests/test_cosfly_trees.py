@@ -36,9 +36,9 @@ from distill.prepare import stage as prepare
 from distill.prepare.sources import RunSource as Prepared
 from distill.prepare.stage import PrepareConfig
 from distill.schema import SPLITS, open_split
-from release.package import stage as package
-from release.package.config import ReleaseConfig
-from release.package.sources import Source
+from release.build import stage as package
+from release.build.config import ReleaseConfig
+from release.build.sources import Source
 from release.record import read_record
 from release.verify.verify import verify
 from specimens import PERSON_ID, make_playback_tree

@@ -33,11 +33,11 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import ConfigError, InputError, VerifyError
 from cosfly.runtime.json_io import read_json
 from cosfly.runtime.png import colours_of
+from release.build.config import ReleaseConfig
+from release.build.plan import plan_shards
+from release.build.sources import Source
+from release.build.stage import run
 from release.card.render import render_card
-from release.package.config import ReleaseConfig
-from release.package.plan import plan_shards
-from release.package.sources import Source
-from release.package.stage import run
 from release.record import ReleaseRecord, read_record
 from release.verify.verify import verify
 from specimens import make_playback_tree
@@ -273,8 +273,8 @@ def test_captions_that_nothing_binds_to_the_tree_are_refused(few, tmp_path):
 
 def test_after_a_failed_flight_the_finished_shards_are_not_done_again(tmp_path, monkeypatch):
     copy = make_material(tmp_path / "material", 3)
-    from release.package import config
-    from release.package import stage as package
+    from release.build import config
+    from release.build import stage as package
 
     monkeypatch.setattr(config, "MB", 20_000)
     whole = run(split_cfg(), [source_of(copy)], tmp_path / "whole")

@@ -26,8 +26,8 @@ from cosfly.formats.captions import write_captions
 from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
-from release.package import stage as package
-from release.package.sources import Source
+from release.build import stage as package
+from release.build.sources import Source
 from release.verify.verify import verify
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]

@@ -25,12 +25,12 @@ from cosfly.formats.frames import instance_bytes
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import read_json
+from release.build import stage as package
+from release.build.config import ReleaseConfig
+from release.build.sources import Source
 from release.columns import INTRINSICS
 from release.export.contract import ExportConfig
 from release.export.stage import run as export
-from release.package import stage as package
-from release.package.config import ReleaseConfig
-from release.package.sources import Source
 from release.rules import split_groups
 from release.verify.verify import verify
 

@@ -30,7 +30,7 @@ def build(
     data: options.Trees = None,
 ) -> None:
     """Select frames of one or more runs, join captions, write parquet, data-set card and checksums."""
-    from release.package.sources import Source
+    from release.build.sources import Source
 
     sources = [Source.of_run(folder) for folder in runs or []]
     if captions or inspected or data or not sources:
@@ -40,7 +40,7 @@ def build(
             problem = "pass one --captions and at most one --inspect for each --data, or pass run directories"
             raise typer.BadParameter(problem)
         sources += [Source.of_files(*files) for files in zip(trees, captions or [], inspections, strict=True)]
-    job.run("release.package.stage", job.cfg.release, sources, out)
+    job.run("release.build.stage", job.cfg.release, sources, out)
 
 
 LEVELS = "structure: names, sizes, records, card. rows: also every row. pixels: also all files."

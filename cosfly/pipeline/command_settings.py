@@ -26,7 +26,7 @@ SECTIONS = {  # section -> its model
     "render": "cosfly.render.settings:RenderConfig",
     "inspect": "cosfly.inspection.settings:InspectConfig",
     "caption": "caption.schema:CaptionConfig",
-    "release": "release.package.config:ReleaseConfig",
+    "release": "release.build.config:ReleaseConfig",
     "fly": "cosfly.closed_loop.settings:FlyConfig",
     "world": "cosfly.worldgen.stage:WorldConfig",
     "distill": "cosfly.pipeline.settings:DistillConfig",

@@ -24,7 +24,7 @@ import cosfly.pedestrians.stage
 import cosfly.planners.stage
 import cosfly.render.stage
 import cosfly.simplify.stage
-import release.package.stage
+import release.build.stage
 from cosfly.formats.bystanders import BYSTANDERS_FILE
 from cosfly.pipeline.command_settings import worker_options
 from cosfly.pipeline.runs import STAGES
@@ -34,7 +34,7 @@ from cosfly.runtime.io import refuse_link, write_bytes
 from cosfly.runtime.json_io import read_object, validated, write_json
 from cosfly.runtime.run_dir import Manifest, Resume, hold_folder, read_manifest
 from cosfly.viz.gallery import contact_sheet
-from release.package.sources import Source, choose_licence
+from release.build.sources import Source, choose_licence
 from release.viewer.page import run as write_viewer
 
 log = logging.getLogger(__name__)
@@ -99,7 +99,7 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
 def joint_release(cfg: RunConfig, sources: list[Source], out: Path, resume: Resume) -> Stage:
     """Return the stage that releases one or more runs together."""
     options: dict[str, Any] = {"resume": resume, **worker_options(cfg)}
-    return Stage("release", partial(release.package.stage.run, cfg.release, sources, out / "release", **options))
+    return Stage("release", partial(release.build.stage.run, cfg.release, sources, out / "release", **options))
 
 
 def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "release") -> list[StageResult]:

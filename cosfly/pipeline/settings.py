@@ -27,7 +27,7 @@ from distill.inference.stage import InferConfig
 from distill.prepare.dual_track import DualTrackConfig
 from distill.prepare.stage import PrepareConfig
 from distill.training.settings import TrainConfig
-from release.package.config import ReleaseConfig
+from release.build.config import ReleaseConfig
 
 TOWN_NAME = re.compile(r"[A-Za-z0-9_-]{1,60}")
 

@@ -34,9 +34,9 @@ from cosfly.formats.frames import FILE_NAMES, FrameFile, depth_bytes, frame_name
 from cosfly.formats.playback import Track, write_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.io import CHECKSUMS, checksum_lines, sha256_bytes
-from release.package.config import ReleaseConfig
-from release.package.sources import Source
-from release.package.stage import run
+from release.build.config import ReleaseConfig
+from release.build.sources import Source
+from release.build.stage import run
 from specimens import Scene, make_flight, paint
 
 # Pictures; frames of a flight, as the paper's have, of which 400 are released.

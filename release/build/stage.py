@@ -15,11 +15,9 @@ from cosfly.runtime.io import CHECKSUMS, atomic_folder
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, read_stage_record, result_of
 from cosfly.runtime.worker import Item, Outcome, Work
-from release.card.ceilings import ceilings_of
-from release.card.numbers import compute_numbers
-from release.package.config import ReleaseConfig
-from release.package.plan import Faults, ReleasePlan, make_plan
-from release.package.records import (
+from release.build.config import ReleaseConfig
+from release.build.plan import Faults, ReleasePlan, make_plan
+from release.build.records import (
     DATASET,
     OF_SHARD,
     PARTS,
@@ -29,9 +27,11 @@ from release.package.records import (
     provenance_of,
     write_records,
 )
-from release.package.rows import ShardPlan
-from release.package.shards import ShardResult, write_shard
-from release.package.sources import Source, input_names, told_apart
+from release.build.rows import ShardPlan
+from release.build.shards import ShardResult, write_shard
+from release.build.sources import Source, input_names, told_apart
+from release.card.ceilings import ceilings_of
+from release.card.numbers import compute_numbers
 from release.record import Shard
 from release.verify.verify import verify
 

@@ -19,14 +19,14 @@ from cosfly.runtime.io import sha256_file, write_bytes, write_checksums
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.run_dir import StageInput, StageRecord, fingerprint, record_of
 from release import columns
+from release.build.captions import CaptionAccount, teacher_settings
+from release.build.config import ReleaseConfig
+from release.build.plan import ReleasePlan
+from release.build.shards import ShardResult
+from release.build.sources import Source, input_names
 from release.card.croissant import CROISSANT, render_croissant
 from release.card.render import render_card
 from release.columns import published
-from release.package.captions import CaptionAccount, teacher_settings
-from release.package.config import ReleaseConfig
-from release.package.plan import ReleasePlan
-from release.package.shards import ShardResult
-from release.package.sources import Source, input_names
 from release.record import (
     CaptionHistory,
     FlightHistory,

@@ -15,12 +15,12 @@ from cosfly.formats.inspection import how_to_decide
 from cosfly.formats.places import TrackChoice
 from cosfly.runtime.errors import CosflyError, InputError, NothingKept, VerifyError
 from cosfly.runtime.run_dir import Failed, StageFolder, Tally, write_failures
+from release.build.captions import CaptionAccount, FlightCaptions, FlightKey, index_captions
+from release.build.config import ReleaseConfig
+from release.build.shards import FlightPart
+from release.build.sources import IN_REVIEW, Material, Source, choose_licence, gather, maps_of
+from release.build.survey import Surveyed, Tell, check_alike, keep_pairs, place_flights, survey
 from release.columns import SPLIT_NAMES, Placement, SplitName
-from release.package.captions import CaptionAccount, FlightCaptions, FlightKey, index_captions
-from release.package.config import ReleaseConfig
-from release.package.shards import FlightPart
-from release.package.sources import IN_REVIEW, Material, Source, choose_licence, gather, maps_of
-from release.package.survey import Surveyed, Tell, check_alike, keep_pairs, place_flights, survey
 from release.record import ReleasedMap
 from release.rules import select_frames
 

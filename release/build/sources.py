@@ -15,7 +15,7 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.io import check_stays_below, inside, read_text
 from cosfly.runtime.run_dir import record_of
-from release.package.captions import FlightKey
+from release.build.captions import FlightKey
 from release.record import ReleasedMap
 
 IN_REVIEW = "review: "  # how it begins, why a flight is left out that waits for a person

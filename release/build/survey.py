@@ -15,8 +15,8 @@ from cosfly.formats.playback import Track, read_track
 from cosfly.geometry.splits import Course, town_family, walks_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
+from release.build.sources import Candidate
 from release.columns import Placement, SplitName
-from release.package.sources import Candidate
 from release.record import Pairs, SplitBy
 from release.rules import split_groups
 

@@ -32,11 +32,11 @@ from cosfly.runtime.png import PNG_HEADER_BYTES, parse_png, png_size
 from cosfly.runtime.run_dir import TRACK_FILE, digest_of, folder_digests
 from cosfly.runtime.worker import advance
 from release import columns
+from release.build.captions import FlightCaptions
+from release.build.rows import Rows, ShardPlan, open_writer
+from release.build.sources import Candidate
+from release.build.survey import look_of, open_flight
 from release.columns import Placement, ReleasedCaption, caption_values
-from release.package.captions import FlightCaptions
-from release.package.rows import Rows, ShardPlan, open_writer
-from release.package.sources import Candidate
-from release.package.survey import look_of, open_flight
 from release.rules import is_whole, select_frames
 
 # Bits a channel; colour type, RGB or RGBA; interlacing: bytes 24, 25 and 28 of a PNG. What the readers of a release
