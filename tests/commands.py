@@ -1,9 +1,15 @@
 """Commands in this process, as a user types them."""
 
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+from unittest import mock
+
 from click.testing import Result
 from typer.testing import CliRunner
 
 from cosfly.cli import app
+from cosfly.runtime import pool
 
 
 def invoke(*words: object) -> Result:
@@ -12,3 +18,18 @@ def invoke(*words: object) -> Result:
     for word in words:
         line += word.split() if isinstance(word, str) else map(str, word if isinstance(word, list) else [word])
     return CliRunner().invoke(app, line)
+
+
+@contextlib.contextmanager
+def working_here() -> Iterator[None]:
+    """Work on items in this process, since each worker takes seconds to begin; `bench` measures workers and keeps
+    them."""
+    in_processes = pool._in_processes
+
+    def work(stage: Any, items: Any, start: Any, workers: int, watch: Any, progress: Any) -> Any:
+        if "bench" in stage.path.parts:
+            return in_processes(stage, items, start, workers, watch, progress)
+        return pool._in_this_process(items, start, progress.move)
+
+    with mock.patch.object(pool, "_in_processes", work):
+        yield

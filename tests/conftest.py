@@ -69,6 +69,15 @@ def held_by_another() -> Callable[[Path], contextlib.AbstractContextManager[subp
     return _held_by_another
 
 
+@pytest.fixture
+def in_this_process() -> Iterator[None]:
+    """Work on items in this process."""
+    from commands import working_here
+
+    with working_here():
+        yield
+
+
 Make = Callable[[Path], object]
 
 

@@ -149,8 +149,8 @@ def test_the_limit_on_concurrency_halves_and_recovers():
 def test_a_retry_after_holds_every_request():
     async def start_s() -> float:
         limit = ConcurrencyLimit(2)
-        limit.was_busy(sent_s=time.monotonic(), retry_after_s=0.2)
         begun_s = time.monotonic()
+        limit.was_busy(sent_s=begun_s, retry_after_s=0.2)
         async with limit.slot():
             return time.monotonic() - begun_s
 

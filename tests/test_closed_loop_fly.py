@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from commands import invoke
+from commands import invoke, working_here
 from specimens_distill import prepared
 from tables import each
 from teacher_server import TeacherServer
@@ -22,7 +22,6 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.student_chat import write_chat_format
 from cosfly.runtime.errors import NothingKept
-from cosfly.runtime.pool import run_items
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
 from distill.student.random_student import make_tiny_student
@@ -40,16 +39,18 @@ SHORT = "--workers 1 --set fly.most_decisions=6 --set fly.tree=false"
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("town")
-    for words in (
-        f"maps {TINY} --out {root}/maps",
-        f"simplify {TINY.replace('--seed 4', '')} --map {root}/maps/boxes_3d.json --out {root}/simplify",
-        f"pedestrians {TINY} --workers 1 --map {root}/simplify/step2_simplified.json --out {root}/pedestrians",
-    ):
-        done = invoke(words)
-        assert done.exit_code == 0, done.output
-    return root
+def town(built_once) -> Path:
+    def make(root: Path) -> None:
+        for words in (
+            f"maps {TINY} --out {root}/maps",
+            f"simplify {TINY.replace('--seed 4', '')} --map {root}/maps/boxes_3d.json --out {root}/simplify",
+            f"pedestrians {TINY} --workers 1 --map {root}/simplify/step2_simplified.json --out {root}/pedestrians",
+        ):
+            with working_here():
+                done = invoke(words)
+            assert done.exit_code == 0, done.output
+
+    return built_once("town_to_fly_in", make)
 
 
 def fly(town: Path, out: Path, more: str) -> dict[str, Episode]:
@@ -64,8 +65,8 @@ def attempt(town: Path, out: Path, more: str):
 
 
 @pytest.mark.slow
-def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(town, tmp_path):
-    flown = fly(town, tmp_path, "--workers 2 --set fly.most_decisions=12 --student rules")
+def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(town, tmp_path, in_this_process):
+    flown = fly(town, tmp_path, "--workers 1 --set fly.most_decisions=12 --student rules")
     assert len(flown) == 3
     for record in flown.values():
         assert (record.engine, record.num_lead, len(record.decisions)) == ("rules", 20, 12)
@@ -100,7 +101,8 @@ def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(t
 def test_the_ceiling_sees_more_than_chance_and_all_is_the_same_however_many_fly_at_once(town, tmp_path):
     seen = {}
     for student, alone in (("planner", False), ("random", True)):
-        flown = fly(town, tmp_path / student, f"--student {student} {LONG} --workers 1")
+        with working_here():
+            flown = fly(town, tmp_path / student, f"--student {student} {LONG} --workers 1")
         seen[student] = np.mean([sum(f.in_view for f in p.flown) / p.num_walk_frames for p in flown.values()])
         if alone:
             one = f"--student {student} {LONG} --workers 2 --set fly.side_by_side=1"
@@ -110,7 +112,7 @@ def test_the_ceiling_sees_more_than_chance_and_all_is_the_same_however_many_fly_
 
 
 @pytest.mark.slow
-def test_a_policy_of_ones_own_flies_as_a_student_that_decides_the_same(town, tmp_path, monkeypatch):
+def test_a_policy_of_ones_own_flies_as_a_student_that_decides_the_same(town, tmp_path, in_this_process, monkeypatch):
     code = "class Ahead:\n    def reset(self, goal, seed): pass\n    def act(self, seen): return 'track_straight'\n"
     (tmp_path / "own.py").write_text(code)
     monkeypatch.chdir(tmp_path)
@@ -130,7 +132,9 @@ ONE = "--set caption.endpoint.max_tries=1 --set fly.side_by_side=3"
 @pytest.mark.parametrize(
     ("fault", "answer"), [("wrong_decision", "invalid"), ("wrong_shape", "unreadable"), ("empty_choices", "none")]
 )
-def test_what_a_model_answers_wrong_is_its_own_failure_and_the_flight_goes_on(town, tmp_path, fault, answer):
+def test_what_a_model_answers_wrong_is_its_own_failure_and_the_flight_goes_on(
+    town, tmp_path, in_this_process, fault, answer
+):
     with TeacherServer(lambda number, body: fault) as server:
         flown = fly(town, tmp_path, f"{SHORT} {ONE} --student {server.url}")
     for record in flown.values():
@@ -142,7 +146,7 @@ def test_what_a_model_answers_wrong_is_its_own_failure_and_the_flight_goes_on(to
 
 
 @pytest.mark.slow
-def test_a_model_is_asked_about_all_flights_at_once_and_nothing_twice(town, tmp_path):
+def test_a_model_is_asked_about_all_flights_at_once_and_nothing_twice(town, tmp_path, in_this_process):
     together = threading.Barrier(3)
 
     def wait(number, body):  # no answer comes before all three flights have asked
@@ -174,7 +178,7 @@ def student(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_student_in_this_process_answers_all_flights_as_one_batch(town, tmp_path, student):
+def test_a_student_in_this_process_answers_all_flights_as_one_batch(town, tmp_path, in_this_process, student):
     few = "--set distill.infer.max_new_tokens=4 --set distill.infer.device=cpu --set fly.most_decisions=2"
     flown = fly(town, tmp_path, f"{SHORT} {few} --student transformers:{student}")
     for record in flown.values():
@@ -184,7 +188,7 @@ def test_a_student_in_this_process_answers_all_flights_as_one_batch(town, tmp_pa
 
 
 @pytest.mark.slow
-def test_a_student_is_asked_with_the_very_prompts_that_it_was_taught_with(town, tmp_path, student):
+def test_a_student_is_asked_with_the_very_prompts_that_it_was_taught_with(town, tmp_path, in_this_process, student):
     with TeacherServer() as server:
         more = f"--workers 1 --set fly.most_decisions=8 --student {server.url} --as-student {student}"
         flown = fly(town, tmp_path, more)
@@ -211,7 +215,7 @@ def relabel(town, flown, out, more=""):
 
 
 @pytest.mark.slow
-def test_where_it_erred_the_planner_goes_on_and_what_is_made_is_captioned(town, tmp_path):
+def test_where_it_erred_the_planner_goes_on_and_what_is_made_is_captioned(town, tmp_path, in_this_process):
     flown = fly(town, tmp_path / "flown", STUDENT)
     done = relabel(town, tmp_path / "flown", tmp_path / "made", "--set fly.relabel.round=2")
     assert done.exit_code == 0, (done.output, done.exception)
@@ -236,7 +240,7 @@ def test_where_it_erred_the_planner_goes_on_and_what_is_made_is_captioned(town, 
 
 
 @pytest.mark.slow
-def test_redrawn_frames_show_what_the_student_saw(town, tmp_path):
+def test_redrawn_frames_show_what_the_student_saw(town, tmp_path, in_this_process):
     weather = "--set render.weather_mode=random_per_path --set render.fovs_deg=[40,70]"
     fly(town, tmp_path / "flown", f"--workers 1 --student track_straight --set fly.most_decisions=20 {weather}")
     done = relabel(town, tmp_path / "flown", tmp_path / "made", weather)
@@ -263,12 +267,10 @@ def test_redrawn_frames_show_what_the_student_saw(town, tmp_path):
     ("--set plan.speed_max_mps=0.2", "no_path"),
     ("", "crashes"),
 ])  # fmt: skip
-def test_why_nothing_can_be_shown_there_is_counted(town, tmp_path, monkeypatch, more, reason):
+def test_why_nothing_can_be_shown_there_is_counted(town, tmp_path, in_this_process, monkeypatch, more, reason):
     fly(town, tmp_path / "flown", f"{STUDENT} --set fly.most_decisions=12")
     if reason == "crashes":
         monkeypatch.setitem(ClosedLoopTrajectory.__init__.__kwdefaults__, "drone", Drone(radius_m=16.0))
-        here = lambda *given, **how: run_items(*given, **how | {"workers": 0})  # noqa: E731  # in this process
-        monkeypatch.setattr("cosfly.closed_loop.relabel.run_items", here)
     done = relabel(town, tmp_path / "flown", tmp_path / "made", more)
     assert isinstance(done.exception, NothingKept)
     assert f"({reason} 6) of 6" in str(done.exception)

@@ -150,6 +150,6 @@ def frames_of(port: int, num_ticks: int, num_pictures: int) -> list[int]:
 @pytest.mark.slow
 def test_planted_faults_come_true(tmp_path):
     """The client's first tick is that of its settings: here the second is 1."""
-    faults = ("drop:depth@3", "drop:rgb@4", "duplicate@4", "reorder:depth@5", "delay:depth@7=1", "drop@9+")
+    faults = ("drop:depth@3", "drop:rgb@4", "duplicate@4", "reorder:depth@5", "delay:depth@7=5", "drop@9+")
     with serving(street(), tmp_path, *faults) as port:
         assert as_client(frames_of, port, 9, 7) == [1, 3, 3, 5, 4, 7, 6]

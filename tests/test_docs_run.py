@@ -8,7 +8,7 @@ import re
 import shlex
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,11 +30,7 @@ from cosfly.formats.captions import read_captions
 from cosfly.formats.kinds import KIND_NAMES
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
-from cosfly.runtime import pool
 from cosfly.runtime.config import shipped
-from cosfly.runtime.pool import Watch
-from cosfly.runtime.run_dir import StageFolder
-from cosfly.runtime.worker import Item
 from distill.student.random_student import make_tiny_student
 
 # Pages in the order in which what one makes is there for the next; the last one draws the tree of all others anew.
@@ -243,20 +239,6 @@ def test_what_cannot_run_here_is_in_the_documents():
     texts = [*lines, *(text for _, text in ALL)]
     assert [word for word in (*NOT_HERE, *BROUGHT) if not any(word in text for text in texts)] == [], "in no document"
     assert [word for word in SMALL if not any(text.startswith(word) for _, text in ALL)] == [], "in no document"
-
-
-@pytest.fixture
-def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Items are worked on in this process, since each worker takes seconds to begin; `bench` measures workers, and
-    keeps them."""
-    in_processes = pool._in_processes
-
-    def work(stage: StageFolder, items: Sequence[Item], start: Any, workers: int, watch: Watch, progress: Any) -> Any:
-        if "bench" in stage.path.parts:
-            return in_processes(stage, items, start, workers, watch, progress)
-        return pool._in_this_process(items, start, progress.move)
-
-    monkeypatch.setattr(pool, "_in_processes", work)
 
 
 @pytest.fixture
