@@ -15,25 +15,24 @@ from functools import cache
 from itertools import islice
 from pathlib import Path
 
-from caption.teachers.rule_decisions import LEAST_TURN_DEG, decide, expected_sizes, is_shaken
+from caption.teachers.rule_decisions import LEAST_TURN_DEG, decide, expected_sizes, is_shaken, sight_rate_dps
 from caption.verification.facts import Facts, wrapped
 from caption.verification.references import Fact, look_up, parse_reference
 from cosfly.formats.segments import MISSION_KINDS
 from cosfly.runtime.config import read_yaml
 
-MODEL = "rules-9"  # its name in the records; counts changes of decisions and wording
+MODEL = "rules-10"  # its name in the records; counts changes of decisions and wording
 Both = tuple[str, str]  # English, Chinese
 Condition = Callable[[Facts, int], bool]  # of the facts and the side of the decision: 1 left, -1 right, 0 neither
 
 CLEAR_WALK_MPS, CLEAR_GAP_M = 0.9, 4.0  # less is taken for shaking on a perturbed track
 BEND_DEG = 15.0  # a change of the target's heading that is worth a sentence
-BORDER_SHARE = 0.35  # of the picture's width: farther from the middle is near the border
 SMALL_SHARE, LARGE_SHARE = 0.04, 0.4  # of the picture's height
 STEEP_DEG = 55.0
 NEAR_M, COMING_M = 3.0, 6.0  # from the target to a bystander at its side, to one on the way to it
 MOST_DIFFERENCES = 1  # in appearance, of a person who is similar
-SLOW_MPS, SLIDING_MPS, CRAWLING_MPS, DRIFTING_MPS = 0.3, 0.5, 0.7, 0.1
-TURNING_DPS, CLIMBING_MPS = 1.0, 0.2  # slower turns and climbs are not worth a sentence
+SLOW_MPS, SLIDING_MPS, CRAWLING_MPS, DRIFTING_MPS = 0.3, 0.5, 0.7, 0.2
+TURNING_DPS, SLIGHT_DPS, CLIMBING_MPS = 1.0, 3.0, 0.2  # slower turns and climbs are not worth a sentence; are slight
 SIDES = (("left", "right"), ("left",), ("right",))  # by the side of the decision
 HIDDEN = ("occluded", "out_of_view")
 CLOSE_M = 30.0  # a target that comes nearer than this leaves the drone little room
@@ -42,7 +41,6 @@ TOPICS = ("heading", "height", "drone", "motion")
 TOPICS_HIDDEN = ("view", "cover", "last", "drone", "height")
 TOPICS_ORDERED = ("order", "view", "drone", "motion", "height")
 STRIKING_TOPICS = ("view", "cover", "people", "place", "gap", "size")  # the first that holds is named as well
-STRIKING = ("off_centre",)  # conditions for which a reason to fly straight on has to account
 
 
 # --- conditions -------------------------------------------------------------------------------------------------------
@@ -94,10 +92,6 @@ def is_walk_known_at_first(f: Facts, side: int) -> bool:
 def is_gap_clear(f: Facts, side: int) -> bool:
     first, last = f.distance_m[0], f.distance_m[-1]
     return first is not None and last is not None and (not is_shaken(f) or abs(last - first) >= CLEAR_GAP_M)
-
-
-def is_box_known_at_first(f: Facts, side: int) -> bool:
-    return is_legible(f, side) and f.box_height_px[0] is not None and not is_shaken(f)
 
 
 walks = says("target_motion", "walking", is_walk_known)
@@ -162,13 +156,23 @@ def off_centre(f: Facts, side: int) -> bool:
     return is_legible(f, side) and word_of(f, "side:offset_x") in SIDES[side]
 
 
-def near_border(f: Facts, side: int) -> bool:
-    return off_centre(f, side) and abs(f.offset_x_px[-1] or 0) > BORDER_SHARE * f.width_px
+def is_turning(f: Facts, side: int) -> bool:
+    return abs(f.yaw_rate_dps[-1] or 0.0) >= TURNING_DPS
+
+
+def turn_ends(f: Facts, side: int) -> bool:
+    """Return whether the nose is expected to turn the other way."""
+    turn = expected_sizes(f)["yaw_left_to_follow"]
+    return is_turning(f, side) and abs(turn) >= 1.0 and turn * (f.yaw_rate_dps[-1] or 0.0) < 0.0
 
 
 def sight_swings(f: Facts, side: int) -> bool:
     turn = expected_sizes(f)["yaw_left_to_follow"]
     return f.is_visible_now and (side * turn if side else abs(turn)) >= 1.0
+
+
+def sight_turns(f: Facts, side: int) -> bool:
+    return sight_swings(f, side) and side * sight_rate_dps(f) >= TURNING_DPS
 
 
 def nose_turns(f: Facts, side: int) -> bool:
@@ -179,10 +183,6 @@ def slides(f: Facts, side: int) -> bool:
     ahead_mps, left_mps, _ = f.velocity_mps
     least_mps = CLEAR_WALK_MPS if is_shaken(f) else SLIDING_MPS
     return (side * left_mps if side else abs(left_mps)) >= max(least_mps, abs(ahead_mps))
-
-
-def _walk_aside_mps(f: Facts) -> float:
-    return 0.0 if f.target_velocity_mps is None else f.target_velocity_mps[1]
 
 
 def gap_scatters(f: Facts, side: int) -> bool:
@@ -237,9 +237,9 @@ CONDITIONS: dict[str, Condition] = {
     "stands": says("target_motion", "standing", is_walk_known),
     "sets_off": sets_off, "turns": turns, "crosses": crosses, "comes": comes, "walks_away": walks_away, "walks": walks,
     "slows": says("trend:target_speed", "decreasing", is_walk_known_at_first),
-    "hurries": hurries, "off_centre": off_centre, "near_border": near_border, "sight_swings": sight_swings,
-    "swings_through_jitter": lambda f, side: is_shaken(f) and sight_swings(f, side),
-    "on_axis": lambda f, side: centred(f, side) and not sight_swings(f, 0) and abs(f.yaw_rate_dps[-1] or 0.0) < TURNING_DPS,
+    "hurries": hurries, "off_centre": off_centre, "sight_swings": sight_swings,
+    "sight_turns": sight_turns, "swings_through_jitter": lambda f, side: is_shaken(f) and sight_turns(f, side),
+    "on_axis": lambda f, side: centred(f, side) and not sight_swings(f, 0) and not is_turning(f, side),
     "gap_steady": says("trend:distance", "steady"),
     "gap_opens": gap_opens, "gap_closes": gap_closes, "gap_scatters": gap_scatters,
     "pace_matched": says("comparison:speed", "matching", is_smooth, walks, walks_evenly),
@@ -251,21 +251,21 @@ CONDITIONS: dict[str, Condition] = {
     "drone_crawls": lambda f, side: is_smooth(f, side) and is_crawling(f, side),
     "drone_flies": lambda f, side: f.velocity_mps[0] >= 0.0,
     "slides": slides, "retreats": lambda f, side: f.velocity_mps[0] <= -max(SLIDING_MPS, abs(f.velocity_mps[1])),
-    "turning": lambda f, side: abs(f.yaw_rate_dps[-1] or 0.0) >= TURNING_DPS,
+    "turn_ends": turn_ends, "turns_slightly": is_turning,
+    "turning": lambda f, side: abs(f.yaw_rate_dps[-1] or 0.0) >= SLIGHT_DPS,
+    "drone_backs": lambda f, side: f.velocity_mps[0] < 0.0 and not is_crawling(f, side),
     "climbing": lambda f, side: (f.climb_mps[-1] or 0.0) >= CLIMBING_MPS,
     "sinking": lambda f, side: (f.climb_mps[-1] or 0.0) <= -CLIMBING_MPS,
     "drone_drifts": lambda f, side: f.velocity_mps[0] >= 0.0 and abs(f.velocity_mps[1]) >= DRIFTING_MPS,
     "comes_near": lambda f, side: comes(f, side) and is_close(f),
     "gap_closes_near": lambda f, side: gap_closes(f, side) and is_close(f),
-    "goes_along": lambda f, side: slides(f, side) and walks(f, side) and side * _walk_aside_mps(f) >= SLOW_MPS,
+    "goes_along": lambda f, side: slides(f, side) and walks(f, side) and side * (f.target_velocity_mps or (0.0, 0.0))[1] >= SLOW_MPS,
     "slides_past": lambda f, side: slides(f, -side),
     "drone_climbs": says("trend:altitude", "increasing", is_smooth),
     "drone_sinks": says("trend:altitude", "decreasing", is_smooth),
     "steep": lambda f, side: (f.depression_deg[-1] or 0.0) >= STEEP_DEG,
     "small": lambda f, side: is_legible(f, side) and 0 < (f.box_height_px[-1] or 0) < SMALL_SHARE * f.height_px,
     "large": lambda f, side: is_legible(f, side) and (f.box_height_px[-1] or 0) > LARGE_SHARE * f.height_px,
-    "grows": says("trend:box_height", "increasing", is_box_known_at_first),
-    "shrinks": says("trend:box_height", "decreasing", is_box_known_at_first),
     "hidden": sees("occluded"), "out_of_view": sees("out_of_view"), "faint": sees("illegible"),
     "partly_hidden": sees("partly_occluded"),
     "cover_closes": says("visibility@t0", "visible", sees("partly_occluded")),
@@ -351,7 +351,8 @@ def write_templates(
     reasons = list(choose.holding(sentences()["reasons"][name], side))
     if not reasons:
         return None
-    components, trace = _critical_components(choose), _reasoning_trace(choose, name, reasons)
+    accounts = list(choose.holding(sentences()["accounts"].get(name, {}), side)) if token == decide(facts) else []
+    components, trace = _critical_components(choose, side), _reasoning_trace(choose, name, accounts, reasons)
     texts = [(" ".join([en for en, _ in both]), "".join([zh for _, zh in both])) for both in (components, trace)]
     english, chinese = [
         {"critical_components": critical, "reasoning_trace": reasoning, "flight_decision": token}
@@ -360,36 +361,30 @@ def write_templates(
     return english, chinese
 
 
-def _critical_components(choose: Chooser) -> list[Both]:
+def _critical_components(choose: Chooser, side: int) -> list[Both]:
     """Return the facts on which a decision rests, in no fixed order.
 
-    They do not depend on the decision: what tells one manoeuvre from another is how the nose turns, how the drone
+    They hardly depend on the decision: what tells one manoeuvre from another is how the nose turns, how the drone
     climbs and moves, and how the target moves. A student that writes them has read what it needs before it decides.
     """
     topics = TOPICS_ORDERED if choose.facts.mission else TOPICS if choose.facts.is_visible_now else TOPICS_HIDDEN
     found = [group for topic in topics for group in islice(choose.holding(sentences()["facts"][topic], 0), 1)]
     if topics is TOPICS:
-        striking = (group for topic in STRIKING_TOPICS for group in choose.holding(sentences()["facts"][topic], 0))
+        striking = (group for topic in STRIKING_TOPICS for group in choose.holding(sentences()["facts"][topic], side))
         found += islice(striking, 1)
     return [choose.sentence(found.pop(choose.below(len(found)))) for _ in tuple(found)]
 
 
-def _reasoning_trace(choose: Chooser, name: str, reasons: list[Group]) -> list[Both]:
+def _reasoning_trace(choose: Chooser, name: str, accounts: list[Group], reasons: list[Group]) -> list[Both]:
     """Return the reason, mostly what else matters or what follows from it, and the conclusion."""
     number = choose.below(len(reasons) if name == "straight" else min(len(reasons), 2))
-    striking = [number for number, group in enumerate(reasons) if group.name in STRIKING]
-    main = reasons.pop(striking[0] if striking else number)  # what a reader would ask about is answered
+    main = accounts.pop(0) if accounts else reasons.pop(number)  # what a reader would ask about is answered
     remarks = list(islice(choose.holding(sentences()["remarks"]["any"], 0), 1))
     consequences = [sentences()["consequences"][FAMILIES[name].why]["always"]]
-    second = (remarks or consequences, reasons[:1] or consequences, consequences, [])[choose.below(4)]
+    second = accounts[:1] or (remarks or consequences, remarks or consequences, [])[choose.below(3)]
     first, *others = [choose.sentence(group) for group in (main, *second, _conclusions(name))]
     lead = sentences()["leads"][name]["always"].smooth[0]
-    return [(f"{lead[0]} {_continued(first[0])}", lead[1] + first[1]), *others]
-
-
-def _continued(sentence: str) -> str:
-    """Return an English sentence as it is written after a colon."""
-    return sentence[0].lower() + sentence[1:]
+    return [(f"{lead[0]} {first[0][0].lower()}{first[0][1:]}", lead[1] + first[1]), *others]
 
 
 @cache
