@@ -59,15 +59,15 @@ def lines_of(window: ObservedWindow, vocabulary=RELATIVE, language="en") -> list
 def test_the_relative_state_by_hand():
     assert lines_of(make_window()) == [
         f"5 frames, 0.5 s apart, oldest first. {PICTURES_MARK}",
-        "Target visibility: visible, visible, visible, visible, visible",
-        "Turn to the left: 0.0 deg/s; yaw 0.0 0.0 0.0 0.0 0.0 deg",
-        "Drone velocity: forward 1.00, left 0.00, up 0.00 m/s; speed 1.00 1.00 1.00 1.00 1.00 m/s",
-        "Altitude: 20.0 20.0 20.0 20.0 20.0 m; change 0 m",
-        "Target velocity: forward 0.00, left 2.00 m/s; speed 2.00 2.00 2.00 2.00 2.00 m/s",
-        "Target from the drone: forward 18.0, left 2.0, up -19.1 m",
-        "Horizontal distance: 20.1 19.5 19.0 18.5 18.1 m; change -2.0 m",
-        "Target bearing to the left: -5.7 -2.9 0.0 3.1 6.3 deg",
-        "Target in the image: right of the centre 60, below it -10 px; box height +33 %",
+        "Target: visible in all frames",
+        "Turn: left 0.0 deg/s, left 0.0 deg since the first frame",
+        "Drone velocity: forward 1.00, left 0.00, up 0.00 m/s; speed 1.00 m/s, at first 1.00",
+        "Altitude: 20.0 m, higher by 0.0 m",
+        "Target velocity: forward 0.00, left 2.00 m/s; speed 2.00 m/s, at first 2.00",
+        "Target place: forward 18.0, left 2.0, down 19.1 m",
+        "Horizontal distance: 18.1 m, nearer by 2.0 m",
+        "Target bearing: left 6.3 deg, at first right 5.7",
+        "Target in the image: right 60, up 10 px from the centre; box larger by 33 %",
     ]
 
 
@@ -85,17 +85,16 @@ def test_both_languages_state_the_same_numbers():
 
 def test_nothing_is_stated_of_a_hidden_target():
     lines = lines_of(make_window((True, False, False, False, True)))
-    assert lines[1] == "Target visibility: occluded, visible, visible, visible, occluded"
-    assert lines[5].endswith("; speed - 2.00 2.00 2.00 - m/s")
-    assert lines[6] == "Target from the drone: forward -, left -, up - m"
-    assert lines[7] == "Horizontal distance: - 19.5 19.0 18.5 - m; change - m"
-    assert lines[9] == "Target in the image: right of the centre -, below it - px; box height - %"
+    assert lines[1] == "Target: occluded, visible, visible, visible, occluded"
+    assert lines[5].endswith("; speed unknown m/s, at first unknown")
+    assert lines[6] == "Target place: unknown, unknown, unknown m"
+    assert lines[7] == "Horizontal distance: unknown m, unknown m"
     late = lines_of(make_window((True, False, False, False, False)))
-    assert late[7] == "Horizontal distance: - 19.5 19.0 18.5 18.1 m; change -1.4 m"
+    assert late[7] == "Horizontal distance: 18.1 m, nearer by 1.4 m"
+    assert late[8] == "Target bearing: left 6.3 deg, at first unknown"
     once = lines_of(make_window((True, True, True, True, False)))
-    assert once[7] == "Horizontal distance: - - - - 18.1 m; change - m"
-    [unknown] = [line for line in lines_of(make_window((True,) * 5)) if line.startswith("Target velocity")]
-    assert unknown == "Target velocity: forward -, left - m/s; speed - - - - - m/s"
+    assert once[7] == "Horizontal distance: 18.1 m, unknown m"
+    assert lines_of(make_window((True,) * 5))[1] == "Target: occluded in all frames"
     paper = lines_of(make_window((True, False, False, True, True)), PAPER)
     assert paper[4] == "Target ground speed: 2.00 m/s."
     assert paper[7].endswith(": unknown; (101.00, 20.00, 0.90); (100.00, 20.00, 0.90); unknown; unknown.")
@@ -105,15 +104,15 @@ def test_a_change_is_the_fact_of_its_slot():
     window = make_window((True, False, False, False, False))
     lines, facts = lines_of(window), measure_facts(window)
     for line, words, slot in (
-        (4, "change", "change:altitude"),
-        (7, "change", "change:distance"),
-        (9, "box height", "growth:box_height"),
+        (4, "higher by", "change:altitude"),
+        (7, "nearer by", "change:distance"),
+        (9, "larger by", "growth:box_height"),
     ):
         reference = parse_reference(slot)
         assert reference is not None
         fact = look_up(reference, facts)
         assert isinstance(fact, Fact)
-        assert [float(change) for change in re.findall(rf"{words} ([+-]?[\d.]+) ", lines[line])] == [fact.value]
+        assert [float(change) for change in re.findall(rf"{words} ([\d.]+) ", lines[line])] == [abs(float(fact.value))]
 
 
 def test_the_relative_state_does_not_depend_on_the_place_in_the_world():
@@ -221,7 +220,7 @@ def test_captions_are_asked_with_them_and_keep_them(tmp_path):
         assert caption.prompt["en"].system.endswith(OWN_LINE.replace("$$", "$"))
         assert caption.prompt["zh"].system.endswith(OWN_LINE.replace("$$", "$"))
         [line] = [line for line in caption.prompt["en"].user.splitlines() if line.startswith("HEIGHT ")]
-        assert " m 100 % $1; change " in line
+        assert " m 100 % $1, " in line
     assert {p.name: p.read_bytes() for p in (out / OWN_PROMPTS).iterdir()} == {
         p.name: p.read_bytes() for p in mine.iterdir()
     }

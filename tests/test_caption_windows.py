@@ -153,8 +153,8 @@ def test_facts_of_a_hand_made_window(tree):
     assert (facts.offset_x_px[2:], facts.offset_y_px[2:]) == ((30, None, None), (10, None, None))
     assert facts.visibility == ("visible", "visible", "partly_occluded", "occluded", "out_of_view")
     prompt = make_question(window, ImageConfig(), "prose", VOCABULARY).prompts["en"].user
-    assert "speed 2.24 2.24 2.24 2.24 2.24 m/s" in prompt
-    assert "Turn to the left: 2.0 deg/s; yaw 0.0 1.0 2.0 3.0 4.0 deg" in prompt
+    assert "speed 2.24 m/s, at first 2.24\n" in prompt
+    assert "Turn: left 2.0 deg/s, left 4.0 deg since the first frame" in prompt
     assert "visible, visible, partly occluded, occluded, out of view\n" in prompt
     chinese = make_question(window, ImageConfig(), "prose", VOCABULARY).prompts["zh"].user
     assert "可见, 可见, 部分遮挡, 被遮挡, 在视野外\n" in chinese
@@ -170,7 +170,7 @@ def test_facts_of_a_hand_made_window(tree):
     halved = dataclasses.replace(window, frames=frames)
     doubled = make_question(halved, ImageConfig(), "prose", VOCABULARY).prompts
     assert "5 frames, 0.25 s apart," in doubled["en"].user
-    assert "speed 4.47 4.47 4.47 4.47 4.47 m/s" in doubled["en"].user
+    assert "speed 4.47 m/s, at first 4.47\n" in doubled["en"].user
 
 
 NUM_POINTS = 160

@@ -98,13 +98,11 @@ def regeneration_lines(question: Question) -> str:
 def user_prompts(window: ObservedWindow, facts: Facts, vocabulary: Vocabulary) -> dict[Language, str]:
     """Return the questions of a window, with a mark for the sentence about the pictures, without system prompts."""
     is_paper = vocabulary.text_state == "paper"
-    numbers = {} if is_paper else _relative_state(facts)
-    numbers |= {"num_frames": str(len(facts)), "step_s": f"{facts.step_s:g}", "pictures": PICTURES_MARK}
+    numbers = {"num_frames": str(len(facts)), "step_s": f"{facts.step_s:g}", "pictures": PICTURES_MARK}
     users: dict[Language, str] = {}
     for language in LANGUAGES:
-        words = _paper_state(window, facts, language) if is_paper else {}
-        words["visibility"] = ", ".join([form_of(word, 0, language) for word in facts.visibility])
-        question = prompt_format(f"user_{language}", vocabulary) % (numbers | words)
+        state = _paper_state(window, facts, language) if is_paper else _relative_state(facts, language)
+        question = prompt_format(f"user_{language}", vocabulary) % (numbers | state)
         users[language] = "\n".join([question, *_further_lines(window, facts, language)])
     return users
 
@@ -138,42 +136,54 @@ def _further_lines(window: ObservedWindow, facts: Facts, language: Language) -> 
         yield prompt_line(window.mission, language)
 
 
-_SERIES = ("distance", "bearing", "target_speed", "speed", "yaw", "altitude")
-_CURRENT = (
-    "ahead", "offset_x", "offset_y", "yaw_rate", "forward_speed", "sideways_speed", "target_forward_speed",
-    "target_sideways_speed",
-)  # fmt: skip
+# What the relative state tells of the current frame, or of the whole window: quantity -> the words of its two directions.
+_CURRENT = {
+    "yaw_rate": "left_right", "yaw": "left_right", "forward_speed": "forward_backward",
+    "sideways_speed": "left_right", "climb_speed": "up_down", "speed": None, "altitude": None,
+    "target_forward_speed": "forward_backward", "target_sideways_speed": "left_right", "target_speed": None,
+    "ahead": "forward_backward", "left": "left_right", "above": "up_down", "distance": None, "bearing": "left_right",
+    "offset_x": "right_left", "offset_y": "down_up",
+}  # fmt: skip
+_FIRST = ("speed", "target_speed", "bearing")  # told of the first frame, too
 # The size in pixels depends on the zoom, which differs between tracks and says nothing about the motion.
-_CHANGES = (Reference("distance", "change"), Reference("altitude", "change"), Reference("box_height", "growth"))
+_CHANGES = {
+    Reference("altitude", "change"): "higher_lower",
+    Reference("distance", "change"): "farther_nearer",
+    Reference("box_height", "growth"): "larger_smaller",
+}
 
 
-def _relative_state(facts: Facts) -> dict[str, str]:
-    """Return the series with a value for each frame, what holds now or for the whole window, and three changes.
+def _relative_state(facts: Facts, language: Language) -> dict[str, str]:
+    """Return what holds now, some values of the first frame, and three changes, those of the slot `{change:...}`.
 
-    A change is that of the slot `{change:...}`. The text is short on purpose: from the same windows a small student
-    learns less the longer its prompts are.
+    A direction is a word, because a small student learns a sign badly. There is no value for each frame, because from
+    the same windows it learns less the longer its prompts are.
     """
-    texts = {
-        name: [_written(value, QUANTITIES[name].digits) for value in QUANTITIES[name].read(facts)]
-        for name in (*_SERIES, *_CURRENT)
-    }
-    numbers = {name: " ".join(texts[name]) for name in _SERIES} | {name: texts[name][-1] for name in _CURRENT}
+
+    def told(value: float | None, digits: int, direction: str | None) -> str:
+        if value is None:
+            return prompt_line("unknown", language)
+        text = f"{value:z.{digits}f}"
+        words = prompt_line(direction, language).split("/") if direction else None
+        return f"{words[text.startswith('-')]} {text.removeprefix('-')}" if words else text
+
     _, left, above = facts.place_m[-1] or (None, None, None)
-    numbers |= {"left": _written(left, 1), "above": _written(above, 1), "climb_speed": f"{facts.velocity_mps[2]:.2f}"}
-    for change in _CHANGES:
+    places = {"left": (left, 1), "above": (above, 1), "climb_speed": (facts.velocity_mps[2], 2)}
+    state = {}
+    for name, direction in _CURRENT.items():
+        now, digits = places.get(name) or (QUANTITIES[name].read(facts)[-1], QUANTITIES[name].digits)
+        state[name] = told(now, digits, direction)
+        if name in _FIRST:
+            state[f"first_{name}"] = told(QUANTITIES[name].read(facts)[0], digits, direction)
+    for change, direction in _CHANGES.items():
         fact = look_up(change, facts)
-        name = f"{change.quantity}_{change.aspect}"
-        numbers[name] = _signed(f"{fact.value:.{fact.digits}f}") if isinstance(fact, Fact) else "-"
-    return numbers
-
-
-def _written(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _signed(number: str) -> str:
-    """Return a printed number with its sign; a zero has none."""
-    return "0" if not number.strip("-0.") else number if number[0] == "-" else f"+{number}"
+        value, digits = (float(fact.value), fact.digits) if isinstance(fact, Fact) else (None, 0)
+        state[f"{change.quantity}_{change.aspect}"] = told(value, digits, direction)
+    words = [form_of(word, 0, language) for word in facts.visibility]
+    state["visibility"] = (
+        prompt_line("in_all_frames", language) % words[0] if len(set(words)) == 1 else ", ".join(words)
+    )
+    return state
 
 
 def _paper_state(window: ObservedWindow, facts: Facts, language: Language) -> dict[str, str]:
@@ -198,6 +208,7 @@ def _paper_state(window: ObservedWindow, facts: Facts, language: Language) -> di
         ),
         "target_speed": f"{sum(speeds) / len(speeds):.2f} {written_unit('mps', language)}" if speeds else unknown,
         "target": "; ".join(positions),
+        "visibility": ", ".join([form_of(word, 0, language) for word in facts.visibility]),
     }
 
 
