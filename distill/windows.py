@@ -168,10 +168,21 @@ class _Shard(BaseModel):
     split: str
 
 
+class _Settings(BaseModel):
+    selection: str
+
+
+class _ReleasedTrack(BaseModel):
+    frames: int
+    frames_available: int
+
+
 class _Record(BaseModel):
     """What is read of `release.json`."""
 
     shards: list[_Shard]
+    settings: _Settings
+    flights: list[_ReleasedTrack]
 
 
 class _Release:
@@ -180,7 +191,13 @@ class _Release:
     def __init__(self, folder: Path, language: Language, split: str | None) -> None:
         self.folder, self.language = folder, language
         path = folder / "release.json"
-        shards = validated(_Record, read_object(path, what="release", tree=folder), path).shards
+        record = validated(_Record, read_object(path, what="release", tree=folder), path)
+        shards = record.shards
+        if record.settings.selection == "stride" and any(f.frames < f.frames_available for f in record.flights):
+            raise InputError(
+                "windows need consecutive frames, of which this release has a uniform stride only", where=folder,
+                fix="build the release with --set release.selection=windows, or pass the run",
+            )  # fmt: skip
         splits = sorted({shard.split for shard in shards})
         if split is not None and split not in splits:
             near, expected = nearest(split, splits), ", ".join(splits)
@@ -238,7 +255,7 @@ TYPES: dict[str, pa.DataType] = {
     **{name: pa.struct([(m, pa.float64()) for m in members]) for name, members in FACTS.items() if len(members) > 1},
     **{name: pa.float64() for name, members in FACTS.items() if len(members) == 1},
     **dict.fromkeys(FLAGS, pa.bool_()),
-    **dict.fromkeys(("caption_window", "caption_picture_px"), pa.list_(pa.field("element", pa.int32()))),
+    **dict.fromkeys(("caption_window", "caption_picture_px"), pa.list_(pa.int32())),
     "image": pa.struct([("bytes", pa.binary()), ("path", pa.string())]),
     "frame_index": pa.int32(),
 }

@@ -7,12 +7,11 @@ reader of parquet shows plain columns.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -100,32 +99,7 @@ CONTRACT: dict[str, Any] = {
 
 # --- the table --------------------------------------------------------------------------------------------------------
 
-# type -> what it is in parquet, and for `datasets`; a tuple names the members of a struct of float64
-TYPES: dict[str, tuple[pa.DataType, dict[str, Any]]] = {
-    **{
-        name: (pa.type_for_alias(name), {"dtype": name, "_type": "Value"})
-        for name in ("string", "int32", "float64", "bool", "binary")
-    },
-    "events": (
-        pa.struct([(event, pa.string()) for event in EVENTS]),
-        {event: {"dtype": "string", "_type": "Value"} for event in EVENTS},
-    ),
-    "image": (pa.struct([("bytes", pa.binary()), ("path", pa.string())]), {"_type": "Image"}),
-    # `element` is parquet's own name. `Sequence` is what `datasets` before version 4 calls a list; later versions still
-    # read it.
-    "indices": (
-        pa.list_(pa.field("element", pa.int32())),
-        {"feature": {"dtype": "int32", "_type": "Value"}, "_type": "Sequence"},
-    ),
-    "texts": (
-        pa.list_(pa.field("element", pa.string())),
-        {"feature": {"dtype": "string", "_type": "Value"}, "_type": "Sequence"},
-    ),
-    "numbers": (
-        pa.list_(pa.field("element", pa.float64())),
-        {"feature": {"dtype": "float64", "_type": "Value"}, "_type": "Sequence"},
-    ),
-}
+LISTS = {"indices": "int32", "texts": "string", "numbers": "float64"}  # types that are lists of values
 
 
 @dataclass(frozen=True)
@@ -146,7 +120,7 @@ class Placement:
 class Column:
     """One column.
 
-    type: of TYPES, or the members of a struct of numbers.
+    type: a type of `datasets.Value`, "image", "events", one of LISTS, or the members of a struct of numbers.
     of_frame: its value at frame i of a flight; of_caption: its value of the frame's caption, null where there is none.
     NaN becomes null. Neither: a
         picture, whose bytes the writer has, or what Placement says.
@@ -394,11 +368,22 @@ CAPTION = (  # what a row holds of an accepted caption, and nulls where there is
     Column(PICTURE_PX, "indices", of_caption=lambda c: list(c.picture_px), required=True),
 )  # fmt: skip
 SCALARS = (*FRAME, *CAPTION)
+# The table of all points of a track, also those without a picture: labels, verdicts and values of captions are
+# recomputed from it. The point of a released frame has the values of the frame's row.
+POINT_NAMES = (
+    *PLACE, "track", "style", "walk", "split", "pair", "frame_index", "time_s", "width_px", "height_px", "fov_deg",
+    "intrinsics", "pose", "target", "target_heading_deg", "target_uv", "target_bbox", "target_mask_bbox",
+    "target_depth_m", "target_in_view", "target_visible", "visibility", "target_height_px", "target_contrast",
+    "target_legible", *COMPANY_COLUMNS, "is_perturbed", "perturbation", "drone_offset", "target_offset",
+    "poses_between",
+)  # fmt: skip
+POINTS = tuple(column for column in FRAME if column.name in POINT_NAMES)
 SCALAR_NAMES = [column.name for column in SCALARS]
 CAPTION_NAMES = [column.name for column in CAPTION]
 COUNTED = [column.name for column in CAPTION if column.counted]
 # All but the prompts and the evidence, which are long.
 SHORT_NAMES = [name for name in SCALAR_NAMES if not name.startswith(("system_", "prompt_", "evidence"))]
+assert len(POINTS) == len(POINT_NAMES)
 REQUIRED = frozenset(column.name for column in FRAME if column.required)
 
 
@@ -431,22 +416,40 @@ def columns_of(files: Collection[FrameFile]) -> list[Column]:
 
 
 def schema(files: Collection[FrameFile]) -> pa.Schema:
-    """Return the parquet schema, features for HuggingFace `datasets` in its metadata."""
-    fields: list[pa.Field] = []
-    features: dict[str, Any] = {}
-    for column in columns_of(files):
-        if isinstance(column.type, tuple):
-            kind = pa.struct([(member, pa.float64()) for member in column.type])
-            features[column.name] = {member: {"dtype": "float64", "_type": "Value"} for member in column.type}
-        else:
-            kind, features[column.name] = TYPES[column.type]
-        fields.append(pa.field(column.name, kind))
-    return pa.schema(fields, {b"huggingface": json.dumps({"info": {"features": features}}).encode()})
+    """Return the schema of the frames, with the features of `datasets` in its metadata."""
+    return _schema(tuple(column.name for column in columns_of(files)))
+
+
+def points_schema() -> pa.Schema:
+    """Return the schema of the points."""
+    return _schema(tuple(column.name for column in POINTS))
+
+
+@cache
+def _schema(names: tuple[str, ...]) -> pa.Schema:
+    from datasets import Features, Image, List, Value  # it takes a second and more to import
+
+    def feature(kind: str | tuple[str, ...]) -> Any:
+        if isinstance(kind, tuple):
+            return {member: Value("float64") for member in kind}
+        if kind == "events":
+            return {event: Value("string") for event in EVENTS}
+        if kind == "image":
+            return Image()
+        return List(Value(LISTS[kind])) if kind in LISTS else Value(kind)
+
+    types = {column.name: column.type for column in (*PICTURES.values(), *SCALARS)}
+    return Features({name: feature(types[name]) for name in names}).arrow_schema
 
 
 def scalar_row(flight: Track, i: int, caption: ReleasedCaption | None, placement: Placement) -> dict[str, Any]:
     """Return the row of one frame without its pictures, right-handed axes."""
     return {column.name: column.cell(flight, i, caption, placement) for column in SCALARS}
+
+
+def point_row(flight: Track, i: int, placement: Placement) -> dict[str, Any]:
+    """Return the row of one point, right-handed axes."""
+    return {column.name: column.cell(flight, i, None, placement) for column in POINTS}
 
 
 # --- flights ----------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from cosfly.formats.captions import Language
+from cosfly.formats.captions import FIELDS, Language
 from cosfly.formats.frames import Camera
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.people import Goal, People, read_goal
@@ -17,7 +17,7 @@ from cosfly.formats.playback import EVENTS, Perturbation, TargetRecord, Track
 from cosfly.formats.shown_captions import ReleasedTrack, ShownCaption
 from cosfly.geometry.axes import BODY_FROM_CAMERA, CORNER_SIGNS, rotation_matrices
 from cosfly.runtime.json_io import parse_document, validated
-from release.columns import BOX, COMPANY_COLUMNS, INTRINSICS, POINT, POSE, between_of, matrices_of
+from release.columns import BOX, COMPANY_COLUMNS, INTRINSICS, POINT, POSE, VALUES, between_of, matrices_of
 
 Row = dict[str, Any]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
@@ -162,12 +162,12 @@ class FlightRows:
             else np.stack([self.numbers(name) for name in COMPANY_COLUMNS], axis=1),
         )  # fmt: skip
 
-    def shown(self, twin: FlightRows | None, settings: dict[str, Any]) -> ReleasedTrack:
-        """Return what a reader of captions gets. settings: of the captions, as the record has them."""
+    def shown(self, points: FlightRows, twin: FlightRows | None, settings: dict[str, Any]) -> ReleasedTrack:
+        """Return what a checker of captions needs. points, twin: All points of this track and of its clean one.
+        settings: Of the captions, as the record has them."""
         captions = [shown_caption(row) for row in self.rows if row.get("has_caption")]
-        same = twin is not None and np.array_equal(twin.index, self.index)
-        other = twin.flight if twin is not None and same else None
-        return ReleasedTrack(self.flight, self.index, captions, other, settings)
+        same = twin is not None and len(twin) == len(points)
+        return ReleasedTrack(points.flight, captions, twin.flight if twin is not None and same else None, settings)
 
 
 def shown_caption(row: Row) -> ShownCaption:
@@ -176,8 +176,15 @@ def shown_caption(row: Row) -> ShownCaption:
     return ShownCaption(
         sample_id=row["sample_id"],
         frame_index=row["frame_index"],
+        window=row["caption_window"] or [],
+        picture_px=tuple(row["caption_picture_px"]),
         prompts={language: row[f"prompt_{language}"] for language in LANGUAGES if row.get(f"prompt_{language}")},
+        texts={language: {name: row[f"caption_{language}_{name}"] for name in FIELDS} for language in LANGUAGES},
+        writing=row["writing"],
+        values={language: tuple(row[f"{name}_{language}"] for name in VALUES) for language in LANGUAGES},
+        evidence=row["evidence"],
         decision=row["decision"],
+        repair=row["repair_strategy"],
         label=row["label"],
         verdict=row["verdict"],
     )

@@ -18,30 +18,37 @@ from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import FileFormat, read_model, write_model
 from release.columns import COUNTED, SPLIT_NAMES, SplitName
 
-RELEASE_FORMAT = FileFormat("cosfly.release", "3.0", "release record")
+RELEASE_FORMAT = FileFormat("cosfly.release", "4.0", "release record")
 RECORD = "release.json"
 
 Counts = dict[str, int]
 SplitBy = Literal["walk", "town"]
 Pairs = Literal["both", "any"]
+Selection = Literal["stride", "windows", "all"]
 
 
 class Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
-class Shard(Strict):
-    """One parquet file; its rows are of one split, and of whole flights."""
+class StoredFile(Strict):
+    """One parquet file."""
 
     path: str
-    split: SplitName
     rows: int
     bytes: int
     sha256: str
 
 
+class Shard(StoredFile):
+    """The released frames of some tracks of one split; `points` has all points of these tracks, in the same order."""
+
+    split: SplitName
+    points: StoredFile
+
+
 class ReleasedFlight(Strict):
-    """One flight, `run/town/trajectory/variant`; `frames_available` is the length of the flight that was rendered.
+    """One flight, `run/town/trajectory/variant`; `frames_available` is the number of its points.
 
     pair: the other track's flight of the same trajectory, null where that is not released. five_ray_mean: share of five
     rays that reach the person, as the inspection measured it on the map, which the shards do not hold; null where
@@ -73,12 +80,11 @@ class ReleasedMap(TownMap):
 
 
 class Settings(Strict):
-    """The settings that change what is released. num_frames: of each flight, null for all; uniform_stride: chosen one
-    by one and not in runs;
-    window_frames: of a caption's window."""
+    """The settings that change what is released. num_frames: Largest number of each track, except of the selection
+    `all`. window_frames: Of a caption's window."""
 
-    num_frames: int | None = Field(ge=1)
-    uniform_stride: bool = False
+    selection: Selection
+    num_frames: int = Field(ge=1)
     window_frames: int = Field(ge=1)
     tracks: list[str]
     pairs: Pairs
@@ -258,16 +264,18 @@ class FlightHistory(Strict):
 
 
 class CaptionHistory(Strict):
-    """read = accepted + dropped, by reason; accepted = released + frame_not_selected + window_not_whole +
-    flight_left_out."""
+    """read = accepted + dropped, by reason; accepted = released + frame_not_selected + flight_left_out.
+
+    frames_without: The released frames without a caption, by reason.
+    """
 
     read: int
     dropped: Counts
     accepted: int
     released: int
     frame_not_selected: int
-    window_not_whole: int
     flight_left_out: int
+    frames_without: Counts
 
 
 class History(Strict):
@@ -304,6 +312,20 @@ class ReleaseRecord(Strict):
     shards: list[Shard]
     ceilings: Ceilings | None = None
 
+    @property
+    def files(self) -> list[StoredFile]:
+        """All parquet files."""
+        return [*self.shards, *(shard.points for shard in self.shards)]
+
+    def require_whole_tracks(self, what: str, where: Path) -> None:
+        """Raise InputError if consecutive frames are needed and a uniform stride has skipped some."""
+        if self.settings.selection == "stride" and any(one.frames < one.frames_available for one in self.flights):
+            raise InputError(
+                f"{what} needs consecutive frames, which this release does not have", where=where,
+                got=f"a uniform stride of {self.settings.num_frames} frames per track",
+                fix="build the release with --set release.selection=windows, or use the run",
+            )  # fmt: skip
+
 
 def numbers_of_splits(flights: Sequence[ReleasedFlight], captions: Mapping[str, int]) -> dict[SplitName, SplitNumbers]:
     """Return the numbers of each split that has flights. captions: of each split."""
@@ -324,25 +346,27 @@ def numbers_of_splits(flights: Sequence[ReleasedFlight], captions: Mapping[str, 
 DIGEST_CHARACTERS = 12  # of the content's digest, in the names of shards
 
 
-def content_digest(shards: Iterable[tuple[SplitName, str]]) -> str:
-    """Return the sha256 of a release's content, of the split and sha256 of each shard in order: other rows, another
-    digest."""
-    return sha256_bytes("".join(f"{split} {sha256}\n" for split, sha256 in shards).encode())
+def digest_of(shards: Iterable[Shard]) -> str:
+    """Return the sha256 of a release's content: of split and sha256 (frames, points) of each shard in order."""
+    return sha256_bytes("".join(f"{one.split} {one.sha256} {one.points.sha256}\n" for one in shards).encode())
 
 
 def shard_paths(splits: Sequence[SplitName], digest: str) -> list[str]:
-    """Return the names of shards in their release, of which the splits are told: each has its number in its split."""
+    """Return the names of shards below `data` and `points`, given their splits: each has its number in its split."""
     counts, numbers, paths = Counter(splits), Counter[str](), list[str]()
     for split in splits:
-        paths.append(f"data/{split}-{digest[:DIGEST_CHARACTERS]}-{numbers[split]:05d}-of-{counts[split]:05d}.parquet")
+        paths.append(f"{split}-{digest[:DIGEST_CHARACTERS]}-{numbers[split]:05d}-of-{counts[split]:05d}.parquet")
         numbers[split] += 1
     return paths
 
 
-def shard_pattern(split: SplitName, digest: str) -> str:
+FRAMES_FOLDER, POINTS_FOLDER = "data", "points"
+
+
+def shard_pattern(split: SplitName, digest: str, folder: str = FRAMES_FOLDER) -> str:
     """Return the pattern that the card names for a split. The library's cache goes by it: without the digest a new
     release shows old rows."""
-    return f"data/{split}-{digest[:DIGEST_CHARACTERS]}-*.parquet"
+    return f"{folder}/{split}-{digest[:DIGEST_CHARACTERS]}-*.parquet"
 
 
 def release_folder(folder: Path) -> Path:

@@ -1,9 +1,4 @@
-"""The rules that the record of a release tells: which frames of a flight are released, and which walks stand in which
-split.
-
-The paper strides evenly (sec:dataset_stats), which at its flights of 618 to 770 frames and 400 of them leaves no window
-of five frames whole (`release.uniform_stride` does so). Runs of six windows' steps keep five sixths of them.
-"""
+"""The rules that the record of a release states: which frames of a track are released, and how splits are assigned."""
 
 from __future__ import annotations
 
@@ -14,43 +9,40 @@ import numpy as np
 from cosfly.formats.predictions import Split
 from cosfly.geometry.splits import assign_splits
 from release.columns import SplitName
+from release.record import Selection
 
 WINDOWS_A_RUN = 6  # a run of 6 (w - 1) frames holds 5 (w - 1) + 1 whole windows of w frames
 
-RULE = (
-    "of n frames m are kept, all where n <= m or m is null, in r = max(1, floor(m / max(1, 6 (w - 1)))) runs (w: "
-    "frames of a caption's window, 1 with uniform_stride): frame k of m is in run j = floor(((k + 1) r - 1) / m) "
-    "and is frame k + floor(j (n - m) / (r - 1)) of the flight, k + floor((n - m) / 2) where r = 1. A caption is "
-    "released where all frames of its window are"
-)
+RULES: dict[Selection, str] = {
+    "stride": "of n frames m are kept, all where n <= m, by a uniform stride: frame k of m is frame "
+    "floor(k (n - 1) / (m - 1)) of the track, floor((n - 1) / 2) where m = 1",
+    "windows": "of n frames m are kept, all where n <= m, in r = max(1, floor(m / max(1, 6 (w - 1)))) runs (w: "
+    "frames of a caption's window): frame k of m is in run j = floor(((k + 1) r - 1) / m) and is frame "
+    "k + floor(j (n - m) / (r - 1)) of the track, k + floor((n - m) / 2) where r = 1",
+    "all": "all frames are kept",
+}
 
 
-def select_frames(num_points: int, num_frames: int | None, window_frames: int, uniform: bool = False) -> np.ndarray:
-    """Choose frames of a flight in runs that are spread evenly.
+def select_frames(num_points: int, num_frames: int, selection: Selection, window_frames: int) -> np.ndarray:
+    """Choose frames of a track.
 
     Args:
-        num_points: n, the flight's frames.
-        num_frames: m, how many to keep; None keeps all. A flight of m or fewer is kept whole, never padded.
-        window_frames: w, frames of a caption's window. uniform: take it for 1, so that every run is one frame: the
-        paper's even stride.
+        num_points: n, the track's frames. num_frames: m, how many to keep; a track of m or fewer is kept whole.
+        window_frames: w, frames of a caption's window, for the selection `windows`.
     Returns:
-        (min(n, m),) int64, strictly increasing; runs differ in length, and the gaps between them, by at most one. With
-        two runs or more the first and the last frame are kept; one run stands in the middle.
+        (k,) int64, strictly increasing. Runs differ in length, and the gaps between them, by at most one. With two runs
+        or more (of `stride` each is one frame) the first and the last frame are kept; one run stands in the middle.
     """
-    if num_points < 0 or window_frames < 1 or (num_frames is not None and num_frames < 1):
+    if num_points < 0 or window_frames < 1 or num_frames < 1:
         raise ValueError(f"cannot choose {num_frames} of {num_points} frames for windows of {window_frames} frames")
-    if num_frames is None or num_points <= num_frames:
+    if selection == "all" or num_points <= num_frames:
         return np.arange(num_points)
-    num_runs = max(1, num_frames // max(1, 0 if uniform else WINDOWS_A_RUN * (window_frames - 1)))
-    left_out, k = num_points - num_frames, np.arange(num_frames, dtype=np.int64)
+    run_frames = WINDOWS_A_RUN * (window_frames - 1) if selection == "windows" else 1
+    num_runs = max(1, num_frames // max(1, run_frames))
+    skipped, k = num_points - num_frames, np.arange(num_frames, dtype=np.int64)
     if num_runs == 1:
-        return k + left_out // 2
-    return k + ((k + 1) * num_runs - 1) // num_frames * left_out // (num_runs - 1)
-
-
-def is_whole(window: Iterable[int], selected: set[int]) -> bool:
-    """Return whether all frames of a caption's window are released."""
-    return selected.issuperset(window)
+        return k + skipped // 2
+    return k + ((k + 1) * num_runs - 1) // num_frames * skipped // (num_runs - 1)
 
 
 NAME_OF: dict[Split, SplitName] = {"train": "train", "val": "validation", "test": "test"}

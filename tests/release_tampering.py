@@ -5,6 +5,7 @@ import shutil
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from io import BytesIO
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ from release.record import (
     ReleasedFlight,
     ReleaseRecord,
     Shard,
-    content_digest,
+    StoredFile,
+    digest_of,
     numbers_of_splits,
     read_record,
     shard_paths,
@@ -56,23 +58,30 @@ def forge(
         shutil.copytree(dataset, out, dirs_exist_ok=True)
         return _finished(out, values, change_record)
     record, shards = read_all(dataset)
+    tables = [pq.read_table(dataset / shard.points.path).to_pylist() for shard in record.shards]
+    of_row = _points_of(shards, tables)
     change([row for rows in shards for row in rows])
+    for row, point in of_row:  # the points of changed rows say the same
+        point.update({name: row[name] for name in point})
     shutil.rmtree(out, ignore_errors=True)
-    (out / "data").mkdir(parents=True)
-    schema = columns.schema(record.settings.modalities)
-    written = []
-    for old, rows in zip(record.shards, shards, strict=True):
-        path = out / "data" / f"{len(written)}.parquet"
+    entries = []
+    for old, rows, points in zip(record.shards, shards, tables, strict=True):
+        (out / "data").mkdir(parents=True, exist_ok=True)
+        (out / "points").mkdir(exist_ok=True)
+        path, schema = out / "data" / f"{len(entries)}.parquet", columns.schema(record.settings.modalities)
         with open_writer(str(path), schema) as writer:
             for at in range(0, len(rows), 50):
                 writer.write_table(pa.Table.from_pylist(rows[at : at + 50], schema=schema))
-        written.append((path, old, len(rows)))
-    hashed = [(path, old.split, rows, sha256_file(path)) for path, old, rows in written]
-    digest = content_digest((split, sha256) for _, split, _, sha256 in hashed)
-    names, entries = shard_paths([split for _, split, _, _ in hashed], digest), []
-    for name, (path, split, rows, sha256) in zip(names, hashed, strict=True):
-        path.rename(out / name)
-        entries.append(Shard(path=name, split=split, rows=rows, bytes=(out / name).stat().st_size, sha256=sha256))
+        of_points = out / "points" / path.name
+        pq.write_table(pa.Table.from_pylist(points, schema=columns.points_schema()), of_points)
+        entries.append(Shard(split=old.split, points=_stored(of_points), **vars(_stored(path))))
+    names = shard_paths([entry.split for entry in entries], digest_of(entries))
+    for name, entry in zip(names, entries, strict=True):
+        for file in (entry, entry.points):
+            new = f"{Path(file.path).parent.name}/{name}"
+            (out / Path(file.path).parent.name / Path(file.path).name).rename(out / new)
+            file.path = new
+    digest = digest_of(entries)
     flights = _flights(record, [row for rows in shards for row in rows])
     update: dict[str, Any] = {"shards": entries, "content_digest": digest, "flights": flights}
     with_caption = Counter(str(row["split"]) for rows in shards for row in rows if row["has_caption"])
@@ -82,10 +91,23 @@ def forge(
     history.captions.accepted += captions - history.captions.released
     history.captions.read += captions - history.captions.released
     history.captions.released = captions
+    history.captions.frames_without = {"forged": sum(map(len, shards)) - captions}
     update["history"] = history
     record = record.model_copy(update=update)
     computed = compute_numbers([out / shard.path for shard in entries], record.settings.num_frames)
     return _finished(out, record.model_copy(update={"numbers": computed}).model_dump(mode="json"), change_record)
+
+
+def _stored(path: Path) -> StoredFile:
+    rows = pq.read_metadata(path).num_rows
+    return StoredFile(path=str(path), rows=rows, bytes=path.stat().st_size, sha256=sha256_file(path))
+
+
+def _points_of(shards: list[list[Row]], tables: list[list[Row]]) -> list[tuple[Row, Row]]:
+    """Return each row with its point."""
+    key = itemgetter(*columns.PLACE, "frame_index")
+    found = {key(point): point for points in tables for point in points}
+    return [(row, found[key(row)]) for rows in shards for row in rows]
 
 
 def _finished(out: Path, values: dict[str, Any], change_record: Callable[[dict[str, Any]], None]) -> Path:

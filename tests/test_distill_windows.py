@@ -31,7 +31,7 @@ def place(tmp_path_factory) -> Path:
     ]
     write_captions(root / "captions.jsonl", captions)
     write_inspection(root / "inspect.json", make_inspection(root / "tree", {}))
-    build(root, root / "release", CFG.model_copy(update={"num_frames": None}))
+    build(root, root / "release", CFG.model_copy(update={"selection": "all"}))
     return root
 
 

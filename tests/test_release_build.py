@@ -23,8 +23,9 @@ from specimens_release import CFG, FREE, all_bytes, build, make_caption, make_in
 
 from caption.schema import CaptionConfig
 from caption.stage import stage as caption_stage
+from caption.stage.released import read_released
 from cosfly.formats.boxes import MapHeader
-from cosfly.formats.captions import write_captions
+from cosfly.formats.captions import read_captions, write_captions
 from cosfly.formats.frames import read_depth, read_instance, read_rgb
 from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback import read_track
@@ -33,8 +34,10 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import ConfigError, InputError, VerifyError
 from cosfly.runtime.json_io import read_json
 from cosfly.runtime.png import colours_of
+from distill.windows import Windows
 from release.build.config import ReleaseConfig
 from release.build.plan import plan_shards
+from release.build.shards import points_part
 from release.build.sources import Source
 from release.build.stage import run
 from release.card.render import render_card
@@ -117,7 +120,7 @@ def test_neither_twin_goes_without_the_other_unless_asked(copy, tmp_path):
 def test_a_public_tree_without_an_inspection_is_released(tmp_path):
     tree = write_foreign_tree(tmp_path / "tree", num_points=13)
     captions = caption_stage.run(CaptionConfig(), tree, tmp_path / "caption")
-    cfg = ReleaseConfig(licence="cc-by-4.0", num_frames=None)
+    cfg = ReleaseConfig(licence="cc-by-4.0", selection="all")
     record = read_record(run(cfg, [Source("theirs", tree, captions)], tmp_path / "r") / "release.json")
     assert (record.history.flights.found, record.history.flights.inspected) == (2, 0)
     assert record.history.trajectories is None
@@ -290,7 +293,7 @@ def test_after_a_failed_flight_the_finished_shards_are_not_done_again(tmp_path, 
     real = package.name_shards
 
     def look(finished, folder):
-        kept.update({path.name: path.stat().st_mtime_ns for path, _ in finished})
+        kept.update({path.name: path.stat().st_mtime_ns for path, _ in finished for path in (path, points_part(path))})
         return real(finished, folder)
 
     monkeypatch.setattr(package, "name_shards", look)
@@ -298,12 +301,12 @@ def test_after_a_failed_flight_the_finished_shards_are_not_done_again(tmp_path, 
     assert sum(kept.get(name) == time_ns for name, time_ns in before.items()) >= len(before) - 1
 
 
-def test_every_released_caption_has_its_whole_window(tmp_path):
+def test_windows_keep_the_pictures_of_captions(tmp_path):
     tree = make_playback_tree(tmp_path / "tree", 1, 100, width_px=32, height_px=18)
     captions = [make_caption(f, i) for f in map(read_track, find_tracks(tree)) for i in range(4, 90)]
     write_captions(tmp_path / "captions.jsonl", captions)
     write_inspection(tmp_path / "inspect.json", make_inspection(tree, {}))
-    folder = run(split_cfg(num_frames=60), [source_of(tmp_path)], tmp_path / "r")
+    folder = run(split_cfg(num_frames=60, selection="windows"), [source_of(tmp_path)], tmp_path / "r")
     rows = table_of(folder, ["variant", "frame_index", "caption_window", "has_caption"])
     for variant in ("ORI", "aug_001"):
         own = [row for row in rows if row["variant"] == variant]
@@ -311,10 +314,29 @@ def test_every_released_caption_has_its_whole_window(tmp_path):
         assert len(frames) == 60
         assert sum(b - a > 1 for a, b in pairwise(sorted(frames))) == 1  # two runs of thirty
         released = [row for row in own if row["has_caption"]]
-        assert all(set(row["caption_window"]) <= frames for row in released)
-        assert len(released) >= 0.8 * len([index for index in frames if 4 <= index < 90])
-    everything = run(split_cfg(num_frames=None), [source_of(tmp_path)], tmp_path / "all")
+        assert sum(set(row["caption_window"]) <= frames for row in released) >= 0.8 * len(released) > 30
+    everything = run(split_cfg(selection="all"), [source_of(tmp_path)], tmp_path / "all")
     assert read_record(everything / "release.json").history.captions.released == 2 * 86
+
+
+def test_a_long_track_is_released_as_in_the_paper(tmp_path):
+    """Of 850 frames 400 by a uniform stride, each with its caption in both languages, recomputed from the points."""
+    tree = make_playback_tree(tmp_path / "tree", 1, 850, width_px=32, height_px=18)
+    captions = caption_stage.run(CaptionConfig(), tree, tmp_path / "caption")
+    cfg = ReleaseConfig(**{**FREE, "pairs": "both"})
+    folder = run(cfg, [Source("one", tree, captions)], tmp_path / "r")
+    rows = table_of(folder, ["variant", "frame_index", "caption_en_reasoning_trace", "caption_zh_reasoning_trace"])
+    for variant in ("ORI", "aug_001"):
+        own = {row.pop("frame_index"): row for row in rows if row["variant"] == variant}
+        assert sorted(own) == [k * 849 // 399 for k in range(400)]
+        with_caption = {index for index, row in own.items() if None not in row.values()}
+        accepted = {c.frame_index for c in read_captions(captions) if (c.variant, c.status) == (variant, "accepted")}
+        assert with_caption == accepted & own.keys()
+        assert len(with_caption) > 350
+    report = verify(folder, level="rows", reader=read_released)
+    assert report.is_ok, str(report)
+    with pytest.raises(InputError, match=r"release\.selection=windows"):
+        Windows(folder)
 
 
 UNLICENSED = CFG.model_copy(update={"licence": None})
@@ -500,6 +522,7 @@ def test_the_account_names_every_flight_and_caption(built):
     captions = history["captions"]
     assert (captions["read"], captions["dropped"]) == (6 * 8, {"hard_conflict": 6})
     assert captions["flight_left_out"] == 2 * 7
-    # Of 12 frames 2 to 9 are released; captions stand at 4 to 10, and each needs the four frames before its own.
-    assert (captions["released"], captions["window_not_whole"]) == (4 * 4, 4 * 2)
-    assert captions["frame_not_selected"] == 4
+    # Of 12 frames 0, 1, 3, 4, 6, 7, 9 and 11 are released; captions stand at 4 to 10, and that of 11 is dropped.
+    assert (captions["released"], captions["frame_not_selected"]) == (4 * 4, 4 * 3)
+    why = {"no whole window, at an end of the track": 4 * 3, "dropped: hard_conflict": 4}
+    assert captions["frames_without"] == why

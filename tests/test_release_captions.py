@@ -41,7 +41,7 @@ def run(tmp_path_factory) -> Path:
     write_captions(root / "caption/captions.jsonl", captions)
     write_captions(root / "captions.jsonl", captions)
     write_inspection(root / "inspect.json", make_inspection(root / "render", {}))
-    build(root, root / "release", CFG.model_copy(update={"num_frames": None}))
+    build(root, root / "release", CFG.model_copy(update={"selection": "all"}))
     return root
 
 

@@ -26,7 +26,7 @@ from release.verify.verify import verify
 ROWS = [make_row(i, variant, f"trajectory_{k}") for k in (1, 2) for variant in ("ORI", "aug_001") for i in range(12)]
 
 
-def numbers_of(rows: list[dict], num_frames: int | None = 12):
+def numbers_of(rows: list[dict], num_frames: int = 12):
     counted = RowCounts()
     counted.add(rows)
     return counted.numbers([], num_frames)
@@ -64,7 +64,7 @@ def test_every_snippet_of_the_card_runs(built, tmp_path, monkeypatch):
     assert values["poses"].num_rows == record.splits.splits[first_split(record)].frames
     assert values["poses"].column_names == ["sample_id", "pose"]
     window = values["window"](0)
-    assert len(window["frames"]) == len(window["facts"]["time_s"]) == record.settings.window_frames
+    assert len(window["facts"]["time_s"]) == record.settings.window_frames
     assert window["prompt"]
     assert window["caption"]
     assert len(values["places"]) == min(10, values["poses"].num_rows)
@@ -99,7 +99,7 @@ WINDOW = 5
 
 @given(st.integers(0, 3000), st.integers(1, 800), st.integers(1, 12))
 def test_so_many_frames_in_order(num_points, num_frames, window):
-    chosen = select_frames(num_points, num_frames, window)
+    chosen = select_frames(num_points, num_frames, "windows", window)
     assert len(chosen) == min(num_points, num_frames)
     assert (np.diff(chosen) >= 1).all()
     assert not len(chosen) or (chosen[0] >= 0 and chosen[-1] < num_points)
@@ -109,7 +109,7 @@ def test_so_many_frames_in_order(num_points, num_frames, window):
 
 @given(st.integers(300, 3000), st.integers(1, 800), st.integers(1, 12))
 def test_runs_and_the_gaps_between_them_differ_by_one_at_most(num_points, num_frames, window):
-    chosen = select_frames(num_points, num_frames, window)
+    chosen = select_frames(num_points, num_frames, "windows", window)
     gaps = np.diff(chosen)[np.diff(chosen) > 1]
     if len(gaps) and num_points - num_frames >= len(gaps) + 1 and gaps.min() > 2:  # no two runs have grown together
         lengths = [len(run) for run in np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)]
@@ -118,8 +118,8 @@ def test_runs_and_the_gaps_between_them_differ_by_one_at_most(num_points, num_fr
 
 
 @given(st.integers(0, 3000), st.integers(1, 800))
-def test_a_window_of_one_frame_gives_the_even_stride_of_the_paper(num_points, num_frames):
-    chosen = select_frames(num_points, num_frames, 1)
+def test_the_stride_is_that_of_the_paper(num_points, num_frames):
+    chosen = select_frames(num_points, num_frames, "stride", 5)
     if 1 < num_frames < num_points:
         assert chosen.tolist() == [k * (num_points - 1) // (num_frames - 1) for k in range(num_frames)]
 
@@ -135,10 +135,11 @@ def test_a_window_of_one_frame_gives_the_even_stride_of_the_paper(num_points, nu
     (20, 13, 2, [0, 1, 2, 3, 4, 5, 13, 14, 15, 16, 17, 18, 19]),
 ])  # fmt: skip
 def test_by_hand(num_points, num_frames, window, expected):
-    assert select_frames(num_points, num_frames, window).tolist() == expected
+    selection = "stride" if window == 1 else "windows"
+    assert select_frames(num_points, num_frames, selection, window).tolist() == expected
 
 
 @given(st.integers(1, 400), st.integers(400, 800))
 def test_a_short_flight_is_kept_whole(num_points, num_frames):
-    assert select_frames(num_points, num_frames, WINDOW).tolist() == list(range(num_points))
-    assert select_frames(num_points, None, WINDOW).tolist() == list(range(num_points))
+    assert select_frames(num_points, num_frames, "windows", WINDOW).tolist() == list(range(num_points))
+    assert select_frames(num_points, 1, "all", WINDOW).tolist() == list(range(num_points))

@@ -6,7 +6,7 @@ The observed frames and the future leave this module as two types, so that a pro
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -35,7 +35,7 @@ def cut_windows(track: Track, cfg: WindowConfig, twin: Track | None = None) -> I
     Args:
         twin: The clean track of a perturbed one; futures are cut from it.
     """
-    motion, frames = label_motion(track, twin), _frames_of(track)
+    motion, frames = label_motion(track, twin), frames_of(track)
     folders = [track.frame_folder(i) for i in range(len(track))]
     files = [files_in(folder) for folder in folders]
     missing = {i for i, names in enumerate(files) if "rgb.png" not in names} if cfg.require_images else set()
@@ -46,7 +46,9 @@ def cut_windows(track: Track, cfg: WindowConfig, twin: Track | None = None) -> I
         chosen = choose_keyframes([TABLE.label_of(measure(future)) for future in futures], KEYFRAME_STRIDE)
         currents, keyframes = [currents[i] for i in chosen], list(chosen.values())
     for current, keyframe in zip(currents, keyframes, strict=True):
-        observed = _observe(track, frames, slice(current - cfg.num_frames + 1, current + 1), folders, files)
+        span, mission = slice(current - cfg.num_frames + 1, current + 1), track.mission
+        order = None if mission is None or mission.order_at(current) is None else mission.kind
+        observed = observe(track, frames, span, order, folders, files)
         problem = "unusable_frame" if missing.intersection(observed.indices) else None
         if problem is None and order_comes_within(track.mission, current, cfg.future_frames):
             problem = "order_to_come"
@@ -67,7 +69,8 @@ def choose_keyframes(labels: list[str | None], stride: int) -> dict[int, Keyfram
     return chosen
 
 
-def _frames_of(track: Track) -> tuple[ObservedFrame, ...]:
+def frames_of(track: Track) -> tuple[ObservedFrame, ...]:
+    """Return what is observed of each frame of a track."""
     target, num_frames = track.target, len(track)
     bystanders = np.full((num_frames, 5), np.nan) if track.bystanders is None else track.bystanders
     return observed_frames(
@@ -85,11 +88,20 @@ def _frames_of(track: Track) -> tuple[ObservedFrame, ...]:
     )
 
 
-def _observe(
-    track: Track, frames: tuple[ObservedFrame, ...], span: slice, folders: list[Path], files: list[frozenset[str]]
+def observe(
+    track: Track,
+    frames: tuple[ObservedFrame, ...],
+    span: slice,
+    order: str | None,
+    folders: Sequence[Path] = (),
+    files: Sequence[frozenset[str]] = (),
 ) -> ObservedWindow:
-    """Return the observed frames of a track, without a reference to those that follow."""
-    goal, mission, current = track.goal, track.mission, span.stop - 1
+    """Return the observed frames of a track, without a reference to those that follow.
+
+    Args:
+        order: The kind of the mission whose order is in force. folders, files: Of the pictures of all frames, if there.
+    """
+    goal, current = track.goal, span.stop - 1
     return ObservedWindow(
         sample_id=sample_id(track.flight_id, current),
         town=track.town,
@@ -101,7 +113,7 @@ def _observe(
         frames=frames[span],
         frame_folders=tuple(folders[span]),
         frame_files=tuple(files[span]),
-        mission=None if mission is None or mission.order_at(current) is None else mission.kind,
+        mission=order,
         goal=None if goal is None or track.bystanders is None else {"en": goal.en, "zh": goal.zh},
     )
 

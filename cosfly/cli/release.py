@@ -12,6 +12,7 @@ from cosfly.cli import options
 from cosfly.cli.options import WORKERS, Job, SettingOption, command, track_options
 
 options.add_group("release", "Package captions and frames as a data set that opens with one line.")
+SELECTION = "Frames of each track: a uniform stride, runs that keep windows of captions whole, or all."
 
 
 @command(
@@ -19,7 +20,8 @@ options.add_group("release", "Package captions and frames as a data set that ope
     "release",
     f"{WORKERS} resume",
     **track_options("release", "flights", "tracks"),
-    frames=SettingOption("release.num_frames", "Frames per track, or all.", values={"all": None}, metavar="N|all"),
+    frames=SettingOption("release.num_frames", "Largest number of frames per track.", int, metavar="N"),
+    selection=SettingOption("release.selection", SELECTION, Literal["stride", "windows", "all"]),
 )
 def build(
     job: Job,

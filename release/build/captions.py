@@ -17,20 +17,29 @@ from release.columns import LANGUAGES, published_name
 
 FlightKey = tuple[str, str, str]  # town's folder, trajectory, variant
 Span = tuple[int, int]  # first byte and size of lines that stand one after the other
+ACCEPTED, NO_REASON = "accepted", "no reason given"
 MOST_SPAN_BYTES = 4_000_000  # of which the captions are in memory at once
 
 
 @dataclass
 class FlightCaptions:
-    """The accepted captions of a flight: where they stand, and which frames have one (one byte a frame)."""
+    """The captions of a track: where the accepted ones stand in the file, and what became of each frame.
+
+    outcomes: By frame, `accepted` or the reason why its caption was dropped.
+    """
 
     path: Path
-    has_caption: bytearray
+    outcomes: dict[int, str] = field(default_factory=dict)
     spans: list[Span] = field(default_factory=list)
 
-    @property
-    def count(self) -> int:
-        return sum(self.has_caption)
+    def why_none(self, index: int) -> str:
+        """Return why a frame has no accepted caption."""
+        if not self.outcomes:
+            return "the track has no captions"
+        if index in self.outcomes:
+            return f"dropped: {self.outcomes[index]}"
+        asked = min(self.outcomes) <= index <= max(self.outcomes)
+        return "not asked for" if asked else "no whole window, at an end of the track"
 
     def add(self, first: int, size: int) -> None:
         if self.spans and sum(self.spans[-1]) == first and self.spans[-1][1] + size <= MOST_SPAN_BYTES:
@@ -64,7 +73,7 @@ class CaptionAccount:
         self.tokens.update(caption.usage.model_dump())
         self.asks += caption.attempts
         if caption.status != "accepted":
-            self.dropped[caption.drop_reason or "no reason given"] += 1
+            self.dropped[caption.drop_reason or NO_REASON] += 1
             return
         self.accepted += 1
         self.window_frames = max(self.window_frames, max(caption.window) - min(caption.window) + 1)
@@ -96,7 +105,7 @@ def index_captions(
         lengths: of the flights that are released, their frames; others: the flights of the tree that are left out.
         tell: takes what is wrong with a caption, under its sample id.
     """
-    found = {key: FlightCaptions(path, bytearray(length)) for key, length in lengths.items()}
+    found = {key: FlightCaptions(path) for key in lengths}
     account, first = CaptionAccount(), 0
     for line, caption in caption_lines(path):
         size = len(line.encode())
@@ -106,18 +115,21 @@ def index_captions(
         problem = _no_place(caption, key, lengths, others, where)
         if problem is None and caption.status == "accepted":
             problem = _no_caption(caption, where)
-            if problem is None and key in found and found[key].has_caption[caption.frame_index]:
+            if problem is None and key in found and found[key].outcomes.get(caption.frame_index) == ACCEPTED:
                 problem = InputError("the frame has two accepted captions", where=where)
         if problem is not None:
             tell(caption.sample_id, problem)
             continue
         account.add(caption)
-        if caption.status == "accepted":
-            if key in found:
-                found[key].has_caption[caption.frame_index] = 1
+        is_accepted = caption.status == ACCEPTED
+        if key in found:
+            outcome = ACCEPTED if is_accepted else caption.drop_reason or NO_REASON
+            found[key].outcomes.setdefault(caption.frame_index, outcome)
+            if is_accepted:
+                found[key].outcomes[caption.frame_index] = ACCEPTED
                 found[key].add(begin, size)
-            else:
-                account.of_no_flight += 1
+        elif is_accepted:
+            account.of_no_flight += 1
     return found, account
 
 

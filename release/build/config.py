@@ -11,7 +11,7 @@ from cosfly.formats.frames import FILE_NAMES, FrameFile
 from cosfly.formats.places import TrackName
 from cosfly.runtime.config import Config
 from release.columns import SplitName
-from release.record import Pairs, SplitBy
+from release.record import Pairs, Selection, SplitBy
 
 MB = 1024 * 1024
 
@@ -25,15 +25,12 @@ class ReleaseConfig(Config):
         description="licence of the data set, as spelled on the Hugging Face Hub (cc-by-4.0); null: that of all maps",
     )
     credits: str = Field("", description="attribution besides that of the maps, which is always included")
-    num_frames: int | None = Field(
-        400,
-        ge=1,
-        description="largest number of frames per track, in runs that keep windows of captions complete; null: all",
+    selection: Selection = Field(
+        "stride",
+        description="frames of each track. stride: a uniform stride, as in the paper; windows: runs of consecutive "
+        "frames, for training on the pictures of windows; all",
     )
-    uniform_stride: bool = Field(
-        False,
-        description="select single frames, as in the paper; captions with incomplete windows are not released",
-    )
+    num_frames: int = Field(400, ge=1, description="largest number of frames per track; not used with selection all")
     flights: tuple[str, ...] = Field(
         (),
         description="patterns of track folders, such as Town01/trajectory_17*/ORI; empty: all",

@@ -84,7 +84,7 @@ def selected_bytes(flight: Surveyed, cfg: ReleaseConfig, window_frames: int, tel
     """Count a flight's selected frames and the bytes of their files, depth unpacked; `tell` takes files that are not
     there."""
     folder, total = flight.candidate.folder, 0
-    selected = select_frames(flight.num_frames, cfg.num_frames, window_frames, cfg.uniform_stride).tolist()
+    selected = select_frames(flight.num_frames, cfg.num_frames, cfg.selection, window_frames).tolist()
     for i in selected:
         for file in cfg.modalities:
             path = frame_path(folder / frame_name(i), FILE_NAMES[file])
@@ -198,7 +198,7 @@ def _index(
         lengths = {key: min(flight.num_frames for flight in group) for key, group in own.items()}
         captions, account = index_captions(source.captions, lengths, others, faults.tell)
         for key, of_flight in captions.items():
-            if len(own[key]) > 1 and of_flight.count:
+            if len(own[key]) > 1 and of_flight.spans:
                 names = ", ".join(flight.name for flight in own[key])
                 what = "the captions fit several tracks"
                 faults.tell(

@@ -22,12 +22,14 @@ from release import columns
 from release.build.captions import CaptionAccount, teacher_settings
 from release.build.config import ReleaseConfig
 from release.build.plan import ReleasePlan
-from release.build.shards import ShardResult
+from release.build.shards import ShardResult, points_part
 from release.build.sources import Source, input_names
 from release.card.croissant import CROISSANT, render_croissant
 from release.card.render import render_card
 from release.columns import published
 from release.record import (
+    FRAMES_FOLDER,
+    POINTS_FOLDER,
     CaptionHistory,
     FlightHistory,
     History,
@@ -43,12 +45,12 @@ from release.record import (
     SourceRecord,
     Splits,
     StoredDepth,
-    content_digest,
+    digest_of,
     numbers_of_splits,
     shard_paths,
     write_record,
 )
-from release.rules import RULE, SPLIT_RULE
+from release.rules import RULES, SPLIT_RULE
 
 
 def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], account: CaptionAccount) -> Provenance:
@@ -129,16 +131,17 @@ def account_for(plan: ReleasePlan, written: list[ShardResult]) -> History:
     """Return where all flights and captions went; every sum is checked here and again by `release verify`."""
     flights = [flight for result in written for flight in result.flights]
     account = plan.account
+    without = sum((Counter(flight.frames_without) for flight in flights), Counter[str]())
     captions = CaptionHistory(
         read=account.accepted + account.dropped.total(),
         dropped=dict(sorted(account.dropped.items())),
         accepted=account.accepted,
         released=sum(flight.captions for flight in flights),
         frame_not_selected=sum(flight.frame_not_selected for flight in flights),
-        window_not_whole=sum(flight.window_not_whole for flight in flights),
         flight_left_out=account.of_no_flight,
+        frames_without=dict(sorted(without.items())),
     )
-    parts = captions.released + captions.frame_not_selected + captions.window_not_whole + captions.flight_left_out
+    parts = captions.released + captions.frame_not_selected + captions.flight_left_out
     assert captions.accepted == parts, captions
     found = FlightHistory(
         found=len(plan.material.candidates),
@@ -192,14 +195,14 @@ def make_record(
         maps=plan.maps,
         made_by=f"cosfly {cosfly.__version__}",
         settings=Settings(
+            selection=cfg.selection,
             num_frames=cfg.num_frames,
-            uniform_stride=cfg.uniform_stride,
             window_frames=plan.window_frames,
             tracks=list(cfg.tracks),
             pairs=cfg.pairs,
             modalities=list(cfg.modalities),
         ),
-        frame_selection=RULE,
+        frame_selection=RULES[cfg.selection],
         depth=StoredDepth() if "depth" in cfg.modalities else None,
         coordinates=columns.CONTRACT,
         prompts=prompts,
@@ -208,40 +211,44 @@ def make_record(
         history=account_for(plan, written),
         provenance=provenance,
         flights=flights,
-        content_digest=content_digest((shard.split, shard.sha256) for shard in shards),
+        content_digest=digest_of(shards),
         shards=shards,
     )
 
 
-OF_SHARD = {"rows", "bytes", "sha256"}  # what is known of it once it is written
 DATASET, PARTS = "dataset", "parts"  # in the folder of the stage: what gets published, and shards on the way there
 
 
 def check_parts(parts: Sequence[tuple[Path, Shard]], out: Path) -> None:
     """See that what was finished, also by an earlier run, is there; `out` is the folder of the stage."""
     for path, shard in parts:
-        if not path.is_file() or path.stat().st_size != shard.bytes:
-            raise VerifyError(
-                "a finished shard is missing or has another size", where=path,
-                expected=f"{shard.bytes} bytes", fix=f"remove {out} and run the same command again",
-            )  # fmt: skip
+        for place, stored in ((path, shard), (points_part(path), shard.points)):
+            if not place.is_file() or place.stat().st_size != stored.bytes:
+                raise VerifyError(
+                    "a finished shard is missing or has another size", where=place,
+                    expected=f"{stored.bytes} bytes", fix=f"remove {out} and run the same command again",
+                )  # fmt: skip
 
 
 def name_shards(parts: Sequence[tuple[Path, Shard]], folder: Path) -> list[Shard]:
     """Put shards under their names in the release: linked, so that no byte moves and a kill costs nothing.
 
     Args:
-        parts: where they stand until the release has its name, and what they are; their `path` is not read.
+        parts: where they stand until the release has its name, and what they are; their paths are not read.
     """
-    digest = content_digest((shard.split, shard.sha256) for _, shard in parts)
-    (folder / "data").mkdir()
+    digest = digest_of([shard for _, shard in parts])
+    for place in (FRAMES_FOLDER, POINTS_FOLDER):
+        (folder / place).mkdir()
     shards = []
-    for (part, shard), path in zip(parts, shard_paths([shard.split for _, shard in parts], digest), strict=True):
-        try:
-            os.link(part, folder / path)
-        except OSError:  # the file system has no links
-            shutil.copyfile(part, folder / path)
-        shards.append(shard.model_copy(update={"path": path}))
+    for (part, shard), name in zip(parts, shard_paths([shard.split for _, shard in parts], digest), strict=True):
+        frames, points = f"{FRAMES_FOLDER}/{name}", f"{POINTS_FOLDER}/{name}"
+        for source, path in ((part, frames), (points_part(part), points)):
+            try:
+                os.link(source, folder / path)
+            except OSError:  # the file system has no links
+                shutil.copyfile(source, folder / path)
+        of_points = shard.points.model_copy(update={"path": points})
+        shards.append(shard.model_copy(update={"path": frames, "points": of_points}))
     return shards
 
 
@@ -250,7 +257,7 @@ def write_records(folder: Path, record: ReleaseRecord) -> None:
     write_record(folder / "release.json", record)
     write_bytes(folder / "README.md", render_card(record).encode())
     write_bytes(folder / CROISSANT, render_croissant(record).encode())
-    digests = {shard.path: shard.sha256 for shard in record.shards}
+    digests = {file.path: file.sha256 for file in record.files}
     for name in ("release.json", "README.md", CROISSANT):
         digests[name] = sha256_file(folder / name)
     write_checksums(folder, digests)

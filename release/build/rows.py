@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import IO, Any
 
 import pyarrow as pa
@@ -12,7 +14,8 @@ from cosfly.formats.frames import FILE_NAMES, FrameFile, as_depth_npy, frame_pat
 from cosfly.formats.places import sample_id
 from cosfly.formats.playback import Track
 from release import columns
-from release.columns import PICTURES
+from release.columns import PICTURES, Placement
+from release.record import Selection
 
 # Values between two looks at the size of a page: with more a page takes a whole row group, twice in memory.
 VALUES_A_BATCH = 4
@@ -22,9 +25,9 @@ MOST_ROWS = 1000  # of a row group: of small pictures it would hold more rows th
 class ShardPlan(BaseModel):
     """How rows are chosen and cut."""
 
-    num_frames: int | None
+    selection: Selection
+    num_frames: int
     window_frames: int
-    uniform_stride: bool
     files: tuple[FrameFile, ...]
     row_group_bytes: int
 
@@ -99,3 +102,16 @@ def open_writer(sink: str | IO[bytes], schema: pa.Schema) -> pq.ParquetWriter:
         write_page_index=True,
         write_batch_size=VALUES_A_BATCH,
     )
+
+
+@contextmanager
+def points_writer(sink: IO[bytes]) -> Iterator[Callable[[Track, Placement], None]]:
+    """Open a table of points; yield the function that adds all points of a track, a row group each."""
+    schema = columns.points_schema()
+    with pq.ParquetWriter(sink, schema, compression="zstd", version="2.6", write_page_index=True) as writer:
+
+        def add(track: Track, placement: Placement) -> None:
+            rows = [columns.point_row(track, i, placement) for i in range(len(track))]
+            writer.write_table(pa.Table.from_pylist(rows, schema=schema))
+
+        yield add

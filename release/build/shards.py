@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,11 +34,12 @@ from cosfly.runtime.run_dir import TRACK_FILE, digest_of, folder_digests
 from cosfly.runtime.worker import advance
 from release import columns
 from release.build.captions import FlightCaptions
-from release.build.rows import Rows, ShardPlan, open_writer
+from release.build.rows import Rows, ShardPlan, open_writer, points_writer
 from release.build.sources import Candidate
 from release.build.survey import look_of, open_flight
 from release.columns import Placement, ReleasedCaption, caption_values
-from release.rules import is_whole, select_frames
+from release.record import StoredFile
+from release.rules import select_frames
 
 # Bits a channel; colour type, RGB or RGBA; interlacing: bytes 24, 25 and 28 of a PNG. What the readers of a release
 # take.
@@ -105,22 +107,24 @@ class FlightPart:
 
 
 class ReleasedPart(BaseModel):
-    """What a shard holds of a flight: counts of frames and captions."""
+    """What a shard holds of a flight: counts of frames and captions.
+
+    frames_without: The frames without a caption, by reason.
+    """
 
     name: str
     frames: int
     frames_available: int
     captions: int
     frame_not_selected: int
-    window_not_whole: int
+    frames_without: dict[str, int]
 
 
 class ShardResult(BaseModel):
-    """A shard that is written."""
+    """A shard that is written: its frames and points, whose paths are those of the parts."""
 
-    rows: int
-    bytes: int
-    sha256: str
+    frames: StoredFile
+    points: StoredFile
     flights: list[ReleasedPart]
 
 
@@ -132,24 +136,37 @@ def write_shard(path: Path, parts: Sequence[FlightPart], plan: ShardPlan) -> Sha
     """
     problems = _Problems()
     flights: list[ReleasedPart] = []
-    with atomic_file(path) as file:
-        with open_writer(file, columns.schema(plan.files)) as writer:
+    of_points = points_part(path)
+    with atomic_file(path) as file, atomic_file(of_points) as points:
+        with open_writer(file, columns.schema(plan.files)) as writer, points_writer(points) as add_points:
             rows = Rows(writer, plan)
             for part in parts:
                 with problems.collected():
-                    flights.append(_write_flight(part, plan, rows, problems))
+                    flights.append(_write_flight(part, plan, rows, add_points, problems))
             rows.flush()
         problems.raise_any()
-    num_rows = sum(flight.frames for flight in flights)
-    return ShardResult(rows=num_rows, bytes=path.stat().st_size, sha256=sha256_file(path), flights=flights)
+    frames = _stored(path, sum(flight.frames for flight in flights))
+    points_file = _stored(of_points, sum(flight.frames_available for flight in flights))
+    return ShardResult(frames=frames, points=points_file, flights=flights)
 
 
-def _write_flight(part: FlightPart, plan: ShardPlan, rows: Rows, problems: _Problems) -> ReleasedPart:
+def points_part(path: Path) -> Path:
+    """Return the file of a shard's points, given that of its frames, while the release is being built."""
+    return path.with_suffix(".points.parquet")
+
+
+def _stored(path: Path, rows: int) -> StoredFile:
+    return StoredFile(path=path.name, rows=rows, bytes=path.stat().st_size, sha256=sha256_file(path))
+
+
+def _write_flight(
+    part: FlightPart, plan: ShardPlan, rows: Rows, add_points: Callable[[Track, Placement], None], problems: _Problems
+) -> ReleasedPart:
     folder = part.candidate.folder
     digests = _digests(part.candidate)
     flight = open_flight(part.candidate)
-    selected = select_frames(len(flight), plan.num_frames, plan.window_frames, plan.uniform_stride).tolist()
-    captions, not_selected, not_whole = _captions_of(part.captions, set(selected))
+    selected = select_frames(len(flight), plan.num_frames, plan.selection, plan.window_frames).tolist()
+    captions, not_selected = _captions_of(part.captions, set(selected))
     tree = tree_of(flight.frame_folder(0))
     check_stays_below(folder / FRAMES_DIR, tree)
     for i in selected:
@@ -168,25 +185,25 @@ def _write_flight(part: FlightPart, plan: ShardPlan, rows: Rows, problems: _Prob
             if not problems.errors:  # else nothing will be written any more
                 rows.add(scalars, pictures, flight, i)
         advance()
+    if not problems.errors:
+        add_points(flight, part.placement)
+    without = Counter(part.captions.why_none(i) for i in selected if i not in captions)
     return ReleasedPart(
         name=part.candidate.name, frames=len(selected), frames_available=len(flight), captions=len(captions),
-        frame_not_selected=not_selected, window_not_whole=not_whole,
+        frame_not_selected=not_selected, frames_without=dict(without),
     )  # fmt: skip
 
 
-def _captions_of(captions: FlightCaptions, selected: set[int]) -> tuple[dict[int, ReleasedCaption], int, int]:
-    """Return the captions whose whole window is released, by frame, and how many lack their own frame or another
-    one."""
+def _captions_of(captions: FlightCaptions, selected: set[int]) -> tuple[dict[int, ReleasedCaption], int]:
+    """Return the captions of released frames, by frame, and how many are of other frames."""
     found: dict[int, ReleasedCaption] = {}
-    not_selected = not_whole = 0
+    not_selected = 0
     for caption in captions.read():
-        if caption.frame_index not in selected:
-            not_selected += 1
-        elif not is_whole(caption.window, selected):
-            not_whole += 1
-        else:
+        if caption.frame_index in selected:
             found[caption.frame_index] = caption_values(caption)
-    return found, not_selected, not_whole
+        else:
+            not_selected += 1
+    return found, not_selected
 
 
 # --- what is read -----------------------------------------------------------------------------------------------------

@@ -19,7 +19,6 @@ from release.build.config import ReleaseConfig
 from release.build.plan import Faults, ReleasePlan, make_plan
 from release.build.records import (
     DATASET,
-    OF_SHARD,
     PARTS,
     check_parts,
     make_record,
@@ -101,7 +100,7 @@ def _write_parts(
 ) -> list[ShardResult]:
     """Write all shards that are not written yet."""
     how = ShardPlan(
-        num_frames=cfg.num_frames, window_frames=plan.window_frames, uniform_stride=cfg.uniform_stride,
+        selection=cfg.selection, num_frames=cfg.num_frames, window_frames=plan.window_frames,
         files=cfg.modalities, row_group_bytes=cfg.row_group_bytes,
     )  # fmt: skip
     items = [Item(shard.name, shard.parts, num_steps=shard.num_frames) for shard in plan.shards]
@@ -117,7 +116,7 @@ def _write_parts(
 def _finished(plan: ReleasePlan, written: list[ShardResult], parts: Path) -> list[tuple[Path, Shard]]:
     """Return the shards that are written, and where they stand until the release has its name."""
     return [
-        (part_path(parts, shard.name), Shard(path="", split=shard.split, **result.model_dump(include=OF_SHARD)))
+        (part_path(parts, shard.name), Shard(split=shard.split, **vars(result.frames), points=result.points))
         for shard, result in zip(plan.shards, written, strict=True)
     ]
 

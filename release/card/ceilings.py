@@ -15,16 +15,17 @@ from cosfly.formats.segments import Segment
 from cosfly.inspection.blind_baseline import FITTED_ON, LEAST_WINDOWS, fit_deciders, is_drawn_ahead, past_of
 from cosfly.runtime.seeding import random_bytes, rng_for
 from release.card.numbers import DIGITS, row_lists
-from release.columns import PLACE, SHORT_NAMES, WINDOW
+from release.columns import PLACE, POINT_NAMES, WINDOW
 from release.flight_rows import FlightRows
-from release.record import Ceilings, ReleaseRecord
+from release.record import Ceilings, ReleaseRecord, Shard
 
+COLUMNS = [*PLACE, "sample_id", "frame_index", "label", "split", WINDOW]
 STAGE, FUTURE_FRAMES = "release.ceilings", 5  # of a label, where no record of captions says
 
 
 def ceilings_of(folder: Path, record: ReleaseRecord) -> Ceilings:
     """Measure them on FITTED_ON labels of a release at most, drawn by their names; raises as `row_lists`."""
-    told = [one for shard in record.shards for one in _windows(folder / shard.path, record)]
+    told = [one for shard in record.shards for one in _windows(folder, shard, record)]
     pasts, labels, splits, ahead = map(np.array, zip(*told, strict=True)) if told else [np.empty(0)] * 4
     split = "test" if "test" in splits else "validation"
     (train, test), known = ((pasts[splits == name], labels[splits == name]) for name in ("train", split)), ahead >= 0
@@ -38,23 +39,29 @@ def ceilings_of(folder: Path, record: ReleaseRecord) -> Ceilings:
     return found.model_copy(update=more)
 
 
-def _windows(shard: Path, record: ReleaseRecord) -> Iterator[tuple[np.ndarray, int, str, int]]:
-    """Yield of labelled windows the past, the label's number, the split, and whether it may hang on what was drawn
-    later, -1 where that is not known; a flight in memory."""
+def _windows(folder: Path, shard: Shard, record: ReleaseRecord) -> Iterator[tuple[np.ndarray, int, str, int]]:
+    """Yield of labelled windows the past, the label's number, the split, and whether it may depend on what was drawn
+    later, -1 where that is not known. Memory holds the points of a shard, and a row group."""
     numbers = {name: number for number, name in enumerate(TOKENS)}
     most_rank = 2**64 * FITTED_ON / max(1, record.numbers.captions.with_label)
     configs = [s.config for source in record.provenance.sources for s in source.stages if s.stage == "caption"]
     num_future = max((c["window"]["future_frames"] for c in configs if "window" in c), default=FUTURE_FRAMES)
-    for name, group in groupby(chain.from_iterable(row_lists(shard, SHORT_NAMES)), itemgetter(*PLACE)):
+    tracks = {}
+    points = chain.from_iterable(row_lists(folder / shard.points.path, list(POINT_NAMES)))
+    for name, group in groupby(points, itemgetter(*PLACE)):
         rows = FlightRows("/".join(name), list(group))
-        styles, place = rows.column("style"), {index: now for now, index in enumerate(rows.index.tolist())}
+        styles = rows.column("style")
         begins = [now for now in range(1, len(rows)) if styles[now] != styles[now - 1]]
-        flight = replace(rows.flight, segments=tuple(Segment(styles[now], now, len(rows)) for now in begins))
-        for now, row in enumerate(rows.rows):
+        segments = tuple(Segment(styles[now], now, len(rows)) for now in begins)
+        tracks[name] = rows, replace(rows.flight, segments=segments)
+    for name, group in groupby(chain.from_iterable(row_lists(folder / shard.path, COLUMNS)), itemgetter(*PLACE)):
+        rows, flight = tracks[name]
+        for row in group:
             if row["label"] is None or int.from_bytes(random_bytes(0, STAGE, row["sample_id"])[:8]) > most_rank:
                 continue
+            now = row["frame_index"]
             is_ordered, last = row["label"] in ORDERS, now + num_future
-            is_known = not rows.is_foreign and place.get(row["frame_index"] + num_future) == last
+            is_known = not rows.is_foreign and last < len(flight)
             ahead = is_drawn_ahead(flight, now, last, is_ordered) if is_known else None
-            past = past_of(flight, [place[index] for index in row[WINDOW]], is_ordered)
+            past = past_of(flight, row[WINDOW], is_ordered)
             yield past, numbers[row["label"]], row["split"], -1 if ahead is None else int(ahead)

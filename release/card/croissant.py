@@ -79,7 +79,7 @@ def _distribution(record: ReleaseRecord) -> list[dict[str, Any]]:
             "@type": "cr:FileObject", "@id": shard.path, "name": shard.path, "contentUrl": shard.path,
             "contentSize": f"{shard.bytes} B", "encodingFormat": PARQUET, "sha256": shard.sha256,
         }
-        for shard in record.shards
+        for shard in record.files
     ]  # fmt: skip
     patterns = [shard_pattern(split, record.content_digest) for split in record.splits.splits]
     return [

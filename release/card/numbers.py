@@ -30,9 +30,10 @@ from release.columns import (
     POINT,
     REQUIRED,
     VALUE_COLUMNS,
+    points_schema,
     schema,
 )
-from release.record import CaptionNumbers, FileNumbers, FramesBy, Numbers, Spread
+from release.record import POINTS_FOLDER, CaptionNumbers, FileNumbers, FramesBy, Numbers, Spread
 
 DIGITS = 4
 MILLION = 1_000_000
@@ -45,16 +46,15 @@ COLUMNS = [
     "height_px", "fov_deg", "pose", "drone_offset", "target",
     "target_heading_deg", "target_mask_bbox", "visibility", *FLAGS, *COUNTED, *VALUE_COLUMNS, *CAPTION_FIELDS,
 ]  # fmt: skip
-SCHEMA = schema(tuple(PICTURES))
 Place3 = tuple[float, float, float]  # m
 
 
-def compute_numbers(shards: list[Path], num_frames: int | None) -> Numbers:
+def compute_numbers(shards: list[Path], num_frames: int) -> Numbers:
     """Compute every number of the card.
 
     Args:
         shards: parquet files in their order.
-        num_frames: the release's frames per flight, None for all; flights with fewer are counted as short.
+        num_frames: the release's frames per flight; flights with fewer are counted as short.
     """
     counted = RowCounts()
     for shard in shards:
@@ -98,11 +98,12 @@ def check_rows(shard: Path, rows: int) -> None:
 
 def check_columns(group: pa.Table, columns: Iterable[str], shard: Path) -> None:
     """See that columns of a row group are those of a release."""
+    expected_schema = points_schema() if shard.parent.name == POINTS_FOLDER else schema(tuple(PICTURES))
     for name in columns:
         found = group.schema.field(name).type if group.schema.get_field_index(name) >= 0 else None
-        if found != SCHEMA.field(name).type:
+        if found != expected_schema.field(name).type:
             got = "no column of this name" if found is None else str(found)
-            expected = str(SCHEMA.field(name).type)
+            expected = str(expected_schema.field(name).type)
             raise InputError(
                 "the columns of the shard are not those of a release",
                 where=f"{shard}: {name}",
@@ -269,7 +270,7 @@ class RowCounts:
         self.example = self.example or {"sample_id": row["sample_id"], **texts}
         self.characters.update({name: len(text or "") for name, text in texts.items()})
 
-    def numbers(self, shards: list[Path], num_frames: int | None) -> Numbers:
+    def numbers(self, shards: list[Path], num_frames: int) -> Numbers:
         """Return the numbers of the rows of these shards."""
         self.counts["fov_deg"] = Counter()
         for frames in self.fovs.values():
@@ -284,7 +285,7 @@ class RowCounts:
             trajectories_by_fov_deg=_sorted(Counter(map(_fov_of, self.fovs.values()))),
             flights_by_track=_sorted(Counter(track for track, *_ in self.flights)),
             frames_per_flight=spread_of(float(flight.frames) for flight in flights),
-            flights_shorter_than_num_frames=sum(flight.frames < (num_frames or 0) for flight in flights),
+            flights_shorter_than_num_frames=sum(flight.frames < (num_frames) for flight in flights),
             flight_duration_s=spread_of(flight.times_s[1] - flight.times_s[0] for flight in flights),
             flight_length_m=spread_of(flight.length / MILLION for flight in flights if flight.is_known),
             height_over_target_m=spread["height_m"],

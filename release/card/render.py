@@ -24,7 +24,7 @@ from cosfly.runtime.io import read_text
 from cosfly.viz.coverage_page import ranges, shares
 from cosfly.viz.page import markdown
 from release.columns import CAPTION, PICTURES, SCALARS, SPLIT_NAMES, schema
-from release.record import History, ReleaseRecord, SourceRecord, shard_pattern
+from release.record import FRAMES_FOLDER, POINTS_FOLDER, History, ReleaseRecord, SourceRecord, shard_pattern
 
 # What a map is, by what made it (`maps.source`): no more than the program knows.
 MAPS = {
@@ -60,6 +60,8 @@ def render_card(record: ReleaseRecord) -> str:
         others=[source.run for source in record.provenance.sources if not _is_rendered_by_us(source)],
         map_kinds=by_kind,
         first_split=first_split(record),
+        points=sum(shard.points.rows for shard in record.shards),
+        is_whole=all(one.frames == one.frames_available for one in record.flights),
         frames_by={title: getattr(numbers.frames_by, name) for name, title in FRAMES_BY.items()},
         spreads={title: getattr(numbers, name) for name, title in SPREADS.items()},
         ranges=ranges(numbers.coverage),
@@ -119,7 +121,11 @@ def _front_matter(record: ReleaseRecord) -> str:
     files = {"depth": "depth", "instance": "instance-segmentation"}
     tags += [tag for file, tag in files.items() if file in record.settings.modalities]
     tags += ["chain-of-thought"] if record.numbers.captions.frames_with else []
-    patterns = {split: shard_pattern(split, record.content_digest) for split in record.splits.splits}
+    patterns = list(record.splits.splits)
+    configs = {
+        name: [{"split": split, "path": shard_pattern(split, record.content_digest, folder)} for split in patterns]
+        for name, folder in (("default", FRAMES_FOLDER), ("points", POINTS_FOLDER))
+    }
     matter = {
         "license": for_terminal(record.licence),
         "language": ["en", "zh"],
@@ -127,7 +133,7 @@ def _front_matter(record: ReleaseRecord) -> str:
         "size_categories": [size_category(record.numbers.frames)],
         "task_categories": ["image-text-to-text", "robotics"],
         "tags": tags,
-        "configs": [{"config_name": "default", "data_files": [{"split": k, "path": v} for k, v in patterns.items()]}],
+        "configs": [{"config_name": name, "data_files": files} for name, files in configs.items()],
     }
     return yaml.safe_dump(matter, sort_keys=False, allow_unicode=True).strip()
 
@@ -156,7 +162,6 @@ def _funnel(history: History) -> list[tuple[str, int]]:
     return [
         *rows,
         ("captions accepted, but frame not selected", captions.frame_not_selected),
-        ("captions accepted, but window incomplete", captions.window_not_whole),
         ("captions accepted, but track not released", captions.flight_left_out),
         ("captions released", captions.released),
     ]

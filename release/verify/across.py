@@ -26,6 +26,7 @@ class Summary:
     track: str | None
     town: str | None
     num_rows: int
+    num_points: int
     frames_digest: str
 
     @property
@@ -33,10 +34,12 @@ class Summary:
         return self.name.rpartition("/")[0]
 
 
-def summary_of(flight: FlightRows) -> Summary:
+def summary_of(flight: FlightRows, num_points: int) -> Summary:
     """Return what is compared of a flight."""
     first = {name: flight.rows[0].get(name) for name in ("split", "walk", "pair", "track", "town")}
-    return Summary(flight.name, **first, num_rows=len(flight), frames_digest=frames_digest(flight.index))
+    return Summary(
+        flight.name, **first, num_rows=len(flight), num_points=num_points, frames_digest=frames_digest(flight.index)
+    )
 
 
 def frames_digest(indices: np.ndarray) -> str:

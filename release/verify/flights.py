@@ -15,13 +15,13 @@ from cosfly.formats.shown_captions import CaptionReader
 from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.worker import Item, Outcome
-from release.columns import CAPTION, CAPTION_NAMES, LANGUAGES, REQUIRED, SCALARS, TARGET_PICTURE, WINDOW
+from release.columns import CAPTION, CAPTION_NAMES, LANGUAGES, POINT_NAMES, REQUIRED, SCALARS, TARGET_PICTURE, WINDOW
 from release.flight_rows import FlightRows, Row
 from release.record import ReleaseRecord
 from release.verify.across import summary_of
 from release.verify.findings import Findings
 from release.verify.scene import check_pictures
-from release.verify.sources import Entry, FlightSource, flight_rows
+from release.verify.sources import Entry, FlightSource, flight_rows, point_rows
 
 PIXEL_PX = 0.5  # a target's pixel: half a pixel is the most that another convention of pixel centres shifts it
 DEPTH_M = 0.02  # z-depth of the target: rounded to centimetres at worst
@@ -201,6 +201,18 @@ def _check_numbers(flight: FlightRows, i: int, name: str, value: Any, findings: 
             findings.error("range", place, number, f"{low:g} to {high:g}")
 
 
+def check_points(flight: FlightRows, points: FlightRows, findings: Findings) -> None:
+    """Check that a track has all of its points, and each row the values of its point."""
+    if not np.array_equal(points.index, np.arange(len(points))):
+        findings.error("points", f"{flight.name}: points", "frame indices with gaps", f"0 to {len(points) - 1}")
+        return
+    for i, row in enumerate(flight.rows):
+        point = points.rows[flight.index[i]] if 0 <= flight.index[i] < len(points) else {}
+        for name in (name for name in POINT_NAMES if row.get(name) != point.get(name)):
+            got = f"{shown(row.get(name))}, and {shown(point.get(name))} in the table of points"
+            findings.error("points", flight.where(i, name), got, "the same value in both")
+
+
 NEVER_NULL = [column.name for column in CAPTION if column.required]
 
 
@@ -210,7 +222,6 @@ def check_captions(flight: FlightRows, window_frames: int | None, findings: Find
     Args:
         window_frames: of every window, as the record says; None where nobody says.
     """
-    released = set(flight.index.tolist())
     for i, row in enumerate(flight.rows):
 
         def tell(code: str, column: str, got: object, expected: str, i: int = i) -> None:
@@ -222,11 +233,11 @@ def check_captions(flight: FlightRows, window_frames: int | None, findings: Find
         elif absent := [name for name in NEVER_NULL if name in row and not row[name]]:
             tell("caption", absent[0], shown(row.get(absent[0])), "a value, because has_caption is true")
         else:
-            _check_window(row, released, window_frames, tell)
+            _check_window(row, window_frames, tell)
             _check_decision(row, tell)
 
 
-def _check_window(row: Row, released: set[int], window_frames: int | None, tell: Callable[..., None]) -> None:
+def _check_window(row: Row, window_frames: int | None, tell: Callable[..., None]) -> None:
     window, index = row[WINDOW], row["frame_index"]
     if any(frame is None or frame > index for frame in window):
         tell("window", WINDOW, window, f"no frame after the current frame, {index}")
@@ -234,8 +245,8 @@ def _check_window(row: Row, released: set[int], window_frames: int | None, tell:
         tell("window", WINDOW, window, f"consecutive frames up to {index}")
     elif window_frames is not None and len(window) != window_frames:
         tell("window", WINDOW, f"{len(window)} frames", f"{window_frames} frames (settings.window_frames)")
-    elif not released.issuperset(window):
-        tell("window", WINDOW, f"frame {min(set(window) - released)} has no row", "a row for each frame of the window")
+    elif window[0] < 0:
+        tell("window", WINDOW, window, "frames of the track")
 
 
 def _check_decision(row: Row, tell: Callable[..., None]) -> None:
@@ -292,12 +303,12 @@ def make_worker(
         findings, summary = Findings(), None
         entry, clean = item.payload  # the clean flight of a perturbed one
         try:
-            flight = flight_rows(source, entry)
-            twin = flight_rows(source, clean) if clean is not None else None
-            if not len(flight):
-                raise InputError("the track has no rows", got="0 rows")
-            _check_flight(flight, twin, source, entry, level, context, reader, findings)
-            summary = vars(summary_of(flight))
+            flight, points = flight_rows(source, entry), point_rows(source, entry)
+            twin = point_rows(source, clean) if clean is not None else None
+            if not len(flight) or not len(points):
+                raise InputError("the track has no rows or no points", got=f"{len(flight)} and {len(points)}")
+            _check_flight(flight, points, twin, source, entry, level, context, reader, findings)
+            summary = vars(summary_of(flight, len(points)))
         except InputError as error:
             findings.error("unreadable", entry.name, f"{error.what}: {error.got}", "a track that can be read")
         except SENSELESS as error:
@@ -309,6 +320,7 @@ def make_worker(
 
 def _check_flight(
     flight: FlightRows,
+    points: FlightRows,
     twin: FlightRows | None,
     source: FlightSource,
     entry: Entry,
@@ -320,7 +332,7 @@ def _check_flight(
     """Run all checks of a flight; a value that makes a check impossible is a finding."""
 
     def read_captions() -> None:
-        shown = flight.shown(twin, context.caption_settings(flight))
+        shown = flight.shown(points, twin, context.caption_settings(flight))
         for lie in reader(shown) if reader is not None else ():
             findings.error(*lie)
 
@@ -330,6 +342,12 @@ def _check_flight(
         lambda: check_captions(flight, context.window_frames, findings),
         read_captions,
     ]
+    if points.rows is not flight.rows and entry.points:
+        checks += [
+            lambda: check_points(flight, points, findings),
+            lambda: check_identity(points, findings),
+            lambda: check_geometry(points, findings),
+        ]
     if level == "pixels":
         checks.append(lambda: check_pictures(flight, source.pictures(entry), findings))
     for check in checks:

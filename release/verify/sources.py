@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
@@ -19,8 +19,9 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import read_bytes
 from cosfly.runtime.tables import open_table, read_row_group, row_batches
-from release.columns import PICTURES, PLACE, SCALAR_NAMES, SCALARS, Placement, flight_name, flight_spans
+from release.columns import PICTURES, PLACE, POINT_NAMES, SCALAR_NAMES, SCALARS, Placement, flight_name, flight_spans
 from release.flight_rows import FlightRows, Row
+from release.record import Shard
 
 BATCH_ROWS = 2  # whose pictures are in memory at once
 Pictures = dict[FrameFile, bytes | memoryview | None]
@@ -28,11 +29,12 @@ Pictures = dict[FrameFile, bytes | memoryview | None]
 
 @dataclass(frozen=True)
 class Entry:
-    """A flight of a source. parts: where its rows are, in the source's own terms."""
+    """A flight of a source. parts, points: where its rows and points are, in the source's own terms."""
 
     name: str
     parts: tuple[Any, ...]
     num_rows: int
+    points: tuple[Any, ...] = ()
     given_id: str | None = None
 
     @property
@@ -59,12 +61,22 @@ class Shards:
     folder: Path
     files: tuple[FrameFile, ...]
 
-    def entries(self, names: list[str]) -> list[Entry]:
+    def entries(self, shards: list[Shard]) -> list[Entry]:
         """Find which rows are of which flight, in the order in which they stand.
 
         Raises:
             InputError: a shard cannot be read.
         """
+        parts = self._parts([shard.path for shard in shards])
+        points = self._parts([shard.points.path for shard in shards])
+        entries = [
+            Entry(name, tuple(own), sum(end - begin for *_, begin, end in own), tuple(points.get(name, ())))
+            for name, own in parts.items()
+            if name.count("/") == len(PLACE) - 1
+        ]
+        return with_ids(entries)
+
+    def _parts(self, names: list[str]) -> dict[str, list[tuple[str, int, int, int]]]:
         parts: dict[str, list[tuple[str, int, int, int]]] = defaultdict(list)
         for name in names:
             path = self.folder / name
@@ -73,14 +85,18 @@ class Shards:
                     places = read_row_group(path, table, group, list(PLACE))
                     for place, begin, end in flight_spans(places):
                         parts[flight_name(place)].append((name, group, begin, end))
-        entries = [Entry(name, tuple(own), sum(end - begin for *_, begin, end in own)) for name, own in parts.items()]
-        entries = [entry for entry in entries if entry.name.count("/") == len(PLACE) - 1]
-        return with_ids(entries)
+        return parts
 
     def rows(self, entry: Entry) -> list[Row]:
+        return self._rows(entry.parts, SCALAR_NAMES)
+
+    def points(self, entry: Entry) -> list[Row]:
+        return self._rows(entry.points, POINT_NAMES)
+
+    def _rows(self, parts: tuple[Any, ...], names: Sequence[str]) -> list[Row]:
         found: list[Row] = []
-        for path, table, group, begin, end in self._groups(entry):
-            own = read_row_group(path, table, group, SCALAR_NAMES)
+        for path, table, group, begin, end in self._groups(parts):
+            own = read_row_group(path, table, group, list(names))
             try:
                 found += own.slice(begin, end - begin).to_pylist()
             except ValueError as error:
@@ -89,7 +105,7 @@ class Shards:
 
     def pictures(self, entry: Entry) -> Iterator[Pictures]:
         names = {file: PICTURES[file].name for file in self.files}
-        for path, table, group, begin, end in self._groups(entry):
+        for path, table, group, begin, end in self._groups(entry.parts):
             row = 0
             for batch in row_batches(path, table, group, list(names.values()), BATCH_ROWS):
                 yield from pictures_of(batch, names)[max(begin - row, 0) : max(end - row, 0)]
@@ -97,12 +113,12 @@ class Shards:
                 if row >= end:
                     break
 
-    def _groups(self, entry: Entry) -> Iterator[tuple[Path, Any, int, int, int]]:
+    def _groups(self, parts: tuple[Any, ...]) -> Iterator[tuple[Path, Any, int, int, int]]:
         """Yield where a flight's rows are: file, the same opened once, row group, first row, row behind the last."""
-        for shard, parts in groupby(entry.parts, key=itemgetter(0)):
+        for shard, own in groupby(parts, key=itemgetter(0)):
             path = self.folder / shard
             with open_table(path, tree=self.folder) as table:
-                for _, group, begin, end in parts:
+                for _, group, begin, end in own:
                     yield path, table, group, begin, end
 
 
@@ -153,6 +169,9 @@ class TreeFlights:
                 row["sample_id"] = f"{entry.given_id}_frame_{i:05d}"
         return rows
 
+    def points(self, entry: Entry) -> list[Row]:
+        return self.rows(entry)
+
     def pictures(self, entry: Entry) -> Iterator[Pictures]:
         flight = self._flight(entry)
         for i in range(len(flight)):
@@ -171,3 +190,7 @@ FlightSource = Shards | TreeFlights
 
 def flight_rows(source: FlightSource, entry: Entry) -> FlightRows:
     return FlightRows(entry.name, source.rows(entry), entry.given_id)
+
+
+def point_rows(source: FlightSource, entry: Entry) -> FlightRows:
+    return FlightRows(entry.name, source.points(entry), entry.given_id)

@@ -34,23 +34,24 @@ from release.card.numbers import compute_numbers
 from release.card.render import render_card
 from release.columns import SPLIT_NAMES
 from release.record import (
+    FRAMES_FOLDER,
+    POINTS_FOLDER,
     RECORD,
     ReleaseRecord,
     StoredDepth,
-    content_digest,
+    digest_of,
     numbers_of_splits,
     read_record,
     release_folder,
     shard_paths,
 )
-from release.rules import RULE, SPLIT_RULE, select_frames, split_groups
+from release.rules import RULES, SPLIT_RULE, select_frames, split_groups
 from release.verify.across import Summary, check_across, frames_digest
 from release.verify.findings import Findings, Verified
 from release.verify.flights import SENSELESS, Context, Level, make_worker
 from release.verify.sources import Entry, FlightSource, Shards, TreeFlights
 
 CEILINGS_DIFFER = 0.03  # another machine rounds otherwise, and a network's fit goes another way
-MOST_FRAMES = 2**31  # of a flight: their indices are int32
 
 
 def check_record(record: ReleaseRecord, findings: Findings) -> None:
@@ -69,7 +70,7 @@ def _contract(record: ReleaseRecord) -> Iterator[Comparison]:
     """Return the convention of axes is one for all releases, and readers go by it."""
     for name in sorted(record.coordinates.keys() | columns.CONTRACT.keys()):
         yield "coordinates", f"coordinates.{name}", record.coordinates.get(name), columns.CONTRACT.get(name)
-    yield "rule", "frame_selection", record.frame_selection, RULE
+    yield "rule", "frame_selection", record.frame_selection, RULES[record.settings.selection]
     yield "depth_coding", "depth", record.depth is not None, "depth" in record.settings.modalities
     if record.depth is not None:
         yield "depth_coding", "depth", record.depth, StoredDepth()
@@ -78,24 +79,25 @@ def _contract(record: ReleaseRecord) -> Iterator[Comparison]:
 def _sums(record: ReleaseRecord) -> Iterator[Comparison]:
     """What the shards cannot tell must at least add up."""
     flights, captions = record.history.flights, record.history.captions
-    gone = captions.frame_not_selected + captions.window_not_whole + captions.flight_left_out
+    gone = captions.frame_not_selected + captions.flight_left_out
     sums = [
         ("flights.found", flights.found, flights.released + sum(flights.left_out.values())),
         ("flights.released", flights.released, record.numbers.flights),
         ("captions.read", captions.read, captions.accepted + sum(captions.dropped.values())),
         ("captions.accepted", captions.accepted, captions.released + gone),
         ("captions.released", captions.released, record.numbers.captions.frames_with),
+        ("captions.frames_without", sum(captions.frames_without.values()), record.numbers.captions.frames_without),
     ]
     yield from (("sum", f"history.{name}", whole, parts) for name, whole, parts in sums)
 
 
 def _shards(record: ReleaseRecord) -> Iterator[Comparison]:
     """Shards are named by the digest of their content and their number in their split."""
-    digest = content_digest((shard.split, shard.sha256) for shard in record.shards)
-    yield "digest", "content_digest", record.content_digest, digest
+    yield "digest", "content_digest", record.content_digest, digest_of(record.shards)
     names = shard_paths([shard.split for shard in record.shards], record.content_digest)
     for shard, name in zip(record.shards, names, strict=True):
-        yield "shard_name", shard.path, shard.path, name
+        yield "shard_name", shard.path, shard.path, f"{FRAMES_FOLDER}/{name}"
+        yield "shard_name", shard.points.path, shard.points.path, f"{POINTS_FOLDER}/{name}"
     yield "sum", "numbers.frames", record.numbers.frames, sum(shard.rows for shard in record.shards)
     yield "sum", "numbers.frames", record.numbers.frames, sum(flight.frames for flight in record.flights)
     yield "sum", "numbers.flights", record.numbers.flights, len(record.flights)
@@ -155,17 +157,17 @@ def check_card(folder: Path, record: ReleaseRecord, findings: Findings) -> None:
 
 def check_footers(folder: Path, record: ReleaseRecord, names: list[str], findings: Findings) -> list[str]:
     """Open every shard; give those that have the release's columns and number of rows."""
-    rows = {entry.path: entry.rows for entry in record.shards}
-    expected = columns.schema(record.settings.modalities)
-    good = []
+    rows, good = {file.path: file.rows for file in record.files}, []
+    schemas = {shard.path: columns.schema(record.settings.modalities) for shard in record.shards}
     for name in (name for name in names if name in rows):
+        expected = schemas.get(name, columns.points_schema())
         try:
             with open_table(folder / name, tree=folder) as table:
                 schema, num_rows = table.schema_arrow, table.metadata.num_rows
         except InputError as error:
             findings.error("unreadable", name, error.got or error.what, "a parquet file")
             continue
-        if not schema.equals(expected, check_metadata=True):
+        if schema != expected or schema.metadata != expected.metadata:
             wrong = ", ".join(m.name for m in schema if m not in list(expected))
             got = wrong or "another order, or other features in the metadata"
             findings.error("columns", name, got, "the columns of the release")
@@ -207,15 +209,12 @@ def check_flights(record: ReleaseRecord, flights: list[Summary], findings: Findi
             got, told = getattr(flight, key), getattr(entry, key)
             if got != told:
                 findings.error("flight", f"{name}: {key}", got, f"{told}, as in release.json")
-        available = entry.frames_available
-        wanted = available if asked.num_frames is None else min(available, asked.num_frames)
-        is_right = wanted == flight.num_rows == entry.frames and 0 < available <= MOST_FRAMES
-        if is_right:
-            rule = select_frames(available, asked.num_frames, asked.window_frames, asked.uniform_stride)
-            is_right = flight.frames_digest == frames_digest(rule)
-        if not is_right:
-            got = f"{flight.num_rows} of {available} frames"
-            findings.error("frames", name, got, f"{wanted} frames, selected by the rule in release.json")
+        rule = select_frames(flight.num_points, asked.num_frames, asked.selection, asked.window_frames)
+        is_right = len(rule) == entry.frames and flight.num_points == entry.frames_available
+        if not is_right or flight.frames_digest != frames_digest(rule):
+            got = f"{flight.num_rows} frames, {flight.num_points} points"
+            expected = f"{len(rule)} of {entry.frames_available} frames, selected by the rule in release.json"
+            findings.error("frames", name, got, expected)
 
 
 ALLOWED = (".git", ".gitattributes", ".cache", ".huggingface")  # what the hub and its client put beside a data set
@@ -338,7 +337,7 @@ def _verify_release(folder: Path, how: _How, findings: Findings) -> None:
         where = str(error.where).replace(f"{folder}/", "")
         findings.error("record", where, error.got or error.what, error.expected or "a release record")
         return
-    expected: dict[str, int | None] = dict.fromkeys(RECORDS) | {shard.path: shard.bytes for shard in record.shards}
+    expected: dict[str, int | None] = dict.fromkeys(RECORDS) | {file.path: file.bytes for file in record.files}
     good = check_names(folder, expected, findings)
     digests = read_digests(folder, findings)
     _check_lists(record, digests, findings)
@@ -350,7 +349,7 @@ def _verify_release(folder: Path, how: _How, findings: Findings) -> None:
     findings.facts.append(
         f"structure: {len(record.shards):,} shards with {record.numbers.frames:,} frames in release.json"
     )
-    if how.level != "structure" and len(readable) < len(record.shards):
+    if how.level != "structure" and len(readable) < len(record.files):
         findings.add(
             "note",
             "not_checked",
@@ -366,7 +365,7 @@ def _verify_release(folder: Path, how: _How, findings: Findings) -> None:
 
 def _check_lists(record: ReleaseRecord, digests: dict[str, str], findings: Findings) -> None:
     """The list of checksums and release.json name the same files with the same digests."""
-    listed = dict.fromkeys(set(RECORDS) - {CHECKSUMS}) | {shard.path: shard.sha256 for shard in record.shards}
+    listed = dict.fromkeys(set(RECORDS) - {CHECKSUMS}) | {file.path: file.sha256 for file in record.files}
     for name in sorted(listed.keys() | digests.keys()):
         if name not in listed or digests.get(name) != (listed[name] or digests.get(name, "")):
             got = f"{shown(digests.get(name))} in {CHECKSUMS}, {shown(listed.get(name))} in release.json"
@@ -379,7 +378,7 @@ def _verify_rows(folder: Path, record: ReleaseRecord, how: _How, findings: Findi
     """Check rows, and at level `pixels` pictures, of a release whose shards are all there and have its columns."""
     source = Shards(folder, tuple(record.settings.modalities))
     try:
-        entries = source.entries([shard.path for shard in record.shards])
+        entries = source.entries(record.shards)
     except InputError as error:
         findings.error("unreadable", str(error.where).replace(f"{folder}/", ""), error.got or error.what, "rows")
         return
