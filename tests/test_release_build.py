@@ -109,7 +109,7 @@ def test_neither_twin_goes_without_the_other_unless_asked(copy, tmp_path):
     names = [folder.relative_to(copy / "tree").as_posix() for folder in find_tracks(copy / "tree")]
     write_inspection(copy / "inspect.json", make_inspection(copy / "tree", {names[0]: ("rejected", "jerk")}))
     record = record_of(copy, tmp_path / "both")
-    assert record.history.flights.left_out == {"its twin is not released": 1, "rejected: jerk": 1}
+    assert record.history.flights.left_out == {"its other track is not released": 1, "rejected: jerk": 1}
     assert len(record.flights) == 2
     alone = record_of(copy, tmp_path / "any", split_cfg(pairs="any"))
     assert (len(alone.flights), [flight.pair for flight in alone.flights].count(None)) == (3, 1)

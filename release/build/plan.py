@@ -19,7 +19,7 @@ from release.build.captions import CaptionAccount, FlightCaptions, FlightKey, in
 from release.build.config import ReleaseConfig
 from release.build.shards import FlightPart
 from release.build.sources import IN_REVIEW, Material, Source, choose_licence, gather, maps_of
-from release.build.survey import Surveyed, Tell, check_alike, keep_pairs, place_flights, survey
+from release.build.survey import NO_TWIN, Surveyed, Tell, check_alike, keep_pairs, place_flights, survey
 from release.columns import SPLIT_NAMES, Placement, SplitName
 from release.record import ReleasedMap
 from release.rules import select_frames
@@ -176,6 +176,8 @@ def _no_flight(sources: list[Source], material: Material, left_out: Counter[str]
     waiting = [one.source for one in material.candidates if (one.left_out or "").startswith(IN_REVIEW)]
     inspected = next((s.inspect for s in [*(sources[k] for k in waiting), *sources] if s.inspect), None)
     choose = "choose other tracks with release.tracks, release.pairs or release.flights"
+    if left_out[NO_TWIN]:
+        choose = "release single tracks too with --set release.pairs=any, or choose others with release.tracks"
     if inspected is None:
         return stage.nothing_kept(tally, expected="a flight", fix=choose)
     folder = inspected.parent

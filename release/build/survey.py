@@ -20,6 +20,7 @@ from release.columns import Placement, SplitName
 from release.record import Pairs, SplitBy
 from release.rules import split_groups
 
+NO_TWIN = "its other track is not released"  # why a track is dropped
 MOST_NAMED = 3  # flights of each kind in a message
 
 
@@ -128,12 +129,12 @@ def _check_frames(flight: Track) -> None:
 def keep_pairs(
     flights: list[Surveyed], pairs: Pairs, tracks: tuple[TrackName, ...], tell: Tell
 ) -> tuple[list[Surveyed], Counter[str]]:
-    """Leave out flights whose twin is not released, where both tracks are wanted and the flight's run has both.
+    """Drop tracks whose other track is not released, unless `pairs` is `any` or one kind of track is wanted.
 
     Args:
-        tell: takes twins that are not of the same frames.
+        flights: Those that every other filter keeps. tell: Takes trajectories whose tracks differ in length.
     Returns:
-        the others, and why those are left out.
+        The others, and the number of dropped ones.
     """
     groups: dict[str, dict[str, Surveyed]] = defaultdict(dict)
     for flight in flights:
@@ -151,16 +152,9 @@ def keep_pairs(
             )
     if pairs == "any" or len(tracks) < 2:
         return flights, Counter()
-    tracks_of: dict[int, set[TrackName]] = defaultdict(set)
-    for flight in flights:
-        tracks_of[flight.candidate.source].add(flight.track)
-    kept = [
-        flight
-        for flight in flights
-        if len(groups[flight.candidate.trajectory]) == 2 or len(tracks_of[flight.candidate.source]) == 1
-    ]
+    kept = [flight for flight in flights if len(groups[flight.candidate.trajectory]) == 2]
     num_alone = len(flights) - len(kept)
-    return kept, Counter({"its twin is not released": num_alone} if num_alone else {})
+    return kept, Counter({NO_TWIN: num_alone} if num_alone else {})
 
 
 def check_alike(flights: list[Surveyed], tell: Tell) -> None:

@@ -71,13 +71,10 @@ def _check_splits(flights: list[Summary], by_town: bool, findings: Findings) -> 
 
 
 def _check_pairs(flights: Mapping[str, Summary], both: bool, findings: Findings) -> None:
-    """Check that twins name each other; where both tracks are wanted, that each flight of a run of both has one."""
-    tracks: dict[str, set[str | None]] = defaultdict(set)
+    """Check that the two tracks of a trajectory name each other, and that both are there where both are wanted."""
     for flight in flights.values():
-        tracks[flight.name.partition("/")[0]].add(flight.track)
-    for flight in flights.values():
-        twin, num_tracks = flights.get(flight.pair or ""), len(tracks[flight.name.partition("/")[0]])
-        if flight.pair is None and flight.split is not None and both and num_tracks > 1:
+        twin = flights.get(flight.pair or "")
+        if flight.pair is None and flight.split is not None and both:
             findings.error("pair", flight.name, "no other track", "both tracks (settings.pairs)")
         elif flight.pair is not None and (
             twin is None
