@@ -158,11 +158,11 @@ def check(cfg: RunConfig) -> dict[str, RunConfig]:
                 got=f"{', '.join(missing)} missing",
                 fix=f"render them, or pass --set 'release.modalities=[{', '.join(town.render.modalities)}]'",
             )
-        if cfg.release.pairs == "both" and (missing := sorted(set(cfg.release.tracks) - set(town.render.tracks))):
+        if cfg.release.pairs == "both" and (absent := set(cfg.release.tracks) - set(town.render.tracks)):
             raise ConfigError(
                 "the release needs both tracks of each trajectory, which the run does not render",
                 where="render.tracks",
-                got=f"{', '.join(missing)} missing",
+                got=f"{', '.join(sorted(absent))} missing",
                 fix=f"render them, or pass --set 'release.tracks=[{', '.join(town.render.tracks)}]'",
             )
     return towns
