@@ -16,6 +16,11 @@ import scenes
 from cosfly.maps.synthetic import SyntheticConfig, load
 scenes.town, scenes.city = lambda seed=0: load(SyntheticConfig(), seed), lambda: None
 """
+HERE = """
+from commands import invoke, working_here
+here = working_here()
+here.__enter__()
+"""
 DRAWN_SMALL = "--set render.width_px=160 --set render.height_px=90 --set fly.tree=false --set fly.most_decisions=6"
 
 
@@ -24,12 +29,13 @@ DRAWN_SMALL = "--set render.width_px=160 --set render.height_px=90 --set fly.tre
 CASES = (
     ("bench_blind", "", r"\| old_town and market \| [1-9]", """
 plain = bench.load
-bench.load = lambda model, path, told: plain(model, path, [*told, "pedestrians.num_paths=2"])
+bench.load = lambda model, path, told: plain(model, path, [*told, "pedestrians.num_paths=1"])
+bench.FITTED_ON = 200
 """),
     ("bench_client", "--windows 40 --concurrency 8", r"encoded on the way .* requests/s .* ratio 0\.\d+"),
     ("bench_decoding", "--batch 1 --tokens 4 --repeats 1", r"generate"),
     ("bench_decoding", "--check --batch 1 --tokens 4", r"\d"),
-    ("bench_flying", "--flights 2 --decisions 4 --workers 1", r"\d+ decisions in .* a second"),
+    ("bench_flying", "--flights 2 --decisions 4 --workers 1", r"\d+ decisions in .* a second", HERE),
     ("bench_flying", "--envs", r"2 side by side: .* steps a second",
              "import cosfly.envs.episodes; cosfly.envs.episodes.NUM_DECISIONS = 4"),
     ("bench_pages", "", r"turns at \d+ frames/s", """
@@ -38,7 +44,8 @@ bench.TURNS, bench.census_town = 1, lambda name, seed: load(SyntheticConfig(), s
 """),
     ("bench_planning", "--maps a --planners track_astar muco", r"the same loss from the same start",
              SMALL_TOWN + "scenes.NUM_WALKS, bench.WALKS = 2, bench.WALKS.model_copy(update={'num_paths': 2})"),
-    ("bench_ray", "render --rounds 1", r"ray / local, by rounds: .*differences: \[\]"),
+    ("bench_ray", "render --rounds 1", r"ray / local, by rounds: .*differences: \[\]",
+             "bench.TOWN = ('pedestrians.num_paths=2', *bench.TOWN[1:], 'render.fovs_deg=[60]', 'render.width_px=160')"),
     ("bench_ray", "memory --counts 10", r"ray, 10 items: driver .* items/s"),
     ("bench_release", "speed 8 --rounds 1", r"depth, one core: \d+ MB/s",
              "bench.NUM_POINTS, bench.NUM_POOL, bench.FRAMES_RELEASED, bench.SIZES['speed'] = 8, 1, 4, (160, 90)"),
@@ -49,9 +56,14 @@ bench.TURNS, bench.census_town = 1, lambda name, seed: load(SyntheticConfig(), s
     ("bench_training", "--check", r'"relative_difference_of_gradients": \d'),
     ("checkpoints", "--map RUN/maps/boxes_3d.json --simplified RUN/simplify/step2_simplified.json "
              "--paths RUN/pedestrians/path.json --captions RUN/caption/captions.jsonl --walks 1 --out OUT",
-             r"noise-0=[01]\.\d+", "bench.NOISE = (0.0,)"),
+             r"noise-0=[01]\.\d+", HERE + "bench.NOISE = (0.0,)"),
     ("dagger_rounds", f"--train RUN --test RUN --out OUT {DRAWN_SMALL}", r"control1 success",
-             "bench.STEPS = 5"),
+             HERE + """
+def cosfly(*words):
+    done = invoke([*words])
+    assert done.exit_code == 0, done.output
+bench.STEPS, bench.cosfly = 5, cosfly
+"""),
 )  # fmt: skip
 
 
