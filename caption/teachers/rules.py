@@ -68,10 +68,6 @@ def says(address: str, word: str, *conditions: Condition) -> Condition:
     return holds
 
 
-def sees(word: str) -> Condition:
-    return lambda f, side: f.visibility[-1] == word
-
-
 def is_smooth(f: Facts, side: int) -> bool:
     return not is_shaken(f)
 
@@ -95,6 +91,7 @@ def is_gap_clear(f: Facts, side: int) -> bool:
 
 
 walks = says("target_motion", "walking", is_walk_known)
+slows = says("trend:target_speed", "decreasing", is_walk_known_at_first)
 hurries = says("trend:target_speed", "increasing", is_walk_known_at_first)
 centred = says("side:offset_x", "centred", is_legible)
 gap_opens = says("trend:distance", "increasing", is_gap_clear)
@@ -236,9 +233,10 @@ CONDITIONS: dict[str, Condition] = {
     "always": lambda f, side: True,
     "stands": says("target_motion", "standing", is_walk_known),
     "sets_off": sets_off, "turns": turns, "crosses": crosses, "comes": comes, "walks_away": walks_away, "walks": walks,
-    "slows": says("trend:target_speed", "decreasing", is_walk_known_at_first),
+    "slows": slows, "stops": lambda f, side: slows(f, side) and (f.target_speeds_mps[-1] or 0.0) < SLOW_MPS,
     "hurries": hurries, "off_centre": off_centre, "sight_swings": sight_swings,
     "sight_turns": sight_turns, "swings_through_jitter": lambda f, side: is_shaken(f) and sight_turns(f, side),
+    "off_centre_no_turn": lambda f, side: off_centre(f, side) and (side != 0 or not is_turning(f, side)),
     "on_axis": lambda f, side: centred(f, side) and not sight_swings(f, 0) and not is_turning(f, side),
     "gap_steady": says("trend:distance", "steady"),
     "gap_opens": gap_opens, "gap_closes": gap_closes, "gap_scatters": gap_scatters,
@@ -253,7 +251,10 @@ CONDITIONS: dict[str, Condition] = {
     "slides": slides, "retreats": lambda f, side: f.velocity_mps[0] <= -max(SLIDING_MPS, abs(f.velocity_mps[1])),
     "turn_ends": turn_ends, "turns_slightly": is_turning,
     "turning": lambda f, side: abs(f.yaw_rate_dps[-1] or 0.0) >= SLIGHT_DPS,
-    "drone_backs": lambda f, side: f.velocity_mps[0] < 0.0 and not is_crawling(f, side),
+    "turns_back": lambda f, side: side * (f.yaw_rate_dps[-1] or 0.0) <= -TURNING_DPS,
+    "drone_backs": lambda f, side: f.velocity_mps[0] <= -DRIFTING_MPS,
+    "drone_lingers": lambda f, side: max(map(abs, f.velocity_mps[:2])) < DRIFTING_MPS,
+    "drone_shifts": lambda f, side: abs(f.velocity_mps[1]) >= abs(f.velocity_mps[0]),
     "climbing": lambda f, side: (f.climb_mps[-1] or 0.0) >= CLIMBING_MPS,
     "sinking": lambda f, side: (f.climb_mps[-1] or 0.0) <= -CLIMBING_MPS,
     "drone_drifts": lambda f, side: f.velocity_mps[0] >= 0.0 and abs(f.velocity_mps[1]) >= DRIFTING_MPS,
@@ -266,9 +267,9 @@ CONDITIONS: dict[str, Condition] = {
     "steep": lambda f, side: (f.depression_deg[-1] or 0.0) >= STEEP_DEG,
     "small": lambda f, side: is_legible(f, side) and 0 < (f.box_height_px[-1] or 0) < SMALL_SHARE * f.height_px,
     "large": lambda f, side: is_legible(f, side) and (f.box_height_px[-1] or 0) > LARGE_SHARE * f.height_px,
-    "hidden": sees("occluded"), "out_of_view": sees("out_of_view"), "faint": sees("illegible"),
-    "partly_hidden": sees("partly_occluded"),
-    "cover_closes": says("visibility@t0", "visible", sees("partly_occluded")),
+    "hidden": says("visibility", "occluded"), "out_of_view": says("visibility", "out_of_view"), "faint": says("visibility", "illegible"),
+    "partly_hidden": says("visibility", "partly_occluded"),
+    "cover_closes": says("visibility@t0", "visible", says("visibility", "partly_occluded")),
     "reappeared": lambda f, side: f.is_legible_now and any(word in HIDDEN for word in f.visibility),
     "stays_hidden": lambda f, side: all(word in HIDDEN for word in f.visibility),
     "seen_at_first": lambda f, side: not f.is_visible_now and f.distance_m[0] is not None,
@@ -351,8 +352,7 @@ def write_templates(
     reasons = list(choose.holding(sentences()["reasons"][name], side))
     if not reasons:
         return None
-    accounts = list(choose.holding(sentences()["accounts"].get(name, {}), side)) if token == decide(facts) else []
-    components, trace = _critical_components(choose, side), _reasoning_trace(choose, name, accounts, reasons)
+    components, trace = _critical_components(choose, side), _reasoning_trace(choose, name, side, reasons)
     texts = [(" ".join([en for en, _ in both]), "".join([zh for _, zh in both])) for both in (components, trace)]
     english, chinese = [
         {"critical_components": critical, "reasoning_trace": reasoning, "flight_decision": token}
@@ -375,15 +375,16 @@ def _critical_components(choose: Chooser, side: int) -> list[Both]:
     return [choose.sentence(found.pop(choose.below(len(found)))) for _ in tuple(found)]
 
 
-def _reasoning_trace(choose: Chooser, name: str, accounts: list[Group], reasons: list[Group]) -> list[Both]:
-    """Return the reason, mostly what else matters or what follows from it, and the conclusion."""
+def _reasoning_trace(choose: Chooser, name: str, side: int, reasons: list[Group]) -> list[Both]:
+    """Return the reason, often what else matters or what follows from it, and the conclusion."""
+    accounts = list(choose.holding(sentences()["accounts"].get(name, {}), side))
     number = choose.below(len(reasons) if name == "straight" else min(len(reasons), 2))
     main = accounts.pop(0) if accounts else reasons.pop(number)  # what a reader would ask about is answered
     remarks = list(islice(choose.holding(sentences()["remarks"]["any"], 0), 1))
     consequences = [sentences()["consequences"][FAMILIES[name].why]["always"]]
-    second = accounts[:1] or (remarks or consequences, remarks or consequences, [])[choose.below(3)]
+    second = accounts[:1] or (remarks or consequences, [])[choose.below(2)]
     first, *others = [choose.sentence(group) for group in (main, *second, _conclusions(name))]
-    lead = sentences()["leads"][name]["always"].smooth[0]
+    lead = next(choose.holding(sentences()["leads"][name], side)).smooth[0]
     return [(f"{lead[0]} {first[0][0].lower()}{first[0][1:]}", lead[1] + first[1]), *others]
 
 
