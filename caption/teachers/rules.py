@@ -236,6 +236,7 @@ CONDITIONS: dict[str, Condition] = {
     "slows": slows, "stops": lambda f, side: slows(f, side) and (f.target_speeds_mps[-1] or 0.0) < SLOW_MPS,
     "hurries": hurries, "off_centre": off_centre, "sight_swings": sight_swings,
     "sight_turns": sight_turns, "swings_through_jitter": lambda f, side: is_shaken(f) and sight_turns(f, side),
+    "off_axis": lambda f, side: sight_swings(f, side) and side * (f.bearing_deg[-1] or 0.0) >= 1.0,
     "off_centre_no_turn": lambda f, side: off_centre(f, side) and (side != 0 or not is_turning(f, side)),
     "on_axis": lambda f, side: centred(f, side) and not sight_swings(f, 0) and not is_turning(f, side),
     "gap_steady": says("trend:distance", "steady"),
