@@ -45,7 +45,7 @@ bench.TURNS, bench.census_town = 1, lambda name, seed: load(SyntheticConfig(), s
     ("bench_planning", "--maps a --planners track_astar muco", r"the same loss from the same start",
              SMALL_TOWN + "scenes.NUM_WALKS, bench.WALKS = 2, bench.WALKS.model_copy(update={'num_paths': 2})"),
     ("bench_ray", "render --rounds 1", r"ray / local, by rounds: .*differences: \[\]",
-             "bench.TOWN = ('pedestrians.num_paths=2', *bench.TOWN[1:], 'render.fovs_deg=[60]', 'render.width_px=160')"),
+             "bench.TOWN = ('pedestrians.num_paths=2', 'render.fovs_deg=[60]', *bench.TOWN[1:])"),
     ("bench_ray", "memory --counts 10", r"ray, 10 items: driver .* items/s"),
     ("bench_release", "speed 8 --rounds 1", r"depth, one core: \d+ MB/s",
              "bench.NUM_POINTS, bench.NUM_POOL, bench.FRAMES_RELEASED, bench.SIZES['speed'] = 8, 1, 4, (160, 90)"),

@@ -95,9 +95,16 @@ def project(points_m: np.ndarray, camera_pose: np.ndarray, intrinsic: np.ndarray
     return uv, z
 
 
-def box_corners(center: np.ndarray, half_extents: np.ndarray, yaw_rad: float = 0.0) -> np.ndarray:
-    """Return the eight corners of a box that is turned about z, (8, 3)."""
-    return CORNER_SIGNS * half_extents @ rotation_matrix(0.0, yaw_rad, 0.0).T + center
+def box_corners(center: np.ndarray, half_extents: np.ndarray, yaw_rad: np.ndarray | float = 0.0) -> np.ndarray:
+    """Return the eight corners of boxes that are turned about z, (..., 8, 3).
+
+    center, half_extents: (..., 3); yaw_rad: (...).
+    """
+    turns = np.zeros((*np.shape(yaw_rad), 3))
+    turns[..., 1] = yaw_rad
+    world_from_box = rotation_matrices(turns.reshape(-1, 3)).reshape(*np.shape(yaw_rad), 3, 3)
+    corners = CORNER_SIGNS * np.asarray(half_extents)[..., None, :] @ world_from_box.swapaxes(-1, -2)
+    return corners + np.asarray(center)[..., None, :]
 
 
 def mask_box(mask: np.ndarray) -> np.ndarray:

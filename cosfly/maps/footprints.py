@@ -67,8 +67,8 @@ def oriented_rectangle(polygon: Polygon) -> Rectangle:
 
 def footprints(box_map: BoxMap) -> np.ndarray:
     """Return the footprint of every upright box as a polygon, (n,)."""
-    rows = zip(box_map.centers, box_map.half_extents, np.radians(box_map.rotations_deg[:, 1]), strict=True)
-    return shapely.polygons(np.array([box_corners(*row)[[0, 2, 6, 4], :2] for row in rows]).reshape(-1, 4, 2))
+    corners = box_corners(box_map.centers, box_map.half_extents, np.radians(box_map.rotations_deg[:, 1]))
+    return shapely.polygons(corners[:, [0, 2, 6, 4], :2])
 
 
 def rectangle_polygon(rectangle: Rectangle, along: Share = (-0.5, 0.5), across: Share = (-0.5, 0.5)) -> Polygon:

@@ -174,6 +174,7 @@ def _find_place(
     """
     if free.is_empty:
         return None
+    shapely.prepare(free)
     by_water = thing.where != "open"
     tree = shapely.STRtree(taken if by_water else [*hard, *taken])
     low_x, low_y, high_x, high_y = free.bounds
