@@ -133,7 +133,7 @@ def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):
     assert result.exit_code == 0, result.output
     inspected = inspection.run(InspectConfig(), None, None, tree, tmp_path / "inspect")
     source = Source("students", tree, tmp_path / "out/captions.jsonl", inspected)
-    folder = package.run(package.ReleaseConfig(licence="mit"), [source], tmp_path / "release")
+    folder = package.run(package.ReleaseConfig(licence="mit", pairs="any"), [source], tmp_path / "release")
     assert verify(folder).is_ok
     captions = read_record(folder / "release.json").numbers.captions
     assert captions.frames_by["teacher_kind"] == {"student": len(rules)}
