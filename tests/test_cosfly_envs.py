@@ -13,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 
 import cosfly.envs
 from cosfly.closed_loop.policy import Policy
+from cosfly.envs import episodes
 from cosfly.envs.episodes import HELD_OUT, TASKS, TRAINING, read_list
 from cosfly.envs.follow import FULL_REWARD_M, NO_REWARD_M, reward_of
 from cosfly.formats.episodes import read_episode
@@ -44,7 +45,8 @@ def flown(env, seed, actions):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
-def test_an_environment_is_as_gymnasium_wants_it_without_a_warning(task):
+def test_an_environment_is_as_gymnasium_wants_it_without_a_warning(task, monkeypatch):
+    monkeypatch.setattr(episodes, "TRAINING", TRAINING if task == FOLLOW else TRAINING[:1])  # a town takes seconds
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(gymnasium.make(task, size_px=SMALL).unwrapped)
@@ -197,11 +199,12 @@ def test_a_slow_answer_is_late_once_and_the_next_ones_are_in_time(ask):
 
 
 @pytest.mark.slow
-def test_a_whole_list_gives_records_and_a_score(tmp_path, monkeypatch):
+def test_a_whole_list_gives_records_and_a_score(tmp_path, in_this_process, monkeypatch):
+    monkeypatch.setattr(episodes, "NUM_DECISIONS", 8)
     (tmp_path / "own.py").write_text(POLICIES)
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "out"
-    invoke("fly", "--env", FOLLOW, "--policy", "own:Word", "--out", out, "--workers", "2")
+    invoke("fly", "--env", FOLLOW, "--policy", "own:Word", "--out", out, "--workers", "1")
     records = [read_episode(path) for path in sorted((out / "episodes").glob("*.json"))]
     assert len(records) == 20
     assert {frame.answer for one in records for frame in one.decisions} == {"invalid"}

@@ -34,6 +34,7 @@ from cosfly.runtime.errors import InputError
 from cosfly.simplify.passes import SimplifyConfig, simplify
 
 SIZE = (320, 180)
+INTRINSIC = intrinsic_matrix(*SIZE, 70.0)
 UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # from glTF's axes
 
 
@@ -258,14 +259,14 @@ def scene_map(folder: Path) -> BoxMap:
     return replace(box_map, meshes=Meshes(refs, folder))
 
 
-def rays_of(pose: np.ndarray, intrinsic: np.ndarray) -> np.ndarray:
+def rays_of(pose: np.ndarray) -> np.ndarray:
     v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]] + 0.5
-    return np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.linalg.inv(intrinsic).T @ pose[:3, :3].T
+    return np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.linalg.inv(INTRINSIC).T @ pose[:3, :3].T
 
 
-def traced(triangles: np.ndarray, owners: np.ndarray, pose: np.ndarray, intrinsic: np.ndarray):
+def traced(triangles: np.ndarray, owners: np.ndarray, pose: np.ndarray):
     """Every pixel's ray against every triangle, by trimesh's geometry: z-depth and owner."""
-    rays = rays_of(pose, intrinsic)
+    rays = rays_of(pose)
     depth, ids = np.full(len(rays), np.inf), np.full(len(rays), NO_INSTANCE)
     normals, is_valid = trimesh.triangles.normals(triangles)
     assert is_valid.all()
@@ -285,10 +286,10 @@ def traced(triangles: np.ndarray, owners: np.ndarray, pose: np.ndarray, intrinsi
     return depth.reshape(SIZE[::-1]), ids.reshape(SIZE[::-1])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(RENDERERS.keys() - {"carla", "unrealcv"}))
-def test_depth_and_ids_are_those_of_trimesh_rays(tmp_path: Path, name: str) -> None:
-    box_map = scene_map(tmp_path)
+@pytest.fixture(scope="module")
+def traced_views(tmp_path_factory) -> tuple[BoxMap, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
+    """The scene, and of three views the pose, depth and ids by rays."""
+    box_map = scene_map(tmp_path_factory.mktemp("traced"))
     solids = solids_of(box_map)
     boxes = [
         trimesh.creation.box(2 * box_map.half_extents[row],
@@ -301,17 +302,25 @@ def test_depth_and_ids_are_those_of_trimesh_rays(tmp_path: Path, name: str) -> N
     boxes.append(trimesh.Trimesh(plane, [(0, 1, 2), (0, 2, 3)]))
     triangles = np.concatenate([solids.corners_m, *(np.asarray(box.triangles) for box in boxes)])
     owners = np.concatenate([box_map.ids[solids.rows].astype(int), np.full(12, 7), np.full(12, 12), [NO_INSTANCE] * 2])
-    renderer = open_renderer(name, box_map, *SIZE, Look())
-    intrinsic, shown = intrinsic_matrix(*SIZE, 70.0), set[int]()
+    views = []
     for eye, target in (((-18, -14, 12), (2, 8, 1)), ((22, -4, 3), (4, 10, 2)), ((4, 11, 30), (4, 12, 0))):
         pitch, yaw = look_at(np.array(eye, float), np.array(target, float))
         pose = world_from_camera(np.array(eye, float), np.degrees([pitch, yaw, 0.0]))
+        views.append((pose, *traced(triangles, owners, pose)))
+    return box_map, views
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(RENDERERS.keys() - {"carla", "unrealcv"}))
+def test_depth_and_ids_are_those_of_trimesh_rays(traced_views, name: str) -> None:
+    box_map, views = traced_views
+    renderer, shown = open_renderer(name, box_map, *SIZE, Look()), set[int]()
+    for pose, depth, ids in views:
         renderer.prepare(np.array([-20.0, -20.0, 0.0]), np.array([25.0, 25.0, 30.0]))
-        frame = renderer.render(pose, intrinsic, None)
-        again = renderer.render(pose, intrinsic, None)
+        frame = renderer.render(pose, INTRINSIC, None)
+        again = renderer.render(pose, INTRINSIC, None)
         for part in ("rgb", "depth", "kinds", "ids"):
             np.testing.assert_array_equal(getattr(frame, part), getattr(again, part))
-        depth, ids = traced(triangles, owners, pose, intrinsic)
         known = np.isfinite(depth)
         same = known & (ids == frame.ids)
         differ = known & ~same

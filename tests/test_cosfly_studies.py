@@ -74,7 +74,7 @@ def test_differences_are_those_of_the_walks_that_both_fly():
 
 
 @pytest.mark.slow
-def test_the_study_of_beams_twice_gives_the_same_bytes(tmp_path):
+def test_the_study_of_beams_twice_gives_the_same_bytes(tmp_path, in_this_process):
     write_boxes(tmp_path / "map.json", town_of(*CANYON))
     write_paths(tmp_path / "path.json", [walk_along("path_00000", [(0, 0), (30, 0)])], {})
     one, two = (
@@ -95,7 +95,7 @@ def test_a_longer_lens_shows_the_middle_as_large():
 
 @pytest.mark.slow
 @needs_gl
-def test_the_target_grows_as_the_lens_does(tmp_path_factory):
+def test_the_target_grows_as_the_lens_does(tmp_path_factory, in_this_process):
     folder = tmp_path_factory.mktemp("study")
     boxes, simplified, traces = write_inputs(folder / "inputs", [circling(6), circling(5, "path_002"), IN_THE_WALL])
     words = f"study zoom --map {boxes} --simplified {simplified} --traces {traces} --out {folder / 'out'} --every 2"

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from commands import working_here
 from specimens_release import SMALL_RUN
 from typer.testing import CliRunner
 
@@ -231,7 +232,8 @@ towns={
 @pytest.fixture(scope="module")
 def towns(tmp_path_factory):
     out = tmp_path_factory.mktemp("towns") / "run"
-    pipeline.run(load(RunConfig, None, [*SMALL_RUN, *OF_TOWNS, TOWNS.strip()]), out)
+    with working_here():
+        pipeline.run(load(RunConfig, None, [*SMALL_RUN, *OF_TOWNS, TOWNS.strip()]), out)
     return out
 
 
@@ -250,7 +252,7 @@ def test_several_towns_are_runs_of_their_own_and_one_release(towns):
 
 
 @pytest.mark.slow
-def test_the_stages_one_by_one_make_a_town_as_the_run_does(towns, tmp_path):
+def test_the_stages_one_by_one_make_a_town_as_the_run_does(towns, tmp_path, in_this_process):
     made = [tmp_path / "maps/boxes_3d.json", tmp_path / "simplify/step2_simplified.json"]
     made += [tmp_path / "pedestrians/path.json", tmp_path / "plan/drone_trace.json"]
     inputs = ([], ["--map", made[0]], ["--map", made[1]], ["--map", made[1], "--paths", made[2]])
