@@ -78,7 +78,7 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
         (("maps", "--out", "taken/inside"), ("taken", "cannot write", "--out")),
         (("run", "stage"), ("stage: this folder is not", "no run.yaml", "cosfly list stage")),
         (("config", "check", "deep/stage"), ("deep/stage: this folder is not", "no run.yaml", "quickstart")),
-        (("view", "town", "--out", "x"), ("town", "there is no such folder", "check the path")),
+        (("view", "town", "--out", "x"), ("town", "the directory of rendered tracks does not exist", "check the path")),
         (("simplify", "--map", "zero.json", "--out", "x"), ("zero.json", "a device", "a regular file")),
         (("caption", "prompts", "--export", "taken"), ("taken", "cannot write", "--out")),
         (

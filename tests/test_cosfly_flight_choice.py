@@ -33,8 +33,8 @@ def test_patterns_are_of_folders_and_those_above_them(tree):
         found = names(tree, **choice)
         assert len(found) == count
         assert set(found) <= set(names(tree))
-    words = r"no track of the tree matches the patterns; got Town9; .*Town01/trajectory_1777083733/ORI"
+    words = r"no track folder in this directory matches the patterns of --flights; got Town9; .*Town01/trajectory_1777083733/ORI"
     with pytest.raises(InputError, match=words):
         names(tree, match=("Town9",))
-    with pytest.raises(InputError, match="the tree has no track of the chosen kind; got perturbed"):
+    with pytest.raises(InputError, match="none of the matching tracks in this directory is a perturbed track"):
         names(tree, match=("*/ORI",), tracks=("perturbed",))

@@ -125,10 +125,10 @@ class Job:
         trees = self.trees(data)
         if len(trees) > 1:
             raise InputError(
-                "the command takes one playback tree, but several are given",
+                "the command takes one directory of rendered tracks, but --data names several",
                 where="--data",
                 got=f"{len(trees)}: {', '.join(map(str, trees))}",
-                fix="run the command once for each tree",
+                fix="run the command once for each directory",
             )
         return trees[0]
 
@@ -140,10 +140,9 @@ class Job:
             if (candidate / "manifest.json").exists() and candidate.resolve().name == "render":
                 return [self.cfg.opened(candidate)]
         raise InputError(
-            "the command has no playback tree to read",
+            "--data is missing, and the current directory is not a run directory",
             where=Path.cwd(),
-            got="no --data, in a directory that is not a run directory",
-            fix="add --data DIR, or change to a run directory",
+            fix="add --data DIR with the directory of rendered tracks, or change to a run directory",
         )
 
     def finish(self, product: Path, out: Path) -> None:
@@ -159,11 +158,11 @@ class Job:
         num_failed = sum(counts.total() for counts in failed.values())
         if num_failed > self.cfg.max_failed:
             raise InputError(
-                "more items failed than max_failed allows; all other items are complete",
+                "more items failed than the setting max_failed allows; all other items are complete",
                 where=where,
                 got="; ".join(f"{stage}: {counts_text(counts)}" for stage, counts in failed.items()),
-                expected=f"at most {self.cfg.max_failed}",
-                fix="fix the causes in failures.jsonl, and run the command again for the failed items",
+                expected=f"at most {self.cfg.max_failed} failed items",
+                fix="remove the causes that failures.jsonl names, and run the command again for the failed items",
             )
 
 

@@ -52,8 +52,8 @@ def read_controls(path: Path, tokens: tuple[str, ...]) -> dict[str, Control]:
     """Read a table and check that it has a row for each token."""
     controls = build(ControlTable, read_yaml(path), path).actions
     if missing := [token for token in tokens if token not in controls]:
-        problem = f"the controller table has no command for {', '.join(missing)}"
-        raise ConfigError(problem, where=path, fix="add an entry for each of them under actions")
+        problem = f"the controller table has no command for the decisions {', '.join(missing)}"
+        raise ConfigError(problem, where=path, fix="add an entry for each of these decisions under actions")
     return controls
 
 

@@ -83,8 +83,8 @@ def tables_of(students: Sequence[tuple[str, Score]], cfg: LeaderboardConfig, see
     for name, score in students:
         group = groups.setdefault(score.episodes_sha256, [])
         if name in (standing.name for standing in group):
-            fix = "give each folder a name of its own: NAME=DIR"
-            raise InputError("two students of one table have the same name", where="leaderboard", got=name, fix=fix)
+            fix = "give each student its own name: NAME=DIR"
+            raise InputError("two students in one table have the same name", where="leaderboard", got=name, fix=fix)
         gain = None
         if cfg.rounds and group:
             gain = figures_of(score.flights, rng_for(seed, "leaderboard", "gains"), group[-1].score.flights)

@@ -67,10 +67,10 @@ class Policy:
             self._reset, self._act = policy.reset, policy.act
         except Exception as error:
             raise InputError(
-                "the policy cannot be created",
+                "the policy class cannot be imported or created",
                 where="--policy",
                 got=f"{spec}: {type(error).__name__}: {error}",
-                expected="an importable module:Class with the methods reset(goal, seed) and act(observation)",
+                expected="a module:Class in the current directory, with reset(goal, seed) and act(observation)",
             ) from error
 
     def decide(self, observations: Sequence[Observation]) -> list[EngineDecision]:

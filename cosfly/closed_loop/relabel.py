@@ -52,7 +52,7 @@ def run(
     plans = read_traces(flown / PLAN / TRACES)
     if (planners := {plan.planner for plan in plans} | {cfg.plan.planner}) != {"foresight"}:
         raise ConfigError(
-            "relabeling needs the planner foresight, because no other planner starts at a pose of the student",
+            "relabeling works only with the planner foresight, because only it can start at the pose of a student",
             where=f"plan.planner, and {flown / PLAN}",
             got=", ".join(sorted(planners)),
             fix="fly the student again with --set plan.planner=foresight, and relabel with the same setting",
@@ -81,12 +81,12 @@ def _seed_of(flown: Path, cfg: ClosedLoopConfig) -> int:
     """Return the seed of a flown folder, which decides clothes and weather; check that the pictures are the same."""
     begun = read_stage_record(flown)
     if begun.stage != "fly":
-        what = "the folder is not the output of `cosfly fly --map --paths`"
+        what = "the folder to relabel is not the output directory of `cosfly fly --map --paths`"
         fix = "pass the output directory of that command"
         raise InputError(what, where=flown, got=f"output of the stage {begun.stage}", fix=fix)
     if "others" in begun.inputs:
         raise InputError(
-            "these episodes have bystanders, which --relabel cannot render",
+            "the recorded episodes have bystanders, but --relabel cannot render bystanders",
             where=flown,
             fix="fly the student again without --others",
         )
@@ -99,7 +99,7 @@ def _seed_of(flown: Path, cfg: ClosedLoopConfig) -> int:
             "the render settings differ from those of the recorded episodes",
             where=flown,
             got="; ".join(changed),
-            fix="use the render settings in stage.json of this folder",
+            fix="use the render settings that stage.json in this folder records",
         )
     return begun.seed
 

@@ -181,7 +181,7 @@ def run(
             "an episode renders every frame, so render.frame_stride must be 1",
             where="render",
             got=f"render.frame_stride={cfg.render.frame_stride}",
-            fix="remove render.frame_stride",
+            fix="remove the setting render.frame_stride",
         )
     read_controls(cfg.fly.table, TOKENS)
     common: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch, "resume": resume}

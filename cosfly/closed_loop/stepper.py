@@ -119,7 +119,7 @@ class ClosedLoopTrajectory:
             lost_s: The episode ends after this time without a visible target; 0 for never.
         """
         if not 2 <= num_lead < len(planned.time_s):
-            raise ValueError(f"num_lead must be from 2 to {len(planned.time_s) - 1}, got {num_lead}")
+            raise ValueError(f"num_lead must be from 2 to {len(planned.time_s) - 1} frames, got {num_lead}")
         self.airspace = airspace
         self.planned = planned
         self.drone = drone
@@ -156,7 +156,7 @@ class ClosedLoopTrajectory:
     def step(self, command: np.ndarray) -> Moment:
         """Fly a command, (5,) as ACTION in the level axes of the present frame; return the next frame."""
         if self.ended is not None:
-            raise ValueError(f"the episode has already ended with {self.ended!r}; call reset first")
+            raise ValueError(f"the episode has already ended (reason: {self.ended}); call reset before step")
         if problem := self.drone.problem_of(command):
             raise ValueError(problem)
         path_m, yaw_deg, pitch_deg = self._path(np.asarray(command, dtype=np.float64))

@@ -55,7 +55,7 @@ TASKS = {
 }
 REACQUIRES = "cosfly/Reacquire-v0"
 UNSUITABLE = (
-    "this pedestrian trajectory cannot be an episode: no drone trajectory was found, or the one found is too short"
+    "this pedestrian trajectory is not suitable for an episode: no drone trajectory, or only a short one, was found"
 )
 
 
@@ -91,7 +91,7 @@ def read_list(name: str) -> tuple[str, tuple[tuple[str, int], ...], str]:
     lists = read_model(EPISODES_FILE, EpisodeLists, EPISODES_FORMAT).lists
     episodes = lists.get(env, {}).get(list_name)
     if episodes is None:
-        problem = "the environment has no list of this name"
+        problem = "the environment has no list of episodes with this name"
         if env not in lists:
             problem = f"there is no environment of this name{nearest(name, lists)}"
         raise InputError(problem, where="--env", got=name, expected=f"one of {', '.join(lists.get(env, lists))}")

@@ -58,7 +58,7 @@ class FollowEnv(gymnasium.Env):
             size_px: Width and height of the pictures.
         """
         if actions not in ("decisions", "velocities"):
-            problem = "the environment has no actions of this kind"
+            problem = "the value of the argument actions is unknown"
             raise ConfigError(problem, where=task, got=actions, expected="decisions or velocities")
         self.task = task
         self.size_px = (size_px[0], size_px[1])
@@ -92,14 +92,15 @@ class FollowEnv(gymnasium.Env):
             if not isinstance(index, int) or not 0 <= index < len(self.listed):
                 where = f"{self.task}: options['episode']"
                 expected = f"a whole number from 0 to {len(self.listed) - 1}"
-                raise InputError("the list has no such episode", where=where, got=repr(index)[:40], expected=expected)
+                what = "the list of episodes has no episode with this number"
+                raise InputError(what, where=where, got=repr(index)[:40], expected=expected)
             town, number = self.listed[index]
             episode = benchmark.episode_of(self.task, world_of(benchmark.HELD_OUT[town]), number)
             if not self._begin(episode):
                 found, expected = ("visible", "hidden") if self.task == benchmark.REACQUIRES else ("hidden", "visible")
                 problem = (
-                    f"this pedestrian trajectory cannot be an episode: the target is {found} at first, but must be "
-                    f"{expected} in this environment"
+                    f"this pedestrian trajectory is not suitable for an episode: at first the target is {found}, but "
+                    f"in this environment it must be {expected}"
                 )
                 raise InputError(
                     benchmark.UNSUITABLE if episode is None else problem,
@@ -110,7 +111,10 @@ class FollowEnv(gymnasium.Env):
             world = world_of(benchmark.TRAINING[int(self.np_random.integers(len(benchmark.TRAINING)))])
             numbers = self.np_random.integers(100_000, size=benchmark.TRIES).tolist()
             if not any(self._begin(benchmark.episode_of(self.task, world, number)) for number in numbers):
-                problem = f"none of {benchmark.TRIES} random pedestrian trajectories can be an episode"
+                problem = (
+                    f"none of {benchmark.TRIES} random pedestrian trajectories is suitable for an episode: no drone "
+                    "trajectory was found, or the target's visibility at the start does not suit the environment"
+                )
                 where = f"{self.task}: {world.town.name}"
                 raise InputError(problem, where=where, fix="call reset with another seed")
         return self._observation(), self._info()
@@ -131,11 +135,11 @@ class FollowEnv(gymnasium.Env):
     def step(self, action: Any) -> tuple[dict, float, bool, bool, dict]:
         """Fly an action for 0.5 s; an episode that crashed or left the map is terminated, a finished one truncated."""
         if self._simulation is None or self._simulation.ended is not None:
-            raise InputError("no episode is running", where=self.task, fix="call reset first")
+            raise InputError("no episode is running", where=self.task, fix="call reset before step")
         if not self.action_space.contains(action):
             got, expected = repr(action)[:120], repr(self.action_space)
             raise InputError(
-                "the action is outside the bounds of the action space", where=self.task, got=got, expected=expected
+                "the action is not in the action space of the environment", where=self.task, got=got, expected=expected
             )
         if isinstance(self.action_space, spaces.Discrete):
             command = self._controller.command(TOKENS[int(action)], self._now)

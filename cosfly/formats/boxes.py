@@ -85,7 +85,7 @@ class GroundGrid(Record):
     def _rows_are_even(self) -> GroundGrid:
         lengths = {len(row) for row in self.heights_m}
         if len(lengths) != 1 or lengths.pop() < 2:
-            raise ValueError("the rows of heights_m must have the same length, at least two")
+            raise ValueError("all rows of heights_m must have the same number of heights, at least two")
         return self
 
     def ground(self) -> Ground:
@@ -217,7 +217,7 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
     unknown = [int(kind) for kind in np.unique(box_map.kinds) if int(kind) not in KIND_NAMES]
     if unknown:
         expected = f"an id from {min(KIND_NAMES)} to {max(KIND_NAMES)}"
-        raise InputError("the semantic id is unknown", where=where, got=str(unknown[0]), expected=expected)
+        raise InputError("a box has an unknown semantic id", where=where, got=str(unknown[0]), expected=expected)
     ids, counts = np.unique(box_map.ids, return_counts=True)
     if (counts > 1).any():
         got = str(ids[counts > 1][0])
@@ -238,8 +238,8 @@ def check_ground(box_map: BoxMap, path: Path) -> None:
             "the map has no ground",
             where=path,
             got="no ground_z_m and no heights in the header, and no box of a ground type",
-            expected="the height of the ground",
-            fix="put ground_z_m into the header, or add boxes of Roads, Sidewalks, Terrain or Ground",
+            expected="the height of the ground in metres",
+            fix="add ground_z_m in metres to the header, or boxes of type Roads, Sidewalks, Terrain or Ground",
         )
 
 
@@ -263,7 +263,7 @@ class _Box(BaseModel):
     @classmethod
     def _is_known(cls, name: str) -> str:
         if name not in KINDS:
-            raise ValueError(f"the type is unknown{nearest(name, KINDS)}; use a CityObjectLabel name")
+            raise ValueError(f"the box type is unknown{nearest(name, KINDS)}; use a CARLA label such as Buildings")
         return name
 
 
@@ -337,7 +337,7 @@ def read_boxes(path: Path) -> BoxMap:
                 expected="a list of boxes",
             )
     if not records:
-        raise InputError("the map has no boxes", where=path, fix="run the stage or the export of this map again")
+        raise InputError("the map has no boxes", where=path, fix="run the stage or program that writes this map again")
     boxes = validated(_Boxes, {"boxes": records}, path).boxes
     box_map = make_box_map(
         [box.center for box in boxes],
@@ -361,7 +361,7 @@ def _check_computed(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, 
         if header.get(name, value) != value:
             got, expected = dump_json(header[name])[:200], dump_json(value)[:200]
             raise InputError(
-                "the field disagrees with the boxes of the file", where=f"{path}: {name}", got=got, expected=expected
+                "the field does not match the boxes of the file", where=f"{path}: {name}", got=got, expected=expected
             )
     for box in boxes:
         number = KINDS[box.type]

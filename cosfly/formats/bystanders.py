@@ -105,9 +105,9 @@ class Bystanders:
     def from_json(cls, record: dict, where: str) -> Bystanders:
         entries = records(record, "others", where)
         bystanders = [Bystander.from_json(entry, f"{where}.others[{i}]") for i, entry in enumerate(entries)]
-        if len({len(bystander.positions_m) for bystander in bystanders}) > 1:
-            expected = "the same number of positions for each bystander"
-            raise InputError("the columns differ in length", where=f"{where}.others", expected=expected)
+        if len(lengths := {len(bystander.positions_m) for bystander in bystanders}) > 1:
+            problem, got = "the bystanders have different numbers of positions", f"{min(lengths)} to {max(lengths)}"
+            raise InputError(problem, where=f"{where}.others", got=got, expected="the same number for all of them")
         return cls(text_id(record, where), bystanders)
 
 

@@ -84,7 +84,7 @@ def column(record: dict, name: str, where: str, *shape: int | None) -> np.ndarra
     expected = f"finite numbers of shape {shape_text}" + (" with n of at least 1" if None in shape else "")
     values = numbers(record.get(name), *shape)
     if values is None or len(values) == 0:
-        what = "the column has the wrong shape or content" if name in record else MISSING
+        what = "the field has a wrong shape, or a value that is not a finite number" if name in record else MISSING
         got = shown(record[name]) if name in record else None
         raise InputError(what, where=f"{where}.{name}", got=got, expected=expected)
     return values

@@ -102,16 +102,16 @@ class Episode(Record):
         for i, answer in enumerate(answers):
             if (answer == "end") != (i == last) or (answer == "lead" and i >= self.num_lead):
                 raise ValueError(
-                    f"frame {i} has the answer `{answer}`, but only frames before the first decision have `lead`, "
-                    "only the last frame has `end`, and all others have a decision"
+                    f"frame {i} has the answer `{answer}`; the answer must be `lead` before the first decision, "
+                    "`end` in the last frame, and a decision in all other frames"
                 )
         if any(later <= earlier for earlier, later in pairwise(times_s)):
-            raise ValueError("the times of the frames must increase")
+            raise ValueError("the field time_s must increase from frame to frame")
         if any((frame.command is None) != (frame.answer == "end") for frame in self.frames):
-            raise ValueError(f"each frame except the last must have a command ({', '.join(ACTION)})")
+            raise ValueError(f"each frame must have a command ({', '.join(ACTION)}), except the last, which has none")
         if len(self.flown) > self.num_walk_frames:
             raise ValueError(
-                f"{len(self.flown)} frames follow the first decision, but num_walk_frames is {self.num_walk_frames}"
+                f"{len(self.flown)} frames follow the first decision, but num_walk_frames allows {self.num_walk_frames}"
             )
         return self
 
@@ -188,7 +188,7 @@ class Score(Record):
     def _has_each_episode_once(self) -> Self:
         counts = Counter((flight.town, flight.episode) for flight in self.flights)
         if repeated := [f"{town}/{episode}" for (town, episode), count in counts.items() if count > 1]:
-            raise ValueError(f"the score lists episode {repeated[0]} twice")
+            raise ValueError(f"the score file lists episode {repeated[0]} twice")
         return self
 
 

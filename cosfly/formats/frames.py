@@ -120,7 +120,7 @@ def _read_axes(names: tuple[str, ...], value: Any) -> np.ndarray:
         row = numbers([value.get(name) for name in names], len(names))
         if row is not None:
             return mirror_poses(row)
-    raise ValueError(f"Value should be an object with finite numbers {', '.join(names)}")
+    raise ValueError(f"the value must be an object whose fields {', '.join(names)} are finite numbers")
 
 
 def _write_axes(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:

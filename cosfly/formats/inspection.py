@@ -129,8 +129,8 @@ def read_inspection(path: Path) -> Inspection:
     inspection = read_model(path, Inspection, INSPECT_FORMAT)
     counts = Counter(flight.folder for flight in inspection.flights)
     if repeated := [folder for folder, count in counts.items() if count > 1]:
-        expected = "one record for each track folder"
-        raise InputError("a track has two records", where=f"{path}: flights", got=repeated[0], expected=expected)
+        what, fix = "the inspection has two records of the same track", "run the inspection again"
+        raise InputError(what, where=f"{path}: flights", got=repeated[0], expected="one record for each track", fix=fix)
     return inspection
 
 
@@ -163,13 +163,13 @@ def read_decisions(inspected: Path) -> dict[str, Decision]:
     decisions: dict[str, Decision] = {}
     for decision in journal.read_as(Decision.model_validate):
         if decision.inspection != digest:
-            found = f"sha256 {decision.inspection[:12]}"
+            found = f"for the version with sha256 {decision.inspection[:12]}"
             fix = f"decide again with cosfly inspect review, or restore the `{inspected.name}` that was reviewed"
             raise InputError(
-                f"this decision was made on a different version of `{inspected.name}`",
+                f"the review decision was made for a different version of `{inspected.name}`",
                 where=f"{path}:{journal.line_num}",
-                got=f"{decision.folder}, {decision.verdict} by {decision.by} at {decision.at}, {found}",
-                expected=f"sha256 {digest[:12]}, as of {inspected}",
+                got=f"{decision.verdict} {decision.folder} by {decision.by} at {decision.at}, {found}",
+                expected=f"a decision for {inspected} with sha256 {digest[:12]}",
                 fix=f"move {REVIEW} away and {fix}",
             )
         decisions[decision.folder] = decision
@@ -238,11 +238,11 @@ def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[D
         for track in _chosen(choice, tracks, inspected):
             if track.result == "rejected" and choice.verdict == "accepted":
                 raise InputError(
-                    "this track breaks a rule, so it cannot be accepted",
+                    "the track breaks a rule of the inspection, so it cannot be accepted",
                     where=track.folder,
                     got=track.reason or "rejected",
                     expected="a track in review",
-                    fix="fix the track, or change the threshold and inspect again",
+                    fix="render the track again, or change the threshold, and run the inspection again",
                 )
             file = {"folder": track.folder, "sha256": track.sha256, "inspection": digest}
             decisions.append(Decision(**file, verdict=choice.verdict, reason=choice.reason, by=by, at=now))
@@ -261,5 +261,6 @@ def _chosen(choice: Choice, tracks: list[TrackInspection], inspected: Path) -> l
     chosen = tracks_of_name or [track for track in of_trajectory if track.result in results] or of_trajectory
     if not chosen:
         expected = f"the folder of a track or of a trajectory, such as {', '.join(_in_review(tracks)[:3])}"
-        raise InputError("the inspection has no such track", where=inspected, got=choice.folder, expected=expected)
+        what = "the inspection has no track or trajectory with this folder"
+        raise InputError(what, where=inspected, got=choice.folder, expected=expected)
     return chosen

@@ -11,6 +11,7 @@ import io
 import json
 import re
 import struct
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -49,17 +50,15 @@ def read_meshes(path: Path, *, tree: Path) -> dict[str, np.ndarray]:
     data = read_bytes(path, what="mesh", tree=tree, most_mb=FILE_MB)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise InputError(
-            "the file type of the mesh is unknown", where=path, got=path.suffix, expected=", ".join(SUFFIXES)
-        )
+        what, fix = "the file type of the mesh is not supported", "export the mesh again with one of these file types"
+        raise InputError(what, where=path, got=path.suffix, expected=" or ".join(SUFFIXES), fix=fix)
     try:
         meshes = _read_obj(data, path) if suffix == ".obj" else _read_gltf(*_chunks_of(data, path), path)
     except NOT_READ as error:
-        raise InputError(
-            "the mesh file cannot be parsed", where=path, got=f"{type(error).__name__}: {error}"[:120]
-        ) from None
+        got, fix = f"{type(error).__name__}: {error}"[:120], "open the file in a mesh viewer, and export the mesh again"
+        raise InputError("the mesh file cannot be parsed", where=path, got=got, fix=fix) from None
     if not any(map(len, meshes.values())):
-        raise InputError("the mesh has no triangles", where=path)
+        raise InputError("the mesh has no triangles", where=path, fix="export the mesh again with its faces")
     for name, corners in meshes.items():
         is_valid = (np.abs(corners) <= LARGEST_M).all(axis=2)  # NaN fails
         if not is_valid.all():
@@ -75,7 +74,7 @@ def read_meshes(path: Path, *, tree: Path) -> dict[str, np.ndarray]:
 def _chunks_of(data: bytes, path: Path) -> tuple[bytes, bytes]:
     """Return the JSON and the binary chunk of a binary glTF."""
     if struct.unpack_from("<II", data.ljust(20)) != (GLB_MAGIC, 2):
-        raise InputError("this file is not a binary glTF 2.0 file", where=path)
+        raise InputError("the mesh file is not binary glTF 2.0", where=path, fix="export the mesh as binary glTF 2.0")
     chunks: dict[int, bytes] = {}
     end = GLB_HEADER_BYTES
     while end + 8 <= len(data):
@@ -83,7 +82,8 @@ def _chunks_of(data: bytes, path: Path) -> tuple[bytes, bytes]:
         chunks.setdefault(kind, data[end + 8 : end + 8 + size])
         end += 8 + size
     if end > len(data):
-        raise InputError("the mesh file is cut short", where=path, got=f"{len(data)} bytes", expected=f"{end} bytes")
+        got, expected, fix = f"{len(data)} bytes", f"{end} bytes", "copy or export the mesh file again"
+        raise InputError("the mesh file is incomplete", where=path, got=got, expected=expected, fix=fix)
     return chunks[JSON_CHUNK], chunks.get(BINARY_CHUNK, b"")
 
 
@@ -98,30 +98,28 @@ def _read_gltf(text: bytes, binary: bytes, path: Path) -> dict[str, np.ndarray]:
     )
     if not is_plain or any("uri" in buffer for buffer in document.get("buffers", ())):
         raise InputError(
-            "the mesh requires a glTF extension, a sparse accessor or data outside of the file",
+            "the mesh file uses an unsupported feature: a glTF extension, a sparse accessor, or data in another file",
             where=path,
-            expected="plain glTF 2.0 in one file",
-            fix="export it again as .glb without compression and other extensions",
+            expected="glTF 2.0 without these features, in one file",
+            fix="export the mesh again as .glb without compression and other extensions",
         )
     if any(node.get("mesh", -1) >= len(meshes) for node in nodes):
-        raise LookupError("a node has a mesh that does not exist")
+        raise LookupError("a node refers to a mesh that the file does not have")
     children = [child for node in nodes for child in node.get("children", ())]
     if "scenes" in document:
         roots = document["scenes"][document.get("scene", 0)].get("nodes", [])
     else:
         roots = sorted(set(range(len(nodes))) - set(children))
-    if len({*children, *roots}) < len(children) + len(roots):  # also a cycle
-        raise InputError("a node of the mesh has two parents", where=path, expected="one parent for each node")
+    if repeated := [node for node, count in Counter([*children, *roots]).items() if count > 1]:  # also a cycle
+        what, got = "a node of the mesh file has two parents", f"node {repeated[0]}"
+        raise InputError(what, where=path, got=got, expected="one parent", fix="export the mesh again")
     counts = [*(a["count"] for a in accessors), *(view["byteLength"] for view in views)]
     most = int(MOST_NUMBERS + FILE_MB * MB)
     if min(counts, default=0) < 0 or sum(counts) > most:
         expected = f"no negative number, and at most {most:,} values and bytes in all"
-        raise InputError(
-            "the mesh file declares a negative number of values, or too many",
-            where=path,
-            got=f"{sum(counts):,}",
-            expected=expected,
-        )
+        what = "the mesh file declares a negative number of values, or too many values"
+        got, fix = f"{sum(counts):,} values and bytes in all", "export the mesh again with fewer triangles"
+        raise InputError(what, where=path, got=got, expected=expected, fix=fix)
     plain_document = {
         "asset": {"version": "2.0"}, "scenes": [{"nodes": roots}], "accessors": accessors, "bufferViews": views,
         "nodes": [{key: value for key, value in node.items() if key != "camera"} for node in nodes],
@@ -195,9 +193,9 @@ class MeshRef(BaseModel):
     def _stays_below(cls, name: str) -> str:
         path = PurePosixPath(name)
         if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
-            raise ValueError("the name of a mesh must lead to a file below the map's folder")
+            raise ValueError("the name of a mesh file must be a relative path without .. and backslashes")
         if path.suffix.lower() not in SUFFIXES:
-            raise ValueError(f"the name of a mesh must end in one of {', '.join(SUFFIXES)}")
+            raise ValueError(f"the name of a mesh file must end in one of {', '.join(SUFFIXES)}")
         return name
 
 
@@ -229,7 +227,7 @@ class Meshes:
                     "the mesh file has no node of this name",
                     where=f"box {box_id}: {ref.file}",
                     got=ref.node[:80],
-                    expected=", ".join(list(nodes)[:8]),
+                    expected=f"the name of a node in this file, such as {', '.join(list(nodes)[:8])}",
                 )
             if ref not in meshes:
                 meshes[ref] = np.concatenate(list(nodes.values())) if ref.node is None else nodes[ref.node]

@@ -49,7 +49,7 @@ class Appearance:
         for name, value in vars(self).items():
             allowed = _rows(name, vars(self))
             if value not in allowed:
-                raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}")
+                raise ValueError(f"the field {name} must be one of {', '.join(map(repr, allowed))}")
 
     def differences(self, other: Appearance) -> tuple[str, ...]:
         """Return the fields in which two people differ; a garment counts once."""
@@ -104,7 +104,8 @@ class Goal:
         in_order = tuple(term for term in GOAL_TERMS if term in self.says)
         if self.says != in_order or not {*self.says} & {*GARMENT_TERMS}:
             raise ValueError(
-                f"says must list some of {', '.join(GOAL_TERMS)}, in this order, with at least one garment"
+                f"the field says must list some of {', '.join(GOAL_TERMS)} in this order, and at least one of "
+                + ", ".join(GARMENT_TERMS)
             )
 
 
@@ -113,5 +114,6 @@ def read_goal(record: Any, num_frames: int, where: str) -> Goal:
     goal = validated(Goal, record, where)
     if goal.frame >= num_frames:
         expected = f"a frame from 0 to {num_frames - 1}"
-        raise InputError("the track has no such frame", where=f"{where}.frame", got=str(goal.frame), expected=expected)
+        what = "the goal names a frame that the track does not have"
+        raise InputError(what, where=f"{where}.frame", got=str(goal.frame), expected=expected)
     return goal

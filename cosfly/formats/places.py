@@ -101,9 +101,10 @@ def flight_ids(places: Collection[Place]) -> dict[Place, str]:
                 break
         else:
             expected = "tracks that differ in run, town, trajectory or variant"
-            fix = "remove all but one of them, or give the folders of their runs different names"
+            fix = "remove all but one of these tracks, or give the folders of their runs different names"
             got = f"{len(group)} tracks in {name}"
-            raise InputError("several tracks have the same id", got=got, expected=expected, fix=fix)
+            what = "several tracks have the same run, town, trajectory and variant, so they get the same id"
+            raise InputError(what, got=got, expected=expected, fix=fix)
         ids |= {place: f"{prefix}{name}_{place.variant}" for prefix, place in zip(prefixes, group, strict=True)}
     return ids
 

@@ -42,8 +42,7 @@ def read_predictions(path: Path) -> list[Prediction]:
     lines = model_lines(path, Prediction, what="predictions", fix="run cosfly distill infer first")
     for number, (_, prediction) in enumerate(lines, 1):
         if prediction.key in predictions:
-            raise InputError(
-                "the file has two predictions for the same sample", where=f"{path}:{number}", got=prediction.key
-            )
+            what, fix = "the file has two predictions for one sample in one language", "remove one of the two lines"
+            raise InputError(what, where=f"{path}:{number}", got=prediction.key, fix=fix)
         predictions[prediction.key] = prediction
     return list(predictions.values())

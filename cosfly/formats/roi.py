@@ -55,10 +55,11 @@ class Roi(RoiPolygon):
 
     def check_map(self, box_map: BoxMap, where: str | Path) -> None:
         """Check that the map and the axes in the file, if it holds them, are those of this map."""
-        for name, got, expected in (("map", self.map, box_map.name), ("axes", self.axes, AXES)):
-            if got not in ("", expected):
+        expected_values = {"map": ("on another map", box_map.name), "axes": ("with other axes", AXES)}
+        for name, (how, expected) in expected_values.items():
+            if (got := getattr(self, name)) not in ("", expected):
                 raise InputError(
-                    f"the region of interest was drawn with another {name}",
+                    f"the region of interest was drawn {how}",
                     where=f"{where}: {name}",
                     got=got,
                     expected=expected,
@@ -82,10 +83,11 @@ def parse_roi(data: bytes, path: Path) -> Roi:
     """Return the region of interest of a file's bytes."""
     roi = validated(Roi, parse_document(data, path), path)
     if not roi.closed:
-        fix = "close the polygon in the editor"
-        raise InputError("the polygon is not closed", where=f"{path}: closed", got="false", expected="true", fix=fix)
+        what, fix = "the polygon of the region of interest is not closed", "close the polygon with cosfly roi edit"
+        raise InputError(what, where=f"{path}: closed", got="false", expected="true", fix=fix)
     if not roi.rings():
-        raise InputError("the file has no polygon", where=f"{path}: points_world", expected="at least three points")
+        expected = "a polygon with at least three points"
+        raise InputError("the region of interest has no polygon", where=f"{path}: points_world", expected=expected)
     rings = [(k, ring) for k, polygon in enumerate(roi.rings()) for ring in (polygon.points_world, *polygon.holes)]
     num_vertices = sum(len(ring) for _, ring in rings)
     if num_vertices > MOST_VERTICES:
@@ -93,13 +95,12 @@ def parse_roi(data: bytes, path: Path) -> Roi:
     for number, ring in rings:
         where = f"{path}: polygon {number}"
         if len(ring) < 3 or numbers(ring, None, 2) is None:
-            what = "a ring has too few points, or a point that is not finite"
-            raise InputError(what, where=where, got=f"{len(ring)} points", expected="at least three finite points")
+            what = "a ring of the polygon has too few points, or a coordinate that is not a finite number"
+            raise InputError(what, where=where, got=f"{len(ring)} points", expected="three or more finite points")
         reason = shapely.is_valid_reason(shapely.Polygon(ring))
         if reason != "Valid Geometry":
-            raise InputError(
-                "a ring crosses itself", where=where, got=reason, fix="draw the ring again without crossings"
-            )
+            fix = "draw the ring again without crossings"
+            raise InputError("a ring of the polygon crosses itself", where=where, got=reason, fix=fix)
     return roi
 
 

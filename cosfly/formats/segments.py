@@ -33,7 +33,7 @@ class Segment:
 
 def _coordinates(value: Any) -> list:
     if not isinstance(value, dict):
-        raise ValueError("Value should be an object with x, y and z")
+        raise ValueError("the value must be an object with the fields x, y and z")
     return [value.get(axis) for axis in "xyz"]
 
 
@@ -91,5 +91,6 @@ def read_flown(record: dict, num_frames: int, where: str) -> tuple[tuple[Segment
     for name, frame in frames.items():
         if frame > num_frames:
             expected = f"a frame from 0 to {num_frames}"
-            raise InputError("the track has no such frame", where=f"{where}: {name}", got=str(frame), expected=expected)
+            what = "the field names a frame that the track does not have"
+            raise InputError(what, where=f"{where}: {name}", got=str(frame), expected=expected)
     return segments, mission

@@ -23,7 +23,7 @@ from cosfly.formats.columns import (
 )
 from cosfly.formats.pedestrian_paths import PLAIN_PACE, pace_field, pace_of
 from cosfly.formats.segments import Mission, Segment, flown_as_json, read_flown
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.json_io import MISSING, FileFormat
 
 TRACE_FORMAT = FileFormat("cosfly.drone_trace", "1.0", "drone traces")
@@ -51,8 +51,10 @@ class Excerpt:
         if record is None:
             return None
         if not isinstance(record, dict) or record.get("number") not in range(MOST_TRAJECTORIES):
-            expected = f"an object with the keys `id`, `number` (0 to {MOST_TRAJECTORIES - 1}) and `before` (positions)"
-            raise InputError("the field does not describe a part of a trajectory", where=where, expected=expected)
+            what = "the field is not a valid record of a part of a trajectory"
+            before = "`before` (positions of the target before this part, in metres)"
+            expected = f"an object with `id`, `number` (0 to {MOST_TRAJECTORIES - 1}) and {before}"
+            raise InputError(what, where=where, got=shown(record), expected=expected)
         return cls(text_id(record, where), int(record["number"]), column(record, "before", where, None, 3))
 
 
@@ -149,7 +151,7 @@ class DroneTrace:
         groups: list[np.ndarray] = []
         for group, names in (("drone", XYZ), ("drone", ANGLES), ("target", XYZ)):
             if not isinstance(record.get(group), dict):
-                raise InputError(MISSING, where=f"{where}.{group}", expected="an object of columns")
+                raise InputError(MISSING, where=f"{where}.{group}", expected="an object with a list for each column")
             groups.append(columns(record[group], names, f"{where}.{group}", len(time_s)))
         visibility, clearances_m = (column(record, name, where, len(time_s)) for name in ("visibility", "clearance"))
         segments, mission = read_flown(record, len(time_s), where)

@@ -18,31 +18,31 @@ TWIN_TOLERANCE_S = 1e-3  # largest difference of the times of two tracks with th
 def find_tracks(root: Path, choice: TrackChoice = ALL_TRACKS) -> list[Path]:
     """Return the chosen folders that hold a `trajectory.json`, sorted."""
     if not root.is_dir():
-        raise InputError("there is no such folder", where=root, expected="a playback tree", fix="check the path")
+        raise InputError("the directory of rendered tracks does not exist", where=root, fix="check the path")
     folders = [path.parent for path in files_named(root, "trajectory.json")]
     if not folders:
         raise InputError(
-            "this folder is not a playback tree",
+            "the directory does not contain rendered tracks",
             where=root,
-            got="no trajectory.json below the folder",
-            expected="Town*/trajectory_*/ORI/trajectory.json",
-            fix="pass the folder of a playback tree with --data",
+            got="no trajectory.json in any folder below the directory",
+            expected="files such as Town*/trajectory_*/ORI/trajectory.json",
+            fix="pass the output directory of cosfly render as --data",
         )
     matching = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
     if not matching:
         raise InputError(
-            "no track of the tree matches the patterns",
+            "no track folder in this directory matches the patterns of --flights",
             where=root,
             got=", ".join(choice.match),
-            expected=f"a pattern for folders such as {folders[0].relative_to(root).as_posix()}",
+            expected=f"a pattern that matches a folder such as {folders[0].relative_to(root).as_posix()}",
             fix="change --flights",
         )
     if len(choice.tracks) == len(TRACKS):
         return matching
     chosen = [folder for folder in matching if track_of(folder) in choice.tracks]
     if not chosen:
-        got = ", ".join(choice.tracks)
-        raise InputError("the tree has no track of the chosen kind", where=root, got=got, fix="change --tracks")
+        what = f"none of the matching tracks in this directory is a {' or '.join(choice.tracks)} track"
+        raise InputError(what, where=root, fix="change --tracks, or render these tracks")
     return chosen
 
 
@@ -62,17 +62,19 @@ def read_twin(track: Track) -> Track | None:
     has_same_times = len(twin) == len(track) and np.abs(twin.time_s - track.time_s).max() < TWIN_TOLERANCE_S
     if not twin.is_original:
         raise VerifyError(
-            "the clean track's folder holds a perturbed track",
+            "the folder of the clean track contains a perturbed track",
             where=twin.folder,
             got="is_original false",
             expected="is_original true",
+            fix="render both tracks again",
         )
     if not has_same_times:
         raise VerifyError(
-            "the clean track does not belong to the perturbed track next to it",
+            "the clean track has other times than the perturbed track next to it",
             where=twin.folder,
             got=_time_span(twin),
             expected=_time_span(track),
+            fix="render both tracks again",
         )
     return twin
 

@@ -74,10 +74,10 @@ class Coverage(Record):
     @classmethod
     def _are_those_of_the_axes(cls, bins: dict[str, list[int]]) -> dict[str, list[int]]:
         if unknown := [name for name in bins if name not in AXES]:
-            raise ValueError(f"axis {unknown[0]} is unknown; expected {', '.join(AXES)}")
+            raise ValueError(f"the coverage has an unknown axis {unknown[0]!r}; the axes are {', '.join(AXES)}")
         for name, axis in AXES.items() if bins else ():
             if (num := len(bins.get(name, ()))) != axis.num_bins:
-                raise ValueError(f"axis {name} has {num} bins, expected {axis.num_bins}")
+                raise ValueError(f"axis {name!r} of the coverage must have {axis.num_bins} bins, got {num}")
         return bins
 
     @classmethod

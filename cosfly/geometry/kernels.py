@@ -65,9 +65,10 @@ def index_boxes(
     centers, half_extents = _points(centers, "centers"), _points(half_extents, "half_extents")
     rotations = np.ascontiguousarray(rotations, dtype=np.float64)
     if len(half_extents) != len(centers) or rotations.shape != (len(centers), 3, 3):
-        raise ValueError(f"arrays of boxes differ in length: {centers.shape}, {half_extents.shape}, {rotations.shape}")
+        got = f"{centers.shape}, {half_extents.shape} and {rotations.shape}"
+        raise ValueError(f"centers, half_extents and rotations must have the same length, got the shapes {got}")
     if not (np.isfinite(rotations).all() and (half_extents >= 0).all() and cell_m > 0):
-        raise ValueError("rotations must be finite, half_extents at least 0 and cell_m positive")
+        raise ValueError("rotations must be finite, half_extents must be at least 0 m, and cell_m must be above 0 m")
     spans = np.einsum("kij,kj->ki", np.abs(rotations), half_extents)
     mins, maxs = centers - spans, centers + spans
     low, high = (mins[:, :2].min(axis=0), maxs[:, :2].max(axis=0)) if len(centers) else (np.zeros(2), np.zeros(2))
@@ -461,14 +462,14 @@ def _visibility(index, drones, targets):
 def _points(values: np.ndarray, name: str) -> np.ndarray:
     array = np.ascontiguousarray(values, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite numbers of shape (n, 3), not {array.shape}")
+        raise ValueError(f"{name} must be an array of finite numbers with shape (n, 3), got the shape {array.shape}")
     return array
 
 
 def _pair(starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     starts, ends = _points(starts, "starts"), _points(ends, "ends")
     if len(starts) != len(ends):
-        raise ValueError(f"starts and ends differ in length: {len(starts)} and {len(ends)}")
+        raise ValueError(f"starts and ends must have the same length, got {len(starts)} and {len(ends)}")
     return starts, ends
 
 

@@ -154,7 +154,7 @@ def assign_splits(
     if len(ranked) < len(requested):
         if too_few == "refuse" or not ranked:
             raise InputError(
-                f"there are too few {what} for the splits, because each belongs to one split only",
+                f"there are fewer {what} than splits, and each split needs at least one",
                 got=f"{len(ranked)} {what}",
                 expected=f"at least {len(requested)}, one for each of {', '.join(requested)}",
                 fix=fix,

@@ -25,7 +25,7 @@ def derivative_rms(positions_m: np.ndarray, order: int, dt_s: float = DT_S) -> f
     """
     differences = _differences(positions_m, order)
     if dt_s <= 0:
-        raise ValueError(f"dt_s must be positive, not {dt_s}")
+        raise ValueError(f"dt_s must be above 0 s, got {dt_s}")
     return float(np.sqrt((differences**2).sum(axis=1).mean())) / dt_s**order if len(differences) else 0.0
 
 
@@ -90,7 +90,7 @@ def trajectory_metrics(
 def _differences(positions_m: np.ndarray, order: int) -> np.ndarray:
     positions = np.asarray(positions_m, dtype=np.float64)
     if positions.ndim != 2 or positions.shape[1] != 3:
-        raise ValueError(f"positions must have the shape (n, 3), not {positions.shape}")
+        raise ValueError(f"positions must have the shape (n, 3), got the shape {positions.shape}")
     return np.diff(positions, n=order, axis=0)
 
 

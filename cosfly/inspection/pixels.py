@@ -74,10 +74,11 @@ def unpack(files: dict[str, bytes], where: Path) -> Picture:
 def _check_size(values: np.ndarray, colours: np.ndarray, file: Path) -> None:
     if values.shape[:2] != colours.shape[:2]:
         raise InputError(
-            "the picture has a different size from rgb.png of the same frame",
+            "the picture does not have the same size as rgb.png of the same frame",
             where=file,
             got="{1} x {0} px".format(*values.shape),
             expected="{1} x {0} px".format(*colours.shape),
+            fix="render this frame again",
         )
 
 
