@@ -148,7 +148,7 @@ def test_a_disk_that_fills_up_costs_nothing_that_was_written(tree, tmp_path, who
             [sys.executable, "-c", LIMITED, "9000", str(tree), str(out), config.model_dump_json()],
             capture_output=True, text=True, check=False,
         )  # fmt: skip
-        assert "cannot write" in filled.stderr, filled.stderr
+        assert "cannot be written" in filled.stderr, filled.stderr
         assert "finished work is kept" in filled.stderr
         assert not (out / "manifest.json").exists()
         kept = keys_by_flight(out)

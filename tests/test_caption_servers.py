@@ -128,7 +128,7 @@ FAULTS: dict[str, tuple] = {
     "nobody: a body of 20 MB": (page(200, "[" + "1," * 10_000_000 + "1]"), silent("bad_reply",
         "longer than 0.5 MB")),
     "nobody: a bomb of gzip": (lambda body: Sent(200, BOMB, {"Content-Encoding": "gzip"}), silent("connection",
-        "compressed the body")),
+        "the response is compressed")),
     "nobody: a stream without end": (raw(CHUNKED, b"1000\r\n" + b" " * 4096 + b"\r\n", is_endless=True),
         silent("bad_reply", "longer than 0.5 MB")),
     "Langchain-Chatchat: chunks that end early, its 4383": (raw(CHUNKED, b"5\r\n{\"a\":\r\n"), silent("connection",

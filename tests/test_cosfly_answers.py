@@ -475,7 +475,7 @@ def test_captions_round_trip_and_errors_name_the_line(tmp_path):
     with pytest.raises(InputError, match=r"captions\.jsonl:1: status"):
         list(read_captions(path))
     path.write_text("{")
-    with pytest.raises(InputError, match=":1: this is not valid JSON"):
+    with pytest.raises(InputError, match=":1: the text is not valid JSON"):
         list(read_captions(path))
     with pytest.raises(InputError, match="run cosfly caption"):
         list(read_captions(tmp_path / "nowhere.jsonl"))

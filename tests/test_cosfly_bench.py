@@ -74,10 +74,10 @@ def test_what_lost_workers_had_done_is_counted_and_left_out(tmp_path):
 
 
 def test_what_cannot_be_measured(tmp_path):
-    with pytest.raises(ConfigError, match=r"this stage cannot be measured.*simplify.*render"):
+    with pytest.raises(ConfigError, match=r"the benchmark cannot measure this stage.*simplify.*render"):
         run(RunConfig(), tmp_path, tmp_path / "out", "simplify", [1])
     asked = RunConfig.model_validate({"caption": {"teacher": "http://127.0.0.1:9"}})
-    with pytest.raises(ConfigError, match="does not become faster with more workers"):
+    with pytest.raises(ConfigError, match="more workers do not make a server faster"):
         run(asked, tmp_path, tmp_path / "out", "caption", [1])
     (tmp_path / "out").mkdir()
     (tmp_path / "out/mine").touch()

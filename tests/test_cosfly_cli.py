@@ -74,13 +74,13 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
         (("config", "check", "quickstart", "--set", no_file), ("does not exist", "maps.boxes", "none.csv")),
         (("simplify", "--map", "nope.json", "--out", "x"), ("nope.json", "no such file")),
         (("simplify", "--map", "town.csv", "--out", "x"), ("town.csv", "cosfly maps --source boxes")),
-        (("maps", "--out", "/proc/x"), ("/proc/x", "cannot write", "--out")),
-        (("maps", "--out", "taken/inside"), ("taken", "cannot write", "--out")),
+        (("maps", "--out", "/proc/x"), ("/proc/x", "cannot be written", "--out")),
+        (("maps", "--out", "taken/inside"), ("taken", "cannot be written", "--out")),
         (("run", "stage"), ("stage: this folder is not", "no run.yaml", "cosfly list stage")),
         (("config", "check", "deep/stage"), ("deep/stage: this folder is not", "no run.yaml", "quickstart")),
         (("view", "town", "--out", "x"), ("town", "the directory of rendered tracks does not exist", "check the path")),
         (("simplify", "--map", "zero.json", "--out", "x"), ("zero.json", "a device", "a regular file")),
-        (("caption", "prompts", "--export", "taken"), ("taken", "cannot write", "--out")),
+        (("caption", "prompts", "--export", "taken"), ("taken", "cannot be written", "--out")),
         (
             ("run", "quickstart", "--out", "stage"),
             ("stage: the output directory is the folder of a stage", "choose another --out"),
@@ -89,7 +89,7 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
             ("run", "quickstart", "--out", "stage", "--dry-run"),
             ("stage: the output directory is the folder of a stage", "another --out"),
         ),
-        (("--log-file", "no/log.txt", "config", "show"), ("cannot write the log file",)),
+        (("--log-file", "no/log.txt", "config", "show"), ("the log file cannot be written",)),
     ):
         with subtests.test(words=words):
             status, line = answer(capfd, monkeypatch, *words)

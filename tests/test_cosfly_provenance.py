@@ -87,7 +87,7 @@ def test_a_stage_without_its_records_is_not_finished(run, name):
 def test_a_name_that_no_record_can_hold(tmp_path):
     path = tmp_path / os.fsdecode(b"bad\xff.json")
     write_json(path, [])
-    with pytest.raises(InputError, match=r"bad\\udcff.json: the path contains a name that is not UTF-8"):
+    with pytest.raises(InputError, match=r"bad\\udcff.json: the path of an input contains a name that is not UTF-8"):
         begin(tmp_path / "out", "simplify", map=path)
     assert not (tmp_path / "out").exists()
 

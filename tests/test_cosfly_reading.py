@@ -245,7 +245,7 @@ def test_a_link_out_of_the_tree_is_refused_unless_the_tree_is_trusted(tmp_path):
     frame = _frame(tmp_path / "tree")
     (frame / "depth.npy").symlink_to(private)
     with pytest.raises(
-        InputError, match=r"a link leads out of its folder; got .*private\.npy; .*--set follow_links=true"
+        InputError, match=r"a symbolic link leads out of its folder; got .*private\.npy; .*--set follow_links=true"
     ):
         read_depth(frame)
     assert read_depth(LinkedPath(frame)).shape == (4, 4)

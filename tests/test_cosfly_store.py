@@ -36,7 +36,7 @@ def test_nan_is_never_a_value(tmp_path):
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(tmp_path / "a.json", {"x": float("nan")})
     (tmp_path / "b.json").write_text('{"x": NaN}')
-    with pytest.raises(InputError, match=r"b\.json: this is not valid JSON"):
+    with pytest.raises(InputError, match=r"b\.json: the text is not valid JSON"):
         read_json(tmp_path / "b.json")
 
 

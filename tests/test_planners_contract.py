@@ -126,7 +126,7 @@ def fly_low_and_straight(scenario, obstacles, cfg, rng):
 def test_a_planner_that_flies_into_a_tower_is_found_out(monkeypatch):
     monkeypatch.setitem(contract.ALL_PLANNERS, "low", f"{__name__}:fly_low_and_straight")
     box_map, corners = WORLDS["tower_behind"]
-    with pytest.raises(NoPathError, match="planner low found no trajectory with enough clearance"):
+    with pytest.raises(NoPathError, match="planner low found no drone trajectory with enough clearance"):
         plan_trajectory(walk_along("w", corners), kernels.obstacle_index(box_map), PlanConfig(planner="low"), 0)
 
 

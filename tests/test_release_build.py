@@ -253,7 +253,7 @@ DAMAGES = {
         "have different decisions"),
     "a frame that is no number": (caption(frame_index="x"), "frame_index"),
     "a picture of 2^64 px": (caption(picture_px=[2**64, 54]), r"picture_px\[0\]: .*got 18446744"),
-    "captions of another version": (caption(schema_version="1.0"), "version that is not supported"),
+    "captions of another version": (caption(schema_version="1.0"), "the captions is not supported"),
 }  # fmt: skip
 
 

@@ -204,7 +204,7 @@ def _drawn(port: int) -> tuple:
         frames.append([renderer.render(pose, lens(160, 90, 60.0), person)])
         if own:
             near = renderer.render(pose, lens(160, 90, 30.0), person)  # other cameras
-            with pytest.raises(RenderError, match=r"cannot draw with this intrinsic matrix.*square pixels"):
+            with pytest.raises(RenderError, match=r"cannot render with this intrinsic matrix.*square pixels"):
                 renderer.render(pose, lens(160, 90, 60.0) + np.eye(3)[0], None)
         for weather in (RAINY_NIGHT, None):
             renderer.prepare(*found.bounds(), weather)

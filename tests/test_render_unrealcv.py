@@ -99,7 +99,7 @@ def test_people_and_cars_stand_where_they_are_and_the_lens_changes():
         for renderer in (ours, theirs):
             frames.append(renderer.render(pose, intrinsic_matrix(160, 90, 60.0), person, [car]))
         near = ours.render(pose, intrinsic_matrix(160, 90, 30.0), person)
-        with pytest.raises(RenderError, match=r"cannot draw with this intrinsic matrix.*square pixels"):
+        with pytest.raises(RenderError, match=r"cannot render with this intrinsic matrix.*square pixels"):
             ours.render(pose, intrinsic_matrix(160, 90, 60.0) + np.eye(3)[0], None)
         ours.close()
         theirs.close()
@@ -184,5 +184,6 @@ def test_the_papers_options(tmp_path):
 
     with Image.open(tmp_path / "render/look.gif") as gif:
         assert (gif.n_frames, gif.info["duration"]) == (3, 120)
-    assert "render.path_index: no trajectory has this index; got 7; expected an index below 2" in str(other.exception)
+    words = "render.path_index: the input has no drone trajectory with this index; got 7; expected an index from 0 to 1"
+    assert words in str(other.exception)
     assert not (tmp_path / "other").exists()

@@ -337,7 +337,7 @@ def read_boxes(path: Path) -> BoxMap:
                 expected="a list of boxes",
             )
     if not records:
-        raise InputError("the map has no boxes", where=path, fix="run the stage or program that writes this map again")
+        raise InputError("the map has no boxes", where=path, fix="make this map again with its stage or program")
     boxes = validated(_Boxes, {"boxes": records}, path).boxes
     box_map = make_box_map(
         [box.center for box in boxes],
@@ -360,9 +360,8 @@ def _check_computed(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, 
     for name, value in computed.items():
         if header.get(name, value) != value:
             got, expected = dump_json(header[name])[:200], dump_json(value)[:200]
-            raise InputError(
-                "the field does not match the boxes of the file", where=f"{path}: {name}", got=got, expected=expected
-            )
+            what, fix = "the field does not match the boxes of the file", "correct this field, or export the map again"
+            raise InputError(what, where=f"{path}: {name}", got=got, expected=expected, fix=fix)
     for box in boxes:
         number = KINDS[box.type]
         if box.semantic_id not in (None, number):
@@ -371,6 +370,7 @@ def _check_computed(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, 
                 where=f"{path}: box {box.id}: semantic_id",
                 got=box.semantic_id,
                 expected=f"{number} for {box.type}",
+                fix="correct semantic_id or type",
             )
     for name, corners in (("min", box_map.mins), ("max", box_map.maxs)):
         # A corner that the file does not hold is NaN, which compares as equal here.

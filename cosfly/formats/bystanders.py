@@ -106,8 +106,9 @@ class Bystanders:
         entries = records(record, "others", where)
         bystanders = [Bystander.from_json(entry, f"{where}.others[{i}]") for i, entry in enumerate(entries)]
         if len(lengths := {len(bystander.positions_m) for bystander in bystanders}) > 1:
-            problem, got = "the bystanders have different numbers of positions", f"{min(lengths)} to {max(lengths)}"
-            raise InputError(problem, where=f"{where}.others", got=got, expected="the same number for all of them")
+            what = "the bystanders have different numbers of positions"
+            got = f"{min(lengths)} to {max(lengths)} positions"
+            raise InputError(what, where=f"{where}.others", got=got, expected="the same number for all bystanders")
         return cls(text_id(record, where), bystanders)
 
 

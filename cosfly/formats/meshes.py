@@ -39,7 +39,7 @@ NOT_READ = (ValueError, LookupError, TypeError, AttributeError, AssertionError, 
 def check_num_triangles(where: object, num_triangles: int) -> None:
     """Raise InputError if a mesh or a map has too many triangles."""
     if num_triangles > MOST_TRIANGLES:
-        raise over_limit(where, f"{num_triangles:,} triangles", f"{MOST_TRIANGLES:,}", "simplify the meshes")
+        raise over_limit(where, f"{num_triangles:,} triangles", f"{MOST_TRIANGLES:,} triangles", "simplify the meshes")
 
 
 def read_meshes(path: Path, *, tree: Path) -> dict[str, np.ndarray]:
@@ -112,7 +112,7 @@ def _read_gltf(text: bytes, binary: bytes, path: Path) -> dict[str, np.ndarray]:
         roots = sorted(set(range(len(nodes))) - set(children))
     if repeated := [node for node, count in Counter([*children, *roots]).items() if count > 1]:  # also a cycle
         what, got = "a node of the mesh file has two parents", f"node {repeated[0]}"
-        raise InputError(what, where=path, got=got, expected="one parent", fix="export the mesh again")
+        raise InputError(what, where=path, got=got, expected="one parent at most", fix="export the mesh again")
     counts = [*(a["count"] for a in accessors), *(view["byteLength"] for view in views)]
     most = int(MOST_NUMBERS + FILE_MB * MB)
     if min(counts, default=0) < 0 or sum(counts) > most:
@@ -193,7 +193,7 @@ class MeshRef(BaseModel):
     def _stays_below(cls, name: str) -> str:
         path = PurePosixPath(name)
         if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
-            raise ValueError("the name of a mesh file must be a relative path without .. and backslashes")
+            raise ValueError("the name of a mesh file must be a relative path without `..` and backslashes")
         if path.suffix.lower() not in SUFFIXES:
             raise ValueError(f"the name of a mesh file must end in one of {', '.join(SUFFIXES)}")
         return name

@@ -361,7 +361,7 @@ class _FieldReader:
         self.issues.append(str(error))
 
     def issue(self, where: str, got: object, expected: str) -> None:
-        self.note(self.error("the field does not follow the layout of the playback tree", where, got, expected))
+        self.note(self.error("the field does not follow the format of the file", where, got, expected))
 
     def optional(self, read: Callable[[], Value]) -> Value | None:
         """Return an optional field; record an issue and return None if its content is invalid."""
@@ -440,7 +440,7 @@ class _FieldReader:
         if poses is None:
             self.issue(
                 "points[].between",
-                "lists of other forms",
+                "lists of another shape",
                 "as many poses at each point, of 6 finite numbers each",
             )
             return None

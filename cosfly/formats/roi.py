@@ -86,12 +86,12 @@ def parse_roi(data: bytes, path: Path) -> Roi:
         what, fix = "the polygon of the region of interest is not closed", "close the polygon with cosfly roi edit"
         raise InputError(what, where=f"{path}: closed", got="false", expected="true", fix=fix)
     if not roi.rings():
-        expected = "a polygon with at least three points"
-        raise InputError("the region of interest has no polygon", where=f"{path}: points_world", expected=expected)
+        expected, fix = "a polygon with at least three points", "draw the region with cosfly roi edit"
+        raise InputError("the region has no polygon", where=f"{path}: points_world", expected=expected, fix=fix)
     rings = [(k, ring) for k, polygon in enumerate(roi.rings()) for ring in (polygon.points_world, *polygon.holes)]
     num_vertices = sum(len(ring) for _, ring in rings)
     if num_vertices > MOST_VERTICES:
-        raise over_limit(path, f"{num_vertices:,} vertices", f"{MOST_VERTICES:,}", "simplify its rings")
+        raise over_limit(path, f"{num_vertices:,} vertices", f"{MOST_VERTICES:,} vertices", "simplify the rings")
     for number, ring in rings:
         where = f"{path}: polygon {number}"
         if len(ring) < 3 or numbers(ring, None, 2) is None:

@@ -151,7 +151,7 @@ class DroneTrace:
         groups: list[np.ndarray] = []
         for group, names in (("drone", XYZ), ("drone", ANGLES), ("target", XYZ)):
             if not isinstance(record.get(group), dict):
-                raise InputError(MISSING, where=f"{where}.{group}", expected="an object with a list for each column")
+                raise InputError(MISSING, where=f"{where}.{group}", expected="an object with lists of numbers")
             groups.append(columns(record[group], names, f"{where}.{group}", len(time_s)))
         visibility, clearances_m = (column(record, name, where, len(time_s)) for name in ("visibility", "clearance"))
         segments, mission = read_flown(record, len(time_s), where)

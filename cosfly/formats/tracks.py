@@ -70,7 +70,7 @@ def read_twin(track: Track) -> Track | None:
         )
     if not has_same_times:
         raise VerifyError(
-            "the clean track has other times than the perturbed track next to it",
+            "the clean track and the perturbed track next to it have different times",
             where=twin.folder,
             got=_time_span(twin),
             expected=_time_span(track),

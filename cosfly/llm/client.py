@@ -300,7 +300,7 @@ class ChatClient:
         if response.status != 200:
             raise RefusedRequest(self._refusal(response), response.retry_after_s)
         if response.is_cut:
-            raise BadReply(f"the body is longer than {MOST_REPLY_MB:g} MB")
+            raise BadReply(f"the response is longer than {MOST_REPLY_MB:g} MB")
         try:
             return protocol.read_completion(response, "json_schema" if is_structured else "plain")
         except BadReply as error:
@@ -354,7 +354,7 @@ class ChatClient:
                 encoding = response.headers.get("content-encoding", "identity")
                 if encoding.strip().lower() not in ("", "identity"):
                     raise httpx.DecodingError(
-                        f"the server compressed the body ({encoding[:40]!r}) without a request to do so"
+                        f"the response is compressed ({encoding[:40]!r}); turn compression off in the server or proxy"
                     )
                 async for piece in response.aiter_raw():
                     body += piece
@@ -375,7 +375,7 @@ class ChatClient:
             return httpx.AsyncClient(headers=headers, timeout=self.cfg.timeout_s, limits=limits, verify=_tls())
         except (httpx.InvalidURL, ValueError, ImportError, OSError) as error:
             raise TeacherError(
-                "the proxy or the certificates cannot be used",
+                "the proxy or the TLS certificates in the environment variables cannot be used",
                 where="HTTPS_PROXY, ALL_PROXY, SSL_CERT_FILE",
                 got=type(error).__name__,
                 fix="correct these environment variables, or unset them",

@@ -109,12 +109,12 @@ def read_body(content: bytes) -> Any:
     """Read JSON of a server: long numbers and duplicate keys are accepted, half a surrogate pair becomes U+FFFD."""
 
     def reject(constant: str) -> float:
-        raise ValueError(f"{constant} is not a JSON value")
+        raise ValueError(f"the response contains {constant}, which is not valid in JSON")
 
     try:
         return _writable(json.loads(content, parse_constant=reject))
     except RecursionError:
-        raise ValueError("the JSON is nested too deeply") from None
+        raise ValueError("the lists and objects of the response are nested too deeply") from None
 
 
 def _writable(value: Any) -> Any:
@@ -145,12 +145,12 @@ def read_completion(response: Response, structured: str) -> Reply:
     """Return the reply in a response; BadReply if a type or a size is wrong. structured: As in `Reply`."""
     value = _object(response)
     if value is None:
-        raise BadReply("the body is not JSON")
+        raise BadReply("the response is not JSON")
     choices = value.get("choices")
     if not isinstance(choices, list) or not choices or not isinstance(choices[0], dict):
         if value.get("error"):
             raise _error_instead(error_words(value))
-        raise BadReply("the body has no choices")
+        raise BadReply("the response has no choices")
     choice = choices[0]
     finish_reason = choice.get("finish_reason")
     if choice.get("error"):

@@ -139,8 +139,8 @@ def _student_folder(folder: Path) -> Path:
         if (candidate / CHAT_FORMAT_FILE).is_file():
             return candidate
     raise InputError(
-        f"the folder has no {CHAT_FORMAT_FILE}, the record of the student's prompts",
+        f"the student's folder has no {CHAT_FORMAT_FILE}, which stores the format of the student's prompts",
         where=folder,
-        expected="the file in this folder, or in adapter/ or model/ below it",
-        fix="pass the output of cosfly distill train or merge",
+        expected="this file in the folder, or in adapter/ or model/ below the folder",
+        fix="pass the output directory of cosfly distill train or merge",
     )

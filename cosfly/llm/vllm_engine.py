@@ -54,10 +54,10 @@ class VllmEngine:
         if not (folder / "config.json").is_file():
             expected = "a folder with config.json"
             raise InputError(
-                "this folder contains no model",
+                "the folder contains no model",
                 where=folder,
                 expected=expected,
-                fix="pass the folder of a model after vllm:",
+                fix="pass vllm:MODEL_DIR with the folder of a model",
             )
         self.folder = folder
         self.model = folder.name
@@ -109,7 +109,8 @@ class VllmEngine:
             got = _one_line(error)
             if isinstance(error, TypeError) or (section == "endpoint" and isinstance(error, ValueError)):
                 where = f"{self.settings}.{section}"
-                raise ConfigError(f"vLLM does not accept a setting of {section}", where=where, got=got) from None
+                what, fix = f"vLLM rejects a setting in the section {section}", "correct or remove this setting"
+                raise ConfigError(what, where=where, got=got, fix=fix) from None
             raise EnvironmentMissing("the vLLM engine does not start", where=self.where, got=got) from None
 
     def arguments(self) -> dict[str, Any]:

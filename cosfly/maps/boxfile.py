@@ -74,7 +74,7 @@ class BoxesConfig(Config):
     @field_validator("types")
     @classmethod
     def _types_are_known(cls, types: dict[str, str]) -> dict[str, str]:
-        problems = [f"{name}: unknown type {kind!r}" for name, kind in types.items() if kind not in TYPES]
+        problems = [f"{name} has the unknown type {kind!r}" for name, kind in types.items() if kind not in TYPES]
         if problems:
             raise ValueError(f"{'; '.join(problems)}; expected one of {', '.join(TYPES)}")
         return types
@@ -98,13 +98,13 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     suffix = path.suffix.lower()
     if suffix not in (".json", ".csv", ".geojson"):
         raise InputError(
-            "the file type of the map is unknown", where=path, got=path.suffix, expected=".json, .csv or .geojson"
+            "the file type of the map is not supported", where=path, got=path.suffix, expected=".json, .csv or .geojson"
         )
     if suffix == ".json" and (cfg.types or cfg.ignore or cfg.ground_z_m):
         raise ConfigError(
-            "boxes_3d.json stores types and ground itself, so settings for them have no effect",
+            "boxes_3d.json contains its own types and ground height, so settings for them would have no effect",
             where="maps.boxes",
-            fix="remove the settings types, ignore and ground_z_m",
+            fix="remove maps.boxes.types, maps.boxes.ignore and maps.boxes.ground_z_m",
         )
     box_map = read_boxes(path) if suffix == ".json" else _read_rows(cfg, path, suffix)
     settings = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})
@@ -145,7 +145,7 @@ def plausibility(box_map: BoxMap) -> str:
 def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
     rows = list(_table_rows(cfg, path) if suffix == ".csv" else _feature_rows(cfg, path))
     if not rows:
-        raise InputError("the map has no boxes", where=path, expected="a box in each row or feature")
+        raise InputError("the file has no boxes", where=path, expected="at least one row or feature with a box")
     boxes = BoxList()
     rows_by_problem = dict[str, list[str]]()  # so that each problem is listed once
     for row in rows:
@@ -153,13 +153,13 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
             rows_by_problem.setdefault(problem, []).append(row.where)
     ids = _ids_of(rows)
     if len(set(ids)) < len(ids) or not all(0 <= number < 2**63 for number in ids):
-        rows_by_problem["ids must be different whole numbers"] = [""]
+        rows_by_problem["the ids must be different whole numbers"] = [""]
     if rows_by_problem:
         problems = []
         for problem, places in rows_by_problem.items():
             more = f" (and {len(places) - 1} more)" if len(places) > 1 else ""
             problems.append(f"{places[0]}: {problem}{more}".removeprefix(": "))
-        expected = f"columns {', '.join(COLUMNS)}; types {', '.join(TYPES)}, or translated by maps.boxes.types"
+        expected = f"columns {', '.join(COLUMNS)}; types {', '.join(TYPES)}, or types listed in maps.boxes.types"
         raise InputError.of_all(problems, where=path, expected=expected)
     box_map = boxes.box_map(MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows)))
     if len(box_map) == len(ids):  # no outline became several boxes
@@ -197,21 +197,19 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
             values = {name: cell for name, cell in zip(names, cells, strict=False) if cell and name in COLUMNS}
             yield _Row(f"line {lines.line_num}", values, problem=problem)
     except csv.Error as error:
-        raise InputError(
-            "the file is not a CSV table", where=f"{path}: line {lines.line_num}", got=str(error)
-        ) from None
+        where, fix = f"{path}: line {lines.line_num}", "export the table again as CSV"
+        raise InputError("the file is not a CSV table", where=where, got=str(error), fix=fix) from None
 
 
 def _feature_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
     value = read_json(path, what="map")
     if not isinstance(value, dict) or value.get("type") not in ("FeatureCollection", "Feature", *GEOMETRIES):
-        expected = "FeatureCollection, Feature, Polygon or MultiPolygon"
-        raise InputError("this file is not GeoJSON", where=f"{path}: type", expected=expected)
+        expected, fix = f"FeatureCollection, Feature, {', '.join(GEOMETRIES)}", "export the file again as GeoJSON"
+        raise InputError("the file is not GeoJSON", where=f"{path}: type", expected=f"one of {expected}", fix=fix)
     items = value.get("features") if value["type"] == "FeatureCollection" else [value]
     if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
-        raise InputError(
-            "the file has no list of features", where=f"{path}: features", expected="a list of Feature objects"
-        )
+        what, fix = "the FeatureCollection has no list of features", "export the file again as GeoJSON"
+        raise InputError(what, where=f"{path}: features", expected="a list of Feature objects", fix=fix)
     features = [_feature(item, number) for number, item in enumerate(items, 1)]
     names = dict.fromkeys(name for feature in features for name in feature.values)
     yield from (_Row("", {}, problem=problem) for problem in _unknown(list(names), cfg))
@@ -263,11 +261,11 @@ def _to_metres(cfg: BoxesConfig, places: np.ndarray, path: Path) -> Callable[[np
     if (cfg.units == "degrees" and not may_be_degrees) or (cfg.units == "m" and may_be_degrees and size > 0):
         other_unit = "degrees" if cfg.units == "m" else "m"
         raise InputError(
-            f"the coordinates do not look like {'metres' if cfg.units == 'm' else cfg.units}",
+            f"the coordinates in the file do not look like {'metres' if cfg.units == 'm' else cfg.units}",
             where=path,
             got=f"{low.tolist()} to {high.tolist()}",
             expected="a map wider than 2 m" if cfg.units == "m" else "longitude and latitude of one town",
-            fix=f"if their unit is {other_unit}, pass --set maps.boxes.units={other_unit}",
+            fix=f"if the unit of the coordinates is {other_unit}, pass --set maps.boxes.units={other_unit}",
         )
     if cfg.units == "m":
         return lambda ring: ring

@@ -52,15 +52,14 @@ def origin_m(low: np.ndarray, high: np.ndarray, where: str | Path, ground_z_m: f
     """Return the place that becomes a map's origin, (3,) m: the middle of its bounds, at the height of its ground."""
     if not (high - low <= WIDEST_M).all():
         got = " x ".join(f"{size:.6g}" for size in high - low) + " m"
-        fix = "cut out a part, or remove vertices that lie far outside"
-        raise InputError("the map is too wide or too high", where=where, got=got, expected="at most 20 km", fix=fix)
+        fix = "cut out a part of the map, or remove vertices that lie far outside"
+        raise InputError("the map is too wide or too high", where=where, got=got, expected="at most 20,000 m", fix=fix)
     return np.array([*np.round((low + high)[:2] / 2), round(float(ground_z_m), 3)])
 
 
 def required(path: Path | None, setting: str) -> Path:
     """Return the path of a setting; raise ConfigError if it is not set."""
     if path is None:
-        raise ConfigError(
-            "the setting has no value", where=setting, expected="the path of a file", fix=f"pass --set {setting}=FILE"
-        )
+        what, fix = "the setting is required, but has no value", f"pass --set {setting}=FILE"
+        raise ConfigError(what, where=setting, expected="the path of a file", fix=fix)
     return path

@@ -117,11 +117,11 @@ def box_map_of(answers: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
         rows[number] = position_m, box[3:6], rotation_deg, KINDS[label]
     if not rows:
         raise InputError(
-            "no object of the town can be used",
+            "the town has no object that can be used as a box",
             where=where,
             got=f"{len(answers.rows)} objects, dropped: {counts_text(dropped)}",
             expected="at least one object of get_environment_objects with a usable box",
-            fix="load a town whose objects have boxes",
+            fix="load a town whose objects have bounding boxes",
         )
     header = MapHeader(
         name=cfg.name or answers.town, source=MapSource(tool="CARLA", version=answers.version, file=answers.town),

@@ -27,6 +27,7 @@ MOST_VERTICES = 100_000  # of a surface, its holes included
 VERSIONS = ("1.1", "2.0")
 RECORD_SEPARATOR = b"\x1e"  # before each text of a sequence of RFC 7464
 # Nesting of `boundaries` above the surfaces. Of a Solid's shells only the outer one counts.
+VALIDATE = "check the file with `cjio FILE validate`"
 NESTING = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2, "CompositeSolid": 2}
 Form = Literal["solid", "wall", "surface", "green"]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
@@ -147,7 +148,8 @@ def read_model(path: Path) -> CityModel:
     dropped = {reason: count for reason, count in dropped.items() if count}
     if not objects:
         counts = f"dropped objects: {counts_text(dropped)}" if dropped else "no objects"
-        raise InputError("the model has no usable object", where=f"{path}: CityObjects", got=counts)
+        expected = "an object with a geometry and a supported type, such as Building"
+        raise InputError("the file has no usable object", where=f"{path}: CityObjects", got=counts, expected=expected)
     return CityModel(list(objects.values()), dropped, num_objects, version)
 
 
@@ -166,11 +168,11 @@ def _read_parts(path: Path) -> tuple[str, _Document, list[tuple[str, _Part]]]:
         expected = "CityJSONFeature" if parts else "CityJSON"
         if object_type != repr(expected):
             raise InputError(
-                "the object has an unexpected type",
+                f"the JSON object is not a {expected} object",
                 where=f"{where}: type",
                 got=object_type,
                 expected=repr(expected),
-                fix=None if parts else "put the CityJSON object with version and transform on the first line",
+                fix=None if parts else "pass a CityJSON file, or a sequence whose first line is of type CityJSON",
             )
         if not parts:
             version = ".".join(str(value.get("version")).split(".")[:2])  # 1.1.3 is 1.1
@@ -199,7 +201,7 @@ def _vectors(values: list[Any], where: str) -> np.ndarray:
     """Return lists of three numbers as (n, 3)."""
     vectors = numbers(values, None, 3) if values else np.empty((0, 3))
     if vectors is None:
-        raise InputError("the vertices are malformed", where=where, expected="lists of three finite numbers")
+        raise InputError("a vertex is malformed", where=where, expected="lists of three finite numbers", fix=VALIDATE)
     return vectors
 
 
@@ -245,8 +247,8 @@ def _surfaces(geometry: _Geometry, vertices: np.ndarray, where: str) -> list[Sur
 
 def _require_list(value: Any, where: str) -> list:
     if not isinstance(value, list):
-        problem = "the boundaries are not nested as the geometry's type requires"
-        raise InputError(problem, where=where, got=shown(value), expected="a list")
+        problem = "the boundaries have too few levels of lists for this type of geometry"
+        raise InputError(problem, where=where, got=shown(value), expected="a list at this level", fix=VALIDATE)
     return value
 
 
@@ -255,21 +257,22 @@ def _rings(surface: Any, vertices: np.ndarray, where: str) -> Surface:
     rings = Surface()
     for ring in _require_list(surface, where):
         if not isinstance(ring, list) or len(ring) < 3 or not all(type(index) is int for index in ring):
-            expected = "at least three vertex indices"
-            raise InputError("the ring is malformed", where=where, got=shown(ring), expected=expected)
+            expected = "a list of at least three vertex indices"
+            raise InputError("the ring is malformed", where=where, got=shown(ring), expected=expected, fix=VALIDATE)
         low, high = min(ring), max(ring)
         if low < 0 or high >= len(vertices):
             raise InputError(
                 "the ring refers to a vertex that does not exist",
                 where=where,
                 got=str(low if low < 0 else high)[:60],
-                expected=f"0 to {len(vertices) - 1}",
+                expected=f"an index from 0 to {len(vertices) - 1}",
+                fix=VALIDATE,
             )
         rings.append(vertices[ring])
     if not rings:
-        raise InputError("the surface has no rings", where=where, expected="at least one ring")
+        raise InputError("the surface has no rings", where=where, expected="at least one ring", fix=VALIDATE)
     if not all(np.isfinite(ring).all() for ring in rings):
-        raise InputError("a vertex of the surface is not finite", where=where, expected="finite coordinates")
+        raise InputError("the surface is not finite", where=where, expected="finite coordinates", fix=VALIDATE)
     if (num_vertices := sum(map(len, rings))) > MOST_VERTICES:
         raise over_limit(
             where, f"a surface of {num_vertices:,} vertices", f"{MOST_VERTICES:,} vertices", "simplify the surface"

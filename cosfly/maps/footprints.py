@@ -96,7 +96,7 @@ def cover(
     """
     if not 0 < min_fill <= 1 or not min_size_m > 0 or not all(0 < share < 1 for share in shares):
         got = f"got min_fill {min_fill}, min_size_m {min_size_m}, shares {shares}"
-        raise ValueError(f"min_fill and shares must lie between 0 and 1, and min_size_m above 0; {got}")
+        raise ValueError(f"min_fill and shares must be between 0 and 1, and min_size_m must be above 0 m; {got}")
     done: list[Rectangle] = []
     waiting = [(piece, 0) for piece in polygons_of(polygon)]
     while waiting:
@@ -137,7 +137,7 @@ def check_outline(polygon: Polygon, where: str) -> None:
     """Reject an outline with so many crossings that making it valid would take minutes and gigabytes."""
     if not polygon.is_valid and num_crossings(polygon) > MOST_CROSSINGS:
         most = f"{MOST_CROSSINGS:,} crossings"
-        raise over_limit(where, f"an outline with more than {most} of itself", most, "correct the outline")
+        raise over_limit(where, f"an outline with more than {most}", most, "correct the outline")
 
 
 def num_crossings(polygon: Polygon) -> int:

@@ -73,7 +73,7 @@ class SimWorldConfig(Config):
     def inputs(self) -> dict[str, Path]:
         world = required(self.world, "maps.simworld.world")
         if world.is_dir():  # its size table would be looked for next to the folder
-            raise InputError("the world file is a folder", where=world, expected="a JSON file of SimWorld")
+            raise InputError("the path of the world is a folder", where=world, expected="a JSON file of SimWorld")
         tables = self.sizes or [world.parent / "Bbox.json"]
         for path in tables:
             if not path.is_file():
@@ -202,7 +202,8 @@ def _check_unknown(cfg: SimWorldConfig, node: _Node, what: str) -> None:
         if what == "kind":
             fix = "add the asset to cosfly/simulators/assets.yaml"
         raise InputError(
-            f"the asset has no {what}", where=f"{cfg.world}: {node.id}.instance_name", got=node.instance_name,
+            f"the {what} of the asset is unknown", where=f"{cfg.world}: {node.id}.instance_name",
+            got=node.instance_name,
             fix=f"{fix}, or drop such assets with --set maps.simworld.unknown=drop",
         )  # fmt: skip
     log.warning("%s: the asset %s has no %s, so the object is dropped", node.id, node.instance_name, what)
@@ -216,7 +217,8 @@ def _add_node(boxes: BoxList, node: _Node, asset: Asset, size_cm: np.ndarray, st
     if not LEAST_M <= size.min() <= size.max() <= LARGEST:
         raise InputError(
             "the size of the object is out of range", where=f"{world}: {node.id}", got=f"{size.tolist()} m",
-            expected=f"sides of at least {LEAST_M:g} m", fix="correct the scale of the object or the size of its asset",
+            expected=f"sides from {LEAST_M:g} to {LARGEST:g} m",
+            fix="correct the scale of the object or the size of its asset",
         )  # fmt: skip
     foot = node.location.z * M_PER_CM
     low = 0.0 if 0 < foot <= stand_m else foot

@@ -119,10 +119,10 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
     counts = {source: sources.count(source) for source in SOURCES}
     if not rows:
         raise InputError(
-            "no object of the level can be used",
+            "the level has no object that can be used as a box",
             where=where,
             got=f"{len(objects)} objects of vget /objects, dropped: {counts_text(dropped)}",
-            fix="load a level with assets, or add their sizes to maps.unrealcv.sizes",
+            fix="load another level, or add a table with the sizes of the assets to maps.unrealcv.sizes",
         )
     share = counts["default"] / len(rows)
     if cfg.most_default is not None and share > cfg.most_default:
@@ -130,8 +130,8 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
         raise InputError(
             "too many boxes have a default size, because the server does not return their bounds", where=where,
             got=f"{share:.1%}: {', '.join(f'{name} ({num})' for name, num in without_size.most_common(5))}",
-            expected=f"at most {cfg.most_default:.1%} (maps.unrealcv.most_default)",
-            fix="add a table of their sizes to maps.unrealcv.sizes, or correct the bounds of these assets",
+            expected=f"at most {cfg.most_default:.1%} of the boxes (maps.unrealcv.most_default)",
+            fix="add a table with the sizes of these assets to maps.unrealcv.sizes, or correct their bounds",
         )  # fmt: skip
     boxes = np.array(rows)
     roads = boxes[np.array(sources) == "road"]

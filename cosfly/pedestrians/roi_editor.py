@@ -72,7 +72,9 @@ def run_propose(map_: Path, cfg: PedestriansConfig, out: Path) -> str:
     if out.is_dir():
         raise InputError("the output path is a folder", where=out, fix="pass the path of a file as --out")
     if out.exists():
-        raise InputError("the output file already exists", where=out, fix="choose another --out, or remove this file")
+        raise InputError(
+            "the output file already exists", where=out, fix="choose another --out, or remove the existing file"
+        )
     box_map = _read_map(map_)
     roi = propose(walkable_ground(box_map, cfg, where=map_), box_map.name)
     ground = walkable_ground(box_map, cfg, roi, where=map_, roi_where=out)
@@ -111,7 +113,7 @@ class Editor:
                 where=self.where,
                 got=f"{num_x} x {num_y} cells",
                 expected=f"at most {MOST_SIDE} cells a side and {MOST_CELLS:,} cells in all",
-                fix="set a larger pedestrians.resolution_m while you draw; the region stays in metres",
+                fix="set a larger pedestrians.resolution_m to draw; the region is stored in metres, so it stays valid",
             )
         self.bare = walkable_ground(self.box_map, self.cfg, where=self.where)
         self.opened = None
@@ -169,8 +171,8 @@ class Editor:
         with self.lock:
             digest = sha256_bytes(read_bytes(self.path)) if self.path.exists() else None
             if digest != self.digest:
-                what = "another program changed the file, so nothing is written"
-                raise InputError(what, where=self.path, fix="restart the editor")
+                what = "another program changed the file of the region, so the editor does not overwrite it"
+                raise InputError(what, where=self.path, fix="restart the editor, which then loads the changed file")
             write_roi(self.path, roi)
             self.digest = sha256_bytes(read_bytes(self.path))
         return {"figures": figures, "saved": str(self.path)}
@@ -221,7 +223,7 @@ def open_editor(map_: Path, cfg: PedestriansConfig, roi: Path, port: int, backdr
         shown = _area_text(west_m, west_m + frame["width"], north_m - frame["height"], north_m)
         low_m, high_m = box_map.bounds()
         raise InputError(
-            "the backdrop lies outside the map",
+            "the backdrop picture does not overlap the map",
             where=backdrop,
             got=f"a picture of {shown}",
             expected=f"a picture that overlaps {_area_text(low_m[0], high_m[0], low_m[1], high_m[1])}",

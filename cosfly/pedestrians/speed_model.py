@@ -58,9 +58,8 @@ class TimedRoute:
         lengths_m = np.linalg.norm(np.diff(self.polyline_m, axis=0), axis=1)
         means_mps = 0.5 * (self.speeds_mps[1:] + self.speeds_mps[:-1])
         if not (means_mps > 0).all():
-            raise ValueError(
-                "the speed is 0 at both ends of a segment of the route, so the pedestrian never reaches its end"
-            )
+            k = int(np.argmin(means_mps))
+            raise ValueError(f"the pedestrian never leaves waypoint {k}: the speed is 0 at waypoints {k} and {k + 1}")
         return np.concatenate([[0.0], np.cumsum(lengths_m / means_mps)])
 
     def resample(self, step_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -105,10 +105,10 @@ def _draw_route(
             continue
         return ground.grid.centers_of(cells), retries
     raise NoPathError(
-        "no pair of start and goal was accepted", where=path_id,
+        "no random pair of start and goal has a suitable route", where=path_id,
         got=f"{cfg.num_retries + 1} tries: {retries['no_goal']} without a goal, {retries['detour']} with a long detour",
         expected=f"a goal {cfg.min_distance_m:g} to {cfg.max_distance_m:g} m away and a route within max_detour",
-        fix="lower min_distance_m, raise max_distance_m, max_detour or num_retries, or widen the region of interest",
+        fix="in the section pedestrians, lower min_distance_m or raise max_distance_m, max_detour or num_retries",
     )  # fmt: skip
 
 

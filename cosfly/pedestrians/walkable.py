@@ -113,7 +113,7 @@ class PedestriansConfig(Config):
             if name not in PACES:
                 raise ValueError(f"pace {name!r} does not exist{nearest(name, PACES)}; choose from {', '.join(PACES)}")
             if share < 0:
-                raise ValueError(f"the share of {name} must not be negative, got {share:g}")
+                raise ValueError(f"the share of the pace {name} must not be negative, got {share:g}")
         if not sum(pace.values()) > 0:
             raise ValueError("the shares of the paces must add up to more than 0")
         return pace
@@ -261,8 +261,8 @@ def walkable_ground(
     ground = WalkableGround(grid, inflated, parts, footing, box_map.ground, costs, is_in_roi, counts)
     if not ground.row_ends[-1]:
         raise NoPathError(
-            "all walkable ground is carriageway, where trajectories must not start or end", where=where,
-            got=f"{counts['cells_used']} walkable cells, all Roads", fix="set road_cost to 1",
+            "all walkable ground is carriageway, where pedestrian trajectories must not start or end", where=where,
+            got=f"{counts['cells_used']} walkable cells, all Roads", fix="set pedestrians.road_cost to 1",
             expected="pavements, squares or paths (Sidewalks, Ground)",
         )  # fmt: skip
     return ground
@@ -317,8 +317,8 @@ def _parts_of_large_components(
         raise NoPathError(
             "no connected walkable area is large enough", where=where,
             got=f"{int(sizes.max())} cells in the largest of {len(sizes) - 1} areas",
-            expected=f"at least {min_component_cells} cells (min_component_cells)",
-            fix="lower min_component_cells or safety_radius_m, or widen the region of interest",
+            expected=f"at least {min_component_cells} cells (pedestrians.min_component_cells)",
+            fix="lower pedestrians.min_component_cells or pedestrians.safety_radius_m, or widen the region of interest",
         )  # fmt: skip
     parts, part_sizes = grids.connected_parts(is_large[components], 4)
     used = sorted(sizes[is_large].tolist(), reverse=True)
@@ -355,15 +355,15 @@ def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | 
             where=where,
             got=f"{counts['cells_occupied']} of {counts['cells']} cells occupied",
             expected="free ground between the boxes",
-            fix="lower safety_radius_m, or give ground boxes a ground type (Roads, Sidewalks, Terrain, Ground)",
+            fix="lower pedestrians.safety_radius_m, or give ground boxes a type such as Roads or Terrain",
         )
     if counts["cells_in_roi"] is None:
         raise NoPathError(
-            "no free cell lies on the requested ground",
+            "no free cell lies on the kind of ground that pedestrians.ground requires",
             where=where,
             got=f"{counts['cells_free']} free cells, all on other ground",
-            expected="a free cell on ground of the kind in the setting ground",
-            fix="set ground to surfaces or anywhere",
+            expected="at least one free cell on this kind of ground",
+            fix="set pedestrians.ground to surfaces or anywhere",
         )
     raise NoPathError(
         "the region of interest has no walkable cell",

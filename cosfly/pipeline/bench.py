@@ -58,16 +58,16 @@ class Bench(BaseModel):
 def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterable[int]) -> Bench:
     """Read a run up to `stage`; write `bench.json` and the events of each measurement."""
     if stage not in STAGES:
-        problem = "this stage cannot be measured"
+        problem = "the benchmark cannot measure this stage"
         raise ConfigError(problem, where="--stage", got=stage, expected=f"one of {', '.join(STAGES)}")
     if out.exists() and any(out.iterdir()):
         raise ResumeError("the output directory is not empty", where=out, fix="choose another --out")
     if stage == "caption" and (cfg.caption.teacher_kind not in EMBEDDED or cfg.caption.judge.url):
         raise ConfigError(
-            "only teachers in this process can be measured, because a server does not become faster with more workers",
+            "the benchmark measures only teachers without a server, because more workers do not make a server faster",
             where="caption.teacher",
             got=cfg.caption.teacher,
-            expected=f"a teacher of the kind {' or '.join(sorted(EMBEDDED))}, and no caption.judge",
+            expected=f"the teacher {' or '.join(sorted(EMBEDDED))}, and no caption.judge.url",
             fix="pass --set caption.teacher=rules",
         )
     rows = [_measure(cfg, run_folder, out / f"workers_{count}", stage, count) for count in sorted(set(workers))]

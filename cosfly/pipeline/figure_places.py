@@ -83,7 +83,7 @@ class FigureReader:
                     f"a value that {functions} accepts" if functions else "an object or a list where the key has `*`"
                 )
                 raise InputError(
-                    "cannot read this value from the file",
+                    "the number to compare cannot be computed from this field of the file",
                     where=f"{file}: {keys}",
                     got=str(error),
                     expected=expected,

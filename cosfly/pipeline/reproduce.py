@@ -107,11 +107,11 @@ def run(
     """Read a run directory; write `reproduction.html` and `reproduction.json`, and return the page."""
     done = [stage.name for stage in summarize(folder).stages if stage.state == "complete"]
     if missing := [name for name in STAGES if name not in done]:
-        fix = f"complete the run: cosfly run {folder}"
+        fix = f"finish the run with cosfly run {folder}"
         if cfg.towns:
-            fix = f"pass the directory of one town: {folder}/{next(iter(cfg.towns))}"
-        got = f"incomplete stages: {', '.join(missing)}"
-        raise InputError("the run directory has no complete drone trajectories", where=folder, got=got, fix=fix)
+            fix = f"pass the directory of one town of this run, such as {folder}/{next(iter(cfg.towns))}"
+        got = f"unfinished stages in this directory: {', '.join(missing)}"
+        raise InputError("the directory has no finished drone trajectories", where=folder, got=got, fix=fix)
     sample = measure(cfg, folder, out, pedestrians, done, pool | {"seed": seed, "resume": resume})
     reader = FigureReader([folder, out], {} if sample is None else {"sample": sample})
     reader.derived |= derived_figures(cfg, folder, reader, done)
@@ -178,7 +178,7 @@ def our_figures(table: PaperTable, reader: FigureReader) -> tuple[dict[str, list
         named_rows = figures[0] or {}
         if not isinstance(named_rows, dict):
             raise InputError(
-                "the value at this place is not a table",
+                "the field of the file is not a table of rows",
                 where=place,
                 got=json_type(named_rows),
                 expected="an object with one entry for each row name",

@@ -151,19 +151,22 @@ def check(cfg: RunConfig) -> dict[str, RunConfig]:
     maps = [(name, town.maps.licence) for name, town in towns.items()] or [(cfg.maps.source, cfg.maps.licence)]
     choose_licence(cfg.release.licence, maps)
     for town in towns.values() or [cfg]:
-        if missing := sorted(set(cfg.release.modalities) - set(town.render.modalities)):
+        if missing := ", ".join(sorted(set(cfg.release.modalities) - set(town.render.modalities))):
+            rendered = ", ".join(town.render.modalities)
             raise ConfigError(
-                "the release needs kinds of pictures that the run does not render",
+                "release.modalities contains kinds of pictures that the run does not render",
                 where="render.modalities",
-                got=f"{', '.join(missing)} missing",
-                fix=f"render them, or pass --set 'release.modalities=[{', '.join(town.render.modalities)}]'",
+                got=f"{rendered}, without {missing}",
+                fix=f"add {missing} to render.modalities, or pass --set 'release.modalities=[{rendered}]'",
             )
-        if cfg.release.pairs == "both" and (absent := set(cfg.release.tracks) - set(town.render.tracks)):
+        absent = ", ".join(sorted(set(cfg.release.tracks) - set(town.render.tracks)))
+        if cfg.release.pairs == "both" and absent:
+            rendered = ", ".join(town.render.tracks)
             raise ConfigError(
-                "the release needs both tracks of each trajectory, which the run does not render",
+                "release.tracks contains tracks that the run does not render",
                 where="render.tracks",
-                got=f"{', '.join(sorted(absent))} missing",
-                fix=f"render them, or pass --set 'release.tracks=[{', '.join(town.render.tracks)}]'",
+                got=f"{rendered}, without {absent}",
+                fix=f"add {absent} to render.tracks, or pass --set 'release.tracks=[{rendered}]'",
             )
     return towns
 
@@ -185,10 +188,10 @@ def check_out(out: Path) -> None:
     """Refuse to make a run in the folder of a stage: its tree would hold a second one."""
     if (out / "stage.json").exists() and not (out / "run.yaml").exists():
         raise ResumeError(
-            "the output directory is the folder of a stage",
+            "the output directory is the folder of a stage, not of a run",
             where=out,
             got="a stage.json without a run.yaml",
-            fix="choose another --out, or the run directory above it",
+            fix="choose another --out, such as the run directory above this folder",
         )
 
 

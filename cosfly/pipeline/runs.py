@@ -89,7 +89,7 @@ def summarize(run: Path) -> RunSummary:
             "the folder is not a run directory",
             where=run,
             got="no run.yaml in it",
-            expected="a directory that `cosfly run` made",
+            expected="a directory that `cosfly run` wrote",
             fix="run `cosfly list DIR` to find run directories below a folder",
         )
     cfg = load(RunConfig, run / "run.yaml")
@@ -103,7 +103,7 @@ def summarize(run: Path) -> RunSummary:
 def find_runs(root: Path, depth: int = 2) -> Iterator[Path]:
     """Yield the run directories below a folder, sorted by name; the towns of a run are not yielded themselves."""
     if not root.is_dir():
-        raise InputError("the folder does not exist", where=root, expected="a folder with run directories")
+        raise InputError("the folder of run directories does not exist", where=root, fix="check the path")
     if (root / "run.yaml").is_file():
         yield root
     elif depth:

@@ -64,7 +64,7 @@ class RunConfig(CommandConfig):
 
     def _check_town(self, name: str) -> None:
         if not TOWN_NAME.fullmatch(name) or name == "release":
-            expected = "1 to 60 letters, digits, underscores and hyphens, and not release"
+            expected = "1 to 60 letters, digits, underscores and hyphens, but not `release`"
             raise ConfigError("a town cannot have this name", where="towns", got=name, expected=expected)
         self.of_town(name)
 

@@ -35,7 +35,7 @@ def explain(cfg: BaseModel, section: str | None = None) -> list[Setting]:
         raise ConfigError(
             f"there is no section or setting of this name{nearest(section, [setting.name for setting in settings])}",
             got=section,
-            expected="a section (plan), a setting (plan.muco), or the file or name of a configuration",
+            expected="a section such as plan, a setting such as plan.muco, or the file or name of a configuration",
         )
     return selected
 

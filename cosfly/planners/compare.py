@@ -181,7 +181,7 @@ class CompareConfig(PlanConfig):
     @classmethod
     def _are_known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         if len(set(names)) < len(names):
-            raise ValueError("each planner may occur only once")
+            raise ValueError("each planner may be listed only once")
         for name in names:
             known_planner(name)
         if len(names) < 2:

@@ -181,7 +181,7 @@ class PlanConfig(Config):
             if name not in NAMES:
                 raise ValueError(f"there is no style {name!r}{nearest(name, NAMES)}; choose from {', '.join(NAMES)}")
             if share < 0:
-                raise ValueError(f"the share of {name} must be 0 or more, got {share}")
+                raise ValueError(f"the share of the style {name} must not be negative, got {share}")
         if sum(shares.values()) <= 0:
             raise ValueError("the shares of the styles must add up to more than 0")
         return shares
@@ -193,7 +193,7 @@ class PlanConfig(Config):
             if name not in ROWS:
                 choices = ", ".join(ROWS)
                 raise ValueError(
-                    f"no style with adjustable ranges is called {name!r}{nearest(name, ROWS)}; choose from {choices}"
+                    f"there is no style {name!r} with adjustable ranges{nearest(name, ROWS)}; choose from {choices}"
                 )
             with_ranges(ROWS[name], style_ranges)
         return ranges

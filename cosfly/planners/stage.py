@@ -53,7 +53,7 @@ def make_scenario(pedestrian: PedestrianTrajectory, obstacles: BoxIndex, cfg: Pl
     targets = pedestrian.positions_m + np.array([0.0, 0.0, TARGET_HEIGHT_M])
     if len(targets) < 2:
         problem = "the pedestrian trajectory has too few points"
-        raise NoPathError(problem, where=path_id, got=f"{len(targets)} points", expected="at least 2")
+        raise NoPathError(problem, where=path_id, got=f"{len(targets)} points", expected="at least 2 points")
     dt_s = step_s(pedestrian.time_s)
     steps_s = np.diff(pedestrian.time_s)
     is_uneven = np.abs(steps_s - max(dt_s, 0.0)) > 1e-3
@@ -63,7 +63,7 @@ def make_scenario(pedestrian: PedestrianTrajectory, obstacles: BoxIndex, cfg: Pl
             "the time stamps of the pedestrian trajectory do not increase in equal steps",
             where=f"{path_id}: t[{first + 1}]",
             got=f"a step of {steps_s[first]:g} s",
-            expected=f"steps of {abs(dt_s):g} s, the median",
+            expected=f"steps of {abs(dt_s):g} s, the median of all steps",
         )
     if (farthest_m := np.abs(targets).max()) > COORDINATE_MAX_M:
         raise NoPathError(
@@ -181,10 +181,10 @@ def _plan_once(
     clearances, _, _ = swept_distances(obstacles, positions, CLEARANCE_CAP_M)
     if clearances.min() < cfg.relaxed_safety_m - CLEARANCE_TOLERANCE_M:
         raise NoPathError(
-            f"planner {cfg.planner} found no trajectory with enough clearance",
+            f"the planner {cfg.planner} found no drone trajectory with enough clearance",
             where=pedestrian.path_id,
             got=f"a clearance of {clearances.min():.2f} m at the narrowest place",
-            expected=f"at least {cfg.relaxed_safety_m:g} m everywhere",
+            expected=f"at least {cfg.relaxed_safety_m:g} m everywhere (plan.relaxed_safety_m)",
         )
     seen = visibility(obstacles, positions, targets)
     is_judged = maneuvers.reference.keeps_sight
@@ -271,9 +271,8 @@ def read_inputs(simplified_map: Path, paths: Path) -> tuple[BoxMap, list[Pedestr
         )
     (path_id, count), *_ = Counter(pedestrian.path_id for pedestrian in pedestrians).most_common(1)
     if count > 1:
-        raise InputError(
-            "several pedestrian trajectories have the same id", where=where, got=path_id, expected="unique ids"
-        )
+        what, fix = "several pedestrian trajectories have the same id", "run the pedestrians stage again"
+        raise InputError(what, where=where, got=path_id, expected="a different id for each of them", fix=fix)
     return box_map, pedestrians
 
 

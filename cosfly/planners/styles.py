@@ -97,10 +97,10 @@ def with_ranges(row: Style, ranges: Mapping[str, Range]) -> Style:
     range_names = [name for name in names if isinstance(getattr(row, name), tuple)]
     for name, (low, high) in ranges.items():
         if name not in range_names:
-            raise ValueError(f"the style has no range with the name {name}; choose from {', '.join(range_names)}")
+            raise ValueError(f"the style has no adjustable range {name!r}; choose from {', '.join(range_names)}")
         if low > high:
-            raise ValueError(f"the range {name} must be [least, greatest], got [{low:g}, {high:g}]")
+            raise ValueError(f"the range {name} must be [least, greatest] in this order, got [{low:g}, {high:g}]")
         if low <= 0 and name not in ("bearing_deg", "round_mps", "climb_m"):
-            raise ValueError(f"the range {name} must begin above 0, got {low:g}")
+            raise ValueError(f"the lower end of the range {name} must be above 0, got {low:g}")
     replaced: dict[str, Any] = dict(ranges)
     return replace(row, **replaced)

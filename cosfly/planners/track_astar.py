@@ -329,8 +329,8 @@ def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
             "the pedestrian trajectory covers too large an area for the voxel grid",
             where=scenario.path_id,
             got=f"{num_xy.prod() * num_z:.0f} voxels",
-            expected=f"at most {MAX_CELLS}",
-            fix="use another planner, or shorter pedestrian trajectories",
+            expected=f"at most {MAX_CELLS} voxels",
+            fix="choose another plan.planner, or make shorter pedestrian trajectories",
         )
     shape = np.array([*num_xy, num_z], dtype=np.int64)
     size = np.array([settings.voxel_m, settings.voxel_m, settings.voxel_height_m])

@@ -72,7 +72,7 @@ def run(cfg: RenderConfig, boxes: Path, out: Path, *, bounds_m: Bounds | None = 
         expected = f"1 to {LONGEST_SIDE_PX} px on each side"
         fix = "change --bounds or --pixels-per-m"
         raise ConfigError(
-            "the picture would be too large, or empty", where="--bounds", got=got, expected=expected, fix=fix
+            "the backdrop picture would be too large or empty", where="--bounds", got=got, expected=expected, fix=fix
         )
     frame = WorldFrame(west_m=west, north_m=north, metres_per_px=1.0 / pixels_per_m)
     view = TopView(west, north, pixels_per_m, (int(size[0]), int(size[1])))

@@ -161,15 +161,17 @@ class CarlaRenderer(SimulatorRenderer):
 
     def _pictures(self, frame: int) -> dict[str, np.ndarray]:
         """Wait for the picture of a tick from every camera, (h, w, 4) BGRA; earlier ones and doubles are ignored."""
-        picture_s = PICTURE_SHARE * self._cfg.timeout_s
+        limit_s = PICTURE_SHARE * self._cfg.timeout_s
         pictures = {}
-        until_s = time.monotonic() + picture_s
+        until_s = time.monotonic() + limit_s
         for name, (_, inbox) in self._cameras.items():
             while name not in pictures:
                 try:
                     number, data = inbox.get(timeout=max(0.0, until_s - time.monotonic()))
                 except queue.Empty:
-                    raise NoPictureError(f"camera {name} sent no picture of tick {frame} in {picture_s:g} s") from None
+                    raise NoPictureError(
+                        f"camera {name} sent no picture of tick {frame} in {limit_s:g} s; raise render.carla.timeout_s"
+                    ) from None
                 if number == frame:
                     pictures[name] = np.frombuffer(data, np.uint8).reshape(*self._size_px[::-1], 4)
         return pictures
@@ -303,9 +305,9 @@ def _ids_in_pictures(server: CarlaConnection, box_map: BoxMap, num_others: int) 
             num_doubtful += actor_of_key[key] != actor
     where = f"{server.endpoint} (CARLA {server.version}), {server.town}"
     if not num_found:
-        what = "no box of the map is in the town that the server has loaded"
+        what = "none of the boxes of the map is in the town that the server has loaded"
         fix = "export the map from this town (cosfly maps --source carla), or name its town in render.carla.town"
-        raise InputError(what, where=where, got=box_map.name, fix=fix)
+        raise InputError(what, where=where, got=f"the map {box_map.name}", fix=fix)
     if num_found < len(box_map) or num_doubtful:
         what = "%s: %d of %d boxes have an id in the pictures; %d of these share their 16-bit id with another box"
         log.warning(what, where, num_found, len(box_map), num_doubtful)

@@ -253,4 +253,5 @@ def check_pose(camera_pose: np.ndarray, intrinsic: np.ndarray) -> None:
     """Raise RenderError where a camera is not finite."""
     if not (np.isfinite(camera_pose).all() and np.isfinite(intrinsic).all()):
         got = f"pose {camera_pose.tolist()}, intrinsic matrix {intrinsic.tolist()}"
-        raise RenderError("the camera has numbers that are not finite", got=got)
+        fix = "correct the drone trajectory or the camera settings"
+        raise RenderError("the camera's pose or intrinsic matrix has a number that is not finite", got=got, fix=fix)

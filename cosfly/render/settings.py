@@ -95,19 +95,20 @@ class RenderConfig(WeatherConfig):
     @model_validator(mode="after")
     def _weather_can_be_drawn(self) -> RenderConfig:
         if self.backend in SIMULATORS and self.look != Look():
-            raise ValueError(f"backend {self.backend} draws its own sun and air; remove look")
+            raise ValueError(f"the simulator {self.backend} draws its own sun and air; remove render.look")
         if self.weather_mode != "off" and self.backend in ("pyrender", "unrealcv"):
-            raise ValueError(f"backend {self.backend} cannot draw weather; use gl or carla, or weather_mode off")
+            fix = "set render.backend to gl or carla, or render.weather_mode to off"
+            raise ValueError(f"the renderer {self.backend} cannot draw weather; {fix}")
         if self.weather_mode != "off" and self.look != Look():
-            fix = "remove look (--set 'render.look={}'), or set weather_mode to off"
-            raise ValueError(f"the setting look cannot be combined with weather_mode {self.weather_mode}; {fix}")
+            fix = "remove render.look (--set 'render.look={}'), or set render.weather_mode to off"
+            raise ValueError(f"render.look cannot be combined with render.weather_mode {self.weather_mode}; {fix}")
         return self
 
     @field_validator("tracks", "modalities")
     @classmethod
     def _each_once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         if len(set(names)) != len(names):
-            raise ValueError("each name may occur only once")
+            raise ValueError("each name may be listed only once")
         return names
 
     @field_validator("town")

@@ -82,7 +82,7 @@ class SimulatorRenderer(ABC):
         fov_deg = round(Camera(width, height, intrinsic).fov_deg, 6)  # all that a simulator knows of a lens
         f = focal_px(width, fov_deg)
         if not np.allclose(intrinsic, [[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]], atol=1e-3):
-            what = "the simulator cannot draw with this intrinsic matrix"
+            what = "the simulator cannot render with this intrinsic matrix of the camera"
             (fx, skew, cx), (_, fy, cy) = intrinsic[:2]
             got = f"fx {fx:g}, fy {fy:g}, skew {skew:g}, principal point {cx:g}, {cy:g} px"
             expected = "square pixels, and the principal point in the middle of the picture"

@@ -164,8 +164,8 @@ def run(
     box_map = read_boxes(boxes)
     inputs |= {f"mesh {name}": path for name, path in box_map.meshes.files().items()}
     if cfg.path_index is not None and cfg.path_index >= (num := len(read_traces(traces))):
-        problem = "no trajectory has this index"
-        expected = f"an index below {num}"
+        problem = "the input has no drone trajectory with this index"
+        expected = f"an index from 0 to {num - 1}"
         raise ConfigError(problem, where="render.path_index", got=cfg.path_index, expected=expected)
     stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
@@ -173,7 +173,8 @@ def run(
     check_ground(box_map, boxes)
     all_traces = read_traces(traces)
     if twice := [path_id for path_id, n in Counter(trace.path_id for trace in all_traces).items() if n > 1]:
-        raise InputError("two trajectories have the same id", where=traces, got=min(twice), expected="unique ids")
+        fix = "run the plan stage again"
+        raise InputError("two drone trajectories have the same id", where=traces, got=min(twice), fix=fix)
     passed = {n: t for n, t in enumerate(all_traces) if t.drop_reason is None and cfg.path_index in (None, n)}
     if not passed:
         tally = Tally(input=len(all_traces), dropped=Counter(str(trace.drop_reason) for trace in all_traces))
@@ -246,10 +247,10 @@ def bystanders_of(others: Path | None, traces: list[DroneTrace]) -> tuple[dict[s
     for trace in traces:
         where = f"{others}: {trace.path_id}"
         if trace.path_id not in by_path:
-            raise InputError("the file has no bystanders for this trajectory", where=where, fix=FROM_ONE_RUN)
+            raise InputError("the file has no bystanders for the drone trajectory", where=where, fix=FROM_ONE_RUN)
         if other_lengths := {len(other.positions_m) for other in by_path[trace.path_id]} - {len(trace.time_s)}:
             raise InputError(
-                "a bystander has more or fewer positions than the trajectory",
+                "a bystander has more or fewer positions than the drone trajectory",
                 where=where,
                 got=f"{other_lengths.pop()} positions",
                 expected=f"{len(trace.time_s)} positions",

@@ -120,9 +120,9 @@ class UnrealCvRenderer(SimulatorRenderer):
             self._ids[color] = NO_INSTANCE if row is None else ids[row]
             self._kinds[color] = KINDS[kind_of(class_name) or "Other"] if row is None else self._map.kinds[row]
         if not linked:
-            what = "no box of the map is in the level that the server has loaded"
+            what = "none of the boxes of the map is in the level that the server has loaded"
             fix = "export the map from this level (cosfly maps --source unrealcv)"
-            raise InputError(what, where=self._server.where, got=self._map.name, fix=fix)
+            raise InputError(what, where=self._server.where, got=f"the map {self._map.name}", fix=fix)
         if len(linked) < len(self._map) or num_doubtful:
             what = "%s: %d of %d boxes are objects of the level; %d objects share their colour with another"
             log.warning(what, self._server.where, len(linked), len(self._map), num_doubtful)
@@ -148,11 +148,11 @@ class UnrealCvRenderer(SimulatorRenderer):
         scale = scale or float("nan")  # all in one place
         high_m = float(np.median(raw[:, 2] / scale - middles_m[:, 2]))
         raise ConfigError(
-            "the scale or the height of the map differs from the level, so the camera would be at wrong places",
+            "the map and the level differ in scale or height, so the camera would be in the wrong place",
             where=self._server.where,
-            got=f"objects {gap_m:.1f} m from their boxes with coord_scale {self._cfg.coord_scale:g} and coord_z_offset "
-            f"{self._cfg.coord_z_offset:g}",
-            expected=f"about coord_scale {scale:.4g} and coord_z_offset {high_m:.2f}",
+            got=f"objects {gap_m:.1f} m away from their boxes with coord_scale {self._cfg.coord_scale:g} and "
+            f"coord_z_offset {self._cfg.coord_z_offset:g} m",
+            expected=f"about coord_scale {scale:.4g} and coord_z_offset {high_m:.2f} m",
             fix="set --coord-scale and --coord-z-offset, or export the map from this level",
         )
 
@@ -221,7 +221,7 @@ class UnrealCvRenderer(SimulatorRenderer):
             heights = zip(both.round(2).tolist(), over_m, strict=True)
             got, expected = (f"{point}, {over:.1f} m over the ground" for point, over in heights)
             what = "the camera is not at the requested position"
-            fix = "stop the level from moving it (for example by gravity), or choose another render.unrealcv.camera"
+            fix = "stop the level from moving the camera (such as by gravity), or choose another render.unrealcv.camera"
             raise RenderError(what, where=self.device, got=got, expected=expected, fix=fix)
 
     def _decoded(self, lit: str | bytes, mask: str | bytes, depth: str | bytes) -> Frame:
@@ -230,13 +230,13 @@ class UnrealCvRenderer(SimulatorRenderer):
         pictures = []
         for name, data in (("lit", lit), ("object_mask", mask)):
             if isinstance(data, str):
-                raise InputError("the server sent a text instead of a picture", where=name, got=shown(data))
+                raise InputError("the server sent text instead of a picture", where=name, got=shown(data))
             pictures.append(colours_of(data, name))
         raw = parse_array(depth if isinstance(depth, bytes) else depth.encode(), "depth", dtype=np.float32, ndim=2)
         for name, picture in zip(("lit", "object_mask", "depth"), (*pictures, raw), strict=True):
             if picture.shape[:2] != (height_px, width_px):
                 raise InputError(
-                    f"the server sent {name} in the wrong size",
+                    f"the server sent the picture `{name}` in the wrong size",
                     where=self.device,
                     got="{1} x {0} px".format(*picture.shape),
                     expected=f"{width_px} x {height_px} px",

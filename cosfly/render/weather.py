@@ -144,9 +144,9 @@ def read_pools(cfg: WeatherConfig) -> Pools:
         kinds = pools.pairs_by_kind()
         if missing := [kind for kind, share in cfg.sky_shares.items() if share and kind not in kinds]:
             raise ConfigError(
-                f"kinds of sky with a share have no preset in the weather and time pools: {', '.join(missing)}",
+                f"render.sky_shares names {', '.join(missing)}, but the weather and time pools have no such preset",
                 where="render.sky_shares",
-                fix="remove their shares, or add presets of these kinds to the pools",
+                fix="remove these names, or add presets of these kinds of sky to the pools",
             )
     return pools
 
@@ -162,7 +162,7 @@ def _read_pool(
     if len(pool) < len(presets):
         tokens = Counter(map(preset_token, presets))
         twins = [key for key in presets if tokens[preset_token(key)] > 1]
-        what = "two presets have the same name, because case, blanks and hyphens are ignored"
+        what = "two presets have the same name; case, blanks and hyphens are ignored"
         raise ConfigError(what, where=path, got=", ".join(twins), fix="rename one of them")
     if problems := _unknown(name, pool, field):
         raise ConfigError("; ".join(problems), where=path)

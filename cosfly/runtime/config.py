@@ -70,9 +70,9 @@ class _Loader(yaml.SafeLoader):
         seen = set[str]()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
-                raise yaml.constructor.ConstructorError(None, None, "a key must be text or a number", key.start_mark)
+                raise yaml.MarkedYAMLError(problem="a key is not text or a number", problem_mark=key.start_mark)
             if key.value in seen and key.value != "<<":
-                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} is given twice", key.start_mark)
+                raise yaml.MarkedYAMLError(problem=f"the key {key.value!r} is given twice", problem_mark=key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
@@ -107,8 +107,8 @@ def read_yaml(path: Path) -> dict:
         raise ConfigError(error.what, where=path, got=error.got, fix=error.fix) from None
     value = parse_yaml(text, path)
     if not isinstance(value, dict | None):
-        what = "the configuration is not a mapping"
-        raise ConfigError(what, where=path, got=json_type(value), expected="lines of the form key: value")
+        what = "the configuration is not a mapping of settings"
+        raise ConfigError(what, where=path, got=json_type(value), expected="lines such as seed: 3")
     return value or {}
 
 
@@ -212,6 +212,6 @@ def config_file(config: Path | None) -> Path | None:
         )
     if is_bare:
         raise ConfigError(
-            f"there is no such configuration{nearest(str(config), names)}", where=config, expected=expected
+            f"there is no configuration of this name{nearest(str(config), names)}", where=config, expected=expected
         )
     return config

@@ -64,7 +64,7 @@ def set_up_logging(level: int, file: Path | None = None) -> None:
             handlers.append(_File(file, encoding="utf-8"))
         except OSError as error:
             fix = "choose another --log-file"
-            raise StorageError("cannot write the log file", where=file, got=error.strerror, fix=fix) from None
+            raise StorageError("the log file cannot be written", where=file, got=error.strerror, fix=fix) from None
         handlers[1].setFormatter(with_time)
     logging.basicConfig(handlers=handlers, force=True)
     set_levels(logging.DEBUG if file is not None else level)

@@ -69,12 +69,12 @@ def open_file(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Pa
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:  # ValueError: an invalid name
         got = "a socket" if getattr(error, "errno", 0) == errno.ENXIO else getattr(error, "strerror", str(error))
-        raise InputError(f"cannot read the {what}", where=path, got=got, fix=fix) from None
+        raise InputError(f"the {what} cannot be read", where=path, got=got, fix=fix) from None
     mode = os.fstat(number).st_mode
     if not stat.S_ISREG(mode):
         os.close(number)
         got = {"d": "a folder", "p": "a named pipe"}.get(stat.filemode(mode)[0], "a device")
-        raise InputError(f"cannot read the {what}", where=path, got=got, expected="a regular file", fix=fix)
+        raise InputError(f"the {what} cannot be read", where=path, got=got, expected="a regular file", fix=fix)
     return os.fdopen(number, "rb")
 
 
@@ -84,7 +84,7 @@ def disk_errors(path: Path, what: str, fix: str = CHECK_PATH) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(f"cannot read the {what}", where=path, got=error.strerror or str(error), fix=fix) from None
+        raise InputError(f"the {what} cannot be read", where=path, got=error.strerror or str(error), fix=fix) from None
 
 
 def read_bytes(
@@ -104,7 +104,7 @@ def read_bytes(
         file.seek(first)
         data = file.read(size)
     if span is not None and len(data) != size:
-        got = f"{first + len(data)} bytes"
+        got = f"{first + len(data)} bytes instead of {first + size} or more"
         fix = "run the command again when no other process writes this file"
         raise InputError(f"the {what} became shorter during reading", where=path, got=got, fix=fix)
     return data
@@ -150,7 +150,8 @@ def read_unpacked(path: Path, *, what: str = "file", most_mb: float = FILE_MB) -
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
             unpacked = packed.read(int(min(by_factor, most_mb * MB)) + 1)
     except (OSError, EOFError, zlib.error) as error:
-        raise InputError("the gzip data is damaged", where=path, got=str(error)) from None
+        fix = "copy or download the file again"
+        raise InputError("the gzip data of the file is damaged", where=path, got=str(error), fix=fix) from None
     if len(unpacked) > most_mb * MB:
         limit = f"{most_mb:,g} MB"
         raise over_limit(path, f"more than {limit} after decompression", limit, SPLIT)
@@ -219,11 +220,11 @@ def check_stays_below(path: Path, tree: Path, *, in_parent: bool = False) -> Non
     try:
         real, root = real_path(path), real_path(tree)
     except ValueError as error:  # a NUL in a name
-        raise InputError("a path has an invalid character", where=tree, got=str(error)) from None
+        raise InputError("a path in this folder contains an invalid character", where=tree, got=str(error)) from None
     blobs = [str(folder.parent / "blobs") for folder in Path(root).parents if folder.name == "snapshots"][:1]
     if not any(is_below(real, allowed) for allowed in (os.path.dirname(root) if in_parent else root, *blobs)):
         raise InputError(
-            "a link leads out of its folder",
+            "a symbolic link leads out of its folder",
             where=path,
             got=real,
             expected=f"a file below {tree}",
@@ -262,10 +263,10 @@ def _plain_name(root: Path, name: str) -> str:
     plain = os.path.normpath(name)
     if "\0" in name or max(len(part.encode("utf-8", "surrogatepass")) for part in plain.split(os.sep)) > LONGEST_NAME:
         expected = f"no null character, and at most {LONGEST_NAME} bytes in the name of each folder and file"
-        raise InputError("the name is not a valid file name", where=root, got=name, expected=expected)
+        raise InputError("the path is not a valid file name", where=root, got=name, expected=expected)
     if os.path.isabs(plain) or plain.split(os.sep)[0] == os.pardir:
         raise InputError(
-            "the file name leads out of this folder", where=root, got=name, expected="a path inside the folder"
+            "the path leads out of this folder", where=root, got=name, expected="a relative path inside the folder"
         )
     return plain
 
@@ -274,10 +275,10 @@ def refuse_link(path: Path) -> None:
     """Refuse to write to a link, which may lead anywhere."""
     if path.is_symlink():
         raise StorageError(
-            "this path is a link, and cosfly does not write through links",
+            "the output path is a symbolic link, and cosfly does not write through links",
             where=path,
             got=f"a link to {os.readlink(path)}",
-            fix="remove the link, or replace it by its target; only the folder of --out itself may be a link",
+            fix="replace the link by what it points to; only the folder of --out itself may be a link",
         )
 
 
@@ -308,7 +309,7 @@ def storage_errors(path: Path) -> Iterator[None]:
             fix = "choose another --out, or fix the folder and run the same command again; finished work is kept"
         else:
             raise
-        raise StorageError("cannot write the file", where=path, got=error.strerror, fix=fix) from error
+        raise StorageError("the file cannot be written", where=path, got=error.strerror, fix=fix) from error
 
 
 @contextlib.contextmanager
@@ -316,7 +317,7 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
     """Open a file under a temporary name that is renamed at the end: a kill leaves either the old file or the new."""
     if path.is_dir():
         fix = "pass the path of a file, not of a folder"
-        raise StorageError("cannot write the file, because a folder has this path", where=path, fix=fix)
+        raise StorageError("the file cannot be written, because a folder has this path", where=path, fix=fix)
     with _renamed(path) as partial, open(partial, "xb") as file:
         yield file
         file.flush()
@@ -404,8 +405,9 @@ def read_checksums(folder: Path) -> dict[str, str]:
     for number, line in enumerate(read_text(path, what="checksums", tree=folder).splitlines(), 1):
         digest, _, name = line.partition("  ")
         if len(digest) != 64 or not name:
-            expected = "64 hex digits, two spaces and a name"
-            raise InputError("the checksum line is damaged", where=f"{path}:{number}", got=line[:80], expected=expected)
+            what, fix = "the line of the checksum file is damaged", "copy the folder again from its source"
+            expected = "64 hexadecimal digits, two spaces and a file name"
+            raise InputError(what, where=f"{path}:{number}", got=line[:80], expected=expected, fix=fix)
         plain = _plain_name(folder, name)
         parent = os.path.dirname(plain)
         if parent not in checked or os.path.islink(f"{folder}{os.sep}{plain}"):

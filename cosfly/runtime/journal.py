@@ -59,10 +59,10 @@ class Journal:
                 detail = error.errors(include_url=False, include_input=False)[0]
                 field = ".".join(str(part)[:40] for part in detail["loc"]) or "top level"
                 raise InputError(
-                    "the line of the journal cannot be used",
+                    "the line of the journal is not a valid record",
                     where=f"{self.path}:{self.line_num}",
                     got=f"{field}: {plain(detail['msg'])[:200]}",
-                    fix="delete this line and run the same command again, which repeats the item of the line",
+                    fix="delete this line and run the same command again; cosfly repeats the item of this line",
                 ) from None
             yield value
 
@@ -77,9 +77,9 @@ class Journal:
                     record = _record_of(file.readline())
                 if record is None:
                     raise InputError(
-                        "a line of the journal changed while the command was running",
+                        "a line of the journal was changed while the command was running",
                         where=f"{self.path}: byte {line_byte}",
-                        fix="run the same command again, which repeats the item of this line",
+                        fix="run the same command again; cosfly repeats the item of this line",
                     )
                 yield record
 

@@ -38,13 +38,13 @@ _COMPACT = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(","
 
 def _finite(text: str) -> float:
     if not math.isfinite(number := float(text)):
-        raise ValueError(f"{reprlib.repr(text)[1:-1]} is not a finite number")
+        raise ValueError(f"the number {reprlib.repr(text)[1:-1]} is not finite")
     return number
 
 
 def _integer(text: str) -> int:
     if len(text.lstrip("-")) > DIGITS:
-        raise ValueError(f"{reprlib.repr(text)[1:-1]} has more than {DIGITS} digits")
+        raise ValueError(f"the number {reprlib.repr(text)[1:-1]} has more than {DIGITS} digits")
     return int(text)
 
 
@@ -89,7 +89,7 @@ def parse_document(data: bytes | str, where: str | Path, *, unique_keys: bool = 
     try:
         return parse_json(data, unique_keys=unique_keys)
     except ValueError as error:
-        raise InputError(f"this is not valid JSON: {error}", where=where) from None
+        raise InputError(f"the text is not valid JSON: {error}", where=where) from None
 
 
 def read_json(
@@ -175,7 +175,7 @@ def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Itera
         value = parse_document(data, where)
         if isinstance(value, dict) and (found := value.get("schema_version", version)) != version:
             raise InputError(
-                f"a line of the {what} has a version that is not supported",
+                f"the version of this line of the {what} is not supported",
                 where=f"{where}: schema_version",
                 got=shown(found),
                 expected=repr(version),
@@ -211,7 +211,7 @@ def check_schema(value: Any, form: FileFormat, path: Path | str) -> dict:
         is_schema = key == "schema"
         is_right = found == wanted if is_schema else str(found).split(".")[0] == wanted.split(".")[0]
         if not is_right:
-            what = "the file is of another kind" if is_schema else "the version of the file is not supported"
+            what = "the file has a wrong schema" if is_schema else "the version of the file is not supported"
             raise InputError(what, where=where, got=shown(found), expected=repr(wanted))
     return value
 

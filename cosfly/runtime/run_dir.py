@@ -309,7 +309,7 @@ class StageFolder:
             package_files={name: _digest(p) for name, p in sorted(package_files.items())},
         )
         if out.exists() and not out.is_dir():
-            raise StorageError("the output folder is a file", where=out, fix="choose another --out")
+            raise StorageError("the output path is a file, not a folder", where=out, fix="choose another --out")
         if (out / "manifest.json").exists():
             manifest = read_manifest(out)
             _check_same(out, record, resume)
@@ -428,7 +428,7 @@ def _check_same(out: Path, record: StageRecord, resume: Resume) -> None:
         raise ResumeError(
             "the folder already contains results of an earlier command",
             where=out,
-            fix="choose another --out, or --resume if-same",
+            fix="choose another --out, or add --resume if-same to continue the earlier command",
         )
     before = flattened(previous.config) | {"seed": previous.seed}
     after = flattened(record.config) | {"seed": record.seed}
@@ -477,7 +477,7 @@ def _check_outputs_exist(out: Path, manifest: Manifest) -> None:
         path = inside(out, entry.path)
         if not path.is_file() or path.stat().st_size != entry.bytes:
             raise VerifyError(
-                "the manifest says that this stage is complete, but a product is missing or has another size",
+                "the manifest lists this product of a complete stage, but the file is missing or has another size",
                 where=path,
                 expected=f"{entry.bytes} bytes",
                 fix=f"remove {out} and run the stage again",
@@ -490,7 +490,7 @@ def _check_outputs_exist(out: Path, manifest: Manifest) -> None:
 def fingerprint(path: Path) -> str:
     """Return one digest for an input: a file's bytes, a stage's list of products, or a tree's trajectory files."""
     if not path.exists():
-        fix = "check the path, or run the stage that makes it"
+        fix = "check the path, or run the stage that writes this file or folder"
         raise InputError("there is no such file or folder", where=path, fix=fix)
     if not path.is_dir():
         return sha256_file(path)  # raises for a pipe or a device
@@ -538,7 +538,7 @@ def checked_inputs(inputs: Mapping[str, Path], audited: Collection[str] = ()) ->
         try:
             str(path).encode()
         except UnicodeEncodeError:
-            problem = "the path contains a name that is not UTF-8 text"
+            problem = "the path of an input contains a name that is not UTF-8 text"
             raise InputError(problem, where=path, fix="rename the file or folder") from None
         if name not in audited:
             _check_finished(path)

@@ -49,5 +49,5 @@ def _cumulative(shares: Mapping[str, float]) -> tuple[list[str], np.ndarray]:
     weights = np.array([shares[name] for name in names], dtype=np.float64)
     if not ((weights >= 0).all() and weights.sum() > 0):
         got = ", ".join(f"{name} {share:g}" for name, share in shares.items()) or "no share"
-        raise ValueError(f"shares must not be negative, and their sum must be positive; got {got}")
+        raise ValueError(f"shares must not be negative, and their sum must be above 0; got {got}")
     return names, np.cumsum(weights)

@@ -33,7 +33,8 @@ def arrow_errors(path: Path | str) -> Iterator[None]:
     try:
         yield
     except (pa.ArrowException, OSError, ValueError) as error:  # which one depends on the damaged byte
-        raise InputError("the parquet file is damaged", where=path, got=str(error)) from None
+        fix = "copy or download the file again"
+        raise InputError("the parquet file is damaged", where=path, got=str(error), fix=fix) from None
 
 
 class _Table(pq.ParquetFile):
@@ -157,7 +158,7 @@ class TableRows(Sequence[dict[str, Any]]):
             table = self._stack.enter_context(open_table(self._path))
             if missing := sorted(set(self._columns) - set(table.schema_arrow.names)):
                 noun = "column" if len(missing) == 1 else "columns"
-                raise InputError(f"the table lacks the {noun} {', '.join(missing)[:200]}", where=self._path)
+                raise InputError(f"the table does not have the {noun} {', '.join(missing)[:200]}", where=self._path)
             counts = (table.metadata.row_group(k).num_rows for k in range(table.num_row_groups))
             self._firsts = list(accumulate(counts, initial=0))
             self._group = lru_cache(GROUPS_HELD)(lambda k: read_row_group(self._path, table, k, self._columns))

@@ -82,7 +82,7 @@ def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same
     result = simplify(raw, cfg)
     if len(result.box_map) == 0:
         raise InputError(
-            "every box lies below the ground",
+            "every box of the map lies below the ground",
             where=maps,
             expected="boxes above the ground",
             fix="correct ground_z_m in the header of the map",

@@ -144,7 +144,7 @@ def _opened(cfg: UnrealCvConfig, port: int, connection: UnrealCvConnection) -> U
             break
         time.sleep(0.5)
     connection.close()
-    fix = "open the level in Unreal and set level to the answer of `vget /level/name`, or remove the setting"
+    fix = "set unrealcv.level to a level that Unreal has, or open the level in Unreal and remove the setting"
     raise ConfigError("the server did not open the level", where=before, got=cfg.level, fix=fix)
 
 
@@ -166,8 +166,8 @@ def _client(cfg: UnrealCvConfig, port: int) -> Any:
             message = unrealcv.SocketMessage.ReceivePayload(self.sock)
             if not message:
                 is_late = time.monotonic() - since_s >= 0.9 * cfg.timeout_s
-                problem = f"no answer in {cfg.timeout_s:g} s" if is_late else "the server closed the connection"
-                raise ConnectionError(problem)
+                problem = f"sent no answer in {cfg.timeout_s:g} s" if is_late else "closed the connection"
+                raise ConnectionError(f"the server {problem}")
             return message
 
         def receive_loop_queue(self) -> None:

@@ -61,8 +61,8 @@ def study_of(truth: np.ndarray, frame: str) -> tuple[dict[str, Any], dict[str, n
     depths = truth[measured]
     if not depths.size or depths.min() == depths.max() or depths.min() < 0:
         got = f"{depths.min():g} to {depths.max():g} m" if depths.size else "no measured pixel"
-        expected = "at least two different depths of 0 m or more"
-        raise InputError("the depth image has too few depths for a study", where=frame, got=got, expected=expected)
+        what, expected = "the depth image has too few different depths", "at least two different depths of 0 m or more"
+        raise InputError(what, where=frame, got=got, expected=expected)
     decoded = {f"{bits}-bit": quantised(truth, measured, bits)[1] for bits in BITS}
     decoded["32-bit float"] = truth.astype(np.float32).astype(np.float64)
     sizes = zip(decoded.items(), (*BITS, 32), strict=True)

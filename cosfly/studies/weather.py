@@ -44,7 +44,7 @@ def run(cfg: RenderConfig, boxes: Path, traces: Path, out: Path, *, seed: int = 
     """
     all_traces = read_traces(traces)
     if not all_traces:
-        raise InputError("the file contains no drone trajectory", where=traces)
+        raise InputError("the file contains no drone trajectory", where=traces, fix="run the plan stage again")
     trace = all_traces[0]
     index = int(np.argmax(trace.rotations_deg[:, 0]))
     box_map = read_boxes(boxes)

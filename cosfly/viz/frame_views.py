@@ -58,11 +58,11 @@ class Pictures:
         """Check that a file of (width, height) gives pictures of `size_px`."""
         if scaled_size(*found_px, max(self.size_px)) != self.size_px:
             raise InputError(
-                "the picture does not fit the size that the prompt states",
+                "the picture cannot be scaled to the size that the prompt states",
                 where=file,
                 got="{} x {} px".format(*found_px),
                 expected="at least {} x {} px, with this aspect ratio".format(*self.size_px),
-                fix="pass the playback tree that was captioned",
+                fix="pass the directory of rendered tracks for which the captions were written",
             )
 
     def sentence(self, language: Language) -> str:

@@ -70,7 +70,7 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
         debug = Overlay(box_map, ids).draw(rgb, read_instance(folder)[1], meta)
     else:
         fix = "pass --map boxes_3d.json, or render with --set render.debug=true"
-        raise InputError("the frame has no debug.png, and no map is given to draw one", where=folder, fix=fix)
+        raise InputError("the frame has no debug.png, and no map is given to draw its boxes", where=folder, fix=fix)
     panels = [
         (f"RGB, {meta.camera.fov_deg:.0f} deg", rgb),
         (f"depth, black: {DEPTH_RANGE_M:g} m and beyond", read_view(folder, "depth")),
@@ -108,9 +108,8 @@ def _first_clean(tree: Path, choice: TrackChoice, *names: str) -> tuple[Track, l
 def _frames_with(track: Track, *names: str) -> list[int]:
     frames = sorted(set(range(len(track))) - set(track.missing_frames(names)))
     if not frames:
-        raise InputError(
-            "the track has no complete frame to show", where=track.folder, expected=f"a frame with {', '.join(names)}"
-        )
+        expected, fix = f"a frame with {', '.join(names)}", "render the track again"
+        raise InputError("the track has no complete frame", where=track.folder, expected=expected, fix=fix)
     return frames
 
 

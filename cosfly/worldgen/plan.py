@@ -112,7 +112,8 @@ class WorldPlan(BaseModel):
                 )
         if self.plazas + self.greens >= self.blocks_along**2:
             raise ValueError(
-                f"{self.plazas} plazas and {self.greens} greens leave no buildings on {self.blocks_along**2} blocks"
+                f"no block is left for buildings, because {self.plazas} plazas and {self.greens} green blocks take all "
+                f"{self.blocks_along**2} blocks"
             )
         narrowest_m = self.block_m * (1.0 - self.unevenness) / (1.0 + self.unevenness)
         if narrowest_m < MIN_BLOCK_M + 1.0 or self.setback_m > narrowest_m / 5:

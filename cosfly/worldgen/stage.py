@@ -148,7 +148,7 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
         reply = asyncio.run(ask())
     except NoAnswer as error:
         fix = error.fix or None
-        raise TeacherError("the planner gave no answer", where=client.url, got=str(error), fix=fix) from None
+        raise TeacherError("the language model gave no answer", where=client.url, got=str(error), fix=fix) from None
     trace = {
         "planner": "model", "url": cfg.planner, "model": client.model, "seed": seed, "messages": messages,
         "answer": reply.text, "finish_reason": reply.finish_reason,
@@ -158,7 +158,7 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
     answer = find_object(reply.text, WorldPlan.model_fields.keys(), reply.finish_reason)
     if answer.value is None:
         raise TeacherError(
-            "the answer of the planner contains no plan", where=where,
+            "the answer of the language model contains no plan", where=where,
             got=f"{answer.reason}: {' '.join(reply.text.split())[:80]!r}", expected="a JSON object",
             fix="try another --seed, prompt or model, or omit --planner to plan by rules without a model",
         )  # fmt: skip
