@@ -99,7 +99,7 @@ def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
     write_boxes(tmp_path / "own.json", town())
     box_map = load(BoxesConfig(path=tmp_path / "own.json", name="Mine", licence="mit"))
     assert (box_map.name, box_map.header.licence, len(box_map)) == ("Mine", "mit", len(town()))
-    with pytest.raises(ConfigError, match="types and ground itself"):
+    with pytest.raises(ConfigError, match="its own types and ground height"):
         load(BoxesConfig(path=tmp_path / "own.json", ignore=["*"]))
 
 

@@ -70,7 +70,7 @@ def test_an_observation_has_what_a_drone_knows_and_no_more(follow):
 def test_an_action_outside_its_bounds_and_a_step_after_the_end_are_refused_in_a_line(follow):
     follow.reset(seed=0)
     for action in (np.array([99, 0, 0, 0, 0], dtype=np.float32), 3, None):
-        with pytest.raises(InputError, match="outside the bounds"):
+        with pytest.raises(InputError, match="not in the action space"):
             follow.step(action)
     flown(follow, 0, [np.array([0, 0, -4, 0, -30], dtype=np.float32)] * 40)  # into the ground
     with pytest.raises(InputError, match="reset"):

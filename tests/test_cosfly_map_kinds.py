@@ -278,7 +278,7 @@ def test_a_building_on_the_road_leaves_a_carriageway(tmp_path: Path):
 
 def test_an_asset_without_a_size_is_an_error_or_counted(tmp_path: Path):
     cfg = write_world(tmp_path, node("BP_Building_01_C", 0, 0), node("BP_Building_99_C", 9000, 0))
-    with pytest.raises(InputError, match=r"has no size.*BP_Building_99_C.*unknown=drop"):
+    with pytest.raises(InputError, match=r"the size of the asset is unknown.*BP_Building_99_C.*unknown=drop"):
         simworld(cfg)
     cfg = cfg.model_copy(update={"unknown": "drop"})
     assert simworld(cfg).header.dropped_objects == {"unknown_asset": 1}

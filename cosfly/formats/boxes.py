@@ -337,7 +337,7 @@ def read_boxes(path: Path) -> BoxMap:
                 expected="a list of boxes",
             )
     if not records:
-        raise InputError("the map has no boxes", where=path, fix="make this map again with its stage or program")
+        raise InputError("the map has no boxes", where=path, fix="export or make this map again")
     boxes = validated(_Boxes, {"boxes": records}, path).boxes
     box_map = make_box_map(
         [box.center for box in boxes],
@@ -383,5 +383,5 @@ def _check_computed(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, 
                 where=f"{path}: box {boxes[bad].id}: {name}",
                 got=str(file_corners[bad].tolist()),
                 expected=str(rounded(corners[bad])),
-                fix="extent is half the size, in metres; rotation is pitch, yaw, roll in degrees",
+                fix="write extent as half the size in metres, and rotation as pitch, yaw and roll in degrees",
             )

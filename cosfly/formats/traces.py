@@ -52,8 +52,10 @@ class Excerpt:
             return None
         if not isinstance(record, dict) or record.get("number") not in range(MOST_TRAJECTORIES):
             what = "the field is not a valid record of a part of a trajectory"
-            before = "`before` (positions of the target before this part, in metres)"
-            expected = f"an object with `id`, `number` (0 to {MOST_TRAJECTORIES - 1}) and {before}"
+            expected = (
+                f"an object with `id`, `number` (0 to {MOST_TRAJECTORIES - 1}) and `before` (target positions in "
+                "metres before this part)"
+            )
             raise InputError(what, where=where, got=shown(record), expected=expected)
         return cls(text_id(record, where), int(record["number"]), column(record, "before", where, None, 3))
 

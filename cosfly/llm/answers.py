@@ -268,7 +268,7 @@ class Budget:
             raise TeacherError(
                 "the endpoint does not report token usage, so a limit on tokens or cost cannot be applied",
                 where=where,
-                fix="remove --max-cost and --max-tokens, and use --limit",
+                fix="remove --max-cost and --max-tokens, and limit the number of windows with --limit",
             )
 
 

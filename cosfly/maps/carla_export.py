@@ -120,7 +120,7 @@ def box_map_of(answers: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
             "the town has no object that can be used as a box",
             where=where,
             got=f"{len(answers.rows)} objects, dropped: {counts_text(dropped)}",
-            expected="at least one object of get_environment_objects with a usable box",
+            expected="at least one object with a usable bounding box",
             fix="load a town whose objects have bounding boxes",
         )
     header = MapHeader(

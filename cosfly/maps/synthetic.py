@@ -87,8 +87,8 @@ class SyntheticConfig(Config):
             hint = nearest(self.preset, list(PRESETS))
             raise ValueError(f"there is no preset {self.preset!r}{hint}; choose one of {', '.join(PRESETS)}")
         if (side := self.plan.narrowest_block_m) < MIN_BLOCK_M:
-            problem = f"the blocks are {side:.1f} m wide, but must be at least {MIN_BLOCK_M:.0f} m"
-            raise ValueError(f"{problem}; raise size_m or lower num_blocks")
+            expected = f"at least {MIN_BLOCK_M:.0f} m"
+            raise ValueError(f"the blocks are {side:.1f} m wide, not {expected}; raise size_m or lower num_blocks")
         return self
 
     @property

@@ -79,9 +79,7 @@ class FigureReader:
                     names = functions.split(",")
                     values = [FUNCTIONS[name](value) if value else None for value in values for name in names]
             except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
-                expected = (
-                    f"a value that {functions} accepts" if functions else "an object or a list where the key has `*`"
-                )
+                expected = f"a value for {functions}" if functions else "an object or a list where the key has `*`"
                 raise InputError(
                     "the number to compare cannot be computed from this field of the file",
                     where=f"{file}: {keys}",

@@ -97,8 +97,7 @@ class RenderConfig(WeatherConfig):
         if self.backend in SIMULATORS and self.look != Look():
             raise ValueError(f"the simulator {self.backend} draws its own sun and air; remove render.look")
         if self.weather_mode != "off" and self.backend in ("pyrender", "unrealcv"):
-            fix = "set render.backend to gl or carla, or render.weather_mode to off"
-            raise ValueError(f"the renderer {self.backend} cannot draw weather; {fix}")
+            raise ValueError(f"render.weather_mode must be off with {self.backend}; only gl and carla can draw weather")
         if self.weather_mode != "off" and self.look != Look():
             fix = "remove render.look (--set 'render.look={}'), or set render.weather_mode to off"
             raise ValueError(f"render.look cannot be combined with render.weather_mode {self.weather_mode}; {fix}")
