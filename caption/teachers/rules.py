@@ -21,7 +21,7 @@ from caption.verification.references import Fact, look_up, parse_reference
 from cosfly.formats.segments import MISSION_KINDS
 from cosfly.runtime.config import read_yaml
 
-MODEL = "rules-10"  # its name in the records; counts changes of decisions and wording
+MODEL = "rules-11"  # its name in the records; counts changes of decisions and wording
 Both = tuple[str, str]  # English, Chinese
 Condition = Callable[[Facts, int], bool]  # of the facts and the side of the decision: 1 left, -1 right, 0 neither
 
@@ -243,7 +243,8 @@ CONDITIONS: dict[str, Condition] = {
     "gap_opens": gap_opens, "gap_closes": gap_closes, "gap_scatters": gap_scatters,
     "pace_matched": says("comparison:speed", "matching", is_smooth, walks, walks_evenly),
     "outrun": says("comparison:speed", "slower", is_smooth, walks, walks_evenly, gap_moves),
-    "overtakes": says("comparison:speed", "faster", is_smooth, walks, walks_evenly, gap_moves),
+    "overtakes": lambda f, side: is_smooth(f, side) and walks_evenly(f, side)
+    and f.velocity_mps[0] > (f.target_speed_mps or math.inf),
     "nose_turns": nose_turns,
     "drone_hovers": says("drone_motion", "hovering", lambda f, side: (f.speed_mps[-1] or 0.0) < SLOW_MPS),
     "drone_brakes": says("trend:speed", "decreasing", is_smooth, is_crawling),
