@@ -68,7 +68,7 @@ def carla_settings(port: int, awaited: tuple | None = None) -> tuple:
     import carla
 
     client = carla.Client("127.0.0.1", port)
-    client.set_timeout(20.0)
+    client.set_timeout(60.0)
     world, until_s = client.get_world(), time.monotonic() + 60.0
     while True:
         actors = world.get_actors(list(range(200, 300)))

@@ -64,7 +64,7 @@ def write_answers(facts: Facts, rng: np.random.Generator, decision: str | None =
     return first.coc, second.coc
 
 
-QUICK = {"max_tries": 2, "timeout_s": 30.0, "concurrency": 4}
+QUICK = {"max_tries": 2, "timeout_s": 60.0, "concurrency": 4}
 
 
 def settings(url: str, **changes) -> CaptionConfig:

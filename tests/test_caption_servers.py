@@ -29,7 +29,7 @@ TRIES = 2
 
 def settings(url: str, **changes) -> CaptionConfig:
     # Slow servers are slow for ever: the limit is what a good answer never takes here, however busy the machine is.
-    endpoint = {"timeout_s": 20.0, "concurrency": 1} | changes.pop("endpoint", {})
+    endpoint = {"timeout_s": 60.0, "concurrency": 1} | changes.pop("endpoint", {})
     return quick(url, endpoint=endpoint, **{"limit": 1, **changes})
 
 
@@ -79,7 +79,7 @@ def raw(*pieces: bytes, pause_s: float = 0.0, is_endless: bool = False) -> Calla
         for piece in pieces[:1] if is_endless else pieces:
             wire.write(piece)
             time.sleep(pause_s)
-        end_s = time.monotonic() + 30
+        end_s = time.monotonic() + 60
         while is_endless and time.monotonic() < end_s:
             wire.write(pieces[-1])
             wire.flush()

@@ -53,7 +53,7 @@ def key_of(user: str) -> str:
 
 def settings(url: str, folder: Path, **changes: Any) -> CaptionConfig:
     return CaptionConfig.model_validate({
-        "teacher": url, "student": {"folder": folder}, "endpoint": {"max_tries": 1, "timeout_s": 30.0}, **changes,
+        "teacher": url, "student": {"folder": folder}, "endpoint": {"max_tries": 1, "timeout_s": 60.0}, **changes,
     })  # fmt: skip
 
 
@@ -61,7 +61,7 @@ def infer_all(place: Path, url: str, out: Path, **changes: Any) -> list[Sample]:
     samples: list[Sample] = []
     for split in ("train", "val", "test"):
         cfg = infer.InferConfig.model_validate({
-            "split": split, "engine": "endpoint", "max_pixels": MAX_PIXELS, "endpoint": {"timeout_s": 30.0}, **changes,
+            "split": split, "engine": "endpoint", "max_pixels": MAX_PIXELS, "endpoint": {"timeout_s": 60.0}, **changes,
         })  # fmt: skip
         infer.run(cfg, place / "set", [place / "tree"], url, out / split)
         samples += open_split(place / "set", split)

@@ -115,7 +115,7 @@ def test_a_polygon_with_a_hole_is_drawn_saved_and_walked_in(map_file, tmp_path):
 
 
 def asked(server: PageServer, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, bytes]:
-    connection = http.client.HTTPConnection(server.host, timeout=20)
+    connection = http.client.HTTPConnection(server.host, timeout=60)
     own = {"Origin": f"http://{server.host}"} | headers
     connection.request(method, path, body, own)
     reply = connection.getresponse()

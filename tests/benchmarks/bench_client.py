@@ -49,7 +49,7 @@ def main() -> None:
     port = context.Queue()
     server = context.Process(target=_serve, args=(port,), daemon=True)
     server.start()
-    url = f"http://127.0.0.1:{port.get(timeout=30)}/v1"
+    url = f"http://127.0.0.1:{port.get(timeout=60)}/v1"
     folder = Path(tempfile.mkdtemp(prefix="bench_client_"))
     try:
         tree = _make_tree(folder / "tree", args.windows)
