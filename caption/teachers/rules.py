@@ -21,7 +21,7 @@ from caption.verification.references import Fact, look_up, parse_reference
 from cosfly.formats.segments import MISSION_KINDS
 from cosfly.runtime.config import read_yaml
 
-MODEL = "rules-11"  # its name in the records; counts changes of decisions and wording
+MODEL = "rules-12"  # its name in the records; counts changes of decisions and wording
 Both = tuple[str, str]  # English, Chinese
 Condition = Callable[[Facts, int], bool]  # of the facts and the side of the decision: 1 left, -1 right, 0 neither
 
@@ -231,7 +231,7 @@ def is_ordered(kind: str) -> Condition:
 # The names by which rule_sentences.yaml refers to conditions.
 CONDITIONS: dict[str, Condition] = {
     "always": lambda f, side: True,
-    "stands": says("target_motion", "standing", is_walk_known),
+    "stands": says("target_motion", "standing", is_walk_known, lambda f, side: not sets_off(f, side)),
     "sets_off": sets_off, "turns": turns, "crosses": crosses, "comes": comes, "walks_away": walks_away, "walks": walks,
     "slows": slows, "stops": lambda f, side: slows(f, side) and (f.target_speeds_mps[-1] or 0.0) < SLOW_MPS,
     "hurries": hurries, "off_centre": off_centre, "sight_swings": sight_swings,
@@ -254,16 +254,16 @@ CONDITIONS: dict[str, Condition] = {
     "turn_ends": turn_ends, "turns_slightly": is_turning,
     "turning": lambda f, side: abs(f.yaw_rate_dps[-1] or 0.0) >= SLIGHT_DPS,
     "turns_back": lambda f, side: side * (f.yaw_rate_dps[-1] or 0.0) <= -TURNING_DPS,
-    "drone_backs": lambda f, side: f.velocity_mps[0] <= -max(DRIFTING_MPS, abs(f.velocity_mps[1])),
+    "drone_backs": lambda f, side: f.velocity_mps[0] <= -max(SLOW_MPS, abs(f.velocity_mps[1])),
     "drone_slides": lambda f, side: slides(f, side) and not is_crawling(f, side),
     "drone_lingers": lambda f, side: max(map(abs, f.velocity_mps[:2])) < DRIFTING_MPS,
     "drone_shifts": lambda f, side: abs(f.velocity_mps[1]) >= abs(f.velocity_mps[0]),
     "climbing": lambda f, side: (f.climb_mps[-1] or 0.0) >= CLIMBING_MPS,
     "sinking": lambda f, side: (f.climb_mps[-1] or 0.0) <= -CLIMBING_MPS,
     "drone_drifts": lambda f, side: f.velocity_mps[0] >= 0.0 and abs(f.velocity_mps[1]) >= DRIFTING_MPS,
-    "comes_near": lambda f, side: comes(f, side) and is_close(f),
+    "comes_near": lambda f, side: comes(f, side) and is_close(f) and not gap_opens(f, side),
     "gap_closes_near": lambda f, side: gap_closes(f, side) and is_close(f),
-    "goes_along": lambda f, side: slides(f, side) and walks(f, side) and side * (f.target_velocity_mps or (0.0, 0.0))[1] >= SLOW_MPS,
+    "goes_along": lambda f, side: slides(f, side) and crosses(f, side),
     "slides_past": lambda f, side: slides(f, -side),
     "drone_climbs": says("trend:altitude", "increasing", is_smooth),
     "drone_sinks": says("trend:altitude", "decreasing", is_smooth),
