@@ -45,7 +45,7 @@ class Drone:
             k = int(np.argmax(outside))
             return f"{ACTION[k]} must be from {low[k]:g} to {high[k]:g}, got {command[k]:g}"
         if (speed_mps := float(np.hypot(*command[:2]))) > self.speed_max_mps * (1 + ROUNDING):
-            return f"the speed over ground must be at most {self.speed_max_mps:g} m/s, got {speed_mps:g}"
+            return f"the speed over ground must be at most {self.speed_max_mps:g} m/s, got {speed_mps:g} m/s"
         return None
 
     def within_speed(self, command: np.ndarray) -> np.ndarray:

@@ -105,7 +105,7 @@ class Goal:
         if self.says != in_order or not {*self.says} & {*GARMENT_TERMS}:
             raise ValueError(
                 f"the field says must list some of {', '.join(GOAL_TERMS)} in this order, and at least one of "
-                + ", ".join(GARMENT_TERMS)
+                f"{', '.join(GARMENT_TERMS)}"
             )
 
 

@@ -55,11 +55,14 @@ class Roi(RoiPolygon):
 
     def check_map(self, box_map: BoxMap, where: str | Path) -> None:
         """Check that the map and the axes in the file, if it holds them, are those of this map."""
-        expected_values = {"map": ("on another map", box_map.name), "axes": ("with other axes", AXES)}
-        for name, (how, expected) in expected_values.items():
+        expected_values = {
+            "map": ("the region of interest was drawn on another map", box_map.name),
+            "axes": ("the region of interest was drawn with other axes", AXES),
+        }
+        for name, (what, expected) in expected_values.items():
             if (got := getattr(self, name)) not in ("", expected):
                 raise InputError(
-                    f"the region of interest was drawn {how}",
+                    what,
                     where=f"{where}: {name}",
                     got=got,
                     expected=expected,

@@ -272,7 +272,7 @@ def _rings(surface: Any, vertices: np.ndarray, where: str) -> Surface:
     if not rings:
         raise InputError("the surface has no rings", where=where, expected="at least one ring", fix=VALIDATE)
     if not all(np.isfinite(ring).all() for ring in rings):
-        raise InputError("the surface is not finite", where=where, expected="finite coordinates", fix=VALIDATE)
+        raise InputError("a coordinate is not finite", where=where, expected="finite coordinates", fix=VALIDATE)
     if (num_vertices := sum(map(len, rings))) > MOST_VERTICES:
         raise over_limit(
             where, f"a surface of {num_vertices:,} vertices", f"{MOST_VERTICES:,} vertices", "simplify the surface"

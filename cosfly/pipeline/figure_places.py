@@ -81,7 +81,7 @@ class FigureReader:
             except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
                 expected = f"a value for {functions}" if functions else "an object or a list where the key has `*`"
                 raise InputError(
-                    "the number to compare cannot be computed from this field of the file",
+                    "the number for the comparison with the paper cannot be computed from this field",
                     where=f"{file}: {keys}",
                     got=str(error),
                     expected=expected,

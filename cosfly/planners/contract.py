@@ -209,7 +209,7 @@ class PlanConfig(Config):
             if (highest_m := row.altitude_range_m[1]) > self.altitude_max_m:
                 problems.append(f"style_ranges.{name} must not go above altitude_max_m, got {highest_m:g} m")
             if (fastest_mps := max(map(abs, row.round_mps))) >= self.speed_max_mps:
-                problems.append(f"style_ranges.{name}.round_mps must stay below speed_max_mps, got {fastest_mps:g}")
+                problems.append(f"style_ranges.{name}.round_mps must stay below speed_max_mps, got {fastest_mps:g} m/s")
         if problems:
             raise ValueError("; ".join(problems))
         return self

@@ -114,5 +114,5 @@ class RenderConfig(WeatherConfig):
     @classmethod
     def _town_is_a_name(cls, town: str | None) -> str | None:
         if town is not None and folder_name(town) != town:
-            raise ValueError("use only letters, digits, dots, hyphens and underscores, and no dot at the start")
+            raise ValueError("a town name may have only letters, digits, '.', '-' and '_', and no dot at the start")
         return town

@@ -614,7 +614,7 @@ def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], records: M
                 f"{path.name} was not made from the {role} that you passed",
                 where=path,
                 got=str(inputs[peer]),
-                expected=f"{sources[0].path}, unchanged",
+                expected=f"the unchanged {sources[0].path}",
                 fix=f"pass the expected {role}, or run the stage that writes {path.name} again",
             )
 
