@@ -85,7 +85,7 @@ SHAPES: dict[str, tuple[str, str, str, Plot | None]] = {  # of each table: title
     "fovs": ("Fields of view", "tab:zoom_config, sec:exp_release", "degrees|trajectories|frames", "bars"),
     "weather": ("Weather and time of day", "tab:weather_coverage", "preset", "heat"),
     "augmentation_states": ("Perturbation", "tab:augmentation_states", "state|frames|%", "bars"),
-    "events": ("Outcome of each perturbation", "sec:exp_zoom", "track|event|outcome|frames", None),
+    "events": ("Outcome of each perturbation", "sec:exp_render, app:dual_track", "track|event|outcome|frames", None),
     "depth": ("Depth, percentiles", "sec:step6", "pixels nearer than|m", None),
     "semantics": ("Kinds in the pictures", "sec:step6", "kind|% of pixels|% of frames", "bars"),
 }  # fmt: skip
@@ -411,7 +411,7 @@ def _absent(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> lis
          "no track of this release was inspected with its map"),
         (no_weather, "weather and time of day, 15 x 4", "tab:weather_coverage",
          "no frame of this release names a preset"),
-        (not counts.events, "fallbacks of the perturbation", "sec:exp_zoom",
+        (not counts.events, "fallbacks of the perturbation", "sec:exp_render, app:dual_track",
          "no frame of this release records the outcome"),
         (pixels is None, "percentiles of depth, kinds in the pictures", "sec:step6",
          "the pictures were not read; pass --pixels"),
