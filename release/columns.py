@@ -1,7 +1,7 @@
 """The columns of the released parquet files: one table that says all there is to say of a column.
 
 A new column is one row of FRAME or CAPTION: its type, the values that it may hold, the field that it is taken from, and
-where people see it. Schema, rows, card, Croissant, viewer and `release verify` follow. Lists are flat, so that every
+where people see it. Schema, rows, card, viewer and `release verify` follow. Lists are flat, so that every
 reader of parquet shows plain columns.
 """
 

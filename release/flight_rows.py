@@ -72,6 +72,7 @@ class FlightRows:
         lambda self: np.array([-1 if i is None else i for i in self.column("frame_index")], np.int64)
     )
     time_s = cached_property(lambda self: self.numbers("time_s"))
+    visibility = cached_property(lambda self: self.numbers("visibility"))
     pose = _vectors("pose", POSE)
     target_m = _vectors("target", POINT)
     drone_offset = _vectors("drone_offset", POSE)

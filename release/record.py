@@ -206,7 +206,7 @@ class CaptionNumbers(Strict):
     frames_by: dict[str, Counts]
     values: dict[str, int]
     mean_characters: dict[str, float | None]
-    example: dict[str, str]
+    example: dict[str, str | None]
 
     @field_validator("frames_by")
     @classmethod
@@ -219,6 +219,7 @@ class CaptionNumbers(Strict):
 class FileNumbers(Strict):
     shards: int
     bytes: int
+    bytes_points: int
     bytes_by_modality: Counts
 
 

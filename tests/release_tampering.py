@@ -20,7 +20,8 @@ from cosfly.runtime.io import sha256_file
 from release import columns
 from release.build.records import write_records
 from release.build.rows import open_writer
-from release.card.numbers import compute_numbers
+from release.card.numbers import numbers_of
+from release.counting import count_release
 from release.record import (
     ReleasedFlight,
     ReleaseRecord,
@@ -94,7 +95,8 @@ def forge(
     history.captions.frames_without = {"forged": sum(map(len, shards)) - captions}
     update["history"] = history
     record = record.model_copy(update=update)
-    computed = compute_numbers([out / shard.path for shard in entries], record.settings.num_frames)
+    tracks = count_release(out, entries)
+    computed = numbers_of(tracks, out, entries, record.settings.num_frames)
     return _finished(out, record.model_copy(update={"numbers": computed}).model_dump(mode="json"), change_record)
 
 

@@ -10,15 +10,9 @@ from specimens_rows import make_row
 from cosfly.geometry.trajectory_metrics import derivative_rms, length_m
 from cosfly.runtime.json_io import read_json
 from release.columns import POINT, POSE
-from release.stats.counting import Counts
+from release.counting import count_track
+from release.flight_rows import FlightRows
 from release.stats.tables import Stats
-
-
-def counted(rows: list[dict]) -> Counts:
-    counts = Counts()
-    for row in rows:
-        counts.add(row)
-    return counts
 
 
 def rows_of(positions: np.ndarray, frames: list[int], offsets: np.ndarray | None = None) -> list[dict]:
@@ -39,8 +33,9 @@ def rows_of(positions: np.ndarray, frames: list[int], offsets: np.ndarray | None
 def test_motion_is_that_of_the_plan_whatever_the_perturbation(seed, num):
     rng = np.random.default_rng(seed)
     plan = np.cumsum(rng.normal(0, 1, (num, 3)), axis=0)
-    (flight,) = counted(rows_of(plan, list(range(num)), rng.normal(0, 2, (num, 3)))).flights.values()
-    assert flight.path_m == pytest.approx(length_m(plan), rel=1e-9)
+    rows = FlightRows("one/Town01/trajectory_1/aug_001", rows_of(plan, list(range(num)), rng.normal(0, 2, (num, 3))))
+    flight = count_track(rows, rows)
+    assert flight.length_m == pytest.approx(length_m(plan), rel=1e-9)
     assert flight.accel_rms_mps2 == pytest.approx(derivative_rms(plan, 2), rel=1e-6)
     assert flight.jerk_rms_mps3 == pytest.approx(derivative_rms(plan, 3), rel=1e-6)
 

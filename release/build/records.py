@@ -24,7 +24,6 @@ from release.build.config import ReleaseConfig
 from release.build.plan import ReleasePlan
 from release.build.shards import ShardResult, points_part
 from release.build.sources import Source, input_names
-from release.card.croissant import CROISSANT, render_croissant
 from release.card.render import render_card
 from release.columns import published
 from release.record import (
@@ -253,11 +252,10 @@ def name_shards(parts: Sequence[tuple[Path, Shard]], folder: Path) -> list[Shard
 
 
 def write_records(folder: Path, record: ReleaseRecord) -> None:
-    """Write release.json, the card, croissant.json and the checksums beside the shards."""
+    """Write release.json, the card and the checksums beside the shards."""
     write_record(folder / "release.json", record)
     write_bytes(folder / "README.md", render_card(record).encode())
-    write_bytes(folder / CROISSANT, render_croissant(record).encode())
     digests = {file.path: file.sha256 for file in record.files}
-    for name in ("release.json", "README.md", CROISSANT):
+    for name in ("release.json", "README.md"):
         digests[name] = sha256_file(folder / name)
     write_checksums(folder, digests)

@@ -1,7 +1,7 @@
 """`cosfly release build`: flights and captions to a folder that `datasets.load_dataset` opens.
 
 Reads the playback trees, captions and inspections of one run or several; writes `dataset/` (parquet shards, README.md,
-release.json, croissant.json, checksums.sha256), which is what gets published: all of it, or nothing. Around it stand
+release.json, checksums.sha256), which is what gets published: all of it, or nothing. Around it stand
 the stage's own records, which hold local paths and do not.
 """
 
@@ -30,7 +30,8 @@ from release.build.rows import ShardPlan
 from release.build.shards import ShardResult, write_shard
 from release.build.sources import Source, input_names, told_apart
 from release.card.ceilings import ceilings_of
-from release.card.numbers import compute_numbers
+from release.card.numbers import numbers_of
+from release.counting import count_release
 from release.record import Shard
 from release.verify.verify import verify
 
@@ -80,7 +81,7 @@ def run(
     written = _write_parts(cfg, plan, stage, parts, workers, watch)
     with atomic_folder(dataset) as folder:
         shards = name_shards(_finished(plan, written, parts), folder)
-        numbers = compute_numbers([folder / shard.path for shard in shards], cfg.num_frames)
+        numbers = numbers_of(count_release(folder, shards), folder, shards, cfg.num_frames)
         provenance = provenance_of(sources, read_stage_record(out).inputs, plan.account)
         prompts = {source.run: source.questions for source in sources if source.questions}
         record = make_record(cfg, plan, written, shards, numbers, provenance, prompts)

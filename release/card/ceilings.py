@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain, groupby
-from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -14,17 +12,17 @@ from cosfly.formats.captions import ORDERS, TOKENS
 from cosfly.formats.segments import Segment
 from cosfly.inspection.blind_baseline import FITTED_ON, LEAST_WINDOWS, fit_deciders, is_drawn_ahead, past_of
 from cosfly.runtime.seeding import random_bytes, rng_for
-from release.card.numbers import DIGITS, row_lists
-from release.columns import PLACE, POINT_NAMES, WINDOW
-from release.flight_rows import FlightRows
+from release.columns import WINDOW
+from release.counting import DIGITS
+from release.reading import read_tracks
 from release.record import Ceilings, ReleaseRecord, Shard
 
-COLUMNS = [*PLACE, "sample_id", "frame_index", "label", "split", WINDOW]
+COLUMNS = ("sample_id", "frame_index", "label", "split", WINDOW)
 STAGE, FUTURE_FRAMES = "release.ceilings", 5  # of a label, where no record of captions says
 
 
 def ceilings_of(folder: Path, record: ReleaseRecord) -> Ceilings:
-    """Measure them on FITTED_ON labels of a release at most, drawn by their names; raises as `row_lists`."""
+    """Measure them on FITTED_ON labels of a release at most, drawn by their names; raises as `read_tracks`."""
     told = [one for shard in record.shards for one in _windows(folder, shard, record)]
     pasts, labels, splits, ahead = map(np.array, zip(*told, strict=True)) if told else [np.empty(0)] * 4
     split = "test" if "test" in splits else "validation"
@@ -41,27 +39,22 @@ def ceilings_of(folder: Path, record: ReleaseRecord) -> Ceilings:
 
 def _windows(folder: Path, shard: Shard, record: ReleaseRecord) -> Iterator[tuple[np.ndarray, int, str, int]]:
     """Yield of labelled windows the past, the label's number, the split, and whether it may depend on what was drawn
-    later, -1 where that is not known. Memory holds the points of a shard, and a row group."""
+    later, -1 where that is not known. Memory holds a row group and a track."""
     numbers = {name: number for number, name in enumerate(TOKENS)}
     most_rank = 2**64 * FITTED_ON / max(1, record.numbers.captions.with_label)
     configs = [s.config for source in record.provenance.sources for s in source.stages if s.stage == "caption"]
     num_future = max((c["window"]["future_frames"] for c in configs if "window" in c), default=FUTURE_FRAMES)
-    tracks = {}
-    points = chain.from_iterable(row_lists(folder / shard.points.path, list(POINT_NAMES)))
-    for name, group in groupby(points, itemgetter(*PLACE)):
-        rows = FlightRows("/".join(name), list(group))
-        styles = rows.column("style")
-        begins = [now for now in range(1, len(rows)) if styles[now] != styles[now - 1]]
-        segments = tuple(Segment(styles[now], now, len(rows)) for now in begins)
-        tracks[name] = rows, replace(rows.flight, segments=segments)
-    for name, group in groupby(chain.from_iterable(row_lists(folder / shard.path, COLUMNS)), itemgetter(*PLACE)):
-        rows, flight = tracks[name]
-        for row in group:
+    for rows, points in read_tracks(folder, shard, COLUMNS):
+        styles = points.column("style")
+        begins = [now for now in range(1, len(points)) if styles[now] != styles[now - 1]]
+        segments = tuple(Segment(styles[now], now, len(points)) for now in begins)
+        flight = replace(points.flight, segments=segments)
+        for row in rows.rows:
             if row["label"] is None or int.from_bytes(random_bytes(0, STAGE, row["sample_id"])[:8]) > most_rank:
                 continue
             now = row["frame_index"]
             is_ordered, last = row["label"] in ORDERS, now + num_future
-            is_known = not rows.is_foreign and last < len(flight)
+            is_known = not points.is_foreign and last < len(flight)
             ahead = is_drawn_ahead(flight, now, last, is_ordered) if is_known else None
             past = past_of(flight, row[WINDOW], is_ordered)
             yield past, numbers[row["label"]], row["split"], -1 if ahead is None else int(ahead)

@@ -18,8 +18,8 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.png import colours_of
 from cosfly.runtime.tables import arrow_errors, open_table, row_groups
 from cosfly.viz.frame_views import small_jpeg
-from release.card.numbers import check_columns
 from release.columns import PICTURES
+from release.reading import check_columns
 from release.record import ReleaseRecord
 
 BIN_M, MOST_M = 0.25, 1000.0  # bins of the depth histogram; percentiles are to a bin

@@ -7,16 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.geometry.coverage import Coverage
-from cosfly.runtime.console import progress_bar
 from cosfly.runtime.escaping import for_markdown
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import write_json
 from cosfly.viz.coverage_page import coverage_html
 from cosfly.viz.page import page
-from release.card.numbers import RowCounts, check_rows, row_lists
-from release.columns import SHORT_NAMES
+from release.counting import count_release
+from release.reading import check_rows
 from release.record import ReleaseRecord, read_record, release_folder
-from release.stats.counting import Counts
 from release.stats.pixels import look_at, middle_picture
 from release.stats.tables import Cell, Stats, Table, make_stats
 
@@ -32,20 +30,15 @@ def run(dataset: Path, out: Path, *, pixels: int = 200) -> Path:
     """
     dataset = release_folder(dataset)
     record = read_record(dataset / "release.json")
-    counts, card = Counts(), RowCounts()
-    with progress_bar("stats: rows", sum(shard.rows for shard in record.shards)) as advance:
-        for shard in record.shards:
-            check_rows(dataset / shard.path, shard.rows)
-            for rows in row_lists(dataset / shard.path, SHORT_NAMES):
-                card.add(rows)
-                for row in rows:
-                    counts.add(row)
-                advance(len(rows))
+    for file in record.files:
+        check_rows(dataset / file.path, file.rows)
+    tracks = count_release(dataset, record.shards)
+    coverage = Coverage.total(track.coverage for track in tracks)
     looked = look_at(dataset, record, pixels) if pixels else None
-    stats = make_stats(record, counts, looked)
-    write_json(out / "stats.json", {**stats.model_dump(mode="json"), "coverage": card.coverage.model_dump(mode="json")})
+    stats = make_stats(record, tracks, looked)
+    write_json(out / "stats.json", {**stats.model_dump(mode="json"), "coverage": coverage.model_dump(mode="json")})
     write_bytes(out / "stats.md", markdown(stats).encode())
-    text = page_html(stats, card.coverage, tiles_of(record, stats), middle_picture(dataset, record))
+    text = page_html(stats, coverage, tiles_of(record, stats), middle_picture(dataset, record))
     write_bytes(out / "stats.html", text.encode())
     return out / "stats.html"
 

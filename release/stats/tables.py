@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Sequence
 from statistics import fmean
 from typing import Literal
 
@@ -20,15 +20,18 @@ from cosfly.geometry.trajectory_metrics import (
 )
 from cosfly.llm.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
 from cosfly.runtime.json_io import Record
-from release.card.numbers import Sum, bounded, spread_of
+from release.card.numbers import spread_of
 from release.columns import LANGUAGE_NAMES, LANGUAGES
+from release.counting import TAB, Sum, TrackCount, total_of
+from release.reading import bounded
 from release.record import ReleaseRecord, Spread
-from release.stats.counting import Counts, FlightSums
 from release.stats.pixels import Pixels
 
 Cell = str | int | float | None
 Rows = list[list[Cell]]
+Tracks = Sequence[TrackCount]
 Plot = Literal["bars", "heat"]
+FIRST_ANSWER = "none: the first answer was accepted"
 REVIEW_BELOW = 0.5  # of the smoothness score (sec:step6)
 VERDICTS = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
 
@@ -91,20 +94,20 @@ SHAPES: dict[str, tuple[str, str, str, Plot | None]] = {  # of each table: title
 }  # fmt: skip
 
 
-def make_stats(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> Stats:
+def make_stats(record: ReleaseRecord, tracks: Tracks, pixels: Pixels | None) -> Stats:
     """Put the tables together.
 
     Args:
         pixels: of some frames' pictures; None where nobody looked at them.
     """
     tables = [
-        _release(record, counts), _quality(record, counts), _dist(record, counts),
-        *_captions(record, counts), _towns(record, counts), _zoom(counts), _fovs(counts), *weather(counts),
-        *_perturbation(counts), *_pixels(pixels),
+        _release(record, tracks), _quality(record, tracks), _dist(record, tracks),
+        *_captions(record, tracks), _towns(record, tracks), _zoom(tracks), _fovs(tracks), *weather(tracks),
+        *_perturbation(tracks), *_pixels(pixels),
     ]  # fmt: skip
     return Stats(
         name=record.name, runs=[source.run for source in record.provenance.sources], tables=tables,
-        content_digest=record.content_digest, absent=_absent(record, counts, pixels),
+        content_digest=record.content_digest, absent=_absent(record, tracks, pixels),
         rules={"Frames of a flight": record.frame_selection, "Splits": record.splits.rule},
     )  # fmt: skip
 
@@ -132,9 +135,9 @@ def _spread_row(title: str, spread: Spread) -> list[Cell]:
     return [title, spread.mean, spread.std, spread.min, spread.max, spread.count]
 
 
-def _over(flights: Iterable[FlightSums], of: Callable[[FlightSums], Sum]) -> Spread:
-    """Spread over flights of a flight's mean, of those that have one."""
-    means = (of(flight).spread().mean for flight in flights)
+def _over(tracks: Iterable[TrackCount], name: str) -> Spread:
+    """Return the spread over tracks of a track's mean, of those that have one."""
+    means = (track.sums[name].mean for track in tracks)
     return spread_of(mean for mean in means if mean is not None)
 
 
@@ -155,28 +158,30 @@ def percent(count: int, total: int) -> float | None:
 # --- how much, how good -----------------------------------------------------------------------------------------------
 
 
-def _release(record: ReleaseRecord, counts: Counts) -> Table:
-    flights, numbers, planned = counts.flights.values(), record.numbers, record.history.trajectories
-    steps: Cell = ", ".join(f"{step:g}" for step in sorted(counts.step_s)) or None
-    if len(counts.step_s) == 1:
-        steps = next(iter(counts.step_s))  # a number stands where numbers stand
+def _release(record: ReleaseRecord, tracks: Tracks) -> Table:
+    flights, numbers, planned = tracks, record.numbers, record.history.trajectories
+    found = sorted(map(float, total_of(tracks, "step_s")))
+    steps: Cell = found[0] if len(found) == 1 else ", ".join(f"{step:g}" for step in found) or None
     rows: Rows = [["trajectories", numbers.trajectories]]
     rows += _pairs("flights, ", sorted(Counter(flight.track for flight in flights).items()))
     kinds = record.settings.modalities
-    rows += [["walks", len({flight.walk for flight in flights})], ["frames", counts.frames]]
-    rows += [[f"pictures ({', '.join(kinds)})", counts.frames * len(kinds)]]
+    rows += [["walks", len({flight.walk for flight in flights})], ["frames", numbers.frames]]
+    rows += [[f"pictures ({', '.join(kinds)})", numbers.frames * len(kinds)]]
     for when, lengths in (
         ("rendered", [one.frames_available for one in record.flights]), ("released", [one.frames for one in flights]),
     ):  # fmt: skip
         rows += [[f"fewest frames of a track, {when}", min(lengths, default=None)]]
         rows += [[f"most frames of a track, {when}", max(lengths, default=None)]]
-    rows += [["time step, s", steps], *_pairs("frames of ", counts.image_px.most_common())]
+    rows += [
+        ["time step, s", steps],
+        *_pairs("frames of ", ((f"{size} px", n) for size, n in numbers.frames_by.image_px.items())),
+    ]
     each = round(planned.planned / planned.accepted, 2) if planned and planned.accepted else None
     rows += [["captions", numbers.captions.frames_with], ["trajectories planned for one accepted", each]]
     return _table("release", rows)
 
 
-def _quality(record: ReleaseRecord, counts: Counts) -> Table:
+def _quality(record: ReleaseRecord, tracks: Tracks) -> Table:
     planned, flights = record.history.trajectories, record.history.flights
     rows: Rows = []
     if planned is not None:
@@ -185,8 +190,8 @@ def _quality(record: ReleaseRecord, counts: Counts) -> Table:
         rows += [["trajectories rendered", planned.rendered], ["of these accepted", planned.accepted]]
         rows += [["of these to review", planned.review], ["of these rejected", planned.rejected]]
     rows += [["tracks found", flights.found], *_pairs("tracks not released: ", flights.left_out.items())]
-    known, within, scores = smoothness(counts)
-    five_ray = _five_ray(record, counts)
+    known, within, scores = smoothness(tracks)
+    five_ray = _five_ray(record, tracks)
     below = sum(mean < FIVE_RAY_MEAN_MIN for mean in five_ray) if five_ray else None
     rows += [
         ["tracks released", flights.released],
@@ -203,45 +208,44 @@ def _quality(record: ReleaseRecord, counts: Counts) -> Table:
     return _table("quality_stats", rows, note + "perturbation, over frames in a row.")
 
 
-def smoothness(counts: Counts) -> tuple[list[tuple[float, float]], int, list[float]]:
+def smoothness(tracks: Tracks) -> tuple[list[tuple[float, float]], int, list[float]]:
     """Return acceleration and jerk of the trajectories whose motion is known, how many are within the paper's
     bounds, and their scores."""
-    dynamics = [(flight.accel_rms_mps2, flight.jerk_rms_mps3) for flight in _trajectories(counts)]
+    dynamics = [(flight.accel_rms_mps2, flight.jerk_rms_mps3) for flight in _trajectories(tracks)]
     known = [(accel, jerk) for accel, jerk in dynamics if accel is not None and jerk is not None]
     within = sum(accel <= ACCEL_RMS_MAX_MPS2 and jerk <= JERK_RMS_MAX_MPS3 for accel, jerk in known)
     return known, within, [smoothness_score(*pair) for pair in known]
 
 
-def _trajectories(counts: Counts) -> list[FlightSums]:
-    """Return one flight of each trajectory: the clean one where it is released."""
-    chosen: dict[tuple[str, ...], FlightSums] = {}
-    for place, flight in counts.flights.items():
-        held = chosen.get(place[:-1])
-        if held is None or (flight.track == "clean") > (held.track == "clean"):
-            chosen[place[:-1]] = flight
+def _trajectories(tracks: Tracks) -> list[TrackCount]:
+    """Return one track of each trajectory: the clean one where it is released."""
+    chosen: dict[str, TrackCount] = {}
+    for track in sorted(tracks, key=lambda track: track.track != "clean"):
+        chosen.setdefault(track.trajectory, track)
     return list(chosen.values())
 
 
-def _five_ray(record: ReleaseRecord, counts: Counts) -> list[float]:
-    """Return the five-ray visibility of the clean flights, of those that were inspected."""
+def _five_ray(record: ReleaseRecord, tracks: Tracks) -> list[float]:
+    """Return the five-ray visibility of the clean tracks, of those that were inspected."""
     means = {flight.flight: flight.five_ray_mean for flight in record.flights}
-    clean = (means.get("/".join(place)) for place, flight in counts.flights.items() if flight.track == "clean")
+    clean = (means.get(track.name) for track in tracks if track.track == "clean")
     return [bounded(mean) for mean in clean if mean is not None]
 
 
-def _dist(record: ReleaseRecord, counts: Counts) -> Table:
-    flights = _trajectories(counts)
-    known = [flight for flight in flights if flight.is_known]
+def _dist(record: ReleaseRecord, tracks: Tracks) -> Table:
+    flights = _trajectories(tracks)
     rows = [
-        _spread_row("trajectory length, m", spread_of(flight.path_m for flight in known)),
-        _spread_row("altitude above the ground under the person, m", _over(known, lambda flight: flight.height)),
-        _spread_row("target distance, m", _over(known, lambda flight: flight.distance)),
-        _spread_row("rendered visibility", _over(flights, lambda flight: flight.visibility)),
-        _spread_row("five-ray visibility, from the inspection", spread_of(_five_ray(record, counts))),
+        _spread_row(
+            "trajectory length, m", spread_of(flight.length_m for flight in flights if flight.length_m is not None)
+        ),
+        _spread_row("altitude above the ground under the person, m", _over(flights, "clean_altitude_m")),
+        _spread_row("target distance, m", _over(flights, "clean_distance_m")),
+        _spread_row("rendered visibility", _over(flights, "visibility")),
+        _spread_row("five-ray visibility, from the inspection", spread_of(_five_ray(record, tracks))),
     ]
     note = (
         "Means of each trajectory without perturbation: of its clean track, or of its perturbed track minus the "
-        f"recorded offsets. The length is that over {sum(f.frames for f in flights):,} released frames."
+        "recorded offsets. The length is that over all points."
     )
     return _table("dist_stats", rows, note)
 
@@ -249,19 +253,22 @@ def _dist(record: ReleaseRecord, counts: Counts) -> Table:
 # --- captions ---------------------------------------------------------------------------------------------------------
 
 
-def _captions(record: ReleaseRecord, counts: Counts) -> list[Table]:
+def _captions(record: ReleaseRecord, tracks: Tracks) -> list[Table]:
     """What captions say: decisions, verdicts, repairs, lengths."""
-    order = [name for name in (*TOKENS, "none") if counts.labels[name] or counts.decisions[name]]
-    confusion: Rows = [[label, *(counts.confusion[label, decision] for decision in order)] for label in order]
-    repairs = _shares(counts.repairs.most_common(), counts.repairs.total())
+    pairs, repaired = total_of(tracks, "confusion"), total_of(tracks, "repair_strategy")
+    found = {name for pair in pairs for name in pair.split(TAB)}
+    order = [name for name in (*TOKENS, "none") if name in found]
+    confusion: Rows = [[label, *(pairs[f"{label}{TAB}{decision}"] for decision in order)] for label in order]
+    repaired[FIRST_ANSWER] += repaired.pop("none", 0)
+    repairs = _shares((+repaired).most_common(), repaired.total())
     return [
-        _decisions(record, counts), _table("confusion", confusion, more=order), _verdicts(counts),
-        _table("repairs", repairs), _teachers(record), _lengths(counts),
+        _decisions(record, tracks), _table("confusion", confusion, more=order), _verdicts(tracks),
+        _table("repairs", repairs), _teachers(record), _lengths(tracks),
     ]  # fmt: skip
 
 
-def _decisions(record: ReleaseRecord, counts: Counts) -> Table:
-    decisions, labels = counts.decisions, counts.labels
+def _decisions(record: ReleaseRecord, tracks: Tracks) -> Table:
+    decisions, labels = total_of(tracks, "decision"), total_of(tracks, "label")
     total, labelled = decisions.total(), labels.total() - labels["none"]
     rows: Rows = []
     for name in (*TOKENS, *sorted(decisions.keys() - {*TOKENS, "none"})):
@@ -272,14 +279,15 @@ def _decisions(record: ReleaseRecord, counts: Counts) -> Table:
     return _table("decisions", rows, note)
 
 
-def _verdicts(counts: Counts) -> Table:
-    tracks = sorted({track for _, track in counts.verdicts})
-    names = [*VERDICTS, *sorted({name for name, _ in counts.verdicts} - set(VERDICTS))]
-    own = {name: [counts.verdicts[name, track] for track in tracks] for name in names}
-    total = counts.verdicts.total()
+def _verdicts(tracks: Tracks) -> Table:
+    kinds = sorted({track.track for track in tracks})
+    by_kind = {kind: total_of((track for track in tracks if track.track == kind), "verdict") for kind in kinds}
+    names = [*VERDICTS, *sorted({name for counts in by_kind.values() for name in counts} - set(VERDICTS))]
+    own = {name: [by_kind[kind][name] for kind in kinds] for name in names}
+    total = sum(map(sum, own.values()))
     rows: Rows = [[name, sum(each), percent(sum(each), total), *each] for name, each in own.items()]
     note = "Of accepted captions, after repair; the figure of the paper shows first answers, before repair."
-    return _table("verdicts", rows, note, tracks)
+    return _table("verdicts", rows, note, kinds)
 
 
 def _teachers(record: ReleaseRecord) -> Table:
@@ -291,25 +299,30 @@ def _teachers(record: ReleaseRecord) -> Table:
     return _table("teachers", rows, "From release.json, over all captions that were read.")
 
 
-def _lengths(counts: Counts) -> Table:
+def _lengths(tracks: Tracks) -> Table:
     rows = list[list[Cell]]()
     for language in LANGUAGES:
         for name in FIELDS[:2]:
             least = (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS)[name]
             title = f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}"
-            rows.append([*_spread_row(title, counts.lengths[language, name].spread()), least])
+            rows.append(
+                [
+                    *_spread_row(title, Sum.all(track.sums[f"caption_{language}_{name}"] for track in tracks).spread()),
+                    least,
+                ]
+            )
     return _table("text_lengths", rows, "Characters. The last column is the smallest accepted length.")
 
 
 # --- frames -----------------------------------------------------------------------------------------------------------
 
 
-def _towns(record: ReleaseRecord, counts: Counts) -> Table:
+def _towns(record: ReleaseRecord, tracks: Tracks) -> Table:
     frames, captions = Counter[str](), Counter[str]()
-    for flight in counts.flights.values():
+    for flight in tracks:
         frames[flight.town] += flight.frames
         captions[flight.town] += flight.captions
-    trajectories = Counter(flight.town for flight in _trajectories(counts))
+    trajectories = Counter(flight.town for flight in _trajectories(tracks))
     maps = {one.town: f"{one.name} ({one.licence})" for one in record.maps}
     rows: Rows = [
         [town, trajectories[town], frames[town], captions[town], maps.get(town, "")] for town in sorted(frames)
@@ -317,14 +330,13 @@ def _towns(record: ReleaseRecord, counts: Counts) -> Table:
     return _table("towns", rows)
 
 
-def _zoom(counts: Counts) -> Table:
-    groups: dict[tuple[float, str], list[FlightSums]] = defaultdict(list)
-    for flight in counts.flights.values():
+def _zoom(tracks: Tracks) -> Table:
+    groups: dict[tuple[float, str], list[TrackCount]] = defaultdict(list)
+    for flight in tracks:
         groups[_fov_of(flight), flight.track].append(flight)
     rows: Rows = []
     for (fov, track), flights in sorted(groups.items(), key=lambda pair: (-pair[0][0], pair[0][1])):
-        sizes = [_over(flights, of).mean for of in (lambda f: f.width_px, lambda f: f.height_px)]
-        visibility, iou = (_over(flights, of).mean for of in (lambda f: f.visibility, lambda f: f.iou))
+        *sizes, visibility, iou = (_over(flights, of).mean for of in ("width_px", "height_px", "visibility", "iou"))
         focal_px = _mean(flight.focal_px for flight in flights if flight.focal_px is not None) if fov else None
         level = LEVEL_NAMES.get(round(fov), "") if fov else "changing"
         seen = None if visibility is None else 100.0 * visibility
@@ -339,24 +351,26 @@ def _zoom(counts: Counts) -> Table:
     return _table("zoom_eval", rows, note + (f" Not in this release: {missing}." if missing else ""))
 
 
-def _fovs(counts: Counts) -> Table:
+def _fovs(tracks: Tracks) -> Table:
     frames = Counter[float]()
-    for flight in counts.flights.values():
+    for flight in tracks:
         frames[_fov_of(flight)] += flight.frames
-    trajectories = Counter(map(_fov_of, _trajectories(counts)))
+    trajectories = Counter(map(_fov_of, _trajectories(tracks)))
     rows: Rows = [[f"{fov:g}" if fov else "changing", trajectories[fov], frames[fov]] for fov in sorted(frames)]
     return _table("fovs", rows)
 
 
-def _fov_of(flight: FlightSums) -> float:
+def _fov_of(flight: TrackCount) -> float:
     """Return its field of view, degrees; 0 for one that zooms."""
     return 0.0 if flight.zooms else round(flight.fov_deg, 1)
 
 
-def weather(counts: Counts) -> list[Table]:
+def weather(tracks: Tracks) -> list[Table]:
     """Return frames by preset and time of day, where a frame names one."""
     tables = []
-    named = Counter({(_token(a), _token(b)): n for (a, b), n in counts.weather.items() if (a, b) != (None, None)})
+    named = Counter[tuple[str, ...]]()
+    for sky, count in total_of(tracks, "sky").items():
+        named[tuple(map(_token, sky.split(TAB)))] += count
     if named:
         presets = [*WEATHERS, *sorted({weather for weather, _ in named} - set(WEATHERS))]
         times = [*TIMES, *sorted({time for _, time in named} - set(TIMES))]
@@ -366,20 +380,21 @@ def weather(counts: Counts) -> list[Table]:
     return tables
 
 
-def _token(text: str | None) -> str:
-    return "not told" if text is None else preset_token(text)
+def _token(text: str) -> str:
+    return preset_token(text) if text else "not known"
 
 
-def _perturbation(counts: Counts) -> list[Table]:
-    tables = []
-    if total := counts.states.total():
+def _perturbation(tracks: Tracks) -> list[Table]:
+    tables, states, events = [], total_of(tracks, "states"), Counter[tuple[str, ...]]()
+    if total := states.total():
         order = ("unperturbed", "position only", "rotation only", "full")
-        rows: Rows = _shares(((state, counts.states[state]) for state in order), total)
+        rows: Rows = _shares(((state, states[state]) for state in order), total)
         note = "Frames of perturbed tracks by the kind of their recorded offsets, after fallbacks, so fewer "
         tables += [_table("augmentation_states", rows, note + "frames are perturbed than were drawn.")]
-    if counts.events:
-        events: Rows = [[*names, count] for names, count in sorted(counts.events.items())]
-        tables += [_table("events", events)]
+    for track in tracks:
+        events.update({(track.track, *event.split(TAB)): count for event, count in track.counts["events"].items()})
+    if events:
+        tables += [_table("events", [[*names, count] for names, count in sorted(events.items())])]
     return tables
 
 
@@ -397,9 +412,9 @@ def _pixels(pixels: Pixels | None) -> list[Table]:
     return [*tables, *([_table("semantics", kinds, note)] if kinds else [])]
 
 
-def _absent(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> list[Absent]:
+def _absent(record: ReleaseRecord, tracks: Tracks, pixels: Pixels | None) -> list[Absent]:
     """Name what the paper has and this release cannot tell."""
-    no_weather = all(weather is None and time is None for weather, time in counts.weather)
+    no_weather = not total_of(tracks, "sky")
     table = [
         (True, "the same tracks at four fields of view", "tab:zoom_eval",
          "it needs rendering, because each track of a release has one field of view"),
@@ -407,11 +422,11 @@ def _absent(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> lis
          "a release contains no map; see simplify_report.json"),
         (True, "verdicts of first answers", "fig:consistency_verdict",
          "a release contains accepted captions only; see caption_report.json"),
-        (not _five_ray(record, counts), "five-ray visibility of the planner", "tab:dist_stats, tab:quality_stats",
+        (not _five_ray(record, tracks), "five-ray visibility of the planner", "tab:dist_stats, tab:quality_stats",
          "no track of this release was inspected with its map"),
         (no_weather, "weather and time of day, 15 x 4", "tab:weather_coverage",
          "no frame of this release names a preset"),
-        (not counts.events, "fallbacks of the perturbation", "sec:exp_render, app:dual_track",
+        (not total_of(tracks, "events"), "fallbacks of the perturbation", "sec:exp_render, app:dual_track",
          "no frame of this release records the outcome"),
         (pixels is None, "percentiles of depth, kinds in the pictures", "sec:step6",
          "the pictures were not read; pass --pixels"),

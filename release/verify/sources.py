@@ -1,16 +1,12 @@
-"""Read rows and pictures of flights from the shards of a release or from a playback tree, in worker processes."""
+"""The tracks of a shard of a release, or one of a playback tree, as a worker reads them: rows, points and pictures."""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import groupby
-from operator import itemgetter
+from itertools import islice
 from pathlib import Path
-from typing import Any
-
-import pyarrow as pa
+from typing import NamedTuple
 
 from cosfly.formats.frames import FILE_NAMES, FrameFile, frame_path
 from cosfly.formats.places import Place, flight_ids
@@ -18,179 +14,111 @@ from cosfly.formats.playback import Track, read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import read_bytes
-from cosfly.runtime.tables import open_table, read_row_group, row_batches
-from release.columns import PICTURES, PLACE, POINT_NAMES, SCALAR_NAMES, SCALARS, Placement, flight_name, flight_spans
-from release.flight_rows import FlightRows, Row
+from cosfly.runtime.tables import open_table, row_batches
+from release.columns import PICTURES, SCALARS, Placement
+from release.flight_rows import FlightRows
+from release.reading import read_tracks
 from release.record import Shard
 
 BATCH_ROWS = 2  # whose pictures are in memory at once
 Pictures = dict[FrameFile, bytes | memoryview | None]
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A flight of a source. parts, points: where its rows and points are, in the source's own terms."""
+class ReadTrack(NamedTuple):
+    """One track. pictures: Of its frames, one after the other."""
 
-    name: str
-    parts: tuple[Any, ...]
-    num_rows: int
-    points: tuple[Any, ...] = ()
-    given_id: str | None = None
-
-    @property
-    def place(self) -> Place:
-        return Place(*self.name.split("/"))
+    frames: FlightRows
+    points: FlightRows
+    pictures: Iterator[Pictures]
 
 
-def with_ids(entries: list[Entry]) -> list[Entry]:
-    """Return the entries with what their sample ids must begin with; None where two flights have one name."""
+def sample_prefixes(names: list[str]) -> dict[str, str]:
+    """Return with what the sample ids of each track, `run/town/trajectory/variant`, begin; empty if names repeat."""
     try:
-        ids = flight_ids([entry.place for entry in entries])
+        places = {name: Place(*name.split("/")) for name in names}
+        ids = flight_ids(list(places.values()))
     except (InputError, TypeError):
-        return entries
-    return [replace(entry, given_id=ids[entry.place]) for entry in entries]
-
-
-# --- shards -----------------------------------------------------------------------------------------------------------
+        return {}
+    return {name: ids[place] for name, place in places.items()}
 
 
 @dataclass(frozen=True)
-class Shards:
-    """Parquet files of a release folder. A part is (shard, row group, first row, row behind the last)."""
+class ShardTracks:
+    """The tracks of one shard. ids: As `sample_prefixes` gives them."""
 
     folder: Path
+    shard: Shard
     files: tuple[FrameFile, ...]
+    ids: dict[str, str]
 
-    def entries(self, shards: list[Shard]) -> list[Entry]:
-        """Find which rows are of which flight, in the order in which they stand.
+    def __iter__(self) -> Iterator[ReadTrack]:
+        """Yield the tracks; all pictures of one must be taken before the next one."""
+        pictures = self._pictures()
+        for frames, points in read_tracks(self.folder, self.shard, strict=False):
+            given_id = self.ids.get(frames.name)
+            yield ReadTrack(
+                replace(frames, given_id=given_id), replace(points, given_id=given_id), islice(pictures, len(frames))
+            )
 
-        Raises:
-            InputError: a shard cannot be read.
-        """
-        parts = self._parts([shard.path for shard in shards])
-        points = self._parts([shard.points.path for shard in shards])
-        entries = [
-            Entry(name, tuple(own), sum(end - begin for *_, begin, end in own), tuple(points.get(name, ())))
-            for name, own in parts.items()
-            if name.count("/") == len(PLACE) - 1
-        ]
-        return with_ids(entries)
-
-    def _parts(self, names: list[str]) -> dict[str, list[tuple[str, int, int, int]]]:
-        parts: dict[str, list[tuple[str, int, int, int]]] = defaultdict(list)
-        for name in names:
-            path = self.folder / name
-            with open_table(path, tree=self.folder) as table:
-                for group in range(table.num_row_groups):
-                    places = read_row_group(path, table, group, list(PLACE))
-                    for place, begin, end in flight_spans(places):
-                        parts[flight_name(place)].append((name, group, begin, end))
-        return parts
-
-    def rows(self, entry: Entry) -> list[Row]:
-        return self._rows(entry.parts, SCALAR_NAMES)
-
-    def points(self, entry: Entry) -> list[Row]:
-        return self._rows(entry.points, POINT_NAMES)
-
-    def _rows(self, parts: tuple[Any, ...], names: Sequence[str]) -> list[Row]:
-        found: list[Row] = []
-        for path, table, group, begin, end in self._groups(parts):
-            own = read_row_group(path, table, group, list(names))
-            try:
-                found += own.slice(begin, end - begin).to_pylist()
-            except ValueError as error:
-                raise InputError("a column is not valid text", where=path, got=str(error)) from None
-        return found
-
-    def pictures(self, entry: Entry) -> Iterator[Pictures]:
+    def _pictures(self) -> Iterator[Pictures]:
         names = {file: PICTURES[file].name for file in self.files}
-        for path, table, group, begin, end in self._groups(entry.parts):
-            row = 0
-            for batch in row_batches(path, table, group, list(names.values()), BATCH_ROWS):
-                yield from pictures_of(batch, names)[max(begin - row, 0) : max(end - row, 0)]
-                row += len(batch)
-                if row >= end:
-                    break
-
-    def _groups(self, parts: tuple[Any, ...]) -> Iterator[tuple[Path, Any, int, int, int]]:
-        """Yield where a flight's rows are: file, the same opened once, row group, first row, row behind the last."""
-        for shard, own in groupby(parts, key=itemgetter(0)):
-            path = self.folder / shard
-            with open_table(path, tree=self.folder) as table:
-                for _, group, begin, end in own:
-                    yield path, table, group, begin, end
-
-
-def pictures_of(batch: pa.RecordBatch, names: dict[FrameFile, str]) -> list[Pictures]:
-    """Return the pictures of a batch's rows. names: of their columns."""
-    values = {file: batch.column(name).to_pylist() for file, name in names.items()}
-    return [
-        {file: cells[i]["bytes"] if isinstance(cells[i], dict) else cells[i] for file, cells in values.items()}
-        for i in range(len(batch))
-    ]
-
-
-# --- a playback tree --------------------------------------------------------------------------------------------------
+        path = self.folder / self.shard.path
+        with open_table(path, tree=self.folder) as table:
+            for group in range(table.num_row_groups):
+                for batch in row_batches(path, table, group, list(names.values()), BATCH_ROWS):
+                    cells = {file: batch.column(name).to_pylist() for file, name in names.items()}
+                    for i in range(len(batch)):
+                        row = {file: column[i] for file, column in cells.items()}
+                        yield {file: cell["bytes"] if isinstance(cell, dict) else cell for file, cell in row.items()}
 
 
 @dataclass(frozen=True)
-class TreeFlights:
-    """A playback tree, ours or the public one. A part is the flight's folder, relative to the tree."""
+class TreeTrack:
+    """One track of a playback tree, ours or the public one. folder: Relative to the tree."""
 
-    folder: Path
+    tree: Path
+    folder: str
+    name: str
     files: tuple[FrameFile, ...]
+    ids: dict[str, str]
 
-    @classmethod
-    def found(cls, folder: Path) -> tuple[TreeFlights, list[Entry]]:
-        """Find the flights of a tree; of the kinds of pictures, those that any frame of it has.
-
-        Raises:
-            InputError: it is none.
-        """
-        folders = find_tracks(folder)
-        frames = [frame for flight in folders for frame in sorted(flight.glob("frames_playback/*"))[:1]]
-        files = (file for file, name in FILE_NAMES.items() if any(frame_path(frame, name).exists() for frame in frames))
-        tree = cls(folder, tuple(files))
-        entries = []
-        for path in folders:
-            *above, town, trajectory, variant = ("", "", "", *path.relative_to(folder).parts)
-            name = "/".join(("_".join(filter(None, above)), town, trajectory, variant))
-            entries.append(Entry(name, (path.relative_to(folder).as_posix(),), 0))
-        return tree, with_ids(entries)
-
-    def rows(self, entry: Entry) -> list[Row]:
-        flight = replace(self._flight(entry), run=entry.place.run)
-        nobody = Placement(walk="", split="train")  # who made the split and told the walks is not said in a tree
-        rows = [{column.name: column.cell(flight, i, None, nobody) for column in SCALARS} for i in range(len(flight))]
-        for i, row in enumerate(rows):
+    def __iter__(self) -> Iterator[ReadTrack]:
+        track = replace(read_track(self.tree / self.folder, strict=False), run=self.name.split("/")[0])
+        nowhere = Placement(walk="", split="train")  # a tree has no splits
+        rows = []
+        for i in range(len(track)):
+            row = {column.name: column.cell(track, i, None, nowhere) for column in SCALARS}
             row |= {"walk": None, "split": None}
-            if entry.given_id:
-                row["sample_id"] = f"{entry.given_id}_frame_{i:05d}"
-        return rows
+            if given_id := self.ids.get(self.name):
+                row["sample_id"] = f"{given_id}_frame_{i:05d}"
+            rows.append(row)
+        frames = FlightRows(self.name, rows, self.ids.get(self.name))
+        yield ReadTrack(frames, frames, self._pictures(track))
 
-    def points(self, entry: Entry) -> list[Row]:
-        return self.rows(entry)
-
-    def pictures(self, entry: Entry) -> Iterator[Pictures]:
-        flight = self._flight(entry)
-        for i in range(len(flight)):
-            paths = {file: frame_path(flight.frame_folder(i), FILE_NAMES[file]) for file in self.files}
+    def _pictures(self, track: Track) -> Iterator[Pictures]:
+        for i in range(len(track)):
+            paths = {file: frame_path(track.frame_folder(i), FILE_NAMES[file]) for file in self.files}
             yield {
-                file: read_bytes(path, what="file of the frame", tree=self.folder) if path.is_file() else None
+                file: read_bytes(path, what="file of the frame", tree=self.tree) if path.is_file() else None
                 for file, path in paths.items()
             }
 
-    def _flight(self, entry: Entry) -> Track:
-        return read_track(self.folder / entry.parts[0], strict=False)
+
+TrackSource = ShardTracks | TreeTrack
 
 
-FlightSource = Shards | TreeFlights
+def tracks_of_tree(tree: Path) -> list[TreeTrack]:
+    """Find the tracks of a tree; of the kinds of pictures, those that any of its first frames has.
 
-
-def flight_rows(source: FlightSource, entry: Entry) -> FlightRows:
-    return FlightRows(entry.name, source.rows(entry), entry.given_id)
-
-
-def point_rows(source: FlightSource, entry: Entry) -> FlightRows:
-    return FlightRows(entry.name, source.points(entry), entry.given_id)
+    Raises:
+        InputError: It is no tree.
+    """
+    folders = find_tracks(tree)
+    frames = [frame for folder in folders for frame in sorted(folder.glob("frames_playback/*"))[:1]]
+    files = tuple(file for file, name in FILE_NAMES.items() if any(frame_path(f, name).exists() for f in frames))
+    names = {}
+    for path in folders:
+        *above, town, trajectory, variant = ("", "", "", *path.relative_to(tree).parts)
+        names["/".join(("_".join(filter(None, above)), town, trajectory, variant))] = path.relative_to(tree).as_posix()
+    ids = sample_prefixes(list(names))
+    return [TreeTrack(tree, folder, name, files, ids) for name, folder in names.items()]

@@ -40,7 +40,6 @@ from cosfly.viz.frame_views import (
 )  # fmt: skip
 from cosfly.viz.page import page, scripts
 from cosfly.viz.topview import footprint
-from release.card.numbers import bounded, check_columns, check_rows, row_lists
 from release.columns import (
     BOX,
     CAPTION,
@@ -58,6 +57,7 @@ from release.columns import (
     caption_values,
     scalar_row,
 )  # fmt: skip
+from release.reading import bounded, check_columns, check_rows, row_lists
 from release.record import ReleaseRecord, read_record
 
 Place = tuple[str, ...]  # PLACE

@@ -1,9 +1,11 @@
-"""Check one flight in a worker process: its rows, its captions, its pictures."""
+"""Check the tracks of a shard or tree in a worker process: rows, points, captions, pictures."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -14,14 +16,15 @@ from cosfly.formats.frames import LEGIBLE_CONTRAST, LEGIBLE_HEIGHT_PX, LEGIBLE_S
 from cosfly.formats.shown_captions import CaptionReader
 from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.runtime.errors import InputError, shown
+from cosfly.runtime.io import sha256_file
 from cosfly.runtime.worker import Item, Outcome
 from release.columns import CAPTION, CAPTION_NAMES, LANGUAGES, POINT_NAMES, REQUIRED, SCALARS, TARGET_PICTURE, WINDOW
+from release.counting import count_track
 from release.flight_rows import FlightRows, Row
 from release.record import ReleaseRecord
-from release.verify.across import summary_of
 from release.verify.findings import Findings
 from release.verify.scene import check_pictures
-from release.verify.sources import Entry, FlightSource, flight_rows, point_rows
+from release.verify.sources import ReadTrack, ShardTracks, TrackSource
 
 PIXEL_PX = 0.5  # a target's pixel: half a pixel is the most that another convention of pixel centres shifts it
 DEPTH_M = 0.02  # z-depth of the target: rounded to centimetres at worst
@@ -133,33 +136,30 @@ def _check_flags(flight: FlightRows, findings: Findings) -> None:
 
 CONSTANT = [column.name for column in SCALARS if column.constant]
 ZOOMED = ("fov_deg", "intrinsics")  # but of a camera that zooms; check_geometry looks at each row
-CLOSED = {column.name: column.words for column in SCALARS if column.words}
+CLOSED = {c.name: TOKENS if c.words == "actions" else c.words for c in SCALARS if c.words}
 RANGES = {column.name: column.ranges for column in SCALARS if column.ranges}
 LARGEST = 1e7  # of any number: farther than any town reaches, m
 
 
-def check_identity(flight: FlightRows, findings: Findings) -> None:
-    """Check ids, names, constants, closed sets, ranges and nulls of a flight's rows."""
+def check_identity(flight: FlightRows, findings: Findings, elsewhere: Collection[str] = ()) -> None:
+    """Check ids, names, constants, closed sets, ranges and nulls of a track's rows; not of the columns `elsewhere`."""
     _check_names(flight, findings)
-    for name in CONSTANT:
+    for name in (name for name in CONSTANT if name not in elsewhere):
         column = flight.column(name)
         differs = [value != column[0] and not (flight.zooms and name in ZOOMED) for value in column]
         if any(differs):
             i = differs.index(True)
-            findings.error(
-                "constant", flight.where(i, name), column[i], f"{column[0]}, as in the first row of the track"
-            )
-    closed = {name: TOKENS if words == "actions" else words for name, words in CLOSED.items()}
+            expected = f"{column[0]}, as in the first row of the track"
+            findings.error("constant", flight.where(i, name), column[i], expected)
     for i, row in enumerate(flight.rows):
-        for name in (name for name in REQUIRED if name in row and row[name] is None):
-            findings.error("null", flight.where(i, name), "null", "a value in every row")
-        for name, allowed in closed.items():
-            value = row.get(name)
-            if value is not None and value not in allowed:
+        for name in (name for name in row if name not in elsewhere):
+            value, allowed = row[name], CLOSED.get(name, ())
+            if value is None and name in REQUIRED:
+                findings.error("null", flight.where(i, name), "null", "a value in every row")
+            elif value is not None and allowed and value not in allowed:
                 expected = f"one of {len(allowed)} words: {', '.join(allowed[:4])} ..."
                 findings.error("closed_set", flight.where(i, name), repr(value), expected)
-        for name, value in row.items():
-            if isinstance(value, float | dict):
+            elif isinstance(value, float | dict):
                 _check_numbers(flight, i, name, value, findings)
 
 
@@ -269,90 +269,110 @@ SENSELESS = (ValueError, KeyError, TypeError, IndexError, ArithmeticError, Attri
 
 @dataclass(frozen=True)
 class Context:
-    """What the record says that the checks of flights need. by_town: splits
-    share no town either. both: every flight's twin is released too. captions: by run the settings of its caption
-    stage, if its source has one."""
+    """What the record says that the checks of tracks need. captions: By run, the settings of its caption stage, if its
+    source has one."""
 
     window_frames: int | None = None
-    by_town: bool = False
-    both: bool = False
     captions: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     @classmethod
     def of_record(cls, record: ReleaseRecord) -> Context:
-        asked, captions = record.settings, dict[str, dict[str, Any]]()
+        captions = dict[str, dict[str, Any]]()
         for source in record.provenance.sources:
             own = [stage.config for stage in source.stages if stage.stage == "caption"]
             captions[source.run] = own[0] if len(own) == 1 else {}
-        both = asked.pairs == "both" and len(asked.tracks) == 2
-        return cls(asked.window_frames, record.splits.by == "town", both, captions)
+        return cls(record.settings.window_frames, captions)
 
     def caption_settings(self, flight: FlightRows) -> dict[str, Any]:
-        """Return the settings of a flight's captions; folders above a town are part of a run's name."""
+        """Return the settings of a track's captions; folders above a town are part of a run's name."""
         name = flight.name.split("/")[0]
         runs = [run for run in self.captions if name == run or name.startswith(f"{run}_")]
         return self.captions[max(runs, key=len)] if runs else {}
 
 
 def make_worker(
-    source: FlightSource, level: Level, context: Context, reader: CaptionReader | None
+    level: Level, context: Context, reader: CaptionReader | None, digests: Mapping[str, str]
 ) -> Callable[[Item], Outcome]:
-    """Worker factory: return the function that checks one flight and returns its summary, None if it is unreadable."""
+    """Worker factory: return the function that checks the tracks of a source in one pass, and returns their counts.
+
+    Args:
+        digests: sha256 by file, compared at the level `pixels`.
+    """
 
     def work(item: Item) -> Outcome:
-        findings, summary = Findings(), None
-        entry, clean = item.payload  # the clean flight of a perturbed one
+        findings, counts = Findings(), list[dict[str, Any]]()
+        source: TrackSource = item.payload
+        clean: FlightRows | None = None  # the points of the clean track of this trajectory
         try:
-            flight, points = flight_rows(source, entry), point_rows(source, entry)
-            twin = point_rows(source, clean) if clean is not None else None
-            if not len(flight) or not len(points):
-                raise InputError("the track has no rows or no points", got=f"{len(flight)} and {len(points)}")
-            _check_flight(flight, points, twin, source, entry, level, context, reader, findings)
-            summary = vars(summary_of(flight, len(points)))
+            for track in source:
+                if track.points.is_clean:
+                    clean = track.points
+                is_twin = clean is not None and clean.name.rpartition("/")[0] == track.frames.name.rpartition("/")[0]
+                twin = clean if is_twin and not track.points.is_clean else None
+                _check_track(track, twin, level, context, reader, findings)
+                with _reported(track.frames.name, findings):
+                    counts.append(count_track(track.frames, track.points).model_dump())
+            if level == "pixels":
+                check_digests(source, digests, findings)
         except InputError as error:
-            findings.error("unreadable", entry.name, f"{error.what}: {error.got}", "a track that can be read")
+            where = str(error.where or item.item_id)
+            findings.error("unreadable", where, f"{error.what}: {error.got}", "tracks that can be read")
         except SENSELESS as error:
-            findings.error("senseless", entry.name, f"{type(error).__name__}: {error}", "rows that can be read")
-        return Outcome({"findings": findings.dumped(), "summary": summary})
+            findings.error("senseless", item.item_id, f"{type(error).__name__}: {error}", "rows that can be read")
+        return Outcome({"findings": findings.dumped(), "counts": counts})
 
     return work
 
 
-def _check_flight(
-    flight: FlightRows,
-    points: FlightRows,
+def check_digests(source: TrackSource, digests: Mapping[str, str], findings: Findings) -> None:
+    """Compare the checksums of the files of a shard with the list."""
+    if isinstance(source, ShardTracks):
+        for name in (source.shard.path, source.shard.points.path):
+            if name in digests and (found := sha256_file(source.folder / name, tree=source.folder)) != digests[name]:
+                findings.error("checksum", name, found, digests[name])
+
+
+@contextmanager
+def _reported(name: str, findings: Findings) -> Iterator[None]:
+    """Report values that make a check impossible."""
+    try:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            yield
+    except (InputError, *SENSELESS) as error:
+        findings.error("senseless", name, f"{type(error).__name__}: {error}", "values to compute with")
+
+
+def _check_track(
+    track: ReadTrack,
     twin: FlightRows | None,
-    source: FlightSource,
-    entry: Entry,
     level: Level,
     context: Context,
     reader: CaptionReader | None,
     findings: Findings,
 ) -> None:
-    """Run all checks of a flight; a value that makes a check impossible is a finding."""
+    """Run all checks of a track."""
+    frames, points, pictures = track
 
     def read_captions() -> None:
-        shown = flight.shown(points, twin, context.caption_settings(flight))
-        for lie in reader(shown) if reader is not None else ():
-            findings.error(*lie)
+        shown = frames.shown(points, twin, context.caption_settings(frames))
+        for mismatch in reader(shown) if reader is not None else ():
+            findings.error(*mismatch)
 
     checks: list[Callable[[], None]] = [
-        lambda: check_identity(flight, findings),
-        lambda: check_geometry(flight, findings),
-        lambda: check_captions(flight, context.window_frames, findings),
+        lambda: check_identity(points, findings),
+        lambda: check_geometry(points, findings),
+        lambda: check_captions(frames, context.window_frames, findings),
         read_captions,
     ]
-    if points.rows is not flight.rows and entry.points:
+    if points is not frames:
         checks += [
-            lambda: check_points(flight, points, findings),
-            lambda: check_identity(points, findings),
-            lambda: check_geometry(points, findings),
+            lambda: check_identity(frames, findings, elsewhere=POINT_NAMES),
+            lambda: check_points(frames, points, findings),
         ]
     if level == "pixels":
-        checks.append(lambda: check_pictures(flight, source.pictures(entry), findings))
+        checks.append(lambda: check_pictures(frames, pictures, findings))
     for check in checks:
-        try:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                check()
-        except SENSELESS as error:
-            findings.error("senseless", flight.name, f"{type(error).__name__}: {error}", "values to compute with")
+        with _reported(frames.name, findings):
+            check()
+    if level == "pixels":
+        deque(pictures, maxlen=0)  # those that a failed check has not read
