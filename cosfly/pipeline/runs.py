@@ -6,6 +6,7 @@ import contextlib
 import math
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from cosfly.formats.inspection import undecided
-from cosfly.formats.pedestrian_paths import read_paths, walk_id
+from cosfly.formats.pedestrian_paths import walk_id
 from cosfly.formats.traces import read_traces
 from cosfly.maps.stage import load_map
 from cosfly.pipeline.settings import RunConfig
@@ -128,21 +129,19 @@ def _stage(name: str, folder: Path) -> StageSummary:
 # --- estimates --------------------------------------------------------------------------------------------------------
 
 # Measured in `cosfly run showcase` (docs/first-runs.md; 2 cores, AMD EPYC, idle): 3 pedestrians, 858 frames of
-# 0.9216 Mpx, 804 windows by `rules`. Rates of frames are per million pixels.
+# 0.9216 Mpx, 804 windows by `rules`. Rates of frames are per million pixels; their disk space is that of `quickstart`.
 BASIS = "`cosfly run showcase` on a 2-core machine (docs/first-runs.md)"
 RATES = {  # stage: unit, seconds per unit, MB per unit
     "maps": ("map", 0.2, 1.1),
     "simplify": ("map", 5.6, 1.2),
     "pedestrians": ("pedestrians", 4.6 / 3, 0.3 / 3),
     "plan": ("pedestrians", 2.3 / 3, 0.4 / 3),
-    "render": ("frames", 51.2 / 790.7, 4383 / 790.7),
+    "render": ("frames", 51.2 / 790.7, 1.95),
     "inspect": ("frames", 8.3 / 790.7, 0.7 / 790.7),
     "caption": ("windows", 4.0 / 804, 7.4 / 804),
-    "release": ("frames", 7.8 / 790.7, 1842 / 790.7),
+    "release": ("frames", 7.8 / 790.7, 1.95),
 }
-# Measured ratio of the frames of a trajectory to those of the straight line between its ends (50 to 100 m at 1.2 m/s
-# with 2 frames/s: 143).
-DETOUR = 1.14
+SAMPLED_FRAMES = 4  # of each track, drawn to measure the disk space of a frame
 MOST_LISTED = 4  # trajectories named in a remark
 
 
@@ -162,50 +161,87 @@ class StageEstimate:
         return f"{self.count:,} {RATES[self.name.rpartition('/')[2]][0]}"
 
 
+@dataclass(frozen=True)
+class Sample:
+    """What a run will draw: the number of frames of each trajectory, and the size of a frame; None if not measured."""
+
+    frames: list[int]
+    frame_bytes: float | None
+
+
 def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
-    """Estimate each stage of a run; with several towns, each stage of each town, and then the release."""
+    """Estimate each stage of a run; with several towns, each stage of each town, and then the release.
+
+    The maps are made, the pedestrians and drones planned, and a few frames drawn, in a temporary folder; stages that
+    are complete in `out` are not repeated.
+    """
     if not cfg.towns:
-        return list(_estimates(cfg, out, STAGES))
-    rows: list[StageEstimate] = []
+        sample = take_sample(cfg, out)
+        return [*_estimates(cfg, out, sample, STAGES[:-1]), _release(cfg, out, [sample])]
+    rows, samples = list[StageEstimate](), list[Sample]()
     for name in cfg.towns:
-        town_rows = _estimates(cfg.of_town(name), out / name, STAGES[:-1])
+        town = cfg.of_town(name)
+        samples.append(take_sample(town, out / name))
+        town_rows = _estimates(town, out / name, samples[-1], STAGES[:-1])
         rows += [replace(row, name=f"{name}/{row.name}") for row in town_rows]
-    num_frames = sum(row.count for row in rows if row.name.endswith("/render"))
-    return [*rows, _estimate("release", num_frames, cfg, out)]
+    return [*rows, _release(cfg, out, samples)]
 
 
-def _estimates(cfg: RunConfig, out: Path, names: tuple[str, ...]) -> Iterator[StageEstimate]:
-    pedestrians = cfg.pedestrians
+def take_sample(cfg: RunConfig, out: Path) -> Sample:
+    """Plan the trajectories of a run without towns, and draw some of their frames."""
+    if _is_complete(out / "render"):
+        return Sample(_planned(out, cfg.render.frame_stride), None)
+    from cosfly.pipeline.run import run  # it imports this module
+
+    draws = cfg.render.backend in ("gl", "pyrender")  # not a simulator, which may not be there
+    with tempfile.TemporaryDirectory(prefix="cosfly-estimate-") as place:
+        scratch = Path(place) / "run"
+        run(cfg, scratch, until="plan")
+        frames = _planned(scratch, cfg.render.frame_stride)
+        if not draws or not frames:
+            return Sample(frames, None)
+        stride = math.ceil(max(frames) * cfg.render.frame_stride / SAMPLED_FRAMES)
+        few = cfg.model_copy(update={"render": cfg.render.model_copy(update={"frame_stride": stride})})
+        run(few, scratch, until="render")
+        pictures = list((scratch / "render").rglob("frames_playback/*/*"))
+        num_drawn = len({picture.parent for picture in pictures})
+        return Sample(frames, sum(picture.stat().st_size for picture in pictures) / num_drawn)
+
+
+def _planned(run: Path, stride: int) -> list[int]:
+    """Return the number of frames of each planned trajectory."""
+    traces = read_traces(run / "plan/drone_trace.json")
+    return [math.ceil(len(trace.time_s) / stride) for trace in traces if trace.drop_reason is None]
+
+
+def _estimates(cfg: RunConfig, out: Path, sample: Sample, names: tuple[str, ...]) -> Iterator[StageEstimate]:
     window = cfg.caption.window
-    frames = _frames_by_trajectory(cfg, out)
     # Number of frames of each trajectory at which a whole window can begin.
-    num_starts = [max(0, count - window.num_frames + 1 - window.future_frames) for count in frames]
+    num_starts = [max(0, count - window.num_frames + 1 - window.future_frames) for count in sample.frames]
     num_windows = sum(math.ceil(count / window.stride) for count in num_starts)
     num_tracks = len(cfg.render.tracks)
     counts = {
         "map": 1,
-        "pedestrians": pedestrians.num_paths,
-        "frames": sum(frames) * num_tracks,
+        "pedestrians": cfg.pedestrians.num_paths,
+        "frames": sum(sample.frames) * num_tracks,
         "windows": num_windows * num_tracks,
     }
     for name in names:
-        yield _estimate(name, counts[RATES[name][0]], cfg, out)
+        row = _estimate(name, counts[RATES[name][0]], cfg, out)
+        if name == "render" and sample.frame_bytes is not None:
+            row = replace(row, bytes=row.count * sample.frame_bytes)
+        yield row
 
 
-def _frames_by_trajectory(cfg: RunConfig, out: Path) -> list[int]:
-    """Return the number of frames of each trajectory: from the plans if they are complete, else an estimate."""
-    pedestrians = cfg.pedestrians
-    stride = cfg.render.frame_stride
-    paths = out / "pedestrians/path.json"
-    traces = out / "plan/drone_trace.json"
-    is_planned = _is_complete(paths.parent) and _is_complete(traces.parent)
-    if is_planned and len(read_paths(paths)) == pedestrians.num_paths:
-        accepted = [trace for trace in read_traces(traces) if trace.drop_reason is None]
-        if accepted:
-            return [math.ceil(len(trace.time_s) / stride) for trace in accepted]
-    distance_m = (pedestrians.min_distance_m + pedestrians.max_distance_m) / 2
-    straight = distance_m / pedestrians.cruise_speed_mps / pedestrians.dt_s / stride
-    return [round(DETOUR * straight)] * pedestrians.num_paths
+def _release(cfg: RunConfig, out: Path, samples: list[Sample]) -> StageEstimate:
+    """Estimate the release of all towns: the selected frames, whose pictures are as large as those of the trees."""
+    most, num_tracks = cfg.release.num_frames, len(set(cfg.release.tracks) & set(cfg.render.tracks))
+    is_all = cfg.release.selection == "all"
+    counts = [sum(n if is_all else min(n, most) for n in sample.frames) * num_tracks for sample in samples]
+    row = _estimate("release", sum(counts), cfg, out)
+    sizes = [count * (sample.frame_bytes or 0.0) for count, sample in zip(counts, samples, strict=True)]
+    is_known = not row.is_done and all(sample.frame_bytes is not None for sample in samples)
+    return replace(row, bytes=sum(sizes)) if is_known else row
 
 
 def _estimate(name: str, count: int, cfg: RunConfig, out: Path) -> StageEstimate:
