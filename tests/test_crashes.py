@@ -68,6 +68,7 @@ def test_a_product_without_its_records_that_another_stage_would_take_is_found(tm
 @pytest.mark.parametrize("asked", [
     pytest.param(("caption prompts",), id="at every step"),
     pytest.param(("maps",), id="of a stage", marks=pytest.mark.slow),
+    pytest.param(("--few", "run"), id="of a run", marks=pytest.mark.timeout(1800)),
     pytest.param(("--few", "--twice", *OF_A_RUN), id="twice", marks=pytest.mark.timeout(1800)),
 ])  # fmt: skip
 @pytest.mark.slow

@@ -162,7 +162,7 @@ class StageEstimate:
 
 
 @dataclass(frozen=True)
-class Sample:
+class RunSample:
     """What a run will draw: the number of frames of each trajectory, and the size of a frame; None if not measured."""
 
     frames: list[int]
@@ -178,7 +178,7 @@ def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
     if not cfg.towns:
         sample = take_sample(cfg, out)
         return [*_estimates(cfg, out, sample, STAGES[:-1]), _release(cfg, out, [sample])]
-    rows, samples = list[StageEstimate](), list[Sample]()
+    rows, samples = list[StageEstimate](), list[RunSample]()
     for name in cfg.towns:
         town = cfg.of_town(name)
         samples.append(take_sample(town, out / name))
@@ -187,10 +187,10 @@ def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
     return [*rows, _release(cfg, out, samples)]
 
 
-def take_sample(cfg: RunConfig, out: Path) -> Sample:
+def take_sample(cfg: RunConfig, out: Path) -> RunSample:
     """Plan the trajectories of a run without towns, and draw some of their frames."""
     if _is_complete(out / "render"):
-        return Sample(_planned(out, cfg.render.frame_stride), None)
+        return RunSample(_planned(out, cfg.render.frame_stride), None)
     from cosfly.pipeline.run import run  # it imports this module
 
     draws = cfg.render.backend in ("gl", "pyrender")  # not a simulator, which may not be there
@@ -199,13 +199,13 @@ def take_sample(cfg: RunConfig, out: Path) -> Sample:
         run(cfg, scratch, until="plan")
         frames = _planned(scratch, cfg.render.frame_stride)
         if not draws or not frames:
-            return Sample(frames, None)
+            return RunSample(frames, None)
         stride = math.ceil(max(frames) * cfg.render.frame_stride / SAMPLED_FRAMES)
         few = cfg.model_copy(update={"render": cfg.render.model_copy(update={"frame_stride": stride})})
         run(few, scratch, until="render")
         pictures = list((scratch / "render").rglob("frames_playback/*/*"))
         num_drawn = len({picture.parent for picture in pictures})
-        return Sample(frames, sum(picture.stat().st_size for picture in pictures) / num_drawn)
+        return RunSample(frames, sum(picture.stat().st_size for picture in pictures) / num_drawn)
 
 
 def _planned(run: Path, stride: int) -> list[int]:
@@ -214,7 +214,7 @@ def _planned(run: Path, stride: int) -> list[int]:
     return [math.ceil(len(trace.time_s) / stride) for trace in traces if trace.drop_reason is None]
 
 
-def _estimates(cfg: RunConfig, out: Path, sample: Sample, names: tuple[str, ...]) -> Iterator[StageEstimate]:
+def _estimates(cfg: RunConfig, out: Path, sample: RunSample, names: tuple[str, ...]) -> Iterator[StageEstimate]:
     window = cfg.caption.window
     # Number of frames of each trajectory at which a whole window can begin.
     num_starts = [max(0, count - window.num_frames + 1 - window.future_frames) for count in sample.frames]
@@ -233,7 +233,7 @@ def _estimates(cfg: RunConfig, out: Path, sample: Sample, names: tuple[str, ...]
         yield row
 
 
-def _release(cfg: RunConfig, out: Path, samples: list[Sample]) -> StageEstimate:
+def _release(cfg: RunConfig, out: Path, samples: list[RunSample]) -> StageEstimate:
     """Estimate the release of all towns: the selected frames, whose pictures are as large as those of the trees."""
     most, num_tracks = cfg.release.num_frames, len(set(cfg.release.tracks) & set(cfg.render.tracks))
     is_all = cfg.release.selection == "all"
