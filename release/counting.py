@@ -20,7 +20,7 @@ from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.weather import preset_token
 from cosfly.geometry.axes import box_iou
 from cosfly.geometry.coverage import Coverage
-from release.columns import CAPTION_FIELDS, COUNTED, VALUE_COLUMNS
+from release.columns import CAPTION_FIELDS, COUNTED, LANGUAGES, VALUE_COLUMNS
 from release.flight_rows import FlightRows
 from release.reading import bounded, read_tracks
 from release.record import Shard, Spread
@@ -38,7 +38,8 @@ STATES = {  # shifted, turned
 COLUMNS = (
     "sample_id", "track", "split", "walk", "pair", "style", "pace", "weather", "time_of_day", "frame_index", "width_px",
     "height_px", "fov_deg", "intrinsics", "pose", "drone_offset", "target", "target_offset", "target_heading_deg",
-    "target_bbox", "target_mask_bbox", "visibility", "perturbation", *FLAGS, *COUNTED, *VALUE_COLUMNS, *CAPTION_FIELDS,
+    "target_bbox", "target_mask_bbox", "visibility", "perturbation", "action", *FLAGS, *COUNTED, *VALUE_COLUMNS,
+    *CAPTION_FIELDS,
 )  # fmt: skip
 
 
@@ -203,6 +204,9 @@ def _counts(frames: FlightRows, points: FlightRows, captioned: list[dict[str, An
     rows, track = frames.rows, str(frames.rows[0]["track"])
     counts = {name: Counter(row[name] or "none" for row in captioned) for name in COUNTED}
     counts["flags"] = Counter(name for row in rows for name in FLAGS if row[name])
+    counts["flags"]["action"] = sum(row["action"] is not None for row in rows)
+    for language in LANGUAGES:
+        counts["flags"][language] = sum(row[f"caption_{language}_reasoning_trace"] is not None for row in captioned)
     counts["flags"]["legible_told"] = sum(row["target_legible"] is not None for row in rows)
     counts["flags"]["with_label"] = sum(row["label"] is not None for row in captioned)
     agrees = (row["label"] is not None and row["decision"] == row["label"] for row in captioned)

@@ -25,7 +25,7 @@ def run(
     job: Job,
     config: Annotated[Path, Argument(help=CONFIG)],
     out: Annotated[Path | None, Option(show_default="runs/<name>", help="Run directory.")] = None,
-    dry_run: Annotated[bool, Option("--dry-run", help="Estimate time and disk by stage and write nothing.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Estimate time and disk by stage; write nothing there.")] = False,
     until: Annotated[Until, Option(help="Last stage to run.")] = "release",
 ) -> None:
     """Make a data set from a configuration: run all stages in order. Repeat the command to resume."""

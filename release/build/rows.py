@@ -11,7 +11,6 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel
 
 from cosfly.formats.frames import FILE_NAMES, FrameFile, as_depth_npy, frame_path
-from cosfly.formats.places import sample_id
 from cosfly.formats.playback import Track
 from release import columns
 from release.columns import PICTURES, Placement
@@ -37,45 +36,27 @@ class Rows:
 
     def __init__(self, writer: pq.ParquetWriter, plan: ShardPlan) -> None:
         self._writer, self._plan = writer, plan
-        self._pictures: dict[FrameFile, list[bytes]] = {file: [] for file in PICTURES if file in plan.files}
-        self._scalars: list[dict[str, Any]] = []
-        self._paths: list[str] = []
+        self._rows: list[dict[str, Any]] = []
         self._num_bytes = 0
 
-    def add(self, scalars: dict[str, Any], pictures: dict[FrameFile, bytes], flight: Track, i: int) -> None:
-        """Add a frame."""
+    def add(self, row: dict[str, Any], pictures: dict[FrameFile, bytes], track: Track, i: int) -> None:
+        """Add a frame and its pictures."""
         for file, data in pictures.items():
             if file == "depth":
-                data = as_depth_npy(data, frame_path(flight.frame_folder(i), FILE_NAMES["depth"]))
-            self._pictures[file].append(data)
+                data = as_depth_npy(data, frame_path(track.frame_folder(i), FILE_NAMES["depth"]))
+                row[PICTURES[file].name] = data
+            else:
+                row[PICTURES[file].name] = {"bytes": data, "path": f"{row['sample_id']}_{FILE_NAMES[file]}"}
             self._num_bytes += len(data)
-        self._scalars.append(scalars)
-        self._paths.append(sample_id(flight.flight_id, i))
-        if self._num_bytes >= self._plan.row_group_bytes or len(self._scalars) >= MOST_ROWS:
+        self._rows.append(row)
+        if self._num_bytes >= self._plan.row_group_bytes or len(self._rows) >= MOST_ROWS:
             self.flush()
 
     def flush(self) -> None:
-        if not self._scalars:
-            return
-        schema = columns.schema(self._plan.files)
-        arrays = [
-            self._array(file, data, schema.field(PICTURES[file].name).type) for file, data in self._pictures.items()
-        ]
-        scalars = pa.Table.from_pylist(
-            self._scalars, schema=pa.schema([schema.field(name) for name in columns.SCALAR_NAMES])
-        )
-        table = pa.Table.from_arrays([*arrays, *scalars.columns], schema=schema)
-        self._writer.write_table(table, row_group_size=table.num_rows)
-        for column in self._pictures.values():
-            column.clear()
-        self._scalars, self._paths, self._num_bytes = [], [], 0
-
-    def _array(self, file: FrameFile, pictures: list[bytes], kind: pa.DataType) -> pa.Array:
-        values = pa.array(pictures, pa.binary())
-        if not pa.types.is_struct(kind):
-            return values
-        paths = pa.array([f"{stem}_{FILE_NAMES[file]}" for stem in self._paths], pa.string())
-        return pa.StructArray.from_arrays([values, paths], fields=list(kind))
+        if self._rows:
+            table = pa.Table.from_pylist(self._rows, schema=columns.schema(self._plan.files))
+            self._writer.write_table(table, row_group_size=table.num_rows)
+            self._rows, self._num_bytes = [], 0
 
 
 def open_writer(sink: str | IO[bytes], schema: pa.Schema) -> pq.ParquetWriter:

@@ -137,7 +137,7 @@ def write_shard(path: Path, parts: Sequence[FlightPart], plan: ShardPlan) -> Sha
     problems = _Problems()
     flights: list[ReleasedPart] = []
     of_points = points_part(path)
-    with atomic_file(path) as file, atomic_file(of_points) as points:
+    with atomic_file(of_points) as points, atomic_file(path) as file:
         with open_writer(file, columns.schema(plan.files)) as writer, points_writer(points) as add_points:
             rows = Rows(writer, plan)
             for part in parts:

@@ -177,7 +177,14 @@ def _release(record: ReleaseRecord, tracks: Tracks) -> Table:
         *_pairs("frames of ", ((f"{size} px", n) for size, n in numbers.frames_by.image_px.items())),
     ]
     each = round(planned.planned / planned.accepted, 2) if planned and planned.accepted else None
-    rows += [["captions", numbers.captions.frames_with], ["trajectories planned for one accepted", each]]
+    flags, why = total_of(tracks, "flags"), record.history.captions.frames_without
+    rows += [["captions", numbers.captions.frames_with]]
+    rows += [[f"captions in {LANGUAGE_NAMES[language]}", flags[language]] for language in LANGUAGES]
+    rows += _pairs("frames without a caption: ", why.items())
+    rows += [["tracks whose other track is released too (`pair`)", sum(one.pair is not None for one in tracks)]]
+    rows += [["frames with an action (`action`, of the planned motion)", flags["action"]]]
+    depth = record.depth and f"{record.depth.coding}, {record.depth.unit}, sky {record.depth.sky:g}"
+    rows += [["depth", depth or "not released"], ["trajectories planned for one accepted", each]]
     return _table("release", rows)
 
 
