@@ -64,7 +64,7 @@ class ReleaseConfig(Config):
     shard_mb: int = Field(
         500,
         ge=1,
-        description="approximate size of a parquet file before compression, MB; exceeded by at most one track",
+        description="approximate size of a parquet file before compression, MB; exceeded by at most one trajectory",
     )
     row_group_mb: int = Field(
         64, ge=1, le=1024, description="size of a row group before compression, MB; viewers load one at a time"

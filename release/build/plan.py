@@ -68,7 +68,7 @@ class PlannedShard:
 
 
 def plan_shards(sizes: Sequence[int], target_bytes: int) -> list[list[int]]:
-    """Group consecutive flights: a shard is closed as soon as it reaches the target."""
+    """Group consecutive trajectories: a shard is closed as soon as it reaches the target."""
     groups: list[list[int]] = []
     total = 0
     for index, size in enumerate(sizes):
@@ -108,16 +108,22 @@ def _size(path: Path) -> int:
 def shards_of(
     flights: list[tuple[Surveyed, FlightCaptions, int, int]], placements: dict[str, Placement], target_bytes: int
 ) -> list[PlannedShard]:
-    """Return the shards in the order of the release: split by split, and in each the flights as they come.
+    """Return the shards in the order of the release: split by split, and in each whole trajectories, both tracks of one
+    next to each other.
 
     Args:
         flights: each with its captions, number of selected frames, and their bytes.
     """
     shards: list[PlannedShard] = []
     for split in SPLIT_NAMES:
-        own = [entry for entry in flights if placements[entry[0].name].split == split]
-        for number, group in enumerate(plan_shards([entry[3] for entry in own], target_bytes)):
-            members = [own[index] for index in group]
+        trajectories = defaultdict[str, list[tuple[Surveyed, FlightCaptions, int, int]]](list)
+        for entry in flights:
+            if placements[entry[0].name].split == split:
+                trajectories[entry[0].candidate.trajectory].append(entry)
+        own = list(trajectories.values())
+        sizes = [sum(entry[3] for entry in tracks) for tracks in own]
+        for number, group in enumerate(plan_shards(sizes, target_bytes)):
+            members = [entry for index in group for entry in own[index]]
             parts = [FlightPart(f.candidate, placements[f.name], captions) for f, captions, *_ in members]
             named = "".join(f"{f.name} {placements[f.name]} {frames} {size}\n" for f, _, frames, size in members)
             name = f"{split}-{number:05d}-{hashlib.sha256(named.encode()).hexdigest()[:12]}"
