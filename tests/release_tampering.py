@@ -5,7 +5,6 @@ import shutil
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from io import BytesIO
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +34,7 @@ from release.record import (
 from release.verify.verify import verify
 
 Row = dict[str, Any]
+CONSTANT = [column.name for column in columns.POINTS if column.constant]
 
 
 def _nothing(rows: list[Row]) -> None:
@@ -62,7 +62,9 @@ def forge(
     tables = [pq.read_table(dataset / shard.points.path).to_pylist() for shard in record.shards]
     of_row = _points_of(shards, tables)
     change([row for rows in shards for row in rows])
-    for row, point in of_row:  # the points of changed rows say the same
+    for row, point, track in of_row:  # the points of changed rows say the same
+        for other in track:
+            other.update({name: row[name] for name in CONSTANT})
         point.update({name: row[name] for name in point})
     shutil.rmtree(out, ignore_errors=True)
     entries = []
@@ -105,11 +107,13 @@ def _stored(path: Path) -> StoredFile:
     return StoredFile(path=str(path), rows=rows, bytes=path.stat().st_size, sha256=sha256_file(path))
 
 
-def _points_of(shards: list[list[Row]], tables: list[list[Row]]) -> list[tuple[Row, Row]]:
-    """Return each row with its point."""
-    key = itemgetter(*columns.PLACE, "frame_index")
-    found = {key(point): point for points in tables for point in points}
-    return [(row, found[key(row)]) for rows in shards for row in rows]
+def _points_of(shards: list[list[Row]], tables: list[list[Row]]) -> list[tuple[Row, Row, list[Row]]]:
+    """Return each row with its point and all points of its track."""
+    tracks: dict[tuple, list[Row]] = defaultdict(list)
+    for point in (point for points in tables for point in points):
+        tracks[tuple(point[name] for name in columns.PLACE)].append(point)
+    of_rows = [(row, tracks[tuple(row[name] for name in columns.PLACE)]) for rows in shards for row in rows]
+    return [(row, track[row["frame_index"]], track) for row, track in of_rows]
 
 
 def _finished(out: Path, values: dict[str, Any], change_record: Callable[[dict[str, Any]], None]) -> Path:
