@@ -103,8 +103,7 @@ def test_the_target_grows_as_the_lens_does(tmp_path_factory, in_this_process):
     sets = [word for setting in settings.split() for word in ("--set", setting)]
     result = CliRunner().invoke(app, [*words.split(), "--workers", "0", *sets])
     assert result.exit_code == 0, result.output
-    studied = folder / "out", result.output
-    out, _ = studied
+    out = folder / "out"
     found = json.loads((out / "zoom_study.json").read_text())
     levels = found["levels"]
     assert [level["fov_deg"] for level in levels] == LEVELS

@@ -193,8 +193,10 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
 
 def small_run(name: str) -> dict[str, Any]:
     value = yaml.safe_load(shipped(f"{name}.yaml").read_text(encoding="utf-8"))
-    value.setdefault("pedestrians", {}).update(num_paths=2, min_distance_m=25, max_distance_m=40)
+    value.setdefault("pedestrians", {}).update(num_paths=2, min_distance_m=15, max_distance_m=25)
     value.setdefault("render", {}).update(width_px=160, height_px=90)
+    if "towns" in value:
+        value["render"].update(frame_stride=2)
     value.setdefault("maps", {}).setdefault("synthetic", {}).update(size_m=150, num_blocks=1)
     value.get("distill", {}).get("train", {}).pop("random_student", None)  # the smallest there is
     value["towns"] = dict(list(value.get("towns", {}).items())[:2])
