@@ -209,7 +209,8 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "release export webdataset": ["release export {release} --format webdataset --out {out} --workers 1"],
     "release export lerobot": ["release export {release} --format lerobot --out {out} --workers 1"],
     "release stats": ["release stats {release} --out {out}"],
-    "release export captions": ["release export {base} --format csv --out {out}/captions.csv"],
+    "release export chat": ["release export {base} --format chat --out {out} --workers 1"],
+    "release export coco": ["release export {base} --format coco --out {out} --workers 1"],
     "distill prepare": [
         "distill prepare --captions {students}/captions.jsonl --data {students}/tree --out {out} "
         "--set distill.prepare.unbound=accept"

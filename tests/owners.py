@@ -19,7 +19,8 @@ UNREACHABLE = (
     *("Network is unreachable", "Max retries exceeded"),
 )
 _LIGHT = (
-    "draccus==0.10.0 mergedeep==1.3.4 typing-inspect==0.9.0 mypy_extensions==1.1.0 pyyaml-include==1.4.1 toml==0.10.2"
+    "draccus==0.10.0 mergedeep==1.3.4 typing-inspect==0.9.0 mypy_extensions==1.1.0 pyyaml-include==1.4.1 toml==0.10.2 "
+    "pyserial==3.5 deepdiff==8.6.1 orderly-set==5.5.0"
 )
 _OF_LEROBOT = (
     "torchvision==0.28.0 jsonlines==4.0.0 attrs==25.3.0 einops==0.8.1 termcolor==3.1.0 huggingface_hub==0.35.3"

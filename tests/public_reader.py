@@ -24,10 +24,15 @@ def need(condition: Any, where: object, what: str) -> None:
         raise Refused(f"{where}: {what}")
 
 
-def read_public(root: Path) -> dict[str, dict[str, dict]]:
+def read_public(root: Path, *, exported: bool = False) -> dict[str, dict[str, dict]]:
+    """Read a tree. exported: Demand also the forms of fields that the public files have."""
     parents = sorted(root.glob("Town*/trajectory_*"))
     need(parents, root, "no Town*/trajectory_*")
-    return {parent.relative_to(root).as_posix(): _parent(parent) for parent in parents}
+    trees = {parent.relative_to(root).as_posix(): _parent(parent) for parent in parents}
+    for name, traces in trees.items() if exported else ():
+        for trace, payload in traces.items():
+            _forms(payload, root / name / trace)
+    return trees
 
 
 def _parent(parent: Path) -> dict[str, dict]:
@@ -64,6 +69,17 @@ def _trace(folder: Path, trace: str) -> dict:
             need(image.size == (camera["width"], camera["height"]), picture, f"size {image.size}")
             image.verify()
     return payload
+
+
+def _forms(payload: dict, folder: Path) -> None:
+    need(payload["dataset_format"] == "v7", folder, "dataset_format")
+    source = payload["source"]
+    need(all(type(source[key]) is int for key in ("path_index", "scenario_id")), folder, "source")
+    need(all(type(source[key]) is str for key in ("scenario_name", "algorithm")), folder, "source")
+    for i, point in enumerate(payload["points"]):
+        flags = [point["perturbation"][key] for key in ("drone_position", "drone_rotation")]
+        need(all(type(flag) is bool for flag in (point["is_perturbed"], *flags)), folder, f"flags {i}")
+        need(folder.joinpath("frames_playback", f"frame_{i:05d}", "depth.npy").is_file(), folder, f"depth {i}")
 
 
 def _point(point: dict, following: dict | None, where: str) -> None:

@@ -1,12 +1,15 @@
-"""Opens a data set with LeRobot itself and prints as JSON what it sees; run where LeRobot is installed."""
+"""Opens a data set with LeRobot itself, gives ACT a batch, and prints as JSON what it sees; run where LeRobot is."""
 
 import hashlib
 import json
 import os
 import sys
+import types
+from pathlib import Path
 
 os.environ["HF_HUB_OFFLINE"] = "1"
 
+import av
 import torch
 from torch import library as operators
 
@@ -16,7 +19,9 @@ if torch.version.cuda is None:
     for name in ("nms", "qnms"):
         library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 
+from lerobot.datasets import lerobot_dataset, utils
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils import import_utils
 
 
 def digest(values: torch.Tensor) -> str:
@@ -35,7 +40,50 @@ def look(item: dict) -> dict:
     return seen
 
 
+def decode_by_pyav(path: Path, times_s: list[float], tolerance_s: float, *_) -> torch.Tensor:
+    """Return the frames nearest to some times; stands in for torchcodec, which needs a system's FFmpeg."""
+    with av.open(str(path)) as file:
+        frames = [(frame.time, torch.from_numpy(frame.to_ndarray(format="rgb24"))) for frame in file.decode(video=0)]
+    nearest = [min(frames, key=lambda frame: abs(frame[0] - time_s)) for time_s in times_s]
+    assert all(abs(found - time_s) < tolerance_s for (found, _), time_s in zip(nearest, times_s, strict=True))
+    return torch.stack([picture for _, picture in nearest]).permute(0, 3, 1, 2) / 255
+
+
+lerobot_dataset.decode_video_frames = decode_by_pyav
+
+
+def act_loss(root: str) -> float:
+    """Return the loss of a small random ACT on a batch of pictures, states and the next four actions."""
+    import_utils._transformers_available = False  # the one of the tests is for another huggingface_hub
+    policies = types.ModuleType("lerobot.policies")  # the package itself imports what other policies need
+    policies.__path__ = [str(Path(import_utils.__file__).parents[1] / "policies")]
+    sys.modules["lerobot.policies"] = policies
+    from lerobot.configs.types import FeatureType
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+    meta = LeRobotDataset("cosfly/flights", root=root).meta
+    features = utils.dataset_to_policy_features(meta.features)
+    outputs = {name: one for name, one in features.items() if one.type is FeatureType.ACTION}
+    seen = (FeatureType.VISUAL, FeatureType.STATE)
+    inputs = {name: one for name, one in features.items() if one.type in seen and name.startswith("observation.")}
+    cfg = ACTConfig(
+        input_features=inputs, output_features=outputs, chunk_size=4, n_action_steps=4, dim_model=32, n_heads=2,
+        dim_feedforward=32, n_encoder_layers=1, pretrained_backbone_weights=None, device="cpu",
+    )  # fmt: skip
+    steps = {"action": [k / meta.fps for k in range(4)]}
+    data = LeRobotDataset("cosfly/flights", root=root, delta_timestamps=steps)
+    loss, _ = ACTPolicy(cfg).forward(next(iter(torch.utils.data.DataLoader(data, batch_size=2))))
+    return loss.item()
+
+
 def main(root: str, *indices: str) -> None:
+    if not indices:
+        constants = {"version": lerobot_dataset.CODEBASE_VERSION, "chunk": utils.DEFAULT_CHUNK_SIZE}
+        constants |= {"data": utils.DEFAULT_DATA_PATH, "episodes": utils.DEFAULT_EPISODES_PATH}
+        constants |= {"video": utils.DEFAULT_VIDEO_PATH, "defaults": sorted(utils.DEFAULT_FEATURES)}
+        print("LOOK " + json.dumps(constants | {"loss": act_loss(root)}))
+        return
     data = LeRobotDataset("cosfly/flights", root=root)
     stats = {name: {kind: values.tolist() for kind, values in one.items()} for name, one in data.meta.stats.items()}
     windows = LeRobotDataset("cosfly/flights", root=root, delta_timestamps={"observation.state": [-0.5, 0.0]})

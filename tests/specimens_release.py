@@ -26,7 +26,8 @@ from cosfly.runtime.config import load
 from release.build.config import ReleaseConfig
 from release.build.sources import Source
 from release.build.stage import run
-from release.export.source import open_release, read_span, scan
+from release.columns import schema
+from release.export.source import open_release
 from specimens import make_playback_tree
 
 NUM_POINTS = 12
@@ -125,10 +126,9 @@ def rewrite_captions(root: Path, change) -> None:
 
 
 def rows_by_id(dataset: Path) -> dict[str, dict]:
-    release = open_release(dataset)
-    return {
-        row["sample_id"]: row for flight in scan(release) for span in flight.spans for row in read_span(release, span)
-    }
+    source = open_release(dataset)
+    columns = schema(source.modalities).names
+    return {row["sample_id"]: row for track in source.tracks for row in track.rows(columns)}
 
 
 def all_bytes(folder: Path) -> dict[str, bytes]:

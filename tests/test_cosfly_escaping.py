@@ -181,7 +181,9 @@ def test_a_card_shows_forged_texts(tree, inspection, tmp_path):
     from release.build.stage import run
 
     captions = caption(CaptionConfig(), tree, tmp_path / "caption")
-    folder = run(ReleaseConfig(licence="mit", pairs="any"), [Source.of_files(tree, captions, inspection)], tmp_path / "release")
+    folder = run(
+        ReleaseConfig(licence="mit", pairs="any"), [Source.of_files(tree, captions, inspection)], tmp_path / "release"
+    )
     folder = folder if folder.is_dir() else folder.parent
     value = read_json(folder / "release.json")
     record = ReleaseRecord.model_validate({k: v for k, v in value.items() if k not in ("schema", "schema_version")})

@@ -26,11 +26,14 @@ from cosfly.runtime.io import CHECKSUMS, read_checksums, sha256_file
 from cosfly.runtime.json_io import read_model
 from cosfly.runtime.png import colours_of
 from release.columns import POSE
-from release.export.contract import FORMATS, ExportConfig
-from release.export.lerobot import runs_of, states
-from release.export.source import ReleasedRows, Span, open_release, scan
-from release.export.stage import EXPORT_FORMAT, ExportRecord
+from release.export.lerobot import CHUNK, DATA_PATH, DEFAULTS, EPISODES_PATH, VERSION, VIDEO_PATH, states
+from release.export.source import open_release
+from release.export.stage import EXPORT_FORMAT, EXPORTS, ExportConfig, ExportRecord
 from release.export.stage import run as export
+from release.record import read_record
+from specimens import PERSON_ID
+
+TEXTS = ("goal_says", "perturbation")  # joined to one text
 
 
 def config(format: str, **more) -> ExportConfig:
@@ -76,56 +79,60 @@ def test_tree_to_release_to_tree_loses_nothing(whole, dataset, tmp_path):
         assert read_checksums(b) == {
             p.relative_to(b).as_posix(): sha256_file(p) for p in b.rglob("*") if p.is_file() and p.name != CHECKSUMS
         }
-    assert len(read_public(product)) == 3  # the strictest public reader
+    assert len(read_public(product, exported=True)) == 3  # the strictest public reader
     about = read_model(product / "export.json", ExportRecord, EXPORT_FORMAT)
     assert about.coordinates["handedness"] == "left"
     assert read_town_map(product / "Town01").licence == about.maps[0].licence
 
 
-def test_webdataset_holds_every_row_and_byte(dataset, tmp_path):
-    product = export(config("webdataset"), dataset, tmp_path / "out")
-    rows = rows_by_id(dataset)
-    seen = set()
-    for shard in sorted(product.glob("*.tar")):
-        with tarfile.open(shard) as tar:
-            names = tar.getnames()
-            keys = [name.partition(".")[0] for name in names]
-            assert keys == [key for key in dict.fromkeys(keys) for _ in range(4)]  # the files of a frame stand together
-            assert names == [
-                f"{key}.{end}"
-                for key in dict.fromkeys(keys)
-                for end in ("depth.npy", "instance.png", "json", "rgb.png")
-            ]
-            assert all(member.mtime == 0 and member.uid == 0 for member in tar)
-            for key in dict.fromkeys(keys):
-                row = rows[key]
-                assert tar.extractfile(f"{key}.rgb.png").read() == row["image"]["bytes"]
-                assert tar.extractfile(f"{key}.instance.png").read() == row["instance"]["bytes"]
-                assert tar.extractfile(f"{key}.depth.npy").read() == row["depth"]
-                pictures = ("image", "depth", "instance", "target_picture")
-                scalars = {name: value for name, value in row.items() if name not in pictures}
-                assert json.loads(tar.extractfile(f"{key}.json").read()) == scalars
-                seen.add(key)
-    assert seen == rows.keys()
-
-
 def test_webdataset_opens_it(dataset, tmp_path):
-    wds = pytest.importorskip("webdataset", reason="extra dev")
+    """Both libraries, whose first rows have no caption, find every value of the release."""
+    datasets, wds = pytest.importorskip("datasets"), pytest.importorskip("webdataset", reason="extra dev")
     product = export(config("webdataset"), dataset, tmp_path / "out")
-    shards = sorted(str(path) for path in product.glob("*.tar"))
-    rows = rows_by_id(dataset)
+    shards, rows = sorted(str(path) for path in product.glob("*.tar")), rows_by_id(dataset)
+    with tarfile.open(shards[0]) as tar:
+        assert all(member.mtime == 0 and member.uid == 0 for member in tar)
     samples = list(wds.WebDataset(shards, shardshuffle=False).decode("rgb8"))
     assert [sample["__key__"] for sample in samples] == list(rows)
-    sample, row = samples[3], list(rows.values())[3]
-    assert (sample["rgb.png"] == colours_of(row["image"]["bytes"], "x")).all()
-    assert (sample["depth.npy"] == np.load(io.BytesIO(row["depth"]))).all()
-    assert sample["json"]["pose"] == row["pose"]
+    found = datasets.load_dataset("webdataset", data_files=shards, split="train", cache_dir=str(tmp_path / "cache"))
+    for sample, other, row in zip(samples, found, rows.values(), strict=True):
+        assert (sample["rgb.png"] == colours_of(row["image"]["bytes"], "x")).all()
+        assert (np.asarray(other["rgb.png"]) == sample["rgb.png"]).all()
+        assert (sample["instance.png"] == colours_of(row["instance"]["bytes"], "x")).all()
+        assert (sample["depth.npy"] == np.load(io.BytesIO(row["depth"]))).all()
+        assert sample["json"] == other["json"]
+        for name, value in row.items():
+            if name in sample["json"]:
+                assert sample["json"][name] == ("" if value is None else value) or name in TEXTS
+            elif name not in ("image", "depth", "instance", "target_picture"):
+                numbers = list(value.values()) if isinstance(value, dict) else value
+                found_numbers = sample[f"{name}.npy"]
+                np.testing.assert_array_equal(found_numbers, other[f"{name}.npy"])
+                if value is None:
+                    assert np.isnan(found_numbers).all()
+                else:
+                    assert found_numbers.tolist() == (numbers if isinstance(numbers, list) else [numbers])
 
 
-def flight_of(frames: list[int]) -> ReleasedRows:
-    flight = ReleasedRows("r", "Town01", "trajectory_1", "ORI", "train", [Span("s", 0, 0, len(frames))])
-    flight.frames, flight.times = [np.array(frames, dtype=np.int32)], [np.array(frames) * 0.5]
-    return flight
+def test_coco_opens_it(dataset, tmp_path):
+    """pycocotools finds the pixels of instance.png, and the target by its id."""
+    coco_api = pytest.importorskip("pycocotools.coco", reason="extra dev")
+    product = export(config("coco"), dataset, tmp_path / "out")
+    coco, rows = coco_api.COCO(product / "annotations/instances_train.json"), rows_by_id(dataset)
+    assert len(coco.imgs) == len(rows)
+    for image in coco.imgs.values():
+        row = rows[image["file_name"].removesuffix(".png")]
+        assert (product / "train" / image["file_name"]).read_bytes() == row["image"]["bytes"]
+        red, green, blue = np.moveaxis(colours_of(row["instance"]["bytes"], "x").astype(int), 2, 0)
+        ids = np.where(red == 12, green + 256 * blue, -1)
+        annotations = coco.loadAnns(coco.getAnnIds(image["id"]))
+        assert {one["instance_id"] for one in annotations} == {*np.unique(ids).tolist()} - {-1}
+        for one in annotations:
+            mask, (x, y, width, height) = ids == one["instance_id"], one["bbox"]
+            assert (coco.annToMask(one) == mask).all()
+            assert one["area"] == mask.sum() == mask[y : y + height, x : x + width].sum()
+            is_target = one["instance_id"] == PERSON_ID
+            assert coco.cats[one["category_id"]]["name"] == ("target" if is_target else "other person")
 
 
 def test_a_state_is_the_motion_that_led_to_a_frame():
@@ -139,19 +146,21 @@ def test_a_state_is_the_motion_that_led_to_a_frame():
 
 @pytest.mark.slow
 def test_a_flight_with_gaps_is_several_episodes(tmp_path, tmp_path_factory):
-    spread = make_release(tmp_path_factory.mktemp("spread"), num_frames=8, window=1)
-    product = export(config("lerobot"), spread, tmp_path / "out")
+    spread = make_release(tmp_path_factory.mktemp("spread"), num_frames=8)
+    with pytest.raises(InputError, match=r"the chat export needs consecutive frames.*release\.selection=windows"):
+        export(config("chat"), spread, tmp_path / "chat")
+    parts = make_release(tmp_path_factory.mktemp("parts"), num_frames=10, window=2, selection="windows")
+    product = export(config("lerobot"), parts, tmp_path / "out")
     info = json.loads((product / "meta/info.json").read_text())
     episodes = pq.read_table(product / "meta/episodes").to_pylist()
-    frames = [flight.frame_index for flight in scan(open_release(spread))]
-    runs = [stop - start for index in frames for start, stop in runs_of(flight_of(index.tolist()))]
+    runs = [stop - start for track in open_release(parts).tracks for start, stop in track.runs()]
     assert [row["length"] for row in sorted(episodes, key=lambda row: row["episode_index"])] == runs
-    assert info["total_episodes"] == len(runs) > 6
-    assert info["total_frames"] == 48
+    assert info["total_episodes"] == len(runs)
+    assert info["total_frames"] == 60
 
 
 def test_splits_reach_every_format(two_splits, tmp_path):
-    numbers = open_release(two_splits).record.splits.splits
+    numbers = read_record(two_splits / "release.json").splits.splits
     assert set(numbers) == {"train", "validation"}
     shards = export(config("webdataset"), two_splits, tmp_path / "wds")
     for split, told in numbers.items():
@@ -166,7 +175,7 @@ def test_splits_reach_every_format(two_splits, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", EXPORTS)
 def test_the_same_bytes_with_one_process_and_with_two(format, dataset, tmp_path):
     one = export(config(format), dataset, tmp_path / "one")
     two = export(config(format), dataset, tmp_path / "two", workers=2)
@@ -177,13 +186,13 @@ def test_the_same_bytes_with_one_process_and_with_two(format, dataset, tmp_path)
     assert not unlisted or format == "tree"  # whose flights have lists of their own
 
 
-@each("format", FORMATS)
+@each("format", [*EXPORTS])
 def test_an_export_says_where_it_came_from_and_whose_it_is(format, dataset, tmp_path):
     product = export(config(format), dataset, tmp_path / "out")
-    about, record = read_model(product / "export.json", ExportRecord, EXPORT_FORMAT), open_release(dataset).record
-    assert about.release.record_sha256 == sha256_file(dataset / "release.json")
+    about, record = read_model(product / "export.json", ExportRecord, EXPORT_FORMAT), open_release(dataset)
+    assert about.digest == record.digest
     assert (about.licence, about.credits, about.maps) == (record.licence, record.credits, record.maps)
-    assert about.frames == record.numbers.frames
+    assert about.frames == sum(map(len, record.tracks))
     readme = (product / "README.md").read_text()
     assert "license: cc-by-4.0" in readme
     assert "Map: a specimen." in readme
@@ -254,20 +263,42 @@ def sha256(array: np.ndarray) -> str:
     return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
 
 
-def test_lerobot_opens_it(tmp_path):
-    dataset = make_release(tmp_path)
-    product = export(config("lerobot"), dataset, tmp_path / "out")
-    python = python_with(LEROBOT)
+def look(product: Path, home: Path, *indices: int) -> dict:
+    """Return what LeRobot itself sees."""
     reader = Path(__file__).with_name("read_lerobot.py")
-    rows = list(rows_by_id(dataset).values())
-    indices = [0, 5, 13, len(rows) - 1]
     done = subprocess.run(
-        [str(python), str(reader), str(product), *map(str, indices)],
-        capture_output=True, text=True, check=False, env={"HF_HOME": str(tmp_path / "hf"), "PATH": "/usr/bin:/bin"},
+        [str(python_with(LEROBOT)), str(reader), str(product), *map(str, indices)],
+        capture_output=True, text=True, check=False, env={"HF_HOME": str(home), "PATH": "/usr/bin:/bin"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("LOOK ")]
-    seen = json.loads(line.removeprefix("LOOK "))
+    return json.loads(line.removeprefix("LOOK "))
+
+
+@each("video", [False, True])
+def test_act_takes_a_batch(dataset, tmp_path, video):
+    """The constants are those of lerobot; by default cameras have one shape; PyAV is in its environment."""
+    script = "from cosfly.__main__ import main; main()"
+    options = ["--format", "lerobot", "--out", str(tmp_path / "out"), "--workers", "1", *(["--video"] if video else [])]
+    command = [str(python_with(LEROBOT)), "-c", script, "release", "export", str(dataset), *options]
+    root = Path(__file__).parents[1]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
+    assert done.returncode == 0, done.stderr[-3000:]
+    seen = look(tmp_path / "out/lerobot", tmp_path / "hf")
+    assert np.isfinite(seen.pop("loss"))
+    assert seen == {
+        "version": VERSION, "chunk": CHUNK, "data": DATA_PATH, "episodes": EPISODES_PATH, "video": VIDEO_PATH,
+        "defaults": sorted(DEFAULTS),
+    }  # fmt: skip
+    assert len(list((tmp_path / "out/lerobot").glob("videos/observation.images.rgb/*/*.mp4"))) == video
+
+
+def test_lerobot_opens_it(tmp_path):
+    dataset = make_release(tmp_path)
+    product = export(config("lerobot", modalities=["rgb", "depth", "instance"]), dataset, tmp_path / "out")
+    rows = list(rows_by_id(dataset).values())
+    indices = [0, 5, 13, len(rows) - 1]
+    seen = look(product, tmp_path / "hf", *indices)
     assert (seen["frames"], seen["episodes"], seen["fps"], seen["splits"]) == (72, 6, 2, {"train": "0:6"})
     assert seen["batch"] == [4, 3, 54, 96]
     for index in indices:

@@ -29,7 +29,7 @@ from release.build import stage as package
 from release.build.config import ReleaseConfig
 from release.build.sources import Source
 from release.columns import INTRINSICS
-from release.export.contract import ExportConfig
+from release.export.stage import ExportConfig
 from release.export.stage import run as export
 from release.rules import split_groups
 from release.verify.verify import verify

@@ -79,35 +79,32 @@ def stats(
 
 
 FORMATS = (
-    "Playback tree (CosFly-Track v7), WebDataset or LeRobot v3.0; captions alone as a table, JSON lines, or "
-    "conversations for LLaMA-Factory or LLaVA."
+    "tree: CosFly-Track v7; lerobot: LeRobot v3.0; webdataset: tar shards; coco: boxes and masks of people; chat: "
+    "conversations for TRL, transformers and ms-swift; sharegpt: for LLaMA-Factory."
 )
-Format = Literal["tree", "webdataset", "lerobot", "csv", "jsonl", "sharegpt", "llava"]
-Split = Literal["train", "validation", "test"]
+Format = Literal["tree", "lerobot", "webdataset", "coco", "chat", "sharegpt"]
 
 
 @command("cosfly release export release --format webdataset --out shards", common=f"{WORKERS} resume")
 def export(
     job: Job,
-    source: Annotated[Path, Argument(help="Release; for captions also a run directory or captions.jsonl.")],
-    out: Annotated[Path, Option(help="Output directory; of captions the file.")],
+    source: Annotated[Path, Argument(help="Release, run directory or playback tree.")],
+    out: Annotated[Path, Option(help="Output directory.")],
     format: Annotated[Format, Option(help=FORMATS)],
-    language: Annotated[Literal["en", "zh", "both"], Option(help="Captions: languages of the texts.")] = "both",
+    modalities: Annotated[str, Option(help="Pictures: rgb,depth,instance; LeRobot has rgb alone by default.")] = "",
+    video: Annotated[bool, Option("--video", help="LeRobot: mp4 instead of PNG, with loss; needs PyAV.")] = False,
+    language: Annotated[Literal["en", "zh", "both"], Option(help="Conversations: languages.")] = "both",
     frames: Annotated[Literal["all", "last"], Option(help="Conversations: pictures of these frames.")] = "all",
-    split: Annotated[Split | None, Option(help="Captions: only this split.")] = None,
-    overwrite: Annotated[bool, Option("--overwrite", help="Captions: replace an existing file.")] = False,
 ) -> None:
-    """Write a release in another format, without loss, or its accepted captions to one file."""
-    if format == "tree" or format == "webdataset" or format == "lerobot":
-        from release.export.contract import ExportConfig
+    """Write a release, a run or a playback tree in another format."""
+    from cosfly.runtime.config import build
+    from release.columns import LANGUAGES
+    from release.export.stage import ExportConfig
 
-        job.run("release.export.stage", ExportConfig(format=format), source, out)
-    else:
-        from release.columns import LANGUAGES
-
-        choice = {"languages": LANGUAGES if language == "both" else [language], "shown": frames, "split": split}
-        tally = job.call("release.export.captions:export", source, out, format, overwrite=overwrite, **choice)
-        typer.echo(f"{out}: {tally}")
+    languages = LANGUAGES if language == "both" else [language]
+    chosen = [name for name in modalities.split(",") if name]
+    choice = {"format": format, "modalities": chosen, "video": video, "languages": languages, "frames": frames}
+    job.run("release.export.stage", build(ExportConfig, choice, "options"), source, out)
 
 
 @command("cosfly view release --out release.html", "inspect", "", **track_options("inspect"))

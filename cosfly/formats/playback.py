@@ -254,7 +254,7 @@ class Track:
     @property
     def is_ours(self) -> bool:
         """Whether cosfly made the track."""
-        return self.raw.get("dataset_format") == DATASET_FORMAT
+        return DATASET_FORMAT in (self.raw.get("dataset_format"), self.raw.get("made_by"))
 
     def target_picture(self, index: int) -> dict[str, str | bytes] | None:
         """Return the picture of the target and its name; None for other frames than that of the goal."""
@@ -522,7 +522,8 @@ def _perturbation(points: list[dict], is_original: bool) -> Perturbation:
 
     def offsets(key: str, names: tuple[str, ...]) -> np.ndarray:
         """Read the offsets under a key, (n, 3); zero if the file has none and states that nothing was applied."""
-        vectors = mirror_poses(_vectors_of(groups, key, names))
+        exact = [object_of(group, "offsets") if key in object_of(group, "offsets") else group for group in groups]
+        vectors = mirror_poses(_vectors_of(exact, key, names))
         is_zero = [
             is_original or flag is False or group.get(key) is False for flag, group in zip(flags, groups, strict=True)
         ]
@@ -540,8 +541,11 @@ def _perturbation(points: list[dict], is_original: bool) -> Perturbation:
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-def write_track(folder: Path, track: Track) -> None:
-    """Write `trajectory.json` into a folder. Unknown keys of `track.raw` are kept, known ones follow the arrays."""
+def write_track(folder: Path, track: Track, *, with_flags: bool = False) -> None:
+    """Write `trajectory.json` into a folder. Unknown keys of `track.raw` are kept, known ones follow the arrays.
+
+    with_flags: As in the public files, a perturbation is flags; its offsets are in `offsets`, next to them.
+    """
     raw = copy.deepcopy(track.raw)
     points = raw.pop("points", None) or raw.pop("waypoints", None) or [{} for _ in range(len(track))]
     assert len(points) == len(track), "raw points and columns differ in number"
@@ -594,7 +598,17 @@ def write_track(folder: Path, track: Track) -> None:
         for group, key, names, values in vectors:
             if values is not None and not (has_no_target and group == "target"):
                 _put_vector(point[group], key, names, values[i])
+        if with_flags:
+            _put_flags(point["perturbation"])
     write_json(folder / "trajectory.json", raw | {"points": points})
+
+
+def _put_flags(perturbation: dict) -> None:
+    """Replace the offsets of a perturbation by flags, and move those that are not zero to `offsets`."""
+    found = {key: perturbation.get(key) for key in ("drone_position", "drone_rotation", "target_position")}
+    offsets = {key: value for key, value in found.items() if isinstance(value, dict) and any(value.values())}
+    flags = {key: key in offsets or value is True for key, value in found.items()}
+    perturbation |= flags | ({"offsets": offsets} if offsets else {})
 
 
 def _tree_action(action: np.ndarray) -> dict[str, float] | None:

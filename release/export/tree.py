@@ -1,12 +1,10 @@
-"""The playback tree (CosFly-Track v7) of a release: what other people's loaders of that layout, and `cosfly caption`,
-read.
+"""The playback tree again, as the public CosFly-Track layout has it: `Town*/trajectory_*/{ORI,aug_*}/`, for loaders of
+that layout and for cosfly.
 
-    Town*/trajectory_*/{ORI, aug_001}/trajectory.json
-    Town*/trajectory_*/{ORI, aug_001}/frames_playback/frame_00000/{rgb.png, depth.npy, instance.png}
-
-Pictures are the released bytes; every number of `trajectory.json` is the release's, its axes the tree's
-(products/playback.py). Frames are counted from 0, as the layout asks; which frame of the flight each was says
-`source.released_frames`. A release of several runs becomes a tree a run, in a folder of its name.
+Pictures are the released bytes, depth is `depth.npy`, axes are CARLA's. Fields have the public forms: `dataset_format`
+v7, an integer `scenario_id`, flags for perturbations; the offsets are in `perturbation.offsets`. Frames count from 0,
+and `source.released_frames` has their indices in the release. Several runs become a tree each, in a folder of its
+name.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ from cosfly.formats.frames import BYSTANDER_COLUMNS, COORDINATES, FILE_NAMES, fr
 from cosfly.formats.pedestrian_paths import pace_field
 from cosfly.formats.people import Goal
 from cosfly.formats.places import TOWN
-from cosfly.formats.playback import LEGIBILITY, TARGET_FILE, Track, write_track
+from cosfly.formats.playback import DATASET_FORMAT, LEGIBILITY, TARGET_FILE, Track, write_track
 from cosfly.formats.segments import FOLLOW, Segment
 from cosfly.formats.town import TOWN_FILE, TOWN_FORMAT, TownMap
 from cosfly.runtime.errors import InputError
@@ -33,78 +31,61 @@ from cosfly.runtime.io import CHECKSUMS, checksum_lines, sha256_file
 from cosfly.runtime.json_io import write_model
 from cosfly.runtime.worker import advance
 from release.columns import COMPANY_COLUMNS, PICTURES, SCALAR_NAMES, TARGET_PICTURE, matrices_of
-from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
-from release.export.source import DEPTH_CODING, Release, ReleasedRows, picture, read_span
+from release.export.source import ExportSource, Row, SourceTrack, picture
+from release.export.stage import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles, track_units
 from release.flight_rows import FlightRows
 
 VERSION = "drone_nav_traj_v7 7.0.0"
-Row = dict[str, Any]
 
 
-def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[ExportUnit]:
-    """Return a unit is one flight."""
-    wrong = [] if "rgb" in release.modalities else ["the release has no colour pictures"]
-    wrong += [
-        f"{flight.name}: the name of the town does not begin with {TOWN}"
-        for flight in flights
-        if not flight.town.startswith(TOWN)
-    ]
-    wrong += [
-        f"{flight.name}: the name of the trajectory does not begin with trajectory_"
-        for flight in flights
-        if not flight.trajectory.startswith("trajectory_")
+def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
+    """Return one unit per track; its `extra` is its folder in the tree, and the number of its trajectory."""
+    wrong = [
+        f"{track.name}: the name of the {kind} does not begin with {begin}"
+        for track in source.tracks
+        for kind, begin in (("town", TOWN), ("trajectory", "trajectory_"))
+        if not getattr(track.place, kind).startswith(begin)
     ]
     if wrong:
-        raise InputError(
-            "the release cannot be written as a playback tree", where=release.folder, got="; ".join(wrong[:20])
-        )
-    has_runs = len({flight.run for flight in flights}) > 1
+        what = "the source cannot be written as a playback tree"
+        raise InputError(what, where=source.folder, got="; ".join(wrong[:20]))
+    has_runs = len({track.place.run for track in source.tracks}) > 1
     numbers: dict[tuple[str, str, str], int] = {}
     units = []
-    for flight in flights:
-        number = numbers.setdefault((flight.run, flight.town, flight.trajectory), len(numbers))
-        folder = tree_folder(flight, has_runs)
-        units.append(ExportUnit(flight.name, len(flight), flights=(flight,), extra=(folder.as_posix(), number)))
+    for unit in track_units(source):
+        place = unit.pieces[0].track.place
+        number = numbers.setdefault((place.run, place.town, place.trajectory), len(numbers))
+        folder = Path(place.run if has_runs else "", place.town, place.trajectory, place.variant)
+        units.append(replace(unit, extra=(folder.as_posix(), number)))
     return units
 
 
-def tree_folder(flight: ReleasedRows, has_runs: bool) -> Path:
-    """Return the folder of a flight, relative to the tree; has_runs: the release is of several runs."""
-    return Path(flight.run if has_runs else "", flight.town, flight.trajectory, flight.variant)
-
-
-def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> UnitFiles:
-    """Write one flight: its pictures, then trajectory.json, then the checksums of all."""
-    (rows,), (place, number) = unit.flights, unit.extra
+def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> UnitFiles:
+    """Write one track: its pictures, then trajectory.json, then the checksums of all."""
+    track, (place, number) = unit.pieces[0].track, unit.extra
     files, digests, scalars = Files(folder), dict[str, str](), list[Row]()
-    for i, row in enumerate(_rows(release, rows)):
-        for file in release.modalities:
+    for i, row in enumerate(track.rows([*SCALAR_NAMES, *(PICTURES[file].name for file in source.modalities)])):
+        for file in source.modalities:
             name = f"{frame_name(i)}/{FILE_NAMES[file]}"
-            data = picture(row, file)
-            digests[name] = files.put(f"{place}/{name}", data, listed=False)
+            digests[name] = files.put(f"{place}/{name}", picture(row, file), listed=False)
         if row[TARGET_PICTURE] is not None:
             digests[TARGET_FILE] = files.put(f"{place}/{TARGET_FILE}", row[TARGET_PICTURE]["bytes"], listed=False)
         scalars.append({column: row[column] for column in SCALAR_NAMES})
         advance()
     (folder / place).mkdir(parents=True, exist_ok=True)
-    write_track(folder / place, flight_of_rows(scalars, rows, number))
+    write_track(folder / place, track_of_rows(scalars, track, number), with_flags=True)
     digests["trajectory.json"] = sha256_file(folder / place / "trajectory.json")
     files.put(f"{place}/{CHECKSUMS}", checksum_lines(digests).encode())
-    has_gaps = bool((np.diff(rows.frame_index) != 1).any() or rows.frame_index[0] != 0)
+    has_gaps = bool((np.diff(track.frame_index) != 1).any() or track.frame_index[0] != 0)
     return files.written(is_original=scalars[0]["track"] == "clean", has_gaps=has_gaps)
 
 
-def _rows(release: Release, flight: ReleasedRows) -> Iterator[Row]:
-    for span in flight.spans:
-        yield from read_span(release, span, [*SCALAR_NAMES, *(PICTURES[file].name for file in release.modalities)])
-
-
 def finish(
-    release: Release, units: Sequence[ExportUnit], written: Sequence[UnitFiles], folder: Path, cfg: ExportConfig
+    source: ExportSource, units: Sequence[ExportUnit], written: Sequence[UnitFiles], folder: Path, cfg: ExportConfig
 ) -> FormatFacts:
-    """Write each town's `map.json`, and say which flights the strictest readers will miss something of."""
-    towns = {(unit.extra[0].rpartition("/trajectory_")[0], unit.flights[0].town) for unit in units}
-    maps = {entry.town: entry for entry in release.record.maps}
+    """Write each town's `map.json`, and count the tracks of which strict readers will miss something."""
+    towns = {(unit.extra[0].rpartition("/trajectory_")[0], unit.pieces[0].track.place.town) for unit in units}
+    maps = {entry.town: entry for entry in source.maps}
     files = {}
     for place, town in sorted(towns):
         shown = maps.get(town)
@@ -114,44 +95,38 @@ def finish(
         files[f"{place}/{TOWN_FILE}"] = sha256_file(folder / place / TOWN_FILE)
     return FormatFacts(
         version=VERSION,
-        codings={
-            file: DEPTH_CODING.format(FILE_NAMES[file])
-            if file == "depth"
-            else f"{FILE_NAMES[file]}, the released bytes"
-            for file in release.modalities
-        },
+        codings={file: f"{FILE_NAMES[file]}, the released bytes" for file in source.modalities},
         coordinates=COORDINATES,
         notes=list(_notes(units, written)),
-        how_to_open="from cosfly.formats.tracks import find_flights\n"
-        "from cosfly.formats.playback import read_flight\n"
-        "flights = [read_flight(folder, strict=False) for folder in find_flights(Path('.'))]",
+        how_to_open="from cosfly.formats.tracks import find_tracks\n"
+        "from cosfly.formats.playback import read_track\n"
+        "tracks = [read_track(folder, strict=False) for folder in find_tracks(Path('.'))]",
         files=files,
     )
 
 
 def _notes(units: Sequence[ExportUnit], written: Sequence[UnitFiles]) -> Iterator[str]:
     yield (
-        "Frames are counted from 0 as the layout asks; source.released_frames of trajectory.json says which frame of "
-        "the flight each was. The layout has no captions: they stand in the release. meta.json and the order of "
-        "missions are not in it."
+        "Frames count from 0 as the layout asks; source.released_frames of trajectory.json has the index of each in "
+        "its track. The layout has no captions: they are in the release. meta.json and missions are not in it."
     )
-    gaps = sum(one.facts["has_gaps"] for one in written)
-    if gaps:
-        parts = f"{gaps} of {len(units)} flights are parts of a flight"
-        yield f"{parts}: steps between their frames are uneven, which strict readers of time refuse."
+    if gaps := sum(one.facts["has_gaps"] for one in written):
+        yield (
+            f"{gaps} of {len(units)} tracks are parts of a track: the steps between their frames are uneven, which "
+            "readers with a strict clock refuse."
+        )
     tracks = defaultdict(set)
     for unit, one in zip(units, written, strict=True):
         tracks[unit.extra[0].rpartition("/")[0]].add(one.facts["is_original"])
-    alone = sum(len(found) < 2 for found in tracks.values())
-    if alone:
-        yield f"{alone} of {len(tracks)} trajectories have one track alone; some public loaders ask for both."
+    if alone := sum(len(found) < 2 for found in tracks.values()):
+        yield f"{alone} of {len(tracks)} trajectories have one track only; some public loaders ask for both."
 
 
 # --- trajectory.json --------------------------------------------------------------------------------------------------
 
 
-def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Track:
-    """Return the flight that released rows are of; `number` is its trajectory's among those of the release."""
+def track_of_rows(rows: list[Row], placed: SourceTrack, number: int) -> Track:
+    """Return the track of released rows; `number` is that of its trajectory in the export."""
     sizes = {(r["width_px"], r["height_px"]) for r in rows}
     if len(sizes) != 1:
         raise InputError("the pictures of the track differ in size", where=placed.name, got=f"{len(sizes)} sizes")
@@ -162,32 +137,32 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Track:
         segments=_segments([row["style"] for row in rows]),
         source={
             "path_index": number,
-            "scenario_id": f"{placed.run}/{placed.town}/{placed.trajectory}".lstrip("/"),
-            "scenario_name": placed.town,
+            "scenario_id": number,
+            "scenario_name": f"{placed.place.run}/{placed.place.town}/{placed.place.trajectory}".lstrip("/"),
+            "algorithm": "unknown",
             "released_frames": placed.frame_index.tolist(),
             **pace_field(rows[0]["pace"]),
         },
         goal=_goal(found, placed),
-        raw={"points": [_point(row) for row in rows]} | _weather(rows[0]),
+        raw={"dataset_format": "v7", "made_by": DATASET_FORMAT, "points": [*map(_point, rows)], **_weather(rows[0])},
     )
 
 
-def _goal(rows: FlightRows, placed: ReleasedRows) -> Goal | None:
-    """Return the goal where its frame is released, under the number that this has in the tree."""
+def _goal(rows: FlightRows, placed: SourceTrack) -> Goal | None:
+    """Return the goal if its frame is released, with the number of that frame in the tree."""
     at = np.flatnonzero(placed.frame_index == (rows.goal.frame if rows.goal else -1))
     return replace(rows.goal, frame=int(at[0])) if rows.goal and len(at) else None
 
 
 def _point(row: Row) -> dict[str, Any]:
-    """What a point says of its perturbation beside the offsets: what became of it, or that there was one whose offsets
-    nobody knows; and of its target whether it can be made out.
-    """
-    told = {name: text for name, text in (row["perturbation"] or {}).items() if text is not None}
+    """Return what a point has in addition to the arrays: the outcome of its perturbation, or flags if the offsets are
+    unknown; whether its target is legible; the other people."""
+    outcome = {name: text for name, text in (row["perturbation"] or {}).items() if text is not None}
     if row["is_perturbed"] and row["drone_offset"] is None:
-        told |= {"drone_position": True, "drone_rotation": True}
+        outcome |= {"drone_position": True, "drone_rotation": True}
     target = {name: value for name in LEGIBILITY if (value := row[f"target_{name}"]) is not None}
     others = dict(zip(BYSTANDER_COLUMNS, (row[name] for name in COMPANY_COLUMNS), strict=True))
-    point = {"perturbation": told, "target": target, "others": others if others["in_view"] is not None else {}}
+    point = {"perturbation": outcome, "target": target, "others": others if others["in_view"] is not None else {}}
     return {name: one for name, one in point.items() if one}
 
 

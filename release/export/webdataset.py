@@ -1,110 +1,125 @@
-"""WebDataset: tar shards in which the files of a frame stand together under one key.
+"""WebDataset: tar shards in which the files of a frame follow each other under one key, for `webdataset` and for
+`load_dataset("webdataset")` of `datasets`.
 
-    train-00000.tar     trajectory_1_ORI_frame_00000.depth.npy, .instance.png, .json, .rgb.png, then the next frame
+    train-00000.tar     trajectory_1_ORI_frame_00000.depth.npy, .instance.png, .json, ..., then the next frame
 
-A shard is a run of row groups of the release, so its size is bounded by the setting and one row group; its bytes depend
-on the rows alone (no times, no owners). The JSON holds every column but the pictures.
+All frames have the same files of the same types, because `datasets` takes the types from the first frames. `json` has
+the texts, flags and numbers that no frame lacks; a missing text is empty. A number or a list that a frame may lack is a
+float64 array of its own: NaN, or an array without elements. The bytes depend on the rows alone.
 """
 
 from __future__ import annotations
 
 import tarfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
-from cosfly.formats.frames import FrameFile
+import numpy as np
+
+from cosfly.formats.frames import FILE_NAMES, FrameFile
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.worker import advance
-from release.columns import PICTURES, SPLIT_NAMES, TARGET_PICTURE
-from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
-from release.export.source import DEPTH_CODING, PART, Release, ReleasedRows, Span, picture, read_span
+from release.columns import PICTURES, SCALAR_NAMES, SCALARS, SPLIT_NAMES, TARGET_PICTURE, Column
+from release.export.source import PART, ExportSource, Row, picture
+from release.export.stage import ExportConfig, ExportUnit, Files, FormatFacts, Piece, UnitFiles, shards
 
-MB = 1024 * 1024
-VERSION = "tar, keys sorted"
-ENDINGS: dict[FrameFile, str] = {"rgb": "rgb.png", "depth": "depth.npy", "instance": "instance.png"}
-PICTURE_COLUMNS = {column.name for column in PICTURES.values()}
+TEXTS = ("string", "texts", "events")
+MOST_FRAMES = 100  # of a piece, the smallest part of a shard
 
 
-def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[ExportUnit]:
-    """Cut each split into shards of about `shard_mb`; a unit is one shard."""
-    units = []
-    for split in SPLIT_NAMES:
-        groups: list[list[Span]] = []
-        filled = 0.0
-        for flight in (flight for flight in flights if flight.split == split):
-            bytes_per_frame = flight.num_bytes / len(flight)
-            for span in flight.spans:
-                if not groups or filled >= cfg.shard_mb * MB:
-                    groups.append([])
-                    filled = 0.0
-                groups[-1].append(span)
-                filled += bytes_per_frame * (span.stop - span.start)
-        for number, spans in enumerate(groups):
-            frames = sum(span.stop - span.start for span in spans)
-            units.append(ExportUnit(f"{split}-{number:05d}", frames, spans=tuple(spans), extra=split))
-    return units
+def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
+    """Cut each split into shards of about `shard_mb`."""
+    pieces = [
+        Piece(track, start, min(start + MOST_FRAMES, len(track)))
+        for track in source.tracks
+        for start in range(0, len(track), MOST_FRAMES)
+    ]
+    return shards(source, pieces, cfg.shard_mb)
 
 
-def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> UnitFiles:
+def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> UnitFiles:
     """Write one shard."""
     files = Files(folder)
     name, keys = f"{unit.name}.tar", set[str]()
-    with (
-        atomic_file(folder / name) as file,
-        tarfile.open(fileobj=file, mode="w|", format=tarfile.GNU_FORMAT) as tar,
-    ):
-        for span in unit.spans:
-            for row in read_span(release, span):
+    columns = [*SCALAR_NAMES, *(PICTURES[file].name for file in source.modalities)]
+    with atomic_file(folder / name) as file, tarfile.open(fileobj=file, mode="w|", format=tarfile.GNU_FORMAT) as tar:
+        for piece in unit.pieces:
+            for row in piece.track.rows(columns, piece.start, piece.stop):
                 key = row["sample_id"].replace(".", "_")  # a key ends at its first dot
                 if key in keys or not PART.fullmatch(key):
-                    raise InputError(
-                        "the sample_id of a frame is repeated or is not a file name", where=unit.name, got=key
-                    )
+                    what = "the sample_id of a frame is repeated or is not a file name"
+                    raise InputError(what, where=unit.name, got=key)
                 keys.add(key)
-                for ending, data in members(row, release):
-                    tar.addfile(_header(f"{key}.{ending}", len(data)), BytesIO(data))
+                for ending, data in sorted(members(row, source.modalities)):
+                    header = tarfile.TarInfo(f"{key}.{ending}")  # without times and owners
+                    header.size, header.mode = len(data), 0o644
+                    tar.addfile(header, BytesIO(data))
                 advance()
     files.note(name)
     return files.written()
 
 
-def members(row: dict[str, Any], release: Release) -> list[tuple[str, bytes]]:
-    """Return the files of one frame, by their endings in order."""
-    scalars = {name: value for name, value in row.items() if name not in PICTURE_COLUMNS}
-    pictures = {ENDINGS[file]: picture(row, file) for file in release.modalities}
-    if (target := scalars.pop(TARGET_PICTURE)) is not None:
-        pictures["target.png"] = target["bytes"]
-    return sorted({"json": (dump_json(scalars) + "\n").encode(), **pictures}.items())
+def members(row: Row, modalities: Sequence[FrameFile]) -> Iterator[tuple[str, bytes]]:
+    """Yield the files of one frame by their endings."""
+    for file in modalities:
+        yield FILE_NAMES[file], picture(row, file)
+    together = {}
+    for column in SCALARS:
+        if column.name == TARGET_PICTURE:
+            continue
+        value = row[column.name]
+        if column.type in TEXTS:
+            together[column.name] = _text(value)
+        elif (column.required and not column.of_caption) or column.name == "has_caption":
+            together[column.name] = value
+        else:
+            buffer = BytesIO()
+            np.save(buffer, _numbers(column, value))
+            yield f"{column.name}.npy", buffer.getvalue()
+    yield "json", (dump_json(together) + "\n").encode()
 
 
-def _header(name: str, size: int) -> tarfile.TarInfo:
-    header = tarfile.TarInfo(name)
-    header.size, header.mode = size, 0o644
-    return header  # times, owners: zero
+def _text(value: object) -> str:
+    """Return a text, the texts of a list, or those of a struct by their names; "" for none."""
+    if isinstance(value, dict):
+        value = [f"{name} {text}" for name, text in value.items() if text]
+    return ", ".join(value) if isinstance(value, list) else str(value or "")
+
+
+def _numbers(column: Column, value: object) -> np.ndarray:
+    if isinstance(column.type, tuple):
+        members = value if isinstance(value, dict) else {}
+        return np.array([members.get(name) for name in column.type], np.float64)
+    if column.type in ("numbers", "indices"):
+        return np.array(value or [], np.float64)
+    return np.array([value], np.float64)
 
 
 def finish(
-    release: Release, units: Sequence[ExportUnit], written: Sequence[UnitFiles], folder: Path, cfg: ExportConfig
+    source: ExportSource, units: Sequence[ExportUnit], written: Sequence[UnitFiles], folder: Path, cfg: ExportConfig
 ) -> FormatFacts:
     """Return how the shards are opened."""
-    codings = {file: f"{ENDINGS[file]}, the released bytes" for file in release.modalities}
-    if "depth" in codings:
-        codings["depth"] = DEPTH_CODING.format(codings["depth"])
-    first = units[0].extra
-    last = sum(unit.extra == first for unit in units) - 1
-    shards = f"{first}-{{00000..{last:05d}}}.tar" if last else f"{first}-00000.tar"
-    splits = ", ".join(
-        f"{split}: {sum(u.extra == split for u in units)} shards"
-        for split in SPLIT_NAMES
-        if any(u.extra == split for u in units)
-    )
+    counts = {split: sum(unit.split == split for unit in units) for split in SPLIT_NAMES}
+    counts = {split: count for split, count in counts.items() if count}
+    first, last = units[0].split, counts[units[0].split] - 1
+    names = f"{first}-{{00000..{last:05d}}}.tar" if last else f"{first}-00000.tar"
+    codings = {file: f"{FILE_NAMES[file]}, the released bytes" for file in source.modalities}
     return FormatFacts(
-        version=VERSION,
-        codings={**codings, "json": "every other column of the release, one object"},
-        notes=[f"Splits: {splits}. A key is the sample_id, dots replaced by _."],
-        how_to_open=f'import webdataset\nrows = webdataset.WebDataset("{shards}", shardshuffle=False).decode("rgb8")',
+        version="tar, keys sorted",
+        codings={
+            **codings,
+            "json": "texts, flags and numbers that no frame lacks; an empty text is a missing one",
+            "*.npy": "float64: a column whose values may be missing (NaN), the members of a struct in order, or a list",
+        },
+        notes=[
+            f"Shards: {', '.join(f'{split} {count}' for split, count in counts.items())}. A key is the sample_id, dots "
+            "replaced by _.",
+        ],
+        how_to_open=f'from datasets import load_dataset\nrows = load_dataset("webdataset", data_files="{first}-*.tar", '
+        f'split="train", streaming=True)\n\nimport webdataset\n'
+        f'rows = webdataset.WebDataset("{names}", shardshuffle=False).decode("rgb8")',
+        split_files={split: f"{split}-*.tar" for split in counts},
     )

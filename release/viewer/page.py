@@ -19,7 +19,7 @@ from cosfly.formats.captions import Caption, Coc, read_captions
 from cosfly.formats.frames import FrameFile, depth_values, frame_path
 from cosfly.formats.inspection import read_settled
 from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
-from cosfly.formats.places import folder_name, place_of, town_folder
+from cosfly.formats.places import place_of
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.answer_text import sentences_of
@@ -57,10 +57,11 @@ from release.columns import (
     caption_values,
     scalar_row,
 )  # fmt: skip
+from release.export.source import Tree, find_trees
 from release.reading import bounded, check_columns, check_rows, row_lists
 from release.record import ReleaseRecord, read_record
 
-Place = tuple[str, ...]  # PLACE
+Place = tuple[str, str, str, str]  # PLACE
 Views = Mapping[View, Callable[[], np.ndarray]]
 Item = TypeVar("Item")
 
@@ -199,32 +200,6 @@ def _picture(row: Mapping[str, Any], file: FrameFile) -> np.ndarray:
 
 
 # --- a run or a playback tree -----------------------------------------------------------------------------------------
-
-
-class Tree(NamedTuple):
-    """A playback tree and what was made of it; None where that does not exist. run: its name among several."""
-
-    run: str
-    data: Path
-    captions: Path | None = None
-    inspect: Path | None = None
-    boxes: Path | None = None
-
-    def place(self, one: Any) -> Place:
-        """Return the place of a track, by the town, trajectory and variant that anything about it names."""
-        return self.run, town_folder(one.town), one.trajectory, one.variant
-
-
-def find_trees(folder: Path, captions: Path | None = None) -> list[Tree]:
-    """Return what a folder is: a run, a run of several towns, or a playback tree."""
-    towns = sorted(path.parent for path in folder.glob("*/render") if path.is_dir())
-    runs = [folder] if (folder / "render").is_dir() else towns
-    trees = []
-    for place in runs:
-        names = ("caption/captions.jsonl", "inspect/inspect.json", "simplify/step2_simplified.json")
-        own_captions, *others = (place / name if (place / name).exists() else None for name in names)
-        trees.append(Tree(folder_name(place.absolute().name), place / "render", captions or own_captions, *others))
-    return trees or [Tree("", folder, captions)]
 
 
 def _show_run(

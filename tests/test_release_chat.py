@@ -1,0 +1,106 @@
+"""Captions as conversations: what TRL, transformers, ms-swift and LLaMA-Factory would make of them."""
+
+import json
+from pathlib import Path
+
+import pytest
+from specimens_release import CFG, build, make_caption, make_inspection
+
+from cosfly.formats.captions import Coc, read_captions, write_captions
+from cosfly.formats.inspection import write_inspection
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
+from cosfly.runtime.config import build as build_config
+from cosfly.runtime.errors import NothingKept
+from release.export.stage import ExportConfig
+from release.export.stage import run as export
+from specimens import make_playback_tree
+
+NUM_POINTS = 9
+ANSWER = {"critical_components": "=HYPERLINK(1) ahead", "reasoning_trace": 'A, B\nC "D"', "flight_decision": "hover"}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A run folder: render/, caption/captions.jsonl (one dropped in each flight), and release/dataset/ of it."""
+    root = tmp_path_factory.mktemp("one") / "run"
+    make_playback_tree(root / "render", 2, NUM_POINTS)
+    (root / "tree").symlink_to("render")
+    captions = []
+    for number, flight in enumerate(map(read_track, find_tracks(root / "render"))):
+        for i in range(4, NUM_POINTS - 1):
+            caption = make_caption(flight, i)
+            if i == NUM_POINTS - 2:
+                caption = caption.model_copy(update={"status": "dropped", "drop_reason": "hard_conflict"})
+            elif number == 0 and i == 4:
+                decision = caption.en.flight_decision
+                caption = caption.model_copy(update={"en": Coc(**ANSWER | {"flight_decision": decision})})
+            captions.append(caption)
+    (root / "caption").mkdir()
+    write_captions(root / "caption/captions.jsonl", captions)
+    write_captions(root / "captions.jsonl", captions)
+    write_inspection(root / "inspect.json", make_inspection(root / "render", {}))
+    build(root, root / "release", CFG.model_copy(update={"selection": "all"}))
+    return root
+
+
+def accepted(run: Path) -> list:
+    return [caption for caption in read_captions(run / "caption/captions.jsonl") if caption.status == "accepted"]
+
+
+def chat(source: Path, out: Path, format: str = "chat", **settings) -> Path:
+    return export(build_config(ExportConfig, {"format": format, **settings}, "test"), source, out)
+
+
+def lines_of(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+@pytest.mark.parametrize("shown", ["all", "last"])
+def test_messages_are_what_their_loaders_ask_for(run, tmp_path, shown):
+    datasets = pytest.importorskip("datasets")
+    product = chat(run, tmp_path / "out", frames=shown)
+    samples = lines_of(product / "train.jsonl")
+    found = datasets.load_dataset(
+        "json", data_files=str(product / "train.jsonl"), split="train", cache_dir=str(tmp_path / "cache")
+    )
+    assert len(found) == len(samples) == 2 * len(accepted(run))
+    for sample, loaded in zip(samples, found, strict=True):
+        assert [turn["role"] for turn in loaded["messages"]] == ["user", "assistant"]
+        blocks = sample["messages"][0]["content"]
+        assert (
+            sum(block["type"] == "image" for block in blocks) == len(sample["images"]) == (5 if shown == "all" else 1)
+        )
+        assert set(json.loads(sample["messages"][1]["content"][0]["text"])) == set(ANSWER)
+        for name in sample["images"]:
+            _, *place, frame = Path(name).with_suffix("").parts
+            picture = run.joinpath("render", *place[-3:], "frames_playback", frame, "rgb.png")
+            assert (product / name).read_bytes() == picture.read_bytes()
+    first, caption = samples[0]["messages"][0]["content"], accepted(run)[0]
+    assert caption.prompt["en"].system in first[0]["text"]
+    assert ("One picture is given" in first[-1]["text"]) == (shown == "last")
+    assert json.loads(samples[0]["messages"][1]["content"][0]["text"])["reasoning_trace"] == ANSWER["reasoning_trace"]
+
+
+def test_sharegpt_is_one_file_a_split_with_its_entry(two_splits, tmp_path):
+    product = chat(two_splits, tmp_path / "out", "sharegpt", languages=["en"])
+    about = json.loads((product / "dataset_info.json").read_text())
+    assert set(about) == {"cosfly_train", "cosfly_validation"}
+    ids = set()
+    for entry in about.values():
+        samples = json.loads((product / entry["file_name"]).read_text(encoding="utf-8"))
+        for sample in samples:
+            human, gpt = sample[entry["columns"]["messages"]]
+            assert (human["from"], gpt["from"]) == ("human", "gpt")
+            assert human["value"].startswith("t0: <image>\n")
+            assert human["value"].count("<image>") == len(sample["images"])
+            assert all((product / name).is_file() for name in sample["images"])
+        ids |= {sample["id"] for sample in samples}
+        assert len({sample["id"] for sample in samples}) == len(samples) > 0
+    assert all(name.endswith("_en") for name in ids)
+
+
+def test_a_source_without_captions_is_refused(run, tmp_path):
+    with pytest.raises(NothingKept, match="no caption to export"):
+        chat(run / "render", tmp_path / "out")
+    assert not (tmp_path / "out/chat").exists()
