@@ -99,7 +99,7 @@ def test_splits_cover_all_and_none_is_empty(num_groups, val, test, seed):
 
 def test_too_few_groups_are_refused_unless_told():
     shares = {"val": 0.1, "test": 0.1}
-    with pytest.raises(InputError, match=r"too few towns.*got 2.*expected at least 3.*fewer splits"):
+    with pytest.raises(InputError, match=r"fewer towns than splits.*got 2.*expected at least 3.*fewer splits"):
         assign_splits(["a", "b"], shares, 0, too_few="refuse", what="towns", fix="ask for fewer splits")
     assert sorted(assign_splits(["a", "b"], shares, 0, too_few="fill").values()) == ["train", "val"]
     assert assign_splits(["a"], shares, 0, too_few="fill") == {"a": "train"}
