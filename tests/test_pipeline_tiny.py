@@ -17,6 +17,7 @@ from cosfly.formats.captions import read_captions
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.pipeline import run as pipeline
+from cosfly.pipeline import runs
 from cosfly.pipeline.runs import estimate
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
@@ -95,6 +96,16 @@ def test_a_dry_run_writes_nothing(small_run):
     assert shown.exit_code == 0, shown.output
     assert "total: about" in shown.output
     assert not beside.exists()
+
+
+def test_a_release_of_the_papers_shape_is_estimated(monkeypatch, tmp_path):
+    """250 trajectories of 618 to 770 frames, 400 of each: 100,000 frames a track."""
+    sample = runs.RunSample([618 + i % 153 for i in range(250)], 4e6)
+    monkeypatch.setattr(runs, "take_sample", lambda cfg, out: sample)
+    release = estimate(tiny(), tmp_path)[-1]
+    assert (release.name, release.count, release.bytes) == ("release", 200_000, 200_000 * 4e6)
+    clean = estimate(tiny(**{"render.tracks": ["clean"], "release.tracks": ["clean"]}), tmp_path)[-1]
+    assert clean.count == 100_000
 
 
 def test_a_finished_run_costs_nothing_more_and_a_half_finished_one_the_rest(small_run, tmp_path):

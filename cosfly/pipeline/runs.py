@@ -141,7 +141,8 @@ RATES = {  # stage: unit, seconds per unit, MB per unit
     "caption": ("windows", 4.0 / 804, 7.4 / 804),
     "release": ("frames", 7.8 / 790.7, 1.95),
 }
-SAMPLED_FRAMES = 4  # of each track, drawn to measure the disk space of a frame
+# Frames that are drawn to measure the disk space of a frame: so many of each track, and of all tracks together.
+SAMPLED_FRAMES, MOST_SAMPLED = 4, 200
 MOST_LISTED = 4  # trajectories named in a remark
 
 
@@ -200,7 +201,8 @@ def take_sample(cfg: RunConfig, out: Path) -> RunSample:
         frames = _planned(scratch, cfg.render.frame_stride)
         if not draws or not frames:
             return RunSample(frames, None)
-        stride = math.ceil(max(frames) * cfg.render.frame_stride / SAMPLED_FRAMES)
+        num_sampled = max(1, min(SAMPLED_FRAMES, MOST_SAMPLED // (len(frames) * len(cfg.render.tracks))))
+        stride = math.ceil(max(frames) * cfg.render.frame_stride / num_sampled)
         few = cfg.model_copy(update={"render": cfg.render.model_copy(update={"frame_stride": stride})})
         run(few, scratch, until="render")
         pictures = list((scratch / "render").rglob("frames_playback/*/*"))
