@@ -36,5 +36,5 @@ def test_patterns_are_of_folders_and_those_above_them(tree):
     words = r"no track folder in this directory matches the patterns of --flights; got Town9; .*Town01/trajectory_1777083733/ORI"
     with pytest.raises(InputError, match=words):
         names(tree, match=("Town9",))
-    with pytest.raises(InputError, match="none of the matching tracks in this directory is a perturbed track"):
+    with pytest.raises(InputError, match="this directory has no perturbed track among those that match --flights"):
         names(tree, match=("*/ORI",), tracks=("perturbed",))

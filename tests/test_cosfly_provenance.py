@@ -63,13 +63,15 @@ def test_what_belongs_together_is_taken(run):
 
 def test_captions_of_another_tree_are_refused(run):
     other = make_tree(run / "other", "of another seed")
-    with pytest.raises(VerifyError, match=r"captions\.jsonl: captions.jsonl was not made from the data.*got .*other"):
+    with pytest.raises(
+        VerifyError, match=r"captions\.jsonl: captions.jsonl was made with another input .data.*got .*other"
+    ):
         run_dir.checked_inputs(inputs_of(run) | {"data": other})
     captions = make(run / "c2", "caption", {"captions.jsonl": "c"}, data=other) / "captions.jsonl"
     two = {"0.data": run / "render", "0.captions": run / "caption/captions.jsonl"}
     two |= {"1.data": other, "1.captions": captions}
     run_dir.checked_inputs(two)
-    with pytest.raises(VerifyError, match="was not made from the data"):
+    with pytest.raises(VerifyError, match="was made with another input"):
         run_dir.checked_inputs(two | {"0.captions": captions})
 
 

@@ -58,8 +58,8 @@ class FollowEnv(gymnasium.Env):
             size_px: Width and height of the pictures.
         """
         if actions not in ("decisions", "velocities"):
-            problem = "the value of the argument actions is unknown"
-            raise ConfigError(problem, where=task, got=actions, expected="decisions or velocities")
+            problem = "the argument `actions` has an unknown value"
+            raise ConfigError(problem, where=task, got=actions, expected="`decisions` or `velocities`")
         self.task = task
         self.size_px = (size_px[0], size_px[1])
         self.has_depth = depth

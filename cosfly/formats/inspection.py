@@ -261,6 +261,6 @@ def _chosen(choice: Choice, tracks: list[TrackInspection], inspected: Path) -> l
     chosen = tracks_of_name or [track for track in of_trajectory if track.result in results] or of_trajectory
     if not chosen:
         expected = f"the folder of a track or of a trajectory, such as {', '.join(_in_review(tracks)[:3])}"
-        what = "the inspection has no track or trajectory with this folder"
+        what = "the inspection file lists no track or trajectory in this folder"
         raise InputError(what, where=inspected, got=choice.folder, expected=expected)
     return chosen

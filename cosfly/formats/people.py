@@ -104,8 +104,8 @@ class Goal:
         in_order = tuple(term for term in GOAL_TERMS if term in self.says)
         if self.says != in_order or not {*self.says} & {*GARMENT_TERMS}:
             raise ValueError(
-                f"the field says must list some of {', '.join(GOAL_TERMS)} in this order, and at least one of "
-                f"{', '.join(GARMENT_TERMS)}"
+                f"the field `says` must name at least one of {', '.join(GARMENT_TERMS)}; its terms must be in "
+                f"the order {', '.join(GOAL_TERMS)}"
             )
 
 

@@ -41,8 +41,8 @@ def find_tracks(root: Path, choice: TrackChoice = ALL_TRACKS) -> list[Path]:
         return matching
     chosen = [folder for folder in matching if track_of(folder) in choice.tracks]
     if not chosen:
-        what = f"none of the matching tracks in this directory is a {' or '.join(choice.tracks)} track"
-        raise InputError(what, where=root, fix="change --tracks, or render these tracks")
+        what = f"this directory has no {' or '.join(choice.tracks)} track among those that match --flights"
+        raise InputError(what, where=root, fix="change --tracks, or render tracks of this kind")
     return chosen
 
 

@@ -77,7 +77,7 @@ class Coverage(Record):
             raise ValueError(f"the coverage has an unknown axis {unknown[0]!r}; the axes are {', '.join(AXES)}")
         for name, axis in AXES.items() if bins else ():
             if (num := len(bins.get(name, ()))) != axis.num_bins:
-                raise ValueError(f"axis {name!r} of the coverage must have {axis.num_bins} bins, got {num}")
+                raise ValueError(f"the coverage must have {axis.num_bins} bins on the axis {name!r}, got {num}")
         return bins
 
     @classmethod

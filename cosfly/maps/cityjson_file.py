@@ -247,7 +247,7 @@ def _surfaces(geometry: _Geometry, vertices: np.ndarray, where: str) -> list[Sur
 
 def _require_list(value: Any, where: str) -> list:
     if not isinstance(value, list):
-        problem = "the boundaries have too few levels of lists for this type of geometry"
+        problem = "the field `boundaries` is not nested deeply enough for this type of geometry"
         raise InputError(problem, where=where, got=shown(value), expected="a list at this level", fix=VALIDATE)
     return value
 
@@ -258,7 +258,13 @@ def _rings(surface: Any, vertices: np.ndarray, where: str) -> Surface:
     for ring in _require_list(surface, where):
         if not isinstance(ring, list) or len(ring) < 3 or not all(type(index) is int for index in ring):
             expected = "a list of at least three vertex indices"
-            raise InputError("the ring is malformed", where=where, got=shown(ring), expected=expected, fix=VALIDATE)
+            raise InputError(
+                "a boundary ring of the surface is invalid",
+                where=where,
+                got=shown(ring),
+                expected=expected,
+                fix=VALIDATE,
+            )
         low, high = min(ring), max(ring)
         if low < 0 or high >= len(vertices):
             raise InputError(

@@ -261,8 +261,9 @@ def walkable_ground(
     ground = WalkableGround(grid, inflated, parts, footing, box_map.ground, costs, is_in_roi, counts)
     if not ground.row_ends[-1]:
         raise NoPathError(
-            "all walkable ground is carriageway, where pedestrian trajectories must not start or end", where=where,
-            got=f"{counts['cells_used']} walkable cells, all Roads", fix="set pedestrians.road_cost to 1",
+            "all walkable ground is road, but pedestrian trajectories must start and end off the road", where=where,
+            got=f"{counts['cells_used']} walkable cells, all Roads",
+            fix="add such boxes, or set pedestrians.road_cost to 1, which allows starts and ends on roads",
             expected="pavements, squares or paths (Sidewalks, Ground)",
         )  # fmt: skip
     return ground

@@ -64,11 +64,11 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
         raise ResumeError("the output directory is not empty", where=out, fix="choose another --out")
     if stage == "caption" and (cfg.caption.teacher_kind not in EMBEDDED or cfg.caption.judge.url):
         raise ConfigError(
-            "the benchmark measures only teachers without a server, because more workers do not make a server faster",
+            "the benchmark cannot measure a teacher or judge on a server, because its speed does not depend on workers",
             where="caption.teacher",
             got=cfg.caption.teacher,
             expected=f"the teacher {' or '.join(sorted(EMBEDDED))}, and no caption.judge.url",
-            fix="pass --set caption.teacher=rules",
+            fix="pass --set caption.teacher=rules and remove caption.judge.url",
         )
     rows = [_measure(cfg, run_folder, out / f"workers_{count}", stage, count) for count in sorted(set(workers))]
     bench = Bench(stage=stage, cores=len(os.sched_getaffinity(0)), rows=rows)

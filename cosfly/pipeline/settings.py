@@ -72,8 +72,10 @@ class RunConfig(CommandConfig):
         """Return the settings of one town's run. Its seed derives from the run's seed and the town's name."""
         changes = self.towns[name]
         if "towns" in changes:
-            fix = "move these towns to the section `towns` at the top of the file"
-            raise ConfigError("a town cannot contain towns", where=f"towns.{name}.towns", fix=fix)
+            fix = "move these towns to the top-level section `towns`"
+            raise ConfigError(
+                "the settings of a town cannot have a section `towns`", where=f"towns.{name}.towns", fix=fix
+            )
         seed = int(rng_for(self.seed, "run", name).integers(2**31))
         shared = self.model_dump(mode="json", exclude={"towns", "maps"}) | {"name": name, "seed": seed}
         changes_but_maps = {setting: value for setting, value in changes.items() if setting != "maps"}

@@ -477,7 +477,7 @@ def _check_outputs_exist(out: Path, manifest: Manifest) -> None:
         path = inside(out, entry.path)
         if not path.is_file() or path.stat().st_size != entry.bytes:
             raise VerifyError(
-                "the manifest lists this product of a complete stage, but the file is missing or has another size",
+                "an output file of a finished stage is missing or has another size",
                 where=path,
                 expected=f"{entry.bytes} bytes",
                 fix=f"remove {out} and run the stage again",
@@ -611,10 +611,10 @@ def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], records: M
         sources = [entry for source, entry in record.inputs.items() if _role(source) == role]
         if sources and peer != name and all(entry.sha256 != records[peer].sha256 for entry in sources):
             raise VerifyError(
-                f"{path.name} was not made from the {role} that you passed",
+                f"{path.name} was made with another input ({role}), or that input has changed since",
                 where=path,
                 got=str(inputs[peer]),
-                expected=f"the unchanged {sources[0].path}",
+                expected=f"{sources[0].path}, unchanged since then",
                 fix=f"pass the expected {role}, or run the stage that writes {path.name} again",
             )
 
