@@ -81,7 +81,7 @@ def building_at(depth_m: float) -> View:
 @each(("before_m", "after_m", "is_found"), [(20.0, 23.0, True), (23.0, 20.0, False), (20.0, 20.0, False)])
 def test_a_thing_that_is_farther_has_moved_and_one_that_is_nearer_may_hide_itself(before_m, after_m, is_found):
     """From behind a corner another wall of the same building stands before the one that was seen."""
-    assert (compare_views(building_at(before_m), building_at(after_m), CAMERA).shifted > 0) == is_found
+    assert (compare_views(building_at(before_m), building_at(after_m), CAMERA).moved > 0) == is_found
 
 
 @each(("kind", "num_renamed", "is_found"), [("Buildings", 40, True), ("Buildings", 2, False), ("Roads", 40, False)])
@@ -93,7 +93,7 @@ def test_a_thing_under_another_id_is_told_but_for_ground(kind, num_renamed, is_f
     views[0].instance[:, :40, 1] = 8
     views[1].instance[:, :num_renamed, 1] = 9
     views[1].instance[:, num_renamed:40, 1] = 8
-    assert (compare_views(*views, CAMERA).renamed > 0) == is_found
+    assert (compare_views(*views, CAMERA).other_id > 0) == is_found
 
 
 def test_what_another_thing_hides_is_not_gone_and_what_comes_nearer_by_itself_is():
@@ -103,6 +103,6 @@ def test_what_another_thing_hides_is_not_gone_and_what_comes_nearer_by_itself_is
     corner = View(corner.depth, corner.instance, np.eye(3), np.array([30.0, 0.0, 0.0]))
     around = compare_views(View(street.depth, street.instance, np.eye(3), np.zeros(3)), corner, CAMERA)
     assert around.hidden == around.seen > 500
-    assert around.gone == 0.0
-    assert compare_views(street, building_at(6.0), CAMERA).gone == 1.0
-    assert compare_views(building_at(6.0), street, CAMERA).gone == 1.0
+    assert around.missing_share == 0.0
+    assert compare_views(street, building_at(6.0), CAMERA).missing_share == 1.0
+    assert compare_views(building_at(6.0), street, CAMERA).missing_share == 1.0

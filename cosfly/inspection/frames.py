@@ -176,8 +176,8 @@ def _report_jumps(track: Track, pairs: dict[int, Agreement], report: Report) -> 
     if not track.is_ours and not _is_consistent(pairs):
         return 0
     for i, pair in pairs.items():
-        if pair.gone > limits.JUMP_GONE_MAX:
-            got = f"{pair.gone:.1%} of this frame or the previous one is missing in the other"
+        if pair.missing_share > limits.JUMP_GONE_MAX:
+            got = f"{pair.missing_share:.1%} of this frame or the previous one is missing in the other"
             report.warn("temporal_jump", _depth_place(track, i), got, f"at most {limits.JUMP_GONE_MAX:.1%}")
     return len(pairs)
 

@@ -1,12 +1,14 @@
-"""The second renderer, a slow cross-check of the default one: plain boxes, trees and figures through trimesh and
-pyrender (EGL). Each frame is drawn three times in segmentation mode, for tags, colours and the float32 bits of the
-depth: pyrender's own depth is wrong by centimetres at 30 m."""
+"""The second renderer, a slow cross-check of the default one, through trimesh and pyrender (EGL).
+
+It draws plain boxes, trees and figures. Each frame is drawn three times in segmentation mode, for tags, colours and the
+float32 bits of the depth: pyrender's own depth is wrong by centimetres at 30 m.
+"""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,6 +26,8 @@ from cosfly.runtime.errors import EnvironmentMissing, RenderError
 
 SKY_COLOR = np.array([0.52, 0.64, 0.78])  # also the haze's, linear RGB like all colours here
 AMBIENT = 0.45  # share of a surface's colour that the sky lights; the sun adds the rest to what faces it
+SUNLIT_GAIN = 1.6  # on all colours, which are of unlit materials: a sunlit surface is this much brighter
+GAMMA = 2.2  # of displays
 PLAIN_COLOR = (0.42, 0.40, 0.37)  # of kinds without an entry in COLORS
 STEM_COLOR = (0.16, 0.11, 0.075)
 COLORS = {
@@ -35,6 +39,27 @@ COLORS = {
 CAR_PAINTS = ((0.30, 0.05, 0.05), (0.05, 0.10, 0.26), (0.50, 0.50, 0.50), (0.04, 0.04, 0.045))
 
 LIMB_SHARE = (0.85, 0.85, 0.95)  # of its half sizes, that an untapered limb fills
+CABIN_WIDTH_SHARE = 0.8  # of a car's width
+CABIN_SHIFT_SHARE = -0.1  # of a car's half length, forwards
+TAGS, LIT_COLORS, DEPTH_BITS = 255, 128, 0  # what the fragment shader writes, by the red that pyrender passes to it
+
+
+class Triangles(NamedTuple):
+    """k triangles to draw."""
+
+    corners_m: np.ndarray  # (k, 3, 3), relative to the scene's origin
+    colors: np.ndarray  # (k, 3) linear RGB
+    tags: np.ndarray  # (k, 4), see `_tags`
+
+
+class Solids(NamedTuple):
+    """One solid in each of some boxes, of n in all."""
+
+    mesh: Any  # trimesh, half size 1
+    rows: np.ndarray  # (n,) bool, the boxes that have one
+    half_m: np.ndarray  # (n, 3) half sizes
+    lift: np.ndarray  # (n,) of its middle over the box's, in half heights of the box
+    colors: np.ndarray  # (n, 3) linear RGB
 
 
 def _open_screen(width_px: int, height_px: int) -> Any:
@@ -78,7 +103,7 @@ class PyrenderRenderer:
         self.device = f"pyrender, EGL, {glGetString(GL_RENDERER).decode()}"
         self._origin = contract.scene_origin(box_map)
         self._scene = pyrender.Scene()
-        self._scene.add(self._mesh(*_all_boxes(box_map, self._origin, num_others)))
+        self._scene.add(self._mesh(_map_triangles(box_map, self._origin, num_others)))
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
         """Check that no weather is asked for; there are no shadows to compute."""
@@ -100,8 +125,8 @@ class PyrenderRenderer:
         added = [self._scene.add(pyrender.IntrinsicsCamera(*lens, NEAR_M, FAR_M), pose=pose)]
         target = [] if person is None else [PosedBystander(contract.PERSON_ID, person)]
         for mover in (*target, *others):
-            added.append(self._scene.add(self._mesh(*_mover(mover, self._origin))))
-        tags, colors, bits = (self._draw(red) for red in (255, 128, 0))
+            added.append(self._scene.add(self._mesh(_mover_triangles(mover, self._origin))))
+        tags, colors, bits = (self._draw(output) for output in (TAGS, LIT_COLORS, DEPTH_BITS))
         for node in added:
             self._scene.remove_node(node)
         return self._frame(tags, colors, bits)
@@ -109,15 +134,19 @@ class PyrenderRenderer:
     def close(self) -> None:
         self._screen.delete()
 
-    def _draw(self, red: int) -> np.ndarray:
-        """Draw one picture of the scene, (h, w, 4) uint8; red selects it, see the fragment shader."""
+    def _draw(self, output: int) -> np.ndarray:
+        """Draw one picture of the scene, (h, w, 4) uint8, of TAGS, LIT_COLORS or DEPTH_BITS."""
         from pyrender import RenderFlags
 
-        nodes = dict.fromkeys(self._scene.mesh_nodes, (red, 0, 0))
+        nodes = dict.fromkeys(self._scene.mesh_nodes, (output, 0, 0))
         image, _ = self._screen.render(self._scene, RenderFlags.SEG | RenderFlags.RGBA, nodes)
         return np.ascontiguousarray(image)
 
     def _frame(self, tags: np.ndarray, colors: np.ndarray, bits: np.ndarray) -> Frame:
+        """Return the frame of the three pictures, (h, w, 4) uint8.
+
+        tags: kind, low byte of the instance id, high byte, and whether it is sky. bits: one float32 of depth, m.
+        """
         is_sky = tags[..., 3] > 0
         depth = np.where(is_sky, np.float32(SKY_DEPTH_M), bits.view("<f4")[..., 0])
         kinds = np.where(is_sky, np.uint8(KINDS["Sky"]), tags[..., 0])
@@ -127,78 +156,95 @@ class PyrenderRenderer:
         rgb = cv2.convertScaleAbs(sky + clear * (colors[..., :3] - sky))
         return contract.far_as_sky(Frame(rgb, depth, kinds, ids))
 
-    def _mesh(self, triangles: np.ndarray, colors: np.ndarray, tags: np.ndarray) -> Any:
-        """Make a mesh of triangles (k, 3, 3) with linear RGB (k, 3) and tags (k, 4), lit by the sun."""
+    def _mesh(self, triangles: Triangles) -> Any:
+        """Make a mesh of triangles, lit by the sun."""
         import pyrender
 
-        normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        corners_m = triangles.corners_m
+        normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         sun = np.maximum(normals @ self._look.sun_direction(), 0.0)[:, None]
-        lit = _as_byte(colors * (AMBIENT + (1.0 - AMBIENT) * sun) * 1.6 * self._look.exposure) / 255.0
-        paint = np.column_stack([lit, np.ones(len(lit))])
-        corners = {"tangents": np.repeat(tags, 3, axis=0), "color_0": np.repeat(paint, 3, axis=0)}
-        return pyrender.Mesh([pyrender.Primitive(triangles.reshape(-1, 3), **corners)])
+        light = AMBIENT + (1.0 - AMBIENT) * sun
+        lit = _as_byte(triangles.colors * light * SUNLIT_GAIN * self._look.exposure) / 255.0
+        opaque = np.column_stack([lit, np.ones(len(lit))])
+        attributes = {"tangents": np.repeat(triangles.tags, 3, axis=0), "color_0": np.repeat(opaque, 3, axis=0)}
+        return pyrender.Mesh([pyrender.Primitive(corners_m.reshape(-1, 3), **attributes)])
 
 
 def _as_byte(linear: np.ndarray) -> np.ndarray:
-    return np.round(255.0 * np.clip(linear, 0.0, 1.0) ** (1.0 / 2.2))
+    """Return linear colours as they are displayed, 0 to 255 in whole numbers, float."""
+    return np.round(255.0 * np.clip(linear, 0.0, 1.0) ** (1.0 / GAMMA))
 
 
 def _tags(kinds: np.ndarray, ids: np.ndarray, layers: np.ndarray) -> np.ndarray:
-    """Return kind, id and layer for the vertex shader, (n, 4) float."""
+    """Return kind, low and high byte of the id, and depth bias of the layer for the vertex shader, (n, 4) float."""
     ids = ids.astype(np.int64)
     return np.column_stack([kinds, ids & 255, ids >> 8, contract.LAYER_STEP * layers]).astype(np.float32)
 
 
-def _all_boxes(box_map: BoxMap, origin: np.ndarray, num_others: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return triangles, colours and tags of every box and the ground plane; crowns are ellipsoids on stems."""
+def _map_triangles(box_map: BoxMap, origin: np.ndarray, num_others: int) -> Triangles:
+    """Return the triangles of every box, solid and draped surface of a map, and of its ground plane."""
     import trimesh
 
-    center, half = contract.ground_plane(box_map)
-    own_ids = contract.instance_ids(box_map, num_others)
-    centers = np.vstack([box_map.centers, center]) - origin
-    halves = np.maximum(np.vstack([box_map.half_extents, half]), 1e-3)
+    plane_center, plane_half = contract.ground_plane(box_map)
+    centers = np.vstack([box_map.centers, plane_center]) - origin
+    halves = np.maximum(np.vstack([box_map.half_extents, plane_half]), 1e-3)
     turns = rotation_matrices(np.radians(np.vstack([box_map.rotations_deg, np.zeros(3)])))
     kinds = np.append(box_map.kinds, KINDS["Terrain"])
-    table = np.tile(PLAIN_COLOR, (256, 1))
-    table[[KINDS[name] for name in COLORS]] = list(COLORS.values())
-    ids = np.append(own_ids, np.uint16(NO_INSTANCE))
+    colors_by_kind = np.tile(PLAIN_COLOR, (256, 1))
+    colors_by_kind[[KINDS[name] for name in COLORS]] = list(COLORS.values())
+    colors = colors_by_kind[kinds]
+    ids = np.append(contract.instance_ids(box_map, num_others), np.uint16(NO_INSTANCE))
     tags = _tags(kinds, ids, np.append(layers_of(box_map), 0))
-    is_round = np.zeros(len(kinds), dtype=bool)
-    low = np.full(len(kinds), -1.0)
-    plants = np.flatnonzero(kinds == KINDS["Vegetation"])
-    forms, low[plants] = contract.plants_of(centers[plants], halves[plants], contract.seeds_of(box_map.ids[plants]))
-    is_round[plants] = forms >= contract.BUSH
-    middle = (1.0 + low) / 2.0
-    radius = contract.stem_radius_m(halves)
-    crowns = halves * np.column_stack([np.ones((len(low), 2)), (1.0 - low) / 2.0])
-    stems = np.column_stack([radius, radius, halves[:, 2] * (1.0 + middle) / 2.0])
+    crowns, stems = _trees(box_map, centers, halves, colors)
     is_box = np.append(~are_solids(box_map), True)
+    is_plain = ~crowns.rows & ~np.append(is_draped(box_map), False)
     box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
-    ball = trimesh.creation.icosphere(subdivisions=1)
-    solids = [
-        (box, is_box & ~is_round & ~np.append(is_draped(box_map), False), halves, 0.0 * low, table[kinds]),
-        (ball, is_box & is_round, crowns, middle, table[kinds]),
-        (box, is_box & (low > -1.0), stems, (middle - 1.0) / 2.0, np.tile(STEM_COLOR, (len(low), 1))),
-    ]
     pieces = []
-    for mesh, rows, size, lift, paint in solids:  # lift: of the middle over the box's, in half heights
-        middles = centers[rows] + turns[rows, :, 2] * (lift * halves[:, 2])[rows, None]
-        corners = np.einsum("nij,nvj->nvi", turns[rows], size[rows, None] * mesh.vertices) + middles[:, None]
-        repeated = (np.repeat(values[rows], len(mesh.faces), axis=0) for values in (paint, tags))
-        pieces.append((corners[:, mesh.faces].reshape(-1, 3, 3), *repeated))
+    for solid in (Solids(box, is_plain, halves, np.zeros(len(kinds)), colors), crowns, stems):
+        rows = solid.rows & is_box
+        middles = centers[rows] + turns[rows, :, 2] * (solid.lift * halves[:, 2])[rows, None]
+        vertices = solid.half_m[rows, None] * solid.mesh.vertices
+        corners = np.einsum("nij,nvj->nvi", turns[rows], vertices) + middles[:, None]
+        repeated = (np.repeat(values[rows], len(solid.mesh.faces), axis=0) for values in (solid.colors, tags))
+        pieces.append((corners[:, solid.mesh.faces].reshape(-1, 3, 3), *repeated))
     placed = solids_of(box_map)
     for sides in (placed.corners_m, placed.corners_m[:, ::-1]):  # seen from both
-        pieces.append((sides - origin, table[kinds][placed.rows], tags[placed.rows]))
+        pieces.append((sides - origin, colors[placed.rows], tags[placed.rows]))
     if not box_map.ground.is_flat:
         draped = drape(box_map)  # the last row, BARE_GROUND, is the plane's
-        pieces.append((draped.corners_m - origin, table[kinds][draped.rows], tags[draped.rows]))
-    triangles, colors, tagged = map(np.concatenate, zip(*pieces, strict=True))
-    return triangles, colors, tagged
+        pieces.append((draped.corners_m - origin, colors[draped.rows], tags[draped.rows]))
+    return Triangles(*map(np.concatenate, zip(*pieces, strict=True)))
 
 
-def _mover(mover: PosedBystander, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return triangles, colours and tags of a bystander.
+def _trees(box_map: BoxMap, centers: np.ndarray, halves: np.ndarray, colors: np.ndarray) -> tuple[Solids, Solids]:
+    """Return the crowns of trees and bushes, which replace their boxes, and the stems of the trees.
+
+    centers, halves, colors: (n, 3) of the map's boxes and its ground plane.
+    """
+    import trimesh
+
+    is_round = np.zeros(len(halves), dtype=bool)
+    # In half heights over the middle of the box: -1 without a stem. The crown ends at the top of the box, 1.
+    crown_bottom = np.full(len(halves), -1.0)
+    plants = np.flatnonzero(box_map.kinds == KINDS["Vegetation"])
+    seeds = contract.seeds_of(box_map.ids[plants])
+    forms, crown_bottom[plants] = contract.plants_of(centers[plants], halves[plants], seeds)
+    is_round[plants] = forms >= contract.BUSH
+    crown_middle = (1.0 + crown_bottom) / 2.0
+    crowns_m = halves * np.column_stack([np.ones((len(halves), 2)), (1.0 - crown_bottom) / 2.0])
+    radius_m = contract.stem_radius_m(halves)
+    stems_m = np.column_stack([radius_m, radius_m, halves[:, 2] * (1.0 + crown_middle) / 2.0])
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
+    bark = np.tile(STEM_COLOR, (len(halves), 1))
+    crowns = Solids(ball, is_round, crowns_m, crown_middle, colors)
+    # A stem reaches from the bottom of the box, -1, to the middle of the crown.
+    return crowns, Solids(box, crown_bottom > -1.0, stems_m, (crown_middle - 1.0) / 2.0, bark)
+
+
+def _mover_triangles(mover: PosedBystander, origin: np.ndarray) -> Triangles:
+    """Return the triangles of the target or a bystander.
 
     A person consists of balls, boxes and cylinders, a car of two boxes: the body, and a shorter, narrower cabin.
     """
@@ -214,16 +260,16 @@ def _mover(mover: PosedBystander, origin: np.ndarray) -> tuple[np.ndarray, np.nd
         solids = zip(figure.shapes, figure.centers_m, figure.turns, figure.half_m, strict=True)
         parts = [(units[shape] * half) @ turn.T + center - origin for shape, center, turn, half in solids]
         kind = KINDS["Pedestrians"]
-        triangles = np.concatenate(parts)
-        paint = np.repeat(figure.colors, [len(part) for part in parts], axis=0)
+        corners_m = np.concatenate(parts)
+        colors = np.repeat(figure.colors, [len(part) for part in parts], axis=0)
     else:
         length, width, height = body.half_extents_m
         lower = trimesh.creation.box(extents=(2 * length, 2 * width, height)).apply_translation((0, 0, -height / 2))
-        cabin = trimesh.creation.box(extents=(length, 1.6 * width, height))
-        cabin.apply_translation((-0.1 * length, 0, height / 2))
+        cabin = trimesh.creation.box(extents=(length, 2 * CABIN_WIDTH_SHARE * width, height))
+        cabin.apply_translation((CABIN_SHIFT_SHARE * length, 0, height / 2))
         kind = KINDS["Car"]
-        triangles = np.concatenate([lower.triangles, cabin.triangles])
-        triangles = triangles @ rotation_matrix(0.0, body.heading_rad, 0.0).T + body.center_m - origin
-        paint = np.tile(CAR_PAINTS[int(body.seed * len(CAR_PAINTS))], (len(triangles), 1))
+        corners_m = np.concatenate([lower.triangles, cabin.triangles])
+        corners_m = corners_m @ rotation_matrix(0.0, body.heading_rad, 0.0).T + body.center_m - origin
+        colors = np.tile(CAR_PAINTS[int(body.seed * len(CAR_PAINTS))], (len(corners_m), 1))
     tag = _tags(np.array([kind]), np.array([mover.instance_id]), np.array([contract.STANDING_LAYER]))
-    return triangles, paint, np.repeat(tag, len(triangles), axis=0)
+    return Triangles(corners_m, colors, np.repeat(tag, len(corners_m), axis=0))

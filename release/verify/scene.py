@@ -280,7 +280,7 @@ def _judge_scale(flight: FlightRows, pairs: list[Pair], findings: Findings) -> N
     """Find depth that is scaled or set off: its planes move with the camera."""
     for what, most, errors in (
         ("ground", FLAT_MOST, [pair.error_flat for *_, pair in pairs]),
-        ("objects on it", STANDING_MOST, [pair.error_standing for *_, pair in pairs]),
+        ("objects on it", STANDING_MOST, [pair.error_off_flat for *_, pair in pairs]),
     ):
         known = [error for error in errors if np.isfinite(error)]
         if len(known) >= LEAST_FRAMES and (error := float(np.median(known))) > most:
@@ -300,18 +300,18 @@ def _judge_pairs(flight: FlightRows, pairs: list[Pair], findings: Findings) -> N
 
 def _odd_pair(pair: Agreement, is_near: bool) -> tuple[str, str, str] | None:
     """Return code, got and expected of two frames that do not show one world, else None."""
-    if pair.error > ERROR_MOST or (is_near and pair.gone > GONE_MOST):
+    if pair.error > ERROR_MOST or (is_near and pair.missing_share > GONE_MOST):
         off = f", and an error of {pair.error:.2%} in planes" if np.isfinite(pair.error) else ""
-        got = f"{pair.gone:.1%} of the points in front of the surfaces of this or the previous frame{off}"
+        got = f"{pair.missing_share:.1%} of the points in front of the surfaces of this or the previous frame{off}"
         most = f"at most {GONE_MOST:.1%}, and an error of at most {ERROR_MOST:.2%}"
         return "scene_depth", got, f"{most}, for depth, pose and camera that agree with the previous frame"
-    if is_near and pair.shifted:
-        got = f"an object of {pair.shifted} points that is farther away than in the previous frame"
+    if is_near and pair.moved:
+        got = f"an object of {pair.moved} points that is farther away than in the previous frame"
         return "scene_depth", got, "the same place, because it does not move"
     if pair.agree >= LEAST_AGREE and pair.same < SAME_LEAST * pair.agree:
         got = f"{pair.same / pair.agree:.1%} of the points with the instance id of the previous frame"
         return "scene_instance", got, f"at least {SAME_LEAST:.0%} of the points with the same depth"
-    if is_near and pair.agree >= LEAST_AGREE and pair.renamed:
-        got = f"an object of {pair.renamed} points with a different id from the previous frame"
+    if is_near and pair.agree >= LEAST_AGREE and pair.other_id:
+        got = f"an object of {pair.other_id} points with a different id from the previous frame"
         return "scene_instance", got, "the same id for an object in all frames"
     return None

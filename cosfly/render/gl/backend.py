@@ -18,7 +18,7 @@ from cosfly.formats.weather import WeatherParams
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Frame, Others, PosedPerson, check_pose, far_as_sky
 from cosfly.render.gl import meshes, movers, programs
 from cosfly.render.gl.parts import DRAW_ORDER, NUM_MATERIALS, PART, CameraView, materials_of
-from cosfly.render.gl.programs import LooseTriangles, Programs, set_uniform
+from cosfly.render.gl.programs import LooseBuffers, Programs, set_uniform
 from cosfly.render.gl.scene import build_scene
 from cosfly.render.gl.weather_pass import WeatherPass, defines
 from cosfly.render.person import figure_of
@@ -80,7 +80,7 @@ class GlRenderer:
             self._num_triangles = [len(mesh.triangles) for mesh in all_meshes]
             self._num_waiting = 0
             self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}  # made when needed
-            self._loose = LooseTriangles(context, self.scene.loose)
+            self._loose = LooseBuffers(context, self.scene.loose)
             texts = programs.sources(("part.glsl", "depth.vert.glsl"), ("depth.frag.glsl",))
             self._depth_program = context.program(*texts)
             self._looks: dict[str | None, tuple[Programs, Any, WeatherPass | None]] = {}
@@ -126,7 +126,7 @@ class GlRenderer:
         away_m = np.linalg.norm(np.maximum(outside, 0.0), axis=1) - parts.object_radii
         shift_m = np.round(((low_m + high_m) / 2.0 - zero) / ORIGIN_STEP_M) * [1.0, 1.0, 0.0] * ORIGIN_STEP_M
         self.origin_m = zero + shift_m
-        self._parts = parts = parts.select(away_m < FAR_M).about(shift_m)
+        self._parts = parts = parts.select(away_m < FAR_M).relative_to(shift_m)
         self._groups = _groups(parts.records, parts.mesh)
         low, high = low_m - self.origin_m, high_m - self.origin_m
         middle = (low + high) / 2.0
@@ -231,7 +231,7 @@ class GlRenderer:
         uniforms = self._uniforms(view, camera_pose, person)
         with self.context:
             self._set_uniforms(self._programs.materials, uniforms)
-            rows = view.rows(self._parts)
+            rows = view.part_rows_in_view(self._parts)
             self._loose.see(view)
             self._image.use()
             self._image.clear(depth=1.0)

@@ -55,8 +55,8 @@ def _car_parts(car: PosedCar, instance_id: int, center: np.ndarray, view: Camera
     half = np.array(car.half_extents_m)
     ids = np.array([instance_id], np.uint16)
     boxes = Boxes(center[None], half[None], turn[None], ids, np.array([car.seed]), KINDS["Car"], np.zeros(1))
-    parts = Parts.joined(parts_of(boxes))
-    rows = view.rows(parts)
+    parts = Parts.concatenate(parts_of(boxes))
+    rows = view.part_rows_in_view(parts)
     return parts.records[rows], parts.mesh[rows]
 
 

@@ -62,13 +62,13 @@ class Parts:
         return len(self.records)
 
     @staticmethod
-    def joined(parts: list[Parts]) -> Parts:
+    def concatenate(parts: list[Parts]) -> Parts:
         return Parts(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
     def select(self, keep: np.ndarray) -> Parts:
         return Parts(*(column[keep] for column in vars(self).values()))
 
-    def about(self, origin_m: np.ndarray) -> Parts:
+    def relative_to(self, origin_m: np.ndarray) -> Parts:
         """Return the same parts relative to a further origin, (3,): float32 is most precise near 0."""
         if not origin_m.any():
             return self
@@ -111,13 +111,13 @@ class Boxes:
         turns[across] = turns[across] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         return replace(self, half=half, turns=turns)
 
-    def chance(self, number: int) -> np.ndarray:
+    def variation(self, number: int) -> np.ndarray:
         """Return a further fixed number in [0, 1) for each box."""
         return chance(self.seeds, number)
 
     def pick(self, palette: np.ndarray) -> np.ndarray:
         """Return a colour of a palette, (k, 3), for each box, (n, 3)."""
-        return palette[(self.chance(0) * len(palette)).astype(int)]
+        return palette[(self.variation(0) * len(palette)).astype(int)]
 
     def part(
         self, mesh: int, half: np.ndarray, material: int, color: np.ndarray | tuple[float, ...], *,
@@ -127,8 +127,9 @@ class Boxes:
         """Return one part of each box.
 
         Args:
-            mesh, material: Their numbers.
+            mesh: Number of the unit mesh, see meshes.py.
             half: (n, 3) or (3,) half sizes of the part in its own axes, m.
+            material: Number in the shader, see PLAIN.
             color: (n, 3) or (3,) linear RGB.
             offset: (n, 3) from the centre of the box, in box axes, m.
             turn: (3, 3) or (n, 3, 3) box_from_part.
@@ -141,7 +142,7 @@ class Boxes:
         records["center"] = centers
         if offset is not None:
             offset_m = np.einsum("nij,nj->ni", self.turns, offset)
-            records["center"] += offset_m
+            records["center"] += offset_m  # to the rounded centre: rounding the sum would move vertices by an ulp
             centers = centers + offset_m
         records["half"] = np.maximum(half, LEAST_HALF_M)
         if num_boxes:
@@ -162,16 +163,16 @@ class Boxes:
 
 
 @dataclass(frozen=True)
-class Loose:
-    """Triangles of no mesh: those of n things (meshes of a map), and the ground.
+class LooseTriangles:
+    """Triangles of no unit mesh: those of n objects (meshes of a map), and the ground.
 
-    Triangles of a material without things are the ground, which is always drawn and casts no shadow.
+    Triangles of a material without objects are the ground, which is always drawn and casts no shadow.
     """
 
     vertices: dict[int, np.ndarray]  # by material: (3 k,) LOOSE_VERTEX, three to a triangle
-    things: dict[int, np.ndarray]  # by material: (k,) ascending, the row of the thing of each triangle
-    centers: np.ndarray  # (n, 3) float64 of things, relative to the scene's origin
-    radii: np.ndarray  # (n,) of things, m
+    objects: dict[int, np.ndarray]  # by material: (k,) ascending, the row of the object of each triangle
+    centers: np.ndarray  # (n, 3) float64 m, of the objects, relative to the scene's origin
+    radii: np.ndarray  # (n,) m, of the objects
 
 
 def tags(kinds: np.ndarray | int, materials: np.ndarray | int, ids: np.ndarray) -> np.ndarray:
@@ -198,13 +199,16 @@ class CameraView:
     width_px: int
     height_px: int
 
-    def rows(self, parts: Parts) -> np.ndarray:
-        """Return the rows of the parts to draw, nearest objects first."""
-        least_px = np.maximum(parts.min_px, np.float32(SMALLEST_PX))
-        rows, away = self._spheres(parts.object_centers, parts.object_radii, least_px, parts.max_px)
-        return rows[np.lexsort((away, -parts.records["bias"][rows]))]
+    def part_rows_in_view(self, parts: Parts) -> np.ndarray:
+        """Return the rows of the parts to draw: the highest layer first, in a layer the nearest object first.
 
-    def shown(self, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
+        Thus most of what is hidden fails the depth test and is not shaded.
+        """
+        least_px = np.maximum(parts.min_px, np.float32(SMALLEST_PX))
+        rows, away_m = self._spheres_in_view(parts.object_centers, parts.object_radii, least_px, parts.max_px)
+        return rows[np.lexsort((away_m, -parts.records["bias"][rows]))]
+
+    def sphere_rows_in_view(self, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
         """Return the rows of the spheres that may be seen, the nearest first.
 
         Args:
@@ -213,24 +217,26 @@ class CameraView:
         """
         least_px = np.full(len(radii), SMALLEST_PX, np.float32)
         most_px = np.full(len(radii), np.inf, np.float32)
-        rows, away = self._spheres(centers.astype(np.float32), radii, least_px, most_px)
-        return rows[np.argsort(away, kind="stable")]
+        rows, away_m = self._spheres_in_view(centers.astype(np.float32), radii, least_px, most_px)
+        return rows[np.argsort(away_m, kind="stable")]
 
-    def _spheres(
+    def _spheres_in_view(
         self, centers: np.ndarray, radii: np.ndarray, min_px: np.ndarray, max_px: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Call `spheres_in_view` for this camera."""
+        """Return the result of `spheres_in_view`, with this camera as its arguments."""
         middle = self.intrinsic[:2, 2]
         size = np.array([self.width_px, self.height_px])
+        # Of the angles between the optical axis and the farther border of the picture, horizontally and vertically. The
+        # kernel measures distances from the border's plane across the axis, not across the plane: 1 / cosine longer.
         tangents = np.maximum(middle, size - middle) / np.diag(self.intrinsic)[:2]
+        slants = np.sqrt(1.0 + tangents**2)
         eye = self.eye.astype(np.float32)
         turn = np.ascontiguousarray(self.world_from_camera, np.float32)
-        slants = np.sqrt(1.0 + tangents**2)
         return spheres_in_view(centers, radii, min_px, max_px, eye, turn, tangents, slants, float(self.intrinsic[0, 0]))
 
     def can_show(self, center: np.ndarray, radius: float) -> bool:
         """Return whether something within a sphere may be seen; center: (3,) relative to the scene's origin."""
-        return len(self.shown(center[None], np.array([radius], np.float32))) > 0
+        return len(self.sphere_rows_in_view(center[None], np.array([radius], np.float32))) > 0
 
     def rectangle_px(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
         """Return the pixels that a hull of points, (n, 3), may cover: x0, y0, x1, y1; None outside the picture."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cosfly.render.contract import DEBIAN_PACKAGES
-from cosfly.render.gl.parts import LOOSE_VERTEX, NUM_MATERIALS, CameraView, Loose
+from cosfly.render.gl.parts import LOOSE_VERTEX, NUM_MATERIALS, CameraView, LooseTriangles
 from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.io import read_text
 
@@ -91,16 +91,16 @@ def set_uniform(program: Any, name: str, value: Any) -> None:
         uniform.value = value
 
 
-class LooseTriangles:
+class LooseBuffers:
     """Loose triangles in buffers of one GL context; every vertex holds its part."""
 
-    def __init__(self, context: Any, loose: Loose) -> None:
+    def __init__(self, context: Any, loose: LooseTriangles) -> None:
         self._context = context
         self._loose = loose
         self._buffers = {material: context.buffer(reserve=rows.nbytes) for material, rows in loose.vertices.items()}
         self._indices = {m: context.buffer(reserve=4 * len(rows), dynamic=True) for m, rows in loose.vertices.items()}
         numbers = np.arange(len(loose.centers) + 1)
-        self._firsts = {material: 3 * np.searchsorted(rows, numbers) for material, rows in loose.things.items()}
+        self._firsts = {material: 3 * np.searchsorted(rows, numbers) for material, rows in loose.objects.items()}
         self._num_indices: dict[int, int] = {}
         self._arrays: dict[tuple[int, int], Any] = {}
         self.centers = loose.centers.astype(np.float32)
@@ -117,8 +117,8 @@ class LooseTriangles:
         self.centers = (self._loose.centers - shift_m).astype(np.float32)
 
     def see(self, view: CameraView | None) -> None:
-        """Select the things that a camera may see, the nearest first; None selects everything."""
-        seen = np.arange(len(self.centers)) if view is None else view.shown(self.centers, self.radii)
+        """Select the objects that a camera may see, the nearest first; None selects everything."""
+        seen = np.arange(len(self.centers)) if view is None else view.sphere_rows_in_view(self.centers, self.radii)
         for material, firsts in self._firsts.items():
             counts = (firsts[1:] - firsts[:-1])[seen]
             before = np.cumsum(counts) - counts
@@ -141,7 +141,7 @@ class LooseTriangles:
         self._arrays[key].render(vertices=self._num_indices[material])
 
     def draw_shadows(self, program: Any) -> None:
-        """Draw the selected things with one program."""
+        """Draw the selected objects with one program."""
         for material in self._firsts:
             self.draw(program, material)
 

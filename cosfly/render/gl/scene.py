@@ -15,7 +15,7 @@ from cosfly.geometry.ground import Ground
 from cosfly.render import contract
 from cosfly.render.contract import LAYER_STEP, NO_INSTANCE, STANDING_LAYER, seeds_of
 from cosfly.render.gl import meshes, parts
-from cosfly.render.gl.parts import LOOSE_VERTEX, PART, Boxes, Loose, Parts, materials_of
+from cosfly.render.gl.parts import LOOSE_VERTEX, PART, Boxes, LooseTriangles, Parts, materials_of
 from cosfly.render.gl.shapes import BUILDING_COLORS, PLAIN_COLORS, TILE_COLORS, parts_of
 from cosfly.render.surfaces import Solids, Triangles, are_solids, drape, is_draped, layers_of, solids_of
 
@@ -30,13 +30,13 @@ SAME_ANGLE_RAD, SAME_PLACE_M = np.radians(1.0), 0.1  # surfaces that differ by l
 THINNEST_M = 0.01  # half size of a flat part
 
 
-def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.ndarray) -> Loose:
+def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.ndarray) -> LooseTriangles:
     """Return the triangles of solids for the shader, which draws both of their sides.
 
     ids: (n,) instance ids of the map's boxes.
     """
     if not len(solids):
-        return Loose({}, {}, np.zeros((0, 3)), np.zeros(0))
+        return LooseTriangles({}, {}, np.zeros((0, 3)), np.zeros(0))
     kinds = box_map.kinds[solids.rows]
     seeds = seeds_of(box_map.ids[solids.rows])
     normals = solids.normals
@@ -70,7 +70,7 @@ def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.
         int(material): np.lexsort((things, materials != material))[: np.count_nonzero(materials == material)]
         for material in np.unique(materials)
     }
-    return Loose(
+    return LooseTriangles(
         {material: vertices[rows].reshape(-1) for material, rows in rows_of.items()},
         {material: things[rows] for material, rows in rows_of.items()},
         (low_m + high_m) / 2.0 - origin_m,
@@ -187,7 +187,7 @@ class Scene:
     origin_m: np.ndarray  # (3,) world position of the origin of the parts
     plane_z_m: float  # height of the ground plane, world
     ground: Ground
-    loose: Loose  # surfaces on sloping ground, and the meshes of boxes
+    loose: LooseTriangles  # surfaces on sloping ground, and the meshes of boxes
     lamps: np.ndarray  # (n, 3) relative to the origin; only for a map without lamps among its parts
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -231,9 +231,9 @@ def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
     loose = loose_solids(box_map, solids_of(box_map), origin, all_ids)
     if not box_map.ground.is_flat:
         loose.vertices.update(_draped(drape(box_map), origin, lying))
-    joined = Parts.joined(all_parts)
-    lamps = np.zeros((0, 3)) if len(joined.lamps()) else lamps_along_streets(box_map) - origin
-    return Scene(joined, origin, contract.plane_z_m(box_map), box_map.ground, loose, lamps)
+    all_drawn = Parts.concatenate(all_parts)
+    lamps = np.zeros((0, 3)) if len(all_drawn.lamps()) else lamps_along_streets(box_map) - origin
+    return Scene(all_drawn, origin, contract.plane_z_m(box_map), box_map.ground, loose, lamps)
 
 
 def _draped(draped: Triangles, origin: np.ndarray, records: np.ndarray) -> dict[int, np.ndarray]:

@@ -94,7 +94,7 @@ def _buildings(boxes: Boxes) -> list[Parts]:
 def _vegetation(boxes: Boxes) -> list[Parts]:
     """Return trees, bushes, hedges and lawns, by the shape of the box."""
     forms, crown_low = contract.plants_of(boxes.centers, boxes.half, boxes.seeds)
-    leaf = boxes.pick(LEAF_COLORS) * (0.85 + 0.35 * boxes.chance(3))[:, None]
+    leaf = boxes.pick(LEAF_COLORS) * (0.85 + 0.35 * boxes.variation(3))[:, None]
     by_form = {form: (boxes.select(forms == form), leaf[forms == form]) for form in range(contract.BROADLEAF + 1)}
     lawns, grass = by_form[contract.LAWN]
     hedges, green = by_form[contract.HEDGE]
@@ -138,12 +138,12 @@ def _crowns(boxes: Boxes, leaf: np.ndarray, crown_low: np.ndarray) -> list[Parts
         boxes.part(meshes.BLOB_FINE, half * 0.74, parts.LEAVES, leaf, offset=center, min_px=FAR_PX),
     ]
     for number in range(7):
-        radius = (0.40 + 0.13 * boxes.chance(10 + number))[:, None]
-        angle = 2.0 * np.pi * (number / 6.0 + boxes.chance(30)) + 0.5 * boxes.chance(20 + number)
-        lift = np.where(number == 6, 0.9, 0.62 * np.sin(2.6 * number + 6.28 * boxes.chance(31)))
+        radius = (0.40 + 0.13 * boxes.variation(10 + number))[:, None]
+        angle = 2.0 * np.pi * (number / 6.0 + boxes.variation(30)) + 0.5 * boxes.variation(20 + number)
+        lift = np.where(number == 6, 0.9, 0.62 * np.sin(2.6 * number + 6.28 * boxes.variation(31)))
         flat = np.sqrt(np.maximum(0.0, 1.0 - lift**2))
         offset = center + half * np.column_stack([flat * np.cos(angle), flat * np.sin(angle), lift]) * (1.0 - radius)
-        shade = leaf * (0.86 + 0.3 * boxes.chance(40 + number))[:, None]
+        shade = leaf * (0.86 + 0.3 * boxes.variation(40 + number))[:, None]
         blobs.append(boxes.part(meshes.BLOB, half * radius, parts.LEAVES, shade, offset=offset, min_px=FAR_PX))
     return blobs
 
