@@ -240,7 +240,7 @@ def straight_scenario(obstacles, length_m=30.0):
     return make_scenario(walk_along("w", [(0, 0), (length_m, 0)]), obstacles, CFG)
 
 
-def test_the_wished_places_are_in_the_lattice_and_cost_nothing():
+def test_the_reference_places_are_in_the_lattice_and_cost_nothing():
     scenario, _ = scenario_of("corner")
     for climbing in (False, True):
         made = foresight.make_lattice(scenario, climbing=climbing)

@@ -18,6 +18,33 @@ from cosfly.planners.line_of_sight import LOWEST_END_M, five_ray_visibility, mak
 from cosfly.planners.smoothing import smooth_trajectory, unsafe
 from cosfly.runtime.compiled import njit
 
+
+def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
+    """Plan one trajectory (the signature of `planners.contract`); nothing here is random."""
+    raw, start, clearance_m = _raw_trajectory(scenario, obstacles, cfg)
+    points, facts = smooth_trajectory(raw, scenario, obstacles, cfg, clearance_m)
+    return Plan(points, {"start": start, "clearance_m": clearance_m, **facts})
+
+
+def _raw_trajectory(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> tuple[np.ndarray, str, float]:
+    """Return the trajectory to smooth, its kind (`wished`, `search` or `climbing search`), and its clearance, m.
+
+    Where the reference is free and sees the target wherever it must, it is the trajectory (`wished`).
+    """
+    reference = scenario.with_past(scenario.reference.places_m(scenario.targets_m, scenario.ground_m))
+    ahead = slice(scenario.start, None)
+    step_m = cfg.speed_max_mps * scenario.dt_s
+    safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
+    seen = ~scenario.reference.keeps_sight | (kernels.visibility(obstacles, reference, scenario.targets_m) == 1.0)
+    if seen[ahead].all() and not unsafe(reference[ahead], obstacles, safety_m, SPEED_SHARE * step_m).any():
+        return reference, "wished", safety_m
+    for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):
+        raw = search_trajectory(scenario, make_lattice(scenario, climbing=climbing), obstacles, cfg, clearance_m)
+        if raw is not None:
+            return raw, "climbing search" if climbing else "search", clearance_m
+    raise scenario.no_path_error("no collision-free path connects the start with the end", relaxed_m)
+
+
 # --- candidate places: rings around the target, counted from the reference position -----------------------------------
 
 NUM_AZIMUTHS = 36
@@ -58,31 +85,47 @@ class Lattice:
 
 def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
     """Return the rings around the target. climbing: add places far above the reference, at fewer key frames."""
-    reference = scenario.reference
-    targets = scenario.targets_m
     stride = max(1, round((BETWEEN_KEYS_CLIMBING_S if climbing else BETWEEN_KEYS_S) / scenario.dt_s))
     frames, least_z, _, greatest_z = scenario.key_frames(stride)
-    least_z, greatest_z = least_z[:, None], greatest_z[:, None]
     rings = np.array(RINGS + CLIMBS if climbing else RINGS, dtype=np.float64)
-    distances_m, grounds_m = reference.distance_m[frames, None], reference.ground_distance_m[frames, None]
+    distances_m = scenario.reference.distance_m[frames, None]
+    ground_distances_m = scenario.reference.ground_distance_m[frames, None]
     steps_m = np.minimum(STEP_OUT_SHARE * distances_m, STEP_OUT_MAX_M)
-    radii_m = np.maximum(grounds_m + rings[:, 0] * steps_m, grounds_m / 2.0)
-    z = np.maximum((scenario.ground_m + reference.altitude_m)[frames, None] + STEP_UP_M * rings[:, 1], least_z)
-    z = np.minimum(z, np.maximum(greatest_z, least_z))
-    turns = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
-    angles = reference.view_rad[frames, None, None] + np.pi + turns
-    x = targets[frames, 0, None, None] + radii_m[:, :, None] * np.cos(angles)
-    y = targets[frames, 1, None, None] + radii_m[:, :, None] * np.sin(angles)
-    places_m = np.stack([x, y, np.broadcast_to(z[:, :, None], x.shape)], axis=-1)
-    off = (radii_m - grounds_m) / distances_m
-    turned, high = (ANY_BEARING_COST, ANY_BEARING_HIGH_COST) if reference.any_bearing else (BEARING_COST, HIGH_COST)
-    aside = np.where(off > 0, FAR_COST, NEAR_COST) * off**2 + high * (STEP_UP_M * rings[:, 1] / distances_m) ** 2
-    costs = aside[:, :, None] + turned * np.minimum(turns, 2.0 * np.pi - turns) ** 2
+    radii_m = np.maximum(ground_distances_m + rings[:, 0] * steps_m, ground_distances_m / 2.0)
+    z = np.maximum((scenario.ground_m + scenario.reference.altitude_m)[frames, None] + STEP_UP_M * rings[:, 1],
+                   least_z[:, None])  # fmt: skip
+    z = np.minimum(z, np.maximum(greatest_z, least_z)[:, None])
+    turns_rad = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
+    places_m = _places(scenario, frames, radii_m, z, turns_rad)
+    distance_errors = (radii_m - ground_distances_m) / distances_m
+    height_errors = STEP_UP_M * rings[:, 1] / distances_m
+    costs = _costs(distance_errors, height_errors, turns_rad, any_bearing=scenario.reference.any_bearing)
     if len(scenario.past_m):  # all places of the first key frame are the drone's position
         places_m[0] = scenario.past_m[-1]
         costs[0] = 0.0
     max_turn = MAX_TURN_CLIMBING if climbing else MAX_TURN
     return Lattice(frames, places_m, costs, _links(rings), float(radii_m.max()), max_turn)
+
+
+def _places(
+    scenario: Scenario, frames: np.ndarray, radii_m: np.ndarray, z: np.ndarray, turns_rad: np.ndarray
+) -> np.ndarray:
+    """Return the places on the rings, (m, r, a, 3) m; radii_m, z: (m, r). turns_rad: (a,) from the reference."""
+    targets_m = scenario.targets_m[frames, :, None, None]
+    angles_rad = scenario.reference.view_rad[frames, None, None] + np.pi + turns_rad
+    x = targets_m[:, 0] + radii_m[:, :, None] * np.cos(angles_rad)
+    y = targets_m[:, 1] + radii_m[:, :, None] * np.sin(angles_rad)
+    return np.stack([x, y, np.broadcast_to(z[:, :, None], x.shape)], axis=-1)
+
+
+def _costs(
+    distance_errors: np.ndarray, height_errors: np.ndarray, turns_rad: np.ndarray, *, any_bearing: bool
+) -> np.ndarray:
+    """Return the costs of the places, (m, r, a); errors: (m, r) shares of the reference distance. turns_rad: (a,)."""
+    bearing_cost, height_cost = (ANY_BEARING_COST, ANY_BEARING_HIGH_COST) if any_bearing else (BEARING_COST, HIGH_COST)
+    distance_cost = np.where(distance_errors > 0, FAR_COST, NEAR_COST)
+    ring_costs = distance_cost * distance_errors**2 + height_cost * height_errors**2
+    return ring_costs[:, :, None] + bearing_cost * np.minimum(turns_rad, 2.0 * np.pi - turns_rad) ** 2
 
 
 def _links(rings: np.ndarray) -> np.ndarray:
@@ -122,19 +165,18 @@ def search_trajectory(
     num_azimuths = lattice.places_m.shape[2]
     places = lattice.places_m.reshape(len(frames), -1, 3)
     aloft = boxes_aloft(obstacles, scenario.targets_m, lattice)
-    gaps, hidden = np.zeros(places.shape[:2]), np.ones(places.shape[:2])
-    _survey(places, scenario.targets_m[frames], obstacles, aloft.rows, clearance_m, REACH_M, gaps, hidden)
+    gaps_m, hidden = np.empty(places.shape[:2]), np.empty(places.shape[:2])
+    _survey(places, scenario.targets_m[frames], obstacles, aloft.rows, clearance_m, REACH_M, gaps_m, hidden)
     hidden_before, hidden_after = np.roll(hidden, 1, axis=0), np.roll(hidden, -1, axis=0)
     hidden_before[0], hidden_after[-1] = hidden[0], hidden[-1]
     place_costs = (1.0 - 2.0 * NEIGHBOUR_SHARE) * hidden + NEIGHBOUR_SHARE * (hidden_before + hidden_after)
     place_costs[~scenario.reference.keeps_sight[frames]] = 0.0
     place_costs += lattice.costs.reshape(place_costs.shape)
     longest_m = SPEED_SHARE * cfg.speed_max_mps * scenario.dt_s * np.diff(frames, prepend=frames[0])
-    links = lattice.links
-    max_turn = lattice.max_turn
     chosen = _cheapest(
-        places, place_costs, gaps, longest_m, aloft, clearance_m, links, num_azimuths, max_turn, WAY_COST
-    )
+        places, place_costs, gaps_m, longest_m, aloft, clearance_m, lattice.links, num_azimuths, lattice.max_turn,
+        WAY_COST,
+    )  # fmt: skip
     return None if chosen[0] < 0 else scenario.between(frames, places[np.arange(len(frames)), chosen])
 
 
@@ -151,13 +193,13 @@ def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) ->
 
 
 @njit(cache=True)
-def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps_m, hidden):
+def _survey(places, targets, index, aloft_rows, clearance_m, reach_m, gaps_m, hidden):
     """Write the distance of each place to the nearest box, at most `reach_m`, and the hidden share of the target.
 
-    Both are (m, c); places nearer than `clearance_m` keep their `hidden`. aloft: rows of the boxes of `index` within
+    Both are (m, c); places nearer than `clearance_m` to a box count as hidden. aloft_rows: the boxes of `index` within
     `reach_m` of places.
     """
-    near = np.empty(len(aloft), dtype=np.int64)
+    near_rows = np.empty(len(aloft_rows), dtype=np.int64)
     for key in range(len(places)):
         target = targets[key]
         farthest_m, least_slope = 0.0, np.inf
@@ -167,27 +209,32 @@ def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps_m, hidden)
             least_slope = min(least_slope, (places[key, c, 2] - target[2] - LOWEST_END_M) / max(away_m, 1.0))
         horizon = make_horizon(index, target, farthest_m, least_slope)
         num_near = 0
-        for box in range(len(aloft)):
-            if squared_gap(aloft, box, target[0], target[1], aloft[box, kernels.LOW_Z]) <= (farthest_m + reach_m) ** 2:
-                near[num_near] = box
+        for box in range(len(aloft_rows)):
+            if (
+                squared_gap(aloft_rows, box, target[0], target[1], aloft_rows[box, kernels.LOW_Z])
+                <= (farthest_m + reach_m) ** 2
+            ):
+                near_rows[num_near] = box
                 num_near += 1
         for c in range(places.shape[1]):
             x, y, z = places[key, c, 0], places[key, c, 1], places[key, c, 2]
             gap_m = reach_m
             for k in range(num_near):
-                if gap_m >= clearance_m and squared_gap(aloft, near[k], x, y, z) < gap_m * gap_m:
-                    gap_m = min(gap_m, distance_to_box(aloft, near[k], x, y, z))
+                if gap_m >= clearance_m and squared_gap(aloft_rows, near_rows[k], x, y, z) < gap_m * gap_m:
+                    gap_m = min(gap_m, distance_to_box(aloft_rows, near_rows[k], x, y, z))
             gaps_m[key, c] = gap_m
+            hidden[key, c] = 1.0
             if gap_m >= clearance_m:
                 hidden[key, c] = 1.0 - five_ray_visibility(index, horizon, target, x, y, z)
 
 
 @njit(cache=True)
-def _cheapest(places, place_costs, gaps_m, longest_m, index, clearance_m, links, num_azimuths, max_turn, way_cost):
+def _cheapest(places, place_costs, gaps_m, longest_m, aloft, clearance_m, links, num_azimuths, max_turn, way_cost):
     """Return the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
     places: (m, c, 3), c = rings * azimuths. place_costs: (m, c). gaps_m: (m, c). longest_m: (m,) longest move into each
-    key frame. links: (rings, r) previous rings, the first -1 ends the list.
+    key frame. aloft: index of the boxes within REACH_M of places. links: (rings, r) previous rings, the first -1 ends
+    the list.
     """
     num_keys, num_places = len(places), places.shape[1]
     first_hit = np.empty(1, dtype=np.int64)
@@ -203,7 +250,7 @@ def _cheapest(places, place_costs, gaps_m, longest_m, index, clearance_m, links,
             x, y, z = places[key, c, 0], places[key, c, 1], places[key, c, 2]
             ring, azimuth = c // num_azimuths, c % num_azimuths
             best = np.inf
-            for trial in range(2 * max_turn + 1):  # 0, -1, 1, -2, 2: the nearest first excludes most others
+            for trial in range(2 * max_turn + 1):  # turns 0, -1, 1, -2, 2: the nearest first excludes most others
                 turn = (trial + 1) // 2 * (1 - 2 * (trial % 2))
                 column = (azimuth + turn) % num_azimuths
                 for link in range(links.shape[1]):
@@ -214,14 +261,14 @@ def _cheapest(places, place_costs, gaps_m, longest_m, index, clearance_m, links,
                         continue
                     x0, y0, z0 = places[key - 1, before, 0], places[key - 1, before, 1], places[key - 1, before, 2]
                     length_m = np.sqrt((x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2)
-                    guess = cost[key - 1, before] + way_cost * length_m
-                    if guess >= best or length_m > longest_m[key]:
+                    total = cost[key - 1, before] + way_cost * length_m
+                    if total >= best or length_m > longest_m[key]:
                         continue
                     # Distance changes by at most a metre per metre: with more clearance at both ends the line is free.
                     is_close = gaps_m[key, c] + gaps_m[key - 1, before] - length_m < 2.0 * clearance_m
-                    if is_close and collect_hits(index, x0, y0, z0, x, y, z, clearance_m, first_hit) > 0:
+                    if is_close and collect_hits(aloft, x0, y0, z0, x, y, z, clearance_m, first_hit) > 0:
                         continue
-                    best = guess
+                    best = total
                     came_from[key, c] = before
             cost[key, c] = best + place_costs[key, c]
     return cheapest_way(cost, came_from)
@@ -240,29 +287,3 @@ def cheapest_way(cost, came_from):
         for key in range(len(cost) - 1, 0, -1):
             chosen[key - 1] = came_from[key, chosen[key]]
     return chosen
-
-
-def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan one trajectory (the signature of `planners.contract`); nothing here is random."""
-    raw, start, clearance_m = raw_trajectory(scenario, obstacles, cfg)
-    points, facts = smooth_trajectory(raw, scenario, obstacles, cfg, clearance_m)
-    return Plan(points, {"start": start, "clearance_m": clearance_m, **facts})
-
-
-def raw_trajectory(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> tuple[np.ndarray, str, float]:
-    """Return the trajectory to smooth, its kind (`wished`, `search` or `climbing search`), and its clearance, m.
-
-    Where the reference is free and sees the target wherever it must, it is the trajectory (`wished`).
-    """
-    requested = scenario.with_past(scenario.reference.places_m(scenario.targets_m, scenario.ground_m))
-    ahead = slice(scenario.start, None)
-    step_m = cfg.speed_max_mps * scenario.dt_s
-    safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
-    seen = ~scenario.reference.keeps_sight | (kernels.visibility(obstacles, requested, scenario.targets_m) == 1.0)
-    if seen[ahead].all() and not unsafe(requested[ahead], obstacles, safety_m, SPEED_SHARE * step_m).any():
-        return requested, "wished", safety_m
-    for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):
-        raw = search_trajectory(scenario, make_lattice(scenario, climbing=climbing), obstacles, cfg, clearance_m)
-        if raw is not None:
-            return raw, "climbing search" if climbing else "search", clearance_m
-    raise scenario.no_path_error("no collision-free path connects the start with the end", relaxed_m)
