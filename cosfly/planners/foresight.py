@@ -31,13 +31,13 @@ def _raw_trajectory(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) ->
 
     Where the reference is free and sees the target wherever it must, it is the trajectory (`wished`).
     """
-    reference = scenario.with_past(scenario.reference.places_m(scenario.targets_m, scenario.ground_m))
+    reference_m = scenario.with_past(scenario.reference.places_m(scenario.targets_m, scenario.ground_m))
     ahead = slice(scenario.start, None)
     step_m = cfg.speed_max_mps * scenario.dt_s
     safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
-    seen = ~scenario.reference.keeps_sight | (kernels.visibility(obstacles, reference, scenario.targets_m) == 1.0)
-    if seen[ahead].all() and not unsafe(reference[ahead], obstacles, safety_m, SPEED_SHARE * step_m).any():
-        return reference, "wished", safety_m
+    seen = ~scenario.reference.keeps_sight | (kernels.visibility(obstacles, reference_m, scenario.targets_m) == 1.0)
+    if seen[ahead].all() and not unsafe(reference_m[ahead], obstacles, safety_m, SPEED_SHARE * step_m).any():
+        return reference_m, "wished", safety_m
     for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):
         raw = search_trajectory(scenario, make_lattice(scenario, climbing=climbing), obstacles, cfg, clearance_m)
         if raw is not None:
@@ -92,8 +92,8 @@ def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
     ground_distances_m = scenario.reference.ground_distance_m[frames, None]
     steps_m = np.minimum(STEP_OUT_SHARE * distances_m, STEP_OUT_MAX_M)
     radii_m = np.maximum(ground_distances_m + rings[:, 0] * steps_m, ground_distances_m / 2.0)
-    z = np.maximum((scenario.ground_m + scenario.reference.altitude_m)[frames, None] + STEP_UP_M * rings[:, 1],
-                   least_z[:, None])  # fmt: skip
+    heights_m = scenario.ground_m + scenario.reference.altitude_m
+    z = np.maximum(heights_m[frames, None] + STEP_UP_M * rings[:, 1], least_z[:, None])
     z = np.minimum(z, np.maximum(greatest_z, least_z)[:, None])
     turns_rad = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
     places_m = _places(scenario, frames, radii_m, z, turns_rad)
@@ -210,10 +210,8 @@ def _survey(places, targets, index, aloft_rows, clearance_m, reach_m, gaps_m, hi
         horizon = make_horizon(index, target, farthest_m, least_slope)
         num_near = 0
         for box in range(len(aloft_rows)):
-            if (
-                squared_gap(aloft_rows, box, target[0], target[1], aloft_rows[box, kernels.LOW_Z])
-                <= (farthest_m + reach_m) ** 2
-            ):
+            gap_squared = squared_gap(aloft_rows, box, target[0], target[1], aloft_rows[box, kernels.LOW_Z])
+            if gap_squared <= (farthest_m + reach_m) ** 2:
                 near_rows[num_near] = box
                 num_near += 1
         for c in range(places.shape[1]):
