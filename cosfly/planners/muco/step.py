@@ -2,6 +2,7 @@
 
 The whole search is one compiled call, because a call from Python unpacks some forty arrays, which takes a third of the
 time of an evaluation. Loops replace NumPy's whole-array forms, because each shape check takes the compiler seconds.
+Literals are passed as `int64(1)` and `boolean(False)`, so that a function is compiled for one signature only.
 """
 
 from __future__ import annotations
@@ -20,6 +21,9 @@ VISIBILITY_PAUSE_MAX = 8  # iterations without the visibility slope, from the on
 DAMPING_LEAST = 1e-3  # keeps the band system positive definite where no term has curvature
 # Damping of a waypoint whose rough terms rise: its first value, and its factors after a failed and a successful trial.
 DAMPING_FIRST, DAMPING_RISE, DAMPING_FALL = 5.0, 10.0, 0.5
+DAMPING_ENDS = DAMPING_FIRST / 10  # a smaller one becomes 0 after a successful trial
+STEP_FALL = 0.25  # factor on the length of a step after a failed trial
+PUSH_EXTRA_M = 1e-6  # beyond the safety distance, so that rounding does not leave a waypoint within it
 CONTACT_CURVATURE = 1e5  # across the face of a touched obstacle: allows only steps along the face
 ALTITUDE_CURVATURE = 1e7  # in z at an altitude bound: keeps the waypoint at the bound
 
@@ -44,15 +48,18 @@ def hold_bounds(points, problem, contacts, band, gradient):
 
     A waypoint at an altitude bound keeps its z if the step would cross the bound. A waypoint that touches an obstacle
     slides along the face if the step would enter the obstacle. The caller ignores the ends of the trajectory.
+
+    band: (BAND_ROWS, 3 n), band[k, j] = H[j + k, j], where 3 i + axis is the row of a coordinate of waypoint i.
     """
     for i in range(len(points)):
         normal = contacts[i]
-        into = gradient[i, 0] * normal[0] + gradient[i, 1] * normal[1] + gradient[i, 2] * normal[2]
-        if into > 0.0:  # the step is against the gradient
-            for a in range(3):
-                gradient[i, a] -= into * normal[a]
-                for b in range(a + 1):
-                    band[a - b, 3 * i + b] += CONTACT_CURVATURE * normal[a] * normal[b]
+        # A step against the gradient, which points away from the obstacle, enters the obstacle.
+        outward = gradient[i, 0] * normal[0] + gradient[i, 1] * normal[1] + gradient[i, 2] * normal[2]
+        if outward > 0.0:
+            for row in range(3):
+                gradient[i, row] -= outward * normal[row]
+                for column in range(row + 1):
+                    band[row - column, 3 * i + column] += CONTACT_CURVATURE * normal[row] * normal[column]
         at_floor = points[i, 2] <= problem.altitudes[i, LEAST] + 1e-9 and gradient[i, 2] > 0.0
         at_ceiling = points[i, 2] >= problem.altitudes[i, GREATEST] - 1e-9 and gradient[i, 2] < 0.0
         if at_floor or at_ceiling:
@@ -143,15 +150,63 @@ def move(points, steps, scale, cap_m, as_a_whole, trial):
 
 
 @njit(cache=True)
+def newton_step(points, loss, gradient, damping, num_tries, rules, problem, index, masked, now, spare, trial):
+    """Search for a step against `gradient` that lowers the loss.
+
+    If only the rough terms (visibility, safety) of some waypoints raise the loss of a trial, the damping of these
+    waypoints grows and the system is solved again. Otherwise the step is shortened. The first time, if the cap
+    shortened single waypoints, all steps are shortened by the same factor instead: a step that is capped per waypoint
+    moves neighbours apart, and may not be a descent.
+
+    Args:
+        points: (n, 3) m, unchanged. loss, now: loss and state of `points`. gradient: (n, 3), changed. damping: (n,)
+            Levenberg damping per waypoint, changed if a step is found. spare, trial: written, state and points of the
+            last trial.
+    Returns:
+        The loss of the trial, infinity if no trial lowers the loss, and the number of trials.
+    """
+    band = now.band.copy()
+    raised = damping.copy()
+    for column in range(band.shape[1]):
+        band[0, column] += DAMPING_LEAST
+    hold_bounds(points, problem, now.contacts, band, gradient)
+    steps = solve_band(band, raised, gradient)
+    scale = 1.0
+    as_a_whole = boolean(False)
+    for tried in range(1, num_tries + 1):
+        trial_loss, is_capped = try_step(
+            points, steps, scale, rules.step_cap_m, as_a_whole, problem, index, masked, spare, trial
+        )
+        if trial_loss < loss:
+            for i in range(len(damping)):
+                damping[i] = raised[i] * DAMPING_FALL if raised[i] > DAMPING_ENDS else 0.0
+            return trial_loss, tried
+        rough_rise = 0.0
+        for i in range(len(raised)):
+            rough_rise += max(spare.rough[i] - now.rough[i], 0.0)
+        if trial_loss < np.inf and rough_rise > trial_loss - loss:
+            for i in range(len(raised)):
+                if spare.rough[i] > now.rough[i]:
+                    raised[i] = max(DAMPING_RISE * raised[i], DAMPING_FIRST)
+            steps = solve_band(band, raised, gradient)
+        elif not as_a_whole and is_capped:
+            as_a_whole = True
+        else:
+            scale *= STEP_FALL
+    return np.inf, num_tries
+
+
+@njit(cache=True)
 def descend(points, problem, index, rules, states, history):
-    """Optimize a feasible trajectory in place; its ends do not move.
+    """Optimize a feasible trajectory; its ends do not move.
 
     The visibility term is piecewise constant, and its curvature is unknown. If a step along its slope does not lower
     the loss, the step is tried without it, and the slope is ignored for the next 0, 1, 3 ... iterations.
 
     Args:
-        points: (n, 3) m, n >= 3. states: two of `make_state`, written. history: (iterations_max + 1,), written, the
-            loss before each iteration and after the last one.
+        points: (n, 3) m, n >= 3, overwritten by intermediate trajectories: only the returned one is the result.
+            states: two of `make_state`, written. history: (iterations_max + 1,), written, the loss before each
+            iteration and after the last one.
     Returns:
         The best trajectory (n, 3), its state, the masked waypoints (n,) bool, the number of iterations, the number of
         trial steps, and an index into STOP_REASONS.
@@ -170,27 +225,24 @@ def descend(points, problem, index, rules, states, history):
     num_tried = 0
     for iteration in range(1, len(history)):
         trial_loss = np.inf
-        uses_visibility = visibility_pause == 0 and now.visibility_gradient.any()
-        for with_visibility in (True, False):
-            if with_visibility and not uses_visibility:
-                continue
-            if with_visibility:
-                gradient = _scaled_sum(now.gradient, now.visibility_gradient, 1.0)
-                num_tries = int64(TRIES_WITH_VISIBILITY)
-            else:
-                gradient = now.gradient.copy()
-                num_tries = int64(TRIES)
+        if visibility_pause == 0 and now.visibility_gradient.any():
+            gradient = _scaled_sum(now.gradient, now.visibility_gradient, 1.0)
             trial_loss, tried = newton_step(
-                points, loss, gradient, damping, num_tries, rules, problem, index, masked, now, spare, trial
-            )
+                points, loss, gradient, damping, int64(TRIES_WITH_VISIBILITY), rules, problem, index, masked, now,
+                spare, trial,
+            )  # fmt: skip
             num_tried += tried
             if trial_loss < np.inf:
-                break
-            if with_visibility:
+                next_pause = 1
+            else:
                 visibility_pause = next_pause
                 next_pause = min(2 * next_pause, VISIBILITY_PAUSE_MAX)
-        if uses_visibility and visibility_pause == 0:  # the step along its slope lowered the loss
-            next_pause = 1
+        if trial_loss == np.inf:
+            trial_loss, tried = newton_step(
+                points, loss, now.gradient.copy(), damping, int64(TRIES), rules, problem, index, masked, now, spare,
+                trial,
+            )  # fmt: skip
+            num_tried += tried
         visibility_pause = max(visibility_pause - 1, 0)
         if trial_loss == np.inf:
             return points, now, masked, iteration - 1, num_tried, NO_STEP
@@ -249,7 +301,10 @@ def descend_paper(points, problem, index, rules, states, history):
 
 @njit(cache=True)
 def update_mask(points, problem, index, rules, masked, state):
-    """Return which waypoints are in low-visibility runs, (n,) bool; evaluate `state` again where `masked` differs."""
+    """Return which waypoints are in low-visibility runs, (n,) bool; evaluate `state` again where `masked` differs.
+
+    The mask changes the gradients only, so the loss of `points` stays valid.
+    """
     new_mask = low_visibility_runs(state.visibility, rules.low_visibility, rules.low_visibility_frames)
     for i in range(len(new_mask)):
         if new_mask[i] != masked[i]:
@@ -281,53 +336,6 @@ def low_visibility_runs(fractions, threshold, frames):
     return marked
 
 
-@njit(cache=True)
-def newton_step(points, loss, gradient, damping, num_tries, rules, problem, index, masked, now, spare, trial):
-    """Search for a step against `gradient` that lowers the loss.
-
-    If only the rough terms (visibility, safety) of some waypoints raise the loss of a trial, the damping of these
-    waypoints grows and the system is solved again. Otherwise the step is shortened. The first time, if the cap
-    shortened single waypoints, all steps are shortened by the same factor instead: a step that is capped per waypoint
-    moves neighbours apart, and may not be a descent.
-
-    Args:
-        points: (n, 3) m, unchanged. loss, now: loss and state of `points`. gradient: (n, 3), changed. damping: (n,)
-            Levenberg damping per waypoint, changed if a step is found. spare, trial: written, state and points of the
-            last trial.
-    Returns:
-        The loss of the trial, infinity if no trial lowers the loss, and the number of trials.
-    """
-    band = now.band.copy()
-    raised = damping.copy()
-    for column in range(band.shape[1]):
-        band[0, column] += DAMPING_LEAST
-    hold_bounds(points, problem, now.contacts, band, gradient)
-    steps = solve_band(band, raised, gradient)
-    scale = 1.0
-    as_a_whole = boolean(False)
-    for tried in range(1, num_tries + 1):
-        trial_loss, is_capped = try_step(
-            points, steps, scale, rules.step_cap_m, as_a_whole, problem, index, masked, spare, trial
-        )
-        if trial_loss < loss:
-            for i in range(len(damping)):
-                damping[i] = raised[i] * DAMPING_FALL if raised[i] > DAMPING_FIRST / 10 else 0.0
-            return trial_loss, tried
-        rough_rise = 0.0
-        for i in range(len(raised)):
-            rough_rise += max(spare.rough[i] - now.rough[i], 0.0)
-        if trial_loss < np.inf and rough_rise > trial_loss - loss:
-            for i in range(len(raised)):
-                if spare.rough[i] > now.rough[i]:
-                    raised[i] = max(DAMPING_RISE * raised[i], DAMPING_FIRST)
-            steps = solve_band(band, raised, gradient)
-        elif not as_a_whole and is_capped:
-            as_a_whole = True
-        else:
-            scale *= 0.25
-    return np.inf, num_tries
-
-
 # --- the feasible region ----------------------------------------------------------------------------------------------
 
 
@@ -357,7 +365,7 @@ def push_out(point, problem, index, nearby, i):
         if nx * last_x + ny * last_y + nz * last_z < 0.0:
             share *= 0.5  # between two obstacles: converge to the middle
         last_x, last_y, last_z = nx, ny, nz
-        shift = share * (problem.safety_m - gap + 1e-6)
+        shift = share * (problem.safety_m - gap + PUSH_EXTRA_M)
         point[0] += shift * nx
         point[1] += shift * ny
         point[2] += shift * nz
@@ -383,7 +391,7 @@ def project(points, problem, index, begin, end, nearby):
                 share = step_max / length
                 points[i, 0], points[i, 1], points[i, 2] = u + share * dx, v + share * dy, w + share * dz
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        count = num_cached(anchors, num_around, i, x, y, z)
+        count = num_cached(anchors, num_around, i, x, y, z)  # -1: unknown, ask the index; 0: no box is near
         if count > 0:
             _, box = nearest_among(rows, around, i, count, x, y, z, problem.safety_m)
             if box < 0:
