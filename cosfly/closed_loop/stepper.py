@@ -166,7 +166,7 @@ class ClosedLoopTrajectory:
         hits = np.flatnonzero(gaps_m < self.drone.radius_m)
         end = int(hits[0]) if len(hits) else len(path_m) - 1  # the drone stops before the part that touches
         i = self.index + 1
-        clearance_m = min(float(gaps_m[: end + 1].min()), self.script.others.distance_m(i, path_m[end]))
+        clearance_m = min(float(gaps_m[: end + 1].min()), self.script.bystanders.distance_m(i, path_m[end]))
         self.index = i
         self.poses.positions_m[i] = path_m[end]
         self.poses.rotations_deg[i] = [pitch_deg, yaw_deg, 0.0]
@@ -214,13 +214,10 @@ class ClosedLoopTrajectory:
         script = self.script
         poses = self.poses
         self.airspace.light(poses.targets_m, None if script.weather is None else script.weather.params)
-        frame, target, others = draw_frame(
-            self.airspace.renderer, script, i, poses, self.airspace.cfg.visible_threshold
-        )
-        target = written_target(target, frame)
+        drawn = draw_frame(self.airspace.renderer, script, i, poses, self.airspace.cfg.visible_threshold)
         position_m = poses.positions_m[i].copy()
         target_m = poses.targets_m[i].copy()
-        people = script.others.people(script.clothes.looks) if self.airspace.renderer.dresses else None
+        people = script.bystanders.people(script.clothes.looks) if self.airspace.renderer.dresses else None
         return Moment(
             index=i,
             time_s=float(script.trace.time_s[i]),
@@ -228,9 +225,9 @@ class ClosedLoopTrajectory:
             rotation_deg=poses.rotations_deg[i].copy(),
             velocity_mps=velocity_mps,
             target_m=target_m,
-            target=target,
-            bystanders={} if others is None else others.people_of(target_m, people),
-            frame=frame,
+            target=written_target(drawn.target, drawn.frame),
+            bystanders={} if drawn.bystanders is None else drawn.bystanders.people_of(target_m, people),
+            frame=drawn.frame,
             clearance_m=clearance_m,
             height_m=float(position_m[2] - (target_m[2] - TARGET_HEIGHT_M)),
         )

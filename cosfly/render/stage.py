@@ -130,7 +130,7 @@ def make_track_script(
         perturbed=perturbed,
         gait=gait.since(len(before_m)),
         clothes=clothes,
-        others=cast,
+        bystanders=cast,
         look=cfg.look if weather is None else None,
         weather=weather,
     )

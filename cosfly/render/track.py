@@ -7,8 +7,9 @@ from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -62,7 +63,7 @@ class TrackScript:
     perturbed: PerturbedTrack
     gait: Gait
     clothes: Clothes
-    others: DressedBystanders
+    bystanders: DressedBystanders
     look: Look | None  # None with a weather
     weather: WeatherRecord | None
 
@@ -97,80 +98,106 @@ def render_track(
         The track as it was written.
     """
     script = replace(script, perturbed=copy.deepcopy(script.perturbed))  # dropped shifts change it
-    perturbed = script.perturbed
-    poses = perturbed.poses
+    poses = script.perturbed.poses
     places = np.concatenate([poses.positions_m, poses.targets_m])
     weather = None if script.weather is None else script.weather.params
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M, weather)
-    people = script.others.people(script.clothes.looks) if renderer.dresses else None
-    targets = list[TargetMeta]()
-    visibility = list[float]()
-    bystanders = list[dict]()
-    pending = deque[Future]()
-    digests = dict[str, str]()
-
-    def collect_oldest() -> None:
-        target, file_digests = pending.popleft().result()
-        targets.append(target)
-        digests.update(file_digests)
-
-    with ThreadPoolExecutor(ENCODER_THREADS) as pool:
-        for i in range(len(script.trace.time_s)):
-            frame, target, others = draw_frame(renderer, script, i, poses, cfg.visible_threshold)
-            if perturbed.is_shifted(i) and not target.visible:
-                assert perturbed.unshifted is not None
-                without = draw_frame(renderer, script, i, perturbed.unshifted.poses, cfg.visible_threshold)
-                if without[1].visible:
-                    perturbed.drop_shift(i, HIDDEN)
-                    frame, target, others = without
-            visibility.append(target.visibility)
-            bystanders.append({} if others is None else {"others": others.people_of(poses.targets_m[i], people)})
-            pending.append(
-                pool.submit(_write_frame, folder, frame, _annotation(script, i, target, others), cfg, overlay)
-            )
-            advance()
-            while len(pending) >= FRAMES_AHEAD:
-                collect_oldest()
-        while pending:
-            collect_oldest()
-    track = _track(script, targets, np.array(visibility), bystanders)
-    track = _with_goal(track, renderer, script, cfg.visible_threshold)
+    drawn = _draw_frames(renderer, script, folder, cfg, overlay)
+    track = _with_goal(_track(script, drawn), renderer, script, cfg.visible_threshold)
     write_track(folder, track)
-    outcomes = {event: Counter(state[event] for state in perturbed.states) for event in ("position", "rotation")}
-    report = {
-        **REPORT_FORMAT.header,
-        "num_frames": len(perturbed.states),
-        "num_perturbed": int(perturbed.is_perturbed.sum()),
-        "clearance_min_m": round(float(poses.clearances_m.min()), 4),
-        **{event: dict(sorted(counts.items())) for event, counts in outcomes.items()},
-    }
-    write_json(folder / "perturbation_report.json", report)
+    write_json(folder / "perturbation_report.json", {**REPORT_FORMAT.header, **_report(script.perturbed)})
     file_names = ["trajectory.json", "perturbation_report.json"]
     if track.goal is not None and "rgb" in cfg.modalities:
-        box = targets[track.goal.frame].mask_bbox_2d
-        rgb = frames.read_rgb(folder / frames.frame_name(track.goal.frame))
-        assert box is not None, "the target is legible there"
-        (folder / TARGET_FILE).write_bytes(frames.rgb_bytes(target_picture(rgb, box)))
+        _write_target_picture(folder, track.goal.frame, drawn.targets[track.goal.frame])
         file_names.append(TARGET_FILE)
-    write_checksums(folder, digests | {name: sha256_file(folder / name) for name in file_names})
+    write_checksums(folder, drawn.digests | {name: sha256_file(folder / name) for name in file_names})
     return track
+
+
+def _report(perturbed: PerturbedTrack) -> dict[str, Any]:
+    """Return the content of `perturbation_report.json`."""
+    outcomes = {event: Counter(state[event] for state in perturbed.states) for event in ("position", "rotation")}
+    return {
+        "num_frames": len(perturbed.states),
+        "num_perturbed": int(perturbed.is_perturbed.sum()),
+        "clearance_min_m": round(float(perturbed.poses.clearances_m.min()), 4),
+        **{event: dict(sorted(counts.items())) for event, counts in outcomes.items()},
+    }
+
+
+def _write_target_picture(folder: Path, i: int, target: TargetMeta) -> None:
+    """Write the part of frame i that shows the target, which is legible there."""
+    assert target.mask_bbox_2d is not None
+    rgb = frames.read_rgb(folder / frames.frame_name(i))
+    (folder / TARGET_FILE).write_bytes(frames.rgb_bytes(target_picture(rgb, target.mask_bbox_2d)))
 
 
 # --- frames -----------------------------------------------------------------------------------------------------------
 
 
-def draw_frame(
-    renderer: Renderer, script: TrackScript, i: int, poses: Poses, threshold: float
-) -> tuple[Frame, TargetMeta, BystandersMeta | None]:
-    """Draw frame i from the given poses; annotate the target, without its legibility, and the bystanders."""
+class DrawnFrame(NamedTuple):
+    """A frame and its annotations; that of the target is without its legibility."""
+
+    frame: Frame
+    target: TargetMeta
+    bystanders: BystandersMeta | None  # None: the track has none
+
+
+class DrawnFrames(NamedTuple):
+    """What remains in memory of the frames of a track."""
+
+    targets: list[TargetMeta]  # as written
+    visibility: list[float]  # of the targets, not rounded
+    bystanders: list[dict[str, Any]]  # fields of the points of `trajectory.json`
+    digests: dict[str, str]  # file -> sha256
+
+
+def _draw_frames(
+    renderer: Renderer, script: TrackScript, folder: Path, cfg: RenderConfig, overlay: Overlay | None
+) -> DrawnFrames:
+    """Draw and write all frames; encode in threads while the next ones are drawn."""
+    perturbed = script.perturbed
+    people = script.bystanders.people(script.clothes.looks) if renderer.dresses else None
+    drawn = DrawnFrames([], [], [], {})
+    pending = deque[Future]()
+
+    def collect_oldest() -> None:
+        target, file_digests = pending.popleft().result()
+        drawn.targets.append(target)
+        drawn.digests.update(file_digests)
+
+    with ThreadPoolExecutor(ENCODER_THREADS) as pool:
+        for i in range(len(script.trace.time_s)):
+            shown = draw_frame(renderer, script, i, perturbed.poses, cfg.visible_threshold)
+            if perturbed.is_shifted(i) and not shown.target.visible:
+                assert perturbed.unshifted is not None
+                unshifted = draw_frame(renderer, script, i, perturbed.unshifted.poses, cfg.visible_threshold)
+                if unshifted.target.visible:
+                    perturbed.drop_shift(i, HIDDEN)
+                    shown = unshifted
+            annotated = shown.bystanders
+            target_m = perturbed.poses.targets_m[i]
+            drawn.visibility.append(shown.target.visibility)
+            drawn.bystanders.append({} if annotated is None else {"others": annotated.people_of(target_m, people)})
+            pending.append(pool.submit(_write_frame, folder, shown.frame, _annotation(script, i, shown), cfg, overlay))
+            advance()
+            while len(pending) >= FRAMES_AHEAD:
+                collect_oldest()
+        while pending:
+            collect_oldest()
+    return drawn
+
+
+def draw_frame(renderer: Renderer, script: TrackScript, i: int, poses: Poses, threshold: float) -> DrawnFrame:
+    """Draw frame i from the given poses; annotate the target and the bystanders."""
     pose = world_from_camera(poses.positions_m[i], poses.rotations_deg[i])
     target_m = poses.targets_m[i]
     camera = script.cameras[i]
-    others = script.others.posed(i)
-    frame = renderer.render(pose, camera.intrinsic, script.gait.posed(i, target_m, script.clothes), others)
+    posed = script.bystanders.posed(i)
+    frame = renderer.render(pose, camera.intrinsic, script.gait.posed(i, target_m, script.clothes), posed)
     view = view_target(target_m, pose, camera)
-    ids = np.array([other.instance_id for other in others], dtype=np.int64)
-    score, *hidden = rendered_visibility(frame, target_m, view, pose, camera, ids)
+    ids = np.array([bystander.instance_id for bystander in posed], dtype=np.int64)
+    score, by_bystanders, by_map = rendered_visibility(frame, target_m, view, pose, camera, ids)
     is_person = frame.ids == PERSON_ID
     num_px = int(np.count_nonzero(is_person))
     target = TargetMeta(
@@ -188,7 +215,7 @@ def draw_frame(
         visibility=score,
         num_pixels=num_px,
     )
-    return frame, target, script.others.meta(i, frame, *hidden) if others else None
+    return DrawnFrame(frame, target, script.bystanders.meta(i, frame, by_bystanders, by_map) if posed else None)
 
 
 def _list_or_none(values: np.ndarray) -> list[float] | None:
@@ -201,7 +228,8 @@ def written_target(target: TargetMeta, frame: Frame) -> TargetMeta:
     return target.model_copy(update=legibility(target, contrast_of(frame.rgb, frame.ids == PERSON_ID)))
 
 
-def _annotation(script: TrackScript, i: int, target: TargetMeta, others: BystandersMeta | None) -> FrameMeta:
+def _annotation(script: TrackScript, i: int, drawn: DrawnFrame) -> FrameMeta:
+    """Return `meta.json` of frame i, before its target's legibility is known."""
     perturbed = script.perturbed
     return FrameMeta(
         index=i,
@@ -211,7 +239,7 @@ def _annotation(script: TrackScript, i: int, target: TargetMeta, others: Bystand
         variant=script.variant,
         camera=frames.camera_meta(script.cameras[i], NEAR_M, FAR_M),
         drone_pose=np.hstack([perturbed.poses.positions_m[i], perturbed.poses.rotations_deg[i]]),
-        target=target,
+        target=drawn.target,
         perturbation=frames.PerturbationMeta(
             **perturbed.states[i],
             drone_position=perturbed.drone_offsets_m[i],
@@ -219,7 +247,7 @@ def _annotation(script: TrackScript, i: int, target: TargetMeta, others: Bystand
             drone_rotation=perturbed.rotation_offsets_deg[i],
         ),
         look=script.look,
-        others=others,
+        others=drawn.bystanders,
         weather=script.weather,
     )
 
@@ -248,21 +276,22 @@ def _write_frame(
     return meta.target, {f"{name}/{file_name}": sha256_bytes(data) for file_name, data in contents.items()}
 
 
-def _track(script: TrackScript, targets: list[TargetMeta], visibility: np.ndarray, bystanders: list[dict]) -> Track:
+def _track(script: TrackScript, drawn: DrawnFrames) -> Track:
+    """Return the track of a script and its frames, without a goal."""
     perturbed = script.perturbed
     trace = script.trace
     cameras = script.cameras
     zooms = any(camera is not cameras[0] for camera in cameras)
 
     def column(name: str, num: int = 1) -> np.ndarray:
-        values = [getattr(target, name) for target in targets]
+        values = [getattr(target, name) for target in drawn.targets]
         return np.array([[np.nan] * num if value is None else value for value in values])
 
     offsets = perturbed.drone_offsets_m, perturbed.rotation_offsets_deg, perturbed.target_offsets_m
     weather = {} if script.weather is None else {"weather": script.weather.model_dump()}
     points = [
-        {"perturbation": dict(state), "target": target.model_dump(include=set(LEGIBILITY)), **others}
-        for state, target, others in zip(perturbed.states, targets, bystanders, strict=True)
+        {"perturbation": dict(state), "target": target.model_dump(include=set(LEGIBILITY)), **bystanders}
+        for state, target, bystanders in zip(perturbed.states, drawn.targets, drawn.bystanders, strict=True)
     ]
     return Track(
         town=script.town,
@@ -275,7 +304,7 @@ def _track(script: TrackScript, targets: list[TargetMeta], visibility: np.ndarra
         rotations_deg=perturbed.poses.rotations_deg,
         targets_m=perturbed.poses.targets_m,
         target=TargetRecord(
-            visibility=visibility,
+            visibility=np.array(drawn.visibility),
             uv=column("image_uv", 2),
             bbox=column("bbox_2d", 4),
             mask_bbox=column("mask_bbox_2d", 4),
@@ -292,7 +321,7 @@ def _track(script: TrackScript, targets: list[TargetMeta], visibility: np.ndarra
         },
         segments=trace.segments,
         mission=trace.mission,
-        people=script.others.people(script.clothes.looks),
+        people=script.bystanders.people(script.clothes.looks),
         between=script.between,
         is_original=script.variant == VARIANTS["clean"],
         raw={**weather, "points": points},
@@ -306,19 +335,19 @@ def _with_goal(track: Track, renderer: Renderer, script: TrackScript, threshold:
     """Add the goal, from the first frame in which the target is legible and distinct, or the reason for its absence."""
     if not renderer.dresses:
         return replace(track, people=None, raw=track.raw | {"goal": {"absent": "clothes_unknown"}})
-    poses = script.perturbed.poses
-    people = script.others.people(script.clothes.looks)
+    people = script.bystanders.people(script.clothes.looks)
     legible = [i for i in range(len(track)) if track.legibility_at(i)["legible"]]
     for i in legible[:MOST_GOAL_FRAMES]:
-
-        def draw(looks: Appearance, i: int = i) -> Frame:
-            dressed = replace(script, clothes=replace(script.clothes, looks=looks))
-            return draw_frame(renderer, dressed, i, poses, threshold)[0]
-
-        if goal := find_goal(people, i, draw):
+        if goal := find_goal(people, i, partial(_draw_dressed, renderer, script, i, threshold)):
             return replace(track, goal=goal)
         advance()
     return replace(track, raw=track.raw | {"goal": {"absent": "not_told_apart" if legible else "never_legible"}})
+
+
+def _draw_dressed(renderer: Renderer, script: TrackScript, i: int, threshold: float, looks: Appearance) -> Frame:
+    """Draw frame i with a target of an appearance."""
+    dressed = replace(script, clothes=replace(script.clothes, looks=looks))
+    return draw_frame(renderer, dressed, i, script.perturbed.poses, threshold).frame
 
 
 def find_goal(people: People, i: int, draw: Callable[[Appearance], Frame]) -> Goal | None:
@@ -337,7 +366,9 @@ def find_goal(people: People, i: int, draw: Callable[[Appearance], Frame]) -> Go
         if slot == "figure":
             return differs(replace(looks, figure=other.figure))
         color, other_color = (getattr(person, f"{slot}_color") for person in (looks, other))
-        if color and other_color and color != other_color:  # the wardrobe's colours differ wherever they are visible
+        # The wardrobe's colours differ wherever they are visible. Whether this slot is visible is the same question for
+        # all other colours, so it is asked of one appearance, and `differs` draws it once.
+        if color and other_color and color != other_color:
             other = otherwise(looks, slot)
         return differs(replace(looks, **{name: getattr(other, name) for name in (slot, f"{slot}_color")}))
 
