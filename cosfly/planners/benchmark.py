@@ -1,8 +1,8 @@
 """The paper's comparison of planners on the same scenarios: `cosfly plan benchmark` (app:three_axis_eval).
 
-Figures and axes are those of compare.py. Here no scenario is skipped: a scenario for which a planner finds no
-trajectory counts as one with visibility 0, all positions in collision and clearance 0. Lengths and dynamics are means
-over the trajectories found; a planner that finds none gets the worst value.
+Figures are numbers, and axes are scores, as in compare.py. Here no scenario is skipped: a scenario for which a planner
+finds no trajectory counts as one with visibility 0, all positions in collision and clearance 0. Lengths and dynamics
+are means over the trajectories found; a planner that finds none gets the worst value.
 
 The paper prints the 14-way score (tab:appendix_h_extended_ranking) without its weights. Its rows determine them: with
 each criterion normalised from the worst planner, 0, to the best, 1, all fourteen scores are 0.35 visibility + 0.30
@@ -57,7 +57,7 @@ CRITERIA = {
     "collision": ("collision_fraction", False, 0.30),
     "clearance": ("clearance_min_m", True, 0.35),
 }
-INSTALL = 'pip install "cosfly[ompl]"'
+INSTALL = 'pip install "cosfly[ompl]"'  # this extra holds both OMPL and matplotlib
 
 
 class PaperRow(NamedTuple):
@@ -70,6 +70,7 @@ class PaperRow(NamedTuple):
     num_free: int  # scenarios of 20 without collision
 
 
+# The fields of a PaperRow: axes_mean, weighted, visibility, clearance_m, num_free.
 _PRINTED = {
     "track_astar": (0.782, 1.0, 0.9787, 4.0291, 20), "muco": (0.699, 0.7861, 0.8941, 2.7543, 20),
     "rrt_star": (0.573, 0.4123, 0.6164, 1.5066, 20), "prm": (0.578, 0.4319, 0.6009, 1.7984, 20),
@@ -98,7 +99,7 @@ def run(
     cfg: BenchmarkConfig, simplified_map: Path, paths: Path, out: Path, *, seed: int = 0, workers: int = 0,
     watch: Watch = Watch(), resume: Resume = "if-same",
 ) -> Path:  # fmt: skip
-    """Read a simplified map and `path.json`; write `benchmark.json`, its tables and the figures.
+    """Read a simplified map and `path.json`; write `benchmark.json`, its tables and the pictures.
 
     A pedestrian trajectory that no planner can follow, such as one through a house, is a failure and no scenario.
     Planning times are written to `items.jsonl` and the manifest, the only files that differ between equal runs. Return
@@ -116,7 +117,7 @@ def run(
     benchmark = header | summarize(planned, cfg.planners, rng_for(seed, "plan_benchmark", "intervals"))
     benchmark["notes"] = planner_notes(cfg.planners, cfg)
     write_json(product, {**FORMAT.header, **benchmark})
-    pages = {"benchmark.md": markdown(benchmark).encode()} | draw_figures(benchmark, planned, box_map)
+    pages = {"benchmark.md": markdown(benchmark).encode()} | draw_pictures(benchmark, planned, box_map)
     for name, data in pages.items():
         write_bytes(out / name, data)
     outputs = [product, *(out / name for name in pages)]
@@ -148,33 +149,47 @@ def summarize(planned: dict[str, PlannedItem], planners: tuple[str, ...], rng: n
         planned: id of a pedestrian trajectory -> the planners' trajectories. rng: draws scenarios for the intervals.
     """
     traces = [item.read_traces(path_id) for path_id, item in planned.items()]
-    figures = {p: [compare.trajectory_figures(t[p]) if p in t else None for t in traces] for p in planners}
-    tables = {p: np.array([_table_row(trajectory) for trajectory in rows]) for p, rows in figures.items()}
+    figures = {
+        planner: [compare.trajectory_figures(found[planner]) if planner in found else None for found in traces]
+        for planner in planners
+    }
+    tables = {planner: np.array([_table_row(row) for row in rows]) for planner, rows in figures.items()}
     means = compare.mean_figures(tables)
-    axes, *resampled_axes = compare.drawn_scores(tables, rng)
-    both_found = all(p in means and np.isfinite(list(means[p].values())).all() for p in PAIR)
-    groups = {group: [list(means[p].values()) for p in members if p in means] for group, members in GROUPS.items()}
+    both_found = all(planner in means and np.isfinite(list(means[planner].values())).all() for planner in PAIR)
     return {
         "scenarios": list(planned),
         "infeasible": {path_id: item.errors for path_id, item in planned.items() if item.errors},
         "figures": figures,
-        "means": {p: _finite(row) for p, row in means.items()},
+        "means": {planner: _finite(row) for planner, row in means.items()},
         "shortest_mean_m": round(compare.shortest_mean_m(means), 4),
-        "axes": {
-            p: {
-                "scores": scores,
-                "intervals": {axis: interval([sample[p][axis] for sample in resampled_axes]) for axis in scores},
-            }
-            for p, scores in axes.items()
-        },
-        "deltas": compare.deltas(*(means[p] for p in PAIR)) if both_found else {},
+        "axes": _axes(tables, rng),
+        "deltas": compare.deltas(*(means[planner] for planner in PAIR)) if both_found else {},
         "ranking": _ranking(means),
-        "groups": {
-            group: {"num_planners": len(rows), "figures": _finite(dict(zip(NAMES, np.mean(rows, axis=0), strict=True)))}
-            for group, rows in groups.items()
-            if rows
-        },
+        "groups": _groups(means),
     }
+
+
+def _axes(tables: dict[str, np.ndarray], rng: np.random.Generator) -> dict[str, dict[str, Any]]:
+    """Return the axis scores of each planner, and their intervals over scenarios."""
+    scores, *resampled_scores = compare.drawn_scores(tables, rng)  # the first without resampling
+    return {
+        planner: {
+            "scores": row,
+            "intervals": {axis: interval([resampled[planner][axis] for resampled in resampled_scores]) for axis in row},
+        }
+        for planner, row in scores.items()
+    }
+
+
+def _groups(means: Means) -> dict[str, dict[str, Any]]:
+    """Return the number of planners of each group, and the means of their mean figures."""
+    groups = {}
+    for group, members in GROUPS.items():
+        rows = [list(means[planner].values()) for planner in members if planner in means]
+        if rows:
+            figures = dict(zip(NAMES, np.mean(rows, axis=0), strict=True))
+            groups[group] = {"num_planners": len(rows), "figures": _finite(figures)}
+    return groups
 
 
 def _table_row(figures: dict[str, float] | None) -> list[float]:
@@ -226,66 +241,89 @@ def _printed(planner: str, *names: str) -> list[str]:
 
 def text_tables(benchmark: dict[str, Any]) -> Iterator[TextTable]:
     """Yield the tables of `benchmark.json` as text: axes, deltas, weighted score, feasibility, groups."""
-    means = benchmark["means"]
+    for table in (_axes_table, _deltas_table, _ranking_table, _feasibility_table, _groups_table):
+        yield table(benchmark)
 
-    def ours(planner: str, *names: str) -> list[str]:
-        return cells(means[planner][name] for name in names)
 
+def _measured(benchmark: dict[str, Any], planner: str, *names: str) -> list[str]:
+    """Return our mean figures of a planner."""
+    return cells(benchmark["means"][planner][name] for name in names)
+
+
+def _axes_table(benchmark: dict[str, Any]) -> TextTable:
     columns = ["visibility", "efficiency", "smoothness", "safety", "mean", "95 %", "paper", "collision", "clearance"]
     shortest = f"{benchmark['shortest_mean_m']:.2f} m (paper: {PAPER_SHORTEST_M} m)"
-    yield TextTable(f"Four axes; efficiency relative to the shortest mean, {shortest}", ["planner", *columns], [
+    by_mean = sorted(benchmark["axes"].items(), key=lambda entry: -entry[1]["scores"]["mean"])
+    return TextTable(f"Four axes; efficiency relative to the shortest mean, {shortest}", ["planner", *columns], [
         [
-            title_of(p), *cells(row["scores"][axis] for axis in AXES_AND_MEAN),
-            " to ".join(cells(row["intervals"]["mean"])), *_printed(p, "axes_mean"),
-            *ours(p, "collision_fraction", "clearance_min_m"),
+            title_of(planner), *cells(row["scores"][axis] for axis in AXES_AND_MEAN),
+            " to ".join(cells(row["intervals"]["mean"])), *_printed(planner, "axes_mean"),
+            *_measured(benchmark, planner, "collision_fraction", "clearance_min_m"),
         ]
-        for p, row in sorted(benchmark["axes"].items(), key=lambda entry: -entry[1]["scores"]["mean"])
+        for planner, row in by_mean
     ])  # fmt: skip
-    yield TextTable(" minus ".join(map(title_of, PAIR)), ["figure", *map(title_of, PAIR), "delta", "%"], [
+
+
+def _deltas_table(benchmark: dict[str, Any]) -> TextTable:
+    deltas = benchmark["deltas"]
+    return TextTable(" minus ".join(map(title_of, PAIR)), ["figure", *map(title_of, PAIR), "delta", "%"], [
         [
-            words, *cells([*(means[p][name] for p in PAIR), benchmark["deltas"][name]["delta"]], digits),
-            *cells([benchmark["deltas"][name]["relative_percent"]], 1),
+            words, *cells([*(benchmark["means"][planner][name] for planner in PAIR), deltas[name]["delta"]], digits),
+            *cells([deltas[name]["relative_percent"]], 1),
         ]
-        for name, words, digits in FIGURES if benchmark["deltas"]
+        for name, words, digits in FIGURES if deltas
     ])  # fmt: skip
+
+
+def _ranking_table(benchmark: dict[str, Any]) -> TextTable:
     words = ", ".join(f"{weight:g} {name}" for name, (*_, weight) in CRITERIA.items())
     title = f"Weighted score: {words}; each is scaled from 0 (worst planner) to 1 (best planner)"
-    yield TextTable(title, ["planner", "score", *CRITERIA, "paper"], [
-        [f"{row['rank']} {title_of(p)}", *cells([row["score"], *row["normalized"].values()]), *_printed(p, "weighted")]
-        for p, row in benchmark["ranking"].items()
+    return TextTable(title, ["planner", "score", *CRITERIA, "paper"], [
+        [
+            f"{row['rank']} {title_of(planner)}", *cells([row["score"], *row["normalized"].values()]),
+            *_printed(planner, "weighted"),
+        ]
+        for planner, row in benchmark["ranking"].items()
     ])  # fmt: skip
+
+
+def _feasibility_table(benchmark: dict[str, Any]) -> TextTable:
     rows = []
-    for p, figures in benchmark["figures"].items():
-        fractions = [trajectory["collision_fraction"] for trajectory in figures if trajectory]
+    for planner, figures in benchmark["figures"].items():
+        fractions = [found["collision_fraction"] for found in figures if found]
         counts = [f"{count} of {len(figures)}" for count in (len(fractions), fractions.count(0.0))]
-        measured = ours(p, "collision_fraction", "five_ray_mean", "clearance_min_m")
-        printed = _printed(p, "num_free", "visibility", "clearance_m")
-        rows.append([title_of(p), GROUP_OF[p], *counts, *measured, *printed])
+        measured = _measured(benchmark, planner, "collision_fraction", "five_ray_mean", "clearance_min_m")
+        printed = _printed(planner, "num_free", "visibility", "clearance_m")
+        rows.append([title_of(planner), GROUP_OF[planner], *counts, *measured, *printed])
     columns = ["found", "free of collisions", "collision", "visibility", "clearance"]
     columns += ["paper: free, of 20", "paper: visibility", "paper: clearance"]
     title = "Feasibility; a missing trajectory counts as a collision without visibility"
-    yield TextTable(title, ["planner", "group", *columns], rows)
+    return TextTable(title, ["planner", "group", *columns], rows)
+
+
+def _groups_table(benchmark: dict[str, Any]) -> TextTable:
     names = ("five_ray_mean", "blocked_fraction", "collision_fraction", "clearance_min_m", "length_m")
     columns = ["visibility", "blocked", "collision", "clearance", "length", "paper: visibility"]
-    yield TextTable("Groups; clearance and length in m", ["group", "planners", *columns], [
+    return TextTable("Groups; clearance and length in m", ["group", "planners", *columns], [
         [group, str(row["num_planners"]), *cells([*(row["figures"][name] for name in names), PAPER_GROUPS.get(group)])]
         for group, row in benchmark["groups"].items()
     ])  # fmt: skip
 
 
-# --- figures ----------------------------------------------------------------------------------------------------------
-# Each target-aware planner has its own color; generic planners are gray.
+# --- pictures ---------------------------------------------------------------------------------------------------------
+# Each target-aware planner has its own colour; generic planners are grey. A `plot` is what matplotlib calls axes.
 
-GRAY = "#9a9a9a"
+GREY = "#9a9a9a"
 # Scenarios shown in 3D. Boxes are drawn within ROOM_M of the trajectories if they are at least LEAST_M high.
 NUM_SHOWN = 4
 ROOM_M = 10.0
 LEAST_M = 5.0
+# Corners of each face of a box, numbered as in CORNER_SIGNS.
 FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 
 
-def draw_figures(benchmark: dict[str, Any], planned: dict[str, PlannedItem], box_map: BoxMap) -> dict[str, bytes]:
-    """Return the figures, file name -> PNG; none, with a warning, where matplotlib is not installed.
+def draw_pictures(benchmark: dict[str, Any], planned: dict[str, PlannedItem], box_map: BoxMap) -> dict[str, bytes]:
+    """Return the pictures, file name -> PNG; none, with a warning, where matplotlib is not installed.
 
     Those of TA*+Smooth against MuCO are drawn only where both found trajectories.
     """
@@ -294,15 +332,15 @@ def draw_figures(benchmark: dict[str, Any], planned: dict[str, PlannedItem], box
         return {}
     from matplotlib.figure import Figure
 
-    figures: dict[str, tuple[tuple[float, float], Callable[..., None]]] = {
+    drawings: dict[str, tuple[tuple[float, float], Callable[..., None]]] = {  # size, inches; function
         "axes_radar.png": ((8.0, 9.0), _radar), "axes_bars.png": ((13.0, 5.5), _bars),
         "axes_pairs.png": ((13.5, 8.0), _pairs),
     }  # fmt: skip
     if benchmark["deltas"]:
-        figures["deltas.png"] = (9.0, 4.5), _deltas
-        figures["trajectories_3d.png"] = (14.0, 11.0), partial(_trajectories, planned=planned, box_map=box_map)
+        drawings["deltas.png"] = (9.0, 4.5), _deltas
+        drawings["trajectories_3d.png"] = (14.0, 11.0), partial(_trajectories, planned=planned, box_map=box_map)
     pictures = {}
-    for name, (size, draw) in figures.items():
+    for name, (size, draw) in drawings.items():
         figure = Figure(figsize=size, dpi=110, layout="constrained")
         draw(figure, benchmark)
         file = io.BytesIO()
@@ -312,53 +350,57 @@ def draw_figures(benchmark: dict[str, Any], planned: dict[str, PlannedItem], box
 
 
 def _color(planner: str) -> Any:
-    return np.array(color_of(planner)) / 255.0 if planner in PLANNERS else GRAY
+    """Return a colour of matplotlib."""
+    return np.array(color_of(planner)) / 255.0 if planner in PLANNERS else GREY
 
 
 def _radar(figure: Any, benchmark: dict[str, Any]) -> None:
     """Draw the four axes of our planners and the paper's seven as polygons (fig:appendix_h_alg3d_measured)."""
-    primary = [p for p in benchmark["axes"] if p not in PAPER or PAPER[p].axes_mean is not None]
-    axes = figure.add_subplot(projection="polar")
+    primary = [name for name in benchmark["axes"] if name not in PAPER or PAPER[name].axes_mean is not None]
+    plot = figure.add_subplot(projection="polar")
     angles = np.arange(len(AXES)) * 2.0 * np.pi / len(AXES)
     for planner in primary or benchmark["axes"]:
         scores = benchmark["axes"][planner]["scores"]
         style = {"edgecolor": _color(planner), "lw": 2.0, "label": f"{title_of(planner)}: mean {scores['mean']:.3f}"}
-        axes.fill(angles, [scores[name] for name in AXES], facecolor="none", **style)
-    axes.set_xticks(angles, [name.replace("_", " ") for name in AXES])
-    axes.set_ylim(0.0, 1.0)
+        plot.fill(angles, [scores[name] for name in AXES], facecolor="none", **style)
+    plot.set_xticks(angles, [name.replace("_", " ") for name in AXES])
+    plot.set_ylim(0.0, 1.0)
     figure.legend(loc="outside lower center", ncols=3)
 
 
 def _bars(figure: Any, benchmark: dict[str, Any]) -> None:
-    axes = figure.add_subplot()
-    places = np.arange(len(benchmark["axes"]))
+    """Draw the four axes and their mean as bars with intervals, next to the mean that the paper prints."""
+    plot = figure.add_subplot()
+    rows = list(benchmark["axes"].values())
+    places = np.arange(len(rows))
     width = 0.8 / len(AXES_AND_MEAN)
     shades = ("#3a6ea5", "#8fb8de", "#7fb069", "#e6aa68", "#303030")
     for k, (name, shade) in enumerate(zip(AXES_AND_MEAN, shades, strict=True)):
-        values = np.array([row["scores"][name] for row in benchmark["axes"].values()])
-        spans = np.array([row["intervals"][name] for row in benchmark["axes"].values()])
+        values = np.array([row["scores"][name] for row in rows])
+        spans = np.array([row["intervals"][name] for row in rows])
         whiskers = np.clip([values - spans[:, 0], spans[:, 1] - values], 0.0, None)
         style = {"yerr": whiskers, "error_kw": {"lw": 0.8}, "color": shade, "label": name.replace("_", " ")}
-        axes.bar(places + (k - 2) * width, values, width, **style)
-    printed = {k: PAPER[p].axes_mean for k, p in enumerate(benchmark["axes"]) if p in PAPER}
-    shown = [(k + 2 * width, value) for k, value in printed.items() if value is not None]
+        plot.bar(places + (k - 2) * width, values, width, **style)
+    printed = {place: PAPER[name].axes_mean for place, name in enumerate(benchmark["axes"]) if name in PAPER}
+    shown = [(place + 2 * width, value) for place, value in printed.items() if value is not None]
     if shown:
-        axes.plot(*zip(*shown, strict=True), "D", color="#d1495b", ms=5, label="mean in the paper")
-    axes.set_xticks(places, [title_of(planner) for planner in benchmark["axes"]], rotation=35, ha="right")
-    axes.set_title("Four axes, with 95 % bootstrap intervals over scenarios")
+        plot.plot(*zip(*shown, strict=True), "D", color="#d1495b", ms=5, label="mean in the paper")
+    plot.set_xticks(places, [title_of(planner) for planner in benchmark["axes"]], rotation=35, ha="right")
+    plot.set_title("Four axes, with 95 % bootstrap intervals over scenarios")
     figure.legend(loc="outside right upper")
 
 
 def _pairs(figure: Any, benchmark: dict[str, Any]) -> None:
+    """Draw the planners as points in each pair of axes."""
     for place, (x_axis, y_axis) in enumerate(itertools.combinations(AXES, 2), 1):
-        axes = figure.add_subplot(2, 3, place)
+        plot = figure.add_subplot(2, 3, place)
         for planner, row in benchmark["axes"].items():
             style = {"ms": 8, "label": title_of(planner)} if planner in PLANNERS else {"ms": 5}
-            axes.plot(row["scores"][x_axis], row["scores"][y_axis], "o", color=_color(planner), **style)
-        axes.set(xlabel=x_axis.replace("_", " "), ylabel=y_axis.replace("_", " "))
-        axes.margins(0.2)
-        axes.grid(alpha=0.3)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=len(PLANNERS))
+            plot.plot(row["scores"][x_axis], row["scores"][y_axis], "o", color=_color(planner), **style)
+        plot.set(xlabel=x_axis.replace("_", " "), ylabel=y_axis.replace("_", " "))
+        plot.margins(0.2)
+        plot.grid(alpha=0.3)
+    figure.legend(*plot.get_legend_handles_labels(), loc="outside lower center", ncols=len(PLANNERS))
     figure.suptitle("Pairs of axes; gray: generic planners")
 
 
@@ -366,7 +408,7 @@ def _deltas(figure: Any, benchmark: dict[str, Any]) -> None:
     """Draw relative changes with their sign set so that TA*+Smooth is better on the right."""
     more_is_better = {"five_ray_mean", "clearance_min_m", "smoothness_score"}
     shown = {"blocked_fraction", "length_m", "accel_rms_mps2", "jerk_rms_mps3"} | more_is_better
-    axes = figure.add_subplot()
+    plot = figure.add_subplot()
     rows = []
     for name, title, _ in reversed(FIGURES):
         base = benchmark["means"]["muco"][name]
@@ -375,20 +417,18 @@ def _deltas(figure: Any, benchmark: dict[str, Any]) -> None:
             words = title if name in more_is_better else f"less {title}"
             rows.append((words, sign * (benchmark["deltas"][name]["delta"] or 0.0)))
     for place, (_, change) in enumerate(rows):
-        axes.barh(place, change, color=_color("track_astar") if change >= 0 else _color("muco"))
-        axes.annotate(f"{change:+.1f} %", (max(change, 0.0), place), xytext=(6, -4), textcoords="offset points")
-    axes.axvline(0.0, color="black", lw=0.8)
-    axes.set_yticks(range(len(rows)), [words for words, _ in rows])
-    axes.margins(x=0.15)
-    axes.set_xlabel("relative to MuCO, %; to the right TA* + Smooth is better")
-    axes.set_title("TA* + Smooth against MuCO")
+        plot.barh(place, change, color=_color("track_astar") if change >= 0 else _color("muco"))
+        plot.annotate(f"{change:+.1f} %", (max(change, 0.0), place), xytext=(6, -4), textcoords="offset points")
+    plot.axvline(0.0, color="black", lw=0.8)
+    plot.set_yticks(range(len(rows)), [words for words, _ in rows])
+    plot.margins(x=0.15)
+    plot.set_xlabel("relative to MuCO, %; to the right TA* + Smooth is better")
+    plot.set_title("TA* + Smooth against MuCO")
 
 
 def _trajectories(figure: Any, benchmark: dict[str, Any], planned: dict[str, PlannedItem], box_map: BoxMap) -> None:
     """Draw the scenarios in which the visibility of TA*+Smooth exceeds that of MuCO most."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-
-    from cosfly.geometry.kernels import NO_OBSTACLE_KINDS
 
     def gain(path_id: str) -> float:
         scenario = benchmark["scenarios"].index(path_id)
@@ -401,21 +441,28 @@ def _trajectories(figure: Any, benchmark: dict[str, Any], planned: dict[str, Pla
         targets = next(iter(traces.values())).targets_m
         low = np.minimum(points.min(axis=0), targets.min(axis=0))
         high = points.max(axis=0)
-        axes = figure.add_subplot(2, 2, place, projection="3d")
-        near = (np.abs(box_map.centers - (low + high) / 2) <= (high - low) / 2 + ROOM_M)[:, :2].all(axis=1)
-        near &= ~box_map.is_any_of(NO_OBSTACLE_KINDS) & (box_map.half_extents[:, 2] >= LEAST_M / 2.0)
-        turns = rotation_matrices(np.radians(box_map.rotations_deg[near]))
-        corners = np.einsum("kij,ksj->ksi", turns, CORNER_SIGNS * box_map.half_extents[near][:, None])
-        faces = (corners + box_map.centers[near][:, None])[:, FACES, :].reshape(-1, 4, 3)
-        axes.add_collection3d(Poly3DCollection(faces, facecolor="#b9b9b9", edgecolor="#909090", lw=0.2, alpha=0.12))
+        plot = figure.add_subplot(2, 2, place, projection="3d")
+        faces = _box_faces(box_map, low, high)
+        plot.add_collection3d(Poly3DCollection(faces, facecolor="#b9b9b9", edgecolor="#909090", lw=0.2, alpha=0.12))
         for planner, trace in reversed(traces.items()):
             style = {"lw": 2.2, "label": title_of(planner)} if planner in PLANNERS else {"lw": 0.8}
-            axes.plot(*trace.positions_m.T, color=_color(planner), **style)
-        axes.plot(*targets.T, "--", color="black", lw=1.5, label="pedestrian")
+            plot.plot(*trace.positions_m.T, color=_color(planner), **style)
+        plot.plot(*targets.T, "--", color="black", lw=1.5, label="pedestrian")
         low[2] = targets[:, 2].min() - TARGET_HEIGHT_M
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-        axes.set_box_aspect(high - low, zoom=1.15)
-        axes.locator_params(nbins=5)
-        axes.set_title(f"{path_id}: visibility {gain(path_id):+.3f}")
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        plot.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+        plot.set_box_aspect(high - low, zoom=1.15)
+        plot.locator_params(nbins=5)
+        plot.set_title(f"{path_id}: visibility {gain(path_id):+.3f}")
+    figure.legend(*plot.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     figure.suptitle("Largest gains in visibility of TA* + Smooth over MuCO; gray: generic planners")
+
+
+def _box_faces(box_map: BoxMap, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the faces of the higher boxes around a box of trajectories, (k, 4, 3) m."""
+    from cosfly.geometry.kernels import NO_OBSTACLE_KINDS
+
+    near = (np.abs(box_map.centers - (low + high) / 2) <= (high - low) / 2 + ROOM_M)[:, :2].all(axis=1)
+    near &= ~box_map.is_any_of(NO_OBSTACLE_KINDS) & (box_map.half_extents[:, 2] >= LEAST_M / 2.0)
+    turns = rotation_matrices(np.radians(box_map.rotations_deg[near]))
+    corners = np.einsum("kij,ksj->ksi", turns, CORNER_SIGNS * box_map.half_extents[near][:, None])
+    return (corners + box_map.centers[near][:, None])[:, FACES, :].reshape(-1, 4, 3)

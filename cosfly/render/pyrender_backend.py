@@ -44,12 +44,8 @@ CABIN_SHIFT_SHARE = -0.1  # of a car's half length, forwards
 TAGS, LIT_COLORS, DEPTH_BITS = 255, 128, 0  # what the fragment shader writes, by the red that pyrender passes to it
 
 
-class Triangles(NamedTuple):
-    """k triangles to draw."""
-
-    corners_m: np.ndarray  # (k, 3, 3), relative to the scene's origin
-    colors: np.ndarray  # (k, 3) linear RGB
-    tags: np.ndarray  # (k, 4), see `_tags`
+# k triangles to draw: corners, (k, 3, 3) m relative to the scene's origin, linear RGB, (k, 3), and tags, (k, 4).
+Triangles = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class Solids(NamedTuple):
@@ -160,14 +156,14 @@ class PyrenderRenderer:
         """Make a mesh of triangles, lit by the sun."""
         import pyrender
 
-        corners_m = triangles.corners_m
+        corners_m, colors, tags = triangles
         normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         sun = np.maximum(normals @ self._look.sun_direction(), 0.0)[:, None]
         light = AMBIENT + (1.0 - AMBIENT) * sun
-        lit = _as_byte(triangles.colors * light * SUNLIT_GAIN * self._look.exposure) / 255.0
+        lit = _as_byte(colors * light * SUNLIT_GAIN * self._look.exposure) / 255.0
         opaque = np.column_stack([lit, np.ones(len(lit))])
-        attributes = {"tangents": np.repeat(triangles.tags, 3, axis=0), "color_0": np.repeat(opaque, 3, axis=0)}
+        attributes = {"tangents": np.repeat(tags, 3, axis=0), "color_0": np.repeat(opaque, 3, axis=0)}
         return pyrender.Mesh([pyrender.Primitive(corners_m.reshape(-1, 3), **attributes)])
 
 
@@ -214,7 +210,8 @@ def _map_triangles(box_map: BoxMap, origin: np.ndarray, num_others: int) -> Tria
     if not box_map.ground.is_flat:
         draped = drape(box_map)  # the last row, BARE_GROUND, is the plane's
         pieces.append((draped.corners_m - origin, colors[draped.rows], tags[draped.rows]))
-    return Triangles(*map(np.concatenate, zip(*pieces, strict=True)))
+    corners_m, colors, tags = map(np.concatenate, zip(*pieces, strict=True))
+    return corners_m, colors, tags
 
 
 def _trees(box_map: BoxMap, centers: np.ndarray, halves: np.ndarray, colors: np.ndarray) -> tuple[Solids, Solids]:
@@ -272,4 +269,4 @@ def _mover_triangles(mover: PosedBystander, origin: np.ndarray) -> Triangles:
         corners_m = corners_m @ rotation_matrix(0.0, body.heading_rad, 0.0).T + body.center_m - origin
         colors = np.tile(CAR_PAINTS[int(body.seed * len(CAR_PAINTS))], (len(corners_m), 1))
     tag = _tags(np.array([kind]), np.array([mover.instance_id]), np.array([contract.STANDING_LAYER]))
-    return Triangles(corners_m, colors, np.repeat(tag, len(corners_m), axis=0))
+    return corners_m, colors, np.repeat(tag, len(corners_m), axis=0)
