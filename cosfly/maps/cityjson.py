@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -37,37 +37,6 @@ from cosfly.runtime.config import Config
 
 log = logging.getLogger(__name__)
 
-# Share of its boxes that a shape fills; pieces of at most this length are not cut again, m.
-SOLID_FILL, SOLID_PIECE_M = 0.9, 3.0
-WALL_FILL, WALL_PIECE_M = 0.6, 1.0
-SURFACE_FILL, SURFACE_PIECE_M = 0.8, 2.0
-WATER_FILL, WATER_PIECE_M = 0.97, 1.5  # an obstacle that must not spill over quays and bridges
-SURFACE_MAX_M = 60.0  # longer slabs are cut even if full
-WALL_MAX_M = 2.5  # highest wall: laser heights are often of trees above
-SLOPED_WALL_M, SLOPED_WALL_DEPTH_M = 6.0, 1.0  # on a slope walls are cut into steps of this length, founded this deep
-SLAB_M = 0.3
-FOOT_M = 0.01  # vertices this near to the lowest one are the solid's foot
-EDGE_M = 0.05  # parts that only touch a rectangle are not over it
-STEEP = 0.02  # a surface with a projection of less than this share of its area is a wall: it has no footprint
-# Over the ground. Where slabs overlap a little the higher kind is seen, so paths cover roads and roads cover lawns.
-SURFACE_TOPS_M = {
-    "Sidewalks": 0.0, "Bridge": -0.02, "Walls": 0.0, "Roads": -0.03, "RailTrack": -0.03, "Ground": -0.05,
-    "Terrain": -0.1, "Water": -0.07,
-}  # fmt: skip
-
-CANOPY_M, CANOPY_MAX_M = 2.5, 40.0  # green that rises higher over the ground is a tree; tallest tree
-CANOPY_CELL_M = 2.0  # raster cell of canopies
-CROWN_CELLS, CROWN_MIN_M = 3, 3.6  # cells along a tree's side at most; least width of a crown: plots are smaller
-
-# Surfaces that people walk on at the file's height. Not water, which is lower than its banks, nor green, with the
-# canopy in its vertices.
-TERRAIN_KINDS = ("Roads", "Sidewalks", "Ground", "Terrain", "RailTrack")
-FLAT_WITHIN_M = 3.0  # ground that rises less over the whole map is made flat
-REPORTED_RISE_M = 1.0  # a smaller rise is kerbs and steps: made flat without a warning
-RISE_SHARES = (2, 98)  # percentiles: a few stray vertices do not tilt a town
-GROUND_CELL_M, MOST_NODES = 4.0, 250_000  # cell of the heights of sloping ground; grown for vast models
-SAME_PLACE_M = 0.1  # vertices nearer than this are one, at their mean height
-
 
 class CityJsonConfig(Config):
     """A CityJSON city model."""
@@ -88,8 +57,24 @@ class CityJsonConfig(Config):
         return {"city_model": required(self.path, "maps.cityjson.path")}
 
 
-# The projection of a surface that is not upright, and its plane z = a x + b y + c.
-Facet = tuple[Polygon, np.ndarray]
+class Facet(NamedTuple):
+    """A surface that is not upright."""
+
+    polygon: Polygon  # its projection
+    plane: np.ndarray  # (3,) a, b, c of z = a x + b y + c
+
+
+@dataclass
+class Town:
+    """The boxes of a city model, and the facts about them that its map needs."""
+
+    boxes: BoxList = field(default_factory=BoxList)
+    solid_rows: list[int] = field(default_factory=list)  # of boxes that keep their heights on sloping ground
+    mesh_refs: dict[int, MeshRef] = field(default_factory=dict)  # by id of a box
+    meshes: dict[str, np.ndarray] = field(default_factory=dict)  # by id of an object
+    footprint_m2: float = 0.0  # of buildings; the same of their boxes, and of the part of it under their boxes
+    boxes_m2: float = 0.0
+    covered_m2: float = 0.0
 
 
 def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
@@ -104,52 +89,44 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
 
     if not ground.is_flat:  # heights over the ground below each vertex; solids keep theirs, or their roofs would slope
         objects = [item if item.rule.form == "solid" else item.moved(lowered) for item in objects]
-    facets = {item.object_id: _facets(item) for item in objects}
-    footprints = {key: united([polygon for polygon, _ in value]) for key, value in facets.items()}
-    boxes = BoxList()
-    solid_rows = list[int]()
-    mesh_refs = dict[int, MeshRef]()
-    meshes = dict[str, np.ndarray]()
-    footprint_m2 = boxes_m2 = covered_m2 = 0.0  # of buildings
-    for item in objects:
-        footprint = footprints[item.object_id]
-        if item.rule.form == "solid":
-            first = len(boxes)
-            outline, mesh = _add_solid(boxes, cfg, item, footprint, ground)
-            rows = range(first, len(boxes))
-            solid_rows += rows
-            if mesh is not None and rows:
-                meshes[item.object_id] = mesh
-                ref = MeshRef(file=MESHES_FILE, node=item.object_id, fit="world")
-                mesh_refs |= {row + 1: ref for row in rows}  # ids are rows counted from 1
-            if item.rule.kind == "Buildings":
-                footprint_m2 += footprint.area
-                boxes_m2 += outline.area
-                covered_m2 += shapely.intersection(footprint, outline).area
-        elif item.rule.form == "wall":
-            _add_wall(boxes, item, footprint, is_flat=ground.is_flat)
-        elif item.rule.kind != "Water":
-            _add_surface(boxes, item.rule.kind, footprint)
-        if item.rule.kind == "Bridge":
-            _add_surface(boxes, "Sidewalks", footprint)  # for pedestrians
-        if item.rule.form == "green" and facets[item.object_id]:
-            _add_trees(boxes, item, facets[item.object_id])
-    _add_surface(boxes, "Water", _open_water(objects, footprints))
+    town = _town_of(objects, cfg, ground)
+    footprint_m2 = town.footprint_m2
     header = MapHeader(
         name=cfg.name, source=MapSource(tool=cfg.tool, version=f"CityJSON {model.version}", file=path.name),
         licence=cfg.licence, credits=cfg.credits, ground_z_m=0.0,
         offset_m=dict(zip("xyz", origin.tolist(), strict=True)), building_footprint_m2=round(footprint_m2, 1),
-        building_area_ratio=round(boxes_m2 / footprint_m2, 4) if footprint_m2 else None,
-        building_covered_share=round(covered_m2 / footprint_m2, 4) if footprint_m2 else None,
+        building_area_ratio=round(town.boxes_m2 / footprint_m2, 4) if footprint_m2 else None,
+        building_covered_share=round(town.covered_m2 / footprint_m2, 4) if footprint_m2 else None,
         num_objects=model.num_objects, dropped_objects=model.dropped,
     )  # fmt: skip
     if not ground.is_flat:
         header = header.model_copy(update={"ground": GroundGrid.of(ground)})
-    box_map = replace(boxes.box_map(header), meshes=Meshes(mesh_refs, made=meshes))
+    box_map = replace(town.boxes.box_map(header), meshes=Meshes(town.mesh_refs, made=town.meshes))
     if not ground.is_flat:
-        follows = ~np.isin(np.arange(len(box_map)), solid_rows)
+        follows = ~np.isin(np.arange(len(box_map)), town.solid_rows)
         box_map.centers[follows, 2] += ground.height_at(box_map.centers[follows])
     return with_derived_ground(box_map) if cfg.derive_ground else box_map
+
+
+def _town_of(objects: list[CityObject], cfg: CityJsonConfig, ground: Ground) -> Town:
+    """Return the boxes of all objects by the forms of their rules: solid, wall, surface, green."""
+    facets = {item.object_id: _facets(item) for item in objects}
+    footprints = {key: united([facet.polygon for facet in value]) for key, value in facets.items()}
+    town = Town()
+    for item in objects:
+        footprint, kind, form = footprints[item.object_id], item.rule.kind, item.rule.form
+        if form == "solid":
+            _add_solid(town, cfg, item, footprint, ground)
+        elif form == "wall":
+            _add_wall(town.boxes, item, footprint, is_flat=ground.is_flat)
+        elif kind != "Water":  # all water is added last
+            _add_surface(town.boxes, kind, footprint)
+            if form == "green" and facets[item.object_id]:
+                _add_trees(town.boxes, item, facets[item.object_id])
+        if kind == "Bridge":
+            _add_surface(town.boxes, "Sidewalks", footprint)  # for pedestrians
+    _add_surface(town.boxes, "Water", _open_water(objects, footprints))
+    return town
 
 
 def _open_water(objects: list[CityObject], footprints: dict[str, Any]) -> Any:
@@ -171,6 +148,9 @@ def _centred(objects: list[CityObject], path: Path) -> tuple[list[CityObject], n
     return [item.moved(lambda ring: ring - origin) for item in objects], origin
 
 
+STEEP = 0.02  # a surface with a projection of less than this share of its area is a wall: it has no footprint
+
+
 def _facets(item: CityObject) -> list[Facet]:
     """Project the surfaces of an object that are not upright."""
     facets = []
@@ -185,34 +165,54 @@ def _facets(item: CityObject) -> list[Facet]:
         plane = np.array([a, b, middle[2] - a * middle[0] - b * middle[1]])
         polygon = Polygon(ring[:, :2], [hole[:, :2] for hole in holes])
         check_outline(polygon, item.object_id)
-        facets.append((polygon, plane))
+        facets.append(Facet(polygon, plane))
     return facets
 
 
-def _pieces(footprint: Any, tolerance_m: float, **rules: Any) -> Iterator[Rectangle]:
-    """Yield the rectangles that cover each polygon of a footprint, simplified; `rules` are those of `cover`."""
+def _pieces(footprint: Any, tolerance_m: float, **cover_settings: Any) -> Iterator[Rectangle]:
+    """Yield the rectangles that cover each polygon of a footprint, simplified."""
     for polygon in polygons_of(footprint):
-        yield from cover(polygon.simplify(tolerance_m), **rules)
+        yield from cover(polygon.simplify(tolerance_m), **cover_settings)
 
 
-def _add_solid(
-    boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint: Any, ground: Ground
-) -> tuple[Any, np.ndarray | None]:
-    """Add a building as upright boxes from its lowest ground (or below it) to its top.
+# --- solids and walls -------------------------------------------------------------------------------------------------
 
-    A box is as high as the mesh in it, so that planners know its spires. Return the union of the outlines of the boxes,
-    and the mesh to draw, if there is one.
+# Share of its boxes that a shape fills; pieces of at most this length are not cut again, m.
+SOLID_FILL, SOLID_PIECE_M = 0.9, 3.0
+WALL_FILL, WALL_PIECE_M = 0.6, 1.0
+WALL_MAX_M = 2.5  # highest wall: laser heights are often of trees above
+SLOPED_WALL_M, SLOPED_WALL_DEPTH_M = 6.0, 1.0  # on a slope walls are cut into steps of this length, founded this deep
+SLAB_M = 0.3
+FOOT_M = 0.01  # vertices this near to the lowest one are the solid's foot
+EDGE_M = 0.05  # parts that only touch a rectangle are not over it
+
+
+def _add_solid(town: Town, cfg: CityJsonConfig, item: CityObject, footprint: Any, ground: Ground) -> None:
+    """Add a solid as upright boxes from its lowest ground (or below it) to its top, and its mesh to draw.
+
+    A box is as high as the mesh in it, so that planners know its spires.
     """
     z = item.corners()[:, 2]
-    low = min(float(z.min()), float(ground.height_at(item.corners()).min()))
-    high = max(float(z.max()), float(z.min()) + 0.1)
-    mesh = solid_mesh(item.detailed, low) if cfg.solids else None
+    bottom_m = min(float(z.min()), float(ground.height_at(item.corners()).min()))
+    top_m = max(float(z.max()), float(z.min()) + 0.1)
+    mesh = solid_mesh(item.detailed, bottom_m) if cfg.solids else None
+    first_row = len(town.boxes)
     outlines = []
     for rectangle in _pieces(footprint, 0.05, min_fill=SOLID_FILL, min_size_m=SOLID_PIECE_M, shares=CUT_SHARES):
-        top = high if mesh is None else _top_within(mesh, rectangle, high)
-        boxes.add(item.rule.kind, rectangle.center, rectangle.size, low, max(top, low + 0.1), rectangle.yaw_deg)
+        high_m = max(top_m if mesh is None else _top_within(mesh, rectangle, top_m), bottom_m + 0.1)
+        town.boxes.add(item.rule.kind, rectangle.center, rectangle.size, bottom_m, high_m, rectangle.yaw_deg)
         outlines.append(rectangle_polygon(rectangle))
-    return united(outlines), mesh
+    rows = range(first_row, len(town.boxes))
+    town.solid_rows += rows
+    if mesh is not None and rows:
+        town.meshes[item.object_id] = mesh
+        ref = MeshRef(file=MESHES_FILE, node=item.object_id, fit="world")
+        town.mesh_refs |= {row + 1: ref for row in rows}  # ids are rows counted from 1
+    if item.rule.kind == "Buildings":
+        outline = united(outlines)
+        town.footprint_m2 += footprint.area
+        town.boxes_m2 += outline.area
+        town.covered_m2 += shapely.intersection(footprint, outline).area
 
 
 def solid_mesh(surfaces: list[Surface], foot_m: float) -> np.ndarray | None:
@@ -233,10 +233,10 @@ def solid_mesh(surfaces: list[Surface], foot_m: float) -> np.ndarray | None:
 
 def _add_wall(boxes: BoxList, item: CityObject, footprint: Any, *, is_flat: bool) -> None:
     """Add a wall as boxes that are as high as the upper quartile of its vertices."""
-    high = float(np.clip(np.percentile(item.corners()[:, 2], 75), 0.3, WALL_MAX_M))
-    longest_m, low = (np.inf, -SLAB_M) if is_flat else (SLOPED_WALL_M, -SLOPED_WALL_DEPTH_M)
+    top_m = float(np.clip(np.percentile(item.corners()[:, 2], 75), 0.3, WALL_MAX_M))
+    longest_m, bottom_m = (np.inf, -SLAB_M) if is_flat else (SLOPED_WALL_M, -SLOPED_WALL_DEPTH_M)
     for piece in _pieces(footprint, 0.02, min_fill=WALL_FILL, min_size_m=WALL_PIECE_M, max_size_m=longest_m):
-        boxes.add(item.rule.kind, piece.center, piece.size, low, high, piece.yaw_deg)
+        boxes.add(item.rule.kind, piece.center, piece.size, bottom_m, top_m, piece.yaw_deg)
 
 
 def _top_within(mesh: np.ndarray, rectangle: Rectangle, default: float) -> float:
@@ -255,29 +255,23 @@ def _triangles_of(rings: Surface) -> np.ndarray:
     If the outline crosses itself, its valid parts are used; their new corners lie in the surface's plane.
     """
     outline = rings[0]
-    after = np.roll(outline, -1, axis=0)
-    normal = np.cross(outline, after).sum(axis=0)  # Newell's, twice the area
+    normal = np.cross(outline, np.roll(outline, -1, axis=0)).sum(axis=0)  # Newell's, twice the area
     if np.linalg.norm(normal) < 1e-9:
         return np.zeros((0, 3, 3))
-    normal /= np.linalg.norm(normal)
     if len(rings) == 1 and len(outline) == 3:
         return outline[None]
+    normal /= np.linalg.norm(normal)
     side = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     side /= np.linalg.norm(side)
     axes = np.stack([side, np.cross(normal, side)])  # seen from outside the outline turns counter-clockwise
     middle = outline.mean(axis=0)
     flat = [(ring - middle) @ axes.T for ring in rings]
-    if len(rings) == 1 and len(outline) == 4:
-        edges = np.roll(flat[0], -1, axis=0) - flat[0]
-        following = np.roll(edges, -1, axis=0)
-        if (edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0] > 0).all():  # convex
-            return outline[[(0, 1, 2), (0, 2, 3)]]
+    if len(rings) == 1 and len(outline) == 4 and _is_convex(flat[0]):
+        return outline[[(0, 1, 2), (0, 2, 3)]]
     polygon = Polygon(flat[0], flat[1:])
     pieces = polygons_of(polygon if polygon.is_valid else shapely.make_valid(polygon))
-    corner_at = {}  # position in the plane -> corner of the surface
-    for flat_ring, ring in zip(flat, rings, strict=True):
-        for (x, y), corner in zip(flat_ring.tolist(), ring, strict=True):
-            corner_at[x, y] = corner
+    flat_corners = map(tuple, np.concatenate(flat).tolist())
+    corner_at = dict(zip(flat_corners, np.concatenate(rings), strict=True))  # (x, y) in the plane -> corner
     triangles = []
     for triangle in shapely.get_parts([shapely.constrained_delaunay_triangles(piece) for piece in pieces]):
         positions = shapely.get_coordinates(shapely.orient_polygons(triangle))[:3]
@@ -285,21 +279,44 @@ def _triangles_of(rings: Surface) -> np.ndarray:
     return np.array(triangles).reshape(-1, 3, 3)
 
 
+def _is_convex(ring: np.ndarray) -> bool:
+    """Return whether a counter-clockwise ring, (n, 2), turns to the left at all corners."""
+    edges = np.roll(ring, -1, axis=0) - ring
+    following = np.roll(edges, -1, axis=0)
+    return bool((edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0] > 0).all())
+
+
+# --- surfaces and trees -----------------------------------------------------------------------------------------------
+
+SURFACE_FILL, SURFACE_PIECE_M = 0.8, 2.0
+WATER_FILL, WATER_PIECE_M = 0.97, 1.5  # an obstacle that must not spill over quays and bridges
+SURFACE_MAX_M = 60.0  # longer slabs are cut even if full
+# Over the ground. Where slabs overlap a little the higher kind is seen, so paths cover roads and roads cover lawns.
+SURFACE_TOPS_M = {
+    "Sidewalks": 0.0, "Bridge": -0.02, "Walls": 0.0, "Roads": -0.03, "RailTrack": -0.03, "Ground": -0.05,
+    "Terrain": -0.1, "Water": -0.07,
+}  # fmt: skip
+
+CANOPY_M, CANOPY_MAX_M = 2.5, 40.0  # green that rises higher over the ground is a tree; tallest tree
+CANOPY_CELL_M = 2.0  # raster cell of canopies
+CROWN_CELLS, CROWN_MIN_M = 3, 3.6  # cells along a tree's side at most; least width of a crown: plots are smaller
+
+
 def _add_surface(boxes: BoxList, kind: str, footprint: Any) -> None:
     """Add a surface as slabs at the height of its kind, so that it never obstructs a pedestrian."""
-    top = SURFACE_TOPS_M.get(kind, -0.1)
+    top_m = SURFACE_TOPS_M.get(kind, -0.1)
     fill, piece_m = (WATER_FILL, WATER_PIECE_M) if kind == "Water" else (SURFACE_FILL, SURFACE_PIECE_M)
     for piece in _pieces(footprint, 0.05, min_fill=fill, min_size_m=piece_m, max_size_m=SURFACE_MAX_M):
-        boxes.add(kind, piece.center, piece.size, top - SLAB_M, top, piece.yaw_deg)
+        boxes.add(kind, piece.center, piece.size, top_m - SLAB_M, top_m, piece.yaw_deg)
 
 
 def _add_trees(boxes: BoxList, item: CityObject, facets: list[Facet]) -> None:
     """Add a vegetation box for every patch of raster cells where the green rises over CANOPY_M."""
-    heights, low = _canopy_heights(item, facets)
-    for x0, y0, x1, y1, top in _crowns(heights):
-        first, last = np.add(low, (x0, y0)), np.add(low, (x1, y1))
-        size = np.maximum((last - first) * CANOPY_CELL_M, CROWN_MIN_M)
-        boxes.add("Vegetation", (first + last) / 2 * CANOPY_CELL_M, size, 0.0, min(top, CANOPY_MAX_M))
+    heights_m, first_cell = _canopy_heights(item, facets)
+    for x0, y0, x1, y1, top_m in _crowns(heights_m):
+        begin, end = np.add(first_cell, (x0, y0)), np.add(first_cell, (x1, y1))
+        size_m = np.maximum((end - begin) * CANOPY_CELL_M, CROWN_MIN_M)
+        boxes.add("Vegetation", (begin + end) / 2 * CANOPY_CELL_M, size_m, 0.0, min(top_m, CANOPY_MAX_M))
 
 
 def _canopy_heights(item: CityObject, facets: list[Facet]) -> tuple[np.ndarray, np.ndarray]:
@@ -308,51 +325,68 @@ def _canopy_heights(item: CityObject, facets: list[Facet]) -> tuple[np.ndarray, 
     Return heights (nx, ny) m, 0 off the surface, and the indices (2,) of the first cell: low corner / CANOPY_CELL_M.
     """
     cell_m = CANOPY_CELL_M
-    bounds = np.array([polygon.bounds for polygon, _ in facets])
+    bounds = np.array([facet.polygon.bounds for facet in facets])
     corners = item.corners()
-    low = np.floor(np.minimum(bounds[:, :2].min(axis=0), corners[:, :2].min(axis=0)) / cell_m).astype(int)
-    high = np.floor(np.maximum(bounds[:, 2:].max(axis=0), corners[:, :2].max(axis=0)) / cell_m).astype(int)
-    heights = np.zeros(high - low + 1)
-    cells = np.floor(corners[:, :2] / cell_m).astype(int) - low
-    np.maximum.at(heights, (cells[:, 0], cells[:, 1]), corners[:, 2])
-    for (polygon, (a, b, c)), (x0, y0, x1, y1) in zip(facets, bounds, strict=True):
-        first = np.ceil(np.array([x0, y0]) / cell_m - 0.5).astype(int)
-        last = np.floor(np.array([x1, y1]) / cell_m - 0.5).astype(int)
-        # No cells where the facet lies between the middles.
-        ix, iy = (a.ravel() for a in np.meshgrid(*(np.arange(first[k], last[k] + 1) for k in (0, 1)), indexing="ij"))
+    first_cell = np.floor(np.minimum(bounds[:, :2].min(axis=0), corners[:, :2].min(axis=0)) / cell_m).astype(int)
+    last_cell = np.floor(np.maximum(bounds[:, 2:].max(axis=0), corners[:, :2].max(axis=0)) / cell_m).astype(int)
+    heights_m = np.zeros(last_cell - first_cell + 1)
+    cells = np.floor(corners[:, :2] / cell_m).astype(int) - first_cell
+    np.maximum.at(heights_m, (cells[:, 0], cells[:, 1]), corners[:, 2])
+    for (polygon, (a, b, c)), facet_bounds in zip(facets, bounds, strict=True):
+        # The cells with their middle in the facet's bounds: none where the facet lies between the middles.
+        begin = np.ceil(facet_bounds[:2] / cell_m - 0.5).astype(int)
+        end = np.floor(facet_bounds[2:] / cell_m - 0.5).astype(int) + 1
+        grids = np.meshgrid(np.arange(begin[0], end[0]), np.arange(begin[1], end[1]), indexing="ij")
+        ix, iy = (grid.ravel() for grid in grids)
         x, y = (ix + 0.5) * cell_m, (iy + 0.5) * cell_m
         inside = shapely.intersects_xy(polygon, x, y)
         z = a * x + b * y + c
-        np.maximum.at(heights, (ix[inside] - low[0], iy[inside] - low[1]), z[inside])
-    return heights, low
+        np.maximum.at(heights_m, (ix[inside] - first_cell[0], iy[inside] - first_cell[1]), z[inside])
+    return heights_m, first_cell
 
 
-def _crowns(heights: np.ndarray) -> list[tuple[int, int, int, int, float]]:
+def _crowns(heights_m: np.ndarray) -> list[tuple[int, int, int, int, float]]:
     """Gather the cells of a canopy, heights (nx, ny) m, into trees, the highest first.
 
     Every cell over CANOPY_M is in exactly one tree: (x0, y0, x1, y1, height), indices with the ends excluded, and m.
     """
-    free = heights > CANOPY_M
+    is_free = heights_m > CANOPY_M
     trees = []
-    for flat in np.argsort(-heights, axis=None, kind="stable"):
-        x, y = (int(k) for k in np.unravel_index(flat, heights.shape))
-        if not heights[x, y] > CANOPY_M:
+    for flat_index in np.argsort(-heights_m, axis=None, kind="stable"):
+        x, y = (int(index) for index in np.unravel_index(flat_index, heights_m.shape))
+        if not heights_m[x, y] > CANOPY_M:
             break
-        if not free[x, y]:
-            continue
-        tree = (x, y, x + 1, y + 1)
-        grown = (0, 0, 0, 0)
-        while tree != grown:
-            grown = tree
-            for step in ((-1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1)):
-                x0, y0, x1, y1 = (a + b for a, b in zip(grown, step, strict=True))
-                fits = x0 >= 0 and y0 >= 0 and x1 <= heights.shape[0] and y1 <= heights.shape[1]
-                if fits and max(x1 - x0, y1 - y0) <= CROWN_CELLS and free[x0:x1, y0:y1].all():
-                    tree = x0, y0, x1, y1
-        x0, y0, x1, y1 = tree
-        free[x0:x1, y0:y1] = False
-        trees.append((x0, y0, x1, y1, float(heights[x0:x1, y0:y1].max())))
+        if is_free[x, y]:
+            x0, y0, x1, y1 = _grown(is_free, x, y)
+            is_free[x0:x1, y0:y1] = False
+            trees.append((x0, y0, x1, y1, float(heights_m[x0:x1, y0:y1].max())))
     return trees
+
+
+def _grown(is_free: np.ndarray, x: int, y: int) -> tuple[int, int, int, int]:
+    """Grow a cell by free rows and columns to at most CROWN_CELLS a side; return x0, y0, x1, y1, ends excluded."""
+    tree = (x, y, x + 1, y + 1)
+    before = (0, 0, 0, 0)
+    while tree != before:
+        before = tree
+        for step in ((-1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1)):
+            x0, y0, x1, y1 = (side + change for side, change in zip(before, step, strict=True))
+            fits = x0 >= 0 and y0 >= 0 and x1 <= is_free.shape[0] and y1 <= is_free.shape[1]
+            if fits and max(x1 - x0, y1 - y0) <= CROWN_CELLS and is_free[x0:x1, y0:y1].all():
+                tree = x0, y0, x1, y1
+    return tree
+
+
+# --- ground -----------------------------------------------------------------------------------------------------------
+
+# Surfaces that people walk on at the file's height. Not water, which is lower than its banks, nor green, with the
+# canopy in its vertices.
+TERRAIN_KINDS = ("Roads", "Sidewalks", "Ground", "Terrain", "RailTrack")
+FLAT_WITHIN_M = 3.0  # ground that rises less over the whole map is made flat
+REPORTED_RISE_M = 1.0  # a smaller rise is kerbs and steps: made flat without a warning
+RISE_SHARES = (2, 98)  # percentiles: a few stray vertices do not tilt a town
+GROUND_CELL_M, MOST_NODES = 4.0, 250_000  # cell of the heights of sloping ground; grown for vast models
+SAME_PLACE_M = 0.1  # vertices nearer than this are one, at their mean height
 
 
 def ground_of(objects: list[CityObject]) -> Ground:
@@ -364,19 +398,17 @@ def ground_of(objects: list[CityObject]) -> Ground:
     else:
         solids = [item for item in objects if item.rule.form == "solid"] or objects
         ends = [(item.corners().min(axis=0), item.corners().max(axis=0)) for item in solids]
-        samples = np.array([[*(low + high)[:2] / 2, low[2]] for low, high in ends])
+        samples = np.array([[*(first + last)[:2] / 2, first[2]] for first, last in ends])
         origin = "the bases of buildings"
-    low, high = np.percentile(samples[:, 2], RISE_SHARES)
-    if high - low <= FLAT_WITHIN_M:
-        if high - low > REPORTED_RISE_M:
-            log.warning("the ground rises by %.1f m, at most %g m, so it is made flat", high - low, FLAT_WITHIN_M)
+    rise_m = float(np.ptp(np.percentile(samples[:, 2], RISE_SHARES)))
+    if rise_m <= FLAT_WITHIN_M:
+        if rise_m > REPORTED_RISE_M:
+            log.warning("the ground rises by %.1f m, at most %g m, so it is made flat", rise_m, FLAT_WITHIN_M)
         return Ground.flat(0.0)
     bounds = np.concatenate([item.corners()[:, :2] for item in objects])
     ground = _gridded(samples, bounds.min(axis=0), bounds.max(axis=0))
-    log.info(
-        "the ground rises by %.1f m; its heights are sampled every %g m from %s", high - low, ground.cell_m, origin
-    )
-    return GroundGrid.of(ground).ground()
+    log.info("the ground rises by %.1f m; its heights are sampled every %g m from %s", rise_m, ground.cell_m, origin)
+    return GroundGrid.of(ground).ground()  # with heights rounded as in the file, so that boxes stand on those
 
 
 def _gridded(samples: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ground:
