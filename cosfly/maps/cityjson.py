@@ -11,7 +11,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import shapely
@@ -57,11 +57,8 @@ class CityJsonConfig(Config):
         return {"city_model": required(self.path, "maps.cityjson.path")}
 
 
-class Facet(NamedTuple):
-    """A surface that is not upright."""
-
-    polygon: Polygon  # its projection
-    plane: np.ndarray  # (3,) a, b, c of z = a x + b y + c
+# The projection of a surface that is not upright, and its plane z = a x + b y + c.
+Facet = tuple[Polygon, np.ndarray]
 
 
 @dataclass
@@ -111,7 +108,7 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
 def _town_of(objects: list[CityObject], cfg: CityJsonConfig, ground: Ground) -> Town:
     """Return the boxes of all objects by the forms of their rules: solid, wall, surface, green."""
     facets = {item.object_id: _facets(item) for item in objects}
-    footprints = {key: united([facet.polygon for facet in value]) for key, value in facets.items()}
+    footprints = {key: united([polygon for polygon, _ in value]) for key, value in facets.items()}
     town = Town()
     for item in objects:
         footprint, kind, form = footprints[item.object_id], item.rule.kind, item.rule.form
@@ -165,7 +162,7 @@ def _facets(item: CityObject) -> list[Facet]:
         plane = np.array([a, b, middle[2] - a * middle[0] - b * middle[1]])
         polygon = Polygon(ring[:, :2], [hole[:, :2] for hole in holes])
         check_outline(polygon, item.object_id)
-        facets.append(Facet(polygon, plane))
+        facets.append((polygon, plane))
     return facets
 
 
@@ -174,8 +171,6 @@ def _pieces(footprint: Any, tolerance_m: float, **cover_settings: Any) -> Iterat
     for polygon in polygons_of(footprint):
         yield from cover(polygon.simplify(tolerance_m), **cover_settings)
 
-
-# --- solids and walls -------------------------------------------------------------------------------------------------
 
 # Share of its boxes that a shape fills; pieces of at most this length are not cut again, m.
 SOLID_FILL, SOLID_PIECE_M = 0.9, 3.0
@@ -286,8 +281,6 @@ def _is_convex(ring: np.ndarray) -> bool:
     return bool((edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0] > 0).all())
 
 
-# --- surfaces and trees -----------------------------------------------------------------------------------------------
-
 SURFACE_FILL, SURFACE_PIECE_M = 0.8, 2.0
 WATER_FILL, WATER_PIECE_M = 0.97, 1.5  # an obstacle that must not spill over quays and bridges
 SURFACE_MAX_M = 60.0  # longer slabs are cut even if full
@@ -325,7 +318,7 @@ def _canopy_heights(item: CityObject, facets: list[Facet]) -> tuple[np.ndarray, 
     Return heights (nx, ny) m, 0 off the surface, and the indices (2,) of the first cell: low corner / CANOPY_CELL_M.
     """
     cell_m = CANOPY_CELL_M
-    bounds = np.array([facet.polygon.bounds for facet in facets])
+    bounds = np.array([polygon.bounds for polygon, _ in facets])
     corners = item.corners()
     first_cell = np.floor(np.minimum(bounds[:, :2].min(axis=0), corners[:, :2].min(axis=0)) / cell_m).astype(int)
     last_cell = np.floor(np.maximum(bounds[:, 2:].max(axis=0), corners[:, :2].max(axis=0)) / cell_m).astype(int)
@@ -376,8 +369,6 @@ def _grown(is_free: np.ndarray, x: int, y: int) -> tuple[int, int, int, int]:
                 tree = x0, y0, x1, y1
     return tree
 
-
-# --- ground -----------------------------------------------------------------------------------------------------------
 
 # Surfaces that people walk on at the file's height. Not water, which is lower than its banks, nor green, with the
 # canopy in its vertices.
