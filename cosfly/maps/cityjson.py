@@ -62,16 +62,16 @@ Facet = tuple[Polygon, np.ndarray]
 
 
 @dataclass
-class Town:
+class CityBoxes:
     """The boxes of a city model, and the facts about them that its map needs."""
 
     boxes: BoxList = field(default_factory=BoxList)
     solid_rows: list[int] = field(default_factory=list)  # of boxes that keep their heights on sloping ground
     mesh_refs: dict[int, MeshRef] = field(default_factory=dict)  # by id of a box
     meshes: dict[str, np.ndarray] = field(default_factory=dict)  # by id of an object
-    footprint_m2: float = 0.0  # of buildings; the same of their boxes, and of the part of it under their boxes
-    boxes_m2: float = 0.0
-    covered_m2: float = 0.0
+    footprint_m2: float = 0.0  # of the buildings
+    boxes_m2: float = 0.0  # of their boxes
+    covered_m2: float = 0.0  # of the part of the buildings' footprints under their boxes
 
 
 def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
@@ -86,44 +86,44 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
 
     if not ground.is_flat:  # heights over the ground below each vertex; solids keep theirs, or their roofs would slope
         objects = [item if item.rule.form == "solid" else item.moved(lowered) for item in objects]
-    town = _town_of(objects, cfg, ground)
-    footprint_m2 = town.footprint_m2
+    city = _boxes_of(objects, cfg, ground)
+    footprint_m2 = city.footprint_m2
     header = MapHeader(
         name=cfg.name, source=MapSource(tool=cfg.tool, version=f"CityJSON {model.version}", file=path.name),
         licence=cfg.licence, credits=cfg.credits, ground_z_m=0.0,
         offset_m=dict(zip("xyz", origin.tolist(), strict=True)), building_footprint_m2=round(footprint_m2, 1),
-        building_area_ratio=round(town.boxes_m2 / footprint_m2, 4) if footprint_m2 else None,
-        building_covered_share=round(town.covered_m2 / footprint_m2, 4) if footprint_m2 else None,
+        building_area_ratio=round(city.boxes_m2 / footprint_m2, 4) if footprint_m2 else None,
+        building_covered_share=round(city.covered_m2 / footprint_m2, 4) if footprint_m2 else None,
         num_objects=model.num_objects, dropped_objects=model.dropped,
     )  # fmt: skip
     if not ground.is_flat:
         header = header.model_copy(update={"ground": GroundGrid.of(ground)})
-    box_map = replace(town.boxes.box_map(header), meshes=Meshes(town.mesh_refs, made=town.meshes))
+    box_map = replace(city.boxes.box_map(header), meshes=Meshes(city.mesh_refs, made=city.meshes))
     if not ground.is_flat:
-        follows = ~np.isin(np.arange(len(box_map)), town.solid_rows)
+        follows = ~np.isin(np.arange(len(box_map)), city.solid_rows)
         box_map.centers[follows, 2] += ground.height_at(box_map.centers[follows])
     return with_derived_ground(box_map) if cfg.derive_ground else box_map
 
 
-def _town_of(objects: list[CityObject], cfg: CityJsonConfig, ground: Ground) -> Town:
+def _boxes_of(objects: list[CityObject], cfg: CityJsonConfig, ground: Ground) -> CityBoxes:
     """Return the boxes of all objects by the forms of their rules: solid, wall, surface, green."""
     facets = {item.object_id: _facets(item) for item in objects}
     footprints = {key: united([polygon for polygon, _ in value]) for key, value in facets.items()}
-    town = Town()
+    city = CityBoxes()
     for item in objects:
         footprint, kind, form = footprints[item.object_id], item.rule.kind, item.rule.form
         if form == "solid":
-            _add_solid(town, cfg, item, footprint, ground)
+            _add_solid(city, cfg, item, footprint, ground)
         elif form == "wall":
-            _add_wall(town.boxes, item, footprint, is_flat=ground.is_flat)
+            _add_wall(city.boxes, item, footprint, is_flat=ground.is_flat)
         elif kind != "Water":  # all water is added last
-            _add_surface(town.boxes, kind, footprint)
+            _add_surface(city.boxes, kind, footprint)
             if form == "green" and facets[item.object_id]:
-                _add_trees(town.boxes, item, facets[item.object_id])
+                _add_trees(city.boxes, item, facets[item.object_id])
         if kind == "Bridge":
-            _add_surface(town.boxes, "Sidewalks", footprint)  # for pedestrians
-    _add_surface(town.boxes, "Water", _open_water(objects, footprints))
-    return town
+            _add_surface(city.boxes, "Sidewalks", footprint)  # for pedestrians
+    _add_surface(city.boxes, "Water", _open_water(objects, footprints))
+    return city
 
 
 def _open_water(objects: list[CityObject], footprints: dict[str, Any]) -> Any:
@@ -182,7 +182,7 @@ FOOT_M = 0.01  # vertices this near to the lowest one are the solid's foot
 EDGE_M = 0.05  # parts that only touch a rectangle are not over it
 
 
-def _add_solid(town: Town, cfg: CityJsonConfig, item: CityObject, footprint: Any, ground: Ground) -> None:
+def _add_solid(city: CityBoxes, cfg: CityJsonConfig, item: CityObject, footprint: Any, ground: Ground) -> None:
     """Add a solid as upright boxes from its lowest ground (or below it) to its top, and its mesh to draw.
 
     A box is as high as the mesh in it, so that planners know its spires.
@@ -191,23 +191,23 @@ def _add_solid(town: Town, cfg: CityJsonConfig, item: CityObject, footprint: Any
     bottom_m = min(float(z.min()), float(ground.height_at(item.corners()).min()))
     top_m = max(float(z.max()), float(z.min()) + 0.1)
     mesh = solid_mesh(item.detailed, bottom_m) if cfg.solids else None
-    first_row = len(town.boxes)
+    first_row = len(city.boxes)
     outlines = []
     for rectangle in _pieces(footprint, 0.05, min_fill=SOLID_FILL, min_size_m=SOLID_PIECE_M, shares=CUT_SHARES):
         high_m = max(top_m if mesh is None else _top_within(mesh, rectangle, top_m), bottom_m + 0.1)
-        town.boxes.add(item.rule.kind, rectangle.center, rectangle.size, bottom_m, high_m, rectangle.yaw_deg)
+        city.boxes.add(item.rule.kind, rectangle.center, rectangle.size, bottom_m, high_m, rectangle.yaw_deg)
         outlines.append(rectangle_polygon(rectangle))
-    rows = range(first_row, len(town.boxes))
-    town.solid_rows += rows
+    rows = range(first_row, len(city.boxes))
+    city.solid_rows += rows
     if mesh is not None and rows:
-        town.meshes[item.object_id] = mesh
+        city.meshes[item.object_id] = mesh
         ref = MeshRef(file=MESHES_FILE, node=item.object_id, fit="world")
-        town.mesh_refs |= {row + 1: ref for row in rows}  # ids are rows counted from 1
+        city.mesh_refs |= {row + 1: ref for row in rows}  # ids are rows counted from 1
     if item.rule.kind == "Buildings":
         outline = united(outlines)
-        town.footprint_m2 += footprint.area
-        town.boxes_m2 += outline.area
-        town.covered_m2 += shapely.intersection(footprint, outline).area
+        city.footprint_m2 += footprint.area
+        city.boxes_m2 += outline.area
+        city.covered_m2 += shapely.intersection(footprint, outline).area
 
 
 def solid_mesh(surfaces: list[Surface], foot_m: float) -> np.ndarray | None:

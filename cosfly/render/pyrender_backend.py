@@ -48,7 +48,7 @@ TAGS, LIT_COLORS, DEPTH_BITS = 255, 128, 0  # what the fragment shader writes, b
 Triangles = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-class Solids(NamedTuple):
+class UnitSolids(NamedTuple):
     """One solid in each of some boxes, of n in all."""
 
     mesh: Any  # trimesh, half size 1
@@ -197,7 +197,7 @@ def _map_triangles(box_map: BoxMap, origin: np.ndarray, num_others: int) -> Tria
     is_plain = ~crowns.rows & ~np.append(is_draped(box_map), False)
     box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
     pieces = []
-    for solid in (Solids(box, is_plain, halves, np.zeros(len(kinds)), colors), crowns, stems):
+    for solid in (UnitSolids(box, is_plain, halves, np.zeros(len(kinds)), colors), crowns, stems):
         rows = solid.rows & is_box
         middles = centers[rows] + turns[rows, :, 2] * (solid.lift * halves[:, 2])[rows, None]
         vertices = solid.half_m[rows, None] * solid.mesh.vertices
@@ -214,7 +214,9 @@ def _map_triangles(box_map: BoxMap, origin: np.ndarray, num_others: int) -> Tria
     return corners_m, colors, tags
 
 
-def _trees(box_map: BoxMap, centers: np.ndarray, halves: np.ndarray, colors: np.ndarray) -> tuple[Solids, Solids]:
+def _trees(
+    box_map: BoxMap, centers: np.ndarray, halves: np.ndarray, colors: np.ndarray
+) -> tuple[UnitSolids, UnitSolids]:
     """Return the crowns of trees and bushes, which replace their boxes, and the stems of the trees.
 
     centers, halves, colors: (n, 3) of the map's boxes and its ground plane.
@@ -235,9 +237,9 @@ def _trees(box_map: BoxMap, centers: np.ndarray, halves: np.ndarray, colors: np.
     ball = trimesh.creation.icosphere(subdivisions=1)
     box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
     bark = np.tile(STEM_COLOR, (len(halves), 1))
-    crowns = Solids(ball, is_round, crowns_m, crown_middle, colors)
+    crowns = UnitSolids(ball, is_round, crowns_m, crown_middle, colors)
     # A stem reaches from the bottom of the box, -1, to the middle of the crown.
-    return crowns, Solids(box, crown_bottom > -1.0, stems_m, (crown_middle - 1.0) / 2.0, bark)
+    return crowns, UnitSolids(box, crown_bottom > -1.0, stems_m, (crown_middle - 1.0) / 2.0, bark)
 
 
 def _mover_triangles(mover: PosedBystander, origin: np.ndarray) -> Triangles:
