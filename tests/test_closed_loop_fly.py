@@ -76,7 +76,8 @@ def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(t
         f"inspect {TINY} --workers 1 --map {simple} --traces {traces} --data {tmp_path}/render --out {tmp_path}/inspect",
         f"caption {TINY} --workers 1 --data {tmp_path}/render --out {tmp_path}/caption",
         f"release build {TINY} --workers 1 --data {tmp_path}/render --captions {tmp_path}/caption/captions.jsonl "
-        f"--inspect {tmp_path}/inspect/inspect.json --out {tmp_path}/release --set release.licence=cc-by-4.0",
+        f"--inspect {tmp_path}/inspect/inspect.json --out {tmp_path}/release --set release.licence=cc-by-4.0 "
+        "--set release.pairs=any",
     ):
         done = invoke(words if words.startswith("caption") else words.replace("--seed 4", ""))
         assert done.exit_code == 0, (words, done.output, done.exception)
@@ -114,15 +115,17 @@ def test_the_ceiling_sees_more_than_chance_and_all_is_the_same_however_many_fly_
 @pytest.mark.slow
 def test_a_policy_of_ones_own_flies_as_a_student_that_decides_the_same(town, tmp_path, in_this_process, monkeypatch):
     code = "class Ahead:\n    def reset(self, goal, seed): pass\n    def act(self, seen): return 'track_straight'\n"
-    (tmp_path / "own.py").write_text(code)
+    (tmp_path / "ahead_policy.py").write_text(code)
     monkeypatch.chdir(tmp_path)
-    flown = fly(town, tmp_path / "policy", f"{SHORT} --policy own:Ahead")
+    flown = fly(town, tmp_path / "policy", f"{SHORT} --policy ahead_policy:Ahead")
     same = fly(town, tmp_path / "floor", f"{SHORT} --student track_straight")
     for one, other in zip(flown.values(), same.values(), strict=True):
-        assert (one.engine, one.student) == ("policy", "own:Ahead")
+        assert (one.engine, one.student) == ("policy", "ahead_policy:Ahead")
         assert [f.command for f in one.frames] == [f.command for f in other.frames]
-    assert "--policy" in attempt(town, tmp_path / "both", f"{SHORT} --policy own:Ahead --student rules").output
-    assert "own:Missing" in str(attempt(town, tmp_path / "none", f"{SHORT} --policy own:Missing").exception)
+    assert "--policy" in attempt(town, tmp_path / "both", f"{SHORT} --policy ahead_policy:Ahead --student rules").output
+    assert "ahead_policy:Missing" in str(
+        attempt(town, tmp_path / "none", f"{SHORT} --policy ahead_policy:Missing").exception
+    )
 
 
 ONE = "--set caption.endpoint.max_tries=1 --set fly.side_by_side=3"
