@@ -41,7 +41,7 @@ def look(item: dict) -> dict:
 
 
 def decode_by_pyav(path: Path, times_s: list[float], tolerance_s: float, *_) -> torch.Tensor:
-    """Return the frames nearest to some times; stands in for torchcodec, which needs a system's FFmpeg."""
+    """Return the frames nearest to some times; replaces torchcodec, which needs FFmpeg on the system."""
     with av.open(str(path)) as file:
         frames = [(frame.time, torch.from_numpy(frame.to_ndarray(format="rgb24"))) for frame in file.decode(video=0)]
     nearest = [min(frames, key=lambda frame: abs(frame[0] - time_s)) for time_s in times_s]

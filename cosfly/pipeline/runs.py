@@ -173,8 +173,8 @@ class RunSample:
 def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
     """Estimate each stage of a run; with several towns, each stage of each town, and then the release.
 
-    The maps are made, the pedestrians and drones planned, and a few frames drawn, in a temporary folder; stages that
-    are complete in `out` are not repeated.
+    A temporary folder gets the maps, the planned trajectories and a few drawn frames, which takes as long as planning
+    does. If the frames of `out` are complete, its own trajectories are counted instead.
     """
     if not cfg.towns:
         sample = take_sample(cfg, out)
