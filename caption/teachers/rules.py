@@ -21,7 +21,7 @@ from caption.verification.references import Fact, look_up, parse_reference
 from cosfly.formats.segments import MISSION_KINDS
 from cosfly.runtime.config import read_yaml
 
-MODEL = "rules-12"  # its name in the records; counts changes of decisions and wording
+MODEL = "rules-13"  # its name in the records; counts changes of decisions and wording
 Both = tuple[str, str]  # English, Chinese
 Condition = Callable[[Facts, int], bool]  # of the facts and the side of the decision: 1 left, -1 right, 0 neither
 
