@@ -7,21 +7,25 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from cosfly.formats.bystanders import BYSTANDERS_FILE
 from cosfly.formats.inspection import undecided
-from cosfly.formats.pedestrian_paths import walk_id
-from cosfly.formats.traces import read_traces
+from cosfly.formats.pedestrian_paths import read_paths, walk_id, write_paths
+from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.maps.stage import load_map
+from cosfly.pipeline.command_settings import worker_options
 from cosfly.pipeline.settings import RunConfig
+from cosfly.planners.stage import run as plan_trajectories
+from cosfly.render.stage import run as draw
 from cosfly.render.weather import dark_trajectories
 from cosfly.runtime.config import load
 from cosfly.runtime.console import duration
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import EnvironmentMissing, InputError, ResumeError
 from cosfly.runtime.run_dir import StageFolder, Tally, is_held, read_manifest
 
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")  # of a run, in order
@@ -141,8 +145,8 @@ RATES = {  # stage: unit, seconds per unit, MB per unit
     "caption": ("windows", 4.0 / 804, 7.4 / 804),
     "release": ("frames", 7.8 / 790.7, 1.95),
 }
-# Frames that are drawn to measure the disk space of a frame: so many of each track, and of all tracks together.
-SAMPLED_FRAMES, MOST_SAMPLED = 4, 200
+# What an estimate makes of each map: pedestrian trajectories, plans of the first ones, and frames of each plan.
+SAMPLED_PEDESTRIANS, SAMPLED_TRAJECTORIES, SAMPLED_FRAMES = 64, 8, 4
 MOST_LISTED = 4  # trajectories named in a remark
 
 
@@ -164,18 +168,23 @@ class StageEstimate:
 
 @dataclass(frozen=True)
 class RunSample:
-    """What a run will draw: the number of frames of each trajectory, and the size of a frame; None if not measured."""
+    """What a run will draw, from a sample of its trajectories.
+
+    frames: Of each accepted trajectory of the sample. scale: Trajectories of the run per trajectory of the sample,
+    weighted by length. frame_bytes: Size of a frame; None if not measured.
+    """
 
     frames: list[int]
     frame_bytes: float | None
+    scale: float = 1.0
+
+    def total(self, counts: Iterable[int]) -> int:
+        """Return the sum of a count over the run, given its values for the sample."""
+        return round(self.scale * sum(counts))
 
 
 def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
-    """Estimate each stage of a run; with several towns, each stage of each town, and then the release.
-
-    A temporary folder gets the maps, the planned trajectories and a few drawn frames, which takes as long as planning
-    does. If the frames of `out` are complete, its own trajectories are counted instead.
-    """
+    """Estimate each stage of a run; with several towns, each stage of each town, and then the release."""
     if not cfg.towns:
         sample = take_sample(cfg, out)
         return [*_estimates(cfg, out, sample, STAGES[:-1]), _release(cfg, out, [sample])]
@@ -189,43 +198,93 @@ def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
 
 
 def take_sample(cfg: RunConfig, out: Path) -> RunSample:
-    """Plan the trajectories of a run without towns, and draw some of their frames."""
+    """Plan the first trajectories of a run without towns in a temporary folder, and draw some of their frames.
+
+    Stages that are complete in `out` are copied. The first trajectories of a run do not depend on their number.
+
+    Raises:
+        EnvironmentMissing: If the map comes from a simulator that does not answer, and `out` has no map.
+        ResumeError: If `out` was made with other settings.
+    """
+    scale = 1.0
     if _is_complete(out / "render"):
-        return RunSample(_planned(out, cfg.render.frame_stride), None)
-    from cosfly.pipeline.run import run  # it imports this module
-
-    draws = cfg.render.backend in ("gl", "pyrender")  # not a simulator, which may not be there
+        return RunSample(_frames(cfg, read_traces(out / "plan/drone_trace.json")), None)
     with tempfile.TemporaryDirectory(prefix="cosfly-estimate-") as place:
-        scratch = Path(place) / "run"
-        run(cfg, scratch, until="plan")
-        frames = _planned(scratch, cfg.render.frame_stride)
-        if not draws or not frames:
-            return RunSample(frames, None)
-        num_sampled = max(1, min(SAMPLED_FRAMES, MOST_SAMPLED // (len(frames) * len(cfg.render.tracks))))
-        stride = math.ceil(max(frames) * cfg.render.frame_stride / num_sampled)
-        few = cfg.model_copy(update={"render": cfg.render.model_copy(update={"frame_stride": stride})})
-        run(few, scratch, until="render")
-        pictures = list((scratch / "render").rglob("frames_playback/*/*"))
-        num_drawn = len({picture.parent for picture in pictures})
-        return RunSample(frames, sum(picture.stat().st_size for picture in pictures) / num_drawn)
+        scratch = Path(place)
+        is_planned = _is_complete(out / "plan")
+        _prepare(cfg, out, scratch, 4 if is_planned else 3)
+        if not is_planned:
+            scale = _plan_sample(cfg, scratch)
+        traces = read_traces(scratch / "plan/drone_trace.json")
+        frame_bytes = None
+        if cfg.render.backend in ("gl", "pyrender"):  # not a simulator, which may not be there
+            frame_bytes = _draw_sample(cfg, scratch, [trace for trace in traces if trace.drop_reason is None])
+        return RunSample(_frames(cfg, traces), frame_bytes, scale)
 
 
-def _planned(run: Path, stride: int) -> list[int]:
-    """Return the number of frames of each planned trajectory."""
-    traces = read_traces(run / "plan/drone_trace.json")
-    return [math.ceil(len(trace.time_s) / stride) for trace in traces if trace.drop_reason is None]
+def _frames(cfg: RunConfig, traces: list[DroneTrace]) -> list[int]:
+    """Return the number of frames of each accepted trajectory."""
+    return [math.ceil(len(trace.time_s) / cfg.render.frame_stride) for trace in traces if trace.drop_reason is None]
+
+
+def _prepare(cfg: RunConfig, out: Path, scratch: Path, num_stages: int) -> None:
+    """Run the first stages in a folder with the first pedestrians, or copy what `out` has of them."""
+    from cosfly.pipeline.run import stages  # it imports this module
+
+    if not _is_complete(out / "pedestrians"):
+        num_paths = min(cfg.pedestrians.num_paths, SAMPLED_PEDESTRIANS)
+        cfg = cfg.model_copy(update={"pedestrians": cfg.pedestrians.model_copy(update={"num_paths": num_paths})})
+    for stage in stages(cfg, scratch)[:num_stages]:
+        own = out / stage.name
+        if _is_complete(own):
+            shutil.copytree(own, scratch / stage.name)
+        try:
+            stage.work()
+        except EnvironmentMissing as error:
+            error.fix = f"{error.fix}; or pass the --out of a run that has finished the stage {stage.name}"
+            raise
+        except ResumeError as error:
+            error.where = own
+            raise
+
+
+def _plan_sample(cfg: RunConfig, scratch: Path) -> float:
+    """Plan the first trajectories; return how many times as long those of the whole run are."""
+    pedestrians = read_paths(scratch / "pedestrians/path.json")
+    first = scratch / "sample/path.json"
+    first.parent.mkdir()
+    write_paths(first, pedestrians[:SAMPLED_TRAJECTORIES], {})
+    simplified = scratch / "simplify/step2_simplified.json"
+    plan_trajectories(cfg.plan, simplified, first, scratch / "plan", seed=cfg.seed, **worker_options(cfg))
+    lengths = [len(pedestrian.time_s) for pedestrian in pedestrians]
+    num_made = read_manifest(scratch / "pedestrians").counts.input
+    return cfg.pedestrians.num_paths / num_made * sum(lengths) / sum(lengths[:SAMPLED_TRAJECTORIES])
+
+
+def _draw_sample(cfg: RunConfig, scratch: Path, traces: list[DroneTrace]) -> float:
+    """Draw some frames of the first trajectories; return the mean size of a frame in bytes."""
+    first = scratch / "sample/drone_trace.json"
+    first.parent.mkdir(exist_ok=True)
+    write_traces(first, traces[:SAMPLED_TRAJECTORIES], {})
+    stride = math.ceil(max(len(trace.time_s) for trace in traces) / SAMPLED_FRAMES)
+    few = cfg.render.model_copy(update={"frame_stride": stride, "path_index": None})
+    maps = scratch / "maps/boxes_3d.json", scratch / "simplify/step2_simplified.json"
+    others = scratch / "pedestrians" / BYSTANDERS_FILE if cfg.pedestrians.has_others else None
+    tree = draw(few, *maps, first, scratch / "render", others=others, seed=cfg.seed, **worker_options(cfg))
+    pictures = list(tree.rglob("frames_playback/*/*"))
+    return sum(picture.stat().st_size for picture in pictures) / len({picture.parent for picture in pictures})
 
 
 def _estimates(cfg: RunConfig, out: Path, sample: RunSample, names: tuple[str, ...]) -> Iterator[StageEstimate]:
     window = cfg.caption.window
     # Number of frames of each trajectory at which a whole window can begin.
     num_starts = [max(0, count - window.num_frames + 1 - window.future_frames) for count in sample.frames]
-    num_windows = sum(math.ceil(count / window.stride) for count in num_starts)
+    num_windows = sample.total(math.ceil(count / window.stride) for count in num_starts)
     num_tracks = len(cfg.render.tracks)
     counts = {
         "map": 1,
         "pedestrians": cfg.pedestrians.num_paths,
-        "frames": sum(sample.frames) * num_tracks,
+        "frames": sample.total(sample.frames) * num_tracks,
         "windows": num_windows * num_tracks,
     }
     for name in names:
@@ -239,7 +298,7 @@ def _release(cfg: RunConfig, out: Path, samples: list[RunSample]) -> StageEstima
     """Estimate the release of all towns: the selected frames, whose pictures are as large as those of the trees."""
     most, num_tracks = cfg.release.num_frames, len(set(cfg.release.tracks) & set(cfg.render.tracks))
     is_all = cfg.release.selection == "all"
-    counts = [sum(n if is_all else min(n, most) for n in sample.frames) * num_tracks for sample in samples]
+    counts = [one.total(n if is_all else min(n, most) for n in one.frames) * num_tracks for one in samples]
     row = _estimate("release", sum(counts), cfg, out)
     sizes = [count * (sample.frame_bytes or 0.0) for count, sample in zip(counts, samples, strict=True)]
     is_known = not row.is_done and all(sample.frame_bytes is not None for sample in samples)
