@@ -223,6 +223,7 @@ FRAME = (  # everything of a frame but pictures and depth
         words=("clean", "perturbed"), required=True, constant=True,
     ),
     Column("style", "string", lambda f, i: f.styles[i], required=True, title="style", shown=True),
+    Column("planner", "string", lambda f, i: f.planner, constant=True, title="planner", shown=True),
     Column("pace", "string", lambda f, i: f.pace, required=True, constant=True, title="pace", shown=True),
     Column("walk", "string", constant=True),
     Column("split", "string", constant=True),

@@ -21,7 +21,7 @@ from cosfly.pipeline import runs
 from cosfly.pipeline.runs import estimate
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
-from cosfly.runtime.errors import ConfigError, ResumeError, VerifyError
+from cosfly.runtime.errors import ConfigError, EnvironmentMissing, ResumeError, VerifyError
 from cosfly.runtime.json_io import read_json, write_json
 from cosfly.runtime.run_dir import read_failures
 from release.verify.verify import verify
@@ -115,6 +115,28 @@ def test_a_finished_run_costs_nothing_more_and_a_half_finished_one_the_rest(smal
     assert [row.name for row in rows if not row.is_done] == ["inspect", "caption", "release"]
     exact = sum(flight["num_frames"] for flight in read_json(small_run / "render/manifest.json")["flights"])
     assert rows[-1].count == exact
+
+
+def test_a_dry_run_reuses_a_plan_and_plans_a_sample_only(small_run, tmp_path, monkeypatch):
+    frames = sum(flight["num_frames"] for flight in read_json(small_run / "render/manifest.json")["flights"])
+    monkeypatch.setattr(runs, "SAMPLED_TRAJECTORIES", 1)
+    sample = runs.take_sample(tiny(), tmp_path / "new")
+    assert len(sample.frames) == 1
+    assert sample.scale > 1
+    assert 2 * sample.total(sample.frames) == frames
+    monkeypatch.setattr(runs, "plan_trajectories", None)
+    planned = begin(small_run, tmp_path / "run", "render")
+    before = sorted(planned.rglob("*"))
+    sample = runs.take_sample(tiny(), planned)
+    assert (2 * sum(sample.frames), sample.scale, sample.frame_bytes is None) == (frames, 1.0, False)
+    with pytest.raises(ResumeError, match=r"run/pedestrians: .*num_paths was 2, is 3"):
+        estimate(tiny(**{"pedestrians.num_paths": 3}), planned)
+    assert sorted(planned.rglob("*")) == before
+
+
+def test_a_dry_run_without_a_map_names_the_simulator_and_the_way_out(tmp_path):
+    with pytest.raises(EnvironmentMissing, match=r"no UnrealCV server answers.*has finished the stage maps"):
+        estimate(tiny(**{"maps.source": "unrealcv", "maps.unrealcv.port": 9}), tmp_path)
 
 
 def test_two_walks_give_two_flights_on_two_tracks_with_captions(small_run):

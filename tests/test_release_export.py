@@ -63,6 +63,7 @@ def assert_same_flight(found: Path, given: Path) -> None:
             assert x == y, name
     assert np.array_equal(a.camera.intrinsic, b.camera.intrinsic)
     assert (a.camera.width_px, a.camera.height_px) == (b.camera.width_px, b.camera.height_px)
+    assert b.source["algorithm"] == a.source["algorithm"] != "unknown"
     assert b.source["released_frames"] == list(range(len(a)))
     for i in range(len(a)):
         for name in ("rgb.png", "depth.npy", "instance.png"):

@@ -205,6 +205,12 @@ class Track:
         return pace_of(self.source, str(self.folder))
 
     @property
+    def planner(self) -> str | None:
+        """Name of the planner; None if the file has none."""
+        name = self.source.get("algorithm")
+        return name if isinstance(name, str) and name else None
+
+    @property
     def weather(self) -> dict[str, str | None]:
         """Names of the presets of weather and time of day; None if the file has none."""
         record = self.weather_record

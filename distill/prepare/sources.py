@@ -34,11 +34,13 @@ class RunSource:
     def of_run(cls, folder: Path) -> RunSource:
         """Take a run folder as `cosfly run` makes it."""
         if not (folder / "render").is_dir():
-            expected, fix = (
-                "the folders render/ and caption/",
-                "pass --data and --captions if they are in other folders",
-            )
-            raise InputError("the folder is not a run directory", where=folder, expected=expected, fix=fix)
+            what, fix = "the folder is not a run directory", "pass --data and --captions if they are in other folders"
+            if any((folder / name).is_file() for name in ("release.json", "dataset/release.json")):
+                what, fix = (
+                    "a release is not a run directory",
+                    "pass the run or the playback tree that it was built from",
+                )
+            raise InputError(what, where=folder, expected="the folders render/ and caption/", fix=fix)
         captions = folder / "caption/captions.jsonl"
         check_stays_below(captions, captions.parent)
         return cls.of_files(folder / "render", captions)

@@ -139,7 +139,7 @@ def track_of_rows(rows: list[Row], placed: SourceTrack, number: int) -> Track:
             "path_index": number,
             "scenario_id": number,
             "scenario_name": f"{placed.place.run}/{placed.place.town}/{placed.place.trajectory}".lstrip("/"),
-            "algorithm": "unknown",
+            "algorithm": rows[0]["planner"] or "unknown",
             "released_frames": placed.frame_index.tolist(),
             **pace_field(rows[0]["pace"]),
         },
