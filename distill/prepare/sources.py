@@ -38,7 +38,7 @@ class RunSource:
             if any((folder / name).is_file() for name in ("release.json", "dataset/release.json")):
                 what, fix = (
                     "a release is not a run directory",
-                    "pass the run or the playback tree that it was built from",
+                    "pass the run that the release was built from",
                 )
             raise InputError(what, where=folder, expected="the folders render/ and caption/", fix=fix)
         captions = folder / "caption/captions.jsonl"
