@@ -132,7 +132,9 @@ class WindowConfig(Config):
 
 
 class ImageConfig(Config):
-    modalities: tuple[View, ...] = Field(("rgb", "depth", "segmentation"), min_length=1, description="views of a frame")
+    modalities: tuple[View, ...] = Field(
+        ("rgb", "depth", "segmentation"), description="views of a frame; none for a model without vision"
+    )
     layout: Layout = Field("separate", description="separate: one image per view; tiled: one per frame, side by side")
     max_side_px: int = Field(
         640, ge=28, description="longest side of a view, px; pixel values in prompts refer to this size"

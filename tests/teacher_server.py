@@ -17,7 +17,11 @@ from cosfly.formats.captions import TOKENS
 from cosfly.llm import client
 from cosfly.runtime.journal import Journal
 
-client.FIRST_PAUSE_S, client.LONGEST_PAUSE_S = 0.01, 0.02  # no test waits for a server that fails
+client.FIRST_PAUSE_S, client.LONGEST_PAUSE_S, client.LOADING_PAUSE_S = (
+    0.01,
+    0.02,
+    0.01,
+)  # no test waits for a server that fails
 MODEL = "test-teacher"
 ENGLISH = {
     "critical_components": "The target pedestrian is {visibility} and walks on the road ahead of the drone.",
@@ -76,6 +80,7 @@ class TeacherServer:
         self.text: Callable[[dict], str] | None = None  # answers with any text at all, for instance a judge's
         self.bodies: list[bytes] = []
         self.headers: list[dict[str, str]] = []
+        self.paths: list[str] = []
         self.most_at_once = 0
         self.active = 0
         self._lock = threading.Lock()
@@ -123,7 +128,7 @@ def is_mirror(body: dict) -> bool:
 
 def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None) -> dict:
     if is_mirror(body):
-        english = json.loads(body["messages"][-1]["content"])
+        english = json.loads(body["messages"][-1]["content"].rsplit("\n\n", 1)[-1])
         return {**CHINESE, "flight_decision": english["flight_decision"]}
     schema = body.get("response_format", {}).get("json_schema", {}).get("schema", {})
     allowed = schema.get("properties", {}).get("flight_decision", {}).get("enum", TOKENS)
@@ -157,6 +162,7 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
             if len(raw) < length:  # the client was killed while it sent: nobody asked anything
                 self.close_connection = True
                 return
+            server.paths.append(self.path)
             number = server.begin(raw, {name.lower(): value for name, value in self.headers.items()})
             try:
                 self._complete(number, json.loads(raw))

@@ -11,7 +11,8 @@ from tables import each
 from teacher_server import ENGLISH, TeacherServer, refusal
 
 from caption.schema import CaptionConfig
-from caption.stage.stage import make_forecast, run
+from caption.stage.stage import run
+from caption.stage.trial import make_forecast
 from caption.teachers.doctor import ODD_WORD, Finding, examine_endpoint
 
 TOKENS_PER_IMAGE, CONTEXT = 220, 8192
@@ -29,11 +30,12 @@ def prompt_tokens(body: dict, seen_images: int) -> int:
     return sum(len(text.split()) for text in texts) + TOKENS_PER_IMAGE * seen_images
 
 
-# A sound endpoint. shortens: the answer to fit the context, in silence. status: of a refusal for too many pictures.
+# A sound endpoint. cuts: prompts to so many tokens, in silence. shortens: the answer to fit the context, in silence. status: of a refusal for too many pictures.
 # in_parts: the answer is a list of parts. takes_null: where a field may be null.
 SOUND = {
     "obeys_schema": True, "refuses_schema": False, "max_images": 15, "sees_images": 99, "thinks": False, "counts": True,
     "context": CONTEXT, "shortens": False, "empty": False, "status": 400, "in_parts": False, "takes_null": True,
+    "cuts": 10**6, "has_system": True, "most_bytes": 10**9,
 }  # fmt: skip
 
 
@@ -45,7 +47,11 @@ def patient(**defects: Any) -> Callable[[dict], tuple[int, dict]]:
         num_images = images_of(body)
         if None in body.values() and not own.takes_null:
             return refusal(400, "Input should be a valid number")
-        tokens = prompt_tokens(body, min(num_images, own.sees_images))
+        if body["messages"][0]["role"] == "system" and not own.has_system:
+            return refusal(400, "System role not supported")
+        if len(json.dumps(body)) > own.most_bytes:
+            return refusal(413, "Request Entity Too Large")
+        tokens = min(prompt_tokens(body, min(num_images, own.sees_images)), own.cuts)
         if num_images > own.max_images:
             return refusal(own.status, f"At most {own.max_images} image(s) may be provided in one prompt.")
         if tokens + (0 if own.shortens else body["max_tokens"]) > own.context:
@@ -81,7 +87,7 @@ def examine(behaviour: Callable, context: int = CONTEXT, **changes) -> dict[str,
 def test_a_sound_endpoint_passes_every_check():
     findings = examine(patient())
     assert {finding.state for finding in findings.values()} == {"ok"}
-    assert list(findings) == ["model", "answers", "thinking", "JSON schema", "image input", "context length"]
+    assert list(findings) == ["model", "answers", "thinking", "JSON schema", "image input", "context length", "speed"]
     assert f"{15 * TOKENS_PER_IMAGE} tokens" in findings["image input"].detail
 
 
@@ -96,6 +102,9 @@ DEFECTS = [
     ({"thinks": True}, "thinking", "warning", "switch thinking off"),
     ({"context": 5000}, "context length", "unusable", "context length is 5000"),
     ({"context": 5000}, "context length", "unusable", "--max-model-len"),
+    ({"cuts": 4096}, "context length", "unusable", "drops the rest without an error"),
+    ({"has_system": False}, "system role", "warning", "sent with the question"),
+    ({"most_bytes": 300_000}, "image input", "unusable", "the request has 0.9 MB"),
     ({"context": 6000, "shortens": True}, "context length", "unusable", "more than 6000"),
     ({"empty": True}, "answers", "unusable", "an empty answer"),
     ({"empty": True, "thinks": True}, "answers", "unusable", "enable_thinking: false"),
@@ -112,6 +121,15 @@ def test_a_defect_is_found(defect, name, state, words):
     findings = examine(patient(**defect), defect.get("context", CONTEXT))
     assert findings[name].state == state
     assert words in findings[name].detail
+
+
+def test_an_examination_without_pictures_and_with_a_limit():
+    findings = examine(patient(max_images=0), image={"modalities": []})
+    assert {finding.state for finding in findings.values()} == {"ok"}
+    with TeacherServer(respond=patient()) as server:
+        findings = examine_endpoint(server.url, CaptionConfig(), VOCABULARY, 2)
+        assert len(server.bodies) == 2
+    assert findings[-1].name == "limit"
 
 
 def test_the_command_exits_with_1_when_unusable():

@@ -123,7 +123,7 @@ def test_what_is_a_windows_fault_costs_that_window_and_is_kept_in_the_servers_wo
     out = tmp_path / "out"
     with deciding(respond=lambda body: refusal(status, text) if body["seed"] == whole[1][0] else None) as server:
         path = run(settings(server.url), tree, out)
-        assert report_of(out)["windows"] == {"input": 10, "kept": 9, "dropped": {"refused": 1}, "failed": {}}
+        assert report_of(out)["windows"] == {"input": 10, "kept": 9, "dropped": {}, "failed": {"refused": 1}}
         assert report_of(out)["structured"] == {"json_schema": 9, "none": 1}  # nobody else lost the schema
         [dropped] = [caption for caption in read_captions(path) if caption.status == "dropped"]
         [held] = quarantine(out).values()

@@ -130,7 +130,7 @@ def test_the_check_tells_a_perfect_judge_and_one_that_always_says_the_same():
     right = {judge_messages(case, VOCABULARY)[1]["content"]: case.judgement for case in gold}
 
     def checked(answer):
-        together = threading.Barrier(6)  # of 36: no answer comes before six have asked
+        together = threading.Barrier(2)  # no answer comes before two have asked
 
         def wait(number, body):
             together.wait(60)

@@ -7,6 +7,7 @@ server is mended, and the same command is run again.
 
 import gzip
 import json
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -23,6 +24,7 @@ from caption.schema import CaptionConfig
 from caption.stage.stage import run
 from cosfly.llm.client import KEY_VARIABLE
 from cosfly.runtime.errors import NothingKept, TeacherError
+from specimens import make_playback_tree
 
 TRIES = 2
 
@@ -166,6 +168,114 @@ def test_what_becomes_of_a_run_at_a_server_like_this(tree, tmp_path, whole, name
             path = run(settings(server.url), tree, out)
             assert without_tokens(path.read_bytes()) == without_tokens(whole)
             assert len(server.bodies) >= asked + 2 if patience else len(server.bodies) == asked + 2
+
+
+def events(body: dict) -> Sent:
+    """Stream the answer, whatever the request says."""
+    text = answer(body)["choices"][0]["message"]["content"]
+    deltas = [
+        {"role": "assistant"},
+        {"reasoning_content": "Hm."},
+        *({"content": text[i : i + 9]} for i in range(0, len(text), 9)),
+    ]
+    chunks = [{"choices": [{"index": 0, "delta": delta, "finish_reason": None}]} for delta in deltas]
+    chunks += [{"choices": [{"index": 0, "delta": {}, "finish_reason": "stop"}]}, {"choices": [], "usage": USAGE}]
+    lines = [": processing", *(f"data: {json.dumps(chunk)}" for chunk in chunks), "data: [DONE]"]
+    return Sent(200, "\n\n".join(lines).encode())
+
+
+USAGE = {"prompt_tokens": 1000, "completion_tokens": 100}
+DECLINED_WORDS = "I'm sorry, I can't help with following a person."
+
+
+def once(first: Callable[[dict], Sent]) -> Callable[[dict], Sent | None]:
+    """Send something else for the first request."""
+    seen: list[dict] = []
+
+    def respond(body: dict) -> Sent | None:
+        seen.append(body)
+        return first(body) if len(seen) == 1 else None
+
+    return respond
+
+
+def refuses_system(body: dict) -> Sent | None:
+    has_system = body["messages"][0]["role"] == "system"
+    return error(400, "System role not supported")({}) if has_system else None
+
+
+def takes_one_sampling_parameter(body: dict) -> Sent | None:
+    words = "`temperature` and `top_p` cannot both be specified for this model. Please use only one."
+    return error(400, words)({}) if {"temperature", "top_p"} <= body.keys() else None
+
+
+# A server that has to be understood: what it sends, settings, what becomes of the window, words of the report.
+UNDERSTOOD: dict[str, tuple] = {
+    "streams in spite of stream: false": (events, {}, "accepted", ""),
+    "loads its model": (once(error(503, "Loading model")), {}, "accepted", ""),
+    "a gateway: 200 with a code": (once(page(200, '{"code": 429, "msg": "concurrency limit exceeded"}')),
+        {"max_tries": 2}, "accepted", ""),
+    "no system role": (refuses_system, {}, "accepted", ""),
+    "temperature or top_p": (takes_one_sampling_parameter, {"extra_body": {"top_p": None}}, "accepted", ""),
+    "declines": (message(content=None, refusal=DECLINED_WORDS), {}, "declined", DECLINED_WORDS),
+}  # fmt: skip
+
+
+@each("name", UNDERSTOOD)
+def test_a_server_is_understood(tree, tmp_path, name):
+    respond, endpoint, outcome, words = UNDERSTOOD[name]
+    out = tmp_path / "out"
+    with deciding(respond=respond) as server:
+        cfg = settings(server.url, endpoint={"max_tries": 1, **endpoint})
+        if outcome == "accepted":
+            run(cfg, tree, out)
+        else:
+            with pytest.raises(NothingKept):
+                run(cfg, tree, out)
+    assert all(json.loads(body)["stream"] is False for body in server.bodies)
+    report = json.loads((out / "caption_report.json").read_text(encoding="utf-8"))
+    assert report["windows"]["kept"] == (outcome == "accepted")
+    assert report["windows"]["dropped"] == ({} if outcome == "accepted" else {outcome: 1})
+    assert words in str(report["refusals"])
+
+
+def test_a_full_address_is_used_as_given(tree, tmp_path):
+    with deciding(list_models=lambda: Sent(404, b"")) as server:
+        url = server.url.removesuffix("/v1") + "/api/chat/completions"
+        run(settings(url, endpoint={"model": MODEL}), tree, tmp_path / "out")
+        assert set(server.paths) == {"/api/chat/completions"}
+
+
+def test_thoughts_that_use_up_all_tokens_are_an_answer_that_was_cut(tree, tmp_path):
+    def respond(body: dict) -> Sent:
+        choice = {"message": {"role": "assistant"}, "finish_reason": "length"}
+        return Sent(200, json.dumps({"choices": [choice], "usage": USAGE | {"completion_tokens": 0}}).encode())
+
+    with deciding(respond=respond) as server, pytest.raises(NothingKept):
+        run(settings(server.url), tree, tmp_path / "out")
+    assert len(server.bodies) == 3
+    report = json.loads((tmp_path / "out" / "caption_report.json").read_text(encoding="utf-8"))
+    assert report["structure"] == {"cut_short": 1}
+
+
+def test_a_server_with_one_slot_answers_every_window(tree, tmp_path):
+    slot = threading.Lock()
+
+    def respond(body: dict) -> None:
+        with slot:
+            time.sleep(0.2)
+
+    with deciding(respond=respond) as server:
+        endpoint = {"timeout_s": 1.2, "concurrency": 16, "max_tries": 6}
+        run(settings(server.url, endpoint=endpoint, limit=10), tree, tmp_path / "out")
+    assert server.most_at_once <= 6  # not 16, of which most would time out in the queue
+
+
+def test_prompts_that_a_server_cuts_in_silence_are_reported(tmp_path, caplog):
+    tree = make_playback_tree(tmp_path / "tree", 1, 24, with_augmented=False)
+    with deciding() as server:  # counts 1,000 tokens for every prompt
+        run(settings(server.url, limit=15), tree, tmp_path / "out")
+    assert "all count 1000 tokens" in caplog.text
 
 
 def without_tokens(product: bytes) -> list[dict]:

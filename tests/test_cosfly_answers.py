@@ -105,7 +105,7 @@ BODIES: list[tuple[str, bytes, str | tuple[str]]] = [
     ("routers: a choice that is null", b'{"choices": [null]}', ("no choices",)),
     ("routers: no message", completion(None), ("no text",)),
     ("proxies: a page", b"<html><body>502 Bad Gateway</body></html>", ("not JSON",)),
-    ("proxies: events though none were asked for", b'data: {"choices": []}\n\ndata: [DONE]\n', ("not JSON",)),
+    ("proxies: events though none were asked for", b'data: {"choices": []}\n\n', ("not JSON",)),
     ("proxies: a list", b"[1]", ("no choices",)),
     ("proxies: nothing", b"", ("not JSON",)),
     ("vLLM: NaN among the logprobs", completion({"content": TEXT}, logprobs=[float("nan")]), ("not JSON",)),

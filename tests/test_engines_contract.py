@@ -331,7 +331,7 @@ def test_a_prompt_that_the_engine_refuses_costs_only_its_window(stand_in, tree, 
     run(cfg, tree, tmp_path / "second")
     assert len(stand_in.asked) == 18  # the others once each
     windows = json.loads((tmp_path / "second" / "caption_report.json").read_text())["windows"]
-    assert windows == {"input": 5, "kept": 4, "dropped": {"refused": 1}, "failed": {}}
+    assert windows == {"input": 5, "kept": 4, "dropped": {}, "failed": {"refused": 1}}
 
 
 @pytest.mark.timeout(60)

@@ -145,6 +145,9 @@ class Asking:
             tally.failed[error.code] += 1
             log.error("caption: %s: %s", track.name, error)
             return
+        except BaseException:
+            self._write_gap(track, windows)
+            raise
         if windows or is_cut:
             tally.kept += 1
         else:
@@ -153,7 +156,11 @@ class Asking:
 
     async def _write_track(self, track: TrackInput, windows: list[asyncio.Task[Caption | None]], is_cut: bool) -> None:
         """Write the part of a track after its last window. One with a gap stays unfinished, for the next run."""
-        answers = await asyncio.gather(*windows)
+        try:
+            answers = await asyncio.gather(*windows)
+        except BaseException:
+            self._write_gap(track, windows)
+            raise
         captions = [caption for caption in answers if caption is not None]
         has_gap = is_cut or len(captions) < len(windows)
         part, gap = track.part(self.stage.path), track.gap(self.stage.path)
@@ -163,6 +170,13 @@ class Asking:
             gap.unlink(missing_ok=True)
         for book in self.books:
             book.forget(track.name)
+
+    def _write_gap(self, track: TrackInput, windows: list[asyncio.Task[Caption | None]]) -> None:
+        """Write the captions of a track in whose middle the run stops, for the report."""
+        done = [window for window in windows if window.done() and not window.cancelled() and not window.exception()]
+        captions = [caption for caption in (window.result() for window in done) if caption is not None]
+        if captions:
+            write_captions(track.gap(self.stage.path), captions)
 
     async def _ask_window(self, window: Window, teacher: Teacher) -> Caption | None:
         """Return the caption of a window; None without an answer."""
@@ -209,7 +223,7 @@ class Asking:
         self.num_failed_in_row += 1
         if self.num_failed_in_row >= STOP_AFTER_FAILURES:
             raise TeacherError(
-                f"{self.num_failed_in_row} windows in a row got no answer",
+                f"{self.num_failed_in_row} windows in a row got no answer or were refused",
                 where=self.cfg.teacher,
                 got=got,
                 fix="fix the server, then run the same command again; answered windows are not asked again",
@@ -266,7 +280,7 @@ class RunProgress:
 
     def add(self, caption: Caption | None) -> None:
         """Count a caption, None for a window without an answer."""
-        if caption is None:
+        if caption is None or caption.drop_reason == "refused":
             self.num_unanswered += 1
         elif caption.status == "accepted":
             self.num_accepted += 1

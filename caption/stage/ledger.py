@@ -21,6 +21,7 @@ REASONS = {
     "teacher is not asked",
     "unusable_frame": "a picture of the window is missing or cannot be read; see `checks.frame`",
     "refused": "the server or engine refused the request; see `checks.refusal`",
+    "declined": "the model declined to answer; see `checks.refusal`",
     "not_in_file": "the file of captions or predictions has none for this window",
     "structure": "no answer had the requested fields; see `checks.structure`",
     "context_full": "prompt and answer fill the server's context: raise it, or send smaller pictures",
@@ -123,7 +124,7 @@ class CaptionReport(BaseModel):
     def warnings(self) -> list[str]:
         """Return what a reader must know before using the captions."""
         return [
-            f"windows were dropped because of {code} ({message}); --retry-failed asks about them again"
+            f"windows got no caption because of {code} ({message}); --retry-failed asks about them again"
             for code, message in self.refusals.items()
         ]
 
@@ -160,7 +161,9 @@ class CaptionReport(BaseModel):
             self.verdicts_of_accepted[str(caption.verdict)] += 1
             self.writing[caption.writing] += 1
         else:
-            self.windows.dropped[str(caption.drop_reason)] += 1
+            # A refused request is a failure of the server, not a fault of the caption.
+            tally = self.windows.failed if caption.drop_reason == "refused" else self.windows.dropped
+            tally[str(caption.drop_reason)] += 1
             if caption.checks.refusal is not None:
                 code, _, message = caption.checks.refusal.partition(": ")
                 self.refusals[code] = message

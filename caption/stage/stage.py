@@ -18,19 +18,17 @@ from caption.stage.asking import ANSWERS, Asking, AskingOutcome, common_causes, 
 from caption.stage.ledger import CaptionReport, SampleCards, explain_drops
 from caption.stage.report import page_html
 from caption.stage.tracks import PARTS, TrackInput, find_inputs, parts_of, restore_parts
-from caption.stage.window_loop import caption_prepared, caption_window, prepare
+from caption.stage.window_loop import caption_prepared, prepare
 from caption.teachers.foreign import read_given
 from caption.teachers.prompt_files import PROMPTS, Vocabulary, keep_own_prompts, vocabulary_of
 from caption.teachers.students import student_settings
-from caption.teachers.teacher import EMBEDDED, embedded_teacher, first_budget, open_teacher
+from caption.teachers.teacher import EMBEDDED, embedded_teacher
 from caption.verification.glossary import GLOSSARY_FILE
-from cosfly.formats.captions import Caption, Usage, caption_lines, line_of, write_caption_lines
+from cosfly.formats.captions import caption_lines, line_of, write_caption_lines
 from cosfly.formats.places import flight_of
-from cosfly.llm.answers import AnswerBook
 from cosfly.llm.contract import run_until_interrupted
 from cosfly.llm.student_chat import student_files
-from cosfly.runtime.console import duration
-from cosfly.runtime.errors import ConfigError, InputError, ResumeError, TeacherError
+from cosfly.runtime.errors import ConfigError, ResumeError, TeacherError
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.json_io import write_json
 from cosfly.runtime.pool import Watch, run_items
@@ -42,7 +40,6 @@ log = logging.getLogger(__name__)
 
 PRODUCT, REPORT, PAGE = "captions.jsonl", "caption_report.json", "report.html"
 PACKAGE_FILES = {"glossary": GLOSSARY_FILE}  # a directory never mixes captions of two glossaries or two prompts
-TRIAL_WINDOWS = 6  # of a plan
 WINDOWS_AT_ONCE = 128  # prepared together for an embedded teacher
 
 
@@ -94,19 +91,38 @@ def run(
                 if track.name in names:
                     track.part(stage.path).unlink(missing_ok=True)
         asking = Asking(stage, cfg, vocabulary, seed, retry_failed=retry_failed)
-        outcome = run_until_interrupted(asking.run(tracks))
-    report, cards = _merge(stage, parts_of(stage.path, tracks, bool(outcome.unanswered)), unused)
-    report.finish(outcome.tracks, len(outcome.unanswered), outcome.judge_usage)
+        outcome = asking.outcome
+        try:
+            run_until_interrupted(asking.run(tracks))
+        except (TeacherError, KeyboardInterrupt, SystemExit):
+            if outcome.tracks.input:  # the report shows what was reached
+                _write_report(stage, cfg, tracks, outcome, unused, has_gaps=True)
+            raise
+    report = _write_report(stage, cfg, tracks, outcome, unused, bool(outcome.unanswered))
     if unused and not is_cut:
         log.warning("caption: %d captions of %s match no window of this tree", len(unused), cfg.caption_file)
-    write_json(stage.path / REPORT, report.as_json())
     for warning in report.warnings():
         log.warning("caption: %s", warning)
+    _finish(stage, cfg, vocabulary, outcome, report.windows, is_cut)
+    return out / PRODUCT
+
+
+def _write_report(
+    stage: StageFolder,
+    cfg: CaptionConfig,
+    tracks: list[TrackInput],
+    outcome: AskingOutcome,
+    unused: set[str],
+    has_gaps: bool,
+) -> CaptionReport:
+    """Write the captions so far, the report and its page. has_gaps: Tracks may be unfinished."""
+    report, cards = _merge(stage, parts_of(stage.path, tracks, has_gaps), unused)
+    report.finish(outcome.tracks, len(outcome.unanswered), outcome.judge_usage)
+    write_json(stage.path / REPORT, report.as_json())
     folders = {track.name: track.folder for track in tracks}
     html = page_html(report, cards.chosen(), folders, cfg.budget, run_name(stage.path))
     write_bytes(stage.path / PAGE, html.encode())
-    _finish(stage, cfg, vocabulary, outcome, report.windows, is_cut)
-    return out / PRODUCT
+    return report
 
 
 def _finish(
@@ -190,63 +206,6 @@ def _merge(stage: StageFolder, parts: list[Path], unused: set[str]) -> tuple[Cap
 
     write_caption_lines(stage.path / PRODUCT, lines())
     return report, cards
-
-
-# --- a plan -----------------------------------------------------------------------------------------------------------
-
-
-def make_forecast(
-    cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, resume: Resume = "if-same"
-) -> list[tuple[str, str]]:
-    """Return the rows of a table: calls, tokens, time and money of a run, scaled from the means of a few windows.
-
-    The trial windows are real ones, spread over the tracks. Their answers stay in the journal, so the run does not ask
-    for them again.
-    """
-    if cfg.teacher_kind != "endpoint":
-        what = "an estimate needs a server as the teacher"
-        raise ConfigError(what, where="--plan", got=cfg.teacher, expected="--teacher URL")
-    vocabulary = vocabulary_of(cfg)
-    cfg = student_settings(cfg, vocabulary)
-    stage = open_stage(cfg, data, out, seed, resume)
-    tracks, _ = find_inputs(cfg, data)
-    guesses = {track: track.guess_num_windows(cfg.window) for track in tracks}
-    left = [track for track in tracks if guesses[track] and not stage.is_complete and not track.part(out).exists()]
-    num_windows = sum(guesses[track] for track in left)
-    if not num_windows:
-        raise InputError("no window is left to caption", where=data, got=f"{len(left)} unfinished tracks")
-    chosen = [left[number * len(left) // TRIAL_WINDOWS] for number in range(TRIAL_WINDOWS)]
-    windows = [w for track in dict.fromkeys(chosen) for w in islice(track.windows(cfg), chosen.count(track))]
-
-    async def ask() -> tuple[list[Caption | BaseException], float]:
-        with AnswerBook(out / ANSWERS) as book:
-            async with open_teacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
-                asked = [caption_window(window, teacher, cfg, vocabulary) for window in windows]
-                found = await asyncio.gather(*asked, return_exceptions=True)
-            ids = [one.sample_id for one in found if isinstance(one, Caption)]
-            return found, sum(book.latency_s(flight_of(sample_id), sample_id) for sample_id in ids)
-
-    found, seconds = run_until_interrupted(ask())
-    captions = [one for one in found if isinstance(one, Caption)]
-    if not captions:
-        what, got = "none of the trial windows got an answer", str(found[0]) if found else None
-        raise TeacherError(what, where=cfg.teacher, got=got)
-    scale = num_windows / len(captions)
-    usage = sum((caption.usage for caption in captions), Usage())
-    prompt, completion = scale * usage.prompt_tokens, scale * usage.completion_tokens
-    is_priced = cfg.budget.price_prompt or cfg.budget.price_completion
-    cost = f"{cfg.budget.cost(prompt, completion):,.2f}" if is_priced else "no prices set (budget.price_prompt)"
-    num_accepted = sum(caption.status == "accepted" for caption in captions)
-    num_done = sum(guesses.values()) - num_windows
-    return [
-        ("windows", f"about {num_windows:,} left" + (f", {num_done:,} done" if num_done else "")),
-        ("trial", f"{len(captions)} windows, {num_accepted} accepted; their answers are kept"),
-        ("requests", f"{scale * sum(caption.attempts for caption in captions):,.0f}"),
-        ("tokens in", f"{prompt:,.0f}"),
-        ("tokens out", f"{completion:,.0f}"),
-        ("cost", cost),
-        ("time", f"{duration(scale * seconds / cfg.most_in_flight)} with {cfg.most_in_flight} requests in flight"),
-    ]
 
 
 # --- embedded teachers ------------------------------------------------------------------------------------------------

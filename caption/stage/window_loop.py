@@ -35,13 +35,14 @@ from cosfly.llm.answer_text import Parsed, parse_answer
 from cosfly.llm.contract import NoAnswer, Reply
 from cosfly.runtime.errors import InputError, RenderError
 from cosfly.runtime.json_io import dump_json
-from cosfly.runtime.model_json import CONTEXT_FULL
+from cosfly.runtime.model_json import CONTEXT_FULL, DECLINED
 
 # Most requests for one text, of a teacher that does not give the same answer again.
 STRUCTURE_ASKS = 3  # until an answer has the right structure
 CORRECTION_ASKS = 1  # that name what was wrong with an answer of the right structure
 MIRROR_ASKS = 2  # for the Chinese mirror, until the pair is consistent
 MAX_COMPLAINTS = 8  # named at once
+MOST_REFUSAL_TEXT = 300  # characters of a refusal in the record
 CONTRADICTED = "contradicted_value"
 
 
@@ -232,14 +233,14 @@ class _WindowLoop:
             answer = await self._answer(asked)
             if isinstance(answer, Draft):
                 self._accept(answer, asked)
-                self.checks.structure = "ok"
+                self.checks.structure, self.checks.refusal = "ok", None
                 return None
             refused = answer
             if refused.complaint or refused.reason == CONTEXT_FULL:
                 self.checks.structure = "ok" if refused.complaint else refused.reason
                 return refused.reason  # the corrections did not help, or there is no room for an answer
         self.checks.structure = refused.reason
-        return "structure"
+        return DECLINED if refused.reason == DECLINED else "structure"
 
     async def _answer(self, question: Question) -> Draft | Refused:
         """Ask, and ask for a correction while the content is refused. A wrong structure has no complaint."""
@@ -274,6 +275,8 @@ class _WindowLoop:
         self._structured = reply.structured
         fields = self.terms.fields if language == "en" else ()
         parsed = parse_answer(reply.text, language, fields, reply.finish_reason)
+        if parsed.reason == DECLINED:
+            self.checks.refusal = f"{DECLINED}: {' '.join(reply.text.split())[:MOST_REFUSAL_TEXT]}"
         if parsed.reason == CONTEXT_FULL:
             asked, answered = usage.prompt_tokens, usage.completion_tokens
             self.checks.refusal = (

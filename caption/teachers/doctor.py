@@ -6,8 +6,9 @@ answer or in the count of tokens.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
+import math
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -21,12 +22,14 @@ from caption.teachers.prompt_files import Vocabulary
 from caption.teachers.prompts import MAX_RETURNED_CHARACTERS, Correction, make_question, question_messages
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.client import ChatClient
-from cosfly.llm.contract import Reply
+from cosfly.llm.contract import Reply, run_until_interrupted
 from cosfly.llm.protocol import BadReply, read_body, thoughts_of
 from cosfly.llm.refusals import MEANINGS, RefusedRequest
 from cosfly.llm.student_chat import EncodedImage, encoded_image
+from cosfly.runtime.console import Advance, progress_bar
 from cosfly.runtime.errors import TeacherError
 from cosfly.runtime.json_io import parse_json
+from cosfly.runtime.model_json import DECLINED
 from cosfly.viz.frame_views import VIEW_FILES, Pictures
 
 State = Literal["ok", "warning", "unusable"]
@@ -39,6 +42,11 @@ ODD_SCHEMA = {
     "required": ["animal", "legs"],
     "additionalProperties": False,
 }
+NUM_REQUESTS = 6  # of an examination without a failure
+MAX_SHOWN = 200  # characters of an answer
+MIN_TOKENS = 64  # the smallest `max_tokens`
+BLOCK_PX = 8  # the JPEG of a random picture with such blocks takes 44 kB at 640 x 360 px, a rendered frame 49 to 57 kB
+PADDING = "Nothing has to change. " * 100  # makes a prompt longer by several hundred tokens
 READY = "Reply with the one word: ready"
 NO_THINKING = "endpoint.extra_body={chat_template_kwargs: {enable_thinking: false}}"
 
@@ -52,9 +60,20 @@ class Finding:
     detail: str
 
 
-def examine_endpoint(url: str, cfg: CaptionConfig, vocabulary: Vocabulary) -> list[Finding]:
-    """Try an endpoint; it is usable if no finding is `unusable`. TeacherError: the URL cannot be asked."""
-    return asyncio.run(_Examination(ChatClient(url, cfg.endpoint), cfg, vocabulary).run())
+def examine_endpoint(
+    url: str, cfg: CaptionConfig, vocabulary: Vocabulary, most_requests: int | None = None
+) -> list[Finding]:
+    """Try an endpoint, which is usable if no finding is `unusable`, and show the progress.
+
+    Args:
+        most_requests: Stop after this number of requests.
+
+    Raises:
+        TeacherError: The URL cannot be asked.
+    """
+    with progress_bar("doctor", NUM_REQUESTS) as advance:
+        examination = _Examination(ChatClient(url, cfg.endpoint), cfg, vocabulary, advance, most_requests)
+        return run_until_interrupted(examination.run(), keeps_work=False)
 
 
 @dataclass(frozen=True)
@@ -79,9 +98,21 @@ class _Probe:
         return None if self.reply is None or self.reply.usage is None else self.reply.usage.prompt_tokens
 
 
+class _LimitReached(Exception):
+    """The examination has sent as many requests as it may."""
+
+
 class _Examination:
-    def __init__(self, client: ChatClient, cfg: CaptionConfig, vocabulary: Vocabulary) -> None:
-        self.client, self.cfg = client, cfg
+    def __init__(
+        self,
+        client: ChatClient,
+        cfg: CaptionConfig,
+        vocabulary: Vocabulary,
+        advance: Advance,
+        most_requests: int | None,
+    ) -> None:
+        self.client, self.cfg, self.advance = client, cfg, advance
+        self.num_requests, self.most_requests = 0, most_requests
         self.largest = largest_messages(cfg, vocabulary)
         self.takes_schema = cfg.endpoint.json_schema
         self.findings: list[Finding] = []
@@ -92,10 +123,12 @@ class _Examination:
             self._add("model", "ok", self.client.model)
             if await self._answers():
                 await self._try_schema()
-                if await self._takes_images():
-                    await self._try_context()
+                if not self.cfg.num_images or await self._takes_images():
+                    await self._try_largest()
         except TeacherError as error:
             self._add("model", "unusable", str(error))
+        except _LimitReached:
+            self._add("limit", "warning", f"stopped after {self.num_requests} requests; further checks are not made")
         finally:
             await self.client.close()
         return self.findings
@@ -106,12 +139,19 @@ class _Examination:
     async def _ask(self, messages: list[dict], max_tokens: int, schema: dict | None = None) -> _Probe:
         endpoint = self.cfg.endpoint.model_copy(update={"max_tokens": max_tokens})
         request = endpoint.request(messages, [], schema or {}, seed=0)  # sampled as a run samples
+        if self.num_requests == self.most_requests:
+            raise _LimitReached
+        self.num_requests += 1
+        self.advance(1, f"{self.num_requests} requests sent")
         try:
             response, reply = await self.client.ask_once(request, schema)
         except (TimeoutError, httpx.RequestError) as error:
             return _Probe(None, self.client.message_of(error))
         except RefusedRequest as error:
             refusal = error.refusal
+            if self.client.leaves_out_system(refusal, request):
+                self._add("system role", "warning", f"refused ({refusal.summary}); {refusal.meaning.fix}")
+                return await self._ask(messages, max_tokens, schema)
             fix = "" if refusal.kind == "unknown" else f"; {refusal.meaning.fix}"
             return _Probe(None, refusal.summary + fix, refusal.kind == "schema")
         except BadReply as error:
@@ -121,8 +161,16 @@ class _Examination:
     async def _answers(self) -> bool:
         probe = await self._ask([_user(READY)], self.cfg.endpoint.max_tokens)
         if not probe.text:
-            empty = f"{probe.thoughts} characters of thinking and no answer; switch thinking off with {NO_THINKING}"
-            self._add("answers", "unusable", probe.detail or (empty if probe.thoughts else "an empty answer"))
+            is_cut = probe.reply is not None and probe.reply.finish_reason == "length"
+            thoughts = f"{probe.thoughts} characters of thinking and no answer"
+            if not probe.thoughts:
+                thoughts = "cut short at endpoint.max_tokens before the text begins, probably by thinking"
+            thoughts = f"{thoughts}; switch thinking off with {NO_THINKING}, or raise endpoint.max_tokens"
+            empty = thoughts if probe.thoughts or is_cut else "an empty answer"
+            self._add("answers", "unusable", probe.detail or empty)
+            return False
+        if probe.reply is not None and probe.reply.finish_reason == DECLINED:
+            self._add("answers", "unusable", f"the model declines to answer: {probe.text[:MAX_SHOWN]!r}")
             return False
         self._add("answers", "ok", f"{probe.text[:40]!r}")
         is_off = not probe.thoughts and "<think" not in probe.text
@@ -160,23 +208,54 @@ class _Examination:
             detail = "but it is unknown whether the model sees them, because token usage is not reported"
             self._add("image input", "warning", f"{count} are accepted, {detail}")
         elif tokens < len(pictures):
-            self._add("image input", "unusable", f"{count} are accepted but ignored: they add {tokens} tokens")
+            ignored = f"{count} are accepted but ignored: they add {tokens} tokens; {MEANINGS['no_vision'].fix}"
+            self._add("image input", "unusable", ignored)
         else:
             self._add("image input", "ok", f"{count}, {tokens} tokens")
         return self.findings[-1].state != "unusable"
 
-    async def _try_context(self) -> None:
-        """Send a prompt as long as ours get, with our answer limit and schema."""
+    async def _try_largest(self) -> None:
+        """Send a prompt as long as ours get, with our answer limit and schema; report context and time."""
         limit, context = self.cfg.endpoint.max_tokens, self.client.context
+        start_s = time.monotonic()
         probe = await self._ask(self.largest, limit, answer_schema(more=THEREFORE) if self.takes_schema else None)
+        seconds = time.monotonic() - start_s
         used, known = probe.prompt_tokens, f" of the context of {context}" if context else ""
         detail = f"{used or 'unknown'} tokens of the largest prompt and {limit} for the answer"
         if probe.reply is None:
             self._add("context length", "unusable", f"the largest prompt is refused: {probe.detail}")
         elif context and used is not None and used + limit > context:
             self._add("context length", "unusable", f"{detail}, more than {context}: {MEANINGS['too_long'].fix}")
+        elif await self._cuts_prompts(used):
+            cut = f"{used} tokens are counted for the largest prompt and for a longer one: the server drops the rest"
+            self._add("context length", "unusable", f"{cut} without an error; {MEANINGS['too_long'].fix}")
         else:
             self._add("context length", "ok", f"{detail}{known}")
+        if probe.reply is not None:
+            self._add_speed(seconds)
+
+    async def _cuts_prompts(self, used: int | None) -> bool:
+        """Return whether a longer prompt counts no more tokens than the largest one."""
+        system, question, *correction = self.largest
+        padded = question | {"content": [*question["content"], {"type": "text", "text": PADDING}]}
+        longer = [system, padded, *correction]
+        probe = await self._ask(longer, MIN_TOKENS)
+        return used is not None and probe.prompt_tokens is not None and probe.prompt_tokens <= used
+
+    def _add_speed(self, seconds: float) -> None:
+        """Report the time of one answer, and what it means if the server answers one request at a time."""
+        endpoint = self.cfg.endpoint
+        queued_s = endpoint.concurrency * seconds
+        detail = f"{seconds:.1f} s for one answer to the largest prompt"
+        if queued_s <= endpoint.timeout_s:
+            self._add("speed", "ok", detail)
+            return
+        meaning = (
+            f"a server with one slot needs {queued_s:.0f} s for endpoint.concurrency={endpoint.concurrency} requests"
+        )
+        limit = f"more than endpoint.timeout_s={endpoint.timeout_s:g}"
+        effect = "a run begins with two requests and sends more only while answers are quick"
+        self._add("speed", "ok", f"{detail}; {meaning}, {limit}, so {effect}")
 
 
 def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary) -> list[dict]:
@@ -199,14 +278,14 @@ def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary) -> list[dict]:
     )
 
     def draw(folder: Path, pictures: Pictures) -> list[EncodedImage]:
-        """Draw the pictures of a frame, each in another grey, so that a server takes none for another."""
+        """Draw the pictures of a frame: random blocks, so that their files are as large as those of detailed frames."""
         num_views, (width_px, height_px) = len(pictures.views), pictures.size_px
-        shape = (height_px, width_px * (num_views if pictures.layout == "tiled" else 1), 3)
-        greys = [
-            (num_views * int(folder.name) + view) % 256
-            for view in range(1 if pictures.layout == "tiled" else num_views)
-        ]
-        return [encoded_image(np.full(shape, grey, np.uint8)) for grey in greys]
+        is_tiled = pictures.layout == "tiled"
+        num_columns = math.ceil(width_px * (num_views if is_tiled else 1) / BLOCK_PX)
+        shape = (1 if is_tiled else num_views, math.ceil(height_px / BLOCK_PX), num_columns, 3)
+        blocks = np.random.default_rng(int(folder.name)).integers(0, 256, shape, dtype=np.uint8)
+        large = blocks.repeat(BLOCK_PX, axis=1).repeat(BLOCK_PX, axis=2)
+        return [encoded_image(picture[:height_px, : width_px * (num_views if is_tiled else 1)]) for picture in large]
 
     return question_messages(question, draw)[0]
 

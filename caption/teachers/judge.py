@@ -21,6 +21,7 @@ from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook, Budget, KeptAnswers
 from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.contract import NoAnswer, Request, Troubles, started
+from cosfly.runtime.console import progress_bar
 from cosfly.runtime.io import read_unpacked
 from cosfly.runtime.json_io import Record, dump_json, parse_document, validated
 from cosfly.runtime.model_json import find_object
@@ -192,13 +193,20 @@ async def check_judge(cfg: JudgeConfig, vocabulary: Vocabulary, gold: list[GoldC
     orders = [(*JUDGEMENTS[i:], *JUDGEMENTS[:i]) for i in range(len(JUDGEMENTS))]
     confusion: Counter[tuple[str, str]] = Counter()
     num_moved = num_first = 0
-    async with open_judge(cfg, vocabulary, seed) as judge:
-        assert judge is not None  # the settings name one
-        records = iter(await asyncio.gather(*(judge.judge(conflict, order) for conflict in gold for order in orders)))
-        for conflict in gold:
-            verdicts = [next(records).verdict for _ in orders]
-            confusion.update((conflict.judgement, verdict) for verdict in verdicts)
-            num_moved += len(set(verdicts)) > 1
-            num_first += sum(verdict == order[0] for verdict, order in zip(verdicts, orders, strict=True))
-        model = f"{judge.kept.engine.model} at {judge.kept.engine.where}"
+    with progress_bar("judge-check", len(gold) * len(orders)) as advance:
+        async with open_judge(cfg, vocabulary, seed) as judge:
+            assert judge is not None  # the settings name one
+
+            async def ask(conflict: GoldConflict, order: Sequence[Judgement]) -> JudgeRecord:
+                record = await judge.judge(conflict, order)
+                advance(1)
+                return record
+
+            records = iter(await asyncio.gather(*(ask(conflict, order) for conflict in gold for order in orders)))
+            model = f"{judge.kept.engine.model} at {judge.kept.engine.where}"
+    for conflict in gold:
+        verdicts = [next(records).verdict for _ in orders]
+        confusion.update((conflict.judgement, verdict) for verdict in verdicts)
+        num_moved += len(set(verdicts)) > 1
+        num_first += sum(verdict == order[0] for verdict, order in zip(verdicts, orders, strict=True))
     return JudgeCheck(model, len(gold), num_moved, num_first, confusion)

@@ -56,7 +56,7 @@ def main() -> None:
     except (SystemExit, KeyboardInterrupt) as end:
         code = end.code if isinstance(end, SystemExit) else 130  # before Typer, which catches it, has started
         if code in ENDED:
-            _fail(f"{ENDED[code]}; finished work is kept; run the same command again to resume", code)
+            _fail(f"{ENDED[code]}; work in an output directory is kept; run the same command again to resume", code)
         _end(code)
     except OSError as error:
         from cosfly.runtime.io import DISK_FULL

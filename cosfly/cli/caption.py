@@ -47,6 +47,9 @@ def caption(
     plan_only: Annotated[
         bool, Option("--plan", help="Caption a few windows and estimate time and cost of the rest.")
     ] = False,
+    num_tried: Annotated[
+        int | None, Option("--try", min=1, help="Show this many windows: each question, answer, complaint and outcome.")
+    ] = None,
     retry_failed: Annotated[
         bool, Option("--retry-failed", help="Caption the windows in quarantine.jsonl again.")
     ] = False,
@@ -60,23 +63,30 @@ def caption(
     if check and cfg.teacher_kind == "endpoint" and not is_student and not (target / "answers").exists():
         _examine_endpoint(cfg.teacher, cfg)
     if plan_only:
-        forecast = job.call("caption.stage.stage:make_forecast", cfg, tree, target)
+        forecast = job.call("caption.stage.trial:make_forecast", cfg, tree, target)
         options.print_table((), forecast, "What this run will take")
+    elif num_tried is not None:
+        for line in job.call("caption.stage.trial:show_windows", cfg, tree, target, num_tried):
+            typer.echo(line)
     else:
         job.run("caption.stage.stage", cfg, tree, target, retry_failed=retry_failed)
 
 
 @command("cosfly caption doctor http://localhost:8000", "caption", model=MODEL)
-def doctor(job: Job, url: Annotated[str, Argument(help="URL of an OpenAI-compatible server.")]) -> None:
-    """Test what a server can do: text, images, schema, thinking, context. Exit with 1 if it cannot caption."""
-    _examine_endpoint(url, job.cfg.caption)
+def doctor(
+    job: Job,
+    url: Annotated[str, Argument(help="URL of an OpenAI-compatible server.")],
+    limit: Annotated[int | None, Option(min=1, help="Stop after this many requests.")] = None,
+) -> None:
+    """Test what a server can do: text, images, schema, thinking, context, time. Exit with 1 if it cannot caption."""
+    _examine_endpoint(url, job.cfg.caption, limit)
 
 
-def _examine_endpoint(url: str, cfg: CaptionConfig) -> None:
+def _examine_endpoint(url: str, cfg: CaptionConfig, limit: int | None = None) -> None:
     from caption.teachers.doctor import examine_endpoint
     from caption.teachers.prompt_files import vocabulary_of
 
-    options.print_checks(examine_endpoint(url, cfg, vocabulary_of(cfg)), "What the server can do")
+    options.print_checks(examine_endpoint(url, cfg, vocabulary_of(cfg), limit), "What the server can do")
 
 
 @command("cosfly caption prompts --export my-prompts", "caption")
@@ -97,17 +107,21 @@ def prompts(
 
 
 @command("cosfly caption judge-check http://localhost:8000", "caption", model=JUDGE_MODEL)
-def judge_check(job: Job, url: Annotated[str, Argument(help="URL of the judge's server.")]) -> None:
+def judge_check(
+    job: Job,
+    url: Annotated[str, Argument(help="URL of the judge's server.")],
+    limit: Annotated[int | None, Option(min=1, help="Ask about at most this many conflicts.")] = None,
+) -> None:
     """Measure a judge on a small gold set: agreement, position bias, unparsable answers."""
-    import asyncio
-
     from caption.teachers.judge import check_judge, gold_conflicts
     from caption.teachers.prompt_files import vocabulary_of
+    from cosfly.llm.contract import run_until_interrupted
     from cosfly.runtime.config import build
 
     cfg = job.cfg.caption
     judge = build(type(cfg.judge), cfg.judge.model_dump() | {"url": url}, "caption.judge")
-    report = asyncio.run(check_judge(judge, vocabulary_of(cfg), gold_conflicts(), job.cfg.seed))
+    checked = check_judge(judge, vocabulary_of(cfg), gold_conflicts()[:limit], job.cfg.seed)
+    report = run_until_interrupted(checked, keeps_work=False)
     head = ("figure", "value", "meaning")
     options.print_table(head, report.rows(), f"Judge {report.model}", left=head)
 

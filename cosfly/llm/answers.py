@@ -14,7 +14,7 @@ import logging
 import re
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Self
@@ -286,15 +286,23 @@ class KeptAnswers:
         Args:
             book: None records nothing. budget: None sets no limit.
             retried: Ids of the samples that are asked again where a recorded answer had filled the context.
+
+        `listener` is called with each sample id, request and reply.
         """
         self.engine = engine
         self.book = book
         self.budget = budget
         self.retried = retried
+        self.listener: Callable[[str, Request, Reply], None] = lambda sample_id, request, reply: None
         self._asking: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()  # by key, held during a request
 
     async def ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
         """Return the recorded answer, or ask the engine; NoAnswer fails this request, TeacherError all requests."""
+        reply = await self._ask(request, track, sample_id, purpose)
+        self.listener(sample_id, request, reply)
+        return reply
+
+    async def _ask(self, request: Request, track: str, sample_id: str, purpose: str) -> Reply:
         engine = self.engine
         key = answer_key(engine.model, request)
         num_pictures = len(request.digests)

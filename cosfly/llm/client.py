@@ -14,6 +14,7 @@ import os
 import random
 import re
 import time
+from collections import deque
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from typing import Any, ClassVar, Literal
@@ -34,7 +35,11 @@ log = logging.getLogger(__name__)
 TOTAL_TIMEOUT_S = 900.0  # limit of one answer with all its tries
 BUSY_STATUS = frozenset({429, 503, 529})
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # the pause after a failed try doubles in this range, with jitter
+LOADING, LOADING_PAUSE_S = "loading", 5.0  # a server that loads its model is waited for; this is no failed try
+FIRST_LIMIT = 2  # requests in flight until the first answer: a small server answers one after the other
+HEADROOM = 1 / 3  # more requests are sent while answers take less than this share of the time limit
 MOST_DOUBLINGS = 60  # keeps the power of two finite; the pause has reached its maximum long before
+NUM_EQUAL_PROMPTS = 8  # token counts in a row that are equal by chance in no run
 MOST_REPLY_MB = 4.0  # of one answer, uncompressed
 MOST_ERROR_TEXT = 300  # characters of a server's error text; the rest is dropped
 HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
@@ -69,14 +74,17 @@ class EndpointConfig(Config):
 
 
 class ConcurrencyLimit:
-    """A limit on requests in flight: halved when the server is busy, raised by one per round of answers.
+    """A limit on requests in flight, which finds what a server can take.
 
-    A Retry-After holds back all requests, not only the one that received it.
+    It begins low and is raised by one per answer until the server is busy for the first time; then it is halved, and
+    raised by one per round of answers. It is not raised while answers are slow: a server with one slot answers no
+    sooner if more requests wait in its queue, and they would time out there. A Retry-After holds back all requests,
+    not only the one that received it.
     """
 
     def __init__(self, ceiling: int) -> None:
         self.ceiling = ceiling
-        self.limit = float(ceiling)
+        self.limit = float(min(ceiling, FIRST_LIMIT))
         self.num_active = 0
         self._held_until_s = 0.0
         self._decreased_s = -math.inf
@@ -98,9 +106,11 @@ class ConcurrencyLimit:
                 self.num_active -= 1
                 self._changed.notify(max(int(self.limit) - self.num_active, 0))
 
-    def succeeded(self) -> None:
-        """Record an answer."""
-        self.limit = min(float(self.ceiling), self.limit + 1.0 / self.limit)
+    def succeeded(self, is_quick: bool) -> None:
+        """Record an answer; a slow one does not raise the limit."""
+        was_never_busy = self._decreased_s == -math.inf
+        if is_quick:
+            self.limit = min(float(self.ceiling), self.limit + (1.0 if was_never_busy else 1.0 / self.limit))
 
     def was_busy(self, sent_s: float, retry_after_s: float | None) -> None:
         """Record that the server is overloaded. Requests sent before the last decrease do not count again."""
@@ -110,6 +120,11 @@ class ConcurrencyLimit:
             self._decreased_s = now_s
         if retry_after_s is not None:
             self._held_until_s = max(self._held_until_s, now_s + retry_after_s)
+
+
+def _num_characters(content: str | list[dict]) -> int:
+    """Return the length of the text of a message."""
+    return len(content) if isinstance(content, str) else sum(len(part.get("text", "")) for part in content)
 
 
 class ChatClient:
@@ -130,7 +145,9 @@ class ChatClient:
         self.concurrency = ConcurrencyLimit(cfg.concurrency)
         self.context: int | None = None  # most tokens of prompt and answer together, if the server reports it
         self._asks_for_schema = cfg.json_schema
-        self._has_warned_of_context = False
+        self.joins_system = False  # whether the system text begins the first question
+        self._has_warned_of_context = self._has_warned_of_cuts = False
+        self._prompts: dict[int, deque[tuple[int, int]]] = {}  # tokens and characters of the last, by pictures
         self._key = os.environ.get(KEY_VARIABLE, "")
         if not (self._key.isascii() and self._key.isprintable()):  # an error of httpx would quote it
             raise TeacherError(
@@ -169,7 +186,7 @@ class ChatClient:
                 failure = error
             longest_s = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** min(num_tries, MOST_DOUBLINGS))
             pause_s = self._jitter.uniform(0.5, 1.0) * longest_s if failure.wait_s is None else failure.wait_s
-            num_tries += 1
+            num_tries += failure.cause != LOADING
             is_last = num_tries >= self.cfg.max_tries
             is_late = time.monotonic() + pause_s >= deadline_s
             if self.troubles.failed(failure.detail):
@@ -189,33 +206,51 @@ class ChatClient:
             reply = await self._ask(request)
         except (TimeoutError, httpx.RequestError) as error:  # also a compressed body
             is_late = isinstance(error, TimeoutError | httpx.TimeoutException)
+            if is_late:  # requests that wait in the server's queue time out, and would wait behind themselves
+                self.concurrency.was_busy(sent_s, None)
             raise NoAnswer("timeout" if is_late else "connection", self.message_of(error)) from None
         except BadReply as error:
             raise NoAnswer("bad_reply", str(error)) from None
         except RefusedRequest as error:
             raise self._refused(error.refusal, sent_s, error.wait_s) from None
-        self.concurrency.succeeded()
+        self.concurrency.succeeded(time.monotonic() - sent_s < HEADROOM * self.cfg.timeout_s)
+        self._watch_prompts(reply, request)
         return self._with_full_context(reply, request)
 
     async def _ask(self, request: Request) -> Reply:
-        """Send a request once, and again without its schema if the server refuses the schema; raises as `ask_once`."""
+        """Send a request once, and again without what the server refuses: a schema, a system role.
+
+        Raises as `ask_once`.
+        """
         schema = request.schema if self._asks_for_schema else None
-        try:
-            _, reply = await self.ask_once(request, schema)
-            return reply
-        except RefusedRequest as error:
-            if schema is None or error.refusal.kind != "schema":
-                raise
-            refused_schema = error.refusal
-        _, reply = await self.ask_once(request, None)
-        if self._asks_for_schema:
-            log.warning(
-                "%s: the server refuses a JSON schema (%s); requests are sent without one",
-                self.where,
-                refused_schema.summary,
-            )
+        refused_schema = None
+        while True:
+            try:
+                _, reply = await self.ask_once(request, schema)
+                break
+            except RefusedRequest as error:
+                if error.refusal.kind == "schema" and schema is not None:
+                    schema, refused_schema = None, error.refusal
+                elif not self.leaves_out_system(error.refusal, request):
+                    raise
+        if refused_schema is not None and self._asks_for_schema:
+            change = "the server refuses a JSON schema (%s); requests are sent without one"
+            log.warning(f"%s: {change}", self.where, refused_schema.summary)
             self._asks_for_schema = False
         return reply
+
+    def leaves_out_system(self, refusal: Refusal, request: Request) -> bool:
+        """Return whether a request that was refused for its system role is sent again without one, as all later ones.
+
+        Requests in flight at the first refusal are refused, too.
+        """
+        if refusal.kind != "no_system" or request.messages[0]["role"] != "system":
+            return False
+        if not self.joins_system:
+            change = "the server has no system role (%s); the instructions are sent with the question"
+            log.warning(f"%s: {change}", self.where, refusal.summary)
+        self.joins_system = True
+        return True
 
     async def ask_once(self, request: Request, schema: dict | None) -> tuple[Response, Reply]:
         """Send one request once; return the response and the reply in it.
@@ -226,9 +261,17 @@ class ChatClient:
             TimeoutError, httpx.TimeoutException: The response was not complete in time.
             httpx.RequestError: The connection failed, or the body is compressed.
         """
+        if self.joins_system:
+            request = replace(request, messages=protocol.without_system(request.messages))
         body = protocol.encode_body(protocol.request_body(self.model, request, schema))
         response = await self._exchange("chat/completions", body)
-        return response, self._read(response, is_structured=schema is not None)
+        try:
+            return response, self._read(response, is_structured=schema is not None)
+        except RefusedRequest as error:
+            if error.refusal.kind != "num_images":
+                raise
+            message = f"{error.refusal.message} (the request has {len(body) / 1e6:.1f} MB)"
+            raise RefusedRequest(replace(error.refusal, message=message), error.wait_s) from None
 
     def _refused(self, refusal: Refusal, sent_s: float, wait_s: float | None) -> NoAnswer | TeacherError:
         """Return the error of a refused request: NoAnswer for this try or this request, TeacherError for all."""
@@ -239,6 +282,8 @@ class ChatClient:
             is_long = wait_s is not None and wait_s > TOTAL_TIMEOUT_S
             if refusal.status in BUSY_STATUS:
                 self.concurrency.was_busy(sent_s, None if is_long else wait_s)
+            if refusal.is_loading:
+                return NoAnswer(LOADING, refusal.summary, wait_s=LOADING_PAUSE_S)
             asked = f" (the server asks to wait {wait_s:.0f} s)" if is_long else ""
             return NoAnswer(f"http_{refusal.status}", refusal.summary + asked, wait_s=wait_s)
         return NoAnswer(refusal.code, refusal.summary, fix=refusal.meaning.fix, is_final=True)
@@ -262,14 +307,36 @@ class ChatClient:
             log.warning("%s: %s: %s; %s", self.where, problem, meaning.what, meaning.fix)
         return replace(reply, finish_reason=CONTEXT_FULL)
 
+    def _watch_prompts(self, reply: Reply, request: Request) -> None:
+        """Warn once if prompts of different lengths all count the same tokens: the server cuts them."""
+        if reply.usage is None or self._has_warned_of_cuts:
+            return
+        num_characters = sum(_num_characters(message["content"]) for message in request.messages)
+        seen = self._prompts.setdefault(len(request.digests), deque(maxlen=NUM_EQUAL_PROMPTS))
+        seen.append((reply.usage.prompt_tokens, num_characters))
+        tokens, lengths = {counted for counted, _ in seen}, {length for _, length in seen}
+        if len(seen) == NUM_EQUAL_PROMPTS and len(tokens) == 1 and len(lengths) >= NUM_EQUAL_PROMPTS // 2:
+            self._has_warned_of_cuts = True
+            count = reply.usage.prompt_tokens
+            problem = f"{len(lengths)} prompts of different lengths all count {count} tokens: the server drops the rest"
+            log.warning("%s: %s; %s", self.where, problem, MEANINGS["too_long"].fix)
+
     async def start(self) -> None:
         """Read the server's list of models and choose the one of the settings; TeacherError if that fails."""
         wanted = self.cfg.model
-        try:
-            response = await self._exchange("models")
-        except (TimeoutError, httpx.RequestError) as error:
-            fix = "start the server, or correct its address"
-            raise self._error("cannot reach the teacher", got=self.message_of(error), fix=fix) from None
+        deadline_s = time.monotonic() + TOTAL_TIMEOUT_S
+        while True:
+            try:
+                response = await self._exchange("models")
+            except (TimeoutError, httpx.RequestError) as error:
+                fix = "start the server, or correct its address"
+                raise self._error("cannot reach the teacher", got=self.message_of(error), fix=fix) from None
+            refusal = self._refusal(response)
+            if response.status == 200 or not refusal.is_loading or time.monotonic() > deadline_s:
+                break
+            if self.troubles.failed(refusal.summary):
+                log.warning("%s: %s; waiting for the server", self.where, refusal.summary)
+            await asyncio.sleep(LOADING_PAUSE_S)
         if response.status in (401, 403):
             raise self._refused(self._refusal(response), 0.0, None)
         entries = None if response.is_cut else protocol.read_models(response)
@@ -305,11 +372,11 @@ class ChatClient:
             return protocol.read_completion(response, "json_schema" if is_structured else "plain")
         except BadReply as error:
             problem = str(error)
-            kind = kind_of(200, problem) if error.is_error else "unknown"
-        text = self._clean(problem)
-        if kind == "unknown":
+            status, text = error.status, self._clean(problem)
+        refusal = Refusal(status or 200, kind_of(status or 200, problem) if status else "unknown", text)
+        if refusal.kind == "unknown" and not refusal.may_pass:
             raise BadReply(text)
-        raise RefusedRequest(Refusal(200, kind, text), response.retry_after_s)
+        raise RefusedRequest(refusal, response.retry_after_s)
 
     def _refusal(self, response: Response) -> Refusal:
         """Return the refusal in a response whose status is not 200."""
@@ -348,7 +415,7 @@ class ChatClient:
         connection = self._free.pop() if self._free else self._connect()
         try:
             async with (
-                asyncio.timeout(self.cfg.timeout_s),
+                asyncio.timeout(self.cfg.timeout_s) as limit,
                 connection.stream(method, f"{self.url}/{path}", content=content, headers=HEADERS) as response,
             ):
                 encoding = response.headers.get("content-encoding", "identity")
@@ -356,6 +423,9 @@ class ChatClient:
                     raise httpx.DecodingError(
                         f"the response is compressed ({encoding[:40]!r}); turn compression off in the server or proxy"
                     )
+                if response.headers.get("content-type", "").startswith("text/event-stream"):
+                    # The time limit is for the answer, which begins now.
+                    limit.reschedule(asyncio.get_running_loop().time() + self.cfg.timeout_s)
                 async for piece in response.aiter_raw():
                     body += piece
                     if len(body) > most_bytes:  # the rest stays unread, and the connection is closed

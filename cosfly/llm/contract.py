@@ -19,7 +19,10 @@ from cosfly.formats.captions import Usage
 
 Result = TypeVar("Result")
 CountName = Literal["prompt_tokens", "completion_tokens"]
-AT_ONCE = b"error: interrupted at once; recorded answers are kept; run the same command again to continue\n"
+AT_ONCE = {
+    False: b"error: interrupted at once\n",
+    True: b"error: interrupted at once; recorded answers are kept; run the same command again to continue\n",
+}
 MOST_TOKENS = 10_000_000  # of one answer: longer than the context of any model
 STOP_AFTER_FAILURES = 20  # consecutive windows or samples without an answer after which a run ends
 
@@ -131,38 +134,50 @@ async def started(engine: Engine) -> AsyncIterator[None]:
         await engine.close()
 
 
-def run_until_interrupted(main: Coroutine[Any, Any, Result]) -> Result:
-    """Run a coroutine as `asyncio.run` does: the first Ctrl-C cancels its tasks in order, a second ends the process.
+def run_until_interrupted(main: Coroutine[Any, Any, Result], *, keeps_work: bool = True) -> Result:
+    """Run a coroutine as `asyncio.run` does: Ctrl-C or SIGTERM cancels its tasks in order, a second ends the process.
 
-    After the first Ctrl-C it raises KeyboardInterrupt when all tasks have ended. asyncio's second Ctrl-C would end
-    the cancelled tasks and print a traceback of each; journals survive an end at any time.
+    After the first one it raises KeyboardInterrupt, or SystemExit as the command line does, when all tasks have ended.
+    Otherwise each cancelled task would print a traceback. Journals survive an end at any time.
+
+    Args:
+        keeps_work: Whether answers are recorded, for the message.
     """
     if threading.current_thread() is not threading.main_thread():
         return asyncio.run(main)
-    is_interrupted = False
+    received: signal.Signals | None = None
 
     async def guarded() -> Result:
         task = asyncio.current_task()
         loop = asyncio.get_running_loop()
 
-        def interrupt() -> None:
-            nonlocal is_interrupted
-            if is_interrupted:
-                os.write(2, AT_ONCE)
-                os._exit(130)
+        def interrupt(number: signal.Signals) -> None:
+            nonlocal received
+            if received is not None:
+                os.write(2, AT_ONCE[keeps_work])
+                os._exit(128 + number)
             assert task is not None
-            is_interrupted = task.cancel()
+            if task.cancel():
+                received = number
 
-        loop.add_signal_handler(signal.SIGINT, interrupt)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, interrupt, number)
         try:
             return await main
         finally:
-            if not is_interrupted:  # otherwise it stays until the last task has ended
-                loop.remove_signal_handler(signal.SIGINT)
+            if received is None:  # otherwise they stay until the last task has ended
+                for number in previous:
+                    loop.remove_signal_handler(number)
 
+    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         return asyncio.run(guarded())
     except asyncio.CancelledError:
-        if is_interrupted:
+        if received is None:
+            raise
+        if received == signal.SIGINT:
             raise KeyboardInterrupt from None
-        raise
+        raise SystemExit(128 + received) from None
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

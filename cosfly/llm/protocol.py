@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,9 +13,12 @@ import httpx
 from cosfly.formats.captions import Usage
 from cosfly.llm.contract import MOST_TOKENS, Reply, Request
 from cosfly.runtime.json_io import dump_json
+from cosfly.runtime.model_json import DECLINED
 
 KEY_VARIABLE = "COSFLY_API_KEY"
 THOUGHT_FIELDS = ("reasoning_content", "reasoning", "thinking", "reasoning_details")  # of a message
+MESSAGE_FIELDS = ("message", "msg", "detail")  # of an error
+EVENT_STARTS = (b"data:", b"event:", b"id:", b"retry:", b":")  # of a stream of server-sent events
 TEXT_PARTS = (None, "text", "output_text")  # types of the parts of a message that hold its text
 ENDED = ("error", "abort")  # finish reasons of an answer that a server gave up; SGLang sends them with status 200
 MOST_NAME = 256  # characters of a name, such as a model or a finish reason; longer ones are dropped
@@ -44,9 +48,14 @@ def check_url(url: str) -> None:
         raise ValueError(f"{problem}{got}")
 
 
+COMPLETIONS = "/chat/completions"
+
+
 def base_url(url: str) -> str:
-    """Return the API root of a URL given as host, host/v1 or the full chat-completions path."""
-    root = url.rstrip("/").removesuffix("/chat/completions").rstrip("/")
+    """Return the API root of a URL: of host or host/v1, host/v1; a full chat-completions address is used as given."""
+    root = url.rstrip("/")
+    if root.endswith(COMPLETIONS):
+        return root.removesuffix(COMPLETIONS)
     return root if re.search(r"/v\d+(beta)?(/openai)?$", root) else f"{root}/v1"
 
 
@@ -55,11 +64,24 @@ def base_url(url: str) -> str:
 
 def request_body(model: str, request: Request, schema: dict | None = None) -> dict[str, Any]:
     """Return the body of a request. schema: The JSON schema that the server must enforce; None enforces none."""
-    body = {"model": model, "messages": request.messages, **request.sampling}
+    body = {"model": model, "messages": request.messages, "stream": False, **request.sampling}
     if schema is None:
         return body
     json_schema = {"name": "chain_of_cause", "strict": True, "schema": schema}
     return body | {"response_format": {"type": "json_schema", "json_schema": json_schema}}
+
+
+def without_system(messages: list[dict]) -> list[dict]:
+    """Return messages whose system text begins the first question, for chat templates without a system role."""
+    if len(messages) < 2 or messages[0]["role"] != "system":
+        return messages
+    system, question, *others = messages
+    content = question["content"]
+    parts = [{"type": "text", "text": content}] if isinstance(content, str) else content
+    joined = [{"type": "text", "text": system["content"]}, *parts]
+    if isinstance(content, str):
+        return [question | {"content": f"{system['content']}\n\n{content}"}, *others]
+    return [question | {"content": joined}, *others]
 
 
 def encode_body(payload: dict) -> bytes:
@@ -98,11 +120,11 @@ class Response:
 
 
 class BadReply(Exception):
-    """A response with status 200 that holds no usable reply. is_error: It holds an error of the server instead."""
+    """A response with status 200 that holds no usable reply. status: Of the error that it holds instead, if it does."""
 
-    def __init__(self, problem: str, *, is_error: bool = False) -> None:
+    def __init__(self, problem: str, status: int | None = None) -> None:
         super().__init__(problem)
-        self.is_error = is_error
+        self.status = status
 
 
 def read_body(content: bytes) -> Any:
@@ -112,9 +134,37 @@ def read_body(content: bytes) -> Any:
         raise ValueError(f"the response contains {constant}, which is not valid in JSON")
 
     try:
+        if content.lstrip().startswith(EVENT_STARTS):
+            return _writable(_joined_events(content, reject))
         return _writable(json.loads(content, parse_constant=reject))
     except RecursionError:
         raise ValueError("the lists and objects of the response are nested too deeply") from None
+
+
+def _joined_events(content: bytes, reject: Callable[[str], float]) -> dict[str, Any]:
+    """Return the completion whose pieces an event stream holds: some servers stream whatever the request says."""
+    texts: dict[str, str] = {}
+    finish_reason = usage = None
+    for line in content.split(b"\n"):  # not splitlines: a JSON string may contain other line separators
+        field, _, data = line.partition(b":")
+        if field != b"data" or not data.strip():
+            continue
+        if data.strip() == b"[DONE]":
+            finish_reason = finish_reason or "stop"
+            continue
+        event = json.loads(data, parse_constant=reject)
+        choices = event.get("choices") if isinstance(event, dict) else None
+        if not isinstance(choices, list):
+            return event if isinstance(event, dict) else {}  # an error, for instance
+        usage = event.get("usage") or usage
+        for choice in choices[:1]:
+            finish_reason = choice.get("finish_reason") or finish_reason
+            for name, piece in (choice.get("delta") or {}).items():
+                if isinstance(piece, str):
+                    texts[name] = texts.get(name, "") + piece
+    if finish_reason is None:
+        raise ValueError("the event stream ends before the answer does")
+    return {"choices": [{"message": texts, "finish_reason": finish_reason}], "usage": usage}
 
 
 def _writable(value: Any) -> Any:
@@ -136,9 +186,18 @@ def _object(response: Response) -> dict[str, Any] | None:
 
 
 def error_words(value: Any) -> str:
-    """Return the text of an error in a server's JSON: its `error`, or all of it."""
+    """Return the text of an error in a server's JSON: the message of its `error`, or of itself, or all of it."""
     error = value.get("error", value) if isinstance(value, dict) else value
-    return str(error.get("message", error) if isinstance(error, dict) else error)
+    if not isinstance(error, dict):
+        return str(error)
+    return str(next((error[name] for name in MESSAGE_FIELDS if error.get(name)), error))
+
+
+def _error_status(value: dict[str, Any]) -> int:
+    """Return the status that an error in a response of status 200 gives as its code; 200 if it gives none."""
+    error = value.get("error")
+    code = str((error if isinstance(error, dict) else value).get("code"))
+    return int(code) if re.fullmatch("[45][0-9]{2}", code) else 200
 
 
 def read_completion(response: Response, structured: str) -> Reply:
@@ -148,23 +207,30 @@ def read_completion(response: Response, structured: str) -> Reply:
         raise BadReply("the response is not JSON")
     choices = value.get("choices")
     if not isinstance(choices, list) or not choices or not isinstance(choices[0], dict):
-        if value.get("error"):
-            raise _error_instead(error_words(value))
+        if any(value.get(name) for name in ("error", *MESSAGE_FIELDS)):
+            raise _error_instead(value)
         raise BadReply("the response has no choices")
     choice = choices[0]
     finish_reason = choice.get("finish_reason")
     if choice.get("error"):
-        raise _error_instead(error_words(choice))
+        raise _error_instead(choice)
     if finish_reason in ENDED:
-        raise _error_instead(finish_reason)
-    text = _final_text(choice["message"] if isinstance(choice.get("message"), dict) else {})
+        raise _error_instead({"error": finish_reason})
+    message = choice["message"] if isinstance(choice.get("message"), dict) else {}
+    text, usage = _final_text(message), _usage(value.get("usage"))
+    refusal = message.get("refusal")
+    if not text and isinstance(refusal, str) and refusal:
+        return Reply(refusal, usage, structured, DECLINED)
+    if text is None and finish_reason == "length":
+        text = ""  # thoughts that the server does not return took all tokens
     if text is None:
         raise BadReply("the message has no text")
-    return Reply(text, _usage(value.get("usage")), structured, _name(finish_reason))
+    return Reply(text, usage, structured, _name(finish_reason))
 
 
-def _error_instead(words: str) -> BadReply:
-    return BadReply(f"the server sent an error instead of an answer: {words}", is_error=True)
+def _error_instead(value: dict[str, Any]) -> BadReply:
+    problem = f"the server sent an error instead of an answer: {error_words(value)}"
+    return BadReply(problem, _error_status(value))
 
 
 def _name(value: Any) -> str | None:
@@ -173,15 +239,13 @@ def _name(value: Any) -> str | None:
 
 
 def _final_text(message: dict[str, Any]) -> str | None:
-    """Return a message's text or refusal; "" if it contains only thoughts, None if it contains nothing."""
+    """Return a message's text; "" if it contains only thoughts, None if it contains nothing."""
     text = message.get("content")
     if isinstance(text, list):
         parts = (part.get("text") for part in text if isinstance(part, dict) and part.get("type") in TEXT_PARTS)
         text = "".join(part for part in parts if isinstance(part, str))
     if isinstance(text, str) and text:
         return text
-    if isinstance(message.get("refusal"), str):
-        return message["refusal"]
     return "" if isinstance(text, str) or any(message.get(name) for name in THOUGHT_FIELDS) else None
 
 

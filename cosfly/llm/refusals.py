@@ -14,7 +14,9 @@ from typing import Any, Literal, NamedTuple
 from cosfly.llm.protocol import KEY_VARIABLE
 from cosfly.runtime.config import read_yaml
 
-Kind = Literal["account", "too_long", "num_images", "no_vision", "schema", "parameter", "content", "unknown"]
+Kind = Literal[
+    "account", "too_long", "num_images", "no_vision", "no_system", "schema", "parameter", "content", "unknown"
+]
 
 MOST_CHARACTERS = 4000  # of a text that are searched: some servers echo the request
 NEVER = "$^"  # a pattern that matches nothing
@@ -83,6 +85,11 @@ class Refusal:
     def meaning(self) -> Meaning:
         by_text = MEANINGS[self.kind]
         return by_text if by_text.ends_run or self.kind == "content" else STATUSES.get(self.status, by_text)
+
+    @property
+    def is_loading(self) -> bool:
+        """Whether the server is loading its model."""
+        return self.status in AWAY and re.search(r"\bloading\b", self.message, re.IGNORECASE) is not None
 
     @property
     def may_pass(self) -> bool:

@@ -40,10 +40,12 @@ _CLOSES = (
 _MARK = re.compile(rf"(?P<opens>{_OPENS})|(?P<closes>{_CLOSES})|\{{(?!\{{)", re.IGNORECASE)
 _CLOSE = re.compile(_CLOSES, re.IGNORECASE)
 
+DECLINED = "declined"  # finish reason: the model declines to answer, in its own words
 CONTEXT_FULL = "context_full"  # finish reason: prompt and answer fill the context, before `max_tokens`
 _NOTHING = re.compile(r"(?:[\s\u00ad\u200b-\u200f\u2028-\u202e\u2060-\u2064\ufeff]|```\w*)*+")
-# Finish reason -> ours, of a message that was cut off.
-_CUT = {"length": "cut_short", "max_tokens": "cut_short"} | {name: name for name in ("content_filter", CONTEXT_FULL)}
+# Finish reason -> ours, of a message that was cut off or declines to answer.
+_CUT = {"length": "cut_short", "max_tokens": "cut_short"}
+_CUT |= {name: name for name in ("content_filter", CONTEXT_FULL, DECLINED)}
 
 _KEY = re.compile(r'\s*"')
 # Half a surrogate pair, which cannot be written, and the replacement of bytes that a decoder could not read.
@@ -65,7 +67,7 @@ def find_object(text: str, names: Collection[str], finish_reason: str | None = N
 
     Without such an object, the last one is returned. Reasons: empty, too_long, no_json_object, only_thinking,
     broken_json, duplicate_key, not_finite, unreadable_character; and for a message that was cut off, whose object may
-    be a draft if text follows it: cut_short, content_filter, context_full.
+    be a draft if text follows it: cut_short, content_filter, context_full, declined.
     """
     if len(text) > MAX_CHARACTERS:
         return AnswerObject(None, "too_long")

@@ -1,0 +1,162 @@
+"""A few windows before a run: `--plan` estimates the rest from them, `--try` shows what is asked and answered.
+
+The windows are real ones, spread over the tracks. Their answers stay in the journal, so the run does not ask for them
+again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+from caption.schema import CaptionConfig
+from caption.stage.asking import ANSWERS
+from caption.stage.ledger import REASONS
+from caption.stage.stage import open_stage
+from caption.stage.tracks import find_inputs
+from caption.stage.window_loop import caption_window
+from caption.teachers.prompt_files import vocabulary_of
+from caption.teachers.students import student_settings
+from caption.teachers.teacher import EMBEDDED, AskingTeacher, first_budget, open_teacher
+from cosfly.formats.captions import Caption, Usage
+from cosfly.formats.places import flight_of
+from cosfly.llm.answers import AnswerBook
+from cosfly.llm.contract import Reply, Request, run_until_interrupted
+from cosfly.runtime.console import duration
+from cosfly.runtime.errors import ConfigError, InputError, TeacherError
+from cosfly.runtime.escaping import LONGEST_LOG, for_terminal
+from cosfly.runtime.run_dir import Resume
+
+PLAN_WINDOWS = 6
+
+
+@dataclass
+class _Trial:
+    """The captions of a few windows. num_all, num_left: Windows of the tree, and those without a caption."""
+
+    num_all: int
+    num_left: int
+    seconds: float = 0.0
+    captions: list[Caption] = field(default_factory=list)
+    exchanges: dict[str, list[tuple[Request, Reply]]] = field(default_factory=dict)  # by sample id, in order
+
+
+def _try_windows(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Resume, num_windows: int) -> _Trial:
+    """Caption a few windows; TeacherError if none gets an answer."""
+    vocabulary = vocabulary_of(cfg)
+    cfg = student_settings(cfg, vocabulary)
+    stage = open_stage(cfg, data, out, seed, resume)
+    tracks, _ = find_inputs(cfg, data)
+    guesses = {track: track.guess_num_windows(cfg.window) for track in tracks}
+    left = [track for track in tracks if guesses[track] and not stage.is_complete and not track.part(out).exists()]
+    trial = _Trial(sum(guesses.values()), sum(guesses[track] for track in left))
+    if not trial.num_left:
+        raise InputError("no window is left to caption", where=data, got=f"{len(left)} unfinished tracks")
+    chosen = [left[number * len(left) // num_windows] for number in range(num_windows)]
+    windows = [w for track in dict.fromkeys(chosen) for w in islice(track.windows(cfg), chosen.count(track))]
+
+    def record(sample_id: str, request: Request, reply: Reply) -> None:
+        trial.exchanges.setdefault(sample_id, []).append((request, reply))
+
+    async def ask() -> list[Caption | BaseException]:
+        with AnswerBook(out / ANSWERS) as book:
+            async with open_teacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
+                assert isinstance(teacher, AskingTeacher)
+                teacher.kept.listener = record
+                asked = [caption_window(window, teacher, cfg, vocabulary) for window in windows]
+                found = await asyncio.gather(*asked, return_exceptions=True)
+            ids = [one.sample_id for one in found if isinstance(one, Caption)]
+            trial.seconds = sum(book.latency_s(flight_of(sample_id), sample_id) for sample_id in ids)
+            return found
+
+    found = run_until_interrupted(ask())
+    trial.captions = [one for one in found if isinstance(one, Caption)]
+    if not trial.captions:
+        what, got = "none of the trial windows got an answer", str(found[0]) if found else None
+        raise TeacherError(what, where=cfg.teacher, got=got)
+    return trial
+
+
+def make_forecast(
+    cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, resume: Resume = "if-same"
+) -> list[tuple[str, str]]:
+    """Return the rows of a table: calls, tokens, time and money of a run, scaled from the means of a few windows."""
+    if cfg.teacher_kind != "endpoint":
+        what = "an estimate needs a server as the teacher"
+        raise ConfigError(what, where="--plan", got=cfg.teacher, expected="--teacher URL")
+    trial = _try_windows(cfg, data, out, seed, resume, PLAN_WINDOWS)
+    captions = trial.captions
+    scale = trial.num_left / len(captions)
+    usage = sum((caption.usage for caption in captions), Usage())
+    prompt, completion = scale * usage.prompt_tokens, scale * usage.completion_tokens
+    is_priced = cfg.budget.price_prompt or cfg.budget.price_completion
+    cost = f"{cfg.budget.cost(prompt, completion):,.2f}" if is_priced else "no prices set (budget.price_prompt)"
+    num_accepted = sum(caption.status == "accepted" for caption in captions)
+    num_done = trial.num_all - trial.num_left
+    return [
+        ("windows", f"about {trial.num_left:,} left" + (f", {num_done:,} done" if num_done else "")),
+        ("trial", f"{len(captions)} windows, {num_accepted} accepted; their answers are kept"),
+        ("requests", f"{scale * sum(caption.attempts for caption in captions):,.0f}"),
+        ("tokens in", f"{prompt:,.0f}"),
+        ("tokens out", f"{completion:,.0f}"),
+        ("cost", cost),
+        (
+            "time",
+            f"{duration(scale * trial.seconds / cfg.most_in_flight)} with {cfg.most_in_flight} requests in flight",
+        ),
+    ]
+
+
+def show_windows(
+    cfg: CaptionConfig, data: Path, out: Path, num_windows: int, *, seed: int = 0, resume: Resume = "if-same"
+) -> Iterator[str]:
+    """Yield the lines that show a few windows: each question and answer, and what became of the window."""
+    if cfg.teacher_kind in EMBEDDED:
+        what = "a trial shows questions and answers, and this teacher asks no model"
+        raise ConfigError(what, where="--try", got=cfg.teacher, expected="--teacher URL or vllm:MODEL_DIR")
+    trial = _try_windows(cfg, data, out, seed, resume, num_windows)
+    for caption in trial.captions:
+        yield f"=== {caption.sample_id} ==="
+        for number, (request, reply) in enumerate(trial.exchanges.get(caption.sample_id, ()), 1):
+            for message in request.messages:
+                yield f"--- request {number}, {message['role']} ---"
+                yield from _text_of(message["content"])
+            usage = reply.usage
+            tokens = (
+                f"{usage.prompt_tokens} tokens in, {usage.completion_tokens} out" if usage else "tokens not reported"
+            )
+            yield f"--- answer {number} ({tokens}) ---"
+            yield for_terminal(reply.text, LONGEST_LOG)
+        yield "--- outcome ---"
+        reason = caption.drop_reason
+        yield caption.status if reason is None else f"dropped because of {reason}: {REASONS[reason]}"
+        for name, value in (
+            ("label", caption.label),
+            ("verdict", caption.verdict),
+            ("refusal", caption.checks.refusal),
+        ):
+            if value is not None:
+                yield f"{name}: {for_terminal(str(value))}"
+        for text in caption.checks.contradictions or ():
+            yield f"contradicted: {for_terminal(text)}"
+        for language, answer in (("en", caption.en), ("zh", caption.zh)):
+            if answer is not None:
+                texts = (answer.critical_components, answer.reasoning_trace, answer.flight_decision)
+                yield from (f"{language}: {for_terminal(text)}" for text in texts)
+
+
+def _text_of(content: str | list[dict]) -> Iterator[str]:
+    """Yield the lines of a message; a picture is its number and size."""
+    if isinstance(content, str):
+        yield for_terminal(content, LONGEST_LOG)
+        return
+    num_pictures = 0
+    for part in content:
+        if part["type"] == "text":
+            yield for_terminal(part["text"], LONGEST_LOG)
+        else:
+            num_pictures += 1
+            yield f"[picture {num_pictures}, {len(part['image_url']['url']) / 1e3:.0f} kB]"
