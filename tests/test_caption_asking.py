@@ -1,19 +1,23 @@
 """Runs of an endpoint teacher that stop, go on, retry and show what they do; and the book of answers."""
 
 import json
+import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 from specimens_captions import deciding, report_of, settings
 from teacher_server import is_mirror, kept_answers
 
+from caption.schema import CaptionConfig
 from caption.stage import asking
 from caption.stage.stage import run
+from caption.stage.trial import show_windows
 from cosfly.formats.captions import read_captions
 from cosfly.llm import client
-from cosfly.runtime.errors import TeacherError
+from cosfly.runtime.errors import ConfigError, TeacherError
 from specimens import make_playback_tree
 
 
@@ -156,3 +160,49 @@ def test_a_disk_that_fills_up_costs_nothing_that_was_written(tree, tmp_path, who
     now = keys_by_flight(out)
     assert all(now[flight][: len(keys)] == keys for flight, keys in kept.items())
     assert len(keys_of(out)) == len(set(keys_of(out)))
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "word"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
+)
+def test_a_run_that_is_ended_leaves_a_report_and_no_traceback(tree, tmp_path, whole, number, code, word):
+    out, half = tmp_path / "out", threading.Event()
+
+    def fault(index: int, body: dict) -> None:
+        if index >= 30:  # of 44; the English answers come first
+            half.set()
+            ended.wait(60)
+
+    ended = threading.Event()
+    with deciding(fault=fault) as server:
+        cfg = tmp_path / "config.yaml"
+        cfg.write_text(json.dumps({"caption": settings(server.url).model_dump(mode="json")}))
+        options = ["--config", str(cfg), "--data", str(tree), "--out", str(out), "--no-check"]
+        command = [sys.executable, "-m", "cosfly", "caption", *options]
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        assert half.wait(120)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=120)
+        ended.set()
+    assert process.returncode == code
+    assert "Traceback" not in errors
+    assert errors.strip().splitlines()[-1].startswith(f"error: {word}")
+    tally = report_of(out)["windows"]
+    assert 0 < tally["kept"] == tally["input"] < 22
+    with deciding() as server:
+        assert run(settings(server.url), tree, out).read_bytes() == whole
+
+
+def test_a_trial_shows_questions_answers_and_outcomes_and_keeps_the_answers(tree, tmp_path):
+    with deciding(fault=lambda index, body: "wrong_shape" if index == 0 else None) as server:
+        lines = list(show_windows(settings(server.url), tree, tmp_path / "out", 1))
+        num_asked = len(server.bodies)
+        run(settings(server.url, limit=1), tree, tmp_path / "out")
+    text = "\n".join(lines)
+    assert num_asked == len(server.bodies) == 3  # a wrong one, the English and the Chinese answer
+    assert "[picture 15," in text
+    assert text.count("--- answer ") == 3
+    assert "because" in text  # the words of the wrong answer
+    assert lines[lines.index("--- outcome ---") + 1] == "accepted"
+    with pytest.raises(ConfigError, match="asks no model"):
+        list(show_windows(CaptionConfig(), tree, tmp_path / "out", 1))

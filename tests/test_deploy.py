@@ -10,6 +10,7 @@ import typer
 from tables import each
 
 from cosfly.cli import app
+from cosfly.runtime import limits
 
 SCRIPT = Path(__file__).parents[1] / "docs/deploy/slurm.sh"
 SBATCH = {  # options of sbatch (its manual page), and what may follow
@@ -66,3 +67,23 @@ def test_every_command_of_the_script_is_one_that_cosfly_takes(tmp_path, argument
     if len(found) > 1:
         assert all(words[1:5] == ["--config", "diverse", "--town", "park"] for words in found)
         assert all(words[words.index("--out") + 1] == f"shared/run/park/{words[0]}" for words in found)
+
+
+@each(("files", "cpus", "memory"), [
+    ({"cgroup": "0::/job/step\n", "job/cpu.max": "max 100000", "job/step/cpu.max": "150000 100000",
+        "job/memory.max": "1073741824", "job/step/memory.max": "max"}, 2, 2**30),
+    ({"cgroup": "4:cpu,cpuacct:/docker/1\n6:memory:/docker/1\n", "cpu/docker/1/cpu.cfs_quota_us": "-1",
+        "cpu/cpu.cfs_quota_us": "100000",
+        "cpu/cpu.cfs_period_us": "100000", "memory/memory.limit_in_bytes": "536870912"}, 1, 2**29),
+    ({"cgroup": "0::/\n"}, 64, None),
+])  # fmt: skip
+def test_the_limits_of_a_job_are_those_of_its_control_groups(tmp_path, monkeypatch, files, cpus, memory):
+    for name, text in files.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    monkeypatch.setattr(limits, "CGROUPS", tmp_path)
+    monkeypatch.setattr(limits, "MEMBERSHIP", tmp_path / "cgroup")
+    monkeypatch.setattr(limits.os, "sched_getaffinity", lambda pid: set(range(64)))
+    assert limits.num_cpus() == cpus
+    assert limits.memory_bytes() == memory or memory is None

@@ -8,7 +8,6 @@ Chinese of an English answer; its complaint says what was wrong with the last on
 from __future__ import annotations
 
 import asyncio
-import os
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -34,6 +33,7 @@ from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Engine, NoAnswer, Reply, Request, Troubles, started
 from cosfly.llm.student_chat import encoded_image
 from cosfly.llm.vllm_engine import VllmEngine
+from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.seeding import random_bytes, rng_for
 
 ENCODING_THREADS = 4
@@ -173,7 +173,7 @@ async def open_teacher(
         return
     engine = make_engine(cfg, troubles)
     async with started(engine):
-        threads = ThreadPoolExecutor(min(ENCODING_THREADS, os.cpu_count() or 1), "encode")
+        threads = ThreadPoolExecutor(min(ENCODING_THREADS, num_cpus()), "encode")
         try:
             yield AskingTeacher(cfg, seed, KeptAnswers(engine, book, budget, retried), threads)
         finally:

@@ -49,6 +49,7 @@ from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError
 from cosfly.runtime.io import sha256_file
 from cosfly.runtime.json_io import write_model
+from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.runtime.worker import Item, Outcome, Work, advance
@@ -139,7 +140,7 @@ class EpisodeRunner:
     def __init__(
         self, cfg: ClosedLoopConfig, out: Path, seed: int, num_workers: int, list_sha256: str | None = None
     ) -> None:
-        os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num_workers)))
+        os.environ.setdefault("LP_NUM_THREADS", str(max(1, num_cpus() // num_workers)))
         self.out = out
         self.engine = open_engine(cfg.fly, cfg.caption, cfg.infer, seed, out / ANSWERS)
         self.controls = read_controls(cfg.fly.table, TOKENS)

@@ -17,6 +17,7 @@ from caption.teachers.teacher import EMBEDDED
 from cosfly.runtime.errors import ConfigError, ResumeError
 from cosfly.runtime.events import EVENTS, LOSSES, Event, read_events
 from cosfly.runtime.json_io import FileFormat, write_model
+from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.run_dir import Manifest, read_manifest
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
             fix="pass --set caption.teacher=rules and remove caption.judge.url",
         )
     rows = [_measure(cfg, run_folder, out / f"workers_{count}", stage, count) for count in sorted(set(workers))]
-    bench = Bench(stage=stage, cores=len(os.sched_getaffinity(0)), rows=rows)
+    bench = Bench(stage=stage, cores=num_cpus(), rows=rows)
     write_model(out / "bench.json", bench, FORMAT)
     return bench
 

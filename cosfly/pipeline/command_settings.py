@@ -6,7 +6,6 @@ It imports no stage: a command loads only the settings of its own sections.
 from __future__ import annotations
 
 import importlib
-import os
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +14,7 @@ from pydantic import Field, create_model, model_validator
 
 from cosfly.runtime.config import Config
 from cosfly.runtime.io import LinkedPath
+from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.pool import Watch
 from cosfly.runtime.ray_engine import ALL_ROOM, RayConfig
 
@@ -85,5 +85,5 @@ def config_with(sections: Collection[str]) -> type[CommandConfig]:
 def worker_options(cfg: CommandConfig) -> dict[str, Any]:
     """Return the arguments that all stages with items take: `workers` and `watch`."""
     cluster = cfg.ray if cfg.engine == "ray" else None
-    workers = cfg.workers or (len(os.sched_getaffinity(0)) if cluster is None else ALL_ROOM)
+    workers = cfg.workers or (num_cpus() if cluster is None else ALL_ROOM)
     return {"workers": workers, "watch": Watch(cluster, cfg.item_limit_s)}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
-import os
 import platform
 import shutil
 import subprocess
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from cosfly.runtime.errors import EnvironmentMissing
+from cosfly.runtime.limits import memory_bytes, num_cpus
 
 OPTIONAL_PACKAGES = {  # name: the purpose, and the packages to install
     "torch": ("students", "cosfly[distill]"),
@@ -41,9 +41,9 @@ class Check(NamedTuple):
 
 def examine(folder: Path) -> Iterator[Check]:
     """Check this machine, whose runs are written below `folder`, and yield the results."""
-    memory_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    memory_gib = memory_bytes() / 2**30
     yield Check("python", "ok", f"{platform.python_version()} on {platform.platform()}")
-    yield Check("machine", "ok", f"{len(os.sched_getaffinity(0))} cores, {memory_gib:.0f} GiB memory")
+    yield Check("machine", "ok", f"{num_cpus()} cores, {memory_gib:.0f} GiB memory")
     yield _check_disk(folder)
     yield _check_gl()
     yield _check_gpu()

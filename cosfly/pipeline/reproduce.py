@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import base64
 import logging
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -33,6 +32,7 @@ from cosfly.runtime.errors import InputError, json_type
 from cosfly.runtime.events import read_events
 from cosfly.runtime.io import read_bytes, write_bytes
 from cosfly.runtime.json_io import FileFormat, read_object, write_json
+from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.png import read_picture
 from cosfly.runtime.run_dir import Manifest, Resume, read_manifest
 from cosfly.studies import beam, depth, weather, zoom
@@ -132,7 +132,7 @@ def run(
 def _write_page(out: Path, name: str, pedestrians: int, parts: list[Part], left_out: dict[str, str]) -> Path:
     facts = {
         "run": name,
-        "made_by": f"cosfly {cosfly.__version__}, {len(os.sched_getaffinity(0))} cores",
+        "made_by": f"cosfly {cosfly.__version__}, {num_cpus()} cores",
         "pedestrians": pedestrians,
         "left_out": left_out,
     }

@@ -32,6 +32,7 @@ from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.io import CHECKSUMS, atomic_folder, inside, sha256_bytes
 from cosfly.runtime.json_io import dump_json, write_json
+from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Kept, Resume, StageFolder, Tally, checked_inputs, fingerprint, result_of
 from cosfly.runtime.seeding import rng_for
@@ -291,7 +292,7 @@ def make_worker(cfg: RenderConfig, inputs: Inputs, out: Path, town: str, seed: i
     boxes, simplified, traces, others = inputs
     if num_processes > 1:
         # Processes share the cores: one rasteriser thread each. The driver reads it when it loads.
-        os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num_processes)))
+        os.environ.setdefault("LP_NUM_THREADS", str(max(1, num_cpus() // num_processes)))
     surroundings = Surroundings(read_boxes(simplified))
     all_traces = read_traces(traces)
     bystanders, num_others = bystanders_of(others, all_traces)

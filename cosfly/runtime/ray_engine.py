@@ -13,6 +13,7 @@ import os
 import pickle
 import signal
 import sys
+import tempfile
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,6 +38,7 @@ ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",  # send no usage report
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # otherwise it hides the GPUs from workers that request none
 }
+MOST_TEMP_BYTES = 38  # of a temporary directory: Ray adds up to 69 bytes to it, and the path of a socket has 107
 WAITING_S = 30.0  # interval of warnings that no node has free resources
 
 
@@ -262,6 +264,10 @@ def connected(cfg: RayConfig) -> Any:
     local_options: dict[str, Any] = {}
     if address == "local":
         local_options = {"object_store_memory": STORE_BYTES, "include_dashboard": False}
+        place = os.environ.get("RAY_TMPDIR") or tempfile.gettempdir()
+        if len(place.encode()) > MOST_TEMP_BYTES:
+            local_options["_temp_dir"] = short = f"/tmp/ray-{os.getuid()}"
+            log.info("ray: the temporary directory %s is too long for the paths of its sockets; using %s", place, short)
     if ":" in address:
         _check_reachable(address)
     handler = signal.getsignal(signal.SIGTERM)

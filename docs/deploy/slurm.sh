@@ -45,14 +45,16 @@ on_ray() {
     mapfile -t nodes < <(scontrol show hostnames "$SLURM_JOB_NODELIST")
     head=$(srun --nodes=1 --ntasks=1 --nodelist="${nodes[0]}" hostname --all-ip-addresses)
     address=${head%% *}:$((20000 + SLURM_JOB_ID % 10000))
+    # srun of Slurm 22.05 to 23.02 does not take the CPUs of a task from the job.
+    local step=(srun --nodes=1 --ntasks=1 "--cpus-per-task=$workers")
     # Ray asks for a token on any address but 127.0.0.1: one, which srun hands to every node with the environment.
     RAY_AUTH_TOKEN=$("${ray[@]}" get-auth-token --generate) && export RAY_AUTH_MODE=token RAY_AUTH_TOKEN
     trap 'kill $(jobs -p) 2>/dev/null || true; wait' EXIT
     local start=("${ray[@]}" start --block --disable-usage-stats "--num-cpus=$workers" "--num-gpus=${SLURM_GPUS_ON_NODE:-0}")
-    srun --nodes=1 --ntasks=1 --nodelist="${nodes[0]}" "${start[@]}" --head --node-ip-address="${address%:*}" --port="${address#*:}" &
+    "${step[@]}" --nodelist="${nodes[0]}" "${start[@]}" --head --node-ip-address="${address%:*}" --port="${address#*:}" &
     sleep 10
     for node in "${nodes[@]:1}"; do
-        srun --nodes=1 --ntasks=1 --nodelist="$node" "${start[@]}" --address="$address" &
+        "${step[@]}" --nodelist="$node" "${start[@]}" --address="$address" &
     done
     for ((second = 0; second < 120; second += 5)); do
         running=$("${ray[@]}" status --address="$address" 2>/dev/null | grep -c " node_") || true
