@@ -131,18 +131,24 @@ def test_no_command_takes_a_url_that_cannot_be_asked_or_holds_a_secret(tmp_path,
 
 def test_the_limit_on_concurrency_halves_and_recovers():
     limit = ConcurrencyLimit(64)
+    for _ in range(4):
+        limit.succeeded(is_quick=False)
+    assert limit.limit == 2  # until a quick answer
+    for _ in range(70):
+        limit.succeeded(is_quick=True)
+    assert limit.limit == 64
     now_s = time.monotonic()
     limit.was_busy(sent_s=now_s, retry_after_s=None)
     limit.was_busy(sent_s=now_s, retry_after_s=None)  # sent before the decrease: does not count again
     assert limit.limit == 32
     for _ in range(32):
-        limit.succeeded()
+        limit.succeeded(is_quick=True)
     assert 32.9 < limit.limit <= 33.0  # one more per round
     for _ in range(20):
         limit.was_busy(sent_s=float("inf"), retry_after_s=None)
     assert limit.limit == 1.0
     for _ in range(10_000):
-        limit.succeeded()
+        limit.succeeded(is_quick=True)
     assert limit.limit == 64
 
 

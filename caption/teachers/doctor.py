@@ -185,7 +185,8 @@ class _Examination:
             answer = parse_json(probe.text)
         if probe.reply is None:
             self.takes_schema &= not probe.refuses_schema
-            self._add("JSON schema", "warning", f"refused ({probe.detail}), so answers are parsed from plain text")
+            problem = "refused, so answers are parsed from plain text" if probe.refuses_schema else "not tested"
+            self._add("JSON schema", "warning", f"{problem}: {probe.detail}")
         elif answer == {"animal": ODD_WORD, "legs": 7}:
             self._add("JSON schema", "ok", "applied: the answer has the unusual shape of the schema")
         else:

@@ -7,6 +7,9 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.io import read_text
+
 CGROUPS = Path("/sys/fs/cgroup")
 MEMBERSHIP = Path("/proc/self/cgroup")
 
@@ -29,11 +32,7 @@ def _folders(controller: str) -> Iterator[Path]:
 
     In a container the path of the group may be that of the host, so that only a parent exists.
     """
-    try:
-        lines = MEMBERSHIP.read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return
-    for line in lines:
+    for line in _lines(MEMBERSHIP):
         _, controllers, path = line.split(":", 2)
         names = controllers.split(",")
         if controllers and controller not in names:
@@ -46,7 +45,7 @@ def _folders(controller: str) -> Iterator[Path]:
 def _quota_cpus(folder: Path) -> float:
     """Return the number of CPUs that a group's quota allows; inf without one."""
     if (folder / "cpu.max").exists():
-        quota, period = _words(folder / "cpu.max")
+        quota, period = _lines(folder / "cpu.max")[0].split()
         return math.inf if quota == "max" else int(quota) / int(period)
     quota_us, period_us = _number(folder / "cpu.cfs_quota_us"), _number(folder / "cpu.cfs_period_us")
     return quota_us / period_us if 0 < quota_us < math.inf and 0 < period_us < math.inf else math.inf
@@ -54,12 +53,12 @@ def _quota_cpus(folder: Path) -> float:
 
 def _number(file: Path) -> float:
     """Return the number in a file; inf if there is no file or no number, for instance `max`."""
-    words = _words(file)
-    return float(words[0]) if words and words[0].lstrip("-").isdigit() else math.inf
+    number = "".join(_lines(file)).strip()
+    return float(number) if number.lstrip("-").isdigit() else math.inf
 
 
-def _words(file: Path) -> list[str]:
+def _lines(file: Path) -> list[str]:
     try:
-        return file.read_text(encoding="utf-8").split()
-    except OSError:
+        return read_text(file).splitlines()
+    except InputError:
         return []
