@@ -157,6 +157,7 @@ GATE = (
 ALLOWED_TO_READ = {
     ("cosfly.runtime.ray_engine", "loads"),  # what a worker says, as `multiprocessing` reads it from a pipe
     ("cosfly.runtime.events", "read_bytes"),  # /proc, whose files have no size
+    ("cosfly.runtime.limits", "read_text"),  # the same, and control groups
     ("cosfly.runtime.png", "decompress"),  # of a picture, up to the size that its header gives
     ("cosfly.llm.protocol", "loads"),  # the reply, of a bounded size
     ("distill.student.random_student", "loads"),  # what the tokenizer's own library gives

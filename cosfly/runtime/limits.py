@@ -7,9 +7,6 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import read_text
-
 CGROUPS = Path("/sys/fs/cgroup")
 MEMBERSHIP = Path("/proc/self/cgroup")
 
@@ -58,7 +55,8 @@ def _number(file: Path) -> float:
 
 
 def _lines(file: Path) -> list[str]:
+    """Return the lines of a file of the kernel, whose reported size is 0; none if there is no such file."""
     try:
-        return read_text(file).splitlines()
-    except InputError:
+        return file.read_text(encoding="utf-8").splitlines()
+    except OSError:
         return []
