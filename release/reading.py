@@ -5,7 +5,7 @@ Memory holds a row group and the points of one shard, however large the release 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from itertools import chain, groupby
 from operator import itemgetter
 from pathlib import Path
@@ -31,16 +31,19 @@ def bounded(value: float) -> float:
     return value
 
 
-def row_lists(shard: Path, columns: Sequence[str], *, strict: bool = True) -> Iterator[list[dict[str, Any]]]:
+def row_lists(
+    shard: Path, columns: Sequence[str], *, strict: bool = True, wanted: Collection[int] | None = None
+) -> Iterator[list[dict[str, Any]]]:
     """Yield the rows of a parquet file of a release, a row group at a time.
 
     Args:
-        strict: Raise InputError if a column is not that of a release, or a value that must be there is null.
+        strict: Raise InputError if a column is not that of a release, a value that must be there is null, or a number
+            is not finite. wanted: Numbers of the row groups; None: all.
     """
-    for group in row_groups(shard, list(columns), tree=shard.parents[1]):
+    for group in row_groups(shard, list(columns), tree=shard.parents[1], wanted=wanted):
         if strict:
             check_columns(group, columns, shard)
-            _check_nulls(group, shard)
+            _check_values(group, shard)
         with arrow_errors(shard):  # text that is no UTF-8 shows here
             rows = group.to_pylist()
         del group
@@ -48,7 +51,7 @@ def row_lists(shard: Path, columns: Sequence[str], *, strict: bool = True) -> It
         del rows
 
 
-def _check_nulls(group: pa.Table, shard: Path) -> None:
+def _check_values(group: pa.Table, shard: Path) -> None:
     for member in group.schema:
         column = group.column(member.name)
         wanted = 0 if member.name in REQUIRED else column.null_count
@@ -57,7 +60,10 @@ def _check_nulls(group: pa.Table, shard: Path) -> None:
         is_plain = all(pa.types.is_floating(part.type) for part in parts)  # words may be missing
         if any(part.null_count > wanted for part in (column, *(parts if is_plain else ()))):
             where, expected = f"{shard}: {member.name}", "a value in every row"
-            raise InputError("the column has no value in a row", where=where, got="null", expected=expected)
+            raise InputError("a required value is missing in a row", where=where, got="null", expected=expected)
+        for part in parts or [column]:
+            if pa.types.is_floating(part.type) and pc.all(pc.is_finite(part)).as_py() is False:
+                raise InputError("a number is not finite", where=f"{shard}: {member.name}")
 
 
 def check_rows(shard: Path, rows: int) -> None:

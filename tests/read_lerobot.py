@@ -5,6 +5,7 @@ import json
 import os
 import sys
 import types
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ["HF_HUB_OFFLINE"] = "1"
@@ -19,6 +20,7 @@ if torch.version.cuda is None:
     for name in ("nms", "qnms"):
         library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 
+import torchvision
 from lerobot.datasets import lerobot_dataset, utils
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils import import_utils
@@ -40,16 +42,22 @@ def look(item: dict) -> dict:
     return seen
 
 
-def decode_by_pyav(path: Path, times_s: list[float], tolerance_s: float, *_) -> torch.Tensor:
-    """Return the frames nearest to some times; replaces torchcodec, which needs FFmpeg on the system."""
-    with av.open(str(path)) as file:
-        frames = [(frame.time, torch.from_numpy(frame.to_ndarray(format="rgb24"))) for frame in file.decode(video=0)]
-    nearest = [min(frames, key=lambda frame: abs(frame[0] - time_s)) for time_s in times_s]
-    assert all(abs(found - time_s) < tolerance_s for (found, _), time_s in zip(nearest, times_s, strict=True))
-    return torch.stack([picture for _, picture in nearest]).permute(0, 3, 1, 2) / 255
+class VideoReader:
+    """The reader that LeRobot's backend `pyav` asks torchvision for; torchvision 0.24 and later have none."""
+
+    def __init__(self, path: str, stream: str) -> None:
+        self.container = av.open(path)
+
+    def seek(self, time_s: float, keyframes_only: bool) -> None:
+        self.container.seek(int(time_s * av.time_base), any_frame=not keyframes_only)
+
+    def __iter__(self) -> Iterator[dict]:
+        for frame in self.container.decode(video=0):
+            yield {"pts": frame.time, "data": torch.from_numpy(frame.to_ndarray(format="rgb24")).permute(2, 0, 1)}
 
 
-lerobot_dataset.decode_video_frames = decode_by_pyav
+torchvision.set_video_backend = lambda name: None
+torchvision.io.VideoReader = VideoReader
 
 
 def act_loss(root: str) -> float:
@@ -72,7 +80,7 @@ def act_loss(root: str) -> float:
         dim_feedforward=32, n_encoder_layers=1, pretrained_backbone_weights=None, device="cpu",
     )  # fmt: skip
     steps = {"action": [k / meta.fps for k in range(4)]}
-    data = LeRobotDataset("cosfly/flights", root=root, delta_timestamps=steps)
+    data = LeRobotDataset("cosfly/flights", root=root, delta_timestamps=steps, video_backend="pyav")
     loss, _ = ACTPolicy(cfg).forward(next(iter(torch.utils.data.DataLoader(data, batch_size=2))))
     return loss.item()
 

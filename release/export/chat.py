@@ -17,22 +17,13 @@ from typing import Any
 
 from cosfly.formats.captions import FIELDS, Language, Prompt
 from cosfly.runtime.errors import NothingKept
-from cosfly.runtime.io import atomic_file
+from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.worker import advance
 from cosfly.viz.frame_views import Pictures, frame_label
 from release.columns import LANGUAGES, PICTURE_PX, PICTURES, SPLIT_NAMES, WINDOW
-from release.export.source import ExportSource, Row, picture
-from release.export.stage import (
-    ExportConfig,
-    ExportUnit,
-    Files,
-    FormatFacts,
-    UnitFiles,
-    join_parts,
-    scratch_of,
-    track_units,
-)
+from release.export.source import ExportSource, Row, SourceTrack
+from release.export.stage import Done, ExportConfig, ExportUnit, FormatFacts, track_units, write_joined
 
 IMAGE = "<image>"  # where ShareGPT has a picture; loaders count these marks
 MARKS = (IMAGE, "<video>", "<audio>")
@@ -53,39 +44,40 @@ def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
     return track_units(source)
 
 
-def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> UnitFiles:
-    """Write the pictures of one track that its samples show, and its samples as lines of a part."""
-    (piece,), files, skipped = unit.pieces, Files(folder), Counter[str]()
-    place = "/".join(filter(None, ("images", *unit.name.split("/"))))
-    known, shown, num_samples = set(piece.track.frame_index.tolist()), set[int](), 0
-    with atomic_file(_part(folder, unit)) as part:
-        for row in piece.track.rows(COLUMNS):
-            for sample in _samples(row, known, place, cfg, skipped):
-                part.write((json.dumps(sample, ensure_ascii=False) + "\n").encode())
-                shown |= {int(Path(name).stem.rpartition("_")[2]) for name in sample["images"]}
-                num_samples += 1
-    for row in piece.track.rows(["sample_id", "frame_index", PICTURES["rgb"].name]) if shown else ():
-        if row["frame_index"] in shown:
-            files.put(f"{place}/frame_{row['frame_index']:05d}.png", picture(row, "rgb"))
+def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> dict[str, Any]:
+    """Write the pictures that the samples of one track show; return the counts of samples and of what is skipped."""
+    track, skipped = unit.track, Counter[str]()
+    samples = list(_samples(track, cfg, skipped))
+    names = {name for sample in samples for name in sample["images"]}
+    for row in track.rows(["sample_id", "frame_index", PICTURES["rgb"].name]) if names else ():
+        name = _picture_name(track, row["frame_index"])
+        if name in names:
+            write_bytes(folder / name, track.picture(row, "rgb"))
         advance()
-    return files.written(samples=num_samples, skipped=skipped)
+    return {"samples": len(samples), "skipped": skipped}
 
 
-def _part(folder: Path, unit: ExportUnit) -> Path:
-    return scratch_of(folder) / f"{unit.name.replace('/', '_')}.jsonl"
+def _picture_name(track: SourceTrack, index: int) -> str:
+    return "/".join(filter(None, ("images", *track.name.split("/"), f"frame_{index:05d}.png")))
 
 
-def _samples(
-    row: Row, known: set[int], place: str, cfg: ExportConfig, skipped: Counter[str]
+def _samples(track: SourceTrack, cfg: ExportConfig, skipped: Counter[str]) -> Iterator[dict[str, Any]]:
+    """Yield the samples of a track; count by reason what cannot be one."""
+    known = set(track.frame_index)
+    for row in track.rows(COLUMNS):
+        if row["has_caption"]:
+            yield from _samples_of(row, track, known, cfg, skipped)
+
+
+def _samples_of(
+    row: Row, track: SourceTrack, known: set[int], cfg: ExportConfig, skipped: Counter[str]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the samples of a row, one per language; count by reason what cannot be one."""
-    if not row["has_caption"]:
-        return
+    """Yield the samples of a caption, one per language."""
     window = row[WINDOW][-1:] if cfg.frames == "last" else row[WINDOW]
     if not set(window) <= known:
         skipped["frames of the window are not in the source"] += 1
         return
-    images = [f"{place}/frame_{index:05d}.png" for index in window]
+    images = [_picture_name(track, index) for index in window]
     for language in cfg.languages:
         answer = {name: row[f"caption_{language}_{name}"] for name in FIELDS}
         system, user = row[f"system_{language}"], row[f"prompt_{language}"]
@@ -126,29 +118,24 @@ def _sharegpt(prompt: Prompt, labels: Sequence[str], reply: str) -> dict[str, An
     return {"conversations": turns, "system": prompt.system}
 
 
-def finish(
-    source: ExportSource, units: Sequence[ExportUnit], written: Sequence[UnitFiles], folder: Path, cfg: ExportConfig
-) -> FormatFacts:
-    """Join the parts to one file a split."""
-    skipped = sum((Counter(one.facts["skipped"]) for one in written), Counter[str]())
+def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) -> FormatFacts:
+    """Write the samples, one file a split."""
+    skipped = sum((Counter(facts["skipped"]) for _, facts in done), Counter[str]())
     reasons = ", ".join(f"{reason}: {count}" for reason, count in sorted(skipped.items()))
-    if not (total := sum(one.facts["samples"] for one in written)):
+    if not (total := sum(facts["samples"] for _, facts in done)):
         got = f"no caption; {reasons}" if reasons else "no caption"
-        raise NothingKept(
-            "the source has no caption to export", where=source.folder, got=got, expected="accepted captions"
-        )
+        what, expected = "the source has no caption to export", "accepted captions"
+        raise NothingKept(what, where=source.folder, got=got, expected=expected)
+    begin, between, end = (b"", b"\n", b"\n") if cfg.format == "chat" else (b"[\n", b",\n", b"\n]\n")
     names = {}
     for split in SPLIT_NAMES:
-        own = [unit for unit, one in zip(units, written, strict=True) if unit.split == split and one.facts["samples"]]
-        if own and cfg.format == "chat":
-            names[split] = f"{split}.jsonl"
-            join_parts([_part(folder, unit) for unit in own], folder / names[split])
-        elif own:
-            names[split] = f"{split}.json"
-            join_parts([_part(folder, unit) for unit in own], folder / names[split], b"[\n", b",\n", b"\n]\n")
-    files = Files(folder)
-    for name in names.values():
-        files.note(name)
+        if tracks := [unit.track for unit, facts in done if unit.split == split and facts["samples"]]:
+            names[split] = f"{split}.jsonl" if cfg.format == "chat" else f"{split}.json"
+            samples = (sample for track in tracks for sample in _samples(track, cfg, Counter()))
+            with atomic_file(folder / names[split]) as file:
+                file.write(begin)
+                write_joined(file, (json.dumps(sample, ensure_ascii=False).encode() for sample in samples), between)
+                file.write(end)
     first = next(iter(names.values()))
     run_here = "Names of pictures are relative to this folder: start the training in it."
     opened = f'from datasets import load_dataset\nsamples = load_dataset("json", data_files="{first}", split="train")'
@@ -158,12 +145,12 @@ def finish(
             f"cosfly_{split}": {"file_name": name, "formatting": "sharegpt", "columns": columns}
             for split, name in names.items()
         }
-        files.put(DATASET_INFO, (dump_json(about, indent=1) + "\n").encode())
+        write_bytes(folder / DATASET_INFO, (dump_json(about, indent=1) + "\n").encode())
         run_here = "dataset_dir and media_dir of LLaMA-Factory are this folder, which has the dataset_info.json."
         opened = "# llamafactory-cli train --dataset_dir . --media_dir . --dataset cosfly_train ..."
     return FormatFacts(
         version="messages and images" if cfg.format == "chat" else "ShareGPT",
         codings={"images": "PNG, the released bytes", "answer": "JSON text of the three fields of a caption"},
         notes=[f"{total} samples, one per window and language. Skipped: {reasons or 'none'}.", run_here],
-        how_to_open=opened, files=files.digests,
-    )  # fmt: skip
+        how_to_open=opened,
+    )

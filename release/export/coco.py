@@ -8,7 +8,7 @@ them. The target and the other people are two categories of the supercategory pe
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,21 +18,20 @@ import numpy as np
 from cosfly.formats.frames import PERSON_ID
 from cosfly.formats.kinds import KINDS
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import atomic_file
+from cosfly.runtime.io import atomic_file, read_lines, write_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.png import colours_of
 from cosfly.runtime.worker import advance
 from release.columns import BOX, PICTURES, SPLIT_NAMES
-from release.export.source import PART, ExportSource, Row, picture
+from release.export.source import PART, ExportSource, Row
 from release.export.stage import (
+    Done,
     ExportConfig,
     ExportUnit,
-    Files,
     FormatFacts,
-    UnitFiles,
-    join_parts,
     scratch_of,
     track_units,
+    write_joined,
 )
 
 TARGET, OTHER = 1, 2
@@ -42,15 +41,9 @@ CATEGORIES = [
 ]
 IDS = 1 << 16  # of instances in a picture; the id of an annotation is that of its picture times this, plus its instance
 COLUMNS = [
-    "sample_id",
-    "frame_index",
-    "width_px",
-    "height_px",
-    "target_bbox",
-    "target_mask_bbox",
-    "perturbation",
-    "visibility",
-]
+    "sample_id", "frame_index", "width_px", "height_px", "target_bbox", "target_mask_bbox", "perturbation",
+    "visibility", PICTURES["rgb"].name, PICTURES["instance"].name,
+]  # fmt: skip
 
 
 def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
@@ -62,35 +55,35 @@ def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
     return units
 
 
-def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> UnitFiles:
-    """Write the pictures of one track, and its images and annotations as lines of two parts."""
-    (piece,), files, num_people = unit.pieces, Files(folder), 0
-    columns = [*COLUMNS, PICTURES["rgb"].name, PICTURES["instance"].name]
-    with atomic_file(_part(folder, unit, "images")) as images, atomic_file(_part(folder, unit, "people")) as people:
-        for image_id, row in enumerate(piece.track.rows(columns), unit.extra):
+def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> dict[str, Any]:
+    """Write the pictures of one track, and its images and annotations as lines of two files for `finish`."""
+    track, num_people = unit.track, 0
+    with atomic_file(_lines(folder, unit, "images")) as images, atomic_file(_lines(folder, unit, "people")) as people:
+        for image_id, row in enumerate(track.rows(COLUMNS), unit.extra):
             if not PART.fullmatch(row["sample_id"]):
                 raise InputError("the sample_id of a frame is not a file name", where=unit.name, got=row["sample_id"])
             name = f"{row['sample_id']}.png"
-            files.put(f"{unit.split}/{name}", picture(row, "rgb"))
+            write_bytes(folder / unit.split / name, track.picture(row, "rgb"))
             image = {
                 "id": image_id, "file_name": name, "width": row["width_px"], "height": row["height_px"],
                 "track": unit.name, "frame_index": row["frame_index"],
             }  # fmt: skip
             images.write((dump_json(image) + "\n").encode())
-            for annotation in people_in(row, image_id):
+            instances = colours_of(track.picture(row, "instance"), row["sample_id"])
+            for annotation in people_in(row, instances, image_id):
                 people.write((dump_json(annotation) + "\n").encode())
                 num_people += 1
             advance()
-    return files.written(annotations=num_people)
+    return {"people": num_people}
 
 
-def _part(folder: Path, unit: ExportUnit, kind: str) -> Path:
-    return scratch_of(folder) / f"{unit.name.replace('/', '_')}.{kind}.jsonl"
+def _lines(folder: Path, unit: ExportUnit, kind: str) -> Path:
+    return scratch_of(folder) / f"{unit.file_name}.{kind}.jsonl"
 
 
-def people_in(row: Row, image_id: int) -> Iterator[dict[str, Any]]:
-    """Yield the annotation of each person with a pixel in the instance picture of a row."""
-    red, green, blue = np.moveaxis(colours_of(picture(row, "instance"), row["sample_id"]), 2, 0)
+def people_in(row: Row, instances: np.ndarray, image_id: int) -> Iterator[dict[str, Any]]:
+    """Yield the annotation of each person with a pixel in the instance picture of a row, (h, w, 3) uint8."""
+    red, green, blue = np.moveaxis(instances, 2, 0)
     is_person, ids = red == KINDS["Pedestrians"], green | blue.astype(np.uint16) << 8
     people = np.unique(ids[is_person]).tolist()
     target = PERSON_ID if PERSON_ID in people else _most_in_box(np.where(is_person, ids.astype(np.int64), -1), row)
@@ -126,25 +119,23 @@ def run_lengths(mask: np.ndarray) -> list[int]:
     return np.diff(starts).tolist()
 
 
-def finish(
-    source: ExportSource, units: Sequence[ExportUnit], written: Sequence[UnitFiles], folder: Path, cfg: ExportConfig
-) -> FormatFacts:
-    """Join the parts to one file a split."""
-    files = Files(folder)
-    about = {"description": source.name, "contributor": source.credits, "version": source.digest}
-    licence = [{"id": 1, "name": source.licence, "url": ""}]
-    used = [split for split in SPLIT_NAMES if any(unit.split == split for unit in units)]
+def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) -> FormatFacts:
+    """Write the annotations, one file a split."""
+    about = {
+        "info": {"description": source.name, "contributor": source.credits, "version": source.digest},
+        "licenses": [{"id": 1, "name": source.licence, "url": ""}], "categories": CATEGORIES,
+    }  # fmt: skip
+    used = [split for split in SPLIT_NAMES if any(unit.split == split for unit, _ in done)]
     for split in used:
-        own = [unit for unit in units if unit.split == split]
-        head = dump_json({"info": about, "licenses": licence, "categories": CATEGORIES})[:-1]
-        images = scratch_of(folder) / f"{split}.images.json"
-        join_parts([_part(folder, u, "images") for u in own], images, f'{head},"images":['.encode(), b",\n", b"],\n")
-        people = scratch_of(folder) / f"{split}.people.json"
-        join_parts([_part(folder, u, "people") for u in own], people, b'"annotations":[', b",\n", b"]}\n")
-        name = f"annotations/instances_{split}.json"
-        join_parts([images, people], folder / name)
-        files.note(name)
-    counts = sum(one.facts["annotations"] for one in written)
+        own = [unit for unit, _ in done if unit.split == split]
+        with atomic_file(folder / f"annotations/instances_{split}.json") as file:
+            file.write(dump_json(about)[:-1].encode())
+            for kind, key, end in (("images", b',"images":[', b"],\n"), ("people", b'"annotations":[', b"]}\n")):
+                lines = (line.rstrip() for unit in own for line in read_lines(_lines(folder, unit, kind)))
+                file.write(key)
+                write_joined(file, lines, b",\n")
+                file.write(end)
+    num_people, num_frames = sum(facts["people"] for _, facts in done), sum(unit.frames for unit, _ in done)
     return FormatFacts(
         version="instances",
         codings={
@@ -152,9 +143,8 @@ def finish(
             "masks": "run lengths of the pixels in instance.png; boxes enclose these pixels",
         },
         notes=[
-            f"{counts:,} people in {sum(unit.frames for unit in units):,} pictures. file_name is relative to the "
-            "folder of the split; instance_id is the same person through a track.",
+            f"{num_people:,} people in {num_frames:,} pictures. file_name is relative to the folder of the split; "
+            "instance_id is the same person through a track.",
         ],
         how_to_open=f'from pycocotools.coco import COCO\ncoco = COCO("annotations/instances_{used[0]}.json")',
-        files=files.digests,
     )

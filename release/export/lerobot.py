@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,13 +28,13 @@ from cosfly.geometry.axes import step_s
 from cosfly.geometry.motion import ACTION, PlannedMotion
 from cosfly.runtime.arrays import parse_array
 from cosfly.runtime.errors import EnvironmentMissing, InputError
-from cosfly.runtime.io import atomic_file
+from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.png import colours_of
 from cosfly.runtime.worker import advance
 from release.columns import BOX, CAPTION_FIELDS, PICTURES, POINT, POSE, SPLIT_NAMES
-from release.export.source import ExportSource, Row, picture
-from release.export.stage import ExportConfig, ExportUnit, Files, FormatFacts, Piece, UnitFiles, shards
+from release.export.source import ExportSource, Row
+from release.export.stage import Done, ExportConfig, ExportUnit, FormatFacts, Piece, shards
 from release.flight_rows import vectors
 
 VERSION = "v3.0"
@@ -217,7 +217,7 @@ def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
     tasks = tuple(dict.fromkeys(task_of(t.goal, one) for t in source.tracks for one in decisions if one in t.decisions))
     units = list[ExportUnit]()
     episode = index = 0
-    for number, unit in enumerate(shards(source, pieces, cfg.shard_mb)):
+    for number, unit in enumerate(shards(pieces, cfg.shard_mb)):
         units.append(replace(unit, extra=Layout(number, episode, index, fps, size_px, tasks)))
         episode, index = episode + len(unit.pieces), index + unit.frames
     return units
@@ -229,8 +229,8 @@ def _fps(pieces: list[Piece]) -> int:
     for piece in pieces:
         if piece.frames < 2:
             continue
-        steps = np.diff(piece.track.time_s[piece.start : piece.stop])
-        dt_s = step_s(piece.track.time_s[piece.start : piece.stop])
+        time_s = np.array(piece.track.time_s[piece.start : piece.stop])
+        steps, dt_s = np.diff(time_s), step_s(time_s)
         fps = round(1 / dt_s)
         found.add(fps)
         if np.abs(steps - dt_s).max() > STEP_TOLERANCE_S or abs(1 / (fps or 1) - dt_s) > STEP_TOLERANCE_S:
@@ -242,36 +242,47 @@ def _fps(pieces: list[Piece]) -> int:
     return found.pop() if found else PAPER_FPS
 
 
-def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> UnitFiles:
-    """Write the data file of a unit, its videos, and its part of the table of episodes."""
+def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> dict[str, Any]:
+    """Write the data file of a unit, its videos, and its part of the table of episodes; return its statistics."""
     layout: Layout = unit.extra
     features = features_of(source.modalities, layout.size_px, layout.fps, cfg.video)
-    files, about, schema = Files(folder), list[dict[str, Any]](), schema_of(features)
-    videos = [name for name, one in features.items() if one["dtype"] == "video"]
-    name = DATA_PATH.format(**layout.place)
+    schema = schema_of(features)
+    cameras = [name for name, one in features.items() if one["dtype"] == "video"]
     texts = [field.name for field in schema if pa.types.is_string(field.type)]
-    first = layout.index
-    with (
-        atomic_file(folder / name) as file,
-        pq.ParquetWriter(
-            file, schema, compression="zstd", use_dictionary=texts, write_statistics=["episode_index"]
-        ) as table,
-        Videos(folder, layout, videos) as video,
-    ):
+    options: dict[str, Any] = {"compression": "zstd", "use_dictionary": texts, "write_statistics": ["episode_index"]}
+    episodes, first = list[dict[str, Any]](), layout.index
+    with contextlib.ExitStack() as stack:
+        file = stack.enter_context(atomic_file(folder / DATA_PATH.format(**layout.place)))
+        table = stack.enter_context(pq.ParquetWriter(file, schema, **options))
+        paths = {name: folder / VIDEO_PATH.format(video_key=name, **layout.place) for name in cameras}
+        videos = {name: stack.enter_context(video_writer(path, layout)) for name, path in paths.items()}
         for number, piece in enumerate(unit.pieces, layout.episode):
-            about.append(_write_episode(source, piece, number, first, layout, features, table, video))
+            episodes.append(_write_episode(source, piece, number, first, layout, features, table, videos))
             first += piece.frames
-    for one in (name, *video.names):
-        files.note(one)
     buffer = io.BytesIO()
-    pq.write_table(pa.Table.from_pylist([_episode_row(row, layout, videos) for row in about]), buffer)
-    files.put(EPISODES_PATH.format(**layout.place), buffer.getvalue())
-    return files.written(stats=_merge_all([row["stats"] for row in about]), episodes=len(about))
+    pq.write_table(pa.Table.from_pylist([_episode_row(row, layout, cameras) for row in episodes]), buffer)
+    write_bytes(folder / EPISODES_PATH.format(**layout.place), buffer.getvalue())
+    return {"stats": _merge_all([row["stats"] for row in episodes])}
+
+
+@contextlib.contextmanager
+def video_writer(path: Path, layout: Layout) -> Iterator[Callable[[np.ndarray], None]]:
+    """Open the video of a camera; yield the function that adds a picture, (h, w, 3) uint8 RGB."""
+    try:
+        import av
+    except ImportError:
+        raise EnvironmentMissing("--video needs PyAV", fix="pip install av, or export without --video") from None
+    with atomic_file(path) as file, av.open(file, "w", format="mp4") as container:
+        stream = container.add_stream(CODEC, layout.fps, options=CODEC_OPTIONS)
+        stream.width, stream.height = layout.size_px
+        stream.pix_fmt = "yuv420p"
+        yield lambda picture: container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
 
 
 def _write_episode(
     source: ExportSource, piece: Piece, number: int, first: int, layout: Layout, features: dict[str, Any],
-    table: pq.ParquetWriter, video: Videos,
+    table: pq.ParquetWriter, videos: dict[str, Callable[[np.ndarray], None]],
 ) -> dict[str, Any]:  # fmt: skip
     """Write the rows of an episode; return what the table of episodes has of it."""
     track, n, schema = piece.track, piece.frames, table.schema
@@ -280,20 +291,20 @@ def _write_episode(
     values = values_of(scalars, number, first, layout.fps, [layout.tasks.index(task) for task in tasks])
     pixels: dict[str, list[np.ndarray]] = {CAMERAS[file]: [] for file in source.modalities}
     sampled = {int(i) for i in np.linspace(0, n - 1, min(n, SAMPLED_FRAMES)).round()}
-    rows = enumerate(track.rows(["sample_id", *(PICTURES[f].name for f in source.modalities)], piece.start, piece.stop))
-    while batch := list(itertools.islice(rows, ROWS_HELD)):
+    rows = track.rows(["sample_id", *(PICTURES[f].name for f in source.modalities)], piece.start, piece.stop)
+    for start in range(0, n, ROWS_HELD):
         images: dict[str, list[Any]] = {name: [] for name in pixels}
-        for i, row in batch:
+        for i, row in enumerate(itertools.islice(rows, ROWS_HELD), start):
             for file in source.modalities:
-                name = CAMERAS[file]
-                if features[name]["dtype"] == "video":
-                    video.add(name, colours_of(picture(row, file), row["sample_id"]))
+                name, data = CAMERAS[file], track.picture(row, file)
+                if name in videos:
+                    videos[name](colours_of(data, row["sample_id"]))
                 else:
-                    images[name].append(_image(row, file))
+                    images[name].append(_image(data, row["sample_id"], file))
                 if i in sampled:
-                    pixels[name].append(_pixels(row, file))
+                    pixels[name].append(_pixels(data, row["sample_id"], file))
             advance()
-        part = slice(batch[0][0], batch[-1][0] + 1)
+        part = slice(start, start + ROWS_HELD)
         columns = [images.get(field.name) or _column(values[field.name][part], field.type) for field in schema]
         table.write_table(pa.table([pa.array(c, f.type) for c, f in zip(columns, schema, strict=True)], schema=schema))
     stats = {name: summarize(np.concatenate(found), len(found), is_picture=True) for name, found in pixels.items()}
@@ -302,7 +313,7 @@ def _write_episode(
             stats[name] = summarize(np.asarray(values[name], dtype=np.float64).reshape(n, -1), n)
     return {
         "episode_index": number, "tasks": list(dict.fromkeys(tasks)), "length": n, "track": track.name,
-        "split": track.split, "first_frame": int(track.frame_index[piece.start]), "dataset_from_index": first,
+        "split": track.split, "first_frame": track.frame_index[piece.start], "dataset_from_index": first,
         "dataset_to_index": first + n, "stats": stats,
     }  # fmt: skip
 
@@ -313,31 +324,31 @@ def _column(values: Any, kind: pa.DataType) -> Any:
     return pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(values).reshape(-1)), kind.list_size)
 
 
-def _image(row: Row, file: FrameFile) -> dict[str, Any]:
+def _image(data: bytes, name: str, file: FrameFile) -> dict[str, Any]:
+    """Return a cell of a picture: the released PNG, or depth as TIFF."""
     if file != "depth":
-        return {"bytes": picture(row, file), "path": f"{row['sample_id']}.{file}.png"}
+        return {"bytes": data, "path": f"{name}.{file}.png"}
     from PIL import Image
 
     buffer = io.BytesIO()
-    depth = parse_array(picture(row, file), row["sample_id"], dtype=np.float32, ndim=2, what="depth image")
-    Image.fromarray(depth).save(buffer, "TIFF")
-    return {"bytes": buffer.getvalue(), "path": f"{row['sample_id']}.depth.tiff"}
+    Image.fromarray(parse_array(data, name, dtype=np.float32, ndim=2)).save(buffer, "TIFF")
+    return {"bytes": buffer.getvalue(), "path": f"{name}.depth.tiff"}
 
 
-def _pixels(row: Row, file: FrameFile) -> np.ndarray:
+def _pixels(data: bytes, name: str, file: FrameFile) -> np.ndarray:
     """Return a part of the pixels, (k, channels) float64: colours from 0 to 1, depth in metres."""
     if file == "depth":
-        depth = parse_array(picture(row, file), row["sample_id"], dtype=np.float32, ndim=2)
+        depth = parse_array(data, name, dtype=np.float32, ndim=2)
         return depth[::PIXEL_STEP, ::PIXEL_STEP].reshape(-1, 1).astype(np.float64)
-    return colours_of(picture(row, file), row["sample_id"])[::PIXEL_STEP, ::PIXEL_STEP].reshape(-1, 3) / 255.0
+    return colours_of(data, name)[::PIXEL_STEP, ::PIXEL_STEP].reshape(-1, 3) / 255.0
 
 
-def _episode_row(row: dict[str, Any], layout: Layout, videos: list[str]) -> dict[str, Any]:
+def _episode_row(row: dict[str, Any], layout: Layout, cameras: list[str]) -> dict[str, Any]:
     begin_s = (row["dataset_from_index"] - layout.index) / layout.fps
     found = {name: value for name, value in row.items() if name != "stats"}
-    for folder in ("data", "meta/episodes", *(f"videos/{name}" for name in videos)):
+    for folder in ("data", "meta/episodes", *(f"videos/{name}" for name in cameras)):
         found |= {f"{folder}/{name}": value for name, value in layout.place.items()}
-    for name in videos:
+    for name in cameras:
         end_s = begin_s + row["length"] / layout.fps
         found |= {f"videos/{name}/from_timestamp": begin_s, f"videos/{name}/to_timestamp": end_s}
     return found | {
@@ -345,70 +356,31 @@ def _episode_row(row: dict[str, Any], layout: Layout, videos: list[str]) -> dict
     }
 
 
-class Videos:
-    """The videos of a unit, one per camera, all episodes in a row."""
-
-    def __init__(self, folder: Path, layout: Layout, cameras: list[str]) -> None:
-        self._stack = contextlib.ExitStack()
-        self._folder, self._layout = folder, layout
-        self.names = [VIDEO_PATH.format(video_key=name, **layout.place) for name in cameras]
-        self._streams = {name: self._open(path) for name, path in zip(cameras, self.names, strict=True)}
-
-    def _open(self, name: str) -> tuple[Any, Any]:
-        try:
-            import av
-        except ImportError:
-            raise EnvironmentMissing("--video needs PyAV", fix="pip install av, or export without --video") from None
-        file = self._stack.enter_context(atomic_file(self._folder / name))
-        container = self._stack.enter_context(av.open(file, "w", format="mp4"))
-        stream = container.add_stream(CODEC, self._layout.fps, options=CODEC_OPTIONS)
-        stream.width, stream.height = self._layout.size_px
-        stream.pix_fmt = "yuv420p"
-        return container, stream
-
-    def __enter__(self) -> Videos:
-        return self
-
-    def add(self, camera: str, picture: np.ndarray) -> None:
-        """Add a picture, (h, w, 3) uint8 RGB."""
-        import av
-
-        container, stream = self._streams[camera]
-        container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-
-    def __exit__(self, *error: Any) -> None:
-        if error[0] is None:
-            for container, stream in self._streams.values():
-                container.mux(stream.encode())
-        self._stack.__exit__(*error)
-
-
-def finish(
-    source: ExportSource, units: Sequence[ExportUnit], written: Sequence[UnitFiles], folder: Path, cfg: ExportConfig
-) -> FormatFacts:
+def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) -> FormatFacts:
     """Write `meta/`."""
-    layout: Layout = units[0].extra
-    files, splits, total = Files(folder), dict[str, str](), 0
+    layout: Layout = done[0][0].extra
+    splits, total = dict[str, str](), 0
     for split in SPLIT_NAMES:
-        here = sum(len(unit.pieces) for unit in units if unit.split == split)
+        here = sum(len(unit.pieces) for unit, _ in done if unit.split == split)
         if here:
             splits[split] = f"{total}:{total + here}"
         total += here
     info = {
         "codebase_version": VERSION, "robot_type": "cosfly_drone", "total_episodes": total,
-        "total_frames": sum(unit.frames for unit in units), "total_tasks": len(layout.tasks), "chunks_size": CHUNK,
+        "total_frames": sum(unit.frames for unit, _ in done), "total_tasks": len(layout.tasks), "chunks_size": CHUNK,
         "fps": layout.fps, "splits": splits, "data_path": DATA_PATH, "video_path": VIDEO_PATH if cfg.video else None,
         "features": features_of(source.modalities, layout.size_px, layout.fps, cfg.video),
         "data_files_size_in_mb": cfg.shard_mb, "video_files_size_in_mb": cfg.shard_mb,
     }  # fmt: skip
-    files.put("meta/stats.json", dump_json(_merge_all([one.facts["stats"] for one in written]), indent=4).encode())
+    stats = _merge_all([facts["stats"] for _, facts in done])
+    for name, content in (("stats", stats), ("info", info)):
+        write_bytes(folder / f"meta/{name}.json", dump_json(content, indent=4).encode())
     import pandas as pd
 
     buffer = io.BytesIO()  # lerobot reads the text as the index of a data frame
     tasks = pd.DataFrame({"task_index": range(len(layout.tasks))}, index=pd.Index(layout.tasks, name="task"))
     tasks.to_parquet(buffer)
-    files.put("meta/tasks.parquet", buffer.getvalue())
-    files.put("meta/info.json", dump_json(info, indent=4).encode())
+    write_bytes(folder / "meta/tasks.parquet", buffer.getvalue())
     picture_form = f"{CODEC} in mp4, with loss" if cfg.video else "PNG, the released bytes"
     codings: dict[str, str] = dict.fromkeys(source.modalities, picture_form)
     if "depth" in codings:
@@ -428,6 +400,5 @@ def finish(
         ],
         how_to_open="from lerobot.datasets.lerobot_dataset import LeRobotDataset\n"
         "frames = LeRobotDataset('cosfly/tracks', root='.')",
-        files=files.digests,
         split_files={"train": "data/*/*.parquet"},
     )

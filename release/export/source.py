@@ -9,15 +9,14 @@ from __future__ import annotations
 import itertools
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 
 import cosfly
 from cosfly.formats.boxes import UNKNOWN_LICENCE
@@ -25,76 +24,109 @@ from cosfly.formats.captions import Caption, caption_lines
 from cosfly.formats.frames import FILE_NAMES, FrameFile, as_depth_npy, frame_path, tree_of
 from cosfly.formats.inspection import read_settled
 from cosfly.formats.places import Place, flight_ids, folder_name, place_of, sample_id, town_folder
-from cosfly.formats.playback import Track, read_track
+from cosfly.formats.playback import read_track
 from cosfly.formats.town import read_town_map
 from cosfly.formats.tracks import find_tracks
+from cosfly.runtime.arrays import parse_array
 from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.io import inside, open_file, read_bytes, sha256_file
 from cosfly.runtime.png import png_size
 from cosfly.runtime.run_dir import fingerprint
-from cosfly.runtime.tables import arrow_errors, open_table, read_row_group, row_groups
 from release.columns import (
     CONTRACT,
     PICTURES,
     PLACE,
-    REQUIRED,
     SCALARS,
     SPLIT_NAMES,
     Column,
     Placement,
     SplitName,
     caption_values,
-    flight_spans,
-    schema,
 )
-from release.record import ReleasedMap, ReleaseRecord, read_record, release_folder
+from release.reading import check_rows, row_lists
+from release.record import ReleasedMap, read_record, release_folder
 
-# Names of columns below come from `release/columns.py`; those of shards from `release build`.
-SHARD_NAME = re.compile(r"data/(train|validation|test)-[0-9a-f]{12}-\d{5}-of-\d{5}\.parquet")
-LIGHT = [*PLACE, "frame_index", "time_s", "sample_id", "decision", "goal_en", "width_px", "height_px"]
+PLANNED = [*PLACE, "frame_index", "time_s", "decision", "goal_en", "width_px", "height_px"]  # what plans need of a row
 # What one part of a path may be that rows name: no separator, nothing hidden, no ".."
 PART = re.compile(r"\w[\w.-]{0,200}", re.ASCII)
 COLUMNS: dict[str, Column] = {column.name: column for column in SCALARS}
-BYTES_PER_PIXEL = 6  # of the three pictures of a frame, a typical value
 FILE_OF: dict[str, FrameFile] = {column.name: file for file, column in PICTURES.items()}
+BYTES_PER_PIXEL = 6  # of the three pictures of a frame, a typical value
 
 Row = dict[str, Any]
+Reader = Callable[[Sequence[str], Sequence[int]], Iterator[Row]]
 
 
 @dataclass
 class SourceTrack:
-    """One track, n frames.
+    """One track. It holds what plans need of its frames; `read` yields rows with the given columns, by number.
 
-    frame_index (n,) int32 and time_s (n,) float64 increase. decisions: Of the captions, "" for a frame without.
-    goal: In English, "" without one. num_bytes: Of its rows, unpacked. read: Yields the rows [start, stop) with the
-    given columns; pictures are among the columns.
+    decisions: Of the captions, "" for a frame without. goal: In English, "" without one.
     """
 
     place: Place
-    split: SplitName = "train"
-    frame_index: np.ndarray = field(default_factory=lambda: np.empty(0, np.int32))
-    time_s: np.ndarray = field(default_factory=lambda: np.empty(0))
+    split: SplitName
+    read: Reader
+    frame_index: list[int] = field(default_factory=list)
+    time_s: list[float] = field(default_factory=list)
     decisions: list[str] = field(default_factory=list)
     goal: str = ""
     size_px: tuple[int, int] = (0, 0)
-    num_bytes: int = 0
-    read: Callable[[Sequence[str], int, int], Iterator[Row]] = field(default=lambda columns, start, stop: iter(()))
 
     @property
     def name(self) -> str:
         return "/".join((self.place.run, self.place.town, self.place.trajectory, self.place.variant))
 
+    @property
+    def num_bytes(self) -> int:
+        """Approximate size of its pictures."""
+        return len(self) * self.size_px[0] * self.size_px[1] * BYTES_PER_PIXEL
+
     def __len__(self) -> int:
         return len(self.frame_index)
 
+    def add(self, rows: Iterable[Row]) -> None:
+        """Note the next frames, given their PLANNED columns."""
+        for row in rows:
+            size_px = (row["width_px"], row["height_px"])
+            if self.frame_index and size_px != self.size_px:
+                raise InputError("the pictures of the track differ in size", where=self.name)
+            if self.frame_index and (row["frame_index"] <= self.frame_index[-1] or row["time_s"] <= self.time_s[-1]):
+                raise InputError("the indices and times of the frames do not increase", where=self.name)
+            self.frame_index.append(row["frame_index"])
+            self.time_s.append(row["time_s"])
+            self.decisions.append(row["decision"] or "")
+            self.goal, self.size_px = row["goal_en"] or "", size_px
+
     def rows(self, columns: Sequence[str], start: int = 0, stop: int | None = None) -> Iterator[Row]:
-        """Yield rows [start, stop) in order, with the columns; one row group is in memory."""
-        return self.read(columns, start, len(self) if stop is None else stop)
+        """Yield rows [start, stop) in order, with the columns, which may be pictures; one row group is in memory."""
+        return self.read(columns, range(start, len(self) if stop is None else stop))
+
+    def pick(self, columns: Sequence[str], numbers: Sequence[int]) -> Iterator[Row]:
+        """Yield the rows with these numbers, which increase."""
+        return self.read(columns, numbers)
 
     def runs(self) -> list[tuple[int, int]]:
         """Return [start, stop) of the rows whose frames follow each other without a gap."""
         edges = [0, *(np.flatnonzero(np.diff(self.frame_index) != 1) + 1).tolist(), len(self)]
         return list(itertools.pairwise(edges))
+
+    def picture(self, row: Mapping[str, Any], file: FrameFile) -> bytes:
+        """Return the bytes of a picture of a row."""
+        value, where = row[PICTURES[file].name], f"{row['sample_id']}: {PICTURES[file].name}"
+        data = value if file == "depth" else value and value["bytes"]
+        if not data:
+            raise InputError("the frame has no picture", where=where, got="no data")
+        if file == "depth":
+            height, width = parse_array(data, where, dtype=np.float32, ndim=2, what="depth image").shape
+        elif (size := png_size(data)) is None:
+            raise InputError("the frame has no picture", where=where, got="data that are not a PNG")
+        else:
+            width, height = size
+        if (width, height) != self.size_px:
+            got, expected = f"{width} x {height} px", "{} x {} px".format(*self.size_px)
+            raise InputError("the picture has another size than its track", where=where, got=got, expected=expected)
+        return data
 
 
 @dataclass(frozen=True)
@@ -145,7 +177,7 @@ def open_source(folder: Path, *, consecutive: str = "") -> ExportSource:
 class Span(NamedTuple):
     """Rows [start, stop) of row group `group` of a shard, all of one track."""
 
-    shard: str
+    shard: Path
     group: int
     start: int
     stop: int
@@ -154,9 +186,10 @@ class Span(NamedTuple):
 def open_release(folder: Path) -> ExportSource:
     """Open the folder of a release and find the rows of its tracks, splits in their order; reads no picture."""
     record = read_record(folder / "release.json")
+    shards = sorted(record.shards, key=lambda shard: (SPLIT_NAMES.index(shard.split), shard.path))
     wrong = []
-    for shard in record.shards:
-        if not SHARD_NAME.fullmatch(shard.path):
+    for shard in shards:
+        if not re.fullmatch(rf"data/{shard.split}-[0-9a-f]{{12}}-\d{{5}}-of-\d{{5}}\.parquet", shard.path):
             wrong.append(f"{shard.path!r} is not the name of a shard")
         elif not (path := inside(folder, shard.path)).is_file():
             wrong.append(f"{shard.path} is missing")
@@ -167,110 +200,47 @@ def open_release(folder: Path) -> ExportSource:
             "the release is incomplete", where=folder, got="; ".join(wrong), fix="run cosfly release verify for details"
         )
     sha256_file(folder / "release.json", tree=folder)  # refuses a link
+    tracks: dict[Place, SourceTrack] = {}
+    spans: dict[Place, list[Span]] = defaultdict(list)
+    for shard in shards:
+        path = inside(folder, shard.path)
+        check_rows(path, shard.rows)
+        for group, rows in enumerate(row_lists(path, PLANNED)):
+            stop = 0
+            for parts, of_track in itertools.groupby(rows, itemgetter(*PLACE)):
+                place, own, start = _place_of_row(parts, path), list(of_track), stop
+                stop = start + len(own)
+                spans[place].append(Span(path, group, start, stop))
+                if place not in tracks:
+                    tracks[place] = SourceTrack(place, shard.split, partial(_released_rows, spans[place]))
+                track = tracks[place]
+                if track.split != shard.split:
+                    got = f"{track.split} and {shard.split}"
+                    raise InputError("the track is in two splits", where=track.name, got=got)
+                track.add(own)
     return ExportSource(
         folder, record.name, record.made_by, record.content_digest, {"release": folder / "release.json"},
         record.licence, record.credits, record.maps, record.coordinates, record.prompts,
-        tuple(record.settings.modalities), _released_tracks(folder, record),
+        tuple(record.settings.modalities), list(tracks.values()),
     )  # fmt: skip
 
 
-def _released_tracks(folder: Path, record: ReleaseRecord) -> list[SourceTrack]:
-    tracks: dict[Place, SourceTrack] = {}
-    spans: dict[Place, list[Span]] = defaultdict(list)
-    wanted = schema(record.settings.modalities)
-    for shard in sorted(
-        (one.path for one in record.shards), key=lambda path: (SPLIT_NAMES.index(split_of(path)), path)
-    ):
-        path = inside(folder, shard)
-        with open_table(path, tree=folder) as table:
-            found = {member.name: member.type for member in table.schema_arrow}
-            names = table.schema_arrow.names
-            if differing := [m.name for m in wanted if found.get(m.name) != m.type or names.count(m.name) != 1]:
-                raise InputError(
-                    "the columns of the shard are not those of this version", where=path,
-                    got=f"columns that are missing, repeated or of another type: {', '.join(differing)}",
-                    fix="build the release again with this version of cosfly",
-                )  # fmt: skip
-            for k in range(table.num_row_groups):
-                size = table.metadata.row_group(k).total_byte_size
-                _scan_group(tracks, spans, shard, k, read_row_group(path, table, k, LIGHT), size)
-    for place, track in tracks.items():
-        if not (np.diff(track.frame_index) > 0).all() or not (np.diff(track.time_s) > 0).all():
-            raise InputError("the indices and times of the frames do not increase", where=f"{folder}: {track.name}")
-        track.read = partial(_released_rows, folder, spans[place])
-    return list(tracks.values())
+def _place_of_row(parts: tuple[Any, ...], shard: Path) -> Place:
+    """Check that the names of a track are folder names; only that of the run may be empty."""
+    if not all(PART.fullmatch(part) or (number == 0 and part == "") for number, part in enumerate(parts)):
+        raise InputError("the names of the track are not folder names", where=shard, got=shown(list(parts), 200))
+    return Place(*parts)
 
 
-def split_of(shard: str) -> SplitName:
-    """Return the split that a shard's name says: train, validation or test."""
-    match = SHARD_NAME.fullmatch(shard)
-    assert match is not None, shard
-    return cast(SplitName, match[1])
-
-
-def _scan_group(
-    tracks: dict[Place, SourceTrack], spans: dict[Place, list[Span]], shard: str, k: int, group: pa.Table, size: int
-) -> None:
-    """Note the tracks of one row group, which may hold several."""
-    with arrow_errors(shard):
-        rows = {name: group.column(name).to_pylist() for name in LIGHT if name not in PLACE}
-        found = flight_spans(group)
-    for parts, start, stop in found:
-        if not all(
-            isinstance(one, str) and (PART.fullmatch(one) or (one == "" and n == 0)) for n, one in enumerate(parts)
-        ):
-            where = f"{shard}: {rows['sample_id'][start]}"
-            raise InputError("the names of the track are not folder names", where=where, got=shown(list(parts), 200))
-        place = Place(*parts)
-        track = tracks.setdefault(place, SourceTrack(place, split_of(shard)))
-        if track.split != split_of(shard):
-            raise InputError("the track is in two splits", where=track.name, got=f"{track.split} and {split_of(shard)}")
-        frames, times = rows["frame_index"][start:stop], rows["time_s"][start:stop]
-        if None in times or None in frames:
-            raise InputError("a frame has no index or no time", where=f"{shard}: {track.name}")
-        spans[place].append(Span(shard, k, start, stop))
-        track.frame_index = np.append(track.frame_index, np.array(frames, np.int32))
-        track.time_s = np.append(track.time_s, times)
-        track.decisions += [decision or "" for decision in rows["decision"][start:stop]]
-        track.goal = rows["goal_en"][start] or ""
-        track.size_px = rows["width_px"][start] or 0, rows["height_px"][start] or 0
-        track.num_bytes += size * (stop - start) // len(group)
-
-
-def _released_rows(folder: Path, spans: list[Span], columns: Sequence[str], start: int, stop: int) -> Iterator[Row]:
-    at = 0
+def _released_rows(spans: list[Span], columns: Sequence[str], numbers: Sequence[int]) -> Iterator[Row]:
+    first = 0
     for span in spans:
-        begin, end = max(at, start), min(at + span.stop - span.start, stop)
-        if begin < end:
-            path = inside(folder, span.shard)
-            (group,) = row_groups(path, list(columns), tree=folder, wanted=[span.group])
-            _check_values(group, f"{path}: row group {span.group}")
-            with arrow_errors(path):
-                rows = group.slice(span.start + begin - at, end - begin).to_pylist()
-            yield from rows
-        at += span.stop - span.start
-
-
-def _check_values(group: pa.Table, where: str) -> None:
-    """Check that required values are there, and that numbers are finite."""
-    for member in group.schema:
-        column = group.column(member.name)
-        if member.name in REQUIRED and column.null_count:
-            raise InputError("a required value is missing in a row", where=f"{where}: {member.name}", got="null")
-        parts = column.combine_chunks().flatten() if pa.types.is_struct(member.type) else [column]
-        for part in parts:
-            if pa.types.is_floating(part.type) and pc.all(pc.is_finite(part)).as_py() is False:
-                raise InputError("a number is not finite", where=f"{where}: {member.name}")
-
-
-def picture(row: Row, file: FrameFile) -> bytes:
-    """Return the bytes of a picture of a row."""
-    value = row[PICTURES[file].name]
-    data = value if file == "depth" else value and value["bytes"]
-    if not data or (file != "depth" and png_size(data) is None):
-        where = f"{row['sample_id']}: {PICTURES[file].name}"
-        raise InputError("the frame has no picture", where=where, got="data that are not a PNG" if data else "no data")
-    return data
+        size = span.stop - span.start
+        wanted = [number - first for number in numbers if first <= number < first + size]
+        if wanted:
+            (rows,) = row_lists(span.shard, columns, wanted=[span.group])
+            yield from (rows[span.start + number] for number in wanted)
+        first += size
 
 
 # --- a run or a playback tree -----------------------------------------------------------------------------------------
@@ -304,74 +274,73 @@ def find_trees(folder: Path, captions: Path | None = None) -> list[Tree]:
 
 def open_trees(folder: Path, trees: list[Tree]) -> ExportSource:
     """Open playback trees: the tracks that their inspection accepted, or all of a tree without one."""
-    found: dict[Place, Path] = {}
-    captions: dict[Place, dict[int, tuple[Path, int]]] = defaultdict(dict)
+    found: dict[Place, tuple[Path, Lines]] = {}
     inputs: dict[str, Path] = {}
     for number, tree in enumerate(trees):
         roles = {"data": tree.data, "captions": tree.captions, "inspect": tree.inspect}
         inputs |= {f"{number}.{role}": path for role, path in roles.items() if path is not None}
         paths = {Place(*tree.place(place_of(path))): path for path in find_tracks(tree.data)}
+        captions = _accepted_captions(tree, paths)
         if tree.inspect is not None:
             results = {Place(*tree.place(one)): one.result for one in read_settled(tree.inspect).flights}
             paths = {place: path for place, path in paths.items() if results.get(place) == "accepted"}
-        found |= paths
-        begin = 0
-        for line, caption in caption_lines(tree.captions) if tree.captions else ():
-            if tree.captions and caption.status == "accepted":
-                captions[Place(*tree.place(caption))][caption.frame_index] = tree.captions, begin
-            begin += len(line.encode())
+        found |= {place: (path, captions[place]) for place, path in paths.items()}
     if not found:
         raise InputError("the inspection accepted no track", where=folder, fix="see inspect/report.html")
     ids = flight_ids(list(found))
-    maps = {path.parents[1]: read_town_map(path.parents[1]) for path in found.values()}
+    maps = {path.parents[1]: read_town_map(path.parents[1]) for path, _ in found.values()}
     licences, credits = {one.licence for one in maps.values()}, {one.credits: None for one in maps.values()}
-    first = read_track(next(iter(found.values())), strict=False).frame_folder(0)
+    first = read_track(next(iter(found.values()))[0], strict=False).frame_folder(0)
+    tracks = []
+    for place, (path, lines) in found.items():
+        track = SourceTrack(place, "train", partial(_tree_rows, place, path, ids[place], lines))
+        track.add(track.rows(PLANNED, 0, len(read_track(path, strict=False))))
+        tracks.append(track)
     return ExportSource(
         folder, folder.absolute().name, f"cosfly {cosfly.__version__}", fingerprint(trees[0].data), inputs,
         licences.pop() if len(licences) == 1 else UNKNOWN_LICENCE, " ".join(credits).strip(),
         [ReleasedMap(town=town.name, **one.model_dump()) for town, one in maps.items()], CONTRACT, {},
-        tuple(file for file, name in FILE_NAMES.items() if frame_path(first, name).is_file()),
-        [_tree_track(place, path, ids[place], captions[place]) for place, path in found.items()],
+        tuple(file for file, name in FILE_NAMES.items() if frame_path(first, name).is_file()), tracks,
     )  # fmt: skip
 
 
-Captions = dict[int, tuple[Path, int]]  # frame -> its captions.jsonl, and the byte at which its line begins
+Lines = dict[int, tuple[Path, int]]  # frame -> the file of its caption, and the byte at which its line begins
 
 
-def _tree_track(place: Place, path: Path, track_id: str, captions: Captions) -> SourceTrack:
-    track = read_track(path, strict=False)
-    decisions = [
-        str(row["decision"] or "") for row in _tree_rows(place, path, track_id, captions, ["decision"], 0, len(track))
-    ]
-    size = (track.camera.width_px, track.camera.height_px)
-    return SourceTrack(
-        place, "train", np.arange(len(track), dtype=np.int32), track.time_s, decisions,
-        track.goal.en if track.goal else "", size, len(track) * size[0] * size[1] * BYTES_PER_PIXEL,
-        partial(_tree_rows, place, path, track_id, captions),
-    )  # fmt: skip
+def _accepted_captions(tree: Tree, tracks: Iterable[Place]) -> dict[Place, Lines]:
+    """Return the accepted captions of the tracks of a tree."""
+    found: dict[Place, Lines] = {place: {} for place in tracks}
+    begin = 0
+    for line, caption in caption_lines(tree.captions) if tree.captions else ():
+        place = Place(*tree.place(caption))
+        if place not in found:
+            raise InputError(
+                "the captions are of another playback tree", where=tree.captions, got=caption.sample_id,
+                expected=f"captions of tracks in {tree.data}", fix="run cosfly caption on this tree",
+            )  # fmt: skip
+        if tree.captions and caption.status == "accepted":
+            found[place][caption.frame_index] = tree.captions, begin
+        begin += len(line.encode())
+    return found
 
 
 def _tree_rows(
-    place: Place, path: Path, track_id: str, captions: Captions, columns: Sequence[str], start: int, stop: int
+    place: Place, path: Path, track_id: str, lines: Lines, columns: Sequence[str], numbers: Sequence[int]
 ) -> Iterator[Row]:
     track = replace(read_track(path, strict=False), run=place.run, town=place.town, given_id=track_id)
     placement = Placement(walk="/".join((place.run, place.town, place.trajectory)), split="train")
-    for i in range(start, stop):
-        caption = _caption_at(*captions[i]) if i in captions else None
-        values = None if caption is None else caption_values(caption)
+    for i in numbers:
+        values = caption_values(_caption_at(*lines[i])) if i in lines else None
         row = {name: COLUMNS[name].cell(track, i, values, placement) for name in columns if name in COLUMNS}
-        yield row | {name: _tree_picture(track, i, FILE_OF[name]) for name in columns if name in FILE_OF}
+        for file in (FILE_OF[name] for name in columns if name in FILE_OF):
+            picture = frame_path(track.frame_folder(i), FILE_NAMES[file])
+            data = read_bytes(picture, what="picture", tree=tree_of(track.frame_folder(i)))
+            name = f"{sample_id(track.flight_id, i)}_{FILE_NAMES[file]}"
+            row[PICTURES[file].name] = as_depth_npy(data, picture) if file == "depth" else {"bytes": data, "path": name}
+        yield row
 
 
 def _caption_at(path: Path, begin: int) -> Caption:
     with open_file(path) as file:
         file.seek(begin)
         return Caption.model_validate_json(file.readline())
-
-
-def _tree_picture(track: Track, i: int, file: FrameFile) -> Any:
-    path = frame_path(track.frame_folder(i), FILE_NAMES[file])
-    data = read_bytes(path, what="picture", tree=tree_of(track.frame_folder(i)))
-    if file == "depth":
-        return as_depth_npy(data, path)
-    return {"bytes": data, "path": f"{sample_id(track.flight_id, i)}_{FILE_NAMES[file]}"}

@@ -4,11 +4,11 @@ Reads a source (`release/export/source.py`); writes `<format>/` with the format'
 of, how things are stored), README.md and checksums.sha256. A format is a module with three functions and a line in
 EXPORTS:
 
-    plan(source, cfg) -> list[ExportUnit]                       cuts the work into units that can be done in any order
-    write(source, unit, folder, cfg) -> UnitFiles               writes the files of one unit, through `Files`
-    finish(source, units, written, folder, cfg) -> FormatFacts  writes what concerns all units; called once
+    plan(source, cfg) -> list[ExportUnit]                  cuts the work into units that can be done in any order
+    write(source, unit, folder, cfg) -> dict               writes the files of one unit; returns what `finish` needs
+    finish(source, done, folder, cfg) -> FormatFacts       writes what concerns all units; called once
 
-The bytes of a unit depend on source, unit and settings alone.
+All files are written atomically. The bytes of a unit depend on source, unit and settings alone.
 """
 
 from __future__ import annotations
@@ -16,41 +16,32 @@ from __future__ import annotations
 import importlib
 import os
 import shutil
-from collections.abc import Iterable, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import IO, Any, Literal, NamedTuple
 
 import yaml
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 import cosfly
 from cosfly.formats.frames import FILE_NAMES, FrameFile
 from cosfly.runtime.config import Config
-from cosfly.runtime.errors import InputError, VerifyError
-from cosfly.runtime.escaping import for_markdown
-from cosfly.runtime.io import (
-    CHECKSUMS,
-    atomic_file,
-    inside,
-    open_file,
-    sha256_bytes,
-    sha256_file,
-    storage_errors,
-    write_bytes,
-    write_checksums,
-)
-from cosfly.runtime.json_io import FileFormat, dump_json
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.io import CHECKSUMS, sha256_file, storage_errors, write_bytes, write_checksums
+from cosfly.runtime.json_io import FileFormat, write_model
 from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import Resume, StageFolder, result_of
+from cosfly.runtime.run_dir import Resume, StageFolder
 from cosfly.runtime.worker import Item, Outcome, Work
+from cosfly.viz.page import markdown
 from release.columns import LANGUAGES, SPLIT_NAMES, SplitName
 from release.export.source import ExportSource, SourceTrack, open_source
 from release.record import ReleasedMap, Strict
 
 FormatName = Literal["tree", "lerobot", "webdataset", "coco", "chat", "sharegpt"]
 EXPORT_FORMAT = FileFormat("cosfly.export", "2.0", "record of an export")
+RECORD, README = "export.json", "README.md"
 MB = 1024 * 1024
 
 
@@ -114,51 +105,35 @@ class ExportUnit:
     def frames(self) -> int:
         return sum(piece.frames for piece in self.pieces)
 
+    @property
+    def track(self) -> SourceTrack:
+        """Its track, if it is a whole one."""
+        return self.pieces[0].track
 
-class UnitFiles(BaseModel):
-    """The files of a unit (relative name -> sha256), and what the format needs to know of it afterwards."""
-
-    files: dict[str, str]
-    bytes: int
-    facts: dict[str, Any] = {}
+    @property
+    def file_name(self) -> str:
+        """Its name as part of the name of a file."""
+        return self.name.replace("/", "_")
 
 
-class FormatFacts(BaseModel):
-    """What a format states about itself in `export.json`, and the files that `finish` wrote (name -> sha256)."""
+Done = list[tuple[ExportUnit, dict[str, Any]]]  # the units, each with what `write` returned
+
+
+@dataclass(frozen=True)
+class FormatFacts:
+    """What a format states about itself in `export.json`.
+
+    codings: How each thing is stored. notes: Conventions, and what the format cannot carry. how_to_open: Lines of
+    Python. coordinates: If the format has other axes than the release. split_files: Split -> pattern of its files,
+    where `datasets` opens the folder.
+    """
 
     version: str
-    codings: dict[str, str] = {}  # how each thing is stored
-    notes: list[str] = []  # conventions, and what the format cannot carry
-    how_to_open: str  # lines of Python
-    coordinates: dict[str, str] = {}  # if the format has other axes than the release
-    files: dict[str, str] = {}
-    split_files: dict[str, str] = {}  # split -> its files, as a pattern, where `datasets` opens the folder
-
-
-class Files:
-    """The files of a unit: each appears whole, and is recorded with its digest."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.digests, self.num_bytes = folder, dict[str, str](), 0
-
-    def put(self, name: str, data: bytes, *, listed: bool = True) -> str:
-        """Write one file and return its sha256. listed: Whether the record of the export names it."""
-        write_bytes(self.folder / name, data)
-        return self._note(name, sha256_bytes(data), len(data), listed)
-
-    def note(self, name: str) -> None:
-        """Record a file that is already written."""
-        path = self.folder / name
-        self._note(name, sha256_file(path), path.stat().st_size, True)
-
-    def _note(self, name: str, digest: str, num_bytes: int, listed: bool) -> str:
-        if listed:
-            self.digests[name] = digest
-        self.num_bytes += num_bytes
-        return digest
-
-    def written(self, **facts: Any) -> UnitFiles:
-        return UnitFiles(files=self.digests, bytes=self.num_bytes, facts=facts)
+    how_to_open: str
+    codings: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    coordinates: dict[str, str] = field(default_factory=dict)
+    split_files: dict[str, str] = field(default_factory=dict)
 
 
 def track_units(source: ExportSource) -> list[ExportUnit]:
@@ -166,37 +141,33 @@ def track_units(source: ExportSource) -> list[ExportUnit]:
     return [ExportUnit(track.name, track.split, (Piece(track, 0, len(track)),)) for track in source.tracks]
 
 
-def shards(source: ExportSource, pieces: Iterable[Piece], shard_mb: int) -> list[ExportUnit]:
+def shards(pieces: Iterable[Piece], shard_mb: int) -> list[ExportUnit]:
     """Group pieces of each split into units of about `shard_mb`, and name them `train-00000`."""
-    groups: list[tuple[SplitName, list[Piece]]] = []
+    groups: dict[SplitName, list[list[Piece]]] = {split: [] for split in SPLIT_NAMES}
     filled = 0.0
-    for piece in sorted(pieces, key=lambda piece: SPLIT_NAMES.index(piece.track.split)):
-        if not groups or groups[-1][0] != piece.track.split or filled >= shard_mb * MB:
-            groups.append((piece.track.split, []))
+    for piece in pieces:
+        of_split = groups[piece.track.split]
+        if not of_split or filled >= shard_mb * MB:
+            of_split.append([])
             filled = 0.0
-        groups[-1][1].append(piece)
+        of_split[-1].append(piece)
         filled += piece.track.num_bytes * piece.frames / len(piece.track)
-    numbers = dict.fromkeys(SPLIT_NAMES, 0)
-    units = []
-    for split, members in groups:
-        units.append(ExportUnit(f"{split}-{numbers[split]:05d}", split, tuple(members)))
-        numbers[split] += 1
-    return units
+    return [
+        ExportUnit(f"{split}-{number:05d}", split, tuple(members))
+        for split, of_split in groups.items()
+        for number, members in enumerate(of_split)
+    ]
+
+
+def write_joined(file: IO[bytes], lines: Iterable[bytes], between: bytes) -> None:
+    """Write lines with other bytes between them."""
+    for number, line in enumerate(lines):
+        file.write((between if number else b"") + line)
 
 
 def scratch_of(folder: Path) -> Path:
-    """Return the folder for parts of a unit that `finish` joins; it is removed after the export."""
+    """Return the folder for files of a unit that `finish` joins; it is removed after the export."""
     return folder.with_name("scratch")
-
-
-def join_parts(paths: Sequence[Path], out: Path, begin: bytes = b"", between: bytes = b"", end: bytes = b"") -> None:
-    """Write the lines of several files as one, with other bytes around and between them."""
-    with atomic_file(out) as file, ExitStack() as stack:
-        lines = (line for path in paths for line in stack.enter_context(open_file(path)))
-        file.write(begin)
-        for number, line in enumerate(lines):
-            file.write((between if number else b"") + (line.rstrip(b"\n") if between else line))
-        file.write(end)
 
 
 # --- the record -------------------------------------------------------------------------------------------------------
@@ -224,6 +195,30 @@ class ExportRecord(Strict):
     bytes: int
 
 
+def _write_records(source: ExportSource, frames: int, facts: FormatFacts, folder: Path, cfg: ExportConfig) -> None:
+    """Write `export.json`, README.md and the checksums."""
+    own_lists = {path.parent for path in folder.rglob(CHECKSUMS)} - {folder}  # such as those of the tracks of a tree
+    paths = [path for path in folder.rglob("*") if path.is_file() and path not in map(folder.joinpath, OWN)]
+    listed = [path for path in paths if path.name == CHECKSUMS or own_lists.isdisjoint(path.parents)]
+    with ThreadPoolExecutor() as pool:
+        digests = dict(zip(listed, pool.map(sha256_file, listed), strict=True))
+    record = ExportRecord(
+        format=cfg.format, format_version=facts.version, made_by=f"cosfly {cosfly.__version__}",
+        source=source.name, source_made_by=source.made_by, digest=source.digest,
+        licence=source.licence, credits=source.credits, maps=source.maps,
+        coordinates=facts.coordinates or source.coordinates, prompts=source.prompts, codings=facts.codings,
+        notes=facts.notes, how_to_open=facts.how_to_open, frames=frames,
+        bytes=sum(path.stat().st_size for path in paths),
+    )  # fmt: skip
+    write_model(folder / RECORD, record, EXPORT_FORMAT)
+    digests[folder / RECORD] = sha256_file(folder / RECORD)
+    write_bytes(folder / README, render_readme(record, facts.split_files).encode())
+    write_checksums(folder, {path.relative_to(folder).as_posix(): digest for path, digest in digests.items()})
+
+
+OWN = (RECORD, README, CHECKSUMS)
+
+
 def render_readme(record: ExportRecord, split_files: dict[str, str]) -> str:
     """Return README.md: front matter as the hub reads it, and `export.json` in words."""
     tags = ["cosfly", "LeRobot" if record.format == "lerobot" else record.format]  # the hub knows LeRobot by this tag
@@ -231,27 +226,8 @@ def render_readme(record: ExportRecord, split_files: dict[str, str]) -> str:
     if split_files:
         files = [{"split": split, "path": path} for split, path in split_files.items()]
         front["configs"] = [{"config_name": "default", "data_files": files}]
-    maps = [
-        f"- {for_markdown(m.town)}: {for_markdown(m.name)}, {for_markdown(m.licence)}. {for_markdown(m.credits)}"
-        for m in record.maps
-    ]
-    lines = [
-        "---", yaml.safe_dump(front, sort_keys=True, allow_unicode=True).rstrip(), "---", "",
-        f"# {for_markdown(record.source)}: {record.format} {record.format_version}", "",
-        f"{record.frames:,} frames of {for_markdown(record.source)} (content {record.digest}), exported by "
-        f"{for_markdown(record.made_by)}. `export.json` has these facts for programs; `checksums.sha256` lists the "
-        "files.", "",
-        "```python", record.how_to_open, "```", "",
-        "## How data are stored", "",
-        *(f"- {name}: {for_markdown(text)}" for name, text in record.codings.items()), "",
-        *(f"- {for_markdown(note)}" for note in record.notes), "",
-        "## Axes", "",
-        *(f"- {for_markdown(name)}: {for_markdown(str(text))}" for name, text in record.coordinates.items()), "",
-        "## Licence and credits", "",
-        f"Licence: {for_markdown(record.licence)}. {for_markdown(record.credits)}".rstrip(), "",
-        *maps,
-    ]  # fmt: skip
-    return "\n".join(lines).rstrip() + "\n"
+    front_matter = yaml.safe_dump(front, sort_keys=True, allow_unicode=True).rstrip()
+    return markdown("release/export/readme.md", record=record, front_matter=front_matter).rstrip() + "\n"
 
 
 # --- the stage ------------------------------------------------------------------------------------------------------
@@ -278,38 +254,10 @@ def check_needs(source: ExportSource, cfg: ExportConfig) -> ExportSource:
     return replace(source, modalities=chosen)
 
 
-def _write_records(
-    source: ExportSource,
-    units: list[ExportUnit],
-    written: list[UnitFiles],
-    facts: FormatFacts,
-    parts: Path,
-    cfg: ExportConfig,
-) -> None:
-    """Write `export.json`, README.md and the checksums."""
-    record = ExportRecord(
-        format=cfg.format, format_version=facts.version, made_by=f"cosfly {cosfly.__version__}",
-        source=source.name, source_made_by=source.made_by, digest=source.digest,
-        licence=source.licence, credits=source.credits, maps=source.maps,
-        coordinates=facts.coordinates or source.coordinates, prompts=source.prompts, codings=facts.codings,
-        notes=facts.notes, how_to_open=facts.how_to_open, frames=sum(unit.frames for unit in units),
-        bytes=sum(one.bytes for one in written),
-    )  # fmt: skip
-    digests = {name: digest for one in written for name, digest in one.files.items()} | facts.files
-    data = (dump_json({**EXPORT_FORMAT.header, **record.model_dump(mode="json")}, indent=1) + "\n").encode()
-    write_bytes(parts / "export.json", data)
-    write_bytes(parts / "README.md", render_readme(record, facts.split_files).encode())
-    write_checksums(parts, digests | {"export.json": sha256_bytes(data)})
-
-
 def make_worker(source: ExportSource, parts: Path, cfg: ExportConfig) -> Work:
     """Return the function that writes one unit."""
     format = importlib.import_module(EXPORTS[cfg.format].module)
-
-    def work(item: Item) -> Outcome:
-        return Outcome(format.write(source, item.payload, parts, cfg).model_dump())
-
-    return work
+    return lambda item: Outcome(format.write(source, item.payload, parts, cfg))
 
 
 def run(
@@ -317,19 +265,18 @@ def run(
 ) -> Path:
     """Read a release, a run or a playback tree; write it in the format of the settings and return its folder."""
     consecutive = f"the {cfg.format} export" if EXPORTS[cfg.format].needs_consecutive else ""
-    source = open_source(folder, consecutive=consecutive)
-    chosen = check_needs(source, cfg)
+    source = check_needs(open_source(folder, consecutive=consecutive), cfg)
     stage = StageFolder.open(out, "export", config=cfg, inputs=source.inputs, seed=0, resume=resume)
     product, parts = out / cfg.format, out / "parts"
     if stage.is_complete:
         return product
-    if product.is_dir() and not parts.exists():  # a kill came between the last rename and the manifest
-        with storage_errors(parts):
+    with storage_errors(parts):
+        if product.is_dir() and not parts.exists():  # a kill came between the last rename and the manifest
             os.replace(product, parts)
     format = importlib.import_module(EXPORTS[cfg.format].module)
-    units = format.plan(chosen, cfg)
+    units = format.plan(source, cfg)
     items = [Item(unit.name, unit, unit.frames) for unit in units]
-    arguments = (replace(chosen, tracks=[]), parts, cfg)
+    arguments = (replace(source, tracks=[]), parts, cfg)
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="export: frames")
     if finished.tally.failed:  # nothing half is published
         raise InputError(
@@ -337,17 +284,11 @@ def run(
             fix="fix what this file lists (see cosfly release verify) and run the same command again, which repeats "
             "only these parts",
         )  # fmt: skip
-    written = [result_of(kept, UnitFiles) for kept in finished.kept]
-    missing = [name for one in written for name in one.files if not inside(parts, name).is_file()]
-    if missing:
-        raise VerifyError(
-            "finished files are missing", where=parts, got=", ".join(missing[:5]),
-            fix=f"remove {out} and run the same command again",
-        )  # fmt: skip
-    facts = format.finish(chosen, units, written, parts, cfg)
-    _write_records(chosen, units, written, facts, parts, cfg)
+    done = [(unit, kept.result) for unit, kept in zip(units, finished.kept, strict=True)]
+    facts = format.finish(source, done, parts, cfg)
+    _write_records(source, sum(unit.frames for unit in units), facts, parts, cfg)
     with storage_errors(product):
         os.replace(parts, product)
-    stage.finish([product / name for name in ("export.json", "README.md", CHECKSUMS)], finished.tally)
+    stage.finish([product / name for name in OWN], finished.tally)
     shutil.rmtree(scratch_of(parts), ignore_errors=True)
     return product

@@ -10,7 +10,7 @@ name.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -27,12 +27,12 @@ from cosfly.formats.playback import DATASET_FORMAT, LEGIBILITY, TARGET_FILE, Tra
 from cosfly.formats.segments import FOLLOW, Segment
 from cosfly.formats.town import TOWN_FILE, TOWN_FORMAT, TownMap
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import CHECKSUMS, checksum_lines, sha256_file
+from cosfly.runtime.io import sha256_bytes, sha256_file, write_bytes, write_checksums
 from cosfly.runtime.json_io import write_model
 from cosfly.runtime.worker import advance
 from release.columns import COMPANY_COLUMNS, PICTURES, SCALAR_NAMES, TARGET_PICTURE, matrices_of
-from release.export.source import ExportSource, Row, SourceTrack, picture
-from release.export.stage import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles, track_units
+from release.export.source import ExportSource, Row, SourceTrack
+from release.export.stage import Done, ExportConfig, ExportUnit, FormatFacts, track_units
 from release.flight_rows import FlightRows
 
 VERSION = "drone_nav_traj_v7 7.0.0"
@@ -53,71 +53,69 @@ def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
     numbers: dict[tuple[str, str, str], int] = {}
     units = []
     for unit in track_units(source):
-        place = unit.pieces[0].track.place
+        place = unit.track.place
         number = numbers.setdefault((place.run, place.town, place.trajectory), len(numbers))
         folder = Path(place.run if has_runs else "", place.town, place.trajectory, place.variant)
         units.append(replace(unit, extra=(folder.as_posix(), number)))
     return units
 
 
-def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> UnitFiles:
+def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> dict[str, Any]:
     """Write one track: its pictures, then trajectory.json, then the checksums of all."""
-    track, (place, number) = unit.pieces[0].track, unit.extra
-    files, digests, scalars = Files(folder), dict[str, str](), list[Row]()
+    track, (place, number) = unit.track, unit.extra
+    out, digests, scalars = folder / place, dict[str, str](), list[Row]()
+
+    def put(name: str, data: bytes) -> None:
+        write_bytes(out / name, data)
+        digests[name] = sha256_bytes(data)
+
     for i, row in enumerate(track.rows([*SCALAR_NAMES, *(PICTURES[file].name for file in source.modalities)])):
         for file in source.modalities:
-            name = f"{frame_name(i)}/{FILE_NAMES[file]}"
-            digests[name] = files.put(f"{place}/{name}", picture(row, file), listed=False)
+            put(f"{frame_name(i)}/{FILE_NAMES[file]}", track.picture(row, file))
         if row[TARGET_PICTURE] is not None:
-            digests[TARGET_FILE] = files.put(f"{place}/{TARGET_FILE}", row[TARGET_PICTURE]["bytes"], listed=False)
+            put(TARGET_FILE, row[TARGET_PICTURE]["bytes"])
         scalars.append({column: row[column] for column in SCALAR_NAMES})
         advance()
-    (folder / place).mkdir(parents=True, exist_ok=True)
-    write_track(folder / place, track_of_rows(scalars, track, number), with_flags=True)
-    digests["trajectory.json"] = sha256_file(folder / place / "trajectory.json")
-    files.put(f"{place}/{CHECKSUMS}", checksum_lines(digests).encode())
+    write_track(out, track_of_rows(scalars, track, number), with_flags=True)
+    digests["trajectory.json"] = sha256_file(out / "trajectory.json")
+    write_checksums(out, digests)
     has_gaps = bool((np.diff(track.frame_index) != 1).any() or track.frame_index[0] != 0)
-    return files.written(is_original=scalars[0]["track"] == "clean", has_gaps=has_gaps)
+    return {"is_original": scalars[0]["track"] == "clean", "has_gaps": has_gaps}
 
 
-def finish(
-    source: ExportSource, units: Sequence[ExportUnit], written: Sequence[UnitFiles], folder: Path, cfg: ExportConfig
-) -> FormatFacts:
+def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) -> FormatFacts:
     """Write each town's `map.json`, and count the tracks of which strict readers will miss something."""
-    towns = {(unit.extra[0].rpartition("/trajectory_")[0], unit.pieces[0].track.place.town) for unit in units}
+    towns = {(unit.extra[0].rpartition("/trajectory_")[0], unit.track.place.town) for unit, _ in done}
     maps = {entry.town: entry for entry in source.maps}
-    files = {}
     for place, town in sorted(towns):
         shown = maps.get(town)
         about = TownMap(name=shown.name, licence=shown.licence, credits=shown.credits) if shown else None
         about = about or TownMap(name=town, licence=UNKNOWN_LICENCE, credits="")
         write_model(folder / place / TOWN_FILE, about, TOWN_FORMAT)
-        files[f"{place}/{TOWN_FILE}"] = sha256_file(folder / place / TOWN_FILE)
     return FormatFacts(
         version=VERSION,
         codings={file: f"{FILE_NAMES[file]}, the released bytes" for file in source.modalities},
         coordinates=COORDINATES,
-        notes=list(_notes(units, written)),
+        notes=list(_notes(done)),
         how_to_open="from cosfly.formats.tracks import find_tracks\n"
         "from cosfly.formats.playback import read_track\n"
         "tracks = [read_track(folder, strict=False) for folder in find_tracks(Path('.'))]",
-        files=files,
     )
 
 
-def _notes(units: Sequence[ExportUnit], written: Sequence[UnitFiles]) -> Iterator[str]:
+def _notes(done: Done) -> Iterator[str]:
     yield (
         "Frames count from 0 as the layout asks; source.released_frames of trajectory.json has the index of each in "
         "its track. The layout has no captions: they are in the release. meta.json and missions are not in it."
     )
-    if gaps := sum(one.facts["has_gaps"] for one in written):
+    if gaps := sum(facts["has_gaps"] for _, facts in done):
         yield (
-            f"{gaps} of {len(units)} tracks are parts of a track: the steps between their frames are uneven, which "
+            f"{gaps} of {len(done)} tracks are parts of a track: the steps between their frames are uneven, which "
             "readers with a strict clock refuse."
         )
     tracks = defaultdict(set)
-    for unit, one in zip(units, written, strict=True):
-        tracks[unit.extra[0].rpartition("/")[0]].add(one.facts["is_original"])
+    for unit, facts in done:
+        tracks[unit.extra[0].rpartition("/")[0]].add(facts["is_original"])
     if alone := sum(len(found) < 2 for found in tracks.values()):
         yield f"{alone} of {len(tracks)} trajectories have one track only; some public loaders ask for both."
 
@@ -127,9 +125,6 @@ def _notes(units: Sequence[ExportUnit], written: Sequence[UnitFiles]) -> Iterato
 
 def track_of_rows(rows: list[Row], placed: SourceTrack, number: int) -> Track:
     """Return the track of released rows; `number` is that of its trajectory in the export."""
-    sizes = {(r["width_px"], r["height_px"]) for r in rows}
-    if len(sizes) != 1:
-        raise InputError("the pictures of the track differ in size", where=placed.name, got=f"{len(sizes)} sizes")
     found = FlightRows(placed.name, rows)
     return replace(
         found.flight,
@@ -140,7 +135,7 @@ def track_of_rows(rows: list[Row], placed: SourceTrack, number: int) -> Track:
             "scenario_id": number,
             "scenario_name": f"{placed.place.run}/{placed.place.town}/{placed.place.trajectory}".lstrip("/"),
             "algorithm": rows[0]["planner"] or "unknown",
-            "released_frames": placed.frame_index.tolist(),
+            "released_frames": placed.frame_index,
             **pace_field(rows[0]["pace"]),
         },
         goal=_goal(found, placed),
@@ -150,7 +145,7 @@ def track_of_rows(rows: list[Row], placed: SourceTrack, number: int) -> Track:
 
 def _goal(rows: FlightRows, placed: SourceTrack) -> Goal | None:
     """Return the goal if its frame is released, with the number of that frame in the tree."""
-    at = np.flatnonzero(placed.frame_index == (rows.goal.frame if rows.goal else -1))
+    at = np.flatnonzero(np.equal(placed.frame_index, rows.goal.frame if rows.goal else -1))
     return replace(rows.goal, frame=int(at[0])) if rows.goal and len(at) else None
 
 

@@ -11,20 +11,22 @@ float64 array of its own: NaN, or an array without elements. The bytes depend on
 from __future__ import annotations
 
 import tarfile
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from cosfly.formats.frames import FILE_NAMES, FrameFile
+from cosfly.formats.frames import FILE_NAMES
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.worker import advance
 from release.columns import PICTURES, SCALAR_NAMES, SCALARS, SPLIT_NAMES, TARGET_PICTURE, Column
-from release.export.source import PART, ExportSource, Row, picture
-from release.export.stage import ExportConfig, ExportUnit, Files, FormatFacts, Piece, UnitFiles, shards
+from release.export.source import PART, ExportSource, Row
+from release.export.stage import Done, ExportConfig, ExportUnit, FormatFacts, Piece, shards
 
 TEXTS = ("string", "texts", "events")
 MOST_FRAMES = 100  # of a piece, the smallest part of a shard
@@ -37,35 +39,35 @@ def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
         for track in source.tracks
         for start in range(0, len(track), MOST_FRAMES)
     ]
-    return shards(source, pieces, cfg.shard_mb)
+    return shards(pieces, cfg.shard_mb)
 
 
-def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> UnitFiles:
+def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> dict[str, Any]:
     """Write one shard."""
-    files = Files(folder)
-    name, keys = f"{unit.name}.tar", set[str]()
+    keys = set[str]()
     columns = [*SCALAR_NAMES, *(PICTURES[file].name for file in source.modalities)]
-    with atomic_file(folder / name) as file, tarfile.open(fileobj=file, mode="w|", format=tarfile.GNU_FORMAT) as tar:
-        for piece in unit.pieces:
-            for row in piece.track.rows(columns, piece.start, piece.stop):
-                key = row["sample_id"].replace(".", "_")  # a key ends at its first dot
-                if key in keys or not PART.fullmatch(key):
-                    what = "the sample_id of a frame is repeated or is not a file name"
-                    raise InputError(what, where=unit.name, got=key)
-                keys.add(key)
-                for ending, data in sorted(members(row, source.modalities)):
-                    header = tarfile.TarInfo(f"{key}.{ending}")  # without times and owners
-                    header.size, header.mode = len(data), 0o644
-                    tar.addfile(header, BytesIO(data))
-                advance()
-    files.note(name)
-    return files.written()
+    rows = ((track, row) for track, start, stop in unit.pieces for row in track.rows(columns, start, stop))
+    with (
+        atomic_file(folder / f"{unit.name}.tar") as file,
+        tarfile.open(fileobj=file, mode="w|", format=tarfile.GNU_FORMAT) as tar,
+    ):
+        for track, row in rows:
+            key = row["sample_id"].replace(".", "_")  # a key ends at its first dot
+            if key in keys or not PART.fullmatch(key):
+                what = "the sample_id of a frame is repeated or is not a file name"
+                raise InputError(what, where=unit.name, got=key)
+            keys.add(key)
+            pictures: dict[str, bytes] = {FILE_NAMES[file]: track.picture(row, file) for file in source.modalities}
+            for ending, data in sorted((pictures | dict(members(row))).items()):
+                header = tarfile.TarInfo(f"{key}.{ending}")  # without times and owners
+                header.size, header.mode = len(data), 0o644
+                tar.addfile(header, BytesIO(data))
+            advance()
+    return {}
 
 
-def members(row: Row, modalities: Sequence[FrameFile]) -> Iterator[tuple[str, bytes]]:
-    """Yield the files of one frame by their endings."""
-    for file in modalities:
-        yield FILE_NAMES[file], picture(row, file)
+def members(row: Row) -> Iterator[tuple[str, bytes]]:
+    """Yield the files of one frame by their endings, but for its pictures."""
     together = {}
     for column in SCALARS:
         if column.name == TARGET_PICTURE:
@@ -98,15 +100,13 @@ def _numbers(column: Column, value: object) -> np.ndarray:
     return np.array([value], np.float64)
 
 
-def finish(
-    source: ExportSource, units: Sequence[ExportUnit], written: Sequence[UnitFiles], folder: Path, cfg: ExportConfig
-) -> FormatFacts:
+def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) -> FormatFacts:
     """Return how the shards are opened."""
-    counts = {split: sum(unit.split == split for unit in units) for split in SPLIT_NAMES}
-    counts = {split: count for split, count in counts.items() if count}
-    first, last = units[0].split, counts[units[0].split] - 1
+    counts = Counter(unit.split for unit, _ in done)
+    first = next(split for split in SPLIT_NAMES if counts[split])
+    last = counts[first] - 1
     names = f"{first}-{{00000..{last:05d}}}.tar" if last else f"{first}-00000.tar"
-    codings = {file: f"{FILE_NAMES[file]}, the released bytes" for file in source.modalities}
+    codings: dict[str, str] = {file: f"{FILE_NAMES[file]}, the released bytes" for file in source.modalities}
     return FormatFacts(
         version="tar, keys sorted",
         codings={

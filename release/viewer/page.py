@@ -6,13 +6,13 @@ from __future__ import annotations
 
 import base64
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
-import pyarrow as pa
 
 from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.formats.captions import Caption, Coc, read_captions
@@ -20,7 +20,7 @@ from cosfly.formats.frames import FrameFile, depth_values, frame_path
 from cosfly.formats.inspection import read_settled
 from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
 from cosfly.formats.places import place_of
-from cosfly.formats.playback import read_track
+from cosfly.formats.playback import Track, read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.answer_text import sentences_of
 from cosfly.runtime.console import progress_bar
@@ -28,7 +28,6 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.io import write_bytes
 from cosfly.runtime.png import colours_of
-from cosfly.runtime.tables import arrow_errors, row_groups
 from cosfly.viz.frame_views import (
     VIEW_FILES,
     View,
@@ -57,9 +56,9 @@ from release.columns import (
     caption_values,
     scalar_row,
 )  # fmt: skip
-from release.export.source import Tree, find_trees
-from release.reading import bounded, check_columns, check_rows, row_lists
-from release.record import ReleaseRecord, read_record
+from release.export.source import ExportSource, SourceTrack, Tree, find_trees, open_release
+from release.reading import bounded
+from release.record import RECORD
 
 Place = tuple[str, str, str, str]  # PLACE
 Views = Mapping[View, Callable[[], np.ndarray]]
@@ -87,9 +86,25 @@ def run(
         most_tracks: Of more, whole trajectories are shown, evenly spread.
         most_frames: Of a track, among them one of each verdict and decision.
     """
-    dataset = next((place for place in (folder, folder / "dataset") if (place / "release.json").exists()), None)
-    limits = most_tracks, most_frames, picture_px
-    data = _show_run(folder, captions, *limits) if dataset is None else _show_release(dataset, *limits)
+    record = next((path for path in (folder / RECORD, folder / "dataset" / RECORD) if path.exists()), None)
+    if record is None:
+        title, kind, trees = folder.absolute().name, "run", find_trees(folder, captions)
+        parts, notes = _run_parts(trees, most_tracks)
+    else:
+        source, kind, trees = open_release(record.parent), "release", []
+        title = source.name
+        parts, notes = _release_parts(source, most_tracks)
+    flights = []
+    with progress_bar("viewer: tracks", len(parts)) as advance:
+        for part in parts:
+            try:
+                flights.append(_flight(part(), most_frames, picture_px))
+            except InputError as error:
+                if record is not None:
+                    raise
+                notes.append(f"not shown: {error.where}: {error.what}")
+            advance(1)
+    data = {"title": title, "kind": kind, "notes": notes, "maps": _maps(trees, flights), "flights": flights}
     script, style = scripts("tools.js", "canvas.js", "viewer.js"), scripts("viewer.css")
     values = {"title": data["title"], "notes": data["notes"], "data": _printable(data)}
     write_bytes(out, page("cosfly/viz/templates/viewer.html", style=style, script=script, **values).encode())
@@ -110,89 +125,72 @@ def _printable(value: Any) -> Any:
     return value
 
 
+@dataclass(frozen=True)
+class _Part:
+    """One track.
+
+    about: Facts for the page. places_m: (n, 4) x, y of drone and target, NaN where unknown. kinds: Of the frames with a
+    caption. read: Yields the rows of frames, in order, with their pictures and caption.
+    """
+
+    place: Place
+    about: dict[str, Any]
+    places_m: np.ndarray
+    fovs_deg: tuple[float, float]
+    frames: Sequence[int]
+    kinds: dict[int, Hashable]
+    read: Callable[[list[int]], Iterator[tuple[Mapping[str, Any], Views, dict[str, Any] | None]]]
+
+
+Parts = list[Callable[[], _Part]]  # each reads its track when it is called
+
+
 # --- a release --------------------------------------------------------------------------------------------------------
 
 
-class _ScannedRow(NamedTuple):
-    """What the first pass keeps of a row: x, y of drone and target, (4,) m; kind of its caption; where it is stored."""
-
-    places_m: list[float]
-    fov_deg: float
-    kind: tuple | None
-    stored: tuple[Path, int]
-
-
-def _show_release(dataset: Path, most_tracks: int, most_frames: int, picture_px: int) -> dict[str, Any]:
-    record = read_record(dataset / "release.json")
-    names = [flight.flight for flight in record.flights]
-    chosen, notes = _choose_tracks(names, [name.rpartition("/")[0] for name in names], most_tracks)
+def _release_parts(source: ExportSource, most_tracks: int) -> tuple[Parts, list[str]]:
+    groups = [track.name.rpartition("/")[0] for track in source.tracks]
+    chosen, notes = _choose_tracks(source.tracks, groups, most_tracks)
     notes.append("a release has no map: the tracks are drawn without one")
-    tracks: dict[Place, dict[str, Any]] = {}
-    scanned: dict[Place, dict[int, _ScannedRow]] = defaultdict(dict)
-    for row, one in _scan(dataset, record, set(chosen)):
-        tracks.setdefault(_place(row), {"town": row["town"], "track": row["track"], "split": row["split"]})
-        scanned[_place(row)][row["frame_index"]] = one
-    frames: dict[Place, list[int]] = {}
-    for place, rows in scanned.items():
-        kinds = {index: row.kind for index, row in rows.items() if row.kind is not None}
-        frames[place] = choose_frames(sorted(rows), kinds, most_frames)
-        fovs, places_m = {row.fov_deg for row in rows.values()}, [rows[index].places_m for index in sorted(rows)]
-        tracks[place] |= _track(place, np.array(places_m), (min(fovs), max(fovs)), len(kinds))
-    wanted: dict[Path, set[int]] = defaultdict(set)
-    for place, indices in frames.items():
-        for path, group in (scanned[place][index].stored for index in indices):
-            wanted[path].add(group)
-    _add_frames(tracks, frames, _release_rows(dataset, record, frames, wanted), picture_px)
-    return {"title": record.name, "kind": "release", "notes": notes, "maps": {}, "flights": list(tracks.values())}
+    return [partial(_released_part, track, source.modalities) for track in chosen], notes
 
 
-def _place(row: Mapping[str, Any]) -> Place:
-    return tuple(row[name] for name in PLACE)
+def _released_part(track: SourceTrack, modalities: Sequence[FrameFile]) -> _Part:
+    places_m, fovs_deg, kinds = [], set[float](), dict[int, Hashable]()
+    for row in track.rows(SCANNED):
+        target = row["target"] or dict.fromkeys(POINT, 0.0)
+        for value in (row["time_s"], *row["pose"].values(), *target.values(), row["visibility"] or 0.0):
+            bounded(value)
+        target_m = [np.nan if row["target"] is None else target[axis] for axis in POINT[:2]]
+        places_m.append([row["pose"][axis] for axis in POINT[:2]] + target_m)
+        fovs_deg.add(bounded(row["fov_deg"]))
+        if row["has_caption"]:
+            kinds[row["frame_index"]] = row["verdict"], row["decision"]
+    about = {"town": row["town"], "track": row["track"], "split": row["split"]}
+    fov_range = min(fovs_deg), max(fovs_deg)
+    read = partial(_released_frames, track, modalities)
+    return _Part(_names(track.place), about, np.array(places_m), fov_range, track.frame_index, kinds, read)
 
 
-def _scan(dataset: Path, record: ReleaseRecord, chosen: set[str]) -> Iterator[tuple[dict[str, Any], _ScannedRow]]:
-    """Read all rows without pictures; yield those of the chosen tracks, in order."""
-    with progress_bar("viewer: rows", sum(shard.rows for shard in record.shards)) as advance:
-        for shard in record.shards:
-            path = dataset / shard.path
-            check_rows(path, shard.rows)
-            for group, rows in enumerate(row_lists(path, SCANNED)):
-                for row in rows:
-                    if "/".join(_place(row)) not in chosen:
-                        continue
-                    target = row["target"] or dict.fromkeys(POINT, 0.0)
-                    for value in (row["time_s"], *row["pose"].values(), *target.values(), row["visibility"] or 0.0):
-                        bounded(value)
-                    places_m = [row["pose"][axis] for axis in POINT[:2]]
-                    places_m += [np.nan if row["target"] is None else target[axis] for axis in POINT[:2]]
-                    kind = (row["verdict"], row["decision"]) if row["has_caption"] else None
-                    yield row, _ScannedRow(places_m, round(bounded(row["fov_deg"]), 1), kind, (path, group))
-                advance(len(rows))
+def _names(place: Any) -> Place:
+    return place.run, place.town, place.trajectory, place.variant
 
 
-def _release_rows(
-    dataset: Path, record: ReleaseRecord, frames: Mapping[Place, list[int]], wanted: Mapping[Path, set[int]]
-) -> Iterator[tuple[Place, dict[str, Any], Views, dict[str, Any] | None]]:
-    """Read the chosen rows with their pictures, from the row groups that hold one."""
-    columns = [*SHORT_NAMES, *(PICTURES[file].name for file in record.settings.modalities)]
-    for path in (dataset / shard.path for shard in record.shards):
-        for table in row_groups(path, columns, tree=dataset, wanted=wanted.get(path, ())):
-            check_columns(table, columns, path)
-            with arrow_errors(path):
-                places = table.select([*PLACE, "frame_index"]).to_pylist()
-                kept = [row["frame_index"] in frames.get(_place(row), ()) for row in places]
-                rows = table.filter(pa.array(kept)).to_pylist()
-            for row in rows:
-                views = {VIEW_OF[file]: partial(_picture, row, file) for file in record.settings.modalities}
-                yield _place(row), row, views, _caption(row) if row["has_caption"] else None
+def _released_frames(
+    track: SourceTrack, modalities: Sequence[FrameFile], frames: list[int]
+) -> Iterator[tuple[Mapping[str, Any], Views, dict[str, Any] | None]]:
+    numbers = np.flatnonzero(np.isin(track.frame_index, frames)).tolist()
+    for row in track.pick([*SHORT_NAMES, *(PICTURES[file].name for file in modalities)], numbers):
+        views = {VIEW_OF[file]: partial(_picture, track, row, file) for file in modalities}
+        yield row, views, _caption(row) if row["has_caption"] else None
 
 
-def _picture(row: Mapping[str, Any], file: FrameFile) -> np.ndarray:
+def _picture(track: SourceTrack, row: Mapping[str, Any], file: FrameFile) -> np.ndarray:
     """Return a picture of a row as colours, (h, w, 3) uint8 RGB."""
-    where, cell = f"{row['sample_id']}: {PICTURES[file].name}", row[PICTURES[file].name]
+    data, where = track.picture(row, file), f"{row['sample_id']}: {PICTURES[file].name}"
     if file == "depth":
-        return depth_colors(depth_values(cell or b"", Path(where)))
-    rgb = colours_of((cell or {}).get("bytes") or b"", where)
+        return depth_colors(depth_values(data, Path(where)))
+    rgb = colours_of(data, where)
     if file == "rgb":
         return rgb
     # Red is the kind, green the low byte of the id, blue the high one.
@@ -202,61 +200,47 @@ def _picture(row: Mapping[str, Any], file: FrameFile) -> np.ndarray:
 # --- a run or a playback tree -----------------------------------------------------------------------------------------
 
 
-def _show_run(
-    folder: Path, captions: Path | None, most_tracks: int, most_frames: int, picture_px: int
-) -> dict[str, Any]:
-    trees = find_trees(folder, captions)
-    found = {tree.place(place_of(path)): (tree, path) for tree in trees for path in find_tracks(tree.data)}
+def _run_parts(trees: list[Tree], most_tracks: int) -> tuple[Parts, list[str]]:
+    found = {tree.place(place_of(path)): path for tree in trees for path in find_tracks(tree.data)}
     chosen, notes = _choose_tracks(list(found), [place[:-1] for place in found], most_tracks)
-    kinds: dict[Place, dict[int, tuple]] = {place: {} for place in chosen}
-    for place, caption in _captions(trees):
-        if place in kinds:
-            decision = caption.en.flight_decision if caption.en else None
-            kinds[place][caption.frame_index] = (caption.status, caption.verdict, decision)
-    inspected = ((tree, read_settled(tree.inspect)) for tree in trees if tree.inspect is not None)
-    results = {tree.place(track): track.result for tree, inspection in inspected for track in inspection.flights}
-    tracks, frames = dict[Place, dict[str, Any]](), dict[Place, list[int]]()
-    for place in chosen:
-        tree, path = found[place]
-        try:
-            track = read_track(path, strict=False)
-        except InputError as error:
-            notes.append(f"not shown: {path.parent.name}/{path.name}: {error.what}")
-            continue
-        frames[place] = choose_frames(range(len(track)), kinds[place], most_frames)
-        names = tree.run, track.town, track.trajectory, track.variant
-        places_m = np.hstack([track.positions_m[:, :2], track.targets_m[:, :2]])
-        tracks[place] = _track(names, places_m, track.fovs_deg, len(kinds[place]))
-        kind = "clean" if track.is_original else "perturbed"
-        tracks[place] |= {"town": track.town, "track": kind, "split": None, "result": results.get(place)}
-    rows = _run_rows({place: found[place][1] for place in frames}, frames, trees)
-    _add_frames(tracks, frames, rows, picture_px)
-    shown = list(tracks.values())
-    title = folder.absolute().name
-    return {"title": title, "kind": "run", "notes": notes, "maps": _maps(trees, shown), "flights": shown}
-
-
-def _captions(trees: list[Tree]) -> Iterator[tuple[Place, Caption]]:
+    captions: dict[Place, dict[int, Caption]] = {place: {} for place in chosen}
     for tree in trees:
         for caption in () if tree.captions is None else read_captions(tree.captions):
-            yield tree.place(caption), caption
+            if (place := tree.place(caption)) in captions:
+                captions[place][caption.frame_index] = caption
+    inspected = ((tree, read_settled(tree.inspect)) for tree in trees if tree.inspect is not None)
+    results = {tree.place(track): track.result for tree, inspection in inspected for track in inspection.flights}
+    parts = [partial(_tree_part, place, found[place], captions[place], results.get(place)) for place in chosen]
+    return list(parts), notes
 
 
-def _run_rows(
-    folders: Mapping[Place, Path], frames: Mapping[Place, list[int]], trees: list[Tree]
-) -> Iterator[tuple[Place, dict[str, Any], Views, dict[str, Any] | None]]:
-    """Read the chosen frames, one track at a time."""
-    every = ((place, caption.frame_index, caption) for place, caption in _captions(trees))
-    captions = {(place, index): caption for place, index, caption in every if index in frames.get(place, ())}
-    for place, indices in frames.items():
-        track = read_track(folders[place], strict=False)
-        for index in indices:
-            folder, caption = track.frame_folder(index), captions.get((place, index))
-            values = None if caption is None else caption_values(caption)
-            row = scalar_row(track, index, values, Placement(walk="", split="train"))
-            files = (view for view in VIEW_OF.values() if frame_path(folder, VIEW_FILES[view]).exists())
-            views: Views = {view: partial(read_view, folder, view) for view in files}
-            yield place, row, views, None if caption is None else _caption(row, caption)
+def _tree_part(place: Place, path: Path, captions: Mapping[int, Caption], result: str | None) -> _Part:
+    try:
+        track = read_track(path, strict=False)
+    except InputError as error:
+        error.where = f"{path.parent.name}/{path.name}"
+        raise
+    kinds: dict[int, Hashable] = {
+        i: (one.status, one.verdict, one.en.flight_decision if one.en else None) for i, one in captions.items()
+    }
+    kind = "clean" if track.is_original else "perturbed"
+    about = {"town": track.town, "track": kind, "split": None, "result": result}
+    places_m = np.hstack([track.positions_m[:, :2], track.targets_m[:, :2]])
+    names = place[0], track.town, track.trajectory, track.variant
+    read = partial(_tree_frames, track, captions)
+    return _Part(names, about, places_m, track.fovs_deg, range(len(track)), kinds, read)
+
+
+def _tree_frames(
+    track: Track, captions: Mapping[int, Caption], frames: list[int]
+) -> Iterator[tuple[Mapping[str, Any], Views, dict[str, Any] | None]]:
+    for index in frames:
+        folder, caption = track.frame_folder(index), captions.get(index)
+        values = None if caption is None else caption_values(caption)
+        row = scalar_row(track, index, values, Placement(walk="", split="train"))
+        files = (view for view in VIEW_OF.values() if frame_path(folder, VIEW_FILES[view]).exists())
+        views: Views = {view: partial(read_view, folder, view) for view in files}
+        yield row, views, None if caption is None else _caption(row, caption)
 
 
 def _maps(trees: list[Tree], tracks: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
@@ -305,40 +289,27 @@ def choose_frames(frames: Sequence[int], kinds: Mapping[int, Hashable], most: in
     return sorted(chosen)
 
 
-def _track(names: Place, places_m: np.ndarray, fovs_deg: tuple[float, float], num_captions: int) -> dict[str, Any]:
-    """Return a track: names as in PLACE; places_m: (n, 4) x, y of drone and target, NaN where unknown."""
+def _flight(part: _Part, most_frames: int, picture_px: int) -> dict[str, Any]:
+    """Return a track with some of its frames."""
+    chosen = choose_frames(part.frames, part.kinds, most_frames)
     return {
-        "name": "/".join(filter(None, names)),
-        "group": "/".join(filter(None, names[:-1])),  # both tracks of a trajectory
-        "map": "/".join(names[:2]),
+        "name": "/".join(filter(None, part.place)),
+        "group": "/".join(filter(None, part.place[:-1])),  # both tracks of a trajectory
+        "map": "/".join(part.place[:2]),
         "result": None,
-        "fovs_deg": [round(fov_deg, 1) for fov_deg in fovs_deg],
-        "num_frames": len(places_m),
-        "num_captions": num_captions,
-        "drone_path": _path(places_m[:, :2]),
-        "target_path": _path(places_m[:, 2:]),
-        "frames": [],
+        "fovs_deg": [round(fov_deg, 1) for fov_deg in part.fovs_deg],
+        "num_frames": len(part.places_m),
+        "num_captions": len(part.kinds),
+        "drone_path": _path(part.places_m[:, :2]),
+        "target_path": _path(part.places_m[:, 2:]),
+        "frames": [_frame(row, page_pictures(views, picture_px), caption) for row, views, caption in part.read(chosen)],
+        **part.about,
     }
 
 
 def _path(points_m: np.ndarray) -> list[list[float]]:
     known = points_m[~np.isnan(points_m).any(axis=1)]
     return known[spread(len(known), PATH_POINTS)].astype(np.float64).round(1).tolist()
-
-
-def _add_frames(
-    tracks: Mapping[Place, dict[str, Any]],
-    frames: Mapping[Place, list[int]],
-    rows: Iterable[tuple[Place, dict[str, Any], Views, dict[str, Any] | None]],
-    picture_px: int,
-) -> None:
-    """Add rows with their pictures and captions to the tracks."""
-    with progress_bar("viewer: frames", sum(map(len, frames.values()))) as advance:
-        for place, row, views, caption in rows:
-            tracks[place]["frames"].append(_frame(row, page_pictures(views, picture_px), caption))
-            advance(1)
-    for track in tracks.values():
-        track["frames"].sort(key=lambda frame: frame["index"])
 
 
 def _frame(row: Mapping[str, Any], pictures: dict[View, str], caption: dict[str, Any] | None) -> dict[str, Any]:
