@@ -43,7 +43,7 @@ def look(item: dict) -> dict:
 
 
 class VideoReader:
-    """The reader that LeRobot's backend `pyav` asks torchvision for; torchvision 0.24 and later have none."""
+    """The reader that LeRobot's backend `pyav` asks torchvision for, which newer versions of torchvision lack."""
 
     def __init__(self, path: str, stream: str) -> None:
         self.container = av.open(path)
