@@ -190,10 +190,11 @@ def test_the_same_bytes_with_one_process_and_with_two(format, dataset, tmp_path)
 @each("format", [*EXPORTS])
 def test_an_export_says_where_it_came_from_and_whose_it_is(format, dataset, tmp_path):
     product = export(config(format), dataset, tmp_path / "out")
-    about, record = read_model(product / "export.json", ExportRecord, EXPORT_FORMAT), open_release(dataset)
-    assert about.digest == record.digest
-    assert (about.licence, about.credits, about.maps) == (record.licence, record.credits, record.maps)
-    assert about.frames == sum(map(len, record.tracks))
+    about, source = read_model(product / "export.json", ExportRecord, EXPORT_FORMAT), open_release(dataset)
+    assert about.digest == source.facts.digest
+    for name in ("licence", "credits", "maps"):
+        assert getattr(about, name) == getattr(source.facts, name)
+    assert about.frames == sum(map(len, source.tracks))
     readme = (product / "README.md").read_text()
     assert "license: cc-by-4.0" in readme
     assert "Map: a specimen." in readme

@@ -149,7 +149,7 @@ def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) ->
         run_here = "dataset_dir and media_dir of LLaMA-Factory are this folder, which has the dataset_info.json."
         opened = "# llamafactory-cli train --dataset_dir . --media_dir . --dataset cosfly_train ..."
     return FormatFacts(
-        version="messages and images" if cfg.format == "chat" else "ShareGPT",
+        format_version="messages and images" if cfg.format == "chat" else "ShareGPT",
         codings={"images": "PNG, the released bytes", "answer": "JSON text of the three fields of a caption"},
         notes=[f"{total} samples, one per window and language. Skipped: {reasons or 'none'}.", run_here],
         how_to_open=opened,

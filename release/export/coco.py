@@ -121,9 +121,10 @@ def run_lengths(mask: np.ndarray) -> list[int]:
 
 def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) -> FormatFacts:
     """Write the annotations, one file a split."""
+    facts = source.facts
     about = {
-        "info": {"description": source.name, "contributor": source.credits, "version": source.digest},
-        "licenses": [{"id": 1, "name": source.licence, "url": ""}], "categories": CATEGORIES,
+        "info": {"description": facts.source, "contributor": facts.credits, "version": facts.digest},
+        "licenses": [{"id": 1, "name": facts.licence, "url": ""}], "categories": CATEGORIES,
     }  # fmt: skip
     used = [split for split in SPLIT_NAMES if any(unit.split == split for unit, _ in done)]
     for split in used:
@@ -135,9 +136,9 @@ def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) ->
                 file.write(key)
                 write_joined(file, lines, b",\n")
                 file.write(end)
-    num_people, num_frames = sum(facts["people"] for _, facts in done), sum(unit.frames for unit, _ in done)
+    num_people, num_frames = sum(counts["people"] for _, counts in done), sum(unit.frames for unit, _ in done)
     return FormatFacts(
-        version="instances",
+        format_version="instances",
         codings={
             "pictures": "PNG, the released bytes",
             "masks": "run lengths of the pixels in instance.png; boxes enclose these pixels",

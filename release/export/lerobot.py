@@ -74,11 +74,8 @@ def features_of(modalities: Sequence[FrameFile], size_px: tuple[int, int], fps: 
     width, height = size_px
     found: dict[str, dict[str, Any]] = {}
     for file in modalities:
-        camera: dict[str, Any] = {
-            "dtype": "image",
-            "shape": [height, width, 3],
-            "names": ["height", "width", "channels"],
-        }
+        shape, names = [height, width, 3], ["height", "width", "channels"]
+        camera: dict[str, Any] = {"dtype": "image", "shape": shape, "names": names}
         if file == "depth":
             camera |= {"shape": [height, width, 1], "info": {"is_depth_map": True, "depth_unit": "m"}}
         elif video:
@@ -285,7 +282,7 @@ def _write_episode(
     table: pq.ParquetWriter, videos: dict[str, Callable[[np.ndarray], None]],
 ) -> dict[str, Any]:  # fmt: skip
     """Write the rows of an episode; return what the table of episodes has of it."""
-    track, n, schema = piece.track, piece.frames, table.schema
+    track, n = piece.track, piece.frames
     tasks = [task_of(track.goal, one) for one in track.decisions[piece.start : piece.stop]]
     scalars = list(track.rows(COLUMNS, piece.start, piece.stop))
     values = values_of(scalars, number, first, layout.fps, [layout.tasks.index(task) for task in tasks])
@@ -305,8 +302,8 @@ def _write_episode(
                     pixels[name].append(_pixels(data, row["sample_id"], file))
             advance()
         part = slice(start, start + ROWS_HELD)
-        columns = [images.get(field.name) or _column(values[field.name][part], field.type) for field in schema]
-        table.write_table(pa.table([pa.array(c, f.type) for c, f in zip(columns, schema, strict=True)], schema=schema))
+        columns = {name: images.get(name) or list(values[name][part]) for name in table.schema.names}
+        table.write_table(pa.Table.from_pydict(columns, schema=table.schema))
     stats = {name: summarize(np.concatenate(found), len(found), is_picture=True) for name, found in pixels.items()}
     for name, feature in features.items():
         if name not in pixels and feature["dtype"] != "string":
@@ -316,12 +313,6 @@ def _write_episode(
         "split": track.split, "first_frame": track.frame_index[piece.start], "dataset_from_index": first,
         "dataset_to_index": first + n, "stats": stats,
     }  # fmt: skip
-
-
-def _column(values: Any, kind: pa.DataType) -> Any:
-    if isinstance(values, list) or values.ndim == 1:
-        return values
-    return pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(values).reshape(-1)), kind.list_size)
 
 
 def _image(data: bytes, name: str, file: FrameFile) -> dict[str, Any]:
@@ -387,7 +378,7 @@ def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) ->
         codings["depth"] = "TIFF of float32 metres, the released numbers"
     codings["poses and points"] = "float32 of the released float64"
     return FormatFacts(
-        version=VERSION,
+        format_version=VERSION,
         codings=codings,
         notes=[
             f"{total} episodes of {len(source.tracks)} tracks at {layout.fps} frames per second; a track with gaps is "

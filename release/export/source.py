@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 import cosfly
 from cosfly.formats.boxes import UNKNOWN_LICENCE
@@ -44,7 +45,7 @@ from release.columns import (
     caption_values,
 )
 from release.reading import check_rows, row_lists
-from release.record import ReleasedMap, read_record, release_folder
+from release.record import ReleasedMap, Strict, read_record, release_folder
 
 PLANNED = [*PLACE, "frame_index", "time_s", "decision", "goal_en", "width_px", "height_px"]  # what plans need of a row
 # What one part of a path may be that rows name: no separator, nothing hidden, no ".."
@@ -129,20 +130,26 @@ class SourceTrack:
         return data
 
 
-@dataclass(frozen=True)
-class ExportSource:
-    """What is exported. digest: Of its content. inputs: The files that a stage records as its inputs."""
+class SourceFacts(Strict):
+    """What `export.json` says of the source. digest: Of its content. prompts: As in `release.json`."""
 
-    folder: Path
-    name: str
-    made_by: str
+    source: str
+    source_made_by: str
     digest: str
-    inputs: dict[str, Path]
     licence: str
     credits: str
     maps: list[ReleasedMap]
     coordinates: dict[str, Any]
-    prompts: dict[str, dict[str, str]]
+    prompts: dict[str, dict[str, str]] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ExportSource:
+    """What is exported. inputs: The files that a stage records as its inputs."""
+
+    folder: Path
+    facts: SourceFacts
+    inputs: dict[str, Path]
     modalities: tuple[FrameFile, ...]
     tracks: list[SourceTrack]
 
@@ -218,11 +225,12 @@ def open_release(folder: Path) -> ExportSource:
                     got = f"{track.split} and {shard.split}"
                     raise InputError("the track is in two splits", where=track.name, got=got)
                 track.add(own)
-    return ExportSource(
-        folder, record.name, record.made_by, record.content_digest, {"release": folder / "release.json"},
-        record.licence, record.credits, record.maps, record.coordinates, record.prompts,
-        tuple(record.settings.modalities), list(tracks.values()),
+    facts = SourceFacts(
+        source=record.name, source_made_by=record.made_by, digest=record.content_digest, licence=record.licence,
+        credits=record.credits, maps=record.maps, coordinates=record.coordinates, prompts=record.prompts,
     )  # fmt: skip
+    inputs = {"release": folder / "release.json"}
+    return ExportSource(folder, facts, inputs, tuple(record.settings.modalities), list(tracks.values()))
 
 
 def _place_of_row(parts: tuple[Any, ...], shard: Path) -> Place:
@@ -296,12 +304,13 @@ def open_trees(folder: Path, trees: list[Tree]) -> ExportSource:
         track = SourceTrack(place, "train", partial(_tree_rows, place, path, ids[place], lines))
         track.add(track.rows(PLANNED, 0, len(read_track(path, strict=False))))
         tracks.append(track)
-    return ExportSource(
-        folder, folder.absolute().name, f"cosfly {cosfly.__version__}", fingerprint(trees[0].data), inputs,
-        licences.pop() if len(licences) == 1 else UNKNOWN_LICENCE, " ".join(credits).strip(),
-        [ReleasedMap(town=town.name, **one.model_dump()) for town, one in maps.items()], CONTRACT, {},
-        tuple(file for file, name in FILE_NAMES.items() if frame_path(first, name).is_file()), tracks,
+    facts = SourceFacts(
+        source=folder.absolute().name, source_made_by=f"cosfly {cosfly.__version__}", digest=fingerprint(trees[0].data),
+        licence=licences.pop() if len(licences) == 1 else UNKNOWN_LICENCE, credits=" ".join(credits).strip(),
+        maps=[ReleasedMap(town=town.name, **one.model_dump()) for town, one in maps.items()], coordinates=CONTRACT,
     )  # fmt: skip
+    modalities = tuple(file for file, name in FILE_NAMES.items() if frame_path(first, name).is_file())
+    return ExportSource(folder, facts, inputs, modalities, tracks)
 
 
 Lines = dict[int, tuple[Path, int]]  # frame -> the file of its caption, and the byte at which its line begins

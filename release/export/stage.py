@@ -18,7 +18,7 @@ import os
 import shutil
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any, Literal, NamedTuple
 
@@ -36,8 +36,8 @@ from cosfly.runtime.run_dir import Resume, StageFolder
 from cosfly.runtime.worker import Item, Outcome, Work
 from cosfly.viz.page import markdown
 from release.columns import LANGUAGES, SPLIT_NAMES, SplitName
-from release.export.source import ExportSource, SourceTrack, open_source
-from release.record import ReleasedMap, Strict
+from release.export.source import ExportSource, SourceFacts, SourceTrack, open_source
+from release.record import Strict
 
 FormatName = Literal["tree", "lerobot", "webdataset", "coco", "chat", "sharegpt"]
 EXPORT_FORMAT = FileFormat("cosfly.export", "2.0", "record of an export")
@@ -119,21 +119,20 @@ class ExportUnit:
 Done = list[tuple[ExportUnit, dict[str, Any]]]  # the units, each with what `write` returned
 
 
-@dataclass(frozen=True)
-class FormatFacts:
-    """What a format states about itself in `export.json`.
+class FormatFacts(Strict):
+    """What a format states about itself.
 
     codings: How each thing is stored. notes: Conventions, and what the format cannot carry. how_to_open: Lines of
     Python. coordinates: If the format has other axes than the release. split_files: Split -> pattern of its files,
     where `datasets` opens the folder.
     """
 
-    version: str
+    format_version: str
+    codings: dict[str, str]
+    notes: list[str]
     how_to_open: str
-    codings: dict[str, str] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    coordinates: dict[str, str] = field(default_factory=dict)
-    split_files: dict[str, str] = field(default_factory=dict)
+    coordinates: dict[str, str] = Field({}, exclude=True)
+    split_files: dict[str, str] = Field({}, exclude=True)
 
 
 def track_units(source: ExportSource) -> list[ExportUnit]:
@@ -173,21 +172,12 @@ def scratch_of(folder: Path) -> Path:
 # --- the record -------------------------------------------------------------------------------------------------------
 
 
-class ExportRecord(Strict):
-    """`export.json`. source, digest: Name and content of what was exported, and the version that made it. prompts: The
-    questions, as the release's record has them."""
+class ExportRecord(SourceFacts):
+    """`export.json`: what was exported, and what its format states about itself."""
 
     format: str
     format_version: str
     made_by: str
-    source: str
-    source_made_by: str
-    digest: str
-    licence: str
-    credits: str
-    maps: list[ReleasedMap]
-    coordinates: dict[str, Any]
-    prompts: dict[str, dict[str, str]] = Field(default_factory=dict)
     codings: dict[str, str]
     notes: list[str]
     how_to_open: str
@@ -203,11 +193,8 @@ def _write_records(source: ExportSource, frames: int, facts: FormatFacts, folder
     with ThreadPoolExecutor() as pool:
         digests = dict(zip(listed, pool.map(sha256_file, listed), strict=True))
     record = ExportRecord(
-        format=cfg.format, format_version=facts.version, made_by=f"cosfly {cosfly.__version__}",
-        source=source.name, source_made_by=source.made_by, digest=source.digest,
-        licence=source.licence, credits=source.credits, maps=source.maps,
-        coordinates=facts.coordinates or source.coordinates, prompts=source.prompts, codings=facts.codings,
-        notes=facts.notes, how_to_open=facts.how_to_open, frames=frames,
+        **dict(source.facts) | facts.model_dump() | {"coordinates": facts.coordinates or source.facts.coordinates},
+        format=cfg.format, made_by=f"cosfly {cosfly.__version__}", frames=frames,
         bytes=sum(path.stat().st_size for path in paths),
     )  # fmt: skip
     write_model(folder / RECORD, record, EXPORT_FORMAT)

@@ -86,14 +86,14 @@ def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfi
 def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) -> FormatFacts:
     """Write each town's `map.json`, and count the tracks of which strict readers will miss something."""
     towns = {(unit.extra[0].rpartition("/trajectory_")[0], unit.track.place.town) for unit, _ in done}
-    maps = {entry.town: entry for entry in source.maps}
+    maps = {entry.town: entry for entry in source.facts.maps}
     for place, town in sorted(towns):
         shown = maps.get(town)
         about = TownMap(name=shown.name, licence=shown.licence, credits=shown.credits) if shown else None
         about = about or TownMap(name=town, licence=UNKNOWN_LICENCE, credits="")
         write_model(folder / place / TOWN_FILE, about, TOWN_FORMAT)
     return FormatFacts(
-        version=VERSION,
+        format_version=VERSION,
         codings={file: f"{FILE_NAMES[file]}, the released bytes" for file in source.modalities},
         coordinates=COORDINATES,
         notes=list(_notes(done)),

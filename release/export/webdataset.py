@@ -108,7 +108,7 @@ def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) ->
     names = f"{first}-{{00000..{last:05d}}}.tar" if last else f"{first}-00000.tar"
     codings: dict[str, str] = {file: f"{FILE_NAMES[file]}, the released bytes" for file in source.modalities}
     return FormatFacts(
-        version="tar, keys sorted",
+        format_version="tar, keys sorted",
         codings={
             **codings,
             "json": "texts, flags and numbers that no frame lacks; an empty text is a missing one",

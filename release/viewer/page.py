@@ -92,7 +92,7 @@ def run(
         parts, notes = _run_parts(trees, most_tracks)
     else:
         source, kind, trees = open_release(record.parent), "release", []
-        title = source.name
+        title = source.facts.source
         parts, notes = _release_parts(source, most_tracks)
     flights = []
     with progress_bar("viewer: tracks", len(parts)) as advance:
