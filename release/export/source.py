@@ -79,9 +79,9 @@ class SourceTrack:
         return "/".join((self.place.run, self.place.town, self.place.trajectory, self.place.variant))
 
     @property
-    def num_bytes(self) -> int:
-        """Approximate size of its pictures."""
-        return len(self) * self.size_px[0] * self.size_px[1] * BYTES_PER_PIXEL
+    def frame_bytes(self) -> int:
+        """Approximate size of the pictures of a frame."""
+        return self.size_px[0] * self.size_px[1] * BYTES_PER_PIXEL
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -282,7 +282,7 @@ def find_trees(folder: Path, captions: Path | None = None) -> list[Tree]:
 
 def open_trees(folder: Path, trees: list[Tree]) -> ExportSource:
     """Open playback trees: the tracks that their inspection accepted, or all of a tree without one."""
-    found: dict[Place, tuple[Path, Lines]] = {}
+    found: dict[Place, tuple[Path, dict[int, Line]]] = {}
     inputs: dict[str, Path] = {}
     for number, tree in enumerate(trees):
         roles = {"data": tree.data, "captions": tree.captions, "inspect": tree.inspect}
@@ -313,33 +313,47 @@ def open_trees(folder: Path, trees: list[Tree]) -> ExportSource:
     return ExportSource(folder, facts, inputs, modalities, tracks)
 
 
-Lines = dict[int, tuple[Path, int]]  # frame -> the file of its caption, and the byte at which its line begins
+Line = tuple[Path, int]  # the file of a caption, and the byte at which its line begins
 
 
-def _accepted_captions(tree: Tree, tracks: Iterable[Place]) -> dict[Place, Lines]:
-    """Return the accepted captions of the tracks of a tree."""
-    found: dict[Place, Lines] = {place: {} for place in tracks}
+def captions_of(tree: Tree) -> Iterator[tuple[tuple[str, str, str, str], Caption, Line]]:
+    """Yield the captions of a tree, each with the place of its track (PLACE) and its line."""
     begin = 0
     for line, caption in caption_lines(tree.captions) if tree.captions else ():
-        place = Place(*tree.place(caption))
-        if place not in found:
+        assert tree.captions is not None
+        yield tree.place(caption), caption, (tree.captions, begin)
+        begin += len(line.encode())
+
+
+def read_caption(line: Line) -> Caption:
+    """Read a caption again."""
+    path, begin = line
+    with open_file(path) as file:
+        file.seek(begin)
+        return Caption.model_validate_json(file.readline())
+
+
+def _accepted_captions(tree: Tree, tracks: Iterable[Place]) -> dict[Place, dict[int, Line]]:
+    """Return the lines of the accepted captions of each track of a tree, by frame."""
+    found: dict[Place, dict[int, Line]] = {place: {} for place in tracks}
+    for names, caption, line in captions_of(tree):
+        if (place := Place(*names)) not in found:
             raise InputError(
                 "the captions are of another playback tree", where=tree.captions, got=caption.sample_id,
                 expected=f"captions of tracks in {tree.data}", fix="run cosfly caption on this tree",
             )  # fmt: skip
-        if tree.captions and caption.status == "accepted":
-            found[place][caption.frame_index] = tree.captions, begin
-        begin += len(line.encode())
+        if caption.status == "accepted":
+            found[place][caption.frame_index] = line
     return found
 
 
 def _tree_rows(
-    place: Place, path: Path, track_id: str, lines: Lines, columns: Sequence[str], numbers: Sequence[int]
+    place: Place, path: Path, track_id: str, lines: dict[int, Line], columns: Sequence[str], numbers: Sequence[int]
 ) -> Iterator[Row]:
     track = replace(read_track(path, strict=False), run=place.run, town=place.town, given_id=track_id)
     placement = Placement(walk="/".join((place.run, place.town, place.trajectory)), split="train")
     for i in numbers:
-        values = caption_values(_caption_at(*lines[i])) if i in lines else None
+        values = caption_values(read_caption(lines[i])) if i in lines else None
         row = {name: COLUMNS[name].cell(track, i, values, placement) for name in columns if name in COLUMNS}
         for file in (FILE_OF[name] for name in columns if name in FILE_OF):
             picture = frame_path(track.frame_folder(i), FILE_NAMES[file])
@@ -347,9 +361,3 @@ def _tree_rows(
             name = f"{sample_id(track.flight_id, i)}_{FILE_NAMES[file]}"
             row[PICTURES[file].name] = as_depth_npy(data, picture) if file == "depth" else {"bytes": data, "path": name}
         yield row
-
-
-def _caption_at(path: Path, begin: int) -> Caption:
-    with open_file(path) as file:
-        file.seek(begin)
-        return Caption.model_validate_json(file.readline())

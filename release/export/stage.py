@@ -42,6 +42,7 @@ from release.record import Strict
 FormatName = Literal["tree", "lerobot", "webdataset", "coco", "chat", "sharegpt"]
 EXPORT_FORMAT = FileFormat("cosfly.export", "2.0", "record of an export")
 RECORD, README = "export.json", "README.md"
+OWN = (RECORD, README, CHECKSUMS)  # files that this module writes
 MB = 1024 * 1024
 
 
@@ -143,14 +144,14 @@ def track_units(source: ExportSource) -> list[ExportUnit]:
 def shards(pieces: Iterable[Piece], shard_mb: int) -> list[ExportUnit]:
     """Group pieces of each split into units of about `shard_mb`, and name them `train-00000`."""
     groups: dict[SplitName, list[list[Piece]]] = {split: [] for split in SPLIT_NAMES}
-    filled = 0.0
+    filled = 0
     for piece in pieces:
         of_split = groups[piece.track.split]
         if not of_split or filled >= shard_mb * MB:
             of_split.append([])
-            filled = 0.0
+            filled = 0
         of_split[-1].append(piece)
-        filled += piece.track.num_bytes * piece.frames / len(piece.track)
+        filled += piece.frames * piece.track.frame_bytes
     return [
         ExportUnit(f"{split}-{number:05d}", split, tuple(members))
         for split, of_split in groups.items()
@@ -187,9 +188,10 @@ class ExportRecord(SourceFacts):
 
 def _write_records(source: ExportSource, frames: int, facts: FormatFacts, folder: Path, cfg: ExportConfig) -> None:
     """Write `export.json`, README.md and the checksums."""
-    own_lists = {path.parent for path in folder.rglob(CHECKSUMS)} - {folder}  # such as those of the tracks of a tree
-    paths = [path for path in folder.rglob("*") if path.is_file() and path not in map(folder.joinpath, OWN)]
-    listed = [path for path in paths if path.name == CHECKSUMS or own_lists.isdisjoint(path.parents)]
+    own = {folder / name for name in OWN}
+    paths = [path for path in folder.rglob("*") if path.is_file() and path not in own]
+    with_list = {path.parent for path in paths if path.name == CHECKSUMS}  # such as the tracks of a tree
+    listed = [path for path in paths if path.name == CHECKSUMS or with_list.isdisjoint(path.parents)]
     with ThreadPoolExecutor() as pool:
         digests = dict(zip(listed, pool.map(sha256_file, listed), strict=True))
     record = ExportRecord(
@@ -201,9 +203,6 @@ def _write_records(source: ExportSource, frames: int, facts: FormatFacts, folder
     digests[folder / RECORD] = sha256_file(folder / RECORD)
     write_bytes(folder / README, render_readme(record, facts.split_files).encode())
     write_checksums(folder, {path.relative_to(folder).as_posix(): digest for path, digest in digests.items()})
-
-
-OWN = (RECORD, README, CHECKSUMS)
 
 
 def render_readme(record: ExportRecord, split_files: dict[str, str]) -> str:

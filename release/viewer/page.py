@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap, read_boxes
-from cosfly.formats.captions import Caption, Coc, read_captions
+from cosfly.formats.captions import Caption, Coc
 from cosfly.formats.frames import FrameFile, depth_values, frame_path
 from cosfly.formats.inspection import read_settled
 from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
@@ -56,7 +56,16 @@ from release.columns import (
     caption_values,
     scalar_row,
 )  # fmt: skip
-from release.export.source import ExportSource, SourceTrack, Tree, find_trees, open_release
+from release.export.source import (
+    ExportSource,
+    Line,
+    SourceTrack,
+    Tree,
+    captions_of,
+    find_trees,
+    open_release,
+    read_caption,
+)
 from release.reading import bounded
 from release.record import RECORD
 
@@ -96,13 +105,9 @@ def run(
         parts, notes = _release_parts(source, most_tracks)
     flights = []
     with progress_bar("viewer: tracks", len(parts)) as advance:
-        for part in parts:
-            try:
-                flights.append(_flight(part(), most_frames, picture_px))
-            except InputError as error:
-                if record is not None:
-                    raise
-                notes.append(f"not shown: {error.where}: {error.what}")
+        for read_part in parts:
+            if (part := read_part(notes)) is not None:
+                flights.append(_flight(part, most_frames, picture_px))
             advance(1)
     data = {"title": title, "kind": kind, "notes": notes, "maps": _maps(trees, flights), "flights": flights}
     script, style = scripts("tools.js", "canvas.js", "viewer.js"), scripts("viewer.css")
@@ -142,7 +147,8 @@ class _Part:
     read: Callable[[list[int]], Iterator[tuple[Mapping[str, Any], Views, dict[str, Any] | None]]]
 
 
-Parts = list[Callable[[], _Part]]  # each reads its track when it is called
+# Each reads its track when it is called; one that cannot be read is None, and is noted.
+Parts = list[Callable[[list[str]], _Part | None]]
 
 
 # --- a release --------------------------------------------------------------------------------------------------------
@@ -155,7 +161,7 @@ def _release_parts(source: ExportSource, most_tracks: int) -> tuple[Parts, list[
     return [partial(_released_part, track, source.modalities) for track in chosen], notes
 
 
-def _released_part(track: SourceTrack, modalities: Sequence[FrameFile]) -> _Part:
+def _released_part(track: SourceTrack, modalities: Sequence[FrameFile], notes: list[str]) -> _Part:
     places_m, fovs_deg, kinds = [], set[float](), dict[int, Hashable]()
     for row in track.rows(SCANNED):
         target = row["target"] or dict.fromkeys(POINT, 0.0)
@@ -203,39 +209,40 @@ def _picture(track: SourceTrack, row: Mapping[str, Any], file: FrameFile) -> np.
 def _run_parts(trees: list[Tree], most_tracks: int) -> tuple[Parts, list[str]]:
     found = {tree.place(place_of(path)): path for tree in trees for path in find_tracks(tree.data)}
     chosen, notes = _choose_tracks(list(found), [place[:-1] for place in found], most_tracks)
-    captions: dict[Place, dict[int, Caption]] = {place: {} for place in chosen}
-    for tree in trees:
-        for caption in () if tree.captions is None else read_captions(tree.captions):
-            if (place := tree.place(caption)) in captions:
-                captions[place][caption.frame_index] = caption
+    kinds: dict[Place, dict[int, Hashable]] = {place: {} for place in chosen}
+    lines: dict[Place, dict[int, Line]] = {place: {} for place in chosen}
+    for place, caption, line in (one for tree in trees for one in captions_of(tree)):
+        if place in kinds:
+            decision = caption.en.flight_decision if caption.en else None
+            kinds[place][caption.frame_index] = caption.status, caption.verdict, decision
+            lines[place][caption.frame_index] = line
     inspected = ((tree, read_settled(tree.inspect)) for tree in trees if tree.inspect is not None)
     results = {tree.place(track): track.result for tree, inspection in inspected for track in inspection.flights}
-    parts = [partial(_tree_part, place, found[place], captions[place], results.get(place)) for place in chosen]
+    parts = [partial(_tree_part, one[0], found[one], kinds[one], lines[one], results.get(one)) for one in chosen]
     return list(parts), notes
 
 
-def _tree_part(place: Place, path: Path, captions: Mapping[int, Caption], result: str | None) -> _Part:
+def _tree_part(
+    run: str, path: Path, kinds: dict[int, Hashable], lines: Mapping[int, Line], result: str | None, notes: list[str]
+) -> _Part | None:
     try:
         track = read_track(path, strict=False)
     except InputError as error:
-        error.where = f"{path.parent.name}/{path.name}"
-        raise
-    kinds: dict[int, Hashable] = {
-        i: (one.status, one.verdict, one.en.flight_decision if one.en else None) for i, one in captions.items()
-    }
+        notes.append(f"not shown: {path.parent.name}/{path.name}: {error.what}")
+        return None
     kind = "clean" if track.is_original else "perturbed"
     about = {"town": track.town, "track": kind, "split": None, "result": result}
     places_m = np.hstack([track.positions_m[:, :2], track.targets_m[:, :2]])
-    names = place[0], track.town, track.trajectory, track.variant
-    read = partial(_tree_frames, track, captions)
+    names = run, track.town, track.trajectory, track.variant
+    read = partial(_tree_frames, track, lines)
     return _Part(names, about, places_m, track.fovs_deg, range(len(track)), kinds, read)
 
 
 def _tree_frames(
-    track: Track, captions: Mapping[int, Caption], frames: list[int]
+    track: Track, lines: Mapping[int, Line], frames: list[int]
 ) -> Iterator[tuple[Mapping[str, Any], Views, dict[str, Any] | None]]:
     for index in frames:
-        folder, caption = track.frame_folder(index), captions.get(index)
+        folder, caption = track.frame_folder(index), read_caption(lines[index]) if index in lines else None
         values = None if caption is None else caption_values(caption)
         row = scalar_row(track, index, values, Placement(walk="", split="train"))
         files = (view for view in VIEW_OF.values() if frame_path(folder, VIEW_FILES[view]).exists())
