@@ -11,7 +11,8 @@ from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.config import build as build_config
-from cosfly.runtime.errors import NothingKept
+from cosfly.runtime.errors import InputError, NothingKept
+from distill.prepare.sources import RunSource
 from release.export.stage import ExportConfig
 from release.export.stage import run as export
 from specimens import make_playback_tree
@@ -98,6 +99,11 @@ def test_sharegpt_is_one_file_a_split_with_its_entry(two_splits, tmp_path):
         ids |= {sample["id"] for sample in samples}
         assert len({sample["id"] for sample in samples}) == len(samples) > 0
     assert all(name.endswith("_en") for name in ids)
+
+
+def test_a_training_set_is_not_made_of_a_release(run):
+    with pytest.raises(InputError, match=r"release: a release is not a run directory.*pass the run"):
+        RunSource.of_run(run / "release")
 
 
 def test_a_source_without_captions_is_refused(run, tmp_path):

@@ -73,15 +73,15 @@ def _samples_of(
     row: Row, track: SourceTrack, known: set[int], cfg: ExportConfig, skipped: Counter[str]
 ) -> Iterator[dict[str, Any]]:
     """Yield the samples of a caption, one per language."""
-    window = row[WINDOW][-1:] if cfg.frames == "last" else row[WINDOW]
-    if not set(window) <= known:
+    window = (row[WINDOW] or [])[-1 if cfg.frames == "last" else 0 :]
+    if not window or not set(window) <= known:
         skipped["frames of the window are not in the source"] += 1
         return
     images = [_picture_name(track, index) for index in window]
     for language in cfg.languages:
         answer = {name: row[f"caption_{language}_{name}"] for name in FIELDS}
         system, user = row[f"system_{language}"], row[f"prompt_{language}"]
-        if None in answer.values() or None in (system, user):
+        if None in (*answer.values(), system, user, row[PICTURE_PX]):
             skipped[f"no text or question in {language}"] += 1
             continue
         size_px = tuple(row[PICTURE_PX])

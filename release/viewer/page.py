@@ -138,7 +138,7 @@ class _Part:
     caption. read: Yields the rows of frames, in order, with their pictures and caption.
     """
 
-    place: Place
+    place: tuple[str, ...]  # PLACE
     about: dict[str, Any]
     places_m: np.ndarray
     fovs_deg: tuple[float, float]
@@ -175,11 +175,7 @@ def _released_part(track: SourceTrack, modalities: Sequence[FrameFile], notes: l
     about = {"town": row["town"], "track": row["track"], "split": row["split"]}
     fov_range = min(fovs_deg), max(fovs_deg)
     read = partial(_released_frames, track, modalities)
-    return _Part(_names(track.place), about, np.array(places_m), fov_range, track.frame_index, kinds, read)
-
-
-def _names(place: Any) -> Place:
-    return place.run, place.town, place.trajectory, place.variant
+    return _Part(tuple(track.name.split("/")), about, np.array(places_m), fov_range, track.frame_index, kinds, read)
 
 
 def _released_frames(
