@@ -244,7 +244,6 @@ def tell_size(folder: Path, path: Path) -> None:
     (lambda rows: rows[3]["image"].update(bytes=b"GIF89a"), "not a PNG"),
     (lambda rows: rows[3].update(depth=None), "the frame has no picture"),
     (lambda rows: rows[3]["pose"].update(x_m=float("inf")), "not finite"),
-    (lambda rows: rows[3].update(width_px=None), "a required value is missing"),
     (lambda rows: rows[3].update(sample_id="../../escaped"), "is not a file name"),
     (lambda rows: rows[3].update(sample_id=rows[2]["sample_id"]), "the sample_id of a frame is repeated"),
 ])  # fmt: skip
@@ -256,6 +255,13 @@ def test_a_unit_that_fails_publishes_nothing(broken, tmp_path, change, words):
     assert words in failures
     assert '"bug"' not in failures
     assert not (tmp_path / "out/webdataset").exists()
+
+
+def test_a_missing_size_is_found_before_anything_is_written(broken, tmp_path):
+    rewrite(broken, lambda rows: rows[3].update(width_px=None))
+    with pytest.raises(InputError, match="width_px: a required value is missing"):
+        export(config("webdataset"), broken, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]

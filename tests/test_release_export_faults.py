@@ -20,7 +20,7 @@ from release.export.stage import EXPORTS, ExportConfig
 from release.export.stage import run as export
 from specimens import make_playback_tree
 
-DISK_BYTES = 15_000  # the largest file that the system permits
+DISK_BYTES = 5_000  # the largest file that the system permits
 
 
 @pytest.fixture(scope="module")
