@@ -16,7 +16,7 @@ from typing import Any, Literal, Self, get_args, get_origin, overload
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cosfly.formats.captions import Language, Prompt
+from cosfly.formats.captions import FIELDS, Language, Place, Prompt
 from cosfly.formats.frames import frame_name
 from cosfly.formats.predictions import Split
 from cosfly.geometry.splits import SPLITS
@@ -88,10 +88,21 @@ class Sample(SplitMember):
     def pictures(self) -> Pictures:
         return Pictures(self.views, self.picture_px, "separate", self.depth_range_m)
 
+    def without_pictures(self) -> Sample:
+        """Return the sample as a student that takes no pictures gets it: its prompt says that none are given."""
+        told, none = (pictures.sentence(self.language) for pictures in (self.pictures, Pictures((), self.picture_px)))
+        user = self.prompt.user.replace(told, none)
+        return self.model_copy(update={"views": (), "prompt": self.prompt.model_copy(update={"user": user})})
+
     @property
     def images(self) -> list[str]:
         """Files of the playback tree in the order of the pictures made of them: frame by frame, its views together."""
         return [f"{frame}/{VIEW_FILES[view]}" for frame in self.frames for view in self.views]
+
+
+def decision_place(answer: str) -> Place:
+    """Return where the decision is among the fields of the JSON text of an answer."""
+    return "first" if answer.lstrip("{ ").startswith(f'"{FIELDS[-1]}"') else "last"
 
 
 class SourceTree(Record):
@@ -172,9 +183,10 @@ def split_path(dataset: Path, split: str) -> Path:
 
 class Samples(Sequence[Sample]):
     """The samples of a split: any by its number, all in a stream. Holds a few row groups; a process that it is sent to
-    opens its own."""
+    opens its own. text_only: samples are given without their pictures."""
 
-    def __init__(self, dataset: Path, split: Split) -> None:
+    def __init__(self, dataset: Path, split: Split, *, text_only: bool = False) -> None:
+        self.text_only = text_only
         record = read_training_set(dataset)
         self.path, self._systems = split_path(dataset, split), record.systems
         self._rows = TableRows(self.path, COLUMNS.names) if record.samples.get(split) else None
@@ -207,12 +219,13 @@ class Samples(Sequence[Sample]):
                 got=shown([system, user]),
                 expected=f"a prompt of {RECORD}",
             )
-        return validated(Sample, {**row, "prompt": Prompt(system=self._systems[system], user=user)}, where)
+        sample = validated(Sample, {**row, "prompt": Prompt(system=self._systems[system], user=user)}, where)
+        return sample.without_pictures() if self.text_only else sample
 
 
-def open_split(dataset: Path, split: Split) -> Samples:
-    """Open a split."""
-    return Samples(dataset, split)
+def open_split(dataset: Path, split: Split, *, text_only: bool = False) -> Samples:
+    """Open a split; with `text_only` as a student that takes no pictures gets it."""
+    return Samples(dataset, split, text_only=text_only)
 
 
 class SplitFiles:

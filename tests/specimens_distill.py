@@ -99,14 +99,14 @@ def make_adapter(base: Path, folder: Path, **changes) -> Path:
 
     from distill.student.checkpoint import ADAPTER_FACTS, adapter_facts
     from distill.student.model import load_student
-    from distill.training.settings import TARGET_MODULES
+    from distill.training.stage import target_modules
 
-    student = load_student(base, device="cpu", max_pixels=ADAPTER_PIXELS)
+    student = load_student(base, device="cpu")
     lora = {"r": 4, "lora_alpha": 12, "init_lora_weights": False, "task_type": "CAUSAL_LM"}
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(7)
         student.model = get_peft_model(
-            student.model, LoraConfig(**{"target_modules": TARGET_MODULES, **lora, **changes})
+            student.model, LoraConfig(**{"target_modules": target_modules(student), **lora, **changes})
         )
     with torch.no_grad():  # what training changes is small beside what was there
         for name, tensor in student.model.named_parameters():

@@ -9,7 +9,8 @@ import pytest
 from specimens_distill import make_captions, prepared
 
 from distill.schema import Sample, open_split, resolve_trees
-from distill.student.encoding import encode_text, load_pictures, patches_of, prompt_batch
+from distill.student.chat import prompt_batch
+from distill.student.features import Encoded, PictureReader, encode, pictures_of
 from distill.student.model import Student, load_student
 from distill.student.random_student import make_tiny_student
 from specimens import make_playback_tree
@@ -31,7 +32,7 @@ def make_place(root: Path) -> Path:
 
 
 def load(place: Path) -> Student:
-    return load_student(place / "student", device="cpu", max_pixels=MAX_PIXELS)
+    return load_student(place / "student", device="cpu")
 
 
 def samples_of(place: Path, split: str = "train") -> list[Sample]:
@@ -46,16 +47,27 @@ def inputs_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Path]
     """All that a model is given of some samples, with their pictures, each looked at anew."""
     import torch
 
-    patches = patches_of(own, [picture for sample in samples for picture in load_pictures(sample, trees)])
-    rows = [encode_text(own, sample) for sample in samples]
-    return prompt_batch(own, rows) | {"pixel_values": torch.from_numpy(patches).to(own.dtype)}
+    rows = [own.encode(sample, MAX_PIXELS) for sample in samples]
+    tokens = {name: torch.from_numpy(array) for name, array in prompt_batch(own, rows).items()}
+    return tokens | pixels_of(own, samples, trees)
 
 
-def features_of(own: Student, inputs: dict[str, Any]) -> Any:
+def pixels_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Path]) -> dict[str, Any]:
+    """The inputs of the pictures of some samples, as they are read."""
     import torch
 
-    found = own.core.get_image_features(inputs["pixel_values"], inputs["image_grid_thw"]).pooler_output
-    return torch.cat(found).detach()
+    reader = PictureReader(own, trees, own.dtype, MAX_PIXELS)
+    read = [reader.read(picture).inputs for sample in samples for picture in pictures_of(sample)]
+    return {name: torch.cat([one[name] for one in read]) for name in (read[0] if read else ())}
+
+
+def features_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Path]) -> list[Encoded]:
+    """The features of the pictures of some samples, each encoded by itself."""
+    import torch
+
+    reader = PictureReader(own, trees, own.dtype, MAX_PIXELS)
+    with torch.no_grad():
+        return [encode(own, [reader.read(picture)])[0] for sample in samples for picture in pictures_of(sample)]
 
 
 def log_of(out: Path, kind: str = "loss") -> list[dict]:

@@ -33,8 +33,6 @@ bench.load = lambda model, path, told: plain(model, path, [*told, "pedestrians.n
 bench.FITTED_ON = 200
 """),
     ("bench_client", "--windows 40 --concurrency 8", r"encoded on the way .* requests/s .* ratio 0\.\d+"),
-    ("bench_decoding", "--batch 1 --tokens 4 --repeats 1", r"generate"),
-    ("bench_decoding", "--check --batch 1 --tokens 4", r"\d"),
     ("bench_flying", "--flights 2 --decisions 4 --workers 1", r"\d+ decisions in .* a second", HERE),
     ("bench_flying", "--envs", r"2 side by side: .* steps a second",
              "import cosfly.envs.episodes; cosfly.envs.episodes.NUM_DECISIONS = 4"),

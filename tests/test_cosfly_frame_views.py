@@ -25,7 +25,7 @@ from cosfly.llm.student_chat import encoded_image
 from distill.inference.stage import InferConfig, make_request
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample
-from distill.student.encoding import load_pictures
+from distill.student.chat import load_pictures
 from specimens import make_playback_tree
 
 

@@ -11,7 +11,7 @@ import pytest
 from commands import invoke
 from later import torch
 from specimens_distill import ADAPTER_PIXELS, make_adapter, make_captions, prepared
-from specimens_students import features_of, inputs_of
+from specimens_students import features_of
 from teacher_server import kept_answers
 
 from cosfly.formats.predictions import Prediction, read_predictions
@@ -20,8 +20,7 @@ from distill.inference import merge
 from distill.inference import stage as infer
 from distill.schema import Sample, open_split, resolve_trees
 from distill.student.checkpoint import ADAPTER_FACTS
-from distill.student.decoding import decode
-from distill.student.encoding import encode_text
+from distill.student.generate import generate
 from distill.student.model import load_student
 from distill.student.random_student import make_tiny_student
 from specimens import make_playback_tree
@@ -70,14 +69,13 @@ def told(predictions: list[Prediction]) -> dict[str, str]:
 
 
 def test_each_sample_has_the_answer_that_it_has_alone(place, clean):
-    student = load_student(
-        place / "student", device="cpu", max_pixels=ADAPTER_PIXELS, adapter=place / "trained" / "adapter"
-    )
+    student = load_student(place / "student", device="cpu", adapter=place / "trained" / "adapter")
     samples, trees = samples_of(place), resolve_trees(place / "set", [place / "tree"])
     alone = {}
     for sample in samples:
-        features = features_of(student, inputs_of(student, [sample], trees))
-        alone[sample.key] = decode(student, [encode_text(student, sample)], features, max_tokens=NUM_TOKENS)[0].text
+        features = features_of(student, [sample], trees)
+        row = student.encode(sample, ADAPTER_PIXELS)
+        alone[sample.key] = generate(student, [row], features, max_tokens=NUM_TOKENS)[0].text
     predictions = read_predictions(clean)
     assert [prediction.key for prediction in predictions] == [sample.key for sample in samples]
     assert told(predictions) == alone

@@ -11,8 +11,7 @@ import pytest
 from specimens_students import FAST, load, samples_of
 
 from cosfly.runtime.errors import InputError
-from distill.student.encoding import END_OF_ANSWER, chat_text, encode_text, prompt_text
-from distill.student.model import END_OF_TURN, Processor
+from distill.student.chat import Processor
 from distill.training import stage as train
 from distill.training.settings import TrainConfig
 
@@ -74,25 +73,24 @@ TEMPLATES = {
 }
 
 
-@pytest.fixture
-def processor(place) -> Processor:
+@pytest.fixture(params=TEMPLATES)
+def processor(place, request) -> Processor:
     own = load(place)
-    return Processor(own.tokenizer, own.image_processor)
+    return Processor(own.tokenizer, own.library, own.picture_token_id, TEMPLATES[request.param])
 
 
-@pytest.mark.parametrize("version", TEMPLATES)
-def test_prompt_answer_and_end_are_the_whole_chat(place, processor, version):
-    processor.tokenizer.chat_template = TEMPLATES[version]
+def test_prompt_answer_and_end_are_the_whole_chat(place, processor):
+    assert processor.end_of_answer == "<|im_end|>\n"
     for sample in samples_of(place)[:4]:
-        prompt = prompt_text(processor, sample, [1] * len(sample.images))
-        assert prompt + sample.answer + END_OF_ANSWER == chat_text(processor, sample)
+        prompt = processor.prompt_text(sample)
+        assert prompt + sample.answer + processor.end_of_answer == processor.chat_text(sample)
         assert prompt.endswith("<|im_start|>assistant\n<think>\n\n</think>\n\n")  # the thought is over before it begins
         assert "Reasoning effort" not in prompt
         assert prompt.count("<|image_pad|>") == len(sample.images) == 5
-        row = encode_text(processor, sample)
-        counts = (row.image_grids.prod(axis=1) // 4).tolist()
+        row = processor.encode(sample)
         taught = processor.tokenizer.decode([*row.prompt_ids, *row.answer_ids])
-        assert taught == prompt_text(processor, sample, counts) + sample.answer + END_OF_TURN
+        pictures = "<|image_pad|>" * processor.picture_tokens(sample.picture_px)
+        assert taught == prompt.replace("<|image_pad|>", pictures) + sample.answer + "<|im_end|>"
 
 
 def test_a_template_that_writes_something_else_ends_before_the_first_step(place, tmp_path):

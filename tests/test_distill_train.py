@@ -27,11 +27,13 @@ from specimens_students import (
 )
 
 from cosfly.formats.predictions import read_predictions
+from cosfly.llm.student_chat import read_chat_format
 from cosfly.runtime.errors import ConfigError, InputError
 from distill.inference import stage as infer
 from distill.student import model as student
+from distill.student.chat import IGNORED, load_pictures, padded
 from distill.student.checkpoint import Progress, load_checkpoint, newest_checkpoint
-from distill.student.encoding import IGNORED, encode_text, load_pictures, padded
+from distill.student.random_student import END_OF_TURN
 from distill.training import fit
 from distill.training import stage as train
 from distill.training.fit import Validation, judged
@@ -59,7 +61,8 @@ def test_processor_agrees_with_the_library_one(place):
             return None if argument is None else super().check_argument_for_proper_class(name, argument)
 
     own, sample = load(place), samples_of(place)[0]
-    oracle = WithoutVideos(own.image_processor, own.tokenizer, None, chat_template=own.tokenizer.chat_template)
+    images = own.library.image_processor
+    oracle = WithoutVideos(images, own.tokenizer, None, chat_template=own.tokenizer.chat_template)
     frames = []
     for number, picture in enumerate(load_pictures(sample, trees_of(place))):
         frames += [{"type": "text", "text": f"t{number}:"}, {"type": "image", "image": picture}]
@@ -78,12 +81,12 @@ def test_processor_agrees_with_the_library_one(place):
 def test_mask_covers_exactly_the_answer(place):
     own = load(place)
     samples = samples_of(place)[:2]  # one in each language
-    rows = [encode_text(own, sample) for sample in samples]
-    ids, labels, positions = padded(own, rows)
-    assert positions.shape == (3, *ids.shape)
+    rows = [own.encode(sample) for sample in samples]
+    batch = padded(own, rows)
+    ids, labels = batch["input_ids"], batch["labels"]
     for i, sample in enumerate(samples):
         counted = labels[i] != IGNORED
-        assert own.tokenizer.decode(ids[i][counted]) == sample.answer + student.END_OF_TURN
+        assert own.tokenizer.decode(ids[i][counted]) == sample.answer + END_OF_TURN
         assert np.array_equal(ids[i][counted], labels[i][counted])
         places = counted.nonzero()[0].tolist()
         assert places == list(range(places[0], places[-1] + 1))
@@ -131,7 +134,7 @@ def test_the_product_holds_no_pickle_and_no_local_path(place, trained):
 def test_adapter_reloads_equal(place, trained):
     own = train.add_adapter(load(place), TrainConfig(**FAST), 0)
     assert load_checkpoint(trained / "checkpoints" / "step_00000012", own).step == 12
-    again = student.load_student(place / "student", device="cpu", max_pixels=MAX_PIXELS, adapter=trained / "adapter")
+    again = student.load_student(place / "student", device="cpu", adapter=trained / "adapter")
     logits = []
     for model in (own, again, load(place)):
         inputs = inputs_of(model, samples_of(place)[:1], trees_of(place))
@@ -184,8 +187,8 @@ def test_a_model_trained_in_full_is_a_whole_folder(place, tmp_path):
     model = AutoModelForImageTextToText.from_pretrained(folder, dtype=torch.float32)
     assert AutoTokenizer.from_pretrained(folder).chat_template == load(place).tokenizer.chat_template
     assert GenerationConfig.from_pretrained(folder) is not None
-    own = student.load_student(folder, device="cpu", max_pixels=10**9)
-    assert own.image_processor.size["longest_edge"] == MAX_PIXELS  # what it was taught with stays its own bound
+    own = student.load_student(folder, device="cpu")
+    assert read_chat_format(folder).max_pixels == MAX_PIXELS  # the limit that it was taught with
     inputs = inputs_of(own, samples_of(place)[:1], trees_of(place))
     with torch.inference_mode():
         assert torch.equal(own.model.eval()(**inputs).logits, model.eval()(**inputs).logits)

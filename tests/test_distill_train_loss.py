@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from later import torch
-from specimens_students import FAST, features_of, inputs_of, load, losses_of, run, samples_of, trees_of
+from specimens_students import FAST, MAX_PIXELS, features_of, load, losses_of, pixels_of, run, samples_of, trees_of
 
-from distill.student.encoding import EncodedSample, encode_text, padded
+from distill.student.chat import EncodedSample, padded
+from distill.student.features import Encoded
 from distill.student.model import Student
 from distill.training import fit
 from distill.training import stage as train
@@ -24,9 +25,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 FOUR = {"max_steps": 4, "validation_samples": 0, "learning_rate": 1e-3}
 
 
-def seen(place: Path, own: Student, count: int) -> tuple[list[EncodedSample], torch.Tensor]:
+def seen(place: Path, own: Student, count: int) -> tuple[list[EncodedSample], list[Encoded]]:
     samples = samples_of(place)[:count]
-    return [encode_text(own, s) for s in samples], features_of(own, inputs_of(own, samples, trees_of(place)))
+    return [own.encode(s, MAX_PIXELS) for s in samples], features_of(own, samples, trees_of(place))
 
 
 @pytest.mark.parametrize("chunk", [7, 1000])
@@ -60,12 +61,9 @@ def test_loss_and_gradients_are_those_of_the_library(place):
     (total / len(row.answer_ids)).backward()
     found = {name: p.grad.clone() for name, p in learning.items()}
     own.model.zero_grad()
-    ids, labels, _ = padded(own, [row])
-    inputs = inputs_of(own, samples_of(place)[:1], trees_of(place)) | {
-        "input_ids": torch.from_numpy(ids), "attention_mask": torch.ones(ids.shape, dtype=torch.int64),
-        "mm_token_type_ids": torch.from_numpy((ids == own.image_token_id).astype(np.int64)),
-    }  # fmt: skip
-    library = own.model(**inputs, labels=torch.from_numpy(labels)).loss
+    inputs = {name: torch.from_numpy(array) for name, array in padded(own, [row]).items() if name != "weights"}
+    inputs["attention_mask"] = torch.ones_like(inputs["input_ids"])
+    library = own.model(**inputs, **pixels_of(own, samples_of(place)[:1], trees_of(place))).loss
     library.backward()
     assert float(total.detach()) / len(row.answer_ids) == pytest.approx(float(library.detach()), rel=1e-5)
     assert float(nats[0]) == pytest.approx(float(total.detach()), rel=1e-6)
@@ -76,16 +74,16 @@ def test_loss_and_gradients_are_those_of_the_library(place):
 def test_a_sample_in_a_batch_has_its_loss_alone(place):
     own = load(place)
     rows, features = seen(place, own, 4)
-    parts = features.split([int((row.prompt_ids == own.image_token_id).sum()) for row in rows])
+    parts = [features[5 * place : 5 * place + 5] for place in range(4)]
     # Lengths far apart, one beyond a piece of 64 tokens of the linear attention.
-    rows[1] = replace(rows[1], answer_ids=np.tile(rows[1].answer_ids, 3))
-    rows[2] = replace(rows[2], answer_ids=rows[2].answer_ids[:5], weight=0.5)
+    rows[1] = replace(rows[1], answer_ids=np.tile(rows[1].answer_ids, 3), weights=np.tile(rows[1].weights, 3))
+    rows[2] = replace(rows[2], answer_ids=rows[2].answer_ids[:5], weights=np.full(5, 0.5, np.float32))
     with torch.no_grad():
         _, together = answer_loss(own, rows, features, 64)
         alone = [answer_loss(own, [row], part, 64) for row, part in zip(rows, parts, strict=True)]
     for row, found, (total, nats) in zip(rows, together.tolist(), alone, strict=True):
         assert found == pytest.approx(float(nats[0]), rel=1e-5)
-        assert float(total) == pytest.approx(row.weight * float(nats[0]), rel=1e-6)
+        assert float(total) == pytest.approx(float(row.weights[0]) * float(nats[0]), rel=1e-6)
 
 
 @pytest.mark.parametrize(("changes", "feature_memory_gb", "logit_chunk"), [

@@ -35,7 +35,6 @@ from cosfly.llm.vllm_engine import VllmEngine
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, TeacherError
 from distill.inference import stage as infer
 from distill.schema import open_split
-from distill.student.model import MODEL_TYPE
 from specimens import make_playback_tree
 
 SAMPLING = EndpointConfig(max_tries=1, max_tokens=64)
@@ -363,7 +362,7 @@ def test_a_student_answers_in_the_same_engine(stand_in, tmp_path):
     training_set = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
     student = tmp_path / "student"
     student.mkdir()
-    (student / "config.json").write_text(json.dumps({"model_type": MODEL_TYPE}))
+    (student / "config.json").write_text(json.dumps({"model_type": "qwen3_5"}))
     (student / "model.safetensors").touch()
     cfg = infer.InferConfig(split="train", engine="vllm", constrained=True)
     predictions = read_predictions(infer.run(cfg, training_set, [tree], student, tmp_path / "out"))

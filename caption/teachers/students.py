@@ -122,7 +122,8 @@ class TrainedStudent:
         prompt, more = question.asked[language], regeneration_lines(question) if language == "en" else ""
         prompt = prompt.model_copy(update={"system": prompt.system + more})
         frames = encode_frames(question, encode)
-        return student_request(prompt, frames, answer_schema(decision, language), self._sampling, seed)
+        schema = answer_schema(decision, language, place=self.chat_format.decision)
+        return student_request(prompt, frames, schema, self._sampling, seed)
 
 
 def _described(views: Sequence[str], size_px: tuple[int, int]) -> str:

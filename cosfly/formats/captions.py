@@ -15,6 +15,14 @@ from cosfly.runtime.io import atomic_file
 from cosfly.runtime.json_io import Record, model_lines
 
 FIELDS = ("critical_components", "reasoning_trace", "flight_decision")
+Place = Literal["first", "last"]  # of the decision among the fields of an answer
+
+
+def fields_in_order(decision: Place) -> tuple[str, ...]:
+    """Return the fields of an answer, with the decision in its place."""
+    return FIELDS if decision == "last" else (FIELDS[-1], *FIELDS[:-1])
+
+
 Language = Literal["en", "zh"]
 TeacherKind = Literal["rules", "endpoint", "vllm", "file", "student"]
 Writing = Literal["slots", "prose"]
@@ -48,6 +56,10 @@ class Coc(Record):
     critical_components: str
     reasoning_trace: str
     flight_decision: str
+
+    def ordered(self, decision: Place) -> dict[str, str]:
+        """Return the fields of an answer, with the decision in its place."""
+        return {name: getattr(self, name) for name in fields_in_order(decision)}
 
 
 def verdict_on(decision: str, label: str | None, contradicted: Collection[str]) -> Verdict:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 
-from cosfly.formats.captions import BY_LETTERS, FIELDS, TOKENS, Coc, Language
+from cosfly.formats.captions import BY_LETTERS, FIELDS, TOKENS, Coc, Language, Place, fields_in_order
 from cosfly.runtime.model_json import find_object
 
 _DECISION = re.compile(
@@ -37,12 +37,15 @@ def normalize_action(text: str) -> str | None:
     return BY_LETTERS.get(re.sub(r"[\s_-]", "", match["action"])) if match else None
 
 
-def answer_schema(decision: str | None = None, language: Language = "en", more: Mapping[str, dict] = {}) -> dict:
+def answer_schema(
+    decision: str | None = None, language: Language = "en", more: Mapping[str, dict] = {}, place: Place = "last"
+) -> dict:
     """Return the JSON schema of an answer.
 
     Args:
         decision: The only decision that is allowed; None allows all.
         more: Further fields and their schemas; they follow the texts and precede the decision.
+        place: Of the decision. Servers write the fields in the order of the schema.
     """
     properties: dict[str, dict] = {
         name: {"type": "string", "minLength": characters, "maxLength": MAX_CHARACTERS[name]}
@@ -50,6 +53,7 @@ def answer_schema(decision: str | None = None, language: Language = "en", more: 
     }
     properties |= more
     properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(TOKENS)}
+    properties = {name: properties[name] for name in dict.fromkeys([*fields_in_order(place)[:1], *properties])}
     return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
 
 

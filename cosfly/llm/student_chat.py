@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
-from cosfly.formats.captions import Language, Prompt
+from cosfly.formats.captions import Language, Place, Prompt
 from cosfly.llm.client import EndpointConfig
 from cosfly.llm.contract import Request
 from cosfly.runtime.errors import InputError
@@ -58,14 +58,29 @@ class EncodedImage(NamedTuple):
     digest: str
 
 
+def limited_size(size_px: tuple[int, int], max_pixels: int) -> tuple[int, int]:
+    """Return the size in which a picture of (width, height) px is given to a student; 0 disables the limit.
+
+    The student's own processor gets this picture in training, inference and a server, so all make the same tokens.
+    """
+    scale = math.sqrt(max_pixels / math.prod(size_px))
+    if not max_pixels or scale >= 1.0:
+        return size_px
+    return max(1, int(size_px[0] * scale)), max(1, int(size_px[1] * scale))
+
+
+def limited_picture(rgb: np.ndarray, max_pixels: int) -> np.ndarray:
+    """Scale a picture, (h, w, 3) uint8 RGB, down to `limited_size`."""
+    height_px, width_px = rgb.shape[:2]
+    size_px = limited_size((width_px, height_px), max_pixels)
+    if size_px == (width_px, height_px):
+        return rgb
+    return np.asarray(Image.fromarray(rgb).resize(size_px, Image.Resampling.BICUBIC))
+
+
 def picture_to_send(rgb: np.ndarray, max_pixels: int) -> EncodedImage:
     """Encode a picture, (h, w, 3) uint8 RGB, without loss, scaled down to `max_pixels`; 0 disables scaling."""
-    height_px, width_px = rgb.shape[:2]
-    scale = math.sqrt(max_pixels / (width_px * height_px))
-    if max_pixels and scale < 1.0:
-        size = (max(1, int(width_px * scale)), max(1, int(height_px * scale)))
-        rgb = np.asarray(Image.fromarray(rgb).resize(size, Image.Resampling.BICUBIC))
-    return encoded_image(rgb, IMAGE_ENCODING)
+    return encoded_image(limited_picture(rgb, max_pixels), IMAGE_ENCODING)
 
 
 def encoded_image(rgb: np.ndarray, encoding: Literal["jpeg", "png"] = "jpeg") -> EncodedImage:
@@ -104,7 +119,7 @@ class ChatFormat(BaseModel):
     """`cosfly_student.json`, next to a student's weights: the form of its chats in training.
 
     prompts: One question per language. num_frames: Frames of a window. looks: Picture formats of all training samples,
-    sorted. max_pixels: Limit of the image processor.
+    sorted. max_pixels: Limit of a picture (`limited_size`). decision: Its place among the fields of an answer.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -113,6 +128,7 @@ class ChatFormat(BaseModel):
     num_frames: int = Field(ge=1)
     looks: list[FrameFormat] = Field(min_length=1)
     max_pixels: int = Field(ge=1)
+    decision: Place = "last"
 
 
 def write_chat_format(folder: Path, chat_format: ChatFormat) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.formats.captions import Language
+from cosfly.formats.captions import Language, Place
 from cosfly.formats.places import flight_of
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.answers import Answer, AnswerBook
@@ -28,10 +28,10 @@ from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import dump_json
 from distill.inference.outcome import OpenFlights, SampleOutcome, failed
 from distill.schema import Sample
-from distill.student.decoding import Completion, Constraint, decode
-from distill.student.encoding import EncodedSample, encode_text
+from distill.student.chat import EncodedSample
 from distill.student.features import FramePicture, PictureData, PictureReader, VisionFeatures, pictures_of
-from distill.student.model import Processor, Student, require
+from distill.student.generate import Completion, Constraint, generate
+from distill.student.model import Student, require
 
 log = logging.getLogger(__name__)
 
@@ -70,21 +70,21 @@ class LocalAnswers:
         model: str,
         batch_size: int,
         max_tokens: int,
+        max_pixels: int,
         constrain: Constrain | None,
         feature_bytes: int,
     ) -> None:
         """
         Args:
-            model: its name, for the journal. max_tokens: of an answer. constrain: makes a batch's constraint.
-            feature_bytes: most memory for what the vision tower made of the pictures of a shelf.
+            model: its name, for the journal. max_tokens: of an answer. max_pixels: of a picture; 0: no limit.
+            constrain: makes a batch's constraint. feature_bytes: most memory for features of the pictures of a shelf.
         """
         self.student, self.book, self.model = student, book, model
         self.batch_size, self.max_tokens, self.constrain = batch_size, max_tokens, constrain
         self.most_rows = batch_size  # fewer once the memory was full
-        self._feature_bytes = feature_bytes
+        self._feature_bytes, self._max_pixels = feature_bytes, max_pixels
         self._flights = OpenFlights(book)
-        processor = Processor(student.tokenizer, student.image_processor)
-        self._reader = PictureReader(processor, trees, student.dtype)
+        self._reader = PictureReader(student.processor, trees, student.dtype, max_pixels)
         self._threads = ThreadPoolExecutor(READING_THREADS, "pictures")
 
     def __enter__(self) -> LocalAnswers:
@@ -95,9 +95,10 @@ class LocalAnswers:
 
     async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
         """Yield the outcome of each sample, in their order; `advance` is called after each batch."""
-        rest = iter(samples)
+        rest = iter(samples if self.student.has_pictures else (sample.without_pictures() for sample in samples))
+        kept: Any = {"memory_bytes": self._feature_bytes, "max_pixels": self._max_pixels}
         while chosen := list(islice(rest, SHELF_BATCHES * self.batch_size)):
-            shelf = _Shelf(chosen, VisionFeatures(self.student, memory_bytes=self._feature_bytes))
+            shelf = _Shelf(chosen, VisionFeatures(self.student, **kept))
             self._take_kept(shelf)
             shelf.tell(advance)
             if len(shelf.found) < len(shelf.samples):
@@ -136,7 +137,7 @@ class LocalAnswers:
         """Cut a shelf into batches of like length; a sample whose prompt cannot be written has failed."""
         for sample in shelf.samples:
             try:
-                shelf.rows[sample.key] = encode_text(self.student, sample)
+                shelf.rows[sample.key] = self.student.encode(sample, self._max_pixels)
             except InputError as error:
                 shelf.found[sample.key] = failed(sample, error.code, error)
         rows = sorted(
@@ -202,7 +203,7 @@ class LocalAnswers:
         constraint = self.constrain([sample.language for sample in samples]) if self.constrain else None
         features = shelf.features.of([picture for sample in samples for picture in pictures_of(sample)])
         rows = [shelf.rows[sample.key] for sample in samples]
-        return decode(self.student, rows, features, max_tokens=self.max_tokens, constraint=constraint)
+        return generate(self.student, rows, features, max_tokens=self.max_tokens, constraint=constraint)
 
     async def _keep(self, shelf: _Shelf, samples: list[Sample], decoded: list[Completion], begun_s: float) -> None:
         """Journal new answers; they are on the disk when this returns."""
@@ -225,7 +226,7 @@ class LocalAnswers:
 
 
 class SchemaConstraint:
-    """Holds the answers of a batch to the schema of their language; see `Constraint` in distill/student/decoding.py."""
+    """Holds the answers of a batch to the schema of their language; see `Constraint` in distill/student/generate.py."""
 
     def __init__(self, tokens: Any, grammars: Sequence[str]) -> None:
         """
@@ -251,8 +252,11 @@ class SchemaConstraint:
 class AnswerSchemas:
     """Makes the constraints of batches; texts of a language share their grammar."""
 
-    def __init__(self, student: Student) -> None:
-        """"""
+    def __init__(self, student: Student, place: Place) -> None:
+        """
+        Args:
+            place: of the decision among the fields.
+        """
         require("llguidance")
         from llguidance import LLMatcher
         from llguidance.hf import from_tokenizer
@@ -261,7 +265,7 @@ class AnswerSchemas:
         languages: tuple[Language, ...] = ("en", "zh")
         # Free whitespace would let a student pad for ever.
         strict: Any = {"whitespace_flexible": False}
-        schemas = {language: answer_schema(language=language) for language in languages}
+        schemas = {language: answer_schema(language=language, place=place) for language in languages}
         grammar_of = LLMatcher.grammar_from_json_schema
         self._grammars = {language: grammar_of(schema, defaults=strict) for language, schema in schemas.items()}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import time
 from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping, Sequence
@@ -33,10 +34,12 @@ from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.run_dir import Resume, StageFolder, read_manifest
 from distill.inference.local import AnswerSchemas, LocalAnswers
 from distill.inference.outcome import ANSWERS, OpenFlights, Results, SampleOutcome, failed, writing_results
-from distill.schema import Sample, open_split, resolve_trees, tree_inputs
+from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
+from distill.student.chat import load_pictures
 from distill.student.checkpoint import read_adapter_facts
-from distill.student.encoding import load_pictures, most_pixels
-from distill.student.model import Device, load_student, require, student_folder, weight_files
+from distill.student.model import Device, load_student, require, student_path, weight_files
+
+log = logging.getLogger(__name__)
 
 # Times those in flight are begun: pictures are read while others are asked, and a slow answer holds up no other.
 WAITING = 4
@@ -48,7 +51,8 @@ def make_request(
     """Return a sample as chat messages: its pictures as the student was taught to see them, then the question."""
     pictures = iter([picture_to_send(picture, max_pixels) for picture in load_pictures(sample, trees)])
     frames = [[next(pictures) for _ in sample.views] for _ in sample.frames]
-    return student_request(sample.prompt, frames, answer_schema(language=sample.language), sampling)
+    schema = answer_schema(language=sample.language, place=decision_place(sample.answer))
+    return student_request(sample.prompt, frames, schema, sampling)
 
 
 class EngineAnswers:
@@ -147,6 +151,7 @@ class InferConfig(Config):
         8, ge=1, description="samples that transformers answers together; rounding may depend on it"
     )
     max_pixels: int = Field(0, ge=0, description="most pixels of a picture; 0: as in training, if that is known")
+    allow_code: bool = Field(False, description="run code from the student's repository; only if you trust it")
     device: Device = Field("auto", description="auto, cpu or cuda for transformers; bfloat16 on cuda, float32 on a CPU")
     endpoint: StudentEndpointConfig = Field(
         StudentEndpointConfig(),
@@ -205,8 +210,10 @@ async def _answering(
 
 def local_answers(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAnswers:
     model = Path(inputs.model)
-    max_pixels = cfg.max_pixels or inputs.taught_pixels or most_pixels(inputs.samples)
-    student = load_student(model, device=cfg.device, max_pixels=max_pixels, adapter=inputs.adapter)
+    student = load_student(model, device=cfg.device, adapter=inputs.adapter, allow_code=cfg.allow_code)
+    if not student.has_pictures and inputs.samples and inputs.samples[0].views:
+        log.warning("%s: the student takes no pictures: it answers from the text state alone", STAGE)
+    place = decision_place(inputs.samples[0].answer) if inputs.samples else "last"
     return LocalAnswers(
         student,
         book,
@@ -214,7 +221,8 @@ def local_answers(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAn
         model=inputs.name,
         batch_size=cfg.batch_size,
         max_tokens=cfg.max_new_tokens,
-        constrain=AnswerSchemas(student) if cfg.constrained else None,
+        max_pixels=cfg.max_pixels or inputs.taught_pixels,
+        constrain=AnswerSchemas(student, place) if cfg.constrained else None,
         feature_bytes=int(FEATURE_MEMORY_GB * 1e9),
     )
 
@@ -285,7 +293,7 @@ def run(
     if cfg.engine == "endpoint":
         cfg, facts["server"] = _identified(cfg, str(model), out)
     else:
-        model = student_folder(str(model))
+        model = student_path(str(model), allow_code=cfg.allow_code)
         files |= weight_files(model)
     if adapter is not None:
         read_adapter_facts(adapter, Path(model))

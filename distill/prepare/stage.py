@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from cosfly.formats.captions import PICTURES_MARK, TOKENS, Caption, Language, Verdict, not_in_set, read_captions
+from cosfly.formats.captions import PICTURES_MARK, TOKENS, Caption, Language, Place, Verdict, not_in_set, read_captions
 from cosfly.formats.places import TrackChoice
 from cosfly.formats.playback import read_track
 from cosfly.formats.predictions import Split
@@ -167,6 +167,9 @@ class PrepareConfig(SplitConfig):
     languages: tuple[Language, ...] = Field(
         ("en", "zh"), min_length=1, description="languages of the answers; each gives its own samples"
     )
+    decision: Place = Field(
+        "last", description="place of the decision among the fields of an answer; a student answers in this order"
+    )
     modalities: tuple[View, ...] = Field(
         ("rgb",),
         description="pictures of each frame, in this order; middle: the middle third of rgb; empty: only text",
@@ -216,7 +219,7 @@ def make_sample(
     coc = caption.en if language == "en" else caption.zh
     if coc is None or language not in caption.prompt:
         return f"no_{language}"
-    answer = dump_json(coc.model_dump())
+    answer = dump_json(coc.ordered(cfg.decision))
     parsed = parse_answer(answer, language)
     if parsed.coc is None:  # nothing may be taught that evaluation would call wrong
         return f"answer_{parsed.reason}"

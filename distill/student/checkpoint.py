@@ -29,7 +29,7 @@ from cosfly.runtime.json_io import (
     write_json,
     write_model,
 )
-from distill.student.model import Student, weight_files
+from distill.student.model import GGUF, TEMPLATE, Student, weight_files
 
 log = logging.getLogger(__name__)
 
@@ -211,30 +211,39 @@ def write_adapter_folder(student: Student, folder: Path, base_name: str) -> None
     """
     with disk_errors(folder):
         student.model.save_pretrained(folder)
+    if student.template:
+        write_bytes(folder / TEMPLATE, student.template.encode())
     (folder / "README.md").unlink(missing_ok=True)
     path = folder / "adapter_config.json"
     write_json(path, read_object(path, what="adapter") | {"base_model_name_or_path": base_name})
 
 
+COPIED = ("*.json", "*.jinja", "*.txt", "*.model", "LICENSE*")  # files of a model folder without weights and code
+
+
 def write_model_folder(student: Student, folder: Path, base: Path) -> None:
-    """Write a whole model that transformers and vLLM load: weights, and whatever else its base has, with the processor
-    as it was used.
+    """Write a whole model that transformers and vLLM load: its weights, and the other files of its base as they are.
 
     Args:
-        student: a model without an adapter beside its weights.
+        student: a model without an adapter next to its weights.
+        base: its folder, or the GGUF file that it was read from.
     """
-    for path in sorted(base.iterdir()):
-        if path.is_file() and path.suffix in (".json", ".jinja", ".txt") and "safetensors" not in path.name:
-            shutil.copyfile(path, folder / path.name)
+    if base.is_dir():
+        for path in sorted({path for pattern in COPIED for path in base.glob(pattern)}):
+            if path.is_file() and "safetensors" not in path.name:
+                shutil.copyfile(path, folder / path.name)  # a hub's cache holds links, of which the content counts
     with disk_errors(folder):
-        student.model.to(student.dtype).save_pretrained(folder)
-        student.tokenizer.save_pretrained(folder)
-        student.image_processor.save_pretrained(folder)
+        student.model.save_pretrained(folder)
+        if not base.is_dir():
+            student.tokenizer.save_pretrained(folder)
+    if student.template:
+        write_bytes(folder / TEMPLATE, student.template.encode())
 
 
 def base_digests(model: Path) -> dict[str, str]:
     """Return the digests of the weight files that an adapter belongs to."""
-    return {path.name: sha256_file(path) for path in weight_files(model).values() if path.suffix == ".safetensors"}
+    suffixes = (".safetensors", GGUF)
+    return {path.name: sha256_file(path) for path in weight_files(model).values() if path.suffix in suffixes}
 
 
 class AdapterFacts(BaseModel):

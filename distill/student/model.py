@@ -1,34 +1,33 @@
-"""The student: a vision-language model of Qwen3.5's structure (3.5, 3.6, 3.8), its tokenizer and its image processor.
+"""Load a student through transformers' Auto classes: a vision-language model or a language model of any family.
 
-The processor is put together here from the tokenizer and the Pillow image processor: the ready-made one needs
-torchvision and, without it, silently shrinks to the tokenizer. Only `student_folder` reaches for a network, for a
-repository's name.
+A student is a folder, the name of a repository on a hub, or a GGUF file. Only `student_path` uses the network.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import importlib.util
+import inspect
+import logging
 import re
 import warnings
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE
-from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, shown
-from cosfly.runtime.json_io import read_json
-from distill.student.kernels import fuse_norms, look_at_equal_sizes_at_once, use_kernels_for
+from cosfly.runtime.errors import EnvironmentMissing, InputError, shown
+from cosfly.runtime.json_io import read_json, read_object
+from distill.student.chat import Processor
+
+log = logging.getLogger(__name__)
 
 INSTALL = 'pip install "cosfly[distill]"'
-MODEL_TYPE = "qwen3_5"
-END_OF_TURN = "<|im_end|>"
-IMAGE_TOKEN = "<|image_pad|>"
-# What the chat templates of Qwen3.5, 3.6 and 3.8 write, and a student must know as one token each.
-NEEDED_TOKENS = ("<|im_start|>", END_OF_TURN, "<|vision_start|>", "<|vision_end|>", IMAGE_TOKEN)
 HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
-MODEL_FILES = ["*.json", "*.safetensors", "*.jinja", "*.txt"]  # of a repository; none of them is code
+MODEL_FILES = ["*.json", "*.safetensors", "*.jinja", "*.txt", "*.model"]  # of a repository; none of them is code
+GGUF = ".gguf"
+TEMPLATE = "chat_template.jinja"
 Device = Literal["auto", "cpu", "cuda"]
 Dtype = Literal["auto", "float32", "bfloat16"]
 
@@ -37,11 +36,12 @@ def require(*packages: str) -> None:
     """Check that optional packages can be imported."""
     for package in packages:
         if importlib.util.find_spec(package) is None:
-            raise EnvironmentMissing("a package that students need is not installed", got=package, fix=INSTALL)
+            fix = "pip install gguf" if package == "gguf" else INSTALL
+            raise EnvironmentMissing("a package that students need is not installed", got=package, fix=fix)
 
 
 def quiet_transformers() -> None:
-    """Keep the library's own bars, hints and talk of its next version off the terminal, where ours stand."""
+    """Turn off the library's progress bars and hints, which would mix with ours."""
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"transformers\.")
     from transformers.utils import logging as transformers_logging
 
@@ -49,36 +49,10 @@ def quiet_transformers() -> None:
     transformers_logging.set_verbosity_error()
 
 
-@dataclass
-class Processor:
-    """What makes numbers of texts and pictures; without the model, so worker processes can have it."""
-
-    tokenizer: Any
-    image_processor: Any
-
-    @cached_property
-    def end_token_id(self) -> int:
-        return int(self.tokenizer.convert_tokens_to_ids(END_OF_TURN))
-
-    @cached_property
-    def image_token_id(self) -> int:
-        return int(self.tokenizer.convert_tokens_to_ids(IMAGE_TOKEN))
-
-    @cached_property
-    def chat_tokens(self) -> tuple[str, ...]:
-        """What texts may not hold: tokens that are no text, but turns, pictures, thoughts and calls."""
-        return tuple(sorted({token.content for token in self.tokenizer.added_tokens_decoder.values()}))
-
-    @property
-    def pad_token_id(self) -> int:
-        found = self.tokenizer.pad_token_id
-        return self.end_token_id if found is None else int(found)
-
-
-@dataclass
+@dataclass(kw_only=True)
 class Student(Processor):
-    """A loaded student. `model` is a transformers model, or a peft model round one; `dtype` is what it computes in,
-    where weights that are trained may have more."""
+    """A loaded student. `model` is a transformers model or a peft model around it; `dtype` is the type of the
+    computation, while weights that are trained may be kept in float32."""
 
     model: Any
     device: str
@@ -86,24 +60,42 @@ class Student(Processor):
 
     @property
     def core(self) -> Any:
-        """The transformers model itself, with the layers of an adapter in it where there is one."""
+        """The transformers model, which includes the layers of an adapter."""
         return self.model.get_base_model() if hasattr(self.model, "get_base_model") else self.model
 
     @property
-    def tower(self) -> Any:
-        """The vision tower."""
-        return self.core.model.visual
+    def processor(self) -> Processor:
+        """The student without its model, for worker processes."""
+        return Processor(self.tokenizer, self.library, self.picture_token_id, self.template)
 
-    def embedded(self, ids: Any, features: Any) -> Any:
-        """Return what the language model reads of tokens (b, n), with features of the pictures (image tokens, width) in
-        them."""
-        found = self.core.get_input_embeddings()(ids).to(self.dtype)
-        if not len(features):
-            return found
-        return found.masked_scatter((ids == self.image_token_id)[..., None], features.to(self.dtype))
+    @property
+    def width(self) -> int:
+        """Width of the language model."""
+        return int(self.core.config.get_text_config().hidden_size)
+
+    @property
+    def has_image_features(self) -> bool:
+        """Whether pictures can be encoded apart from the language model, so that each is encoded once."""
+        return hasattr(self.core.base_model, "get_image_features")
+
+    def vision_modules(self) -> list[Any]:
+        """Return the parts of the model that are not its language model and not its output head."""
+        decoder = {id(module) for module in self.core.get_decoder().modules()} if self.has_pictures else set()
+        head = self.core.get_output_embeddings()
+        children = self.core.base_model.children() if self.has_pictures else ()
+        return [child for child in children if id(child) not in decoder and child is not head]
+
+    def language_layers(self) -> tuple[str, list[str]]:
+        """Return the name of the language model inside `core`, and the names of its linear layers below it."""
+        import torch
+
+        decoder, head = self.core.get_decoder(), self.core.get_output_embeddings()
+        prefix = next(name for name, module in self.core.named_modules() if module is decoder)
+        linear = (torch.nn.Linear,)
+        return prefix, [n for n, m in decoder.named_modules() if isinstance(m, linear) and m is not head]
 
     def computing(self) -> contextlib.AbstractContextManager:
-        """Compute in `dtype`, whatever the weights are kept in; in float32 there is nothing to convert."""
+        """Compute in `dtype`, whatever the type of the weights; in float32 there is nothing to convert."""
         import torch
 
         if self.dtype == torch.float32:
@@ -111,47 +103,61 @@ class Student(Processor):
         return torch.autocast(self.device, self.dtype)
 
 
+# --- where a student is -----------------------------------------------------------------------------------------------
+
+
 def is_hub_name(name: str) -> bool:
-    """Return whether a student is named as a repository of a hub, and not as a folder."""
-    return HUB_NAME.fullmatch(name) is not None and not name.startswith(".") and not Path(name).is_dir()
+    """Return whether a student is named as a repository of a hub and not as a folder or a file."""
+    return HUB_NAME.fullmatch(name) is not None and not name.startswith(".") and not Path(name).exists()
 
 
-def student_folder(name: str) -> Path:
-    """Return the folder of a student: a folder as it is; of a repository's name, as `Qwen/Qwen3.5-2B`, the copy in the
-    hub's cache.
+def student_path(name: str, *, allow_code: bool = False) -> Path:
+    """Return the folder or the GGUF file of a student.
+
+    Args:
+        name: a folder, a GGUF file, a folder with one GGUF file and no configuration, or a repository such as
+            `Qwen/Qwen3.5-2B`, which is downloaded into the hub's cache.
+        allow_code: download the code of the repository too.
     """
-    if not is_hub_name(name):
-        return Path(name)
-    require("torch", "transformers", "peft")
-    from huggingface_hub import snapshot_download
+    if is_hub_name(name):
+        require("torch", "transformers", "peft")
+        from huggingface_hub import snapshot_download
 
-    try:
-        return Path(snapshot_download(name, allow_patterns=MODEL_FILES))
-    except (OSError, ValueError, RuntimeError) as error:  # no network, no such repository, no permission
-        words = "the student is neither a folder nor a repository that can be loaded"
-        fix = "correct the name, or download the model elsewhere and pass its folder"
-        raise InputError(words, where=name, got=str(error)[:300], fix=fix) from error
+        patterns = [*MODEL_FILES, *["*.py"] * allow_code]
+        try:
+            path = Path(snapshot_download(name, allow_patterns=patterns))
+        except (OSError, ValueError, RuntimeError) as error:  # no network, no such repository, no permission
+            words = "the student is neither a folder nor a repository that can be loaded"
+            fix = "correct the name, or download the model elsewhere and pass its folder"
+            raise InputError(words, where=name, got=str(error)[:300], fix=fix) from error
+    else:
+        path = Path(name)
+    found = sorted(path.glob(f"*{GGUF}")) if path.is_dir() and not (path / "config.json").is_file() else []
+    if len(found) > 1:
+        names = ", ".join(file.name for file in found)
+        raise InputError("the folder has several GGUF files", where=path, got=names, fix="pass one of these files")
+    return found[0] if found else path
 
 
-def weight_files(folder: Path) -> dict[str, Path]:
-    """Return the files that decide what a model folder computes, for the inputs of a stage: name -> path."""
-    config = read_json(folder / "config.json", what="student model (a folder with config.json)")
-    found = config.get("model_type") if isinstance(config, dict) else None
-    if found != MODEL_TYPE:
-        where, expected = f"{folder / 'config.json'}: model_type", f"{MODEL_TYPE!r}, the type of Qwen3.5, 3.6 and 3.8"
-        raise InputError("the model type is not supported", where=where, got=shown(found), expected=expected)
-    weights = sorted(folder.glob("*.safetensors"))
+def weight_files(path: Path) -> dict[str, Path]:
+    """Return the files that decide what a student computes, for the inputs of a stage: name -> path."""
+    if path.suffix == GGUF:
+        if not path.is_file():
+            raise InputError("the file does not exist", where=path)
+        return {f"model/{path.name}": path}
+    read_json(path / "config.json", what="student model (a folder with config.json, or a GGUF file)")
+    weights = sorted(path.glob("*.safetensors"))
     if not weights:
-        raise InputError(
-            "the folder has no weights", where=folder, expected="*.safetensors", fix="download the whole model folder"
-        )
-    settings = ("config.json", "tokenizer.json", "tokenizer_config.json", "preprocessor_config.json", CHAT_FORMAT_FILE)
-    files = [folder / name for name in (*settings, "chat_template.jinja")]
-    return {f"model/{path.name}": path for path in (*files, *weights) if path.is_file()}
+        fix = "download the whole model folder"
+        raise InputError("the folder has no weights", where=path, expected="*.safetensors", fix=fix)
+    settings = ("config.json", "tokenizer.json", "tokenizer.model", "tokenizer_config.json", CHAT_FORMAT_FILE)
+    pictures = ("preprocessor_config.json", "processor_config.json")
+    files = [path / name for name in (*settings, *pictures, TEMPLATE, "chat_template.json")]
+    return {f"model/{file.name}": file for file in (*files, *weights) if file.is_file()}
 
 
 def pick_device(wanted: Device) -> str:
-    """Return the device to use: `cuda` if there is one, unless told otherwise."""
+    """Return the device to use: `cuda` if there is one, unless the settings say otherwise."""
     require("torch")
     import torch
 
@@ -161,8 +167,7 @@ def pick_device(wanted: Device) -> str:
 
 
 def compute_dtype(wanted: Dtype, device: str) -> Any:
-    """Return torch's name of what to compute in: bfloat16 on an accelerator and float32 on a CPU, unless told
-    otherwise."""
+    """Return the type of the computation: bfloat16 on an accelerator and float32 on a CPU, unless `wanted`."""
     import torch
 
     if wanted == "auto":
@@ -170,98 +175,199 @@ def compute_dtype(wanted: Dtype, device: str) -> Any:
     return getattr(torch, wanted)
 
 
+# --- loading ----------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def loading_errors(what: str, where: Path) -> Any:
+    """Turn what transformers, gguf and safetensors raise about a bad file into one line."""
+    from safetensors import SafetensorError
+
+    try:
+        yield
+    except (ImportError, LookupError, OSError, RuntimeError, TypeError, ValueError, SafetensorError) as error:
+        words = (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
+        fix = "use a file of another quantization, such as Q8_0 or F16" if where.suffix == GGUF else None
+        raise InputError(f"the {what} cannot be loaded", where=where, got=words, fix=fix) from error
+
+
+def _arguments(path: Path, allow_code: bool) -> dict[str, Any]:
+    """Return what transformers' `from_pretrained` is given for a student."""
+    common = {"local_files_only": True, "trust_remote_code": allow_code}
+    if path.suffix != GGUF:
+        return {"pretrained_model_name_or_path": path, **common}
+    require("gguf")
+    return {"pretrained_model_name_or_path": path.parent, "gguf_file": path.name, **common}
+
+
+def load_config(path: Path, *, allow_code: bool = False) -> Any:
+    """Load the configuration of a student, and check that transformers knows its family without code of its own."""
+    require("torch", "transformers")
+    from transformers import AutoConfig
+    from transformers.models.auto.configuration_auto import CONFIG_MAPPING
+
+    if path.suffix != GGUF:
+        value = read_object(path / "config.json", what="student model")
+        kind = value.get("model_type")
+        if kind not in CONFIG_MAPPING and "auto_map" in value and not allow_code:
+            words = "the student needs code from its own repository, which is not run"
+            fix = "use a family that transformers has, or allow it with allow_code=true if you trust the code"
+            raise InputError(words, where=path, got=f"model_type {shown(kind)}", fix=fix)
+        if kind not in CONFIG_MAPPING and "auto_map" not in value:
+            fix = "update transformers, or use another student"
+            raise InputError("transformers does not know the model type", where=path, got=shown(kind), fix=fix)
+    with loading_errors("configuration of the student", path):
+        return AutoConfig.from_pretrained(**_arguments(path, allow_code))
+
+
+def model_class(config: Any, path: Path) -> Any:
+    """Return the Auto class of a student: with a vision part for image, text to text, otherwise for text alone."""
+    from transformers import AutoModelForCausalLM, AutoModelForImageTextToText
+    from transformers.models.auto.modeling_auto import (
+        MODEL_FOR_CAUSAL_LM_MAPPING,
+        MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING,
+    )
+
+    auto_map = getattr(config, "auto_map", None) or {}
+    pairs = (
+        (AutoModelForImageTextToText, MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING),
+        (AutoModelForCausalLM, MODEL_FOR_CAUSAL_LM_MAPPING),
+    )
+    for auto_class, mapping in pairs:
+        if type(config) in mapping or auto_class.__name__ in auto_map:
+            return auto_class
+    words = "the model is neither a language model nor a vision-language model"
+    raise InputError(words, where=path, got=f"model_type {config.model_type!r}", fix="use another student")
+
+
+def load_processor(
+    path: Path, *, adapter: Path | None = None, template: str = "", allow_code: bool = False
+) -> Processor:
+    """Load the tokenizer of a student and, if it has a vision part, its processor.
+
+    Args:
+        adapter: folder whose chat template takes precedence: the one of its training.
+        template: text of a chat template that takes precedence over all.
+    """
+    config = load_config(path, allow_code=allow_code)
+    auto_class = model_class(config, path)
+    from transformers import AutoTokenizer
+
+    quiet_transformers()
+    arguments = _arguments(path, allow_code)
+    with loading_errors("tokenizer of the student", path):
+        tokenizer: Any = AutoTokenizer.from_pretrained(**arguments)
+    library = None
+    if auto_class.__name__ == "AutoModelForImageTextToText" and hasattr(config, "vision_config"):
+        with loading_errors("processor of the student", path):
+            library = _picture_processor(config, tokenizer, arguments)
+    taught = adapter / TEMPLATE if adapter is not None else None
+    if not template and taught is not None and taught.is_file():
+        template = taught.read_text(encoding="utf-8")
+    token = getattr(config, "image_token_id", None) or getattr(config, "image_token_index", None)
+    processor = Processor(tokenizer, library, token, template)
+    processor.check(path)
+    return processor
+
+
+def _picture_processor(config: Any, tokenizer: Any, arguments: dict[str, Any]) -> Any:
+    """Put the processor of a family together without its video part, which needs torchvision and is never used."""
+    from transformers import AutoImageProcessor
+    from transformers.models.auto import processing_auto
+
+    folder = arguments["pretrained_model_name_or_path"]
+    images = AutoImageProcessor.from_pretrained(**arguments, backend="pil")
+    own: dict[str, Any] = {}
+    if (folder / "processor_config.json").is_file():
+        own = read_object(folder / "processor_config.json", what="processor")
+    name = own.get("processor_class") or processing_auto.PROCESSOR_MAPPING_NAMES.get(config.model_type)
+    if name is None:
+        raise ValueError(f"transformers has no processor for model_type {config.model_type!r}")
+    base: Any = processing_auto.processor_class_from_name(name)
+    used = [part for part in base.get_attributes() if part in ("image_processor", "tokenizer")]
+
+    class PictureProcessor(base):
+        @classmethod
+        def get_attributes(cls) -> list[str]:
+            return used
+
+    known = inspect.signature(base.__init__).parameters
+    settings = {key: value for key, value in own.items() if key in known and "processor" not in key}
+    if "video_processor" in known:
+        settings["video_processor"] = None
+    if (file := folder / "chat_template.json").is_file():
+        settings.setdefault("chat_template", read_object(file, what="chat template").get("chat_template"))
+    PictureProcessor.__name__ = base.__name__
+    return PictureProcessor(image_processor=images, tokenizer=tokenizer, **settings)
+
+
 def load_student(
-    folder: Path,
+    path: Path,
     *,
     device: Device = "auto",
     dtype: Dtype = "auto",
-    max_pixels: int,
     adapter: Path | None = None,
     is_trained: bool = False,
+    template: str = "",
+    allow_code: bool = False,
 ) -> Student:
-    """Load a model folder, with an adapter if one is given.
+    """Load a student, with an adapter if one is given.
 
     Args:
-        dtype: what it computes in; auto is bfloat16 on an accelerator and float32 on a CPU.
-        max_pixels: images with more pixels are scaled down, sides to multiples of the patch.
-        is_trained: keep the weights in float32 in any case, for an optimizer.
+        path: a model folder or a GGUF file.
+        dtype: type of the computation; auto is bfloat16 on an accelerator and float32 on a CPU.
+        is_trained: keep all weights in float32, for an optimizer.
+        template: chat template that replaces that of the student.
     """
     require("torch", "transformers", "peft")
-    weight_files(folder)
-    quiet_transformers()
+    weight_files(path)
     import torch
     from peft import PeftModel
-    from safetensors import SafetensorError
-    from transformers import AutoModelForImageTextToText
 
     device_name = pick_device(device)
     computed = compute_dtype(dtype, device_name)
-    use_kernels_for(computed, device_name)
-    tokenizer, image_processor = load_processor(folder, max_pixels)
+    processor = load_processor(path, adapter=adapter, template=template, allow_code=allow_code)
+    config = load_config(path, allow_code=allow_code)
+    family = importlib.import_module(FAST_FAMILIES[config.model_type]) if config.model_type in FAST_FAMILIES else None
+    if family is not None:
+        family.choose_kernels(computed, device_name)
     model: Any
-    try:
-        model = AutoModelForImageTextToText.from_pretrained(
-            folder, dtype=torch.float32 if is_trained else computed, local_files_only=True, use_safetensors=True
+    with loading_errors("student", adapter or path):
+        model = model_class(config, path).from_pretrained(
+            **_arguments(path, allow_code), dtype=torch.float32 if is_trained else computed, use_safetensors=True
         )
+        if path.suffix == GGUF:
+            model.config.__dict__.pop("quantization_config", None)  # the weights are plain numbers now
         if adapter is not None:
             if not (adapter / "adapter_model.safetensors").is_file():
                 raise InputError("the folder is not an adapter", where=adapter, expected="adapter_model.safetensors")
             model = PeftModel.from_pretrained(model, adapter)
-    except (OSError, RuntimeError, ValueError, SafetensorError) as error:
-        raise InputError("the student cannot be loaded", where=adapter or folder, got=str(error)[:300]) from error
-    student = Student(tokenizer, image_processor, model, device_name, computed)
-    check_tokens_fit(student, folder)
+            check_adapter(model, adapter)
+    parts = processor.tokenizer, processor.library, processor.picture_token_id, processor.template
+    student = Student(*parts, model=model, device=device_name, dtype=computed)
+    known, most = len(student.tokenizer), student.core.get_input_embeddings().weight.shape[0]
+    if known > most:
+        words = "the tokenizer has more tokens than the model"
+        raise InputError(words, where=path, got=known, expected=f"at most {most}")
     try:
         model.to(device_name)
     except torch.OutOfMemoryError as error:
-        raise EnvironmentMissing(
-            "the weights do not fit into the memory of the accelerator", where=folder, got=str(error)[:99]
-        ) from error
-    if device_name == "cuda":
-        fuse_norms(student.core)
-    look_at_equal_sizes_at_once(student.core)
+        words = "the weights do not fit into the memory of the accelerator"
+        raise EnvironmentMissing(words, where=path, got=str(error)[:99]) from error
+    if family is not None and device_name == "cuda":
+        family.fuse_norms(student.core)
     return student
 
 
-def check_tokens_fit(student: Student, folder: Path) -> None:
-    """Check that tokenizer and weights are of one model."""
-    known, most = len(student.tokenizer), student.core.get_input_embeddings().weight.shape[0]
-    if known > most:
-        raise InputError(
-            "the tokenizer has more tokens than the model", where=folder, got=known, expected=f"at most {most}"
-        )
-    found, wanted = student.image_token_id, student.core.config.image_token_id
+def check_adapter(model: Any, adapter: Path) -> None:
+    """Check that each tensor of an adapter has its layer in the model, because peft ignores those without one."""
+    from safetensors.torch import load_file
+
+    found = len(load_file(adapter / "adapter_model.safetensors"))
+    wanted = sum("lora_" in name for name, _ in model.named_parameters())
     if found != wanted:
-        words = f"the tokenizer and the model have different ids for {IMAGE_TOKEN}"
-        raise InputError(words, where=folder, got=found, expected=f"{wanted} (image_token_id in config.json)")
+        words, fix = "the base model lacks a layer that the adapter changes", "pass the base model of this adapter"
+        raise InputError(words, where=adapter, got=f"{found} tensors", expected=f"{wanted}", fix=fix)
 
 
-def load_processor(folder: Path, max_pixels: int) -> tuple[Any, Any]:
-    """Load the tokenizer and the image processor of a model folder."""
-    require("transformers")
-    from transformers import AutoTokenizer
-    from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
-
-    try:
-        tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
-        image_processor = Qwen2VLImageProcessorPil.from_pretrained(folder, local_files_only=True)
-    except (OSError, ValueError) as error:
-        raise InputError("the processor of the student cannot be loaded", where=folder, got=str(error)[:300]) from error
-    if not tokenizer.chat_template:
-        raise InputError("the tokenizer has no chat template", where=folder, expected="chat_template.jinja")
-    if missing := set(NEEDED_TOKENS) - tokenizer.get_vocab().keys():
-        raise InputError(
-            "the tokenizer lacks tokens for chats with pictures", where=folder, expected=", ".join(missing)
-        )
-    side_px = image_processor.patch_size * image_processor.merge_size
-    if max_pixels < side_px**2:
-        raise ConfigError(
-            "the value is too small for one patch",
-            where="max_pixels",
-            got=max_pixels,
-            expected=f"at least {side_px**2}",
-        )
-    own = image_processor.size  # areas in pixels, in spite of the names
-    largest = min(int(own["longest_edge"]), max_pixels)
-    image_processor.size = {"shortest_edge": min(int(own["shortest_edge"]), largest), "longest_edge": largest}
-    return tokenizer, image_processor
+FAST_FAMILIES = {"qwen3_5": "distill.student.qwen3_5"}  # families with faster code of ours

@@ -19,8 +19,9 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_folder
 from cosfly.runtime.seeding import rng_for
 from distill.student.checkpoint import disk_errors
-from distill.student.model import END_OF_TURN, IMAGE_TOKEN, quiet_transformers, require
+from distill.student.model import quiet_transformers, require
 
+END_OF_TURN, IMAGE_TOKEN = "<|im_end|>", "<|image_pad|>"
 TINY, RANDOM = "tiny", "random"  # what `--student` may say beside folders and names of repositories
 _CHAT_TEMPLATE = (
     "{%- for m in messages %}{{ '<|im_start|>' + m.role + '\n' }}"

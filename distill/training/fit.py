@@ -38,7 +38,7 @@ from distill.student.checkpoint import (
     newest_checkpoint,
     save_checkpoint,
 )
-from distill.student.decoding import Completion, decode
+from distill.student.generate import Completion, generate
 from distill.student.model import Student
 from distill.training.loading import Census, ReadyStep, Row, Supply
 from distill.training.loss import answer_loss
@@ -112,11 +112,10 @@ def _validate_batch(student: Student, rows: Sequence[Row], supply: Supply, cfg: 
     features = supply.features.of([picture for row in rows for picture in row.pictures])
     encoded = [row.encoded for row in rows]
     nats, _ = answer_loss(student, encoded, features, LOGIT_CHUNK)
-    weight = sum(len(row.answer_ids) * row.weight for row in encoded)
+    weight = sum(float(row.weights.sum()) for row in encoded)
     counts = np.zeros(4)
     if cfg.validation_answers:
-        with student.computing():
-            answers = decode(student, encoded, features, max_tokens=cfg.max_new_tokens)
+        answers = generate(student, encoded, features, max_tokens=cfg.max_new_tokens)
         both = zip(rows, answers, strict=True)
         counts = sum((_judged_answer(row.sample, answer) for row, answer in both), counts)
     return np.array([float(nats), weight, len(rows), *counts])
@@ -207,8 +206,9 @@ def train_step(lesson: Lesson, optimizer: Any, ready: ReadyStep, rate: float) ->
         nats, _ = answer_loss(student, [row.encoded for row in batch], features, LOGIT_CHUNK)
         nats.backward()
         own_nats += float(nats.detach())
-    answers = [(len(row.encoded.answer_ids), row.encoded.weight, len(row.encoded)) for row in rows]
-    own = [sum(n * w for n, w, _ in answers), sum(n for n, _, _ in answers), sum(n for _, _, n in answers), len(rows)]
+    encoded = [row.encoded for row in rows]
+    weights, answers = sum(float(row.weights.sum()) for row in encoded), sum(len(row.answer_ids) for row in encoded)
+    own = weights, answers, sum(map(len, encoded)), len(rows)
     lesson.ranks.add_gradients(parameters)
     total, weight, answer_tokens, tokens, samples = lesson.ranks.total([own_nats, *map(float, own)])
     if not weight:

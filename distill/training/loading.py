@@ -23,9 +23,16 @@ from cosfly.runtime.io import inside
 from cosfly.runtime.worker import end_with_parent
 from cosfly.viz.frame_views import VIEW_FILES
 from distill.schema import Sample
-from distill.student.encoding import EncodedSample, encode_text, image_size, special_token_in
-from distill.student.features import FramePicture, PictureData, PictureReader, VisionFeatures, pictures_of
-from distill.student.model import Processor
+from distill.student.chat import PLAIN_WEIGHTS, AnswerWeights, EncodedSample, Processor, image_size, special_token_in
+from distill.student.features import (
+    FramePicture,
+    PictureData,
+    PictureReader,
+    VisionFeatures,
+    pack,
+    pictures_of,
+    unpack,
+)
 from distill.training.ranks import Ranks
 
 log = logging.getLogger(__name__)
@@ -132,21 +139,12 @@ class Order:
 
 @dataclass(frozen=True)
 class StepData:
-    """What a worker made. unreadable: picture -> why it cannot be read.
-
-    Patches of all pictures are one tensor, since each on its way from one process to another holds a file open, and a
-    step may have hundreds of pictures. pictures: each with how many rows are its own.
-    """
+    """What a worker made. packed: the pictures (`unpack`). unreadable: picture -> why it cannot be read."""
 
     step: int
     rows: list[Row]
-    pictures: list[tuple[FramePicture, int]]
-    patches: Any
+    packed: Any
     unreadable: dict[FramePicture, str]
-
-    def loaded(self) -> list[PictureData]:
-        parts = self.patches.split([count for _, count in self.pictures]) if self.pictures else ()
-        return [PictureData(picture, part) for (picture, _), part in zip(self.pictures, parts, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -155,20 +153,20 @@ class Maker:
 
     samples: Sequence[Sample]
     reader: PictureReader
+    weights: AnswerWeights
 
     def __call__(self, order: Order) -> StepData:
-        import torch
-
-        samples = [self.samples[index] for index in order.samples]
-        rows = [Row(encode_text(self.reader.processor, s), tuple(pictures_of(s)), s) for s in samples]
-        loaded, unreadable = [], {}
+        samples, reader = [self.samples[index] for index in order.samples], self.reader
+        encode = partial(reader.processor.encode, max_pixels=reader.max_pixels, weights=self.weights)
+        rows = [Row(encode(sample), tuple(pictures_of(sample)), sample) for sample in samples]
+        loaded: list[PictureData] = []
+        unreadable: dict[FramePicture, str] = {}
         for picture in order.pictures:
             try:
                 loaded.append(self.reader.read(picture))
             except InputError as error:
                 unreadable[picture] = str(error)
-        patches = torch.cat([item.patches for item in loaded]) if loaded else None
-        return StepData(order.step, rows, [(item.picture, len(item.patches)) for item in loaded], patches, unreadable)
+        return StepData(order.step, rows, pack(loaded), unreadable)
 
 
 @dataclass(frozen=True)
@@ -188,6 +186,7 @@ class Supply:
     features: VisionFeatures
     reader: PictureReader
     workers: int
+    weights: AnswerWeights = PLAIN_WEIGHTS
     waited_s: float = 0.0  # for the last step
     _unreadable: dict[FramePicture, str] = field(default_factory=dict)
 
@@ -207,11 +206,11 @@ class Supply:
             Order(step, indices, self.features.wanted(plan, (p for index in indices for p in pictures(index))))
             for step, indices in shares
         )
-        made_steps = in_order(Maker(samples, self.reader), orders, self.workers)
+        made_steps = in_order(Maker(samples, self.reader, self.weights), orders, self.workers)
         begun_s = time.monotonic()
         for made in made_steps:
             self._unreadable |= made.unreadable
-            self.features.take(made.loaded())
+            self.features.take(unpack(made.packed))
             ready = ReadyStep(made.step, [], {})
             for row in made.rows:
                 bad = next((picture for picture in row.pictures if picture in self._unreadable), None)
@@ -262,12 +261,14 @@ class Counting:
     processor: Processor
     trees: Mapping[str, Path]
     max_tokens: int
+    max_pixels: int
 
     def __call__(self, indices: Sequence[int]) -> SampleCounts:
         seen, checked = SampleCounts(), dict[FramePicture, str]()
         for index in indices:
             sample = self.samples[index]
-            row = None if (token := special_token_in(self.processor, sample)) else encode_text(self.processor, sample)
+            token = special_token_in(self.processor, sample)
+            row = None if token else self.processor.encode(sample, self.max_pixels)
             if row is None:
                 reason, detail = SPECIAL_TOKEN, f"a text contains {token}"
             elif len(row) > self.max_tokens:
@@ -336,13 +337,14 @@ def take_census(
     trees: Mapping[str, Path],
     *,
     max_tokens: int,
+    max_pixels: int,
     workers: int,
     ranks: Ranks,
     label: str,
 ) -> Census:
     """Look at the chosen samples of a split; each process of the training takes its share."""
     chunks = [chosen[start : start + SAMPLES_AT_ONCE] for start in range(0, len(chosen), SAMPLES_AT_ONCE)]
-    mine, counting = chunks[ranks.rank :: ranks.size], Counting(samples, processor, trees, max_tokens)
+    mine, counting = chunks[ranks.rank :: ranks.size], Counting(samples, processor, trees, max_tokens, max_pixels)
     seen, whole = SampleCounts(), SampleCounts()
     with progress_bar(label, total=sum(map(len, mine))) as advance:
         for counts in in_order(counting, mine, max(0, min(workers, len(mine) - 1))):

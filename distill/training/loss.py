@@ -1,4 +1,4 @@
-"""The loss: negative log-likelihood of answer tokens, without a table of logits for all of them at once.
+"""The loss: weighted negative log-likelihood of answer tokens, without a table of logits for all of them at once.
 
 With a vocabulary of 248,320 the logits of one token take a megabyte, and plain training keeps three such tables for
 every token of a batch. Here they exist for a chunk of answer tokens at a time: loss and gradient of the chunk are
@@ -13,7 +13,8 @@ from functools import cache
 from typing import Any
 
 from cosfly.runtime.errors import ConfigError
-from distill.student.encoding import IGNORED, EncodedSample, padded
+from distill.student.chat import IGNORED, EncodedSample, padded
+from distill.student.features import Encoded, shown
 from distill.student.model import Student
 
 
@@ -86,36 +87,34 @@ def output_head(student: Student) -> Any:
     head = student.core.get_output_embeddings()
     if type(head) is not torch.nn.Linear or head.bias is not None:
         got = type(head).__name__
-        raise ConfigError(
-            "the output head cannot have an adapter", where="target_modules", got=got, fix="remove lm_head"
-        )
+        raise ConfigError("the output head is no plain matrix", where="student", got=got, fix="use another student")
     return head.weight
 
 
-def answer_loss(student: Student, rows: Sequence[EncodedSample], features: Any, chunk: int) -> tuple[Any, Any]:
+def answer_loss(
+    student: Student, rows: Sequence[EncodedSample], pictures: Sequence[Encoded], chunk: int
+) -> tuple[Any, Any]:
     """Run samples forward, padded on the right.
 
     Args:
-        features: (image tokens of all rows, width), row after row.
+        pictures: features of the pictures of all rows, row after row.
     Returns:
         The sum over all answer tokens of weight times nats, differentiable; and (b,) the unweighted nats of each row.
     """
     import torch
 
-    ids, labels, positions = (torch.from_numpy(array).to(student.device) for array in padded(student, rows))
-    with student.computing():
-        hidden = student.core.model.language_model(
-            inputs_embeds=student.embedded(ids, features), position_ids=positions, attention_mask=None, use_cache=False
-        ).last_hidden_state
-    is_target = labels[:, 1:] != IGNORED  # what stands before i + 1 tells it
-    row_of = is_target.nonzero()[:, 0]
-    row_weights = torch.tensor([row.weight for row in rows], dtype=torch.float32, device=student.device)
+    given = {name: torch.from_numpy(array).to(student.device) for name, array in padded(student, rows).items()}
+    labels, weights = given.pop("labels")[:, 1:], given.pop("weights")[:, 1:]
+    with student.computing(), shown(student, pictures) as inputs:
+        hidden = student.core.base_model(**given, **inputs, use_cache=False).last_hidden_state
+    is_target = labels != IGNORED  # the token at i is predicted at i - 1
     total, nats = chunked_loss(
         hidden[:, :-1][is_target],
         output_head(student),
-        labels[:, 1:][is_target],
-        row_weights[row_of],
+        labels[is_target],
+        weights[is_target],
         chunk=chunk,
         dtype=student.dtype,
     )
+    row_of = is_target.nonzero()[:, 0]
     return total, torch.zeros(len(rows), device=student.device).index_add_(0, row_of, nats)

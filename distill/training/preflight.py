@@ -18,9 +18,9 @@ from cosfly.formats.captions import TOKENS
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.json_io import write_json
 from distill.schema import Sample, Samples
-from distill.student.encoding import END_OF_ANSWER, EncodedSample, chat_text, prompt_text
+from distill.student.chat import EncodedSample, Processor
 from distill.student.features import VisionFeatures
-from distill.student.model import Processor, Student
+from distill.student.model import FAST_FAMILIES, Student
 from distill.training.loading import Census
 from distill.training.loss import answer_loss
 from distill.training.settings import LOGIT_CHUNK, Steps, TrainConfig
@@ -77,9 +77,9 @@ def saved_bytes_per_token(student: Student, cfg: TrainConfig) -> float:
             return tensor
 
         half = np.full(length // 2, student.end_token_id, np.int64)
-        row = EncodedSample("probe", half, half, np.zeros((0, 3), np.int64), 1.0)
+        row = EncodedSample("probe", half, half, np.ones(length // 2, np.float32))
         with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
-            answer_loss(student, [row], torch.zeros((0, 1)), LOGIT_CHUNK)
+            answer_loss(student, [row], (), LOGIT_CHUNK)
         found.append(sum(storage.nbytes() for storage in storages.values()))
     return (found[1] - found[0]) / (PROBES[1] - PROBES[0])
 
@@ -93,7 +93,7 @@ def estimate(student: Student, cfg: TrainConfig, longest: int, picture_bytes: fl
     parameters = list(student.model.parameters())
     learning = sum(p.numel() * p.element_size() for p in parameters if p.requires_grad)
     weights = float(sum(p.numel() * p.element_size() for p in parameters))
-    config, rows = student.core.config.text_config, cfg.batch_size
+    config, rows = student.core.config.get_text_config(), cfg.batch_size
     return Memory(
         weights=weights,
         gradients=learning,
@@ -209,8 +209,8 @@ def _about_decisions(census: Census, validation: Census) -> list[Precheck]:
 
 def _about_chat(processor: Processor, sample: Sample) -> Precheck:
     """Hold what a student is taught against what its own chat template makes of the whole chat."""
-    prompt = prompt_text(processor, sample, [1] * len(sample.images))
-    taught, whole = prompt + sample.answer + END_OF_ANSWER, chat_text(processor, sample)
+    prompt, whole = processor.prompt_text(sample), processor.chat_text(sample)
+    taught = prompt + processor.lead + sample.answer + processor.end_of_answer
     thinking = "an empty thought" if "<think>" in prompt else "no thoughts"
     if taught == whole:
         return Precheck("chat template", f"the student's own; {thinking}; the prompt ends with {prompt[-32:]!r}")
@@ -246,8 +246,8 @@ def _about_features(census: Census, validation: Census, features: VisionFeatures
 
 
 def _about_kernels(student: Student) -> list[Precheck]:
-    if student.device == "cpu":
-        return [Precheck("kernels", "PyTorch, as on every CPU")]
+    if student.device == "cpu" or student.core.config.model_type not in FAST_FAMILIES:
+        return [Precheck("kernels", "PyTorch's own")]
     return [
         Precheck("kernels", f"{package} is not installed, so {what} is slow; pip install {package}", "warning")
         for module, (package, what) in FAST_KERNELS.items()

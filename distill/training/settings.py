@@ -16,13 +16,6 @@ from cosfly.runtime.seeding import rng_for
 from distill.student.model import Device, Dtype
 from distill.student.random_student import RandomStudent
 
-# All linear layers of the language model. Three of four Qwen3.5 layers are linear attention, so q, k, v, o alone would
-# leave most of the network untouched; the vision tower stays frozen.
-TARGET_MODULES = (
-    r".*language_model\.layers\.\d+\.(self_attn\.(q|k|v|o)_proj"
-    r"|linear_attn\.(in_proj_qkv|in_proj_z|in_proj_a|in_proj_b|out_proj)"
-    r"|mlp\.(gate|up|down)_proj)"
-)
 STAGE = "distill.train"
 LOGIT_CHUNK = 512  # answer tokens whose logits exist at a time
 FEATURE_MEMORY_GB = 16.0  # for features of pictures, a process; what has no room is computed each time
@@ -41,7 +34,6 @@ class TrainConfig(Config):
     )
     lora_rank: int = Field(16, ge=1, description="rank of the LoRA update")
     lora_alpha: ClassVar[float] = 32.0  # the LoRA update is multiplied by alpha / rank
-    target_modules: ClassVar[str] = TARGET_MODULES
     epochs: int = Field(3, ge=1, description="passes over the training split")
     max_steps: int = Field(0, ge=0, description="stop after this many optimizer steps; 0: no limit")
     samples_per_step: int = Field(16, ge=1, description="samples of an optimizer step, over all processes")
@@ -49,6 +41,14 @@ class TrainConfig(Config):
     schedule: Literal["cosine", "constant"] = Field("cosine", description="learning rate after the warm-up")
     warmup_fraction: float = Field(0.03, ge=0, lt=1, description="share of the steps with a rising rate; 0: none")
     weight_decay: float = Field(0.0, ge=0, description="AdamW's decoupled weight decay")
+    decision_weight: float = Field(
+        1.0, gt=0, le=1000, description="weight of the decision's tokens in the loss; other tokens have weight 1"
+    )
+    reason_weight: float = Field(
+        1.0, ge=0, le=1000, description="weight of the tokens of the reasoning trace in the loss; 0: not learnt"
+    )
+    chat_template: str = Field("", description="file with a chat template for a base model without one; empty: its own")
+    allow_code: bool = Field(False, description="run code from the student's repository; only if you trust it")
     max_pixels: int = Field(
         0, ge=0, description="most pixels of a picture; 0: no limit, so that pixel values in texts are right"
     )

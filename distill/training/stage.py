@@ -5,23 +5,27 @@ The loss counts answer tokens only, and nothing is ever cut: a sample that does 
 
 from __future__ import annotations
 
+import logging
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from cosfly.formats.captions import Language, Prompt
+from cosfly.formats.captions import Language, Place, Prompt
+from cosfly.formats.predictions import Split
 from cosfly.llm.student_chat import ChatFormat, FrameFormat, write_chat_format
-from cosfly.runtime.errors import ConfigError, InputError
-from cosfly.runtime.io import atomic_folder
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.io import atomic_folder, read_text
 from cosfly.runtime.json_io import write_json
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.runtime.seeding import rng_for
-from distill.schema import Sample, open_split, resolve_trees, tree_inputs
+from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
+from distill.student.chat import AnswerWeights
 from distill.student.checkpoint import ADAPTER_FACTS, Progress, adapter_facts, write_adapter_folder, write_model_folder
 from distill.student.features import PictureReader, VisionFeatures
-from distill.student.model import Processor, Student, is_hub_name, load_student, require, student_folder, weight_files
+from distill.student.model import Student, is_hub_name, load_student, require, student_path, weight_files
 from distill.student.random_student import make_random_student, random_student_settings
 from distill.training.fit import LOG, Lesson, fit, seeded
 from distill.training.loading import Census, Supply, choose_over_all, num_workers, reader_errors, take_census
@@ -34,12 +38,14 @@ def taught_by(samples: Iterable[Sample], max_pixels: int) -> ChatFormat:
     """Return what samples teach.
 
     Args:
-        max_pixels: most that the student's image processor keeps of a picture.
+        max_pixels: limit of a picture; 0: none.
     """
     prompts: dict[Language, Prompt] = {}
     looks: set[FrameFormat] = set()
     lengths: set[int] = set()
+    decision: Place = "last"
     for sample in samples:
+        decision = decision_place(sample.answer)
         prompts.setdefault(sample.language, sample.prompt)
         looks.add(FrameFormat(views=sample.views, size_px=sample.picture_px, depth_range_m=sample.depth_range_m))
         lengths.add(len(sample.frames))
@@ -47,10 +53,17 @@ def taught_by(samples: Iterable[Sample], max_pixels: int) -> ChatFormat:
         raise InputError("the training set has windows of different lengths", got=f"{sorted(lengths)} frames")
     ordered = sorted(looks, key=lambda look: (look.views, look.size_px, look.depth_range_m))
     return ChatFormat(
-        prompts=dict(sorted(prompts.items())), num_frames=lengths.pop(), looks=ordered, max_pixels=max_pixels
+        prompts=dict(sorted(prompts.items())),
+        num_frames=lengths.pop(),
+        looks=ordered,
+        max_pixels=max_pixels or max(math.prod(look.size_px) for look in ordered),
+        decision=decision,
     )
 
 
+log = logging.getLogger(__name__)
+
+TAUGHT: tuple[Split, ...] = ("train", "val")
 ADAPTER, MODEL, STUDENT, PREFLIGHT = "adapter", "model", "student", "preflight.json"
 UNREADABLE = "unreadable_picture"
 TOKENIZER_SAMPLES = 2000  # what the tokenizer of a student of random weights is trained on, at most
@@ -58,17 +71,12 @@ TOKENIZER_SAMPLES = 2000  # what the tokenizer of a student of random weights is
 
 def add_adapter(student: Student, cfg: TrainConfig, seed: int) -> Student:
     """Wrap the student's model with a fresh LoRA adapter; only the adapter can be trained."""
-    import torch
     from peft import LoraConfig, get_peft_model
 
-    pattern = re.compile(cfg.target_modules)
-    names = [name for name, module in student.model.named_modules() if isinstance(module, torch.nn.Linear)]
-    if not any(pattern.fullmatch(name) for name in names):
-        raise ConfigError("no layer of the student matches the pattern", where="target_modules", got=cfg.target_modules)
     lora = LoraConfig(
         r=cfg.lora_rank,
         lora_alpha=cfg.lora_alpha,  # type: ignore[arg-type]  # a plain number; the library says int
-        target_modules=cfg.target_modules,
+        target_modules=target_modules(student),
         task_type="CAUSAL_LM",
     )
     with seeded(student, seed, "adapter"):
@@ -81,18 +89,29 @@ def add_adapter(student: Student, cfg: TrainConfig, seed: int) -> Student:
     return student
 
 
+def target_modules(student: Student) -> str:
+    """Return the pattern of all linear layers of the language model, which an adapter changes.
+
+    The vision tower and the output head are not among them: the features of a frozen tower are kept.
+    """
+    prefix, names = student.language_layers()
+    last = sorted({name.rpartition(".")[2] for name in names})
+    return rf"{re.escape(prefix)}\.(.*\.)?({'|'.join(map(re.escape, last))})"
+
+
 def free_weights(student: Student, cfg: TrainConfig) -> Student:
     """Let all weights learn but those of the vision tower, which stays as it is unless `train_vision`."""
     student.model.requires_grad_(True)
-    if not cfg.train_vision:
-        student.tower.requires_grad_(False)
-        student.tower.to(student.dtype)
+    for module in () if cfg.train_vision else student.vision_modules():
+        module.requires_grad_(False)
+        module.to(student.dtype)
     return student
 
 
-def prepared_student(cfg: TrainConfig, base: Path, max_pixels: int, seed: int, device: str) -> Student:
-    """Load a student and make it ready to learn."""
-    given: Any = {"device": device, "dtype": cfg.dtype, "max_pixels": max_pixels}
+def prepared_student(cfg: TrainConfig, base: Path, seed: int, device: str) -> Student:
+    """Load a student and prepare it for training."""
+    template = read_text(Path(cfg.chat_template), what="chat template") if cfg.chat_template else ""
+    given: Any = {"device": device, "dtype": cfg.dtype, "template": template, "allow_code": cfg.allow_code}
     if cfg.method == "lora":
         student = add_adapter(load_student(base, **given), cfg, seed)
     else:
@@ -141,7 +160,7 @@ def run(
     with joined(cfg.device) as ranks:
         trees = resolve_trees(dataset, data)
         preset = random_student_settings(str(student), cfg.random_student)
-        base = student_folder(str(student)) if preset is None else out / STUDENT
+        base = out / STUDENT if preset else student_path(str(student), allow_code=cfg.allow_code)
         if preset is not None:
             cfg = cfg.model_copy(update={"random_student": preset})
         inputs = {"dataset": dataset, **tree_inputs(trees), **({} if preset else weight_files(base))}
@@ -166,30 +185,32 @@ def run(
 def _lesson(
     cfg: TrainConfig, dataset: Path, trees: dict[str, Path], base: Path, out: Path, seed: int, ranks: Ranks
 ) -> tuple[Lesson, ChatFormat]:
-    samples, validation = open_split(dataset, "train"), open_split(dataset, "val")
+    student = prepared_student(cfg, base, seed, ranks.device)
+    samples, validation = (open_split(dataset, split, text_only=not student.has_pictures) for split in TAUGHT)
     chosen = choose_over_all(validation, cfg.validation_samples, rng_for(seed, STAGE, "validation"))
     if not samples:
         fix = "prepare the training set with more captions, or with other fractions"
         raise InputError("the training split is empty", where=dataset, fix=fix)
-    taught = taught_by(samples, max(1, cfg.max_pixels))
-    sizes_px = [*(look.size_px for look in taught.looks), *(validation[index].picture_px for index in chosen)]
-    max_pixels = cfg.max_pixels or max(width_px * height_px for width_px, height_px in sizes_px)
-    student = prepared_student(cfg, base, max_pixels, seed, ranks.device)
-    processor = Processor(student.tokenizer, student.image_processor)
-    workers = num_workers(cfg.data_workers)
-    counting: Any = {"max_tokens": cfg.max_tokens, "workers": workers, "ranks": ranks}
+    if not student.has_pictures and open_split(dataset, "train")[0].views:
+        log.warning("%s: the student takes no pictures: it is taught with the text state alone", STAGE)
+    taught = taught_by(samples, cfg.max_pixels)
+    processor = student.processor
+    workers, max_pixels = num_workers(cfg.data_workers), cfg.max_pixels
+    counting: Any = {"max_tokens": cfg.max_tokens, "max_pixels": max_pixels, "workers": workers, "ranks": ranks}
     census = take_census(samples, range(len(samples)), processor, trees, **counting, label=f"{STAGE}: counting tokens")
     asked = take_census(validation, chosen, processor, trees, **counting, label=f"{STAGE}: counting tokens of val")
     if not len(census):
         raise _nothing_to_learn(out, census)
     memory_bytes = int(FEATURE_MEMORY_GB * GB)
-    features = VisionFeatures(student, memory_bytes=memory_bytes, is_frozen=not cfg.train_vision)
-    reader = PictureReader(processor, trees, student.dtype)
-    lesson = Lesson(student, samples, census, validation, asked, Supply(features, reader, workers), cfg, ranks, seed)
+    kept: Any = {"memory_bytes": memory_bytes, "is_frozen": not cfg.train_vision, "max_pixels": max_pixels}
+    features = VisionFeatures(student, **kept)
+    reader = PictureReader(processor, trees, student.dtype, max_pixels)
+    weights = AnswerWeights(cfg.decision_weight, cfg.reason_weight)
+    supply = Supply(features, reader, workers, weights)
+    lesson = Lesson(student, samples, census, validation, asked, supply, cfg, ranks, seed)
     found = findings(cfg, student, census, asked, features, samples, lesson.steps)
     ranks.first_does(lambda: tell(found, out / PREFLIGHT))
-    most = int(student.image_processor.size["longest_edge"])
-    return lesson, taught.model_copy(update={"max_pixels": most})
+    return lesson, taught
 
 
 def _nothing_to_learn(out: Path, census: Census) -> Exception:
@@ -208,12 +229,13 @@ def _write_product(
     stage: StageFolder,
 ) -> None:
     student, cfg, census = lesson.student, lesson.cfg, lesson.census
-    facts = adapter_facts(student, int(student.image_processor.size["longest_edge"]), base)
+    facts = adapter_facts(student, taught.max_pixels, base)
     with atomic_folder(product) as partial:
         if cfg.method == "lora":
             write_adapter_folder(student, partial, base_name)
             write_json(partial / ADAPTER_FACTS, facts)
         else:
+            student.model.to(student.dtype)
             write_model_folder(student, partial, base)
         write_chat_format(partial, taught)
     num_unreadable = len(progress.unreadable)

@@ -7,6 +7,8 @@ samples.
     torchrun --nproc-per-node 4 $P --shape 2b --batch 64 --micro 16
     python $P --shape 2b --check                 loss and gradients against plain, in float32; `--kept FILE` keeps them
     python $P --shape 2b --check --dtype bfloat16 --kept FILE    bfloat16 and the fast kernels against what was kept
+    python $P --shape smollm2 --batch 64 --micro 32              SmolLM2-135M, text alone; `--plain` is the same with
+                                                                 plain transformers and peft
 
 Steps are the project's own: features of pictures kept, logits for a few answer tokens at a time, rows by
 length. Pictures are noise in memory: what reading takes tells `cosfly distill train` on a tree (`waited_share` in its
@@ -20,25 +22,33 @@ from typing import Any
 
 import numpy as np
 import torch
+from peft import LoraConfig, get_peft_model
 from safetensors.torch import load_file, save_file
-from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
-from distill.student.encoding import EncodedSample, padded
+from distill.student.chat import EncodedSample, padded
 from distill.student.features import FramePicture, PictureData, VisionFeatures
-from distill.student.kernels import fuse_norms, look_at_equal_sizes_at_once, use_kernels_for
 from distill.student.model import Student, compute_dtype
+from distill.student.qwen3_5 import choose_kernels, fuse_norms
 from distill.training.fit import make_optimizer
 from distill.training.loss import answer_loss
 from distill.training.preflight import used_gb
 from distill.training.ranks import Ranks, joined
 from distill.training.settings import TrainConfig
-from distill.training.stage import add_adapter
+from distill.training.stage import add_adapter, target_modules
 
 SHAPES: dict[str, dict[str, Any]] = {
     "2b": {
         "hidden_size": 2048, "num_hidden_layers": 24, "num_attention_heads": 8, "num_key_value_heads": 2,
         "head_dim": 256, "linear_num_key_heads": 16, "linear_num_value_heads": 16, "linear_key_head_dim": 128,
         "linear_value_head_dim": 128, "intermediate_size": 6144, "vocab_size": 248_320,
+    },
+    "smollm2": {
+        "hidden_size": 576, "num_hidden_layers": 30, "num_attention_heads": 9, "num_key_value_heads": 3, "head_dim": 64,
+        "intermediate_size": 1536, "vocab_size": 49_152, "max_position_embeddings": 8192,
+    },
+    "tiny_text": {
+        "hidden_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16,
+        "intermediate_size": 128, "vocab_size": 5000,
     },
     "tiny": {
         "hidden_size": 64, "num_hidden_layers": 4, "num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16,
@@ -48,7 +58,7 @@ SHAPES: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 TOWERS = {"2b": (1024, 24, 4096), "tiny": (32, 2, 64)}  # width, layers, MLP
 SIZES_PX = {"2b": (640, 352), "tiny": (64, 64)}
-WORDS = {"2b": (660, 250), "tiny": (80, 40)}  # of prompt and answer
+WORDS = {"2b": (660, 250), "tiny": (80, 40), "smollm2": (1120, 250), "tiny_text": (80, 40)}  # of prompt and answer
 PICTURES = 5
 IMAGE, END, PAD, FIRST_WORD = 3, 1, 0, 10  # token numbers of the made-up vocabulary
 WARM_UP = 3
@@ -60,12 +70,20 @@ class Words:
 
     pad_token_id = PAD
 
-    def convert_tokens_to_ids(self, token: str) -> int:
-        return {"<|image_pad|>": IMAGE}.get(token, END)
+
+class MadeUp(Student):
+    """A student of made-up tokens: it has a model, and neither a tokenizer nor a processor."""
+
+    end_token_id, kinds_name = END, "mm_token_type_ids"
+
+    def picture_tokens(self, size_px: tuple[int, int]) -> int:
+        return size_px[0] * size_px[1] // 1024
 
 
 def make_student(shape: str, device: str, dtype: Any, seed: int = 0) -> Student:
-    use_kernels_for(dtype, device)
+    choose_kernels(dtype, device)
+    if shape not in TOWERS:
+        return make_text_student(shape, device, dtype, seed)
     from transformers import Qwen3_5Config, Qwen3_5ForConditionalGeneration
 
     sizes, (width, depth, inner) = SHAPES[shape], TOWERS[shape]
@@ -86,23 +104,30 @@ def make_student(shape: str, device: str, dtype: Any, seed: int = 0) -> Student:
     torch.manual_seed(seed)
     with torch.device(device):
         model = Qwen3_5ForConditionalGeneration(config).to(dtype)
-    areas = {"shortest_edge": 32 * 32, "longest_edge": 1280 * 1280}
-    images = Qwen2VLImageProcessorPil(patch_size=16, merge_size=2, temporal_patch_size=2, size=areas)
-    look_at_equal_sizes_at_once(model)
-    return Student(Words(), images, model, device, dtype)
+    return MadeUp(Words(), "made up", IMAGE, model=model, device=device, dtype=dtype)
+
+
+def make_text_student(shape: str, device: str, dtype: Any, seed: int) -> Student:
+    from transformers import LlamaConfig, LlamaForCausalLM
+
+    ends: Any = {"eos_token_id": END, "pad_token_id": PAD, "bos_token_id": END}
+    torch.manual_seed(seed)
+    with torch.device(device):
+        model = LlamaForCausalLM(LlamaConfig(**SHAPES[shape], **ends, tie_word_embeddings=True)).to(dtype)
+    return MadeUp(Words(), None, model=model, device=device, dtype=dtype)
 
 
 def make_rows(shape: str, count: int, seed: int) -> list[tuple[EncodedSample, list[FramePicture]]]:
-    rng, size_px = np.random.default_rng(seed), SIZES_PX[shape]
-    grid, vocabulary = (1, size_px[1] // 16, size_px[0] // 16), SHAPES[shape]["vocab_size"]
+    rng, size_px, vocabulary = np.random.default_rng(seed), SIZES_PX.get(shape), SHAPES[shape]["vocab_size"]
     rows = []
     for number in range(count):
         prompt, answer = (int(length * rng.uniform(0.9, 1.1)) for length in WORDS[shape])
-        ids = [5, *[IMAGE] * (grid[1] * grid[2] // 4), 6] * PICTURES
-        ids += rng.integers(FIRST_WORD, vocabulary, prompt).tolist()
+        pictures = [5, *[IMAGE] * (size_px[0] * size_px[1] // 1024), 6] * PICTURES if size_px else []
+        ids = np.array(pictures + rng.integers(FIRST_WORD, vocabulary, prompt).tolist())
         answers = np.append(rng.integers(FIRST_WORD, vocabulary, answer), END)
-        encoded = EncodedSample(str(number), np.array(ids), answers, np.array([grid] * PICTURES), 1.0)
-        frames = [str(seed * count + number + i) for i in range(PICTURES)]
+        kinds = (ids == IMAGE).astype(np.int64) if size_px else None
+        encoded = EncodedSample(str(number), ids, answers, np.ones(len(answers), np.float32), kinds)
+        frames = [str(seed * count + number + i) for i in range(PICTURES)] if size_px else []
         rows.append((encoded, [FramePicture("run", frame, "rgb", size_px, 100.0) for frame in frames]))
     return rows
 
@@ -110,28 +135,27 @@ def make_rows(shape: str, count: int, seed: int) -> list[tuple[EncodedSample, li
 def noise_of(picture: FramePicture, dtype: Any) -> PictureData:
     width_px, height_px = picture.size_px
     values = np.random.default_rng(int(picture.frame)).standard_normal((height_px * width_px // 256, 1536), np.float32)
-    return PictureData(picture, torch.from_numpy(values).to(dtype))
+    grid = torch.tensor([[1, height_px // 16, width_px // 16]])
+    return PictureData(picture, {"pixel_values": torch.from_numpy(values).to(dtype), "image_grid_thw": grid})
 
 
-def plain_loss(student: Student, rows: list[EncodedSample], patches: Any) -> Any:
+def plain_loss(student: Student, rows: list[EncodedSample], read: list[PictureData]) -> Any:
     """What plain transformers does: every token's logits, the tower in every step, a padding mask."""
-    ids, labels, _ = padded(student, rows)
+    arrays = {name: array for name, array in padded(student, rows).items() if name != "weights"}
     lengths = np.array([[len(row)] for row in rows])
-    arrays = {
-        "input_ids": ids, "labels": labels, "attention_mask": (np.arange(ids.shape[1]) < lengths).astype(np.int64),
-        "mm_token_type_ids": (ids == IMAGE).astype(np.int64),
-        "image_grid_thw": np.concatenate([row.image_grids for row in rows]),
-    }  # fmt: skip
+    arrays["attention_mask"] = (np.arange(arrays["input_ids"].shape[1]) < lengths).astype(np.int64)
     inputs = {name: torch.from_numpy(array).to(student.device) for name, array in arrays.items()}
+    names = read[0].inputs if read else ()
+    pictures = {name: torch.cat([one.inputs[name] for one in read]).to(student.device) for name in names}
     count = sum(len(row.answer_ids) for row in rows)
-    return student.model(**inputs, pixel_values=patches.to(student.device), use_cache=False).loss * count
+    return student.model(**inputs, **pictures, use_cache=False).loss * count
 
 
 def backward(student: Student, way: str, rows: list, features: VisionFeatures) -> float:
     encoded, pictures = [row for row, _ in rows], [picture for _, found in rows for picture in found]
     if way == "plain":
         with student.computing():
-            loss = plain_loss(student, encoded, torch.cat([noise_of(p, student.dtype).patches for p in pictures]))
+            loss = plain_loss(student, encoded, [noise_of(picture, student.dtype) for picture in pictures])
     else:
         plan = features.plan()
         features.take([noise_of(picture, student.dtype) for picture in features.wanted(plan, pictures)])
@@ -144,8 +168,14 @@ def backward(student: Student, way: str, rows: list, features: VisionFeatures) -
 def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
     shape, dtype = arguments.shape, compute_dtype(arguments.dtype, ranks.device)
     cfg = TrainConfig(batch_size=arguments.micro or arguments.batch, samples_per_step=arguments.batch)
-    student = add_adapter(make_student(shape, ranks.device, dtype), cfg, 0)
-    fuse_norms(student.core)
+    student, way = make_student(shape, ranks.device, dtype), "plain" if arguments.plain else "ours"
+    if arguments.plain:
+        lora = LoraConfig(r=cfg.lora_rank, lora_alpha=32, target_modules=target_modules(student), task_type="CAUSAL_LM")
+        student.model = get_peft_model(student.model, lora)
+    else:
+        student = add_adapter(student, cfg, 0)
+        if shape in TOWERS and not arguments.library_norms:
+            fuse_norms(student.core)
     student.model.train()
     optimizer = make_optimizer(student, cfg)
     parameters = [p for p in student.model.parameters() if p.requires_grad]
@@ -153,11 +183,12 @@ def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
     seconds, tokens = 0.0, 0
     for step in range(WARM_UP + arguments.steps):
         rows = make_rows(shape, arguments.batch, 0 if arguments.same else step)
-        rows = sorted(rows, key=lambda row: -len(row[0]))[ranks.rank :: ranks.size]
+        rows = rows if arguments.plain else sorted(rows, key=lambda row: -len(row[0]))
+        rows = rows[ranks.rank :: ranks.size]
         ranks.total([0.0])  # all begin a step together
         begun_s = time.perf_counter()
         for start in range(0, len(rows), cfg.batch_size):
-            backward(student, "ours", rows[start : start + cfg.batch_size], features)
+            backward(student, way, rows[start : start + cfg.batch_size], features)
         ranks.add_gradients(parameters)
         torch.nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()
@@ -169,7 +200,7 @@ def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
             tokens += sum(len(row) for row, _ in rows)
     (all_tokens,) = ranks.total([float(tokens)])
     return {
-        "shape": shape, "parameters": sum(p.numel() for p in student.model.parameters()),
+        "shape": shape, "way": way, "parameters": sum(p.numel() for p in student.model.parameters()),
         "processes": ranks.size, "samples_per_step": arguments.batch, "batch_size": cfg.batch_size,
         "dtype": str(dtype), "step_s": round(seconds / arguments.steps, 4),
         "tokens_per_s": round(all_tokens / seconds, 1), "memory_gb": round(used_gb(ranks.device), 2),
@@ -230,6 +261,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--dtype", choices=("auto", "float32", "bfloat16"), default="auto")
     parser.add_argument("--same", action="store_true", help="the same samples in every step: all features are kept")
+    parser.add_argument("--plain", action="store_true", help="plain transformers and peft, for comparison")
+    parser.add_argument("--library-norms", action="store_true", help="the norms of transformers, for comparison")
     parser.add_argument("--check", action="store_true")
     parser.add_argument("--kept", help="a safetensors file of a float32 check's gradients and adapter")
     arguments = parser.parse_args()

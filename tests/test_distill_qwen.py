@@ -1,12 +1,11 @@
-"""distill: faster code for parts of a student against the library's, and which code is chosen when."""
+"""distill: the fused norms of Qwen3.5 against those of transformers."""
 
 from __future__ import annotations
 
 import pytest
 from later import qwen, torch
-from tables import each
 
-from distill.student import kernels
+from distill.student import qwen3_5
 
 
 def norms(dtype) -> torch.nn.ModuleDict:
@@ -34,29 +33,9 @@ def computed(found: torch.nn.ModuleDict, dtype, autocast: bool) -> list[torch.Te
 def test_fused_norms_are_the_librarys_with_their_gradients(dtype, autocast, tolerance):
     dtype = getattr(torch, dtype)
     plain, fused = norms(dtype), norms(dtype)
-    kernels.fuse_norms(fused)
+    qwen3_5.fuse_norms(fused)
     assert {type(module).__name__ for module in fused.values()} == {"FusedNorm", "FusedGatedNorm"}
     assert fused.state_dict().keys() == plain.state_dict().keys()
     for found, wanted in zip(computed(fused, dtype, autocast), computed(plain, dtype, autocast), strict=True):
         assert found.dtype == wanted.dtype
         assert (found - wanted).float().norm() <= tolerance * wanted.float().norm()
-
-
-@each("grids", [[[1, 4, 6]] * 5, [[1, 4, 6], [1, 2, 8], [1, 4, 6]]])
-def test_a_tower_attends_to_pictures_of_one_size_at_once_and_gives_the_same(grids):
-    cfg = qwen.Qwen3_5VisionConfig(depth=2, hidden_size=32, intermediate_size=64, num_heads=2, out_hidden_size=48)
-    cfg._attn_implementation = "sdpa"
-    torch.manual_seed(0)
-    towers = [qwen.Qwen3_5VisionModel(cfg), qwen.Qwen3_5VisionModel(cfg)]
-    towers[1].load_state_dict(towers[0].state_dict())
-    kernels.look_at_equal_sizes_at_once(towers[1])
-    assert type(towers[1].blocks[0].attn).__name__ == "JoinedAttention"
-    found = []
-    for tower in towers:
-        for seed in (1, 2):  # borders of another call are not those of the one before
-            patches = torch.randn(sum(h * w for _, h, w in grids), 1536, generator=torch.Generator().manual_seed(seed))
-            output = tower(patches, torch.tensor(grids)).pooler_output
-            output.square().sum().backward()
-        found.append([output, *(p.grad for p in tower.parameters())])
-    for ours, wanted in zip(*found, strict=True):
-        assert torch.allclose(ours, wanted, atol=1e-5, rtol=1e-4)

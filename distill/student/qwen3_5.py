@@ -1,5 +1,4 @@
-"""Which code computes a student: faster kernels where an accelerator has them, PyTorch's own where float32 is asked
-for, and fewer calls."""
+"""Faster code for students of Qwen3.5's structure (3.5, 3.6, 3.8) on an accelerator; no other family is known here."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ CONVOLUTION = "causal_conv1d"  # the package whose short convolution transformer
 LINEAR_ATTENTION = "fla"
 
 
-def use_kernels_for(dtype: Any, device: str) -> None:
+def choose_kernels(dtype: Any, device: str) -> None:
     """Decide what transformers will find when it first loads the model's code, which is when it chooses; call this
     before.
 
@@ -80,39 +79,3 @@ def _fused_norms() -> dict[type, type]:
             return (scaled * torch.nn.functional.silu(gate.float())).type_as(hidden_states)
 
     return {Qwen3_5RMSNorm: FusedNorm, Qwen3_5RMSNormGated: FusedGatedNorm}
-
-
-# --- pictures ---------------------------------------------------------------------------------------------------------
-
-
-def look_at_equal_sizes_at_once(model: Any) -> None:
-    """Have a vision tower attend to all pictures of a call in one product where they are of one size, as those of a
-    flight are.
-
-    The library's attention asks the accelerator for their lengths in every layer and takes them one after the other; of
-    pictures that differ in size it still does.
-    """
-    import torch
-    from transformers.models.qwen3_5.modeling_qwen3_5 import Qwen3_5VisionAttention, apply_rotary_pos_emb_vision
-
-    asked: list[Any] = [None, []]  # the borders of the last call, and the lengths between them: all layers get the same
-
-    def lengths_of(borders: Any) -> list[int]:
-        if asked[0] is not borders:
-            asked[:] = borders, borders.diff().tolist()
-        return asked[1]
-
-    class JoinedAttention(Qwen3_5VisionAttention):
-        def forward(self, hidden_states: Any, cu_seqlens: Any, **others: Any) -> Any:  # type: ignore[override]
-            lengths = lengths_of(cu_seqlens)
-            if len(set(lengths)) != 1:
-                return super().forward(hidden_states, cu_seqlens, **others)
-            query, key, value = self.qkv(hidden_states).unflatten(-1, (3, self.num_heads, -1)).unbind(1)
-            query, key = apply_rotary_pos_emb_vision(query, key, *others["position_embeddings"])
-            query, key, value = (x.unflatten(0, (len(lengths), -1)).transpose(1, 2) for x in (query, key, value))
-            found = torch.nn.functional.scaled_dot_product_attention(query, key, value, scale=self.scaling)
-            return self.proj(found.transpose(1, 2).flatten(2).flatten(0, 1))
-
-    for module in model.modules():
-        if type(module) is Qwen3_5VisionAttention and module.config._attn_implementation == "sdpa":
-            module.__class__ = JoinedAttention
