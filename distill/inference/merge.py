@@ -15,7 +15,16 @@ from cosfly.runtime.io import atomic_folder
 from cosfly.runtime.json_io import read_json, validated
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from distill.student.checkpoint import read_adapter_facts, write_model_folder
-from distill.student.model import GGUF, load_config, load_student, loading_errors, require, student_path, weight_files
+from distill.student.model import (
+    GGUF,
+    adapter_tensors,
+    load_config,
+    load_student,
+    loading_errors,
+    require,
+    student_path,
+    weight_files,
+)
 
 STAGE = "distill.merge"
 
@@ -83,12 +92,8 @@ def adapter_files(adapter: Path) -> dict[str, Path]:
 
 def _check_tensors(adapter: Path) -> int:
     """Check that the tensors of an adapter are pairs of LoRA matrices; return the number of pairs."""
-    from safetensors.torch import load_file
-
-    with loading_errors("adapter", adapter):
-        names = load_file(adapter / "adapter_model.safetensors").keys()
     layers: dict[str, set[str]] = {}
-    for name in names:
+    for name in adapter_tensors(adapter):
         layer, _, part = name.rpartition(".lora_")
         if part not in ("A.weight", "B.weight"):
             raise InputError("the file has a tensor that is not of a LoRA adapter", where=adapter, got=name)

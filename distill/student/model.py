@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE
 from cosfly.runtime.errors import EnvironmentMissing, InputError, shown
+from cosfly.runtime.io import read_text
 from cosfly.runtime.json_io import read_json, read_object
 from distill.student.chat import Processor
 
@@ -186,7 +187,7 @@ def loading_errors(what: str, where: Path) -> Any:
     try:
         yield
     except (ImportError, LookupError, OSError, RuntimeError, TypeError, ValueError, SafetensorError) as error:
-        words = (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
+        words = " ".join(str(error).split())[:300] or type(error).__name__
         fix = "use a file of another quantization, such as Q8_0 or F16" if where.suffix == GGUF else None
         raise InputError(f"the {what} cannot be loaded", where=where, got=words, fix=fix) from error
 
@@ -263,7 +264,7 @@ def load_processor(
             library = _picture_processor(config, tokenizer, arguments)
     taught = adapter / TEMPLATE if adapter is not None else None
     if not template and taught is not None and taught.is_file():
-        template = taught.read_text(encoding="utf-8")
+        template = read_text(taught, what="chat template")
     token = getattr(config, "image_token_id", None) or getattr(config, "image_token_index", None)
     processor = Processor(tokenizer, library, token, template)
     processor.check(path)
@@ -359,11 +360,17 @@ def load_student(
     return student
 
 
+def adapter_tensors(adapter: Path) -> list[str]:
+    """Return the names of the tensors of an adapter."""
+    from safetensors import safe_open
+
+    with loading_errors("adapter", adapter), safe_open(adapter / "adapter_model.safetensors", framework="pt") as file:
+        return list(file.keys())
+
+
 def check_adapter(model: Any, adapter: Path) -> None:
     """Check that each tensor of an adapter has its layer in the model, because peft ignores those without one."""
-    from safetensors.torch import load_file
-
-    found = len(load_file(adapter / "adapter_model.safetensors"))
+    found = len(adapter_tensors(adapter))
     wanted = sum("lora_" in name for name, _ in model.named_parameters())
     if found != wanted:
         words, fix = "the base model lacks a layer that the adapter changes", "pass the base model of this adapter"
