@@ -246,7 +246,7 @@ class Processor:
             is_alone: it is the only picture of its sample. LLaVA-OneVision cuts such a picture into tiles.
         """
         image = Image.fromarray(picture)
-        found: Any = self.library(text=[self._picture_text], images=[[image]], return_tensors="np")
+        found: dict[str, Any] = dict(self.library(text=[self._picture_text], images=[[image]], return_tensors="np"))
         if "batch_num_images" in found and not is_alone:
             twice = self.library(text=[self._picture_text * 2], images=[[image, image]], return_tensors="np")
             found = {name: value[:1] for name, value in twice.items()}
