@@ -315,7 +315,7 @@ def padded(processor: Processor, rows: Sequence[EncodedSample]) -> dict[str, np.
         labels[i, begin:end], weights[i, begin:end] = row.answer_ids, row.weights
         if row.kinds is not None:
             kinds[i, :begin] = row.kinds
-    found = {"input_ids": ids, "labels": labels, "weights": weights}
+    found: dict[str, np.ndarray] = {"input_ids": ids, "labels": labels, "weights": weights}
     return found | ({processor.kinds_name: kinds} if any(row.kinds is not None for row in rows) else {})
 
 
