@@ -329,6 +329,7 @@ DEFECTS = {
     ),
     "projection_differs in depth": lambda f: edit(f, at_point("target", "depth", 1.0)),
     "target_missing in the picture": lambda f: edit(f, at_point("target", "image_uv", None)),
+    "illegible": lambda f: edit(f, lambda t: [p["target"].update(legible=False) for p in t["points"]]),
     "teleport": lambda f: edit(f, lambda t: t["points"][3]["drone_pose"].update(x=99.0)),
     "missing_file that is listed": lambda f: (f / FRAME / "meta.json").unlink(),
     "broken_annotation of another frame": lambda f: edit(f / FRAME, lambda m: m.update(index=4), "meta.json"),
@@ -482,7 +483,7 @@ def test_a_planted_defect_is_found_in_that_flight_alone(specimen, tmp_path, subt
             assert issue.severity == severity
             assert str(tmp_path) not in issue.where  # a report can be handed on
             if severity == "error":
-                assert FRAME in issue.where or "points[3]" in issue.where or code in ("layout", "checksum")
+                assert FRAME in issue.where or "points[3]" in issue.where or code in ("layout", "checksum", "illegible")
                 assert (broken.result, twin.result) == ("rejected", "accepted")
             assert code not in {issue.code for issue in twin.issues}
 

@@ -15,6 +15,8 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.formats.weather import TIMES, WEATHERS, WeatherParams, resolved
 from cosfly.geometry.axes import intrinsic_matrix
+from cosfly.pipeline.runs import small_targets
+from cosfly.pipeline.settings import RunConfig
 from cosfly.render.contract import PosedPerson
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
@@ -210,3 +212,19 @@ def test_rain_falls_and_wets_the_road(renderer):
     assert np.median(road[1].rgb[where]) < 0.85 * np.median(road[0].rgb[where]), "darker from above"
     moved = drawn(renderer, wet, pose_towards((-14.0, -16.0, 8.01), (12.0, 2.0, 2.0)))
     assert (moved.rgb[:20] != after.rgb[:20]).any(), "drops fall anew in another frame"
+
+
+def test_the_towns_of_a_run_have_weather_seeds_of_their_own():
+    towns = {"a": {}, "b": {"render": {"weather_seed": 5}}, "c": {}}
+    cfg = RunConfig.model_validate({"towns": towns, "render": {"weather_mode": "random_per_path", "weather_seed": 70}})
+    assert [cfg.of_town(name).render.weather_seed for name in towns] == [70, 5, 72]
+    drawn = cfg.model_copy(update={"render": cfg.render.model_copy(update={"weather_seed": -1})})
+    assert drawn.of_town("c").render.weather_seed == -1
+
+
+def test_a_configuration_in_which_the_target_is_small_is_remarked_on():
+    assert small_targets(RunConfig()) == []
+    [line] = small_targets(RunConfig.model_validate({"render": {"width_px": 320, "height_px": 180}}))
+    assert "lower than 16 px in pictures (follow " in line
+    mostly = {"plan": {"styles": {"follow": 90, "top": 10}}, "render": {"width_px": 640, "height_px": 360}}
+    assert small_targets(RunConfig.model_validate(mostly)) == []

@@ -169,7 +169,9 @@ def check(job: Job, config: Annotated[Path, Argument(help="YAML file, or the nam
     from cosfly.pipeline.runs import caveats
 
     check_with_files(job.cfg)
-    options.print_lines([*caveats(job.cfg), f"{config}: ok"])
+    lines = caveats(job.cfg)
+    verdict = f"valid, with {len(lines)} remarks" if lines else "ok"
+    options.print_lines([*lines, f"{config}: {verdict}"])
 
 
 @options.groups["config"].command("show", epilog="cosfly config show --describe plan")

@@ -53,4 +53,7 @@ class InspectConfig(Config):
         ge=0,
         description="smallest accepted distance of the drone to obstacles, m; 0: anywhere outside obstacles",
     )
+    legible_min: Share = Field(
+        0.2, description="smallest accepted share of frames in which the target can be recognized; 0: no limit"
+    )
     check_checksums: bool = Field(True, description="read every file and compare it with checksums.sha256")

@@ -290,6 +290,7 @@ def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Met
     heights_px = (target.bbox[:, 3] - target.bbox[:, 1])[target.in_view]
     heights_m = track.positions_m[:, 2] - (track.targets_m[:, 2] - TARGET_HEIGHT_M)  # over the target's feet
     is_judged = target.legible is not None and len(heights_px) > 0
+    legible = None if target.legible is None else float(target.legible.mean())
     metrics.update(
         num_frames_checked=frames.num_checked,
         num_frames_compared=frames.num_compared,
@@ -297,13 +298,16 @@ def _check_frames(track: Track, cfg: InspectConfig, report: Report, metrics: Met
         height_mean_m=None if np.isnan(heights_m).all() else float(np.nanmean(heights_m)),
         rendered_visibility_mean=float(visibility.mean()) if len(visibility) else None,
         visible_share=float(target.visible.mean()),
-        legible_share=None if target.legible is None else float(target.legible.mean()),
+        legible_share=legible,
         small_share=float((heights_px < LEGIBLE_HEIGHT_PX).mean()) if is_judged else None,
         in_view_share=float(target.in_view.mean()),
         perturbed_share=float(track.perturbation.is_perturbed.mean()),
         track_quality=quality,
         invalid_depth_share_max=invalid,
     )
+    if legible is not None and legible < cfg.legible_min:
+        where, expected = "trajectory.json: points[].target.legible", f"at least {cfg.legible_min:g} of the frames"
+        report.error("illegible", where, f"true in {legible:.2f} of the frames", expected)
     if not target.visible.any():
         report.warn("never_visible", "trajectory.json: points[].target.visible", "false everywhere", "a target")
     if quality is not None and quality < limits.TRACK_QUALITY_MIN:

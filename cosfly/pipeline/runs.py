@@ -13,7 +13,10 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from cosfly.formats.bystanders import BYSTANDERS_FILE
+from cosfly.formats.frames import LEGIBLE_HEIGHT_PX
 from cosfly.formats.inspection import undecided
 from cosfly.formats.pedestrian_paths import read_paths, walk_id, write_paths
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
@@ -21,6 +24,7 @@ from cosfly.maps.stage import load_map
 from cosfly.pipeline.command_settings import worker_options
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.stage import run as plan_trajectories
+from cosfly.planners.styles import ROWS
 from cosfly.render.stage import run as draw
 from cosfly.render.weather import dark_trajectories
 from cosfly.runtime.config import load
@@ -147,6 +151,8 @@ RATES = {  # stage: unit, seconds per unit, MB per unit
 }
 # What an estimate makes of each map: pedestrian trajectories, plans of the first ones, and frames of each plan.
 SAMPLED_PEDESTRIANS, SAMPLED_TRAJECTORIES, SAMPLED_FRAMES = 64, 8, 4
+PERSON_M, PERSON_DEPTH_M = 1.75, 0.45  # height of a person, and extent in the plane
+SMALL_SHARE = 0.2  # of the time
 MOST_LISTED = 4  # trajectories named in a remark
 
 
@@ -340,8 +346,8 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
 
 
 def caveats(cfg: RunConfig) -> list[str]:
-    """Return remarks on settings that apply to some trajectories only, and on trajectories that are too dark."""
-    lines = cfg.plan.remarks()
+    """Return remarks on settings that apply to some trajectories only, and on targets too small or too dark to see."""
+    lines = [*cfg.plan.remarks(), *small_targets(cfg)]
     towns = {name: cfg.of_town(name) for name in cfg.towns} or {cfg.name: cfg}
     for name, town in towns.items():
         num_paths = town.pedestrians.num_paths
@@ -355,6 +361,33 @@ def caveats(cfg: RunConfig) -> list[str]:
                 "(render.tod_name, render.tod_pool), another render.weather_seed, or a map with streets"
             )
     return lines
+
+
+def small_targets(cfg: RunConfig) -> list[str]:
+    """Return a remark if the target is lower than LEGIBLE_HEIGHT_PX in the styles of SMALL_SHARE of the time or more.
+
+    Distances, altitudes and fields of view are the middles of their ranges.
+    """
+    plan, render = cfg.plan, cfg.render
+    fov_deg = sum(render.fovs_deg) / len(render.fovs_deg)
+    focal_px = render.width_px / 2.0 / math.tan(math.radians(fov_deg / 2.0))
+    small: dict[str, float] = {}
+    for name, share in plan.styles.items():
+        apart_m, up_m = plan.behind_distance_m, plan.altitude_preferred_m
+        if name in ROWS:
+            row = plan.style(name)
+            apart_m = float(np.mean([row.ground_distance_m, row.ground_distance_end_m or row.ground_distance_m]))
+            up_m = float(np.mean([row.altitude_m, row.altitude_end_m or row.altitude_m]))
+        height_px = focal_px * (PERSON_M * apart_m + PERSON_DEPTH_M * up_m) / math.hypot(apart_m, up_m) ** 2
+        if share > 0 and height_px < LEGIBLE_HEIGHT_PX:
+            small[f"{name} {height_px:.0f} px"] = share
+    if sum(small.values()) < SMALL_SHARE * sum(plan.styles.values()):
+        return []
+    return [
+        f"the target is lower than {LEGIBLE_HEIGHT_PX:g} px in pictures ({', '.join(small)}), so it can hardly be "
+        "recognized. Choose larger pictures (render.width_px), a narrower field of view (render.fovs_deg), or smaller "
+        "distances (plan.behind_distance_m, plan.altitude_preferred_m, plan.style_ranges)"
+    ]
 
 
 def in_words(num_bytes: float) -> str:

@@ -69,7 +69,10 @@ class RunConfig(CommandConfig):
         self.of_town(name)
 
     def of_town(self, name: str) -> RunConfig:
-        """Return the settings of one town's run. Its seed derives from the run's seed and the town's name."""
+        """Return the settings of one town's run.
+
+        Its seed derives from the run's seed and the town's name; its weather seed is the run's plus the town's index.
+        """
         changes = self.towns[name]
         if "towns" in changes:
             fix = "move these towns to the top-level section `towns`"
@@ -77,7 +80,10 @@ class RunConfig(CommandConfig):
                 "the settings of a town cannot have a section `towns`", where=f"towns.{name}.towns", fix=fix
             )
         seed = int(rng_for(self.seed, "run", name).integers(2**31))
+        index = list(self.towns).index(name)
         shared = self.model_dump(mode="json", exclude={"towns", "maps"}) | {"name": name, "seed": seed}
+        if self.render.weather_seed >= 0:  # otherwise the first trajectories of all towns have one sky
+            shared["render"]["weather_seed"] += index
         changes_but_maps = {setting: value for setting, value in changes.items() if setting != "maps"}
         maps = _named_maps(changes.get("maps", {}), name)
         return build(RunConfig, _merged(self, shared, changes_but_maps) | {"maps": maps}, f"towns.{name}")
