@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cache, partial
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -19,22 +20,17 @@ import pyarrow as pa
 
 from cosfly.formats.captions import FIELDS, Caption, LabelFrom, Language, TeacherKind, ValueCounts, Verdict, Writing
 from cosfly.formats.frames import (
-    INVALID_DEPTH_M,
     LEAST_FOV_DEG,
-    LEGIBLE_CONTRAST,
-    LEGIBLE_HEIGHT_PX,
-    LEGIBLE_SHARE,
     MOST_FOV_DEG,
     PERSON_ID,
-    SKY_DEPTH_M,
     FrameFile,
     Look,
 )
 from cosfly.formats.places import sample_id
 from cosfly.formats.playback import EVENTS, Track
 from cosfly.formats.weather import WeatherMode, WeatherParams
-from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.geometry.motion import ACTION
+from cosfly.runtime.config import read_yaml
 from cosfly.runtime.json_io import dump_json
 
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")
@@ -57,44 +53,8 @@ Place = tuple[str, str, str, str]
 SplitName = Literal["train", "validation", "test"]
 SPLIT_NAMES: tuple[SplitName, ...] = get_args(SplitName)  # as `datasets` shows them
 
-CONTRACT: dict[str, Any] = {
-    "handedness": "right",
-    "position": "metres; x east, y north, z up",
-    "rotation": "degrees; yaw counter-clockwise from east seen from above, pitch nose-up, roll right-side-down",
-    "world_from_body": "Rz(yaw) @ Ry(-pitch) @ Rx(roll); body axes: x forward, y left, z up",
-    "body_from_camera": BODY_FROM_CAMERA.astype(int).tolist(),
-    "camera": "pose is the camera's; image x right, y down, z along the optical axis; pixel (0, 0) is the corner, "
-    "the centre of the first pixel is (0.5, 0.5)",
-    "projection": "u = fx * x / z + cx, v = fy * y / z + cy for a point (x, y, z) in camera axes",
-    "depth": f"z-depth along the optical axis, metres, float32; {SKY_DEPTH_M:g} sky, {INVALID_DEPTH_M:g} invalid",
-    "instance": "PNG; R semantic number (CARLA 0.9.16 CityObjectLabel), G low and B high byte of the instance id",
-    "target": "hip of the tracked person; target_heading_deg, its walking direction as yaw; null before its first step",
-    "goal": "description of the target that is true of no other person with a pixel in frame goal_frame, where "
-    "target_picture shows the target; goal_says, the terms that it uses: garments (people has the appearance of the "
-    "target, and of others by instance id) or a place (left, right, near, far, or a landmark next to the target). Null "
-    "if nothing distinguishes the target, or if the tree does not record it",
-    "others": "others_in_view, number of other people with a pixel in the frame; other_distance_m, distance over the "
-    "ground from the target to the nearest of them, other_id; alike_id, the one that looks most like the target, and "
-    "alike_differences, in how many of figure, top, legs, hat and bag it differs; null without others",
-    "legibility": "target_height_px, of its box in the image; target_contrast, CIE76 difference between the colours of "
-    "its pixels and of those around it; target_legible: visible, at least "
-    f"{LEGIBLE_HEIGHT_PX:g} px high, at least {LEGIBLE_SHARE:g} of it unhidden (visibility), contrast at least "
-    f"{LEGIBLE_CONTRAST:g}; null if the tree does not record it",
-    "offsets": "the perturbation of the frame, which pose and target include; if a position is shifted, the camera is "
-    "aimed at the person again, and the rotation offset is the turn away from that aim",
-    "perturbation": "outcome of the two events of a frame, position (shift of drone and person) and rotation (turn of "
-    "the view): none, applied, or `fallback: ` and the reason why the frame is as planned; null if the tree does not "
-    "record it",
-    "action": "for a policy: mean velocities in m/s until the next frame along the level axes of the camera's yaw "
-    "(forward, left, up), yaw rate in degrees/s, camera pitch at the next frame. It is that of the planned motion, as "
-    "the label is; null at the end of a track, and if the plan is unknown",
-    "actions": "groups of five numbers: the action in each of the equal planning steps until the next frame; "
-    "poses_between, groups of six: the planned poses between these steps, empty if frames and plan have the same rate",
-    "waypoints": "groups of four numbers: the planned positions (x, y, z in m, yaw in degrees) at the next 10 frames, "
-    "fewer at the end of a track; body_waypoints: the same as forward, left, up in m and yaw, from the camera of the "
-    "frame along its level axes, so that those of a perturbed frame lead back to the plan",
-    "time": "seconds; consecutive frames of a track are one time step apart, 0.5 s in the paper",
-}
+# Axes, units and meanings, which every release states.
+CONTRACT: dict[str, Any] = read_yaml(Path(__file__).with_name("coordinates.yaml"))
 
 
 # --- the table --------------------------------------------------------------------------------------------------------
@@ -337,7 +297,10 @@ CAPTION = (  # what a row holds of an accepted caption, and nulls where there is
         title="verdict against the geometry", counted=True,
     ),
     Column("repair_strategy", "string", of_caption=_repair, title="repair", counted=True, shown=True),
-    Column("repair_rung", "string", of_caption=lambda c: c.repair and c.repair.rung, title="repaired by", shown=True),
+    Column(
+        "repair_rung", "string", of_caption=lambda c: c.repair and c.repair.rung, title="repaired by", counted=True,
+        shown=True,
+    ),
     Column(
         "teacher_kind", "string", of_caption=lambda c: c.teacher.kind, words=get_args(TeacherKind), required=True,
         title="kind of teacher", counted=True, shown=True,
@@ -380,7 +343,6 @@ POINT_NAMES = (
 )  # fmt: skip
 POINTS = tuple(column for column in FRAME if column.name in POINT_NAMES)
 SCALAR_NAMES = [column.name for column in SCALARS]
-CAPTION_NAMES = [column.name for column in CAPTION]
 COUNTED = [column.name for column in CAPTION if column.counted]
 # All but the prompts and the evidence, which are long.
 SHORT_NAMES = [name for name in SCALAR_NAMES if not name.startswith(("system_", "prompt_", "evidence"))]

@@ -1,15 +1,16 @@
-"""What is counted of each track of a release: the numbers of the card, the statistics and their checks are sums of it.
+"""What is counted in one pass over the rows of a release: each track, and the numbers of the release, which add it up.
 
-Motion is the plan's: positions less the recorded offsets, over all points, so that a perturbed track counts as its
-clean one does. Sums are of whole millionths, so they are exact and the same in any order.
+Card, statistics and `release verify` use them. Motion is the plan's: positions minus the recorded offsets, over all
+points, so that a perturbed track counts as its clean one does. Sums are of whole millionths, so they are exact and the
+same in any order.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections import Counter
-from collections.abc import Iterable
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,21 +21,26 @@ from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.weather import preset_token
 from cosfly.geometry.axes import box_iou
 from cosfly.geometry.coverage import Coverage
+from cosfly.geometry.trajectory_metrics import ACCEL_RMS_MAX_MPS2, JERK_RMS_MAX_MPS3, smoothness_score
 from release.columns import CAPTION_FIELDS, COUNTED, LANGUAGES, VALUE_COLUMNS
 from release.flight_rows import FlightRows
 from release.reading import bounded, read_tracks
-from release.record import Shard, Spread
+from release.record import Counts, Numbers, Shard, Spread
 
 DIGITS = 4
 MILLION = 1_000_000
 LEAST_STEP_S = 1e-3  # between two points
 SAME_FOV_DEG = 0.05
-TAB = "\t"  # between the two names of a pair that is counted
+REVIEW_BELOW = 0.5  # of the smoothness score (sec:step6)
+HOVER_MPS, TURN_DEGPS = 0.3, 5.0  # an action that is slower is hover; one that turns faster is a turn
+MOVES = (("forward", "backward"), ("left", "right"), ("up", "down"))  # by the sign of the velocities of an action
+ACTION_CLASSES = (*(name for pair in MOVES for name in pair), "turn left", "turn right", "hover")
+LENS = ("focal_px", "width_px", "height_px", "visibility", "iou")  # of the frames by field of view
+POOLED = ("height_m", "distance_m", "visibility")
+TAB = "\t"  # between the names of a pair that is counted
 # Columns of yes and no whose frames are counted.
 FLAGS = ("is_perturbed", "target_in_view", "target_visible", "target_legible", "has_caption")
-STATES = {  # shifted, turned
-    (False, False): "unperturbed", (True, False): "position only", (False, True): "rotation only", (True, True): "full",
-}  # fmt: skip
+STATES = ("unperturbed", "position only", "rotation only", "full")  # number: 1 for a shift, 2 for a turn
 COLUMNS = (
     "sample_id", "track", "split", "walk", "pair", "style", "pace", "weather", "time_of_day", "frame_index", "width_px",
     "height_px", "fov_deg", "intrinsics", "pose", "drone_offset", "target", "target_offset", "target_heading_deg",
@@ -53,46 +59,41 @@ class Sum(BaseModel):
     high: int | None = None
 
     @classmethod
-    def of(cls, values: Iterable[float]) -> Sum:
-        """Add up values; NaN is skipped. Raise InputError as `bounded`."""
-        parts = [round(bounded(value) * MILLION) for value in values if not math.isnan(value)]
-        ends = (min(parts), max(parts)) if parts else (None, None)
-        return cls(
-            count=len(parts), total=sum(parts), squares=sum(part * part for part in parts), low=ends[0], high=ends[1]
-        )
+    def of(cls, values: Iterable[float | None]) -> Sum:
+        """Add up values; None and NaN are skipped. Raise InputError as `bounded`."""
+        known = (value for value in values if value is not None and not math.isnan(value))
+        parts = [round(bounded(value) * MILLION) for value in known]
+        squares = sum(part * part for part in parts)
+        low, high = min(parts, default=None), max(parts, default=None)
+        return cls(count=len(parts), total=sum(parts), squares=squares, low=low, high=high)
 
     @classmethod
     def all(cls, sums: Iterable[Sum]) -> Sum:
         """Add up sums."""
-        known = [one for one in sums if one.low is not None and one.high is not None]
-        lows, highs = (
-            [one.low for one in known if one.low is not None],
-            [one.high for one in known if one.high is not None],
-        )
-        return cls(
-            count=sum(one.count for one in known), total=sum(one.total for one in known),
-            squares=sum(one.squares for one in known), low=min(lows, default=None), high=max(highs, default=None),
-        )  # fmt: skip
-
-    @property
-    def mean(self) -> float | None:
-        return self.spread().mean
+        parts = list(sums)
+        low = min((part.low for part in parts if part.low is not None), default=None)
+        high = max((part.high for part in parts if part.high is not None), default=None)
+        count, total, squares = (sum(getattr(part, name) for part in parts) for name in ("count", "total", "squares"))
+        return cls(count=count, total=total, squares=squares, low=low, high=high)
 
     def spread(self) -> Spread:
         """Return the sums as the record has them."""
-        if not self.count or self.low is None or self.high is None:
-            return Spread(count=0, mean=None, std=None, min=None, max=None)
+        if self.low is None or self.high is None:
+            return Spread()
         std = math.sqrt(self.count * self.squares - self.total * self.total) / self.count
         values = (self.total / self.count, std, self.low, self.high)
         mean, std, low, high = (round(value / MILLION, DIGITS) for value in values)
         return Spread(count=self.count, mean=mean, std=std, min=low, max=high)
 
 
+# --- a track ----------------------------------------------------------------------------------------------------------
+
+
 class TrackCount(BaseModel):
     """The counts of one track.
 
-    frames_digest: Of the indices of its frames. fov_deg, focal_px: Of its first frame; zooms: Later ones have others.
-    length_m, accel_rms_mps2, jerk_rms_mps3: Of its motion without perturbation, None where that is not known.
+    frames_digest: Of the indices of its frames. fov: Its field of view in degrees, or `changing`.
+    motion: Duration, length, acceleration and jerk without perturbation, None where that is not known.
     sums: Over its frames. counts: Of the frames by a value of what the key names; pairs of values are joined by TAB.
     """
 
@@ -104,16 +105,10 @@ class TrackCount(BaseModel):
     frames: int
     points: int
     frames_digest: str
-    image_px: str
-    fov_deg: float
-    focal_px: float | None
-    zooms: bool
-    duration_s: float
-    length_m: float | None
-    accel_rms_mps2: float | None
-    jerk_rms_mps3: float | None
+    fov: str
+    motion: dict[str, float | None]
     sums: dict[str, Sum]
-    counts: dict[str, dict[str, int]]
+    counts: dict[str, Counts]
     coverage: Coverage
     example: dict[str, str | None]
 
@@ -125,15 +120,6 @@ class TrackCount(BaseModel):
     def trajectory(self) -> str:
         """What it shares with its other track."""
         return self.name.rpartition("/")[0]
-
-    @property
-    def captions(self) -> int:
-        return self.counts["flags"].get("has_caption", 0)
-
-    @property
-    def fov(self) -> str:
-        """Its field of view, degrees, or that it changes."""
-        return "changing" if self.zooms else f"{self.fov_deg:g}"
 
 
 def count_release(folder: Path, shards: Iterable[Shard]) -> list[TrackCount]:
@@ -150,38 +136,31 @@ def count_track(frames: FlightRows, points: FlightRows) -> TrackCount:
     """Count the rows of a track, n frames. Raise InputError where a number is out of range."""
     first, rows = frames.rows[0], frames.rows
     offsets_m = frames.pose[:, :3] - frames.target_m
-    clean_m = frames.pose[:, :3] - frames.drone_offset[:, :3] - frames.target_m + frames.target_offset
+    clean_m = offsets_m - frames.drone_offset[:, :3] + frames.target_offset
     heights_px = frames.mask_box[:, 3] - frames.mask_box[:, 1]
-    seen = [
-        box if share > 0.0 else np.full(4, np.nan) for box, share in zip(frames.box, frames.visibility, strict=True)
-    ]
-    boxes = np.array(seen).reshape(-1, 4)
-    named = {name: [row[name] for row in rows if row[name] is not None] for name in ("style", "pace", "label")}
-    weather = [
-        [preset_token(row[name]) for row in rows if row[name] is not None] for name in ("weather", "time_of_day")
-    ]
-    told = np.column_stack([offsets_m, frames.numbers("target_heading_deg"), heights_px, frames.visibility])
+    seen = np.where(frames.visibility[:, None] > 0.0, frames.box, np.nan)
+    fovs = frames.numbers("fov_deg")
+    is_zooming = bool((np.abs(fovs - fovs[0]) > SAME_FOV_DEG).any())
     captioned = [row for row in rows if row["has_caption"]]
-    fovs, both = frames.numbers("fov_deg"), zip(boxes, frames.mask_box, strict=True)
+    texts = {name: [row[name] or "" for row in captioned] for name in CAPTION_FIELDS}
     measured = {
         "height_m": offsets_m[:, 2], "distance_m": np.linalg.norm(offsets_m, axis=1),
         "clean_altitude_m": clean_m[:, 2] + TARGET_HEIGHT_M, "clean_distance_m": np.linalg.norm(clean_m, axis=1),
-        "visibility": frames.visibility, "width_px": boxes[:, 2] - boxes[:, 0], "height_px": boxes[:, 3] - boxes[:, 1],
+        "visibility": frames.visibility, "width_px": seen[:, 2] - seen[:, 0], "height_px": seen[:, 3] - seen[:, 1],
+        "focal_px": frames.intrinsics[:, 0],
+        "iou": np.array([box_iou(*boxes) for boxes in zip(seen, frames.mask_box, strict=True)]),
+        **{name: np.array([len(text) for text in own], float) for name, own in texts.items()},
     }  # fmt: skip
-    texts = {name: [row[name] or "" for row in captioned] for name in CAPTION_FIELDS}
+    covered = np.column_stack([offsets_m, frames.numbers("target_heading_deg"), heights_px, frames.visibility])
+    named = [[row[name] for row in rows if row[name] is not None] for name in ("style", "pace", "label")]
+    skies = [[preset_token(row[name]) for row in rows if row[name] is not None] for name in ("weather", "time_of_day")]
     return TrackCount(
         name=frames.name, **{name: first[name] for name in ("track", "split", "walk", "pair")}, frames=len(rows),
         points=len(points), frames_digest=frames_digest(frames.index),
-        image_px=f"{first['width_px']} x {first['height_px']}", fov_deg=bounded(first["fov_deg"]),
-        focal_px=first["intrinsics"] and bounded(first["intrinsics"]["fx"]),
-        zooms=bool((np.abs(fovs - fovs[0]) > SAME_FOV_DEG).any()), **_motion(points),
-        sums={
-            **{name: Sum.of(values.tolist()) for name, values in measured.items()},
-            "iou": Sum.of(box_iou(*pair) for pair in both if not np.isnan(pair).any()),
-            **{name: Sum.of(float(len(text)) for text in own) for name, own in texts.items()},
-        },
-        counts=_counts(frames, points, captioned),
-        coverage=Coverage.of(told, TARGET_HEIGHT_M, named["style"], named["pace"], named["label"], *weather),
+        fov="changing" if is_zooming else f"{round(bounded(first['fov_deg']), 1):g}", motion=_motion(points),
+        sums={name: Sum.of(values.tolist()) for name, values in measured.items()},
+        counts={name: dict(counter) for name, counter in _counts(frames, points, captioned).items()},
+        coverage=Coverage.of(covered, TARGET_HEIGHT_M, *named, *skies),
         example={name: captioned[0][name] for name in ("sample_id", *CAPTION_FIELDS)} if captioned else {},
     )  # fmt: skip
 
@@ -189,43 +168,112 @@ def count_track(frames: FlightRows, points: FlightRows) -> TrackCount:
 def _motion(points: FlightRows) -> dict[str, float | None]:
     """Return duration, length, and RMS acceleration and jerk of the motion without perturbation."""
     clean_m, steps_s = points.pose[:, :3] - points.drone_offset[:, :3], np.diff(points.time_s)
-    found: dict[str, float | None] = dict.fromkeys(("length_m", "accel_rms_mps2", "jerk_rms_mps3"))
-    if not np.isnan(clean_m).any():
-        found["length_m"] = bounded(float(np.linalg.norm(np.diff(clean_m, axis=0), axis=1).sum()))
-        for name, order in (("accel_rms_mps2", 2), ("jerk_rms_mps3", 3)):
-            differences, steps = np.diff(clean_m, order, axis=0), steps_s[order - 1 :]
-            if len(differences) and steps.min() >= LEAST_STEP_S:
-                squares = (differences**2).sum(axis=1) / steps ** (2 * order)
-                found[name] = bounded(math.sqrt(float(squares.mean())))
-    return {"duration_s": bounded(float(points.time_s[-1] - points.time_s[0])), **found}
+    found: dict[str, float | None] = {"duration_s": bounded(float(points.time_s[-1] - points.time_s[0]))}
+    found |= dict.fromkeys(("length_m", "accel_rms_mps2", "jerk_rms_mps3"))
+    if np.isnan(clean_m).any():
+        return found
+    found["length_m"] = bounded(float(np.linalg.norm(np.diff(clean_m, axis=0), axis=1).sum()))
+    for name, order in (("accel_rms_mps2", 2), ("jerk_rms_mps3", 3)):
+        differences, steps = np.diff(clean_m, order, axis=0), steps_s[order - 1 :]
+        if len(differences) and steps.min() >= LEAST_STEP_S:
+            squares = (differences**2).sum(axis=1) / steps ** (2 * order)
+            found[name] = bounded(math.sqrt(float(squares.mean())))
+    return found
 
 
-def _counts(frames: FlightRows, points: FlightRows, captioned: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
-    rows, track = frames.rows, str(frames.rows[0]["track"])
+def action_class(action: Mapping[str, float]) -> str:
+    """Return the class of an action: its greatest velocity, else its turn, else hover."""
+    velocities = [action[name] for name in ("forward_mps", "left_mps", "up_mps")]
+    greatest = max(range(len(MOVES)), key=lambda k: abs(velocities[k]))
+    if math.hypot(*velocities) >= HOVER_MPS:
+        return MOVES[greatest][velocities[greatest] < 0]
+    turn = action["yaw_rate_degps"]
+    return "hover" if abs(turn) < TURN_DEGPS else "turn left" if turn > 0 else "turn right"
+
+
+def _counts(frames: FlightRows, points: FlightRows, captioned: list[dict[str, Any]]) -> dict[str, Counter[str]]:
+    rows, first = frames.rows, frames.rows[0]
     counts = {name: Counter(row[name] or "none" for row in captioned) for name in COUNTED}
     counts["flags"] = Counter(name for row in rows for name in FLAGS if row[name])
-    counts["flags"]["action"] = sum(row["action"] is not None for row in rows)
     for language in LANGUAGES:
         counts["flags"][language] = sum(row[f"caption_{language}_reasoning_trace"] is not None for row in captioned)
-    counts["flags"]["legible_told"] = sum(row["target_legible"] is not None for row in rows)
+    counts["flags"]["legibility_known"] = sum(row["target_legible"] is not None for row in rows)
     counts["flags"]["with_label"] = sum(row["label"] is not None for row in captioned)
     agrees = (row["label"] is not None and row["decision"] == row["label"] for row in captioned)
     counts["flags"]["decision_equals_label"] = sum(agrees)
+    counts["image_px"] = Counter({f"{first['width_px']} x {first['height_px']}": len(rows)})
+    counts["action"] = Counter(action_class(row["action"]) for row in rows if row["action"] is not None)
     counts["values"] = Counter({name: sum(row[name] or 0 for row in captioned) for name in VALUE_COLUMNS})
-    counts["step_s"] = Counter(f"{step:.3f}" for step in np.diff(points.time_s).tolist())
+    counts["step_s"] = Counter(f"{round(step, 3):g}" for step in np.diff(points.time_s).tolist())
     counts["confusion"] = Counter(f"{row['label'] or 'none'}{TAB}{row['decision'] or 'none'}" for row in captioned)
-    skies = ((row["weather"], row["time_of_day"]) for row in rows)
-    counts["sky"] = Counter(TAB.join(name or "" for name in sky) for sky in skies if sky != (None, None))
+    skies = ([row["weather"], row["time_of_day"]] for row in rows)
+    counts["sky"] = Counter(
+        TAB.join(preset_token(name) if name else "not known" for name in sky) for sky in skies if any(sky)
+    )
     events = (event for row in rows for event in (row["perturbation"] or {}).items())
-    counts["events"] = Counter(f"{event}{TAB}{outcome}" for event, outcome in events if outcome is not None)
+    counts["events"] = Counter(f"{first['track']}{TAB}{event}{TAB}{out}" for event, out in events if out is not None)
     counts["states"] = Counter()
-    if track == "perturbed":
-        offsets, walked = frames.drone_offset, np.nan_to_num(frames.target_offset)
-        shifts_m, turns_deg = (np.abs(part).max(axis=1) for part in (offsets[:, :3], offsets[:, 3:]))
-        is_known, is_shifted = ~np.isnan(shifts_m), (shifts_m > 0) | (np.abs(walked).max(axis=1) > 0)
-        pairs = zip(is_shifted[is_known].tolist(), (turns_deg[is_known] > 0).tolist(), strict=True)
-        counts["states"].update(STATES[pair] for pair in pairs)
-    return {name: dict(counter) for name, counter in counts.items()}
+    if first["track"] == "perturbed":
+        offsets = frames.drone_offset[~np.isnan(frames.drone_offset).any(axis=1)]
+        walked = np.nan_to_num(frames.target_offset)[~np.isnan(frames.drone_offset).any(axis=1)]
+        is_shifted = offsets[:, :3].any(axis=1) | walked.any(axis=1)
+        counts["states"] = Counter(STATES[k] for k in (is_shifted + 2 * offsets[:, 3:].any(axis=1)).tolist())
+    return counts
+
+
+# --- a release --------------------------------------------------------------------------------------------------------
+
+
+def numbers_of(tracks: Sequence[TrackCount], num_frames: int) -> Numbers:
+    """Compute every number of the card and the statistics.
+
+    Args:
+        tracks: The counts of all rows, of one track at least. num_frames: The largest number of frames per track.
+    """
+    counts = {name: _sorted(total_of(tracks, name)) for name in tracks[0].counts}
+    by_fov = defaultdict[str, list[TrackCount]](list)
+    for track in tracks:
+        by_fov[track.fov].append(track)
+    for name in ("town", "track", "fov"):
+        frames = Counter[str]()
+        for track in tracks:
+            frames[getattr(track, name)] += track.frames
+        counts[name] = _sorted(frames)
+        counts[f"tracks_by_{name}"] = _sorted(Counter(getattr(track, name) for track in tracks))
+    trajectories = dict[str, TrackCount]()  # one track of each: the clean one where it is released
+    for track in sorted(tracks, key=lambda track: track.track != "clean"):
+        trajectories.setdefault(track.trajectory, track)
+    moved = [(one.motion["accel_rms_mps2"], one.motion["jerk_rms_mps3"]) for one in trajectories.values()]
+    known = [(accel, jerk) for accel, jerk in moved if accel is not None and jerk is not None]
+    scores = [smoothness_score(*pair) for pair in known]
+    within = sum(accel <= ACCEL_RMS_MAX_MPS2 and jerk <= JERK_RMS_MAX_MPS3 for accel, jerk in known)
+    below = sum(score < REVIEW_BELOW for score in scores)
+    counts["motion"] = {"known": len(known), "within": within, "score_below": below}
+    spreads = _sums(tracks, list(trajectories.values())) | {"smoothness": Sum.of(scores)}
+    return Numbers(
+        frames=sum(track.frames for track in tracks), flights=len(tracks), trajectories=len(trajectories),
+        flights_shorter_than_num_frames=sum(track.frames < num_frames for track in tracks), counts=counts,
+        spreads={name: own.spread() for name, own in spreads.items()},
+        lenses={
+            fov: {name: Sum.all(track.sums[name] for track in own).spread().mean for name in LENS}
+            for fov, own in sorted(by_fov.items())
+        },
+        coverage=Coverage.total(track.coverage for track in tracks),
+        example=next((track.example for track in tracks if track.example), {}),
+    )  # fmt: skip
+
+
+def _sums(tracks: Sequence[TrackCount], trajectories: Sequence[TrackCount]) -> dict[str, Sum]:
+    """Return sums over the tracks, over means of the trajectories (tab:dist_stats), and over all frames."""
+    motions = ("length_m", "accel_rms_mps2", "jerk_rms_mps3")
+    means = ("clean_altitude_m", "clean_distance_m", "visibility")
+    return {
+        "track_frames": Sum.of(track.frames for track in tracks),
+        "track_duration_s": Sum.of(track.motion["duration_s"] for track in tracks),
+        **{f"trajectory_{name}": Sum.of(one.motion[name] for one in trajectories) for name in motions},
+        **{f"trajectory_{name}": Sum.of(one.sums[name].spread().mean for one in trajectories) for name in means},
+        **{name: Sum.all(track.sums[name] for track in tracks) for name in (*POOLED, *CAPTION_FIELDS)},
+    }
 
 
 def total_of(tracks: Iterable[TrackCount], name: str) -> Counter[str]:
@@ -234,3 +282,8 @@ def total_of(tracks: Iterable[TrackCount], name: str) -> Counter[str]:
     for track in tracks:
         total.update(track.counts[name])
     return total
+
+
+def _sorted(counts: Counter[str]) -> Counts:
+    """Return counts, largest first, then by name: the order does not depend on the rows' order."""
+    return dict(sorted(counts.items(), key=lambda pair: (-pair[1], pair[0])))

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile
 from cosfly.formats.inspection import TrajectoryFunnel
@@ -16,9 +16,9 @@ from cosfly.geometry.coverage import Coverage
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import FileFormat, read_model, write_model
-from release.columns import COUNTED, SPLIT_NAMES, SplitName
+from release.columns import SPLIT_NAMES, SplitName
 
-RELEASE_FORMAT = FileFormat("cosfly.release", "4.0", "release record")
+RELEASE_FORMAT = FileFormat("cosfly.release", "5.0", "release record")
 RECORD = "release.json"
 
 Counts = dict[str, int]
@@ -135,9 +135,9 @@ class SourceRecord(Strict):
     without), and the stages that made them."""
 
     run: str
-    tree_sha256: str
+    data_sha256: str
     captions_sha256: str
-    inspect_sha256: str | None
+    inspect_sha256: str | None = None
     review_sha256: str | None = None
     stages: list[MadeBy]
 
@@ -151,36 +151,12 @@ class ReleasedTeacher(Strict):
     captions: int
 
 
-class Repairs(Strict):
-    """Of the accepted captions, those whose first answer stood and those that a repair made, by rung."""
-
-    accepted: int
-    first_answers: int
-    repaired_by_rung: Counts
-
-
-class Ceilings(Strict):
-    """What labels can be told without a picture (inspection/blind_baseline.py), shares of `tested` ones of `split`,
-    fitted on some of train; null where these are too few. drawn_ahead: share of `known` ones that may hang on what came
-    later."""
-
-    split: str
-    fitted_on: int
-    tested: int
-    majority: float | None = None
-    rule: float | None = None
-    blind: float | None = None
-    known: int
-    drawn_ahead: float | None = None
-
-
 class Provenance(Strict):
-    """Where it all comes from: versions of what built it, its sources, teachers, repairs, and tokens of all asks."""
+    """Where it all comes from: versions of what built it, its sources and teachers, and the tokens of all asks."""
 
     versions: dict[str, str]
     sources: list[SourceRecord]
     teachers: list[ReleasedTeacher]
-    repairs: Repairs
     tokens: Counts
     asks: int
 
@@ -188,71 +164,33 @@ class Provenance(Strict):
 class Spread(Strict):
     """Mean, standard deviation (of the population), least, greatest and number of values."""
 
-    count: int
-    mean: float | None
-    std: float | None
-    min: float | None
-    max: float | None
-
-
-class CaptionNumbers(Strict):
-    """frames_by: column -> frames by what their captions say there; values: numbers of values by column; `example` is
-    the first one's sample_id and texts, empty without any."""
-
-    frames_with: int
-    frames_without: int
-    with_label: int
-    decision_equals_label: int
-    frames_by: dict[str, Counts]
-    values: dict[str, int]
-    mean_characters: dict[str, float | None]
-    example: dict[str, str | None]
-
-    @field_validator("frames_by")
-    @classmethod
-    def _each_column(cls, value: dict[str, Counts]) -> dict[str, Counts]:
-        if set(value) != set(COUNTED):
-            raise ValueError(f"the keys must be {', '.join(COUNTED)}")
-        return value
-
-
-class FileNumbers(Strict):
-    shards: int
-    bytes: int
-    bytes_points: int
-    bytes_by_modality: Counts
-
-
-class FramesBy(Strict):
-    town: Counts
-    track: Counts
-    fov_deg: Counts
-    image_px: Counts
+    count: int = 0
+    mean: float | None = None
+    std: float | None = None
+    min: float | None = None
+    max: float | None = None
 
 
 class Numbers(Strict):
-    """Every number of the card; all can be computed from the shards."""
+    """Every number of the card and the statistics; all are computed from the shards (release/counting.py).
+
+    counts: Frames by a value of what the key names. spreads: Of frames, tracks and trajectories. lenses: Means over the
+    frames by field of view. example: The first caption's sample_id and texts, empty without captions.
+    """
 
     frames: int
     flights: int
     trajectories: int
-    frames_by: FramesBy
-    trajectories_by_fov_deg: Counts
-    flights_by_track: Counts
-    frames_per_flight: Spread
     flights_shorter_than_num_frames: int
-    flight_duration_s: Spread
-    flight_length_m: Spread
-    height_over_target_m: Spread
-    distance_to_target_m: Spread
-    visibility: Spread
-    frames_perturbed: int
-    frames_target_in_view: int
-    frames_target_visible: int
-    frames_target_legible: int | None = None  # null in releases of before
+    counts: dict[str, Counts]
+    spreads: dict[str, Spread]
+    lenses: dict[str, dict[str, float | None]]
     coverage: Coverage
-    captions: CaptionNumbers
-    files: FileNumbers
+    example: dict[str, str | None]
+
+    def of(self, name: str) -> Counter[str]:
+        """Return the counts of a name."""
+        return Counter(self.counts.get(name, {}))
 
 
 class FlightHistory(Strict):
@@ -265,14 +203,13 @@ class FlightHistory(Strict):
 
 
 class CaptionHistory(Strict):
-    """read = accepted + dropped, by reason; accepted = released + frame_not_selected + flight_left_out.
+    """read = dropped, by reason, + released + frame_not_selected + flight_left_out.
 
     frames_without: The released frames without a caption, by reason.
     """
 
     read: int
     dropped: Counts
-    accepted: int
     released: int
     frame_not_selected: int
     flight_left_out: int
@@ -311,7 +248,6 @@ class ReleaseRecord(Strict):
     flights: list[ReleasedFlight]
     content_digest: str
     shards: list[Shard]
-    ceilings: Ceilings | None = None
 
     @property
     def files(self) -> list[StoredFile]:
@@ -328,7 +264,9 @@ class ReleaseRecord(Strict):
             )  # fmt: skip
 
 
-def numbers_of_splits(flights: Sequence[ReleasedFlight], captions: Mapping[str, int]) -> dict[SplitName, SplitNumbers]:
+def numbers_of_splits(
+    flights: Sequence[ReleasedFlight], captions: Mapping[SplitName, int]
+) -> dict[SplitName, SplitNumbers]:
     """Return the numbers of each split that has flights. captions: of each split."""
     found = {}
     for split in SPLIT_NAMES:
@@ -352,16 +290,17 @@ def digest_of(shards: Iterable[Shard]) -> str:
     return sha256_bytes("".join(f"{one.split} {one.sha256} {one.points.sha256}\n" for one in shards).encode())
 
 
-def shard_paths(splits: Sequence[SplitName], digest: str) -> list[str]:
-    """Return the names of shards below `data` and `points`, given their splits: each has its number in its split."""
-    counts, numbers, paths = Counter(splits), Counter[str](), list[str]()
+FRAMES_FOLDER, POINTS_FOLDER = "data", "points"
+
+
+def shard_paths(splits: Sequence[SplitName], digest: str) -> list[tuple[str, str]]:
+    """Return the paths of frames and points of each shard, given its split: it has its number in its split."""
+    counts, numbers, paths = Counter(splits), Counter[str](), list[tuple[str, str]]()
     for split in splits:
-        paths.append(f"{split}-{digest[:DIGEST_CHARACTERS]}-{numbers[split]:05d}-of-{counts[split]:05d}.parquet")
+        name = f"{split}-{digest[:DIGEST_CHARACTERS]}-{numbers[split]:05d}-of-{counts[split]:05d}.parquet"
+        paths.append((f"{FRAMES_FOLDER}/{name}", f"{POINTS_FOLDER}/{name}"))
         numbers[split] += 1
     return paths
-
-
-FRAMES_FOLDER, POINTS_FOLDER = "data", "points"
 
 
 def shard_pattern(split: SplitName, digest: str, folder: str = FRAMES_FOLDER) -> str:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from cosfly.formats.predictions import Split
-from cosfly.geometry.splits import assign_splits
-from release.columns import SplitName
-from release.record import Selection
+from cosfly.geometry.splits import assign_splits, town_family
+from release.columns import CONTRACT, SplitName
+from release.record import Selection, Settings, Shard, SplitBy, StoredDepth, digest_of
 
 WINDOWS_A_RUN = 6  # a run of 6 (w - 1) frames holds 5 (w - 1) + 1 whole windows of w frames
 
@@ -54,12 +55,23 @@ SPLIT_RULE = (
 )
 
 
-def split_groups(
-    groups: Iterable[str], fractions: Mapping[SplitName, float], seed: int, what: str
+def split_flights(
+    flights: Mapping[str, tuple[str, str]], by: SplitBy, fractions: Mapping[SplitName, float], seed: int
 ) -> dict[str, SplitName]:
-    """Return each group, a walk or a family of towns, its split. Those of which no flight is released are not among
-    them, and have no rank.
+    """Return the split of each flight, given its walk and town. Walks, or families of towns, of which no flight is
+    released have no rank.
     """
     shares: dict[Split, float] = {"val": fractions["validation"], "test": fractions["test"]}
-    splits = assign_splits(groups, shares, seed, too_few="fill", what=what)
-    return {group: NAME_OF[split] for group, split in splits.items()}
+    groups = {name: walk if by == "walk" else town_family(town) for name, (walk, town) in flights.items()}
+    splits = assign_splits(groups.values(), shares, seed, too_few="fill", what=f"{by}s")
+    return {name: NAME_OF[splits[group]] for name, group in groups.items()}
+
+
+def stated_rules(settings: Settings, shards: Sequence[Shard]) -> dict[str, Any]:
+    """Return what every record of such a release states."""
+    return {
+        "frame_selection": RULES[settings.selection],
+        "depth": StoredDepth() if "depth" in settings.modalities else None,
+        "coordinates": CONTRACT,
+        "content_digest": digest_of(shards),
+    }

@@ -19,8 +19,7 @@ from cosfly.runtime.io import sha256_file
 from release import columns
 from release.build.records import write_records
 from release.build.rows import open_writer
-from release.card.numbers import numbers_of
-from release.counting import count_release
+from release.counting import count_release, numbers_of
 from release.record import (
     ReleasedFlight,
     ReleaseRecord,
@@ -78,27 +77,25 @@ def forge(
         of_points = out / "points" / path.name
         pq.write_table(pa.Table.from_pylist(points, schema=columns.points_schema()), of_points)
         entries.append(Shard(split=old.split, points=_stored(of_points), **vars(_stored(path))))
-    names = shard_paths([entry.split for entry in entries], digest_of(entries))
-    for name, entry in zip(names, entries, strict=True):
-        for file in (entry, entry.points):
-            new = f"{Path(file.path).parent.name}/{name}"
+    paths = shard_paths([entry.split for entry in entries], digest_of(entries))
+    for own, entry in zip(paths, entries, strict=True):
+        for file, new in zip((entry, entry.points), own, strict=True):
             (out / Path(file.path).parent.name / Path(file.path).name).rename(out / new)
             file.path = new
     digest = digest_of(entries)
     flights = _flights(record, [row for rows in shards for row in rows])
     update: dict[str, Any] = {"shards": entries, "content_digest": digest, "flights": flights}
-    with_caption = Counter(str(row["split"]) for rows in shards for row in rows if row["has_caption"])
+    with_caption = Counter(row["split"] for rows in shards for row in rows if row["has_caption"])
     update["splits"] = record.splits.model_copy(update={"splits": numbers_of_splits(flights, with_caption)})
     captions = with_caption.total()
     history = record.history.model_copy(deep=True)
-    history.captions.accepted += captions - history.captions.released
     history.captions.read += captions - history.captions.released
     history.captions.released = captions
     history.captions.frames_without = {"forged": sum(map(len, shards)) - captions}
     update["history"] = history
     record = record.model_copy(update=update)
     tracks = count_release(out, entries)
-    computed = numbers_of(tracks, out, entries, record.settings.num_frames)
+    computed = numbers_of(tracks, record.settings.num_frames)
     return _finished(out, record.model_copy(update={"numbers": computed}).model_dump(mode="json"), change_record)
 
 
@@ -124,7 +121,7 @@ def _finished(out: Path, values: dict[str, Any], change_record: Callable[[dict[s
 
 def errors_in(folder: Path, level: str = "pixels", **how: Any) -> dict[str, int]:
     report = verify(folder, level=level, reader=read_released, **how)
-    return {kind.code: kind.count for kind in report.kinds if kind.severity == "error"}
+    return {kind.code: kind.count for kind in report.issues if kind.severity == "error"}
 
 
 def _flights(record: ReleaseRecord, rows: list[Row]) -> list[ReleasedFlight]:

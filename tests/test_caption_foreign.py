@@ -135,6 +135,6 @@ def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):
     source = Source("students", tree, tmp_path / "out/captions.jsonl", inspected)
     folder = package.run(package.ReleaseConfig(licence="mit", pairs="any"), [source], tmp_path / "release")
     assert verify(folder).is_ok
-    captions = read_record(folder / "release.json").numbers.captions
-    assert captions.frames_by["teacher_kind"] == {"student": len(rules)}
-    assert captions.frames_by["teacher_model"] == {MODEL: len(rules)}
+    counts = read_record(folder / "release.json").numbers.counts
+    assert counts["teacher_kind"] == {"student": len(rules)}
+    assert counts["teacher_model"] == {MODEL: len(rules)}

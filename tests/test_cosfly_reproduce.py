@@ -7,7 +7,7 @@ from cosfly.pipeline.reproduce import OF_RELEASE, read_paper
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import write_json
-from release.stats.tables import SHAPES
+from release.card.tables import SHAPES
 
 # All labels of tables and figures in the paper.
 FIGURES = """

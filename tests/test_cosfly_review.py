@@ -75,11 +75,11 @@ def test_the_release_takes_what_was_accepted(product, inspected, monkeypatch):
     tree = inspected.parent.parent / "tree"
     source = Source("run", tree, product, product)  # captions are not read here
     take = lambda: gather([source], include_review=False, accept_unbound=True)  # noqa: E731
-    assert {one.left_out for one in take().candidates} == {"review: smoothness"}
+    assert {one.dropped for one in take().candidates} == {"review: smoothness"}
     flights = folders_of(product)
     decide(product, "accepted", *flights[:2])
     decide(product, "rejected", flights[2])
-    assert [one.left_out for one in take().candidates] == [None, None, "rejected: review", "review: smoothness"]
+    assert [one.dropped for one in take().candidates] == [None, None, "rejected: review", "review: smoothness"]
     assert source.files["review"] == product.with_name(REVIEW), (
         "an input of the stage: a later decision is another input"
     )

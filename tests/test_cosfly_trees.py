@@ -259,8 +259,8 @@ def test_a_foreign_tree_gives_samples_and_a_release(way):
         assert sum(len(list(open_split(way / f"by_{split_by}", split))) for split in SPLITS) == 2 * 4 * 4
     assert verify(way / "release").is_ok
     record = read_record(way / "release/dataset/release.json")
-    assert record.numbers.flights_by_track == {"clean": 2, "perturbed": 2}
-    assert (record.numbers.captions.frames_with, record.history.captions.released) == (4 * 4, 4 * 4)
+    assert record.numbers.counts["tracks_by_track"] == {"clean": 2, "perturbed": 2}
+    assert (record.numbers.of("flags")["has_caption"], record.history.captions.released) == (4 * 4, 4 * 4)
 
 
 def test_of_a_foreign_tree_what_was_inspected_is_released_and_nothing_else(tmp_path):

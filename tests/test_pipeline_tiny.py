@@ -281,7 +281,7 @@ def test_several_towns_are_runs_of_their_own_and_one_release(towns):
         assert not (towns / town / "release").exists()
         assert (towns / town / "contact_sheet.png").exists()
     numbers = read_json(towns / "release/dataset/release.json")["numbers"]
-    assert set(numbers["frames_by"]["town"]) == {"Town_one", "Town_two"}
+    assert set(numbers["counts"]["town"]) == {"Town_one", "Town_two"}
     assert verify(towns / "release/dataset").is_ok
     stages = [row["stage"] for row in read_json(towns / "summary.json")["stages"]]
     assert stages == [*(f"one/{name}" for name in STAGES[:-1]), *(f"two/{name}" for name in STAGES[:-1]), "release"]

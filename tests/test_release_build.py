@@ -140,7 +140,6 @@ def test_the_record_says_where_it_comes_from_and_nothing_of_this_machine(copy, t
     origin = record.provenance
     assert [(one.kind, one.model) for one in origin.teachers] == [("endpoint", "teacher-7")]
     assert origin.tokens == {"completion_tokens": 10 * 4 * 9, "prompt_tokens": 100 * 4 * 9}
-    assert origin.repairs.accepted == 4 * 9
     assert {"cosfly", "pyarrow"} <= origin.versions.keys()
     for data in all_bytes(tmp_path / "r/dataset").values():
         assert b"/home/somebody" not in data
@@ -394,18 +393,17 @@ def test_numbers_against_a_slow_oracle(loaded, built):
     assert numbers["frames"] == len(rows)
     assert numbers["flights"] == len({(r["town"], r["trajectory"], r["variant"]) for r in rows}) == 4
     assert numbers["trajectories"] == len({(r["town"], r["trajectory"]) for r in rows})
-    assert numbers["captions"]["frames_with"] == len(with_caption)
-    assert numbers["captions"]["frames_without"] == len(rows) - len(with_caption)
-    for decision, count in numbers["captions"]["frames_by"]["decision"].items():
+    assert numbers["counts"]["flags"]["has_caption"] == len(with_caption)
+    for decision, count in numbers["counts"]["decision"].items():
         assert count == sum(row["decision"] == decision for row in with_caption)
-    assert sum(numbers["captions"]["frames_by"]["decision"].values()) == len(with_caption)
+    assert sum(numbers["counts"]["decision"].values()) == len(with_caption)
     heights = np.array([row["pose"]["z_m"] - row["target"]["z_m"] for row in rows])
-    assert numbers["height_over_target_m"]["mean"] == pytest.approx(heights.mean(), abs=1e-4)
-    assert numbers["height_over_target_m"]["std"] == pytest.approx(heights.std(), abs=1e-4)
+    assert numbers["spreads"]["height_m"]["mean"] == pytest.approx(heights.mean(), abs=1e-4)
+    assert numbers["spreads"]["height_m"]["std"] == pytest.approx(heights.std(), abs=1e-4)
     characters = np.mean([len(row["caption_zh_reasoning_trace"]) for row in with_caption])
-    assert numbers["captions"]["mean_characters"]["caption_zh_reasoning_trace"] == pytest.approx(characters, abs=0.06)
-    assert numbers["frames_perturbed"] == sum(row["is_perturbed"] for row in rows)
-    assert numbers["files"]["bytes"] == sum(p.stat().st_size for p in (built / "data").iterdir())
+    assert numbers["spreads"]["caption_zh_reasoning_trace"]["mean"] == pytest.approx(characters, abs=1e-4)
+    assert numbers["counts"]["flags"]["is_perturbed"] == sum(row["is_perturbed"] for row in rows)
+    assert sum(numbers["counts"]["action"].values()) == sum(row["action"] is not None for row in rows)
 
 
 def with_maps(release_inputs: Path, copy: Path, **licences: str) -> Path:

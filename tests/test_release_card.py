@@ -3,7 +3,6 @@
 import itertools
 import math
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +11,17 @@ from hypothesis import strategies as st
 from specimens_rows import make_row
 from tables import each
 
-from release.card.numbers import numbers_of
+from cosfly.formats.frames import (
+    INVALID_DEPTH_M,
+    LEGIBLE_CONTRAST,
+    LEGIBLE_HEIGHT_PX,
+    LEGIBLE_SHARE,
+    SKY_DEPTH_M,
+)
+from cosfly.geometry.axes import BODY_FROM_CAMERA
 from release.card.render import first_split, render_card
-from release.counting import Sum, count_track
+from release.columns import CONTRACT
+from release.counting import Sum, action_class, count_track, numbers_of
 from release.flight_rows import FlightRows
 from release.record import read_record
 from release.rules import select_frames
@@ -28,9 +35,12 @@ TRACKS = [
 
 def test_a_track_is_as_long_as_it_is_without_its_perturbation():
     tracks = [count_track(rows, rows) for rows in TRACKS]
-    numbers = numbers_of(tracks, Path(), [], 12)
+    numbers = numbers_of(tracks, 12)
     assert (numbers.flights, numbers.trajectories, numbers.frames) == (4, 2, 48)
-    assert numbers.flight_length_m.model_dump() == {"count": 4, "mean": 33.0, "std": 0.0, "min": 33.0, "max": 33.0}
+    length = numbers.spreads["trajectory_length_m"].model_dump()
+    assert length == {"count": 2, "mean": 33.0, "std": 0.0, "min": 33.0, "max": 33.0}
+    alone = numbers_of(tracks[1::2], 12)  # the perturbed tracks, minus their offsets
+    assert alone.spreads["trajectory_length_m"].model_dump() == length
     # What the noise would add: 11 steps of hypot(3, 2) m in place of 3 m.
     places = TRACKS[1].pose[:, :3].tolist()
     assert math.fsum(math.dist(a, b) for a, b in itertools.pairwise(places)) == pytest.approx(11 * math.hypot(3, 2))
@@ -39,6 +49,16 @@ def test_a_track_is_as_long_as_it_is_without_its_perturbation():
 @given(st.lists(st.floats(-1e6, 1e6), max_size=30), st.integers(0, 30))
 def test_values_added_in_pieces_give_the_same_sum(values, cut):
     assert Sum.all([Sum.of(values[:cut]), Sum.of(values[cut:])]) == Sum.of(values)
+
+
+@each(("forward", "left", "up", "turn", "expected"), [
+    (1.0, 0.2, 0.0, 30.0, "forward"), (-1.0, 0.2, 0.0, 0.0, "backward"), (0.1, -0.4, 0.0, 0.0, "right"),
+    (0.1, 0.2, 0.5, 0.0, "up"), (0.1, 0.1, 0.0, 6.0, "turn left"), (0.0, 0.0, 0.0, -6.0, "turn right"),
+    (0.1, 0.1, 0.0, 2.0, "hover"),
+])  # fmt: skip
+def test_the_class_of_an_action(forward, left, up, turn, expected):
+    action = {"forward_mps": forward, "left_mps": left, "up_mps": up, "yaw_rate_degps": turn}
+    assert action_class(action) == expected
 
 
 def test_every_snippet_of_the_card_runs(built, tmp_path, monkeypatch):
@@ -109,3 +129,10 @@ def test_by_hand(num_points, num_frames, window, expected):
 def test_a_short_flight_is_kept_whole(num_points, num_frames):
     assert select_frames(num_points, num_frames, "windows", WINDOW).tolist() == list(range(num_points))
     assert select_frames(num_points, 1, "all", WINDOW).tolist() == list(range(num_points))
+
+
+def test_the_coordinates_state_the_constants_of_the_code():
+    assert CONTRACT["body_from_camera"] == BODY_FROM_CAMERA.astype(int).tolist()
+    assert f"{SKY_DEPTH_M:g} sky, {INVALID_DEPTH_M:g} invalid" in CONTRACT["depth"]
+    limits = (f"{LEGIBLE_HEIGHT_PX:g} px high", f"{LEGIBLE_SHARE:g} of it", f"contrast at least {LEGIBLE_CONTRAST:g}")
+    assert all(limit in CONTRACT["legibility"] for limit in limits)

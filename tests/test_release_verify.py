@@ -16,7 +16,7 @@ import pytest
 from commands import invoke
 from release_lies import LIES, at, captioned, change, everything, put
 from release_tampering import errors_in, forge, read_all, set_depth
-from specimens_foreign import hub_snapshot, write_foreign_tree
+from specimens_foreign import hub_snapshot
 from specimens_png import png_around
 from tables import each
 
@@ -29,9 +29,7 @@ from release.build import stage as package
 from release.build.config import ReleaseConfig
 from release.build.sources import Source
 from release.columns import INTRINSICS
-from release.export.stage import ExportConfig
-from release.export.stage import run as export
-from release.rules import split_groups
+from release.rules import split_flights
 from release.verify.verify import verify
 
 
@@ -81,9 +79,9 @@ def test_a_snapshot_of_the_hubs_cache_passes(honest, tmp_path):
     assert errors_in(hub_snapshot(honest, tmp_path)) == {}
 
 
-def test_trees_pass_ours_and_the_public_layout(small_run, tmp_path):
-    assert errors_in(small_run / "render") == {}
-    assert errors_in(write_foreign_tree(tmp_path / "public")) == {}
+def test_a_tree_is_no_release(small_run):
+    report = verify(small_run / "render")
+    assert [(issue.code, issue.where) for issue in report.issues] == [("record", "release.json")]
 
 
 # One of each kind of check; all of them take a minute and more.
@@ -121,8 +119,9 @@ RECORD_LIES = {
 
 def _seed_of_other_splits(record: dict) -> int:
     told = record["splits"]
-    walks = {flight["walk"]: flight["split"] for flight in record["flights"]}
-    return next(seed for seed in range(100) if split_groups(walks, told["fractions"], seed, "walks") != walks)
+    walks = {flight["flight"]: (flight["walk"], "") for flight in record["flights"]}
+    splits = {flight["flight"]: flight["split"] for flight in record["flights"]}
+    return next(seed for seed in range(100) if split_flights(walks, "walk", told["fractions"], seed) != splits)
 
 
 @pytest.mark.slow
@@ -268,12 +267,3 @@ def test_the_command_tells_people_and_machines(honest, tmp_path):
     assert {path: path.read_bytes() for path in forged.rglob("*") if path.is_file()} == before
     assert invoke("release verify", honest, "--level structure").exit_code == 0
     assert invoke("release verify", honest, "--level all").exit_code == 2
-
-
-OF_TREES = ["depth_doubled", pytest.param("empty_instances", marks=pytest.mark.slow)]
-
-
-@pytest.mark.parametrize("name", OF_TREES)
-def test_a_lie_is_found_in_a_tree(honest, tmp_path, name):
-    forged = forge(honest, tmp_path / "forged", LIES[name][0])
-    assert errors_in(export(ExportConfig(format="tree"), forged, tmp_path / "export", workers=0))

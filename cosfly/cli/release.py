@@ -51,7 +51,7 @@ LEVELS = "structure: names, sizes, records, card. rows: also every row. pixels: 
 @command("cosfly release verify release", common=WORKERS)
 def verify(
     job: Job,
-    folder: Annotated[Path, Argument(help="Release, run directory, playback tree, export, or the hub's cache.")],
+    folder: Annotated[Path, Argument(help="Release, run directory, or a snapshot in the hub's cache.")],
     level: Annotated[Literal["structure", "rows", "pixels"], Option(help=LEVELS)] = "pixels",
     json_file: Annotated[Path | None, Option("--json", help="File for the findings, as JSON.")] = None,
 ) -> None:
@@ -71,11 +71,10 @@ def verify(
 def stats(
     job: Job,
     folder: Annotated[Path, Argument(help="Release directory, or a run directory.")],
-    out: Annotated[Path, Option(help="Folder for stats.html, stats.md and stats.json.")],
-    pixels: Annotated[int, Option(min=0, help="Frames whose depth and instance pictures are read; 0 for none.")] = 200,
+    out: Annotated[Path, Option(help="Folder for stats.html and stats.json.")],
 ) -> None:
-    """Compute the paper's tables from the rows of a release, and draw what it covers."""
-    typer.echo(job.call("release.stats.stats", folder, out, pixels=pixels))
+    """Draw the tables of a release, as the paper has them, and what it covers."""
+    typer.echo(job.call("release.card.stats", folder, out))
 
 
 FORMATS = (

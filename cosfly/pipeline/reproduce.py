@@ -40,9 +40,9 @@ from cosfly.viz.frame_views import small_jpeg
 from cosfly.viz.gallery import four_panels
 from cosfly.viz.page import page, run_name
 from distill.prepare.dual_track import windows_of
-from release.stats.stats import TABLE_LOOK
-from release.stats.stats import run as release_stats
-from release.stats.tables import Cell, Rows, Table
+from release.card.stats import TABLE_LOOK
+from release.card.stats import run as release_stats
+from release.card.tables import Cell, Rows, Table
 
 log = logging.getLogger(__name__)
 
@@ -299,7 +299,7 @@ def measure(
     compare.run(compared, simplified, paths, out / "compare", **options)
     beam.run(plan, simplified, paths, out / "beam", **options)
     if "release" in done:
-        release_stats(folder / "release/dataset", out / "release", pixels=0)
+        release_stats(folder / "release/dataset", out / "release")
     if "render" not in done:
         return None
     log.info("reproduce: pictures")

@@ -16,16 +16,15 @@ import pyarrow as pa
 import cosfly
 from cosfly.runtime.errors import VerifyError
 from cosfly.runtime.io import sha256_file, write_bytes, write_checksums
-from cosfly.runtime.json_io import dump_json
+from cosfly.runtime.json_io import dump_json, parse_json
 from cosfly.runtime.run_dir import StageInput, StageRecord, fingerprint, record_of
-from release import columns
-from release.build.captions import CaptionAccount, teacher_settings
+from release.build.captions import CaptionAccount
 from release.build.config import ReleaseConfig
-from release.build.plan import ReleasePlan
-from release.build.shards import ShardResult, points_part
+from release.build.plan import Chosen, ReleasePlan
+from release.build.shards import points_part
 from release.build.sources import Source, input_names
 from release.card.render import render_card
-from release.columns import published
+from release.columns import SplitName, published
 from release.record import (
     FRAMES_FOLDER,
     POINTS_FOLDER,
@@ -38,68 +37,46 @@ from release.record import (
     ReleasedFlight,
     ReleasedTeacher,
     ReleaseRecord,
-    Repairs,
     Settings,
     Shard,
     SourceRecord,
     Splits,
-    StoredDepth,
     digest_of,
     numbers_of_splits,
     shard_paths,
     write_record,
 )
-from release.rules import RULES, SPLIT_RULE
+from release.rules import SPLIT_RULE, stated_rules
+
+SOURCE_FILES = ("data", "captions", "inspect", "review")  # roles whose digests the record has
 
 
 def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], account: CaptionAccount) -> Provenance:
     """Return what the record says of the sources and of all their captions.
 
     Args:
-        inputs: of the stage, by their names (`input_names`).
+        inputs: Of the stage, by their names (`input_names`).
     """
-    repaired = dict(sorted(account.repairs.items()))
-    first = account.accepted - sum(repaired.values())
+    versions = {"cosfly": cosfly.__version__, "python": platform.python_version()}
     return Provenance(
-        versions={
-            "cosfly": cosfly.__version__,
-            "python": platform.python_version(),
-            "pyarrow": pa.__version__,
-            "numpy": np.__version__,
-        },
+        versions=versions | {"pyarrow": pa.__version__, "numpy": np.__version__},
         sources=[_source(source, names, inputs) for source, names in zip(sources, input_names(sources), strict=True)],
         teachers=[
-            ReleasedTeacher(kind=kind, model=model, settings=published(teacher_settings(settings)), captions=count)
+            ReleasedTeacher(kind=kind, model=model, settings=published(parse_json(settings)), captions=count)
             for (kind, model, settings), count in sorted(account.teachers.items())
         ],
-        repairs=Repairs(
-            accepted=account.accepted,
-            first_answers=first,
-            repaired_by_rung=repaired,
-        ),
         tokens=dict(sorted(account.tokens.items())),
         asks=account.asks,
     )
 
 
 def _source(source: Source, names: dict[str, str], inputs: Mapping[str, StageInput]) -> SourceRecord:
-    sha256 = {role: inputs[name].sha256 for role, name in names.items()}
-    return SourceRecord(
-        run=source.run,
-        tree_sha256=sha256["data"],
-        captions_sha256=sha256["captions"],
-        inspect_sha256=sha256.get("inspect"),
-        review_sha256=sha256.get("review"),
-        stages=[
-            MadeBy(
-                stage=record.stage,
-                code_version=record.code_version,
-                seed=record.seed,
-                config=published(record.config),
-            )
-            for record in stages_behind(source.files.values())
-        ],
-    )
+    sha256 = {f"{role}_sha256": inputs[names[role]].sha256 for role in SOURCE_FILES if role in names}
+    stages = [
+        MadeBy(stage=one.stage, code_version=one.code_version, seed=one.seed, config=published(one.config))
+        for one in stages_behind(source.files.values())
+    ]
+    return SourceRecord(run=source.run, stages=stages, **sha256)
 
 
 def stages_behind(products: Iterable[Path]) -> list[StageRecord]:
@@ -126,93 +103,62 @@ def stages_behind(products: Iterable[Path]) -> list[StageRecord]:
     return ordered
 
 
-def account_for(plan: ReleasePlan, written: list[ShardResult]) -> History:
-    """Return where all flights and captions went; every sum is checked here and again by `release verify`."""
-    flights = [flight for result in written for flight in result.flights]
-    account = plan.account
-    without = sum((Counter(flight.frames_without) for flight in flights), Counter[str]())
-    captions = CaptionHistory(
-        read=account.accepted + account.dropped.total(),
-        dropped=dict(sorted(account.dropped.items())),
-        accepted=account.accepted,
-        released=sum(flight.captions for flight in flights),
-        frame_not_selected=sum(flight.frame_not_selected for flight in flights),
-        flight_left_out=account.of_no_flight,
-        frames_without=dict(sorted(without.items())),
-    )
-    parts = captions.released + captions.frame_not_selected + captions.flight_left_out
-    assert captions.accepted == parts, captions
-    found = FlightHistory(
-        found=len(plan.material.candidates),
-        inspected=plan.material.num_inspected,
-        released=len(flights),
-        left_out=dict(sorted(plan.left_out.items())),
-    )
-    assert found.found == len(flights) + plan.left_out.total(), found
-    return History(trajectories=plan.material.trajectories, flights=found, captions=captions)
-
-
-def splits_of(
-    cfg: ReleaseConfig, plan: ReleasePlan, written: list[ShardResult], flights: list[ReleasedFlight]
-) -> Splits:
-    """Return what the record says of its splits."""
-    captions = Counter[str]()
-    for flight in (flight for result in written for flight in result.flights):
-        captions[plan.placements[flight.name].split] += flight.captions
-    numbers = numbers_of_splits(flights, captions)
-    return Splits(by=cfg.split_by, rule=SPLIT_RULE, seed=cfg.split_seed, fractions=cfg.fractions, splits=numbers)
-
-
 def make_record(
     cfg: ReleaseConfig,
     plan: ReleasePlan,
-    written: list[ShardResult],
     shards: list[Shard],
     numbers: Numbers,
     provenance: Provenance,
     prompts: dict[str, dict[str, str]],
 ) -> ReleaseRecord:
-    """Return what release.json says of its shards. prompts: as the record has them."""
-    five_ray = {flight.name: flight.candidate.five_ray_mean for flight, *_ in plan.flights}
+    """Return what release.json says of its shards. prompts: As the record has them."""
+    tracks = [track for shard in plan.shards for track in shard.tracks]
     flights = [
         ReleasedFlight(
-            flight=flight.name,
-            frames=flight.frames,
-            frames_available=flight.frames_available,
-            split=plan.placements[flight.name].split,
-            walk=plan.placements[flight.name].walk,
-            pair=plan.placements[flight.name].pair,
-            five_ray_mean=five_ray[flight.name],
+            flight=one.name, frames=len(one.selected), frames_available=one.num_frames, split=one.placement.split,
+            walk=one.placement.walk, pair=one.placement.pair, five_ray_mean=one.candidate.five_ray_mean,
         )
-        for result in written
-        for flight in result.flights
-    ]
+        for one in tracks
+    ]  # fmt: skip
+    captions = Counter[SplitName]()
+    for one in tracks:
+        captions[one.placement.split] += len(one.captioned)
+    settings = Settings(
+        selection=cfg.selection, num_frames=cfg.num_frames, window_frames=plan.account.window_frames, pairs=cfg.pairs,
+        tracks=[*cfg.tracks], modalities=[*cfg.modalities],
+    )  # fmt: skip
+    splits = Splits(
+        by=cfg.split_by, rule=SPLIT_RULE, seed=cfg.split_seed, fractions=cfg.fractions,
+        splits=numbers_of_splits(flights, captions),
+    )  # fmt: skip
     return ReleaseRecord(
-        name=cfg.name,
-        licence=plan.licence,
-        credits=cfg.credits,
-        maps=plan.maps,
-        made_by=f"cosfly {cosfly.__version__}",
-        settings=Settings(
-            selection=cfg.selection,
-            num_frames=cfg.num_frames,
-            window_frames=plan.window_frames,
-            tracks=list(cfg.tracks),
-            pairs=cfg.pairs,
-            modalities=list(cfg.modalities),
-        ),
-        frame_selection=RULES[cfg.selection],
-        depth=StoredDepth() if "depth" in cfg.modalities else None,
-        coordinates=columns.CONTRACT,
-        prompts=prompts,
-        splits=splits_of(cfg, plan, written, flights),
-        numbers=numbers,
-        history=account_for(plan, written),
-        provenance=provenance,
-        flights=flights,
-        content_digest=digest_of(shards),
-        shards=shards,
+        name=cfg.name, licence=plan.licence, credits=cfg.credits, maps=plan.maps,
+        made_by=f"cosfly {cosfly.__version__}", settings=settings, prompts=prompts, splits=splits, numbers=numbers,
+        history=_history(plan, tracks), provenance=provenance, flights=flights, shards=shards,
+        **stated_rules(settings, shards),
+    )  # fmt: skip
+
+
+def _history(plan: ReleasePlan, tracks: list[Chosen]) -> History:
+    """Return what became of all tracks and captions; `release verify` checks that it adds up."""
+    account, candidates = plan.account, plan.material.candidates
+    without = Counter[str]()
+    for one in tracks:
+        without.update(one.captions.why_none(i) for i in {*one.selected} - {*one.captioned})
+    num_released = sum(len(one.captioned) for one in tracks)
+    captions = CaptionHistory(
+        read=account.accepted + account.dropped.total(),
+        dropped=dict(sorted(account.dropped.items())),
+        released=num_released,
+        frame_not_selected=sum(len(one.captions.spans) for one in tracks) - num_released,
+        flight_left_out=account.of_no_flight,
+        frames_without=dict(sorted(without.items())),
     )
+    found = FlightHistory(
+        found=len(candidates), inspected=plan.material.num_inspected, released=len(tracks),
+        left_out=dict(sorted(plan.dropped.items())),
+    )  # fmt: skip
+    return History(trajectories=plan.material.trajectories, flights=found, captions=captions)
 
 
 DATASET, PARTS = "dataset", "parts"  # in the folder of the stage: what gets published, and shards on the way there
@@ -239,8 +185,8 @@ def name_shards(parts: Sequence[tuple[Path, Shard]], folder: Path) -> list[Shard
     for place in (FRAMES_FOLDER, POINTS_FOLDER):
         (folder / place).mkdir()
     shards = []
-    for (part, shard), name in zip(parts, shard_paths([shard.split for _, shard in parts], digest), strict=True):
-        frames, points = f"{FRAMES_FOLDER}/{name}", f"{POINTS_FOLDER}/{name}"
+    paths = shard_paths([shard.split for _, shard in parts], digest)
+    for (part, shard), (frames, points) in zip(parts, paths, strict=True):
         for source, path in ((part, frames), (points_part(part), points)):
             try:
                 os.link(source, folder / path)

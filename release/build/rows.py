@@ -8,34 +8,22 @@ from typing import IO, Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from pydantic import BaseModel
 
 from cosfly.formats.frames import FILE_NAMES, FrameFile, as_depth_npy, frame_path
 from cosfly.formats.playback import Track
 from release import columns
 from release.columns import PICTURES, Placement
-from release.record import Selection
 
 # Values between two looks at the size of a page: with more a page takes a whole row group, twice in memory.
 VALUES_A_BATCH = 4
 MOST_ROWS = 1000  # of a row group: of small pictures it would hold more rows than memory should
 
 
-class ShardPlan(BaseModel):
-    """How rows are chosen and cut."""
-
-    selection: Selection
-    num_frames: int
-    window_frames: int
-    files: tuple[FrameFile, ...]
-    row_group_bytes: int
-
-
 class Rows:
     """Rows on their way into row groups of a size that viewers load one at a time."""
 
-    def __init__(self, writer: pq.ParquetWriter, plan: ShardPlan) -> None:
-        self._writer, self._plan = writer, plan
+    def __init__(self, writer: pq.ParquetWriter, row_group_bytes: int) -> None:
+        self._writer, self._most_bytes = writer, row_group_bytes
         self._rows: list[dict[str, Any]] = []
         self._num_bytes = 0
 
@@ -49,12 +37,12 @@ class Rows:
                 row[PICTURES[file].name] = {"bytes": data, "path": f"{row['sample_id']}_{FILE_NAMES[file]}"}
             self._num_bytes += len(data)
         self._rows.append(row)
-        if self._num_bytes >= self._plan.row_group_bytes or len(self._rows) >= MOST_ROWS:
+        if self._num_bytes >= self._most_bytes or len(self._rows) >= MOST_ROWS:
             self.flush()
 
     def flush(self) -> None:
         if self._rows:
-            table = pa.Table.from_pylist(self._rows, schema=columns.schema(self._plan.files))
+            table = pa.Table.from_pylist(self._rows, schema=self._writer.schema)
             self._writer.write_table(table, row_group_size=table.num_rows)
             self._rows, self._num_bytes = [], 0
 

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,22 +22,22 @@ from cosfly.formats.frames import (
     depth_values,
     frame_name,
     frame_path,
+    read_meta,
     tree_of,
 )
 from cosfly.formats.playback import TARGET_FILE, Track
-from cosfly.runtime.errors import CosflyError, InputError, VerifyError
+from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.io import CHECKSUMS, atomic_file, check_stays_below, read_bytes, read_checksums, sha256_file
 from cosfly.runtime.png import PNG_HEADER_BYTES, parse_png, png_size
 from cosfly.runtime.run_dir import TRACK_FILE, digest_of, folder_digests
 from cosfly.runtime.worker import advance
 from release import columns
-from release.build.captions import FlightCaptions
-from release.build.rows import Rows, ShardPlan, open_writer, points_writer
+from release.build.plan import Chosen, open_track
+from release.build.problems import Problems
+from release.build.rows import Rows, open_writer, points_writer
 from release.build.sources import Candidate
-from release.build.survey import look_of, open_flight
-from release.columns import Placement, ReleasedCaption, caption_values
+from release.columns import caption_values
 from release.record import StoredFile
-from release.rules import select_frames
 
 # Bits a channel; colour type, RGB or RGBA; interlacing: bytes 24, 25 and 28 of a PNG. What the readers of a release
 # take.
@@ -92,32 +90,9 @@ def _check_depth(values: np.ndarray, size_px: tuple[int, int], where: Path) -> N
         )
 
 
-MOST_TOLD = 20  # problems of one shard: after so many the others need not be looked for
+MOST_PROBLEMS = 20  # of one shard: after so many the others need not be looked for
 META = "meta.json"
 RESTORE = "restore the file, or inspect and caption the changed tree"
-
-
-@dataclass(frozen=True)
-class FlightPart:
-    """A flight of a shard."""
-
-    candidate: Candidate
-    placement: Placement
-    captions: FlightCaptions
-
-
-class ReleasedPart(BaseModel):
-    """What a shard holds of a flight: counts of frames and captions.
-
-    frames_without: The frames without a caption, by reason.
-    """
-
-    name: str
-    frames: int
-    frames_available: int
-    captions: int
-    frame_not_selected: int
-    frames_without: dict[str, int]
 
 
 class ShardResult(BaseModel):
@@ -125,29 +100,31 @@ class ShardResult(BaseModel):
 
     frames: StoredFile
     points: StoredFile
-    flights: list[ReleasedPart]
 
 
-def write_shard(path: Path, parts: Sequence[FlightPart], plan: ShardPlan) -> ShardResult:
-    """Write the selected frames of some flights.
+def write_shard(
+    path: Path, tracks: Sequence[Chosen], files: Collection[FrameFile], row_group_bytes: int
+) -> ShardResult:
+    """Write the selected frames of some tracks.
 
     Raises:
-        InputError, VerifyError: names everything that is wrong with them.
+        InputError, VerifyError: Names everything that is wrong with them.
     """
-    problems = _Problems()
-    flights: list[ReleasedPart] = []
+    problems = Problems(MOST_PROBLEMS)
     of_points = points_part(path)
     with atomic_file(of_points) as points, atomic_file(path) as file:
-        with open_writer(file, columns.schema(plan.files)) as writer, points_writer(points) as add_points:
-            rows = Rows(writer, plan)
-            for part in parts:
-                with problems.collected():
-                    flights.append(_write_flight(part, plan, rows, add_points, problems))
+        with open_writer(file, columns.schema(files)) as writer, points_writer(points) as add_points:
+            rows = Rows(writer, row_group_bytes)
+            for chosen in tracks:
+                with problems.collected(chosen.name):
+                    track = open_track(chosen.candidate)
+                    _write_track(chosen, track, files, rows, problems)
+                    if not problems.failures:
+                        add_points(track, chosen.placement)
             rows.flush()
-        problems.raise_any()
-    frames = _stored(path, sum(flight.frames for flight in flights))
-    points_file = _stored(of_points, sum(flight.frames_available for flight in flights))
-    return ShardResult(frames=frames, points=points_file, flights=flights)
+        problems.raise_any("the tracks have {}")
+    frames = _stored(path, sum(len(chosen.selected) for chosen in tracks))
+    return ShardResult(frames=frames, points=_stored(of_points, sum(chosen.num_frames for chosen in tracks)))
 
 
 def points_part(path: Path) -> Path:
@@ -159,79 +136,40 @@ def _stored(path: Path, rows: int) -> StoredFile:
     return StoredFile(path=path.name, rows=rows, bytes=path.stat().st_size, sha256=sha256_file(path))
 
 
-def _write_flight(
-    part: FlightPart, plan: ShardPlan, rows: Rows, add_points: Callable[[Track, Placement], None], problems: _Problems
-) -> ReleasedPart:
-    folder = part.candidate.folder
-    digests = _digests(part.candidate)
-    flight = open_flight(part.candidate)
-    selected = select_frames(len(flight), plan.num_frames, plan.selection, plan.window_frames).tolist()
-    captions, not_selected = _captions_of(part.captions, set(selected))
-    tree = tree_of(flight.frame_folder(0))
+def _write_track(chosen: Chosen, track: Track, files: Collection[FrameFile], rows: Rows, problems: Problems) -> None:
+    folder = chosen.candidate.folder
+    digests = _digests(chosen.candidate)
+    tree = tree_of(track.frame_folder(0))
     check_stays_below(folder / FRAMES_DIR, tree)
-    for i in selected:
-        with problems.collected():
-            frame = flight.frame_folder(i)
+    for i in chosen.selected:
+        with problems.collected(chosen.name):
+            frame = track.frame_folder(i)
             if frame.is_symlink():
                 check_stays_below(frame, tree)
             _check_digest(folder, f"{frame_name(i)}/{META}", None, digests)
-            placement = replace(part.placement, look=look_of(flight, i))
+            placement = replace(chosen.placement, look=_look_of(track, i))
             pictures = dict[FrameFile, bytes]()
-            for file in plan.files:
+            for file in files:
                 path = frame_path(frame, FILE_NAMES[file])
-                pictures[file] = _read_picture(flight, path, file, tree, is_known=bool(digests))
+                pictures[file] = _read_picture(track, path, file, tree, is_known=bool(digests))
                 _check_digest(folder, f"{frame_name(i)}/{path.name}", pictures[file], digests)
-            scalars = columns.scalar_row(flight, i, captions.get(i), placement)
-            if not problems.errors:  # else nothing will be written any more
-                rows.add(scalars, pictures, flight, i)
+            caption = caption_values(chosen.captions.read(i)) if i in chosen.captions.spans else None
+            scalars = columns.scalar_row(track, i, caption, placement)
+            if not problems.failures:  # else nothing will be written any more
+                rows.add(scalars, pictures, track, i)
         advance()
-    if not problems.errors:
-        add_points(flight, part.placement)
-    without = Counter(part.captions.why_none(i) for i in selected if i not in captions)
-    return ReleasedPart(
-        name=part.candidate.name, frames=len(selected), frames_available=len(flight), captions=len(captions),
-        frame_not_selected=not_selected, frames_without=dict(without),
-    )  # fmt: skip
 
 
-def _captions_of(captions: FlightCaptions, selected: set[int]) -> tuple[dict[int, ReleasedCaption], int]:
-    """Return the captions of released frames, by frame, and how many are of other frames."""
-    found: dict[int, ReleasedCaption] = {}
-    not_selected = 0
-    for caption in captions.read():
-        if caption.frame_index in selected:
-            found[caption.frame_index] = caption_values(caption)
-        else:
-            not_selected += 1
-    return found, not_selected
-
-
-# --- what is read -----------------------------------------------------------------------------------------------------
-
-
-class _Problems:
-    """What is wrong with the flights of a shard: reading goes on after an error, writing does not."""
-
-    def __init__(self) -> None:
-        self.errors: list[CosflyError] = []
-
-    @contextmanager
-    def collected(self) -> Iterator[None]:
-        try:
-            yield
-        except (InputError, VerifyError) as error:
-            self.errors.append(error)
-            if len(self.errors) >= MOST_TOLD:
-                self.raise_any()
-
-    def raise_any(self) -> None:
-        """Raise what was collected as one error."""
-        if len(self.errors) == 1:
-            raise self.errors[0]
-        if self.errors:
-            kind = VerifyError if all(isinstance(error, VerifyError) for error in self.errors) else InputError
-            more = " or more" if len(self.errors) >= MOST_TOLD else ""
-            raise kind(f"the track has {len(self.errors)}{more} problems", got=" | ".join(map(str, self.errors)))
+def _look_of(track: Track, i: int) -> np.ndarray | None:
+    """Return sun and air of a frame, (4,), None where its annotation does not have them."""
+    folder = track.frame_folder(i)
+    if not (folder / META).is_file():
+        return None
+    meta = read_meta(folder)
+    if meta.index != i:
+        what, got = "the annotation belongs to another frame", f"index {meta.index}"
+        raise InputError(what, where=folder / META, got=got)
+    return None if meta.look is None else np.array(list(meta.look.model_dump().values()))
 
 
 def _digests(candidate: Candidate) -> dict[str, str]:
@@ -263,7 +201,7 @@ def _check_digest(folder: Path, name: str, data: bytes | None, digests: Mapping[
         raise VerifyError(what, where=folder / name, got=got, expected=expected, fix=RESTORE)
 
 
-def _read_picture(flight: Track, path: Path, file: FrameFile, tree: Path, *, is_known: bool) -> bytes:
+def _read_picture(track: Track, path: Path, file: FrameFile, tree: Path, *, is_known: bool) -> bytes:
     """Read a picture, and see that it is what it must be.
 
     Args:
@@ -271,5 +209,5 @@ def _read_picture(flight: Track, path: Path, file: FrameFile, tree: Path, *, is_
     """
     inside = tree if path.is_symlink() else None  # its folder was looked at
     data = read_bytes(path, what="file of the frame", fix="render the track again", tree=inside)
-    check_picture(file, data, (flight.camera.width_px, flight.camera.height_px), path, is_known=is_known)
+    check_picture(file, data, (track.camera.width_px, track.camera.height_px), path, is_known=is_known)
     return data

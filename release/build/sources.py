@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cosfly.formats.boxes import UNKNOWN_LICENCE
 from cosfly.formats.captions import OWN_PROMPTS, QUESTIONS
-from cosfly.formats.inspection import REVIEW, Inspection, TrackInspection, TrajectoryFunnel, read_settled
+from cosfly.formats.inspection import REVIEW, Inspection, TrajectoryFunnel, read_settled
 from cosfly.formats.places import ALL_TRACKS, Place, TrackChoice, flight_ids, folder_name
 from cosfly.formats.town import read_town_map
 from cosfly.formats.tracks import find_tracks
@@ -93,28 +93,28 @@ def input_names(sources: list[Source]) -> list[dict[str, str]]:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A flight that a source has: where it stands and what it is called.
+    """A track that a source has: where it is stored and what it is called.
 
-    left_out: why the inspection leaves it out, `result: reason`, None where it does not. sha256: of its files as they
-    were inspected; None where no inspection says. five_ray_mean: as it was inspected.
+    source: Its number. dropped: Why it is not released, `result: reason` of the inspection, else None. sha256: Of its
+    files as they were inspected; five_ray_mean: As it was inspected; None without an inspection.
     """
 
     source: int
     place: Place
     folder: Path
-    flight_id: str
-    left_out: str | None = None
+    flight_id: str = ""
+    dropped: str | None = None
     sha256: str | None = None
     five_ray_mean: float | None = None
 
     @property
     def name(self) -> str:
         """Its name in the release's records."""
-        return "/".join((self.place.run, self.place.town, self.place.trajectory, self.place.variant))
+        return f"{self.trajectory}/{self.place.variant}"
 
     @property
     def trajectory(self) -> str:
-        """What it shares with its twin."""
+        """What it shares with its other track."""
         return "/".join((self.place.run, self.place.town, self.place.trajectory))
 
     @property
@@ -125,7 +125,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Material:
-    """All flights of the sources, and what the inspections say of the way there. num_inspected: flights."""
+    """All tracks of the sources, and the funnel of their inspections. num_inspected: Of the tracks."""
 
     candidates: list[Candidate]
     num_inspected: int
@@ -135,9 +135,7 @@ class Material:
 def gather(
     sources: list[Source], *, include_review: bool, accept_unbound: bool, choice: TrackChoice = ALL_TRACKS
 ) -> Material:
-    """Read the inspections of the runs, and list their flights; of a tree without one all. Those that are not chosen
-    are left out.
-    """
+    """List the tracks of the runs with the results of their inspections; those that are not chosen are dropped."""
     name, count = Counter(source.run for source in sources).most_common(1)[0]
     if count > 1:  # rows and records know a run by its name alone
         raise InputError(
@@ -146,7 +144,7 @@ def gather(
             fix="rename one of the trees, or the folder that contains it",
         )  # fmt: skip
     wanted = ("accepted", "review") if include_review else ("accepted",)
-    found: list[tuple[int, Place, Path, str | None, str | None, float | None]] = []
+    found: list[Candidate] = []
     inspections: list[Inspection] = []
     for number, source in enumerate(sources):
         if not accept_unbound and record_of(source.captions) is None:
@@ -159,28 +157,31 @@ def gather(
         if source.inspect is None:
             for folder in find_tracks(source.data):
                 inner = folder.relative_to(source.data)
-                found.append((number, _place(source, inner), folder, _not_chosen(choice, inner.as_posix()), None, None))
+                dropped = None if choice.names(inner.as_posix()) else NOT_CHOSEN
+                found.append(Candidate(number, _place(source, inner), folder, dropped=dropped))
             continue
-        inspection = read_settled(source.inspect)
-        inspections.append(inspection)
-        for flight in inspection.flights:
-            left_out = None if flight.result in wanted else f"{flight.result}: {flight.reason}"
-            left_out = left_out or _not_chosen(choice, flight.folder)
-            folder, five_ray = inside(source.data, flight.folder, in_parent=True), flight.metrics.get("five_ray_mean")
-            found.append((number, _inspected_place(source, flight), folder, left_out, flight.sha256, five_ray))
-    # What is left out makes no name longer: `release verify` knows the released ones alone.
-    ids = flight_ids([place for _, place, *_ in found])
-    ids |= flight_ids([place for _, place, _, left_out, *_ in found if left_out is None])
-    candidates = [
-        Candidate(number, place, folder, ids[place], left_out, sha256, five_ray)
-        for number, place, folder, left_out, sha256, five_ray in found
-    ]
-    num_inspected = sum(len(inspection.flights) for inspection in inspections)
-    return Material(candidates, num_inspected, _sum_of(inspections) if inspections else None)
+        inspections.append(read_settled(source.inspect))
+        for one in inspections[-1].flights:
+            dropped = None if choice.names(one.folder) else NOT_CHOSEN
+            if one.result not in wanted:
+                dropped = f"{one.result}: {one.reason}"
+            folder, five_ray = inside(source.data, one.folder, in_parent=True), one.metrics.get("five_ray_mean")
+            place = _place(source, Path(one.folder))
+            found.append(Candidate(number, place, folder, "", dropped, one.sha256, five_ray))
+    # Dropped tracks make no name longer: `release verify` knows the released ones alone.
+    ids = flight_ids([one.place for one in found])
+    ids |= flight_ids([one.place for one in found if one.dropped is None])
+    candidates = [replace(one, flight_id=ids[one.place]) for one in found]
+    return Material(candidates, sum(len(one.flights) for one in inspections), _funnel_of(inspections))
 
 
-def _not_chosen(choice: TrackChoice, folder: str) -> str | None:
-    return None if choice.names(folder) else NOT_CHOSEN
+def _funnel_of(inspections: list[Inspection]) -> TrajectoryFunnel | None:
+    """Return the sum of the funnels of trajectories, None without an inspection."""
+    counts, reasons = Counter[str](), Counter[str]()
+    for funnel in (inspection.funnel.trajectories for inspection in inspections):
+        counts.update(funnel.model_dump(exclude={"dropped"}))
+        reasons.update(funnel.dropped)
+    return TrajectoryFunnel(dropped=dict(sorted(reasons.items())), **counts) if inspections else None
 
 
 def maps_of(candidates: list[Candidate]) -> list[ReleasedMap]:
@@ -190,33 +191,11 @@ def maps_of(candidates: list[Candidate]) -> list[ReleasedMap]:
     return sorted(shown, key=lambda one: (one.town, one.name, one.licence, one.credits))
 
 
-def _inspected_place(source: Source, flight: TrackInspection) -> Place:
-    """Tell a flight's place; raises InputError where the record of one flight has the folder of another."""
-    parts = Path(flight.folder).parts[-2:]
-    if parts != (flight.trajectory, flight.variant)[2 - len(parts) :]:
-        raise InputError(
-            "the record of a track has the folder of another track", where=source.inspect, got=flight.folder,
-            expected=f"a folder that ends in {flight.trajectory}/{flight.variant}", fix="run cosfly inspect again",
-        )  # fmt: skip
-    return _place(source, Path(flight.folder))
-
-
 def _place(source: Source, folder: Path) -> Place:
     """Tell a place by a flight's folder in its tree. Folders above the town, in a tree of several, count as part of the
     run's name."""
     town, trajectory, variant = ("", "", *folder.parts)[-3:]
     return Place("_".join((source.run, *folder.parts[:-3])), town, trajectory, variant)
-
-
-def _sum_of(inspections: list[Inspection]) -> TrajectoryFunnel:
-    funnels = [inspection.funnel.trajectories for inspection in inspections]
-    counts = {
-        name: sum(getattr(funnel, name) for funnel in funnels)
-        for name in TrajectoryFunnel.model_fields
-        if name != "dropped"
-    }
-    dropped = sum((Counter(funnel.dropped) for funnel in funnels), Counter[str]())
-    return TrajectoryFunnel(dropped=dict(sorted(dropped.items())), **counts)
 
 
 def choose_licence(licence: str | None, maps: list[tuple[str, str]]) -> str:

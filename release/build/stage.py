@@ -10,13 +10,15 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from cosfly.formats.frames import FrameFile
 from cosfly.runtime.errors import VerifyError
 from cosfly.runtime.io import CHECKSUMS, atomic_folder
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, read_stage_record, result_of
 from cosfly.runtime.worker import Item, Outcome, Work
 from release.build.config import ReleaseConfig
-from release.build.plan import Faults, ReleasePlan, make_plan
+from release.build.plan import ReleasePlan, make_plan, report_problems
+from release.build.problems import Problems
 from release.build.records import (
     DATASET,
     PARTS,
@@ -26,12 +28,9 @@ from release.build.records import (
     provenance_of,
     write_records,
 )
-from release.build.rows import ShardPlan
 from release.build.shards import ShardResult, write_shard
 from release.build.sources import Source, input_names, told_apart
-from release.card.ceilings import ceilings_of
-from release.card.numbers import numbers_of
-from release.counting import count_release
+from release.counting import count_release, numbers_of
 from release.record import Shard
 from release.verify.verify import verify
 
@@ -41,11 +40,12 @@ def part_path(parts: Path, name: str) -> Path:
     return parts / f"{name}.parquet"
 
 
-def make_worker(plan: ShardPlan, parts: Path) -> Work:
-    """Worker factory: give the function that writes one shard."""
+def make_worker(files: tuple[FrameFile, ...], row_group_bytes: int, parts: Path) -> Work:
+    """Worker factory: return the function that writes one shard."""
 
     def work(item: Item) -> Outcome:
-        return Outcome(write_shard(part_path(parts, item.item_id), item.payload, plan).model_dump())
+        path = part_path(parts, item.item_id)
+        return Outcome(write_shard(path, item.payload, files, row_group_bytes).model_dump())
 
     return work
 
@@ -80,17 +80,17 @@ def run(
     plan = make_plan(cfg, sources, stage)
     written = _write_parts(cfg, plan, stage, parts, workers, watch)
     with atomic_folder(dataset) as folder:
-        shards = name_shards(_finished(plan, written, parts), folder)
-        numbers = numbers_of(count_release(folder, shards), folder, shards, cfg.num_frames)
+        shards = name_shards(written, folder)
+        numbers = numbers_of(count_release(folder, shards), cfg.num_frames)
         provenance = provenance_of(sources, read_stage_record(out).inputs, plan.account)
         prompts = {source.run: source.questions for source in sources if source.questions}
-        record = make_record(cfg, plan, written, shards, numbers, provenance, prompts)
-        write_records(folder, record.model_copy(update={"ceilings": ceilings_of(folder, record)}))
+        record = make_record(cfg, plan, shards, numbers, provenance, prompts)
+        write_records(folder, record)
         _check_release(folder)
     # checksums.sha256 speaks for the shards: hashing them again would only cost time.
     outputs = [dataset / name for name in ("README.md", "release.json", CHECKSUMS)]
     history = record.history
-    tally = Tally(input=history.flights.found, kept=history.flights.released, dropped=plan.left_out)
+    tally = Tally(input=history.flights.found, kept=history.flights.released, dropped=plan.dropped)
     stage.finish(outputs, tally, history=history.model_dump(mode="json"))
     shutil.rmtree(parts, ignore_errors=True)
     return dataset
@@ -98,28 +98,21 @@ def run(
 
 def _write_parts(
     cfg: ReleaseConfig, plan: ReleasePlan, stage: StageFolder, parts: Path, workers: int, watch: Watch
-) -> list[ShardResult]:
-    """Write all shards that are not written yet."""
-    how = ShardPlan(
-        selection=cfg.selection, num_frames=cfg.num_frames, window_frames=plan.window_frames,
-        files=cfg.modalities, row_group_bytes=cfg.row_group_bytes,
-    )  # fmt: skip
-    items = [Item(shard.name, shard.parts, num_steps=shard.num_frames) for shard in plan.shards]
-    finished = run_items(stage, items, make_worker, (how, parts), workers=workers, watch=watch, label="release: frames")
-    faults = Faults(stage)
-    faults.failures += [record for record in finished.records if isinstance(record, Failed)]
-    faults.check()
+) -> list[tuple[Path, Shard]]:
+    """Write all shards that are not written yet; return all, and where they are until the release has its name."""
+    items = [Item(shard.name, shard.tracks, sum(len(one.selected) for one in shard.tracks)) for shard in plan.shards]
+    how = (cfg.modalities, cfg.row_group_bytes, parts)
+    finished = run_items(stage, items, make_worker, how, workers=workers, watch=watch, label="release: frames")
+    problems = Problems()
+    problems.failures += [record for record in finished.records if isinstance(record, Failed)]
+    report_problems(problems, stage)
     written = [result_of(record, ShardResult) for record in finished.kept]
-    check_parts(_finished(plan, written, parts), stage.path)
-    return written
-
-
-def _finished(plan: ReleasePlan, written: list[ShardResult], parts: Path) -> list[tuple[Path, Shard]]:
-    """Return the shards that are written, and where they stand until the release has its name."""
-    return [
+    found = [
         (part_path(parts, shard.name), Shard(split=shard.split, **vars(result.frames), points=result.points))
         for shard, result in zip(plan.shards, written, strict=True)
     ]
+    check_parts(found, stage.path)
+    return found
 
 
 def _check_release(folder: Path) -> None:

@@ -1,6 +1,6 @@
 """The data-set card: `render_card` turns release.json into README.md, so that a card which says anything else is found.
 
-Its numbers are those of `numbers.py`: build writes them into release.json, verify computes them again and compares.
+Build writes its numbers (release/counting.py) into release.json, verify computes them again and compares.
 In words it says only what the record gives grounds for. Where it gives none, that is said. Every text that the template
 prints is escaped.
 """
@@ -18,13 +18,14 @@ import yaml
 from cosfly.formats.captions import FIELDS, TOKENS
 from cosfly.formats.frames import FrameFile
 from cosfly.geometry.coverage import NAMED
-from cosfly.inspection.blind_baseline import DRAWN_AHEAD, LEAST_WINDOWS, LOOKS_BACK
 from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.io import read_text
 from cosfly.viz.coverage_page import ranges, shares
 from cosfly.viz.page import markdown
-from release.columns import CAPTION, PICTURES, SCALARS, SPLIT_NAMES, schema
-from release.record import FRAMES_FOLDER, POINTS_FOLDER, History, ReleaseRecord, SourceRecord, shard_pattern
+from release.card.stats import shown
+from release.card.tables import tables_of
+from release.columns import PICTURES, SCALARS, SPLIT_NAMES, schema
+from release.record import FRAMES_FOLDER, POINTS_FOLDER, ReleaseRecord, SourceRecord, shard_pattern
 
 # What a map is, by what made it (`maps.source`): no more than the program knows.
 MAPS = {
@@ -40,21 +41,19 @@ FEW_WALKS = 10
 def render_card(record: ReleaseRecord) -> str:
     """Return README.md for a release.json."""
     numbers, splits = record.numbers, record.splits.splits
-    captions = numbers.captions
     by_kind: dict[str, list[str]] = defaultdict(list)
     for source in record.provenance.sources:
         by_kind[_map_kind(source)].append(source.run)
-    decided = captions.frames_by["decision"]
+    decided, repairs = numbers.of("decision"), numbers.of("repair_strategy")
     return markdown(
         "release/card/template.md",
         record=record,
         numbers=numbers,
-        captions=captions,
+        flags=numbers.of("flags"),
+        teacher_kind=numbers.of("teacher_kind"),
+        label_from=numbers.of("label_from"),
         splits=splits,
         modalities=record.settings.modalities,
-        looks_back=LOOKS_BACK,
-        least=LEAST_WINDOWS,
-        drawn_ahead=DRAWN_AHEAD,
         front_matter=_front_matter(record),
         ours=[source.run for source in record.provenance.sources if _is_rendered_by_us(source)],
         others=[source.run for source in record.provenance.sources if not _is_rendered_by_us(source)],
@@ -62,32 +61,19 @@ def render_card(record: ReleaseRecord) -> str:
         first_split=first_split(record),
         points=sum(shard.points.rows for shard in record.shards),
         is_whole=all(one.frames == one.frames_available for one in record.flights),
-        frames_by={title: getattr(numbers.frames_by, name) for name, title in FRAMES_BY.items()},
-        spreads={title: getattr(numbers, name) for name, title in SPREADS.items()},
+        tables=tables_of(record),
+        shown=shown,
         ranges=ranges(numbers.coverage),
         shares={kind: shares(numbers.coverage, kind) for kind in NAMED},
         fields=FIELDS,
-        counted=[column for column in CAPTION if column.counted and column.words != "actions"],
-        funnel=_funnel(record.history),
         never_decided=[name for name in TOKENS if name not in decided],
         most_decided=max(decided.items(), key=lambda pair: pair[1], default=("none", 0)),
-        repaired=sum(count for name, count in captions.frames_by["repair_strategy"].items() if name != "none"),
+        repaired=repairs.total() - repairs["none"],
         small_splits=[name for name, own in splits.items() if len(own.walks) < FEW_WALKS],
         columns=_columns(record.settings.modalities),
         coordinates=_coordinates(record),
         citation=read_text(Path(__file__).with_name("citation.bib")).strip(),
     )
-
-
-FRAMES_BY = {"town": "town", "track": "track", "fov_deg": "field of view (degrees)", "image_px": "image (px)"}
-SPREADS = {
-    "frames_per_flight": "frames per track",
-    "flight_duration_s": "duration of a track, s",
-    "flight_length_m": "length of a track without its perturbation, over its released frames, m",
-    "height_over_target_m": "height over the target's hip, m",
-    "distance_to_target_m": "distance to the target, m",
-    "visibility": "rendered visibility of the target",
-}
 
 
 def _map_kind(source: SourceRecord) -> str:
@@ -120,7 +106,7 @@ def _front_matter(record: ReleaseRecord) -> str:
     tags = ["uav", "aerial-tracking", *(["synthetic"] if rendered else [])]
     files = {"depth": "depth", "instance": "instance-segmentation"}
     tags += [tag for file, tag in files.items() if file in record.settings.modalities]
-    tags += ["chain-of-thought"] if record.numbers.captions.frames_with else []
+    tags += ["chain-of-thought"] if record.numbers.of("flags")["has_caption"] else []
     patterns = list(record.splits.splits)
     configs = {
         name: [{"split": split, "path": shard_pattern(split, record.content_digest, folder)} for split in patterns]
@@ -146,25 +132,6 @@ def _coordinates(record: ReleaseRecord) -> str:
     text = yaml.safe_dump(values, sort_keys=False, width=150).strip()  # what is not ASCII as escapes
     fence = "`" * max(3, 1 + max(map(len, re.findall("`+", text)), default=0))  # no text of the record ends the block
     return f"{fence}yaml\n{text}\n{fence}"
-
-
-def _funnel(history: History) -> list[tuple[str, int]]:
-    planned, flights, captions = history.trajectories, history.flights, history.captions
-    rows: list[tuple[str, int]] = []
-    if planned is not None:
-        rows += [("trajectories planned", planned.planned)]
-        rows += [(f"dropped before rendering: {reason}", count) for reason, count in planned.dropped.items()]
-        rows += [("trajectories not rendered", planned.not_rendered), ("trajectories rendered", planned.rendered)]
-    rows += [("tracks found", flights.found), ("of these inspected", flights.inspected)]
-    rows += [(f"tracks not released: {reason}", count) for reason, count in flights.left_out.items()]
-    rows += [("tracks released", flights.released), ("captions made", captions.read)]
-    rows += [(f"captions dropped: {reason}", count) for reason, count in captions.dropped.items()]
-    return [
-        *rows,
-        ("captions accepted, but frame not selected", captions.frame_not_selected),
-        ("captions accepted, but track not released", captions.flight_left_out),
-        ("captions released", captions.released),
-    ]
 
 
 def _columns(files: list[FrameFile]) -> Iterable[tuple[str, str, str]]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -33,14 +33,33 @@ class Kind(Issue):
 
 @dataclass
 class Findings(Report):
-    """Findings by kind."""
+    """Findings, one issue of each kind. level: Of the verification."""
 
-    kinds: dict[tuple[str, str], Kind] = field(default_factory=dict)
+    level: str = ""
 
     def add(self, severity: Severity, code: str, where: object, got: object, expected: str) -> None:
         place = cut(str(where))
         kind = Kind(severity=severity, code=code, where=place, got=cut(str(got)), expected=expected, examples=[place])
-        self._merge(kind)
+        self.merge([kind])
+
+    def merge(self, kinds: Iterable[Kind]) -> None:
+        """Add findings, such as those of a worker."""
+        for new in kinds:
+            for kind in self.issues:
+                if isinstance(kind, Kind) and (kind.severity, kind.code) == (new.severity, new.code):
+                    kind.count += new.count
+                    kind.examples = (kind.examples + new.examples)[:EXAMPLES]
+                    break
+            else:
+                self.issues.append(new)
+
+    def compare(self, code: str, where: str, got: Any, expected: Any) -> None:
+        """Add an error if a value is not the expected one; of mappings one for each key."""
+        if isinstance(got, Mapping) and isinstance(expected, Mapping):
+            for name in sorted({*got, *expected}):
+                self.compare(code, f"{where}: {name}", got.get(name), expected.get(name))
+        elif got != expected:
+            self.error(code, where, got, str(expected))
 
     def judge(self, flight: FlightRows, rules: Iterable[tuple[str, str, np.ndarray, Words, Words]]) -> None:
         """Add an error for each row that is wrong. rules: code, column, which rows are wrong (n,) bool, what was found,
@@ -50,38 +69,10 @@ class Findings(Report):
                 got, expected = (one if isinstance(one, str) else one(i) for one in words)
                 self.error(code, flight.where(i, column), got, str(expected))
 
-    def merge(self, kinds: Iterable[dict[str, Any]]) -> None:
-        """Add what a worker found, as `dumped` gives it."""
-        for values in kinds:
-            self._merge(Kind.model_validate(values))
-
-    def _merge(self, new: Kind) -> None:
-        kind = self.kinds.setdefault((new.severity, new.code), new)
-        if kind is not new:
-            kind.count += new.count
-            kind.examples = (kind.examples + new.examples)[:EXAMPLES]
-
-    def dumped(self) -> list[dict[str, Any]]:
-        return [kind.model_dump() for kind in self.kinds.values()]
-
-    def report(self, level: str = "") -> Verified:
-        """Return the report of all that was found."""
-        return Verified(facts=self.facts, kinds=sorted(self.kinds.values(), key=sort_key), level=level)
-
-
-@dataclass
-class Verified(Report):
-    """The report of a verification; of each kind of finding the first places."""
-
-    kinds: list[Kind] = field(default_factory=list)
-    level: str = ""
-
-    def __post_init__(self) -> None:
-        self.issues = [*self.kinds]
-
     def as_json(self) -> dict[str, Any]:
         """Return what `--json` writes."""
         return {
             "schema": "cosfly.verification", "schema_version": "1.0", "level": self.level, "ok": self.is_ok,
-            "facts": self.facts, "findings": [kind.model_dump(exclude={"where"}) for kind in self.kinds],
+            "facts": self.facts,
+            "findings": [kind.model_dump(exclude={"where"}) for kind in sorted(self.issues, key=sort_key)],
         }  # fmt: skip

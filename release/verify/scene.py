@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,10 +15,7 @@ from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.geometry.goals import SeenFrame, meant, target_picture, words_of
 from cosfly.geometry.reprojection import (
-    COLUMNS,
-    GRID_ROWS,
     LEAST_SEEN,
-    SHARED_ID,
     Agreement,
     View,
     compare_views,
@@ -32,14 +28,12 @@ from cosfly.runtime.worker import advance
 from release.columns import PICTURES, TARGET_PICTURE
 from release.flight_rows import FlightRows
 from release.verify.findings import Findings
-from release.verify.sources import Pictures
 
 SURFACE_M = PERSON_HALF_EXTENTS_M[2] + 0.3  # between the hip and the visible surface of a person along the optical axis
 PERSON, SKY, MOST_KIND = KINDS["Pedestrians"], KINDS["Sky"], max(KINDS.values())
-NUM_IDS = 65536
 NOTHING = np.empty((0, 0), np.float32)
-NOTHING.flags.writeable = False
 NO_IDS = np.empty((0, 0, 3), np.uint8)
+Pictures = dict[FrameFile, bytes | memoryview | None]  # of a frame
 Decoded = tuple[np.ndarray, np.ndarray]  # depth, instance
 
 
@@ -52,58 +46,50 @@ def decode(flight: FlightRows, i: int, files: Pictures, findings: Findings) -> D
         try:
             if not data:
                 raise InputError("there is no picture", got="null" if data is None else "0 bytes")
-            if file == "depth":
-                found[file] = depth_values(memoryview(data), Path(where))
-                found[file].flags.writeable = False  # the compiled checks are compiled for such, once
-            else:
-                found[file] = colours_of(data, where)
+            pixels = depth_values(memoryview(data), Path(where)) if file == "depth" else colours_of(data, where)
+            if pixels.shape[1::-1] != (width, height):
+                raise InputError("the picture has another size", got=f"{pixels.shape[1]} x {pixels.shape[0]} px")
+            found[file] = pixels
         except InputError as error:
             findings.error("picture", where, f"{error.what}: {error.got}", f"a {file} picture of {width} x {height} px")
-            continue
-        size = found[file].shape[1::-1]
-        if size != (width, height):
-            findings.error("picture", where, f"{size[0]} x {size[1]} px", f"{width} x {height} px, the size in the row")
-            found.pop(file)
     if len(found) < len(files):
         return None
-    return found.get("depth", NOTHING), found.get("instance", NO_IDS)
+    depth = found.get("depth", NOTHING)
+    depth.flags.writeable = False  # the compiled checks are compiled for such, once
+    return depth, found.get("instance", NO_IDS)
 
 
 def check_picture(flight: FlightRows, i: int, decoded: Decoded, findings: Findings) -> bool:
     """Check depth and mask of a row with each other and with the row; False where the depth is no depth."""
     depth, instance = decoded
-    found = survey(depth, instance)
-    good = not depth.size or 0.0 <= found.low_m < found.high_m
+    low_m, high_m = (float(depth.min()), float(depth.max())) if depth.size else (0.0, 0.0)
+    good = not depth.size or 0.0 <= low_m < high_m < np.inf  # NaN is not
     if not good:
-        got, expected = f"{found.low_m:.3f} to {found.high_m:.3f} m", f"a range within 0 to {SKY_DEPTH_M:g} m"
+        got, expected = f"{low_m:.3f} to {high_m:.3f} m", f"a range within 0 to {SKY_DEPTH_M:g} m"
         findings.error("depth_range", flight.where(i, "depth"), got, expected)
-    if instance.size:
-        if not flight.is_foreign:
-            _check_instance(flight, i, found, bool(depth.size), findings)
-        if depth.size and good:
-            _check_person_depth(flight, i, instance, depth, findings)
+    if instance.size and not flight.is_foreign:
+        _check_instance(flight, i, depth, instance, findings)
+    if instance.size and depth.size and good:
+        _check_person_depth(flight, i, instance, depth, findings)
     return good
 
 
-def _check_instance(flight: FlightRows, i: int, found: Survey, has_depth: bool, findings: Findings) -> None:
+def _check_instance(flight: FlightRows, i: int, depth: np.ndarray, instance: np.ndarray, findings: Findings) -> None:
     """Check the mask: the person where the row has it, kinds that exist, sky where the depth is the sky's."""
-    where, recorded = flight.where(i, "instance"), flight.mask_box[i]
-    box = found.box.astype(np.float64) if found.num_person else np.full(4, np.nan)
+    where, recorded = flight.where(i, "instance"), flight.mask_box[i].tolist()
+    counts, pixels = survey(depth, np.ascontiguousarray(instance))
+    num_odd_sky, num_person, num_odd_person, most_kind = counts.tolist()
+    box = pixels.astype(float).tolist() if num_person else [np.nan] * 4
     if not np.array_equal(box, recorded, equal_nan=True):
-        got = f"pixels in {box.tolist()}" if found.num_person else "no pixel of the person"
-        is_null = np.isnan(recorded).any()
-        expected = (
-            "no pixel, because target_mask_bbox is null" if is_null else f"{recorded.tolist()}, the target_mask_bbox"
-        )
-        findings.error("mask", where, got, expected)
-    if found.num_odd_person:
         findings.error(
-            "mask", where, f"{found.num_odd_person} pixels of the target with another kind", f"kind {PERSON}"
+            "mask", where, f"{num_person} pixels of the person in {box}", f"{recorded}, the target_mask_bbox"
         )
-    if found.most_kind > MOST_KIND:
-        findings.error("mask", where, f"kind {found.most_kind}", f"kinds of 0 to {MOST_KIND}")
-    if has_depth and found.num_odd_sky:
-        got = f"{found.num_odd_sky:,} pixels are sky in only one of instance and depth"
+    if num_odd_person:
+        findings.error("mask", where, f"{num_odd_person} pixels of the target with another kind", f"kind {PERSON}")
+    if most_kind > MOST_KIND:
+        findings.error("mask", where, f"kind {most_kind}", f"kinds of 0 to {MOST_KIND}")
+    if depth.size and num_odd_sky:
+        got = f"{num_odd_sky:,} pixels are sky in only one of instance and depth"
         findings.error("sky", where, got, "the same sky in both")
 
 
@@ -116,62 +102,24 @@ def _check_person_depth(
     if expected is None or np.isnan([expected, *box]).any() or not flight.rows[i].get("target_visible"):
         return
     size = depth.shape[::-1]
-    low, high = (np.clip(end, 0, size).astype(int) for end in (np.floor(box[:2]), np.ceil(box[2:])))
-    surface = depths_of_person(depth, instance, np.concatenate([low, high]), not flight.is_foreign)
+    (x0, y0), (x1, y1) = (np.clip(end, 0, size).astype(int) for end in (np.floor(box[:2]), np.ceil(box[2:])))
+    part = instance[y0:y1, x0:x1]
+    is_person = part[..., 0] == PERSON
+    if not flight.is_foreign:
+        is_person &= (part[..., 1:] == 255).all(axis=-1)
+    surface = depth[y0:y1, x0:x1][is_person]
     if len(surface) and abs((found := median_of(surface)) - expected) > SURFACE_M:
         wanted = f"{expected:.2f} m (target_depth_m) within {SURFACE_M:.1f} m"
         findings.error("depth", flight.where(i, "depth"), f"{found:.2f} m at the person", wanted)
 
 
-# --- pixels: every one of mask and depth ----------------------------------------------------------
-
-
-class Survey(NamedTuple):
-    """Least and greatest depth of a frame, NaN where one is not finite; pixels that are sky by one of depth and kind
-    alone, of the person, of its id with another kind; the greatest kind; box (4,) of the person, edges at borders."""
-
-    low_m: float
-    high_m: float
-    num_odd_sky: int
-    num_person: int
-    num_odd_person: int
-    most_kind: int
-    box: np.ndarray
-
-
-def survey(depth: np.ndarray, instance: np.ndarray) -> Survey:
-    """Look at every pixel once. depth: (h, w) float32, or (0, 0); instance: (h, w, 3) uint8, or (0, 0, 3)."""
-    limits = np.array([depth.min(initial=np.inf), depth.max(initial=-np.inf)]) if depth.size else np.zeros(2)
-    low, high = limits.tolist() if np.isfinite(limits).all() else (np.nan, np.nan)
-    counts, box = _survey(depth, np.ascontiguousarray(instance))
-    num_odd_sky, num_person, num_odd_person, most_kind = counts.tolist()
-    return Survey(low, high, num_odd_sky, num_person, num_odd_person, most_kind, box)
-
-
-def new_kinds(instance: np.ndarray, known: np.ndarray) -> list[int]:
-    """Return id * 256 + kind of things at the grid's points that have another kind than is known of them, each once.
-    known: (NUM_IDS,) int16, -1: not seen yet."""
-    height, width = instance.shape[:2]
-    rows = ((np.arange(GRID_ROWS) + 0.5) * height / GRID_ROWS).astype(int)
-    columns = ((np.arange(COLUMNS) + 0.5) * width / COLUMNS).astype(int)
-    kinds, low, high = np.moveaxis(instance[np.ix_(rows, columns)].astype(np.int64), 2, 0)
-    ids = low | high << 8
-    is_new = (ids != 0) & (ids != SHARED_ID) & (known[ids] != kinds)
-    return np.unique((ids << 8 | kinds)[is_new]).tolist()
-
-
-def depths_of_person(depth: np.ndarray, instance: np.ndarray, box: np.ndarray, is_ours: bool) -> np.ndarray:
-    """Return the depths, (k,) float32 m, of the person's pixels in a box (4,) of whole pixels. is_ours: those of the
-    person's id alone."""
-    x0, y0, x1, y1 = box
-    part = instance[y0:y1, x0:x1]
-    is_person = part[..., 0] == PERSON
-    return depth[y0:y1, x0:x1][is_person & (part[..., 1:] == 255).all(axis=-1) if is_ours else is_person]
-
-
 @njit(cache=True, nogil=True)
-def _survey(depth, instance):  # type: ignore[no-untyped-def]
-    """Return the counts of a `Survey` (4,), and its box."""
+def survey(depth, instance):  # type: ignore[no-untyped-def]
+    """Return counts (4,) and the box (4,) of the person, edges at borders, of a mask (h, w, 3) and a depth or nothing.
+
+    Counts: pixels that are sky by one of depth and kind alone, of the person, of its id with another kind; the greatest
+    kind.
+    """
     num_odd_sky, num_person, num_odd_person, most_kind = 0, 0, 0, 0
     box = np.array([1 << 30, 1 << 30, -1, -1], np.int64)
     for y in range(len(instance)):
@@ -240,7 +188,7 @@ Pair = tuple[int, int, Agreement]  # of neighbouring frames: row of the later on
 
 def check_pictures(flight: FlightRows, pictures: Iterator[Pictures], findings: Findings) -> None:
     """Check all pictures of a flight, one after the other; memory holds two frames."""
-    pairs, kinds = list[Pair](), np.full(NUM_IDS, -1, np.int16)
+    pairs = list[Pair]()
     before: tuple[int, View] | None = None
     for i, files in enumerate(pictures):
         advance()
@@ -248,8 +196,6 @@ def check_pictures(flight: FlightRows, pictures: Iterator[Pictures], findings: F
         if decoded is None or not check_picture(flight, i, decoded, findings):
             before = None
             continue
-        if decoded[1].size and not flight.is_foreign:
-            _check_kinds(flight, i, decoded[1], kinds, findings)
         check_goal(flight, i, decoded, files.get("rgb"), findings)
         rotation = np.ascontiguousarray(flight.rotations[i] @ BODY_FROM_CAMERA)
         view = View(*decoded, rotation, flight.pose[i, :3].copy())
@@ -262,22 +208,8 @@ def check_pictures(flight: FlightRows, pictures: Iterator[Pictures], findings: F
         _judge_pairs(flight, pairs, findings)
 
 
-def _check_kinds(flight: FlightRows, i: int, instance: np.ndarray, kinds: np.ndarray, findings: Findings) -> None:
-    """Check that an instance is of one kind in all frames. kinds: (NUM_IDS,) as in the frames before; what is new is
-    added."""
-    for code in new_kinds(instance, kinds):
-        own, kind = code >> 8, code & 255
-        if kinds[own] >= 0:
-            got = f"instance {own} of kind {kind}"
-            findings.error(
-                "instance_kind", flight.where(i, "instance"), got, f"kind {kinds[own]}, as in the frames before"
-            )
-        else:
-            kinds[own] = kind
-
-
-def _judge_scale(flight: FlightRows, pairs: list[Pair], findings: Findings) -> None:
-    """Find depth that is scaled or set off: its planes move with the camera."""
+def _judge_pairs(flight: FlightRows, pairs: list[Pair], findings: Findings) -> None:
+    """Find depth that is scaled or shifted, whose planes move with the camera, and pairs that do not show one world."""
     for what, most, errors in (
         ("ground", FLAT_MOST, [pair.error_flat for *_, pair in pairs]),
         ("objects on it", STANDING_MOST, [pair.error_off_flat for *_, pair in pairs]),
@@ -285,14 +217,8 @@ def _judge_scale(flight: FlightRows, pairs: list[Pair], findings: Findings) -> N
         known = [error for error in errors if np.isfinite(error)]
         if len(known) >= LEAST_FRAMES and (error := float(np.median(known))) > most:
             got = f"an error of {error:.4%} in the planes of {what} between frames"
-            findings.error(
-                "scene_depth", flight.name, got, f"at most {most:.4%}, for depth in metres along the optical axis"
-            )
-
-
-def _judge_pairs(flight: FlightRows, pairs: list[Pair], findings: Findings) -> None:
-    """Find the pairs of frames that do not show one world."""
-    _judge_scale(flight, pairs, findings)
+            expected = f"at most {most:.4%}, for depth in metres along the optical axis"
+            findings.error("scene_depth", flight.name, got, expected)
     for i, gap, pair in pairs:
         if pair.seen >= LEAST_SEEN and (odd := _odd_pair(pair, gap <= NEAR_FRAMES)):
             findings.error(odd[0], flight.where(i), *odd[1:])
@@ -300,18 +226,22 @@ def _judge_pairs(flight: FlightRows, pairs: list[Pair], findings: Findings) -> N
 
 def _odd_pair(pair: Agreement, is_near: bool) -> tuple[str, str, str] | None:
     """Return code, got and expected of two frames that do not show one world, else None."""
-    if pair.error > ERROR_MOST or (is_near and pair.missing_share > GONE_MOST):
-        off = f", and an error of {pair.error:.2%} in planes" if np.isfinite(pair.error) else ""
-        got = f"{pair.missing_share:.1%} of the points in front of the surfaces of this or the previous frame{off}"
-        most = f"at most {GONE_MOST:.1%}, and an error of at most {ERROR_MOST:.2%}"
-        return "scene_depth", got, f"{most}, for depth, pose and camera that agree with the previous frame"
-    if is_near and pair.moved:
-        got = f"an object of {pair.moved} points that is farther away than in the previous frame"
-        return "scene_depth", got, "the same place, because it does not move"
-    if pair.agree >= LEAST_AGREE and pair.same < SAME_LEAST * pair.agree:
-        got = f"{pair.same / pair.agree:.1%} of the points with the instance id of the previous frame"
-        return "scene_instance", got, f"at least {SAME_LEAST:.0%} of the points with the same depth"
-    if is_near and pair.agree >= LEAST_AGREE and pair.other_id:
-        got = f"an object of {pair.other_id} points with a different id from the previous frame"
-        return "scene_instance", got, "the same id for an object in all frames"
-    return None
+    is_known, off = pair.agree >= LEAST_AGREE, ""
+    if np.isfinite(pair.error):
+        off = f", and an error of {pair.error:.2%} in planes"
+    rules = (
+        (pair.error > ERROR_MOST or (is_near and pair.missing_share > GONE_MOST), "scene_depth",
+         f"{pair.missing_share:.1%} of the points in front of the surfaces of this or the previous frame{off}",
+         f"at most {GONE_MOST:.1%}, and an error of at most {ERROR_MOST:.2%}, for depth, pose and camera that agree "
+         "with the previous frame"),
+        (is_near and pair.moved, "scene_depth",
+         f"an object of {pair.moved} points that is farther away than in the previous frame",
+         "the same place, because it does not move"),
+        (is_known and pair.same < SAME_LEAST * pair.agree, "scene_instance",
+         f"{pair.same / max(1, pair.agree):.1%} of the points with the instance id of the previous frame",
+         f"at least {SAME_LEAST:.0%} of the points with the same depth"),
+        (is_near and is_known and pair.other_id, "scene_instance",
+         f"an object of {pair.other_id} points with a different id from the previous frame",
+         "the same id for an object in all frames"),
+    )  # fmt: skip
+    return next(((code, got, expected) for is_odd, code, got, expected in rules if is_odd), None)
