@@ -1,4 +1,4 @@
-"""`release.json`: what a release says about itself. Written by package, checked by verify, rendered by card."""
+"""`release.json`: the record of a release. Written by build, checked by verify, rendered by card."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class SplitNumbers(Strict):
 
 
 class Splits(Strict):
-    """What two splits may not share, how it was handed out, and what came of it; a split without rows is left out."""
+    """What two splits may not share, the rule, and the splits; those without rows are skipped."""
 
     by: SplitBy
     rule: str
@@ -122,7 +122,7 @@ class Splits(Strict):
 
 
 class MadeBy(Strict):
-    """One stage of one source: its settings, seed and version. Paths and addresses are left out."""
+    """One stage of one source: its settings, seed and version. Paths and addresses are skipped."""
 
     stage: str
     code_version: str

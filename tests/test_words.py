@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 USER_WORDS = "cosfly/worldgen/rules.py"  # it recognizes words of a prompt
-TO_REWRITE = ("release/", "distill/", "docs/", "tests/", "CHANGELOG.md", "CONTRIBUTING.md", "README.md")
+TO_REWRITE = ("distill/", "docs/", "tests/", "CHANGELOG.md", "CONTRIBUTING.md", "README.md")
 
 VERBS = frozenset(
     """

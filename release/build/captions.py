@@ -45,11 +45,11 @@ class TrackCaptions:
 
 @dataclass
 class CaptionAccount:
-    """What all captions of a source say of where they come from."""
+    """Counts of all captions and of their teachers."""
 
     dropped: Counter[str] = field(default_factory=Counter)  # reason -> captions
     accepted: int = 0
-    of_no_flight: int = 0  # accepted, of flights that are left out
+    of_no_flight: int = 0  # accepted, of tracks that are not released
     window_frames: int = 1  # the longest window, from its first frame to its last
     teachers: Counter[tuple[str, str, str]] = field(default_factory=Counter)  # kind, model, settings as JSON
     tokens: Counter[str] = field(default_factory=Counter)

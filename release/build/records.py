@@ -1,5 +1,4 @@
-"""The folder that is published: finished shards under their names, and the records beside them, without anything of
-this machine."""
+"""The folder that is published: finished shards under their names, and records that hold nothing of this machine."""
 
 from __future__ import annotations
 
@@ -165,7 +164,7 @@ DATASET, PARTS = "dataset", "parts"  # in the folder of the stage: what gets pub
 
 
 def check_parts(parts: Sequence[tuple[Path, Shard]], out: Path) -> None:
-    """See that what was finished, also by an earlier run, is there; `out` is the folder of the stage."""
+    """Check that the finished shards are there, also those of an earlier run. out: The folder of the stage."""
     for path, shard in parts:
         for place, stored in ((path, shard), (points_part(path), shard.points)):
             if not place.is_file() or place.stat().st_size != stored.bytes:
@@ -176,10 +175,10 @@ def check_parts(parts: Sequence[tuple[Path, Shard]], out: Path) -> None:
 
 
 def name_shards(parts: Sequence[tuple[Path, Shard]], folder: Path) -> list[Shard]:
-    """Put shards under their names in the release: linked, so that no byte moves and a kill costs nothing.
+    """Link shards under their names in the release, so that no byte moves and a kill costs nothing.
 
     Args:
-        parts: where they stand until the release has its name, and what they are; their paths are not read.
+        parts: Where they are until the release has its name, and what they are; their paths are not read.
     """
     digest = digest_of([shard for _, shard in parts])
     for place in (FRAMES_FOLDER, POINTS_FOLDER):
@@ -198,7 +197,7 @@ def name_shards(parts: Sequence[tuple[Path, Shard]], folder: Path) -> list[Shard
 
 
 def write_records(folder: Path, record: ReleaseRecord) -> None:
-    """Write release.json, the card and the checksums beside the shards."""
+    """Write release.json, the card and the checksums."""
     write_record(folder / "release.json", record)
     write_bytes(folder / "README.md", render_card(record).encode())
     digests = {file.path: file.sha256 for file in record.files}

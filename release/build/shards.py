@@ -1,4 +1,4 @@
-"""One shard: the frames of some flights, read once, held against their digests and written as parquet.
+"""One shard: the frames of some tracks, read once, compared with their digests and written as parquet.
 
 A worker writes whole shards, so that no byte is written twice.
 """
@@ -51,10 +51,10 @@ RENDER = "render the track again, or restore the file"
 
 
 def check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where: Path, *, is_known: bool) -> None:
-    """See that a file is whole and of its flight's size.
+    """Check that a file is whole and has the size of its track.
 
     Args:
-        size_px: width, height. is_known: its digest was compared, so that a PNG's own checksums need not be.
+        size_px: width, height. is_known: Its digest was compared, so that the checksums of a PNG need not be.
     """
     if file == "depth":
         _check_depth(depth_values(data, where), size_px, where)
@@ -202,10 +202,10 @@ def _check_digest(folder: Path, name: str, data: bytes | None, digests: Mapping[
 
 
 def _read_picture(track: Track, path: Path, file: FrameFile, tree: Path, *, is_known: bool) -> bytes:
-    """Read a picture, and see that it is what it must be.
+    """Read a picture and check it.
 
     Args:
-        is_known: its digest will be compared.
+        is_known: Its digest will be compared.
     """
     inside = tree if path.is_symlink() else None  # its folder was looked at
     data = read_bytes(path, what="file of the frame", fix="render the track again", tree=inside)

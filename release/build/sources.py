@@ -18,8 +18,8 @@ from cosfly.runtime.run_dir import record_of
 from release.build.captions import FlightKey
 from release.record import ReleasedMap
 
-IN_REVIEW = "review: "  # how it begins, why a flight is left out that waits for a person
-NOT_CHOSEN = "not chosen"  # why a flight is left out that `release.flights` does not name
+IN_REVIEW = "review: "  # how the reason begins why a track is dropped that waits for a person
+NOT_CHOSEN = "not chosen"  # why a track is dropped that `release.flights` does not name
 
 
 @dataclass(frozen=True)

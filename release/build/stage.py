@@ -1,8 +1,8 @@
 """`cosfly release build`: flights and captions to a folder that `datasets.load_dataset` opens.
 
 Reads the playback trees, captions and inspections of one run or several; writes `dataset/` (parquet shards, README.md,
-release.json, checksums.sha256), which is what gets published: all of it, or nothing. Around it stand
-the stage's own records, which hold local paths and do not.
+release.json, checksums.sha256), which is published whole or not at all. The records of the stage are next to it: they
+hold local paths and are not published.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def part_path(parts: Path, name: str) -> Path:
 
 
 def make_worker(files: tuple[FrameFile, ...], row_group_bytes: int, parts: Path) -> Work:
-    """Worker factory: return the function that writes one shard."""
+    """Return the function that writes one shard."""
 
     def work(item: Item) -> Outcome:
         path = part_path(parts, item.item_id)
@@ -60,11 +60,11 @@ def run(
     resume: Resume = "if-same",
 ) -> Path:
     """Read the playback tree, the captions and, where there is one, the inspection of each run; write `dataset/` and
-    give its path.
+    return its path.
 
     Raises:
-        InputError, VerifyError: something is wrong with the material; nothing is published, and what was finished stays
-        for the next run.
+        InputError, VerifyError: The material has problems; nothing is published, and finished shards stay for the next
+            run.
     """
     sources = told_apart(sources)
     names = input_names(sources)
@@ -116,7 +116,7 @@ def _write_parts(
 
 
 def _check_release(folder: Path) -> None:
-    """See that a release is one, before it has its name."""
+    """Check the structure of a release before it has its name."""
     report = verify(folder, level="structure")
     if not report.is_ok:
         raise VerifyError(

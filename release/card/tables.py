@@ -88,7 +88,7 @@ NOTES = {
 
 
 def tables_of(record: ReleaseRecord) -> list[Table]:
-    """Return the tables of a release; those without rows are left out."""
+    """Return the tables of a release; those without rows are skipped."""
     numbers = record.numbers
     times = [*TIMES, *sorted({sky.partition(TAB)[2] for sky in numbers.of("sky")} - {*TIMES})]
     found = {name for pair in numbers.of("confusion") for name in pair.split(TAB)}

@@ -202,7 +202,7 @@ class Layout:
 
 
 def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
-    """Number episodes and frames; a unit is a data file."""
+    """Index episodes and frames; a unit is a data file."""
     pieces = [Piece(track, start, stop) for track in source.tracks for start, stop in track.runs()]
     fps, size_px = _fps(pieces), source.tracks[0].size_px
     if cfg.video and any(side % 2 for side in size_px):

@@ -58,7 +58,7 @@ def check_camera(flight: FlightRows, findings: Findings) -> None:
 
 
 def check_projection(flight: FlightRows, findings: Findings) -> None:
-    """The target's pixel and depth are those of pose and camera; NaN behind the camera."""
+    """Check the pixel and depth of the target against pose and camera."""
     body = np.einsum("nji,nj->ni", flight.rotations, flight.target_m - flight.pose[:, :3])
     x, y, z = (body @ BODY_FROM_CAMERA).T
     fx, fy, cx, cy = flight.intrinsics.T
@@ -76,7 +76,7 @@ def check_projection(flight: FlightRows, findings: Findings) -> None:
 
 
 def check_boxes(flight: FlightRows, findings: Findings) -> None:
-    """Boxes are inside the picture, min before max; those of our renderers are the projected person's."""
+    """Check that boxes are inside the picture, min before max; those of our renderers are the projected person's."""
     box, mask, size = flight.box, flight.mask_box, np.tile(flight.size_px, 2)
     is_ours, slack = not flight.is_foreign, np.inf if flight.is_foreign else 0.5
     has_box, has_mask = ~np.isnan(box[:, 0]), ~np.isnan(mask[:, 0])
@@ -252,7 +252,7 @@ class Context:
 
 
 def make_worker(context: Context) -> Callable[[Item], Outcome]:
-    """Worker factory: return the function that checks a shard in one pass, and returns the counts of its tracks."""
+    """Return the function that checks a shard in one pass, and returns the counts of its tracks."""
 
     def work(item: Item) -> Outcome:
         findings, counts = Findings(), list[dict[str, Any]]()
