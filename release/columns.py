@@ -81,9 +81,8 @@ class Column:
     """One column.
 
     type: a type of `datasets.Value`, "image", "events", one of LISTS, or the members of a struct of numbers.
-    of_frame: its value at frame i of a flight; of_caption: its value of the frame's caption, null where there is none.
-    NaN becomes null. Neither: a
-        picture, whose bytes the writer has, or what Placement says.
+    of_frame: its value at frame i of a track; of_caption: its value of the frame's caption, null where there is none.
+    NaN becomes null. Without either it is a picture, which the writer reads, or a field of Placement.
     words: those that it may hold, empty: any; "actions": the decisions of the release. ranges: of its numbers, by
     member ("" where it has none).
     required: it is null in no row (of a caption's: in no row with a caption). constant: it does not change within a

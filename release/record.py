@@ -217,7 +217,7 @@ class CaptionHistory(Strict):
 
 
 class History(Strict):
-    """What the shards cannot tell: where all flights and captions went. It can only add up.
+    """What the shards do not show: what became of all tracks and captions.
 
     trajectories: of the sources that were inspected; null where none was.
     """

@@ -33,7 +33,7 @@ class Source:
 
     @property
     def files(self) -> dict[str, Path]:
-        """Role -> what stands there."""
+        """The files by their role."""
         files = {"data": self.data, "captions": self.captions}
         if self.inspect is not None:
             files["inspect"] = self.inspect
@@ -67,13 +67,13 @@ class Source:
 
     @classmethod
     def of_files(cls, data: Path, captions: Path, inspect: Path | None = None) -> Source:
-        """Name a run by the folder that its tree stands in."""
+        """Name a run by the folder that contains its tree."""
         return cls(folder_name(data.absolute().parent.name), data, captions, inspect)
 
 
 def told_apart(sources: list[Source]) -> list[Source]:
-    """Return runs of one name, as trees in one folder are, the name of their tree too: rows and records know a run
-    by its name alone."""
+    """Add the names of the trees to runs with the same name, such as trees in one folder: rows and records know a run by
+    its name alone."""
     counts = Counter(source.run for source in sources)
     return [
         replace(source, run=folder_name(f"{source.run}_{source.data.absolute().name}"))

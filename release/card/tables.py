@@ -1,4 +1,4 @@
-"""The statistics of a release as tables: what sec:dataset_stats and the paper's tables tell of its data.
+"""The statistics of a release as tables: those of the paper (sec:dataset_stats) that it supports.
 
 All of it is in release.json, which `release verify` compares with the rows. The card prints these tables, and
 `cosfly release stats` draws them.

@@ -188,11 +188,11 @@ def check_card(folder: Path, record: ReleaseRecord, findings: Findings) -> None:
 
 def check_record(record: ReleaseRecord, findings: Findings) -> None:
     """Compare release.json with what every release states, and with what follows from its other parts."""
-    shards, flights, history, told = record.shards, record.flights, record.history, record.splits
+    shards, flights, history, stated = record.shards, record.flights, record.history, record.splits
     captions, num_captions = history.captions, record.numbers.of("flags")["has_caption"]
     paths = shard_paths([shard.split for shard in shards], record.content_digest)
     num_read = captions.released + captions.frame_not_selected + captions.flight_left_out
-    by_split = {name: own.captions for name, own in told.splits.items()}
+    by_split = {name: own.captions for name, own in stated.splits.items()}
     expected: dict[str, tuple[Any, Any]] = {
         **{name: (getattr(record, name), rule) for name, rule in stated_rules(record.settings, shards).items()},
         "shards": ([(shard.path, shard.points.path) for shard in shards], paths),
@@ -201,19 +201,19 @@ def check_record(record: ReleaseRecord, findings: Findings) -> None:
         "captions read": (captions.read, num_read + sum(captions.dropped.values())),
         "captions released": (captions.released, num_captions),
         "frames without": (sum(captions.frames_without.values()), record.numbers.frames - num_captions),
-        "splits": (told.splits, numbers_of_splits(flights, by_split)),
+        "splits": (stated.splits, numbers_of_splits(flights, by_split)),
         "captions of splits": (sum(by_split.values()), num_captions),
         "maps": ({one.town for one in record.maps} >= {*record.numbers.counts.get("town", ())}, True),
-        "rule of splits": (told.rule, SPLIT_RULE),
+        "rule of splits": (stated.rule, SPLIT_RULE),
     }  # fmt: skip
     for name, (got, wanted) in expected.items():
         findings.compare("record", f"{RECORD}: {name}", got, wanted)
-    shares = told.fractions
+    shares = stated.fractions
     if shares.keys() != {*SPLIT_NAMES} or not all(0 <= share <= 1 for share in shares.values()):
         findings.error("record", f"{RECORD}: fractions of splits", shares, "three fractions")
     elif flights:
         own = {one.flight: (one.walk, one.town) for one in flights}
-        splits = split_flights(own, told.by, shares, told.seed)
+        splits = split_flights(own, stated.by, shares, stated.seed)
         findings.compare("split", RECORD, {one.flight: one.split for one in flights}, splits)
 
 
