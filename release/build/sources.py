@@ -72,7 +72,7 @@ class Source:
 
 
 def told_apart(sources: list[Source]) -> list[Source]:
-    """Add the names of the trees to runs with the same name, such as trees in one folder: rows and records know a run by
+    """Add the name of the tree to runs that share a name, as two trees in one folder do: rows and records know a run by
     its name alone."""
     counts = Counter(source.run for source in sources)
     return [
