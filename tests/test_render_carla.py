@@ -231,6 +231,40 @@ def test_a_person_zoom_and_weather_are_those_of_the_embedded_renderer(tmp_path):
     assert np.abs(fair - their_fair).mean() < 2.0
 
 
+def _after_another_client(port: int) -> tuple:
+    """Fair weather after a client that set CARLA's default weather; the spectator meanwhile and at the end."""
+    import carla
+
+    world = carla.Client("127.0.0.1", port).get_world()
+    world.set_weather(carla.WeatherParameters())  # fog from 0 m, and the sun on the horizon
+    world.get_spectator().set_transform(carla.Transform(carla.Location(1.0, 2.0, 3.0), carla.Rotation(0.0, 90.0, 0.0)))
+    world.wait_for_tick()
+    settings = build(CarlaRenderConfig, {"port": port, **QUICK}, "test")
+    renderer = open_renderer("carla", street(), 160, 90, settings=settings)
+    renderer.prepare(*street().bounds(), None)
+    pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-32.5, 60.0, 0.0]))
+    fair = renderer.render(pose, intrinsic_matrix(160, 90, 60.0), None)
+    renderer.render(pose, intrinsic_matrix(160, 90, 60.0), None)  # a client knows a place one tick later
+    places = [renderer._spectator.get_transform().location]
+    renderer.close()
+    world.wait_for_tick()
+    places.append(world.get_spectator().get_transform().location)
+    left = world.get_weather()
+    return fair.rgb.mean(), [(one.x, one.y, one.z) for one in places], (left.fog_distance, left.sun_altitude_angle)
+
+
+def test_what_another_client_left_neither_stops_nor_changes_pictures(tmp_path):
+    with serving(street(), tmp_path) as port:
+        mean, (camera_m, left_m), weather = as_client(_after_another_client, port)
+    gl = open_renderer("gl", street(), 160, 90)
+    pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-32.5, 60.0, 0.0]))
+    assert mean == pytest.approx(gl.render(pose, intrinsic_matrix(160, 90, 60.0), None).rgb.mean(), abs=3.0)
+    gl.close()
+    assert camera_m == pytest.approx((-1.0, 9.5, 5.5))
+    assert left_m == pytest.approx((1.0, 2.0, 3.0))
+    assert weather == (0.0, 0.0)
+
+
 _WORKER = """
 import sys, time, numpy as np, test_render_carla as t
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera

@@ -74,10 +74,14 @@ class CarlaRenderer(SimulatorRenderer):
             with self._server.asking("CARLA did not return its world"):
                 world = self._world = self._server.world
                 settings = world.get_settings()
-                self._found_weather = world.get_weather()
-                weather = read_attributes(self._found_weather)
-                self._guard.note({"settings": read_attributes(settings), "weather": weather})
+                self._spectator = world.get_spectator()
+                found = self._spectator.get_transform()
+                place = [[found.location.x, found.location.y, found.location.z]]
+                place += [[found.rotation.pitch, found.rotation.yaw, found.rotation.roll]]
+                weather = read_attributes(world.get_weather())
+                self._guard.note({"settings": read_attributes(settings), "weather": weather, "spectator": place})
                 settings.synchronous_mode = True
+                settings.spectator_as_ego = True  # the tiles of a large map are loaded around the spectator
                 settings.fixed_delta_seconds = SIMULATED_STEP_S
                 world.apply_settings(settings)
                 self._library = world.get_blueprint_library()
@@ -124,17 +128,21 @@ class CarlaRenderer(SimulatorRenderer):
     # --- one trajectory --------------------------------------------------------------------------------------
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
-        """Set the weather, or restore that of the server for None, and remove all people and cars."""
+        """Set the weather, and remove all people and cars."""
         self._weather = weather
         for number in list(self._movers):
             self._remove(number)
         self._set_weather()
 
     def _set_weather(self) -> None:
-        """Set the six knobs of the paper; CARLA's others are zero, so that no trajectory inherits them."""
-        weather = self._found_weather
+        """Set the six knobs of the paper, with CARLA's others zero; without a weather, CARLA's ClearNoon.
+
+        So no trajectory inherits what another client left.
+        """
+        carla = self._server.carla
+        weather = carla.WeatherParameters.ClearNoon
         if self._weather is not None:
-            weather = set_attributes(self._server.carla.WeatherParameters(), self._weather.model_dump())
+            weather = set_attributes(carla.WeatherParameters(), self._weather.model_dump())
         with self._server.asking("CARLA did not set the weather"):
             self._world.set_weather(weather)
 
@@ -150,6 +158,7 @@ class CarlaRenderer(SimulatorRenderer):
             self._place(number, body)
         for camera, _ in self._cameras.values():
             camera.set_transform(pose)
+        self._spectator.set_transform(pose)
         pictures = self._pictures(self._world.tick(self._cfg.timeout_s))
         depth = conventions.depth_of(pictures["depth"])
         kinds, actors = conventions.tags_of(pictures["tags"])

@@ -7,7 +7,8 @@ Protocol: the user writes lines of JSON to the standard input of the guard. The 
 guard restores nothing if it received no line.
 
     engine    first line                                          each further line
-    carla     {"settings": {...}, "weather": {...}}: attributes   the id of an actor that was spawned
+    carla     {"settings": {...}, "weather": {...}: attributes,   the id of an actor that was spawned
+              "spectator": [location, rotation]}
     unrealcv  a list of commands that restore the camera          (none)
 """
 
@@ -77,7 +78,7 @@ def _wait_until_listening(host: str, port: int, timeout_s: float) -> None:
 
 
 def _restore_carla(host: str, port: int, state: dict[str, Any], actor_ids: list[int]) -> None:
-    """Destroy the spawned actors, and reset weather and world settings to the recorded state."""
+    """Destroy the spawned actors, and reset spectator, weather and world settings to the recorded state."""
     import carla
 
     from cosfly.simulators.carla_client import set_attributes
@@ -87,6 +88,8 @@ def _restore_carla(host: str, port: int, state: dict[str, Any], actor_ids: list[
     world = client.get_world()
     for actor in world.get_actors(actor_ids):
         actor.destroy()
+    location, rotation = state["spectator"]
+    world.get_spectator().set_transform(carla.Transform(carla.Location(*location), carla.Rotation(*rotation)))
     world.set_weather(set_attributes(carla.WeatherParameters(), state["weather"]))
     world.apply_settings(set_attributes(carla.WorldSettings(), state["settings"]))
 

@@ -22,7 +22,9 @@ BYTES_AFTER_POSE = 90  # of an actor's state: its motion, and what depends on it
 FIRST_BOX = 100_000  # number of the first box as an actor; pictures hold its low 16 bits
 ANY_LABEL = 255
 KNOBS = dict(zip(WeatherParams.model_fields, (0, 1, 6, 7, 5, 4), strict=True))  # their places among the parameters
-FAIR_WEATHER = [5.0, 0.0, 0.0, 10.0, 215.0, 42.0, 0.0, 60.0, 0.0, 0.0, 1.0, 0.03, 0.0331, 0.0]
+FAIR_WEATHER = [5.0, 0.0, 0.0, 10.0, -1.0, 45.0, 2.0, 0.75, 0.1, 0.0, 1.0, 0.03, 0.0331, 0.0]  # ClearNoon
+SPECTATOR = 100  # number of this actor, which a client can move
+LEAST_FOG_M = 0.01  # of the embedded renderer; CARLA's own default is 0
 SENSORS = {"depth": 1, "rgb": 13, "semantic_segmentation": 14, "instance_segmentation": 15}  # their numbers in streams
 CAMERAS = {f"sensor.camera.{name}": number for name, number in SENSORS.items()}
 ATTRIBUTES = [  # name, type (2 int, 3 float, 4 str), value
@@ -57,6 +59,7 @@ class CarlaServer(Server):
                 [k, name, name.replace(".", ","), detailed] for k, name in enumerate(MODELS)
             ],
             "get_actors_by_id": lambda numbers: [self._actor(n) for n in numbers if n in actors],
+            "get_spectator": lambda: self._actor(SPECTATOR),
             "spawn_actor": self._spawn, "destroy_actor": lambda number: actors.pop(number, None) is not None,
             "set_actor_transform": lambda number, to: actors[number].pose.__setitem__(slice(6), [*to[0], *to[1]]),
             "get_actor_bounding_box": lambda number: self._actor(number)[3],
@@ -65,6 +68,7 @@ class CarlaServer(Server):
             **{f"set_actor_{name}": lambda *_: None for name in ("collisions", "enable_gravity", "simulate_physics")},
             "tick_cue": lambda: self.count() or self._tick(),
         }  # fmt: skip
+        actors[SPECTATOR] = Mover("Camera", "spectator", [0.0] * 6, [0, "spectator", []])
         listen(port, self._read_calls)
         listen(port + 1, self._read_subscription)
 
@@ -93,12 +97,15 @@ class CarlaServer(Server):
 
     def _set_weather(self, told: list[float]) -> None:
         is_fair, self.told_weather = np.allclose(told, FAIR_WEATHER), told  # single precision
-        self.weather = None if is_fair else WeatherParams(**{name: told[k] for name, k in KNOBS.items()})
+        knobs = {name: told[k] for name, k in KNOBS.items()}
+        knobs["fog_distance"] = max(knobs["fog_distance"], LEAST_FOG_M)
+        knobs["sun_azimuth_angle"] %= 360.0
+        self.weather = None if is_fair else WeatherParams(**knobs)
 
     def _actor(self, number: int) -> list:
         actor = self.movers[number]
         box = [[0.0] * 3, BUILDS.get(actor.kind, BUILDS["Car"]).half_extents_m, [0.0] * 3, number]
-        return [number, 0, actor.description, box, b"", b"" if actor.kind in BUILDS else self._token(number)]
+        return [number, 0, actor.description, box, b"", self._token(number) if actor.model in CAMERAS else b""]
 
     def _spawn(self, description: list, transform: list, *_: Any) -> list:
         number, pose = next(self._numbers), [*transform[0], *transform[1]]
