@@ -415,12 +415,13 @@ def test_what_a_wall_hides_is_not_said(y_m, says_legs):
     renderer.prepare(low_m, high_m)
     pose = pose_towards([0.2, y_m, 1.3], hips_m[0])
 
-    def draw(looks: Appearance) -> Frame:
-        dressed = [replace(clothes, looks=one) for one in (looks, people.others[other_id(0)])]
+    def draw(looks: Appearance, number: int) -> Frame:
+        both = {PERSON_ID: LOOKS, **people.others} | {number: looks}
+        dressed = [replace(clothes, looks=one) for one in both.values()]
         bodies = [PosedPerson(hip_m, 0.0, 0.5, 1.0, one) for hip_m, one in zip(hips_m, dressed, strict=True)]
         return renderer.render(pose, intrinsic, bodies[0], [PosedBystander(other_id(0), bodies[1])])
 
-    goal = find_goal(people, 3, draw)
+    goal = find_goal(people, 3, draw, 8)
     renderer.close()
     assert goal is not None
     assert (goal.frame, "legs" in goal.says) == (3, says_legs)

@@ -71,11 +71,13 @@ def _excess(relation: str, numbers: Collection[int], picture: SeenFrame) -> dict
 
 
 def find_says(
-    people: Mapping[int, Appearance], picture: SeenFrame, tells: Callable[[str, Appearance], bool]
-) -> tuple[str, ...] | None:
+    people: Mapping[int, Appearance], picture: SeenFrame, tells: Callable[[str, Appearance], bool],
+    shows: Callable[[str, int], bool] = lambda slot, number: True,
+) -> tuple[str, ...] | None:  # fmt: skip
     """Find the shortest description that only the target (PERSON_ID) fits in a picture; None if there is none.
 
-    tells: (slot, appearance) -> whether the picture shows that the target does not look like that in the slot.
+    tells: (slot, appearance) -> whether the picture shows that the target does not look like that in the slot. shows:
+    (slot, id) -> whether it shows that this other person does not look like the target in the slot.
     """
     looks = people[PERSON_ID]
     rivals = {
@@ -92,7 +94,9 @@ def find_says(
             continue  # it cannot be better; `tells` renders pictures
         if all(tells(slot, otherwise(looks, slot)) for slot in chosen):
             confused = {
-                number for number, slots in differing.items() if not any(tells(slot, rivals[number]) for slot in slots)
+                number
+                for number, slots in differing.items()
+                if not any(tells(slot, rivals[number]) and shows(slot, number) for slot in slots)
             }
             if best_says is None or len(confused) < len(best_rivals):
                 best_says = says

@@ -118,6 +118,13 @@ class DressedBystanders:
         }
         return People(target, looks)
 
+    def dressed(self, instance_id: int, looks: Appearance) -> DressedBystanders:
+        """Return the bystanders with one of them in another appearance."""
+        clothes = list(self.clothes)
+        number = other_id(0) - instance_id
+        clothes[number] = replace(clothes[number], looks=looks)
+        return replace(self, clothes=clothes)
+
     def posed(self, i: int) -> list[PosedBystander]:
         """Return all bystanders in frame i."""
         bystanders = []

@@ -43,8 +43,7 @@ ENCODER_THREADS = 2  # of each worker, next to the drawing
 FRAMES_AHEAD = 6  # drawn but not written yet: bounds the memory (about 10 MB each)
 TOUCH_M = 0.01  # a camera this deep in a box still touches it only
 MOST_GOAL_FRAMES = 8  # the first in which the target is legible
-# Two appearances differ to the eye if enough pixels of the person differ in colour.
-DIFFERENT_PX = 8  # least number of these pixels
+# Two appearances differ to the eye if enough pixels of the person differ in colour (`render.goal_least_px`).
 DIFFERENT_SHARE = 0.04  # least share of the person's pixels
 DIFFERENT_CONTRAST = 10.0  # least difference of a pixel (CIE76)
 
@@ -103,7 +102,7 @@ def render_track(
     weather = None if script.weather is None else script.weather.params
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M, weather)
     drawn = _draw_frames(renderer, script, folder, cfg, overlay)
-    track = _with_goal(_track(script, drawn), renderer, script, cfg.visible_threshold)
+    track = _with_goal(_track(script, drawn), renderer, script, cfg)
     write_track(folder, track)
     write_json(folder / "perturbation_report.json", {**REPORT_FORMAT.header, **_report(script.perturbed)})
     file_names = ["trajectory.json", "perturbation_report.json"]
@@ -331,54 +330,69 @@ def _track(script: TrackScript, drawn: DrawnFrames) -> Track:
 # --- the goal in words ------------------------------------------------------------------------------------------------
 
 
-def _with_goal(track: Track, renderer: Renderer, script: TrackScript, threshold: float) -> Track:
+def _with_goal(track: Track, renderer: Renderer, script: TrackScript, cfg: RenderConfig) -> Track:
     """Add the goal, from the first frame in which the target is legible and distinct, or the reason for its absence."""
     if not renderer.dresses:
         return replace(track, people=None, raw=track.raw | {"goal": {"absent": "clothes_unknown"}})
     people = script.bystanders.people(script.clothes.looks)
     legible = [i for i in range(len(track)) if track.legibility_at(i)["legible"]]
     for i in legible[:MOST_GOAL_FRAMES]:
-        if goal := find_goal(people, i, partial(_draw_dressed, renderer, script, i, threshold)):
+        draw = partial(_draw_dressed, renderer, script, i, cfg.visible_threshold)
+        if goal := find_goal(people, i, draw, cfg.goal_least_px):
             return replace(track, goal=goal)
         advance()
     return replace(track, raw=track.raw | {"goal": {"absent": "not_told_apart" if legible else "never_legible"}})
 
 
-def _draw_dressed(renderer: Renderer, script: TrackScript, i: int, threshold: float, looks: Appearance) -> Frame:
-    """Draw frame i with a target of an appearance."""
-    dressed = replace(script, clothes=replace(script.clothes, looks=looks))
+def _draw_dressed(
+    renderer: Renderer, script: TrackScript, i: int, threshold: float, looks: Appearance, number: int
+) -> Frame:
+    """Draw frame i with one person in another appearance."""
+    if number == PERSON_ID:
+        dressed = replace(script, clothes=replace(script.clothes, looks=looks))
+    else:
+        dressed = replace(script, bystanders=script.bystanders.dressed(number, looks))
     return draw_frame(renderer, dressed, i, script.perturbed.poses, threshold).frame
 
 
-def find_goal(people: People, i: int, draw: Callable[[Appearance], Frame]) -> Goal | None:
+def find_goal(people: People, i: int, draw: Callable[[Appearance, int], Frame], least_px: int) -> Goal | None:
     """Find the words that distinguish the target of frame i from the bystanders that have a pixel in it.
 
-    draw: Draws the frame with a target of that appearance.
+    Args:
+        draw: Draws the frame with the person of an id in that appearance.
+        least_px: Fewest pixels by which a person shows a garment or the figure; a bystander of fewer pixels shows none,
+            and is taken as different from the target where the records differ.
     """
     looks = people.target
-    frame = draw(looks)
+    everyone = {PERSON_ID: looks, **people.others}
+    frame = draw(looks, PERSON_ID)
 
     @cache
-    def differs(other: Appearance) -> bool:
-        return targets_differ(frame, draw(other))
+    def differs(other: Appearance, number: int) -> bool:
+        return people_differ(frame, draw(other, number), number, least_px)
 
-    def distinguishes(slot: str, other: Appearance) -> bool:
+    def distinguishes(number: int, slot: str, other: Appearance) -> bool:
+        person = everyone[number]
         if slot == "figure":
-            return differs(replace(looks, figure=other.figure))
-        color, other_color = (getattr(person, f"{slot}_color") for person in (looks, other))
+            return differs(replace(person, figure=other.figure), number)
+        color, other_color = (getattr(one, f"{slot}_color") for one in (person, other))
         # The wardrobe's colours differ wherever they are visible. Whether this slot is visible is the same question for
         # all other colours, so it is asked of one appearance, and `differs` draws it once.
         if color and other_color and color != other_color:
-            other = otherwise(looks, slot)
-        return differs(replace(looks, **{name: getattr(other, name) for name in (slot, f"{slot}_color")}))
+            other = otherwise(person, slot)
+        return differs(replace(person, **{name: getattr(other, name) for name in (slot, f"{slot}_color")}), number)
 
-    says = find_says({PERSON_ID: looks, **people.others}, SeenFrame(frame.ids, frame.depth), distinguishes)
+    def shows(slot: str, number: int) -> bool:
+        return bool((frame.ids == number).sum() < least_px) or distinguishes(number, slot, looks)
+
+    picture = SeenFrame(frame.ids, frame.depth)
+    says = find_says(everyone, picture, partial(distinguishes, PERSON_ID), shows)
     return None if says is None else Goal(i, **words_of(says, looks), says=says)
 
 
-def targets_differ(frame: Frame, other: Frame) -> bool:
-    """Return whether the target of two frames that differ in its appearance only looks different to the eye."""
-    is_person = (frame.ids == PERSON_ID) | (other.ids == PERSON_ID)
+def people_differ(frame: Frame, other: Frame, number: int, least_px: int) -> bool:
+    """Return whether a person looks different to the eye in two frames that differ in its appearance only."""
+    is_person = (frame.ids == number) | (other.ids == number)
     a, b = (cv2.cvtColor(f.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[is_person] for f in (frame, other))
     num_px = np.count_nonzero(np.linalg.norm(a - b, axis=-1) >= DIFFERENT_CONTRAST)
-    return bool(num_px >= max(DIFFERENT_PX, DIFFERENT_SHARE * np.count_nonzero(is_person)))
+    return bool(num_px >= max(least_px, DIFFERENT_SHARE * np.count_nonzero(is_person)))
