@@ -36,6 +36,7 @@ bench.FITTED_ON = 200
     ("bench_flying", "--flights 2 --decisions 4 --workers 1", r"\d+ decisions in .* a second", HERE),
     ("bench_flying", "--envs", r"2 side by side: .* steps a second",
              "import cosfly.envs.episodes; cosfly.envs.episodes.NUM_DECISIONS = 4"),
+    ("bench_flying", "--resets", r"Reacquire-v0: reset in a known town: \d+ ms"),
     ("bench_pages", "", r"turns at \d+ frames/s", """
 from cosfly.maps.synthetic import SyntheticConfig, load
 bench.TURNS, bench.census_town = 1, lambda name, seed: load(SyntheticConfig(), seed)

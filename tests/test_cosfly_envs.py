@@ -1,6 +1,9 @@
 """cosfly/envs: the environments as Gymnasium has them, episodes, rewards that no cheat earns, policies that fail."""
 
 import json
+import os
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,15 +16,20 @@ from gymnasium.utils.env_checker import check_env
 
 import cosfly.envs
 from cosfly.closed_loop.policy import Policy
+from cosfly.closed_loop.settings import FlyConfig
+from cosfly.closed_loop.stage import STEP_S, watch_of
 from cosfly.envs import episodes
 from cosfly.envs.episodes import HELD_OUT, TASKS, TRAINING, read_list
-from cosfly.envs.follow import FULL_REWARD_M, NO_REWARD_M, reward_of
+from cosfly.envs.follow import FULL_REWARD_M, LOOKS, NO_REWARD_M, reward_of
 from cosfly.formats.episodes import read_episode
+from cosfly.formats.people import Appearance
 from cosfly.runtime.config import read_yaml
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import ConfigError, InputError, TeacherError
+from cosfly.runtime.pool import Watch
 
 FOLLOW, SMALL = "cosfly/Follow-v0", (160, 96)
-DOCUMENT = Path(cosfly.envs.__file__).parents[2] / "docs" / "closed-loop.md"
+ROOT = Path(cosfly.envs.__file__).parents[2]
+DOCUMENT = ROOT / "docs" / "closed-loop.md"
 
 
 @pytest.fixture(scope="module")
@@ -45,11 +53,11 @@ def flown(env, seed, actions):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
-def test_an_environment_is_as_gymnasium_wants_it_without_a_warning(task, monkeypatch):
-    monkeypatch.setattr(episodes, "TRAINING", TRAINING if task == FOLLOW else TRAINING[:1])  # a town takes seconds
+def test_an_environment_is_as_gymnasium_wants_it_without_a_warning(task):
+    towns = (0, 1) if task == FOLLOW else (0,)  # a town takes a second
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(gymnasium.make(task, size_px=SMALL).unwrapped)
+        check_env(gymnasium.make(task, size_px=SMALL, towns=towns).unwrapped)
 
 
 def test_equal_seeds_and_actions_give_equal_bytes_and_other_seeds_others(follow):
@@ -58,6 +66,20 @@ def test_equal_seeds_and_actions_give_equal_bytes_and_other_seeds_others(follow)
     for one, same in zip(first, again, strict=True):
         assert all(np.array_equal(one[name], same[name]) for name in one)
     assert not np.array_equal(first[-1]["rgb"], other[-1]["rgb"])
+
+
+@pytest.mark.slow
+def test_an_episode_looks_the_same_whatever_was_flown_before(follow):
+    [first], _ = flown(follow, 6, [])  # draws in the context of another town
+    alone = gymnasium.make(FOLLOW, episodes="test", actions="velocities", size_px=SMALL, depth=True).unwrapped
+    [fresh], _ = flown(alone, 6, [])
+    flown(follow, 4, [])
+    [again], _ = flown(follow, 6, [])
+    assert len(follow._airspaces) > 1
+    assert len({airspace.renderer.context for airspace in follow._airspaces.values()}) == 1
+    for seen in (first, again):
+        assert all(np.array_equal(seen[name], fresh[name]) for name in fresh)
+    alone.close()
 
 
 def test_an_observation_has_what_a_drone_knows_and_no_more(follow):
@@ -75,6 +97,101 @@ def test_an_action_outside_its_bounds_and_a_step_after_the_end_are_refused_in_a_
     flown(follow, 0, [np.array([0, 0, -4, 0, -30], dtype=np.float32)] * 40)  # into the ground
     with pytest.raises(InputError, match="reset"):
         follow.step(np.zeros(5, dtype=np.float32))
+
+
+def test_actions_are_cast_before_their_bounds_are_checked(follow):
+    follow.reset(seed=0)
+    for action in (np.array([1.0, 0, 0, 0, -30]), np.array([1, 0, 0, 0, -30]), [1, 0, 0, 0, -30.0]):
+        follow.step(action)
+    decisions = gymnasium.make(FOLLOW, episodes="test", size_px=SMALL).unwrapped
+    decisions.reset(seed=0)
+    for action in (3, np.int64(3), np.array([3], dtype=np.int32)):
+        decisions.step(action)
+    for action in (17, 2.5, [1, 2], "hover"):
+        with pytest.raises(InputError, match="not in the action space"):
+            decisions.step(action)
+    decisions.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("observation", ["numbers", "flat"])
+def test_an_observation_without_text(observation):
+    env = gymnasium.make(FOLLOW, episodes="test", observation=observation, size_px=SMALL).unwrapped
+    check_env(env, skip_render_check=True)
+    seen, info = env.reset(seed=1)
+    assert env.observation_space.contains(seen)
+    assert not {"episode", "final_info", "final_obs", "terminal_observation", "TimeLimit.truncated"} & {*info}
+    if observation == "numbers":
+        looks = dict(zip(LOOKS, seen["goal"].tolist(), strict=True))
+        worn = {name: choices[looks[name]] for name, choices in LOOKS.items()}
+        assert Appearance(**worn) == env._simulation.script.clothes.looks
+    else:
+        assert seen.max() <= 1
+        assert seen.min() >= 0
+        assert seen.std() > 0.1
+    env.close()
+
+
+def test_unknown_arguments_are_refused_in_a_line():
+    for arguments in ({"observation": "text"}, {"actions": "moves"}, {"towns": ()}, {"towns": (0, 64)}):
+        with pytest.raises(ConfigError, match="argument"):
+            gymnasium.make(FOLLOW, **arguments)
+
+
+# Programs of others, unmodified: the second needs the path of CleanRL's ppo.py in CLEANRL_PPO.
+TRAINERS = {
+    "statistics and SyncVectorEnv": """
+import gymnasium, numpy as np
+envs = gymnasium.vector.SyncVectorEnv(
+    [lambda: gymnasium.wrappers.RecordEpisodeStatistics(gymnasium.make("cosfly.envs:cosfly/FollowFlat-v0"))] * 2)
+envs.reset(seed=1)
+for _ in range(81):
+    seen, _, _, _, info = envs.step(np.array([14, 14]))
+assert "episode" in info or seen.shape[0] == 2
+""",
+    "AsyncVectorEnv": """
+import gymnasium, numpy as np
+make = lambda: gymnasium.make("cosfly.envs:cosfly/Follow-v0", observation="numbers", size_px=(64, 48))
+envs = gymnasium.vector.AsyncVectorEnv([make] * 2)
+first, _ = envs.reset(seed=[1, 2])
+seen, rewards, *_ = envs.step(np.array([14, 14]))
+alone = make()
+alone.reset(seed=2)
+assert (alone.step(14)[0]["goal"] == seen["goal"][1]).all() and seen["goal"].any()
+envs.close()
+""",
+    "stable_baselines3": """
+import gymnasium, cosfly.envs
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+keys = {"observation": "numbers", "size_px": (64, 48)}
+for actions in ("decisions", "velocities"):
+    envs = make_vec_env("cosfly/Follow-v0", n_envs=2, env_kwargs=keys | {"actions": actions})
+    PPO("MultiInputPolicy", envs, n_steps=96, batch_size=32, n_epochs=1, device="cpu").learn(192)
+    envs.close()
+""",
+    "tyro": """
+import os, runpy, sys
+sys.argv = ["ppo.py", "--env-id", "cosfly.envs:cosfly/FollowFlat-v0", "--total-timesteps", "192", "--num-envs", "2",
+            "--num-steps", "96", "--no-cuda"]
+runpy.run_path(os.environ["CLEANRL_PPO"], run_name="__main__")
+""",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TRAINERS)
+def test_wrappers_and_trainers_of_others_run_unmodified(name, tmp_path):
+    package = name if name in ("stable_baselines3", "tyro") else "gymnasium"
+    pytest.importorskip(package, reason=f"{package} is not installed")
+    if name == "tyro" and not os.environ.get("CLEANRL_PPO"):
+        pytest.skip("CLEANRL_PPO does not name CleanRL's ppo.py")
+    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    done = subprocess.run(
+        [sys.executable, "-c", TRAINERS[name]], cwd=tmp_path, capture_output=True, text=True, check=False,
+        env=os.environ | {"PYTHONPATH": path},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
 
 
 @pytest.mark.slow
@@ -198,9 +315,22 @@ def test_a_slow_answer_is_late_once_and_the_next_ones_are_in_time(ask):
     assert [one.answer for one in ask("Slow", slow_at=1)] == ["ok", "late", "ok", "ok", "ok"]
 
 
+def test_a_policy_that_hangs_is_stopped_in_a_line(ask, follow):
+    policy = Policy("own:Never", 0.1, 0, most_late=3)
+    seen = SimpleNamespace(simulation=follow._simulation, moments=[follow._now], episode="a")
+    assert [policy.decide([seen])[0].answer for _ in range(2)] == ["late", "late"]
+    with pytest.raises(TeacherError, match=r"own:Never: the policy hangs .*fly\.answer_limit_s"):
+        policy.decide([seen])
+    # What Python cannot interrupt ends with its worker, once.
+    watch = watch_of(FlyConfig(student="policy:own:Never", answer_limit_s=5), Watch())
+    assert (watch.item_limit_s, watch.retries) == (5 + STEP_S, 0)
+    assert watch_of(FlyConfig(student="rules"), Watch()) == Watch()
+
+
 @pytest.mark.slow
 def test_a_whole_list_gives_records_and_a_score(tmp_path, in_this_process, monkeypatch):
     monkeypatch.setattr(episodes, "NUM_DECISIONS", 8)
+    episodes.episode_of.cache_clear()
     (tmp_path / "own.py").write_text(POLICIES)
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "out"
@@ -208,4 +338,5 @@ def test_a_whole_list_gives_records_and_a_score(tmp_path, in_this_process, monke
     records = [read_episode(path) for path in sorted((out / "episodes").glob("*.json"))]
     assert len(records) == 20
     assert {frame.answer for one in records for frame in one.decisions} == {"invalid"}
+    episodes.episode_of.cache_clear()
     assert json.loads((out / "score.json").read_text())["list_sha256"] == read_list(FOLLOW)[2]

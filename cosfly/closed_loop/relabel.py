@@ -25,7 +25,7 @@ from cosfly.closed_loop.stage import PLAN, TRACES, TREE, ClosedLoopConfig, flown
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, as_drawn
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.episodes import Episode, EpisodeFrame, episode_file, read_episode, read_score
-from cosfly.formats.traces import ARRAYS, DroneTrace, Excerpt, read_traces, write_traces
+from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.geometry.axes import look_at, step_s
 from cosfly.geometry.kernels import signed_distances, swept_distances
 from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M
@@ -128,9 +128,7 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
             planned = _planned_on(plan, flown_frames, airspace, cfg.plan)
         except NoPathError:
             return Outcome(drop_reason="no_path")
-        cut: Any = {name: getattr(planned, name)[begin:end] for name in (*ARRAYS, "clearances_m")}
-        part_of = Excerpt(plan.path_id, number, plan.targets_m[: begin + 1])
-        planned = replace(planned, **cut, part_of=part_of)
+        planned = planned.part(number, begin, end)
         simulation = ClosedLoopTrajectory(airspace, planned, number=number, num_lead=window.num_frames)
         moments = [*simulation.reset()]
         while simulation.ended is None:
@@ -153,7 +151,7 @@ def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Pat
             np.array([moment.position_m[2] - moment.height_m for moment in moments]), path_id=item.item_id,
             planner=f"replanned from frame {i} of {record.student}, round {relabel.round}", pace=record.style.pace,
             solver={"source": episode, "frame": i, **source, "decision": record.frames[i].action, "reasons": reasons},
-            part_of=part_of,
+            part_of=planned.part_of,
         )  # fmt: skip
         return Outcome({"trace": trace.as_json(), "reasons": reasons})
 

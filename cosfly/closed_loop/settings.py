@@ -81,6 +81,9 @@ class FlyConfig(Config):
     controller: Path | None = Field(None, description="table of commands per decision, instead of controller.yaml")
     lead_frames: int = Field(21, ge=5, le=1000, description="number of planned frames up to that of the first decision")
     answer_limit_s: float = Field(60.0, gt=0, description="time limit of a decision, s; after it, the drone hovers")
+    most_late_answers: int = Field(
+        10, ge=0, description="a policy is stopped after this number of late answers in a row; 0: never"
+    )
     lost_s: float = Field(
         30.0, ge=0, description="an episode ends after this time without a visible target, s; 0: never"
     )

@@ -58,6 +58,7 @@ from distill.inference.stage import InferConfig
 log = logging.getLogger(__name__)
 
 PLAN, TRACES, TREE, ANSWERS = "plan", "drone_trace.json", "render", "answers"
+STEP_S = 60.0  # for drawing a step, and for opening an episode
 HALF_SEEN = 0.5  # of five rays
 
 
@@ -209,12 +210,19 @@ def run(
             batch = ordered[start : start + batch_size]
             steps = sum(len(_cut(traces[n], cfg.fly).time_s) - cfg.fly.lead_frames for n in batch)
             items.append(Item(f"{traces[batch[0]].path_id} and {len(batch) - 1}", batch, steps))
-        run_items(stage, items, make_worker, worker_args, workers=num_workers, watch=watch)
+        run_items(stage, items, make_worker, worker_args, workers=num_workers, watch=watch_of(cfg.fly, watch))
         names = [traces[n].path_id for n in flown]
         finish_episodes(stage, cfg.fly, seed, names, dropped, obstacle_index(read_boxes(simplified)))
     if cfg.fly.tree:
         rendering.run(as_drawn(cfg.render, seed), boxes, simplified, out / TRACES, out / TREE, others=others, **common)
     return out
+
+
+def watch_of(fly: FlyConfig, watch: Watch) -> Watch:
+    """Return the limits of workers: one whose policy Python cannot interrupt is stopped, and its episode has failed."""
+    if fly.engine != "policy" or watch.item_limit_s is not None:
+        return watch
+    return replace(watch, item_limit_s=fly.answer_limit_s + STEP_S, retries=0)
 
 
 def finish_episodes(

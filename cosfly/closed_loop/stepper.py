@@ -23,7 +23,7 @@ from cosfly.formats.weather import WeatherParams
 from cosfly.geometry.axes import step_s, wrap_deg
 from cosfly.geometry.kernels import swept_distances
 from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M
-from cosfly.render.contract import Frame
+from cosfly.render.contract import Frame, Renderer
 from cosfly.render.perturbation import PerturbedTrack, Poses, Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import make_track_script, renderer_of
@@ -32,7 +32,7 @@ from cosfly.render.weather import read_pools, weather_of
 
 RATE_HZ = 20.0  # of the autopilot
 LEAVES_M = 100.0  # farther outside the map's bounds the drone has left the map
-AREA_M = 420.0  # side of the area that is lit at once
+AREA_M = 420.0  # side of the area that is lit at once; a smaller map is lit once
 AREA_STEP_M = 200.0  # spacing of such areas
 
 
@@ -46,17 +46,19 @@ class Airspace:
     """A map with its renderer and obstacles. One per process, used from one thread."""
 
     def __init__(
-        self, cfg: RenderConfig, boxes: BoxMap, simplified: BoxMap, *, seed: int = 0, num_others: int = 0
-    ) -> None:
+        self, cfg: RenderConfig, boxes: BoxMap, simplified: BoxMap, *, seed: int = 0, num_others: int = 0,
+        like: Airspace | None = None,
+    ) -> None:  # fmt: skip
         """
         Args:
             boxes: The map that is drawn.
             simplified: The map whose boxes are obstacles.
             num_others: Number of ids that the bystanders of an episode need at most.
+            like: One of another map with the same settings, whose renderer's device is shared.
         """
         self.cfg = as_drawn(cfg, seed).model_copy(update={"first_timestamp": cfg.first_timestamp or 0})
         self.seed = seed
-        self.renderer = renderer_of(cfg, boxes, num_others)
+        self.renderer: Renderer = renderer_of(cfg, boxes, num_others, None if like is None else like.renderer)
         self.pools = read_pools(cfg)
         self.surroundings = Surroundings(simplified)
         self.ground = simplified.ground
@@ -72,10 +74,11 @@ class Airspace:
 
     def light(self, targets_m: np.ndarray, weather: WeatherParams | None) -> None:
         """Prepare the renderer for a pedestrian trajectory."""
-        middle = np.array(self.area_of(targets_m))
+        low, high = self.bounds_m
+        is_small = (high - low)[:2].max() <= AREA_M
+        middle = (low + high)[:2] / 2.0 if is_small else np.array(self.area_of(targets_m))
         key = (*middle, None if weather is None else weather.model_dump_json())
         if key != self._lit:
-            low, high = self.bounds_m
             half = AREA_M / 2.0
             self.renderer.prepare(np.append(middle - half, low[2]), np.append(middle + half, high[2]), weather)
             self._lit = key
@@ -146,12 +149,15 @@ class ClosedLoopTrajectory:
         turned_deg = wrap_deg(flown.rotations_deg[last, 1] - flown.rotations_deg[last - 1, 1])
         self.yaw_rate_degps = float(turned_deg) / self.dt_s
 
-    def reset(self) -> tuple[Moment, ...]:
-        """Start from the beginning; return the lead frames, whose last one is the present frame."""
+    def reset(self, num_drawn: int | None = None) -> tuple[Moment, ...]:
+        """Start from the beginning; return the last `num_drawn` lead frames (None: all) up to the present one."""
         self._begin()
+        first = 0 if num_drawn is None else self.num_lead - num_drawn
         steps = np.diff(self.poses.positions_m[: self.num_lead], axis=0) / self.dt_s
         velocities = [steps[0], *steps]
-        return tuple(self._drawn(i, velocities[i], float(self.poses.clearances_m[i])) for i in range(self.num_lead))
+        return tuple(
+            self._drawn(i, velocities[i], float(self.poses.clearances_m[i])) for i in range(first, self.num_lead)
+        )
 
     def step(self, command: np.ndarray) -> Moment:
         """Fly a command, (5,) as ACTION in the level axes of the present frame; return the next frame."""

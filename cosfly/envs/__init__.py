@@ -14,6 +14,8 @@ except ImportError as error:
     fix = 'pip install "cosfly[envs]"'
     raise EnvironmentMissing("Gymnasium is not installed", got=str(error), fix=fix) from None
 
-for _name in TASKS:
-    if _name not in gymnasium.registry:
-        gymnasium.register(_name, entry_point="cosfly.envs.follow:FollowEnv", kwargs={"task": _name})
+_FLAT = {"observation": "flat", "size_px": (96, 54)}  # for trainers that take one array
+for _task in TASKS:
+    for _name, _fixed in ((_task, {}), (_task.replace("-v0", "Flat-v0"), _FLAT)):
+        if _name not in gymnasium.registry:
+            gymnasium.register(_name, entry_point="cosfly.envs.follow:FollowEnv", kwargs={"task": _task, **_fixed})

@@ -16,9 +16,11 @@ import numpy as np
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.bystanders import Bystander
+from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import walk_id
 from cosfly.formats.traces import DroneTrace
-from cosfly.geometry.kernels import BoxIndex, obstacle_index
+from cosfly.geometry.axes import intrinsic_matrix, project, world_from_camera
+from cosfly.geometry.kernels import BoxIndex, obstacle_index, visibility
 from cosfly.maps.synthetic import PRESETS, SyntheticConfig, load
 from cosfly.pedestrians.bystanders import bystanders_of
 from cosfly.pedestrians.lanes import Lane, lanes_of
@@ -42,6 +44,7 @@ FOV_DEG = 60.0
 NUM_DECISIONS = 80  # 40 s
 LEAD_FRAMES = 21  # of the plan, as in `fly.lead_frames`
 AFTER_LOSS = 3  # frames without visibility before a policy takes over
+EACH = 4  # every fourth start of an episode and every fourth of its frames is tried
 TURNED_DEG = (60.0, 300.0)  # initial turn away from the target
 TRIES = 40  # pedestrian trajectories until one can be an episode
 PACE = {"walk": 0.4, "stop_and_look": 0.2, "hurry": 0.1, "fits_and_starts": 0.2, "turn_back": 0.1}
@@ -73,7 +76,7 @@ HELD_OUT = {
 }
 TRAINING = tuple(
     BenchmarkTown(f"Training_{preset}_{seed}", preset, seed)
-    for preset in PRESETS if preset != "small_town" for seed in range(7_001, 7_009)
+    for seed in range(7_001, 7_009) for preset in PRESETS if preset != "small_town"
 )  # fmt: skip
 
 
@@ -104,7 +107,7 @@ def episode_id(town: str, number: int) -> str:
     return f"{town}_{walk_id(number)}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BenchmarkWorld:
     """A town with all that its episodes need."""
 
@@ -115,6 +118,7 @@ class BenchmarkWorld:
     lanes: list[Lane]
     obstacles: BoxIndex
     screens: BoxIndex
+    solids: BoxIndex  # that are drawn, without plants, whose foliage has gaps
 
     @property
     def sha256(self) -> str:
@@ -122,16 +126,16 @@ class BenchmarkWorld:
         parts = (self.boxes.centers, self.boxes.half_extents, self.boxes.rotations_deg, self.boxes.kinds)
         return sha256_bytes(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
 
-    def airspace(self, task: str, size_px: tuple[int, int] = SIZE_PX) -> Airspace:
-        """Open a renderer for a task."""
+    def airspace(self, task: str, size_px: tuple[int, int] = SIZE_PX, like: Airspace | None = None) -> Airspace:
+        """Open a renderer for a task; like: another town of this task and size, which shares its GL context."""
         num_others = TASKS[task].others + TASKS[task].traffic
         cfg = RenderConfig(width_px=size_px[0], height_px=size_px[1], fovs_deg=(FOV_DEG,))
-        return Airspace(cfg, self.boxes, self.simplified, seed=self.town.seed, num_others=num_others)
+        return Airspace(cfg, self.boxes, self.simplified, seed=self.town.seed, num_others=num_others, like=like)
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=len(HELD_OUT) + len(TRAINING))
 def world_of(town: BenchmarkTown) -> BenchmarkWorld:
-    """Build a town; the last ones are cached."""
+    """Build a town, once per process."""
     boxes = load(SyntheticConfig(name=town.name, preset=town.preset), town.seed)
     simplified = simplify(boxes, SimplifyConfig()).box_map
     return BenchmarkWorld(
@@ -142,6 +146,7 @@ def world_of(town: BenchmarkTown) -> BenchmarkWorld:
         lanes=lanes_of(simplified),
         obstacles=obstacle_index(simplified),
         screens=screens_of(simplified),
+        solids=obstacle_index(boxes.select(~boxes.is_any_of({KINDS["Vegetation"]}))),
     )
 
 
@@ -161,8 +166,30 @@ class BenchmarkEpisode:
         return ClosedLoopTrajectory(airspace, self.plan, number=self.number, num_lead=self.num_lead, others=self.others)
 
 
+def hardest_begin(plan: DroneTrace, solids: BoxIndex) -> tuple[int, float]:
+    """Return where an episode begins: a drone that hovers after the lead frames sees the target in the fewest frames.
+
+    Returns:
+        A point of the plan, and that share of the episode's frames.
+    """
+    intrinsic = intrinsic_matrix(*SIZE_PX, FOV_DEG)
+    found = 0, 1.0
+    for begin in range(0, len(plan.time_s) - LEAD_FRAMES - NUM_DECISIONS + 1, EACH):
+        now = begin + LEAD_FRAMES - 1
+        frames = np.arange(now, now + NUM_DECISIONS + 1, EACH)
+        camera_m = plan.positions_m[now]
+        pixels, _ = project(plan.targets_m[frames], world_from_camera(camera_m, plan.rotations_deg[now]), intrinsic)
+        targets_m = plan.targets_m[frames[((pixels >= 0) & (pixels < SIZE_PX)).all(axis=1)]]
+        seen = visibility(solids, np.broadcast_to(camera_m, targets_m.shape), targets_m) > 0.0
+        share = np.count_nonzero(seen) / len(frames)
+        if plan.visibility[now] >= 0.5 and share < found[1]:
+            found = begin, share
+    return found
+
+
+@lru_cache(maxsize=256)
 def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisode | None:
-    """Return the episode of a town's trajectory; None if the trajectory or its plan is unsuitable."""
+    """Return the episode of a town's trajectory; None if it or its plan is unsuitable. The last ones are cached."""
     cfg = TASKS[task]
     town = world.town
     name = walk_id(number)
@@ -172,24 +199,30 @@ def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisod
         plan = plan_trajectory(target, world.obstacles, planning, town.seed, world.screens)
     except NoPathError:
         return None
+    if plan.drop_reason is not None or len(plan.time_s) < LEAD_FRAMES + NUM_DECISIONS:
+        return None
+    begin = 0
     num_lead = LEAD_FRAMES
     rotations_deg = plan.rotations_deg.copy()
     if task == REACQUIRES:
         dt_s = float(plan.time_s[1])
         lost = None if plan.instead_of else first_loss(plan.visibility, dt_s, AFTER_LOSS * dt_s)
         if lost is not None and lost + AFTER_LOSS > LEAD_FRAMES // 2:
-            num_lead = lost + AFTER_LOSS
+            num_lead = min(lost + AFTER_LOSS, LEAD_FRAMES)
+            begin = lost + AFTER_LOSS - num_lead
         else:
             rotations_deg[:num_lead, 1] += float(rng_for(town.seed, "reacquire", name).uniform(*TURNED_DEG))
-    if plan.drop_reason is not None or len(plan.time_s) < num_lead + NUM_DECISIONS:
+    else:
+        begin = hardest_begin(plan, world.solids)[0]
+    if len(plan.time_s) < (end := begin + num_lead + NUM_DECISIONS):
         return None
-    end = num_lead + NUM_DECISIONS
-    plan = replace(plan, rotations_deg=rotations_deg).until(end)
+    plan = replace(plan.part(number, begin, end), rotations_deg=rotations_deg[begin:end])
+    plan = replace(plan, time_s=plan.time_s - plan.time_s[0])
     bystanders = tuple[Bystander, ...]()
     if cfg.has_others:
         rng = rng_for(town.seed, "pedestrians", f"{name}/others")
         bystanders = tuple(
-            replace(other, positions_m=other.positions_m[:end], headings_rad=other.headings_rad[:end])
+            replace(other, positions_m=other.positions_m[begin:end], headings_rad=other.headings_rad[begin:end])
             for other in bystanders_of(target, world.ground, world.lanes, cfg, rng).others
         )
     return BenchmarkEpisode(task, world, number, plan, num_lead, bystanders)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+import contextlib
+from collections.abc import Sequence
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -15,10 +17,17 @@ from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, Moment
 from cosfly.envs import episodes as benchmark
 from cosfly.envs.episodes import SIZE_PX, BenchmarkEpisode, world_of
 from cosfly.formats.captions import TOKENS
+from cosfly.formats.people import COLORS, FIGURES, GARMENTS, Appearance
 from cosfly.render.contract import FAR_M
 from cosfly.runtime.errors import ConfigError, InputError
 
 GOAL_CHARACTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ -,"
+OBSERVATIONS = ("words", "numbers", "flat")
+LOOKS: dict[str, list[str]] = {
+    name: [*(FIGURES if name == "figure" else GARMENTS.get(name, ("", *COLORS)))]
+    for name in Appearance.__dataclass_fields__
+}
+TOWNS = tuple(range(8))  # one training town of each preset
 FULL_REWARD_M = 35.0  # greatest distance from drone to target with full reward
 NO_REWARD_M = 70.0  # least distance without reward
 CRASH_REWARD = -10.0
@@ -36,6 +45,11 @@ def reward_of(now: Moment, ended: str | None) -> float:
     return share if now.target.visible else 0.0
 
 
+def looks_numbers(looks: Appearance) -> np.ndarray:
+    """Return the index in LOOKS of each field of an appearance, (9,) int64."""
+    return np.array([LOOKS[name].index(value) for name, value in vars(looks).items()])
+
+
 class FollowEnv(gymnasium.Env):
     """One drone and one pedestrian; a step is 0.5 s.
 
@@ -46,24 +60,35 @@ class FollowEnv(gymnasium.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012
 
     def __init__(
-        self, task: str, *, actions: str = "decisions", episodes: str = "train", depth: bool = False,
-        size_px: tuple[int, int] = SIZE_PX, render_mode: str | None = None,
+        self, task: str, *, actions: str = "decisions", observation: str = "words", episodes: str = "train",
+        towns: Sequence[int] = TOWNS, depth: bool = False, size_px: tuple[int, int] = SIZE_PX,
+        render_mode: str | None = None,
     ) -> None:  # fmt: skip
         """
         Args:
             actions: decisions or velocities.
+            observation: words; numbers, where the goal is `looks_numbers`; or flat, one array of all of it, 0 to 1.
             episodes: With train, reset chooses a random town and trajectory. Otherwise the name of a list, from which
                 reset takes options["episode"] or a random one.
+            towns: Indices of the training towns that reset chooses from. Each stays in memory once it is seen.
             depth: Add the depth image to observations.
             size_px: Width and height of the pictures.
         """
-        if actions not in ("decisions", "velocities"):
-            problem = "the argument `actions` has an unknown value"
-            raise ConfigError(problem, where=task, got=actions, expected="`decisions` or `velocities`")
+        for name, value, choices in (
+            ("actions", actions, ("decisions", "velocities")), ("observation", observation, OBSERVATIONS),
+        ):  # fmt: skip
+            if value not in choices:
+                problem = f"the argument `{name}` has an unknown value"
+                raise ConfigError(problem, where=task, got=value, expected=f"one of {', '.join(choices)}")
+        if not towns or not {*towns} <= {*range(len(benchmark.TRAINING))}:
+            problem = "the argument `towns` is not a list of indices of training towns"
+            expected = f"at least one number from 0 to {len(benchmark.TRAINING) - 1}"
+            raise ConfigError(problem, where=task, got=repr(towns)[:80], expected=expected)
         self.task = task
         self.size_px = (size_px[0], size_px[1])
         self.has_depth = depth
         self.render_mode = render_mode
+        self.towns = tuple(towns)
         self.listed = None if episodes == "train" else benchmark.read_list(f"{task}/{episodes}")[1]
         self.drone = Drone()
         self._controls = read_controls(CONTROLLER_FILE, TOKENS)
@@ -77,12 +102,19 @@ class FollowEnv(gymnasium.Env):
         }
         if depth:
             observed["depth"] = spaces.Box(0.0, FAR_M, (height_px, width_px), np.float32)
-        self.observation_space = spaces.Dict(observed)
-        self._airspace: Airspace | None = None
+        if observation != "words":
+            observed["goal"] = spaces.MultiDiscrete([len(choices) for choices in LOOKS.values()])
+        self._seen = spaces.Dict(observed)
+        self._flat = None
+        self.observation_space: spaces.Space = self._seen
+        if observation == "flat":
+            self._flat = cast(spaces.Box, spaces.flatten_space(self._seen))
+            self.observation_space = spaces.Box(0.0, 1.0, self._flat.shape)
+        self._airspaces = dict[str, Airspace]()  # of the towns seen so far, in one GL context
         self._episode: BenchmarkEpisode | None = None
         self._simulation: ClosedLoopTrajectory | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
         """Start an episode: that of index options["episode"] in the list, or a random one."""
         super().reset(seed=seed)
         if self.listed is not None:
@@ -108,7 +140,7 @@ class FollowEnv(gymnasium.Env):
                     fix="choose another options['episode']",
                 )
         else:
-            world = world_of(benchmark.TRAINING[int(self.np_random.integers(len(benchmark.TRAINING)))])
+            world = world_of(benchmark.TRAINING[self.towns[int(self.np_random.integers(len(self.towns)))]])
             numbers = self.np_random.integers(100_000, size=benchmark.TRIES).tolist()
             if not any(self._begin(benchmark.episode_of(self.task, world, number)) for number in numbers):
                 problem = (
@@ -123,21 +155,29 @@ class FollowEnv(gymnasium.Env):
         """Start an episode; return whether it suits the task: only with REACQUIRES the target is hidden at first."""
         if episode is None:
             return False
-        if self._airspace is None or self._episode is None or self._episode.world is not episode.world:
-            self.close()
-            self._airspace = episode.world.airspace(self.task, self.size_px)
+        world = episode.world
+        if world.town.name not in self._airspaces:
+            like = next(iter(self._airspaces.values()), None)
+            self._airspaces[world.town.name] = world.airspace(self.task, self.size_px, like)
         self._episode = episode
-        self._simulation = episode.simulation(self._airspace)
-        self._now = self._simulation.reset()[-1]
+        self._simulation = episode.simulation(self._airspaces[world.town.name])
+        [self._now] = self._simulation.reset(num_drawn=1)
         self._controller = Controller(self._controls, self.drone, self._now)
         return self._now.target.visible != (self.task == benchmark.REACQUIRES)
 
-    def step(self, action: Any) -> tuple[dict, float, bool, bool, dict]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
         """Fly an action for 0.5 s; an episode that crashed or left the map is terminated, a finished one truncated."""
         if self._simulation is None or self._simulation.ended is not None:
             raise InputError("no episode is running", where=self.task, fix="call reset before step")
-        if not self.action_space.contains(action):
-            got, expected = repr(action)[:120], repr(self.action_space)
+        space = self.action_space
+        with contextlib.suppress(TypeError, ValueError):  # of what is no number
+            value = np.asarray(action)
+            if isinstance(space, spaces.Box):
+                action = value.astype(space.dtype)
+            elif value.size == 1 and np.issubdtype(value.dtype, np.integer):
+                action = value.reshape(())[()]
+        if not space.contains(action):
+            got, expected = repr(action)[:120], repr(space)
             raise InputError(
                 "the action is not in the action space of the environment", where=self.task, got=got, expected=expected
             )
@@ -150,9 +190,16 @@ class FollowEnv(gymnasium.Env):
         reward = reward_of(self._now, ended)
         return self._observation(), reward, ended in ("crashed", "left"), ended == "finished", self._info()
 
-    def _observation(self) -> dict[str, Any]:
+    def _observation(self) -> Any:
         assert self._simulation is not None
-        return observe(self._simulation, self._now, depth=self.has_depth)
+        seen = observe(self._simulation, self._now, depth=self.has_depth)
+        if not isinstance(self._seen["goal"], spaces.Text):
+            seen["goal"] = looks_numbers(self._simulation.script.clothes.looks)
+        if self._flat is None:
+            return seen
+        low, high = self._flat.low, self._flat.high
+        values = cast(np.ndarray, spaces.flatten(self._seen, seen))
+        return ((values - low) / (high - low)).astype(np.float32)
 
     def _info(self) -> dict[str, Any]:
         """Return measures of the present frame, which a policy must not use."""
@@ -160,7 +207,7 @@ class FollowEnv(gymnasium.Env):
         assert self._simulation is not None
         now = self._now
         return {
-            "episode": benchmark.episode_id(self._episode.world.town.name, self._episode.number),
+            "episode_id": benchmark.episode_id(self._episode.world.town.name, self._episode.number),
             "ended": self._simulation.ended or "",
             "in_view": now.target.in_view,
             "visible": now.target.visible,
@@ -176,7 +223,7 @@ class FollowEnv(gymnasium.Env):
 
     def close(self) -> None:
         """Close the renderer."""
-        if self._airspace is not None:
-            self._airspace.renderer.close()
-        self._airspace = None
+        for airspace in self._airspaces.values():
+            airspace.renderer.close()
+        self._airspaces.clear()
         self._simulation = None

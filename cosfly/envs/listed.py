@@ -7,7 +7,7 @@ from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
 
-from cosfly.closed_loop.stage import ClosedLoopConfig, EpisodeRunner, finish_episodes
+from cosfly.closed_loop.stage import ClosedLoopConfig, EpisodeRunner, finish_episodes, watch_of
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory
 from cosfly.envs import episodes as benchmark
 from cosfly.runtime.errors import InputError
@@ -38,7 +38,7 @@ def run(
                 items.append(Item(f"{town} {batch[0]}", (town, batch), benchmark.NUM_DECISIONS * len(batch)))
         num_workers = 1 if cfg.fly.asks_model else workers
         worker_args = (cfg, stage.path, seed, num_workers)
-        run_items(stage, items, make_worker, worker_args, workers=num_workers, watch=watch)
+        run_items(stage, items, make_worker, worker_args, workers=num_workers, watch=watch_of(cfg.fly, watch))
         finish_episodes(stage, cfg.fly, seed, [benchmark.episode_id(*episode) for episode in episodes])
     return out
 

@@ -94,10 +94,14 @@ class DroneTrace:
         """Return the excerpt that determines its appearance as trajectory `number` of a run."""
         return self.part_of or Excerpt(self.path_id, number, self.targets_m[:1])
 
-    def until(self, end: int) -> DroneTrace:
-        """Return the trajectory before point `end`, without segments and mission."""
-        cut = {name: getattr(self, name)[:end] for name in (*ARRAYS, "clearances_m")}
+    def until(self, end: int, begin: int = 0) -> DroneTrace:
+        """Return the trajectory from point `begin` to before point `end`, without segments and mission."""
+        cut = {name: getattr(self, name)[begin:end] for name in (*ARRAYS, "clearances_m")}
         return replace(self, **cut, segments=(), mission=None)
+
+    def part(self, number: int, begin: int, end: int) -> DroneTrace:
+        """Return the points from `begin` to before `end`, which look as they do in trajectory `number` of a run."""
+        return replace(self.until(end, begin), part_of=Excerpt(self.path_id, number, self.targets_m[: begin + 1]))
 
     def every(self, stride: int) -> DroneTrace:
         """Return every `stride`-th point; each clearance is the least one up to the next point."""

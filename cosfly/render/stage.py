@@ -71,8 +71,11 @@ def open_renderer(
     return renderer(box_map, width_px, height_px, look or Look(), num_others, **options)
 
 
-def renderer_of(cfg: RenderConfig, box_map: BoxMap, num_others: int = 0) -> Renderer:
-    """Open the renderer that the settings ask for."""
+def renderer_of(cfg: RenderConfig, box_map: BoxMap, num_others: int = 0, like: Renderer | None = None) -> Renderer:
+    """Open the renderer of the settings; like: one of another map with these settings, whose device it shares if it
+    can."""
+    if with_map := getattr(like, "with_map", None):
+        return with_map(box_map)
     settings = getattr(cfg, cfg.backend, None)
     return open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look, num_others, settings)
 

@@ -5,6 +5,7 @@ One pass draws colour, z-depth (float32, metres) and kind with instance id.
 
 from __future__ import annotations
 
+import copy
 import weakref
 from typing import Any
 
@@ -53,8 +54,8 @@ class GlRenderer:
         self._release.atexit = False
         driver = (str(self.context.info[f"GL_{name}"]) for name in ("VENDOR", "RENDERER", "VERSION"))
         self.device = ", ".join(("EGL", *driver))
+        self._opened_by: GlRenderer | None = None
         self._is_software = SOFTWARE in self.device
-        self.scene = build_scene(box_map, num_others)
         self.look = look
         self.num_others = num_others
         self.width_px, self.height_px = width_px, height_px
@@ -65,13 +66,6 @@ class GlRenderer:
             self._depth = context.texture(size, 1, dtype="f4")
             self._tags = context.texture(size, 1, dtype="u4")
             self._image = context.framebuffer([self._color, self._depth, self._tags], context.depth_renderbuffer(size))
-            self._shadow = context.depth_texture((SHADOW_SIZE_PX, SHADOW_SIZE_PX))
-            self._shadow.compare_func = "<="
-            self._shadow_target = context.framebuffer(depth_attachment=self._shadow)
-            self._height = context.texture((HEIGHT_SIZE_PX, HEIGHT_SIZE_PX), 1, dtype="f4")
-            self._height.filter = (context.NEAREST, context.NEAREST)  # it is smooth already, and this is faster
-            for texture in (self._shadow, self._height):
-                texture.repeat_x = texture.repeat_y = False
             all_meshes = meshes.all_meshes()
             self._meshes = [
                 (context.buffer(mesh.vertices.tobytes()), context.buffer(mesh.triangles.tobytes()))
@@ -80,12 +74,38 @@ class GlRenderer:
             self._num_triangles = [len(mesh.triangles) for mesh in all_meshes]
             self._num_waiting = 0
             self._arrays: dict[tuple[int, int], tuple[Any, Any]] = {}  # made when needed
-            self._loose = LooseBuffers(context, self.scene.loose)
             texts = programs.sources(("part.glsl", "depth.vert.glsl"), ("depth.frag.glsl",))
             self._depth_program = context.program(*texts)
             self._looks: dict[str | None, tuple[Programs, Any, WeatherPass | None]] = {}
             self._use_weather(None)
+        self._open_map(box_map)
         self.prepare(*self.scene.bounds())
+
+    def with_map(self, box_map: BoxMap) -> GlRenderer:
+        """Return a renderer of another map with the GL context and the programs of this one; `prepare` it first.
+
+        Closing one of them closes all.
+        """
+        other = copy.copy(self)
+        other._opened_by = self  # whose end releases the context
+        other._looks = {None: self._looks[None]}  # the others are prepared for a map
+        other._open_map(box_map)
+        return other
+
+    def _open_map(self, box_map: BoxMap) -> None:
+        """Build the scene of a map, and textures for its shadows and heights."""
+        context = self.context
+        self.scene = build_scene(box_map, self.num_others)
+        with context:
+            self._loose = LooseBuffers(context, self.scene.loose)
+            self._shadow = context.depth_texture((SHADOW_SIZE_PX, SHADOW_SIZE_PX))
+            self._shadow.compare_func = "<="
+            self._shadow_target = context.framebuffer(depth_attachment=self._shadow)
+            self._height = context.texture((HEIGHT_SIZE_PX, HEIGHT_SIZE_PX), 1, dtype="f4")
+            self._height.filter = (context.NEAREST, context.NEAREST)  # it is smooth already, and this is faster
+            for texture in (self._shadow, self._height):
+                texture.repeat_x = texture.repeat_y = False
+        self._area: dict[str, Any] = {}  # uniforms of what `prepare` computed
 
     def _use_weather(self, define: str | None) -> None:
         """Switch to the programs of fair weather (None), or of a weather with these defines."""
@@ -170,9 +190,8 @@ class GlRenderer:
         self._draw_depth(self._shadow_target, clip_from_world, casting)
         to_texture = np.diag([0.5, 0.5, 0.5, 1.0])
         to_texture[:3, 3] = 0.5
-        for program in (*self._programs.materials, *self._programs.near_movers):
-            set_uniform(program, "shadow_from_world", to_texture @ clip_from_world)
-            set_uniform(program, "shadow_texel_m", 2.2 * half / SHADOW_SIZE_PX)
+        self._area["shadow_from_world"] = to_texture @ clip_from_world
+        self._area["shadow_texel_m"] = 2.2 * half / SHADOW_SIZE_PX
 
     def _prepare_openness(self, casting: np.ndarray, top: float, middle: np.ndarray, half: float) -> None:
         """Draw a blurred height map from above: higher objects nearby darken a point. top: no caster is higher."""
@@ -196,8 +215,7 @@ class GlRenderer:
         heights = np.minimum(heights, base + TALLEST_AMBIENT_M).astype(np.float32)
         heights = cv2.GaussianBlur(heights, (0, 0), max(AMBIENT_BLUR_M / pixel_m, 0.5))
         self._height.write(np.ascontiguousarray(heights).tobytes())
-        for program in (*self._programs.materials, *self._programs.near_movers):
-            set_uniform(program, "height_area", np.array([*low, 0.5 / half, 0.5 / half]))
+        self._area["height_area"] = np.array([*low, 0.5 / half, 0.5 / half])
 
     def _draw_depth(self, target: Any, clip_from_world: np.ndarray, rows: np.ndarray) -> None:
         target.use()
@@ -274,6 +292,7 @@ class GlRenderer:
             "height_map": 1,
             "sky_depth_m": SKY_DEPTH_M,
             "sky_tag": KINDS["Sky"],
+            **self._area,
             **of_weather,
         }
 
