@@ -2,24 +2,28 @@
 
 import csv
 import json
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from commands import invoke
 from pydantic import ValidationError
 from tables import each
 from teacher_server import TeacherServer
 
+from cosfly.maps.footprints import rectangle_polygon
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import read_json, read_model
 from cosfly.runtime.run_dir import read_manifest
+from cosfly.worldgen.patterns import PATTERNS
 from cosfly.worldgen.plan import OBJECTS, PLAN_FORMAT, WorldPlan
 from cosfly.worldgen.rules import plan_by_rules
 from cosfly.worldgen.stage import WorldConfig, check_world, run
-from cosfly.worldgen.town import build
+from cosfly.worldgen.town import build, of_kinds
 
 PROMPTS = list(csv.DictReader(Path(__file__).with_name("world_prompts.tsv").open(), delimiter="\t"))
 COUNTS = {"two": 2, "three": 3, "twelve": 12}
@@ -72,11 +76,12 @@ def test_any_plan_that_can_be_gives_a_world_and_says_what_it_lacks():
     for _ in range(25):
         low, span = rng.uniform(3, 200), rng.uniform(0, 100)
         values = {
-            "blocks_along": int(rng.integers(2, 5)), "block_m": rng.uniform(36, 120), "street_m": rng.uniform(12, 40),
-            "avenue_m": rng.uniform(12, 60), "unevenness": rng.uniform(0, 0.3), "gap_m": rng.uniform(0.5, 40),
+            "pattern": str(rng.choice(list(PATTERNS))), "size_m": [None, (170.0, 250.0)][rng.integers(2)],
+            "blocks_along": int(rng.integers(2, 5)), "block_m": rng.uniform(36, 120), "street_m": rng.uniform(5, 40),
+            "avenue_m": rng.uniform(5, 60), "unevenness": rng.uniform(0, 0.3), "gap_m": rng.uniform(0.5, 40),
             "setback_m": rng.uniform(0, 15), "heights_m": (low, low + span), "trees_per_ha": (0.0, rng.uniform(0, 200)),
             "footprint_m": (6.0, rng.uniform(6, 120)), "river_m": rng.choice([0.0, 30.0]), "bridges": int(rng.integers(4)),
-            "shore_m": rng.choice([0.0, 60.0]), "lanes": bool(rng.integers(2)), "plazas": int(rng.integers(2)),
+            "shore_m": rng.choice([0.0, 60.0]), "plazas": int(rng.integers(2)),
             "objects": [{"name": str(name), "count": 2} for name in rng.choice(list(OBJECTS), 5, replace=False)],
         }  # fmt: skip
         try:
@@ -99,10 +104,88 @@ def test_what_a_prompt_says_there_is_none_of_is_not_there():
     assert [one.name for one in by_rules("a village, no fountain but a well").objects] == ["well"]
 
 
-@each("prompt", ["asdf qwer zxcv", "一个带喷泉的小村庄", "42"])
-def test_a_prompt_of_which_nothing_can_be_read_is_refused_in_words(prompt):
-    with pytest.raises(InputError, match=r"rule-based planner recognises no word.*expected an English.*--planner URL"):
+@each("prompt", ["asdf qwer zxcv", "42", "嗡嗡嗡"])
+def test_a_prompt_of_which_nothing_can_be_read_is_refused_in_its_language(prompt):
+    english = r"rule-based planner recognises no word.*expected an English or Chinese.*--planner URL"
+    with pytest.raises(InputError, match="认不出.*小村庄.*--planner URL" if prompt == "嗡嗡嗡" else english):
         by_rules(prompt)
+
+
+@each(
+    "prompt, pattern, settlement",
+    [
+        ("Manhattan with wide avenues", "grid", "downtown"),
+        ("a city with 6 avenues that meet at a roundabout", "radial", "city"),
+        ("an old town of narrow winding streets", "organic", "old town"),
+        ("a hamlet along a country road", "linear", "village"),
+        ("a university with footpaths between lawns", "campus", "campus"),
+        ("棋盘式的城市", "grid", "city"),
+        ("以环岛为中心的放射状小镇", "radial", "town"),
+        ("古城, 街道狭窄弯曲", "organic", "old town"),
+        ("公路边带状的村庄", "linear", "village"),
+        ("大学校园, 草坪之间有小路", "campus", "campus"),
+    ],
+)
+def test_the_words_of_a_prompt_choose_the_street_pattern_and_the_settlement(prompt, pattern, settlement):
+    plan, trace = plan_by_rules(prompt, 0)
+    assert (plan.pattern, trace["settlement"]) == (pattern, settlement)
+
+
+@each("prompt", [
+    "a suburb of 12 detached houses with two fountains, 300 m x 200 m, no building higher than 8 m, streets 12 m wide",
+    "郊区, 十二栋独立住宅, 两座喷泉, 300米乘200米, 没有高于8米的建筑, 街宽12米",
+])  # fmt: skip
+def test_numbers_and_sizes_of_a_prompt_are_respected(prompt):
+    plan, trace = plan_by_rules(prompt, 0)
+    town = build(plan, "W", 0)
+    assert town.built == {"house": 12}
+    assert [one.name for one in town.placed] == ["fountain"] * 2
+    assert town.size_m == (300.0, 200.0)
+    assert np.ptp(town.boxes.bounds(), axis=0)[:2] == pytest.approx([300.0, 200.0], abs=0.5)
+    assert town.boxes.maxs[of_kinds(town.boxes, "Buildings"), 2].max() <= 8.0
+    assert {street.width_m for street in town.network.streets} <= {12.0, plan.avenue_m}
+    assert (trace["not_used"], trace["not_respected"]) == ([], [])
+    assert all(one["is_met"] for one in check_world(town, plan) if one["check"].startswith(("number", "highest")))
+
+
+def test_what_is_not_respected_is_named_in_the_report_and_in_one_line(tmp_path, caplog):
+    prompt = "an airport with a control tower, 90 detached houses, 100 m x 100 m, streets 2 m wide, a purple windmill"
+    run(WorldConfig(prompt=prompt), tmp_path / "w")
+    checks = read_json(tmp_path / "w/checks.json", what="checks")
+    assert checks["words_not_used"] == ["airport", "control tower", "purple"]
+    assert checks["not_respected"] == ["street width, m: 2 is said, 5 is possible"]
+    assert [one["is_met"] for one in checks["checks"] if one["check"] == "number of houses"] == [False]
+    (line,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert all(name in line for name in ("airport, control tower", "street width", "number of houses"))
+    assert plan_by_rules(prompt, 0)[0].heights_m[1] < 20.0  # a control tower makes no city of towers
+
+
+def test_patterns_and_seeds_give_different_plans():
+    """The share of ground that is street in both of two towns, of that which is in one, stays below 0.6."""
+
+    def streets_of(pattern: str | None, seed: int):
+        plan = by_rules("a town") if pattern else plan_by_rules("a town", seed)[0]
+        plan = plan.model_copy(update={"pattern": pattern or plan.pattern, "size_m": (300.0, 300.0)})
+        town = build(plan, "W", seed)
+        named = {one["check"]: one["is_met"] for one in check_world(town, plan)}
+        assert named["overlapping buildings"]
+        assert named["buildings without a pavement"]
+        yaws = town.layout.rotations_deg[of_kinds(town.layout, "Buildings"), 1] % 90
+        is_square = bool((np.minimum(yaws, 90 - yaws) < 1e-6).all())
+        assert is_square == (plan.pattern == "grid")
+        return shapely.union_all(
+            [
+                rectangle_polygon(street.rectangle((0.0, street.length_m), (-8.0, 8.0)))
+                for street in town.network.streets
+            ]
+        )
+
+    areas = [streets_of(pattern, 0) for pattern in PATTERNS]
+    areas += [streets_of("grid", seed) for seed in (1, 2)] + [streets_of(None, seed) for seed in range(3)]
+    for one, other in combinations(areas[:-3], 2):
+        assert one.intersection(other).area < 0.6 * one.union(other).area
+    for one, other in combinations(areas[-3:], 2):
+        assert one.intersection(other).area < 0.6 * one.union(other).area
 
 
 PLANNED = {
@@ -148,6 +231,8 @@ def test_worlds_go_on_to_releases_with_the_settings_that_are_told(tmp_path, in_t
         result = invoke("run", [folder / "loop.yaml", *told], f"--seed {5 + number} --out", [run_folder])
         assert result.exit_code == 0, result.output
         assert read_manifest(run_folder / "render").counts.kept == 2
+        report = read_json(run_folder / "pedestrians/pedestrians_report.json", what="report")
+        assert report["total"]["on_carriageway_share"] <= 0.02
         assert (run_folder / "release/dataset/README.md").is_file()
         assert (run_folder / "viewer.html").is_file()
         assert f"seed: {5 + number}\n" in (run_folder / "run.yaml").read_text()

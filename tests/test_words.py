@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-USER_WORDS = "cosfly/worldgen/rules.py"  # it recognizes words of a prompt
+USER_WORDS = "cosfly/worldgen/words.yaml"  # the words of prompts
 TO_REWRITE = ("distill/", "docs/", "tests/", "CHANGELOG.md", "CONTRIBUTING.md", "README.md")
 
 VERBS = frozenset(

@@ -36,9 +36,11 @@ BACKEND = SettingOption("render.backend", "Renderer: gl, pyrender, carla or unre
 )
 def world(
     job: Job,
-    prompt: Annotated[str, Argument(help="The world, in plain English.")],
+    prompt: Annotated[str, Argument(help="The world, in plain English or Chinese.")],
     out: Annotated[Path | None, Option(show_default="worlds/<prompt>-<time>", help="New folder.")] = None,
-    count: Annotated[int, Option(min=1, max=1000, help="Number of worlds, each with its own seed.")] = 1,
+    count: Annotated[
+        int, Option(min=1, max=1000, help="Number of worlds, each with its own seed, pattern and sizes.")
+    ] = 1,
 ) -> None:
     """Make a world from text: SimWorld's combined_world.json of the town that a prompt describes."""
     from cosfly.runtime.config import build

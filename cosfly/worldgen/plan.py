@@ -5,23 +5,19 @@ Source: app:simworld:step1, the structured high-level plan.
 
 from __future__ import annotations
 
-import math
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from cosfly.maps.synthetic import MIN_BLOCK_M, VERGE_M, TownPlan
-from cosfly.maps.town_blocks import Lots, Range
 from cosfly.runtime.config import read_yaml
 from cosfly.runtime.json_io import FileFormat, Record
 
-PLAN_FORMAT = FileFormat("cosfly.world_plan", "1", "plan of a world")
+PLAN_FORMAT = FileFormat("cosfly.world_plan", "2", "plan of a world")
 
-OPEN_SHARE = 0.45  # share of an open block that objects may fill
-SPACE_M = 4.0  # free ground around each object
-EDGE_M = 14.0  # width of both edges of an open block together, which hold its trees
+VERGE_M = 10.0  # of lawn around the town
+PATH_M = 4.0  # width of a footpath
 LOW_PART_M = 3.0  # parts of a quay that begin above this height are over the water
 
 
@@ -71,7 +67,19 @@ class NamedObject(Record):
     """An object of the table, and how many of it."""
 
     name: str = Field(description="a name of the object table")
-    count: int = Field(1, ge=1, le=60)
+    count: int = Field(1, ge=1, le=500)
+
+
+Range = tuple[float, float]
+
+
+class Buildings(Record):
+    """Buildings of one kind. count: how many; null: as many of them as there is room for."""
+
+    name: str = Field(description="what they are called, such as warehouse")
+    count: int | None = Field(None, ge=1, le=1000)
+    footprint_m: Range = Field((12.0, 30.0), description="sides of buildings")
+    heights_m: Range = Field((8.0, 24.0), description="heights of buildings")
 
 
 class WorldPlan(BaseModel):
@@ -79,48 +87,63 @@ class WorldPlan(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    blocks_along: int = Field(4, ge=2, le=9, description="building blocks along each side of the town")
-    block_m: float = Field(60.0, ge=36.0, le=180.0, description="mean side of a block")
-    street_m: float = Field(16.0, ge=12.0, le=40.0, description="streets, from front to front")
-    avenue_m: float = Field(24.0, ge=12.0, le=60.0, description="the two widest streets")
+    pattern: Literal["grid", "radial", "organic", "linear", "campus"] = Field(
+        "grid",
+        description="streets: grid; radial (avenues from a middle, rings); organic (winding); linear (one long road, "
+        "along a river or shore if there is one); campus (a ring road, footpaths over lawns)",
+    )
+    size_m: Range | None = Field(
+        None, description="the town from west to east and from south to north, 80 to 2000; null: as its blocks need"
+    )
+    blocks_along: float = Field(4.0, ge=1.0, le=9.0, description="blocks along each side of a town without size_m")
+    block_m: float = Field(60.0, ge=30.0, le=180.0, description="mean side of a block")
+    street_m: float = Field(16.0, ge=5.0, le=40.0, description="streets, from front to front; below 9 without cars")
+    avenue_m: float = Field(24.0, ge=5.0, le=60.0, description="main streets, from front to front")
+    spokes: int = Field(0, ge=0, le=16, description="avenues of a radial town; 0: 5 to 8")
     unevenness: float = Field(0.1, ge=0.0, le=0.3, description="how much the sides of blocks differ")
-    footprint_m: Range = Field((12.0, 30.0), description="sides of buildings")
-    heights_m: Range = Field((8.0, 24.0), description="heights of buildings")
+    buildings: list[Buildings] = Field([], max_length=12, description="kinds of buildings that the user names")
+    only_these: bool = Field(False, description="there are no buildings but those of `buildings` and `objects`")
+    footprint_m: Range = Field((12.0, 30.0), description="sides of other buildings")
+    heights_m: Range = Field((8.0, 24.0), description="heights of other buildings")
+    highest_m: float | None = Field(None, ge=3.0, le=450.0, description="no building is higher; null: no limit")
     high_center: bool = Field(False, description="the highest buildings stand in the middle")
-    building_share: Range = Field((0.15, 0.45), description="ground that buildings cover, of the town without water")
+    building_share: Range = Field((0.0, 0.8), description="ground that buildings cover, of the town without water")
     gap_m: float = Field(3.0, ge=0.5, le=40.0, description="between neighbouring buildings")
     setback_m: float = Field(1.0, ge=0.0, le=15.0, description="from pavement to front; from 2.5 on there are gardens")
     trees_per_ha: Range = Field((10.0, 60.0), description="trees on a hectare of the town without water")
     plazas: int = Field(1, ge=0, le=20, description="paved open blocks")
     greens: int = Field(1, ge=0, le=40, description="blocks that are lawn with trees")
-    lanes: bool = Field(False, description="blocks are terraces with narrow lanes, as in an old town")
     river_m: float = Field(0.0, ge=0.0, le=100.0, description="width of a river; 0: none")
-    bridges: int = Field(0, ge=0, le=10, description="bridges over the river; 0: one at each street")
+    bridges: int = Field(0, ge=0, le=10, description="bridges over the river; 0: one to four")
     shore_m: float = Field(0.0, ge=0.0, le=300.0, description="open water at the south edge; 0: none")
     parked_share: float = Field(0.25, ge=0.0, le=1.0, description="share of parking places that are taken")
     objects: list[NamedObject] = Field([], max_length=40, description="what the prompt names, each once")
-    not_in_table: list[str] = Field([], max_length=100, description="what it names and the object table lacks")
+    not_used: list[str] = Field([], max_length=200, description="words of the prompt that no other field holds")
 
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
         limits = {"footprint_m": (6.0, 120.0), "heights_m": (3.0, 450.0), "building_share": (0.0, 0.8)}
-        for name, (least, most) in (limits | {"trees_per_ha": (0.0, 400.0)}).items():
-            low, high = getattr(self, name)
+        ranges = [(name, getattr(self, name), limit) for name, limit in limits.items()]
+        ranges.append(("trees_per_ha", self.trees_per_ha, (0.0, 400.0)))
+        for group in self.buildings:
+            ranges += [(f"{name} of {group.name}", getattr(group, name), limits[name]) for name in list(limits)[:2]]
+        for name, (low, high), (least, most) in ranges:
             if not least <= low <= high <= most:
                 raise ValueError(
                     f"{name} is {low:g} to {high:g}, but must lie within {least:g} to {most:g}, the lower value first"
                 )
-        if self.plazas + self.greens >= self.blocks_along**2:
-            raise ValueError(
-                f"no block is left for buildings, because {self.plazas} plazas and {self.greens} green blocks take all "
-                f"{self.blocks_along**2} blocks"
-            )
-        narrowest_m = self.block_m * (1.0 - self.unevenness) / (1.0 + self.unevenness)
-        if narrowest_m < MIN_BLOCK_M + 1.0 or self.setback_m > narrowest_m / 5:
-            expected = f"at least {MIN_BLOCK_M + 1.0:g} m and at least five times setback_m"
-            fix = "raise block_m, or lower unevenness or setback_m"
-            raise ValueError(f"the narrowest block is {narrowest_m:.1f} m wide, but must be {expected}; {fix}")
+        if self.size_m and not 80.0 <= min(self.size_m) <= max(self.size_m) <= 2000.0:
+            raise ValueError(f"size_m is {self.size_m[0]:g} x {self.size_m[1]:g}, but must lie within 80 to 2000")
+        if self.size_m and self.river_m > min(self.size_m) / 3:
+            raise ValueError(f"river_m is {self.river_m:g}, but must be at most a third of the town's side")
         return self
+
+    def kinds_of_buildings(self) -> list[Buildings]:
+        """Return the kinds of buildings to build: the counted ones first, then those that take the remaining lots."""
+        ordinary = Buildings(name="building", footprint_m=self.footprint_m, heights_m=self.heights_m)
+        fill = [group for group in self.buildings if group.count is None]
+        counted = [group for group in self.buildings if group.count is not None]
+        return counted + (fill or ([] if self.only_these else [ordinary]))
 
     def known_objects(self) -> list[tuple[Object, int]]:
         """Return the named objects of the table with their counts, summed over equal names."""
@@ -132,53 +155,4 @@ class WorldPlan(BaseModel):
     def unknown_objects(self) -> list[str]:
         """Return the names of objects that the table lacks, as often as they are counted."""
         unknown = [named for named in self.objects if named.name not in OBJECTS]
-        return [named.name for named in unknown for _ in range(named.count)] + self.not_in_table
-
-
-def town_plan(plan: WorldPlan) -> TownPlan:
-    """Return the plan for the town generator, with enough open blocks, and large enough ones, for the objects."""
-    block_m = plan.block_m
-    along = plan.blocks_along
-    placed = [(thing, count) for thing, count in plan.known_objects() if thing.where == "open"]
-    for thing, _ in placed:
-        block_m = max(block_m, min(max(thing.size_m) * thing.least_scale + EDGE_M + 4.0, 150.0))
-    narrowest = block_m * (1.0 - plan.unevenness) / (1.0 + plan.unevenness)
-    room = OPEN_SHARE * (narrowest - EDGE_M) ** 2
-    needed = sum(
-        count * math.prod(side * thing.least_scale + SPACE_M for side in thing.size_m) for thing, count in placed
-    )
-    num_open = max(plan.plazas + plan.greens, int(-(-needed // room)))
-    while num_open > along**2 // 2 and along < 9:
-        along += 1
-    plazas = max(plan.plazas, num_open - plan.greens)
-    shares = {"lanes" if plan.lanes else "lots": along**2 - plazas - plan.greens, "plaza": plazas, "green": plan.greens}
-    streets_m = along * plan.street_m + max(plan.avenue_m, plan.river_m)
-    tree_share = 0.4 if plan.trees_per_ha[1] < 25 else 0.9
-    if plan.trees_per_ha[1] < 3:
-        tree_share = 0.0
-    return TownPlan(
-        size_m=block_m * along + streets_m + 2 * VERGE_M, num_blocks=along, street_m=plan.street_m,
-        boulevard_m=plan.avenue_m, unevenness=plan.unevenness, center="plaza" if plazas else None,
-        blocks={block: float(share) for block, share in shares.items() if share > 0}, river_m=plan.river_m,
-        bridges=plan.bridges, shore_m=plan.shore_m, parked_share=plan.parked_share, tree_parts=False,
-        tree_share=tree_share,
-        lots=Lots(
-            footprints_m=_footprints(plan), heights_m=plan.heights_m, gap_m=plan.gap_m, setback_m=plan.setback_m,
-            fall_m=0.5 * (block_m + plan.street_m) * along if plan.high_center else 0.0,
-        ),
-    )  # fmt: skip
-
-
-def _footprints(plan: WorldPlan) -> tuple[Range, ...]:
-    """Return the footprints of SimWorld's buildings in a plan's range; if fewer than four fit, scale all into it."""
-    low, high = plan.footprint_m
-    sizes = [(size[0], size[1]) for name, size in assets().items() if name.startswith("BP_Building")]
-    fitting = [size for size in sizes if low <= min(size) and max(size) <= high]
-    if len(fitting) >= 4:
-        return tuple(fitting)
-    slim = sorted(size for size in sizes if max(size) / min(size) < 2.2)
-    longest = [low + (high - low) * k / (len(slim) - 1) for k in range(len(slim))]
-    return tuple(
-        (round(x * side / max(x, y), 1), round(max(low * 0.6, y * side / max(x, y)), 1))
-        for (x, y), side in zip(slim, longest, strict=True)
-    )
+        return [named.name for named in unknown for _ in range(named.count)]

@@ -1,4 +1,7 @@
-"""The embedded planner: reads a prompt by tables of words, without a model. English only.
+"""The embedded planner: reads an English or Chinese prompt by tables of words, without a model.
+
+What is read is taken out of the text, so that the rest are the words that were not used. Chinese is first turned into
+this English, word by word.
 
 Source: an alternative to the language model of app:simworld:step1 where no endpoint is given.
 """
@@ -13,151 +16,385 @@ from typing import Any
 from cosfly.runtime.config import read_yaml
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.seeding import rng_for
-from cosfly.worldgen.plan import OBJECTS, NamedObject, WorldPlan
+from cosfly.worldgen.plan import OBJECTS, WorldPlan
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
+
 
 WORDS = read_yaml(Path(__file__).with_name("words.yaml"))
-KNOWN = {
-    *(word for name in ("ordinary", "open", "water", "sized") for word in WORDS[name]),
-    *(word for table in (WORDS["settlements"], *WORDS["groups"].values())
-      for entry in table.values() for word in entry["words"].split()),
-}  # fmt: skip
-NUMBERS = {word: number for number, word in enumerate(WORDS["numbers"], 1)}
-ARTICLES = {"a", "an", "the", "its", "some", "several"}
-_STOPS = re.compile(
-    r"\b(?:and|or|with|of|on|in|at|by|along|around|round|near|beside|between|to|from|for|over|through|without|under|is|are|has|have"
-    r"|it|there|where|that|which|them|stands?|surrounded|lined)\b|[,.;:()]"
+STOPS, ORDINARY = set(_words(WORDS["stops"])), set(_words(WORDS["ordinary"]))
+LIMITS = (
+    ("blocks_along", 2.0, 9.0), ("block_m", 30.0, 180.0), ("gap_m", 0.5, 40.0), ("street_m", 5.0, 40.0),
+    ("avenue_m", 5.0, 60.0), ("parked_share", 0.0, 0.9),
 )  # fmt: skip
-_PHRASE = rf"(?:(?!{_STOPS.pattern}|\b(?:but|no)\b).)+"
-_WITHOUT = re.compile(rf"\b(?:no|without(?: any)?)\s+({_PHRASE}(?:\b(?:or|nor)\b{_PHRASE})*)")  # "no fountain or well"
-_HEIGHTS = re.compile(r"\b(?:between|from)\s+(\d+)\s*(?:m\b)?\s*(?:and|to)\s+(\d+)\s*(?:m|metres?|meters?)\b")
 SEVERAL = 4  # objects of a plural without a number
+STOREY_M = 3.2
+LOW_TOWN_M = 16.0  # highest building of a town without high-rises
+DEEP = 2.4  # depth of a linear town of a given length, in blocks
+_NUMBER, _LENGTH = r"(\d+(?:\.\d+)?)", r"(km|kilomet(?:er|re)s?|m|metres?|meters?)\b"
+_HEIGHT = rf"{_NUMBER}[ -]?(m|metres?|meters?|floors?|storeys?|stor(?:y|ies)|levels?)\b(?! (?:wide|long|x|by))"
+_HIGH = r"(?: high| tall| in height)?"
+_STREET = r"\b(street|road|lane|alley|avenue)s?"
+_LIMITS = {  # of the heights of buildings
+    "most": r"(?:(?:no|none|not|nothing)(?: \w+)?(?: is| are)? (?:higher|taller|more|over|above)(?: than)?|under|below"
+            rf"|at most|up to|max(?:imum)?\.?(?: height)?(?: of)?|limited to) {_HEIGHT}{_HIGH}",
+    "most_too": rf"{_HEIGHT}{_HIGH},? (?:at most|or less|or lower|maximum|at the most)",
+    "between": rf"(?:\b(?:between|from) )?\b{_NUMBER} ?(?:m|metres?|meters?)? ?(?:and|to|-) {_HEIGHT}{_HIGH}",
+    "least": rf"(?:at least|more than|over|above|minimum) {_HEIGHT}{_HIGH}",
+    "exactly": rf"{_HEIGHT}{_HIGH}",
+}  # fmt: skip
+_SIZES = {
+    "sides": rf"{_NUMBER} ?(?:{_LENGTH})? ?(?:x|×|by|times) ?{_NUMBER} ?{_LENGTH}",
+    "square": rf"{_NUMBER} ?{_LENGTH} (?:square\b|across|on (?:a|each) side)",
+    "area": rf"{_NUMBER} ?(km2|km²|square kilomet(?:er|re)s?|sq\.? ?km|hectares?|ha|m2|m²|square met(?:er|re)s)(?!\w)",
+    "length": rf"{_NUMBER} ?{_LENGTH} long\b",
+}
+_CHINESE = re.compile(r"[\u4e00-\u9fff]")
+_DIGITS = {character: value for value, character in enumerate("零一二三四五六七八九")} | {"两": 2}
+_UNITS = {"十": 10, "百": 100, "千": 1000}
 
 
 def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
-    """Read a prompt; return the plan, and the trace: the choice for each property.
+    """Read a prompt; return the plan, and the trace: what was read as what, and what was not respected.
 
-    The seed varies unspecified sizes, by up to a tenth.
+    The seed chooses the street pattern and sizes that the prompt does not name.
     """
-    text = prompt.lower().replace("’", "'")
-    trees = r"\b(no|without(?: any)?|few|many|hardly any|lots of) (trees|vegetation|greenery)"
-    text = re.sub(trees, lambda m: f"{re.sub('^without.*', 'no', m[1])}-trees".replace(" ", "-"), text)
-    text = re.sub(r"\bgarden city\b", "garden-city", text)
-    without = " ".join(_WITHOUT.findall(text))
-    text = _WITHOUT.sub(" , ", text)
-    objects, remaining_text = _find_objects(text)
-    words = re.findall(r"[a-z][a-z'-]*", remaining_text)
-    not_in_table = _find_unknown(remaining_text)
-    if not (objects or not_in_table or without or set(words) & KNOWN):
-        raise InputError(
-            "the rule-based planner recognises no word of this prompt", where="PROMPT", got=repr(prompt[:60]),
-            expected="an English description, such as 'a small village with a church'",
-            fix="name a kind of place, or use a language model with --planner URL",
-        )  # fmt: skip
-    settlements = WORDS["settlements"]
-    kind = next((name for name, entry in settlements.items() if set(entry["words"].split()) & set(words)), "town")
-    trace: dict[str, Any] = {"planner": "rules", "settlement": kind, "objects": {w.name: w.count for w in objects}}
-    plan = WorldPlan().model_dump() | {name: value for name, value in settlements[kind].items() if name != "words"}
-    for group, choice in _choices(remaining_text).items():
-        trace[group] = choice
-        for name, factor in WORDS["groups"][group][choice].items():
-            if name != "words":
-                plan[name] = _scaled(plan[name], factor)
-    for name in ("blocks_along", "block_m", "gap_m"):
-        plan[name] = _scaled(plan[name], rng_for(seed, "world", name).uniform(0.92, 1.08))
-    if heights := _HEIGHTS.search(prompt.lower()):
-        plan["heights_m"] = float(heights[1]), float(heights[2])
-        if not 3 <= plan["heights_m"][0] <= plan["heights_m"][1] <= 450:
-            expected = "a lowest and a highest height, within 3 to 450 m"
-            what = "the range of building heights is impossible"
-            raise InputError(what, where="PROMPT", got=heights[0], expected=expected)
-    plan |= _open_and_water(words, objects, plan)
-    if without:
-        trace["without"] = without
+    return _Reader(prompt).read(seed)
+
+
+class _Reader:
+    """Reads one prompt. text: what is not read yet; plan: fields of the plan, found so far."""
+
+    def __init__(self, prompt: str) -> None:
+        self.prompt = prompt
+        self.plan: dict[str, Any] = WorldPlan().model_dump()
+        self.not_used: list[str] = []
+        self.not_respected: list[str] = []
+        self.chinese = dict[str, str]()  # the words of a Chinese prompt by their English
+        text = prompt.lower().replace("’", "'")
+        if _CHINESE.search(text):
+            text = self._in_english(text)
+        for word in sorted(WORDS["numbers"], key=len, reverse=True):
+            text = re.sub(rf"\b{word}\b", str(WORDS["numbers"][word]), text)
+        for plain, pattern in (("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"(?<!\d )\bhotels\b")):
+            text = re.sub(pattern, plain, text)
+        text = re.sub(r"\b([2-9]0)[- ]([1-9])\b", lambda match: str(int(match[1]) + int(match[2])), text)
+        amount = (
+            r"\b(no|without(?: any)?|few|many|hardly any|almost no|lots of|plenty of) (trees|vegetation|greenery|cars)"
+        )
+        self.text = " " + re.sub(rf"{amount}\b", self._amount, text) + " "
+
+    @staticmethod
+    def _amount(match: re.Match[str]) -> str:
+        word = "trees" if match[2] != "cars" else "cars"
+        much = {"without": "no", "without any": "no", "almost no": "few", "plenty of": "lots-of"}.get(
+            match[1], match[1]
+        )
+        return f"{much} {word}".replace(" ", "-") if (much, word) != ("no", "cars") else "no cars"
+
+    def _in_english(self, text: str) -> str:
+        """Return a Chinese text as English words in the order of the Chinese; unknown characters stay."""
+
+        def number(match: re.Match[str]) -> str:
+            total = digit = 0
+            for character in match[0]:
+                if character in _UNITS:
+                    total, digit = total + max(1, digit) * _UNITS[character], 0
+                digit = _DIGITS.get(character, digit)
+            return str(total + digit)
+
+        def word(match: re.Match[str]) -> str:
+            english = words.get(match[0], "")
+            self.chinese.setdefault(english.strip(), match[0])
+            return f" {english} "
+
+        measures = WORDS["chinese_measures"]
+        for many, about in (("几百|数百|上百", "200"), ("几十|数十", "30"), ("几|数", "4")):
+            text = re.sub(rf"(?:{many})(?=[{measures}])", about, text)
+        text = re.sub(rf"[零一二两三四五六七八九十百千]+(?=[{measures}米公顷平到至])", number, text)
+        for pattern, english in WORDS["chinese_rules"]:
+            text = re.sub(pattern.replace("N", _NUMBER), english, text)
+        text = re.sub(rf"(\d) *[{measures}]", r"\1 ", text)
+        words = {name: english for english, names in WORDS["chinese_words"].items() for name in names.split()}
+        words |= dict.fromkeys(WORDS["chinese_particles"].split(), "")
+        text = re.sub("|".join(sorted(words, key=len, reverse=True)), word, text)
+        return re.sub(r"\s+", " ", re.sub("[，。；、：！？（）]", " , ", text))
+
+    # --- what is taken from the text ---
+
+    def _take(self, pattern: str, keep: str = ",") -> re.Match[str] | None:
+        """Return the first match of a pattern, and put `keep` in its place."""
+        if match := re.search(pattern, self.text):
+            self.text = f"{self.text[: match.start()]} {match.expand(keep)} {self.text[match.end() :]}"
+        return match
+
+    def _take_words(self, words: str) -> None:
+        """Take all of some words, singular or plural."""
+        for word in sorted(_words(words), key=len, reverse=True):
+            while self._take(rf"(?<![\w-]){re.escape(word)}s?(?![\w-])"):
+                pass
+
+    def _take_counted(self, word: str, *, needs_number: bool = False) -> tuple[int | None, bool] | None:
+        """Take a noun with its number; return the number, and whether it is a plural. Adjectives between them stay."""
+        plural = f"{word[:-1]}ies" if re.search("[^aeiou]y$", word) else f"{word}(?:e?s)?"
+        stops = "|".join(sorted(STOPS, key=len, reverse=True))
+        number = rf"(?:\b(\d+) ((?:(?!(?:{stops}) )[a-z-]+ ){{0,3}}?)){'' if needs_number else '?'}"
+        match = self._take(rf"{number}\b({word}|{plural})\b(?!-)", keep=r", \2 ,")
+        return match and (int(match[1]) if match[1] else None, match[3] != word)
+
+    def read(self, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
+        """Return the plan and the trace."""
+        before = self.text
+        sizes = {name: match for name, pattern in _SIZES.items() if (match := self._take(pattern))}
+        widths = [match for pattern in (
+            rf"{_STREET}(?: (?:width|are|is|of))* {_NUMBER} ?{_LENGTH}(?: wide| in width)?",
+            rf"{_NUMBER} ?{_LENGTH}[- ]wide {_STREET}",
+        ) if (match := self._take(pattern))]  # fmt: skip
+        limits = {name: match for name, pattern in _LIMITS.items() if (match := self._take(pattern))}
+        without = ""
+        while match := self._take(r"\b(?:no|without(?: any)?)\s+((?:(?! (?:but|and|with) )[^.,;:()])+)"):
+            without += f"{match[1]} "
+        objects = self._objects()
+        lacking = [match[0] for word in _words(WORDS["lacking"]) if (match := self._take(rf"(?:\b\d+ )?\b{word}s?\b"))]
+        self.not_used += [self._said(phrase) for phrase in lacking]
+        pattern = next((name for name, words in WORDS["patterns"].items() if self._has(words)), None)
+        kind = next((name for name, entry in WORDS["settlements"].items() if self._has(entry["words"])), None)
+        buildings = self._buildings()
+        implied = [WORDS["buildings"][one["name"]].get("implies") for one in buildings if one["count"] != 1]
+        place = kind or next(filter(None, implied), "town")
+        entry = WORDS["settlements"][place]
+        self.plan |= {name: value for name, value in entry.items() if name in self.plan}
+        choices = self._choices()
+        for group, choice in choices.items():
+            for name, factor in WORDS["groups"][group][choice].items():
+                if name != "words":
+                    self.plan[name] = _scaled(self.plan[name], factor)
+        self._set_open_and_water(objects)
+        for words in (entry["words"], WORDS["settlements"]["city"]["words"], WORDS["settlements"]["town"]["words"],
+                      WORDS["patterns"].get(pattern, "")):  # fmt: skip
+            self._take_words(words)
+        if not (self.text != before or without):
+            self._refuse()
+        self.plan["pattern"] = pattern or entry["patterns"][seed % len(entry["patterns"])]
+        self._set_buildings(buildings, entry, choices)
+        for name, low, high in (("blocks_along", 0.92, 1.08), ("block_m", 0.85, 1.2), ("gap_m", 0.92, 1.08)):
+            self.plan[name] = _scaled(self.plan[name], rng_for(seed, "world", name).uniform(low, high))
+        self._set_heights(limits, without)
+        self._set_widths(widths)
+        self._set_size(sizes)
         if re.search(r"\b(?:cars?|vehicles?|traffic)\b", without):
-            plan["parked_share"] = 0.0
-    if "tower" in " ".join(words) and kind not in ("downtown", "high-rise city"):
-        plan["heights_m"] = (plan["heights_m"][0], max(plan["heights_m"][1], 48.0))
-    if re.search(r"\b(?:towers|high-rises|skyscrapers) in the (?:cent|middle)", text):
-        plan["high_center"] = True
-        plan["heights_m"] = (min(plan["heights_m"][0], 8.0), plan["heights_m"][1])
-    least = math.ceil(math.sqrt(2 * (plan["plazas"] + plan["greens"])))  # half of the blocks are built on
-    plan["blocks_along"] = int(min(9, max(2, least, round(plan["blocks_along"]))))
-    plan["gap_m"] = max(0.5, plan["gap_m"])
-    plan |= {"objects": [named.model_dump() for named in objects], "not_in_table": not_in_table}
-    return WorldPlan.model_validate(plan), trace | {"not_in_table": not_in_table}
+            self.plan["parked_share"] = 0.0
+        self.not_used += self._left_over()
+        for name, low, high in LIMITS:
+            self.plan[name] = min(high, max(low, self.plan[name]))
+        self.plan |= {"objects": [{"name": name, "count": count} for name, count in objects.items()]}
+        plan = WorldPlan.model_validate(self.plan | {"not_used": self.not_used})
+        trace = {
+            "planner": "rules", "settlement": place, "settlement_is_named": bool(kind or any(implied)),
+            "pattern": plan.pattern, "pattern_is_named": pattern is not None, "objects": objects, "without": without,
+            **choices,
+            "not_used": self.not_used, "not_respected": self.not_respected,
+        }  # fmt: skip
+        return plan, trace
+
+    def _refuse(self) -> None:
+        """Raise the error of a prompt of which nothing is read, in its language."""
+        what = "the rule-based planner recognises no word of this prompt"
+        expected = "an English or Chinese description, such as 'a small village with a church'"
+        fix = "name a kind of place, or use a language model with --planner URL"
+        if _CHINESE.search(self.prompt):
+            what, expected = "内置规则认不出这段描述中的任何词", "对城镇的描述, 例如 '有一座教堂的小村庄'"
+            fix = "写出地点的类型, 或用 --planner URL 指定语言模型"
+        raise InputError(what, where="PROMPT", got=repr(self.prompt[:60]), expected=expected, fix=fix)
+
+    def _has(self, words: str) -> bool:
+        return any(re.search(rf"(?<![\w-]){re.escape(word)}s?(?![\w-])", self.text) for word in _words(words))
+
+    def _said(self, phrase: str) -> str:
+        """Return a phrase in the language of the prompt."""
+        phrase = phrase.strip()
+        return self.chinese.get(re.sub(r"^\d+ ", "", phrase), phrase)
+
+    def _objects(self) -> dict[str, int]:
+        """Take the objects of the table, the longest names first; return their counts."""
+        objects: dict[str, int] = {}
+        names = {word: thing.name for thing in OBJECTS.values() for word in (thing.name, *thing.words)}
+        for word in sorted(names, key=len, reverse=True):
+            while found := self._take_counted(word):
+                count = found[0] or (SEVERAL if found[1] else 1)
+                objects[names[word]] = self._within(f"number of {names[word]}s", count, 1, 500)
+        return dict(sorted(objects.items()))
+
+    def _buildings(self) -> list[dict[str, Any]]:
+        """Take the kinds of buildings; return them with their counts, null for a plural without a number."""
+        names = {word: name for name, entry in WORDS["buildings"].items() for word in [*_words(entry["words"]), name]}
+        found: dict[str, int | None] = {}
+        for word in sorted(names, key=len, reverse=True):
+            name = names[word]
+            while counted := self._take_counted(word, needs_number=name == "building"):
+                count = counted[0] or (0 if counted[1] else 1)
+                if count := count + (found.get(name) or 0):
+                    count = self._within(f"number of {name}s", count, 1, 1000)
+                found[name] = count or None
+        return [{"name": name, "count": count} for name, count in found.items()]
+
+    def _choices(self) -> dict[str, str]:
+        """Take the choice of the text in each group; words of size count only in phrases about the settlement."""
+        chosen: dict[str, str] = {}
+        ends = "with|of|and|around|in|by|on|at|along|near|between|to|from|for|over|through"
+        phrases = re.split(rf"[.,;:()]|(?<![\w-])(?:{ends})(?![\w-])", self.text)
+        sized = [
+            phrase for phrase in phrases if re.search(rf"\b(?:{'|'.join(_words(WORDS['sized']))})\b|-scale", phrase)
+        ]
+        for group, entries in WORDS["groups"].items():
+            text = " , ".join(sized if group == "size" else phrases)
+            found = {
+                choice: word for choice, entry in entries.items() for word in _words(entry["words"])
+                if re.search(rf"(?<![\w-]){word}(?![\w-])", text)
+            }  # fmt: skip
+            if len(found) > 1:
+                got = " and ".join(repr(self._said(word)) for word in found.values())
+                what = f"two words about {group} contradict each other"
+                raise InputError(what, where="PROMPT", got=got, fix="use only one of these words")
+            if found:
+                chosen[group] = next(iter(found))
+                self._take_words(entries[chosen[group]]["words"])
+        return chosen
+
+    def _set_open_and_water(self, objects: dict[str, int]) -> None:
+        """Take words of open blocks and of water; objects in the water need some too."""
+        for word, (field, wide) in WORDS["water"].items():
+            if self._has(word):
+                self.plan[field] = wide
+        for word, field in WORDS["open"].items():
+            if counted := self._take_counted(word):
+                most = 20 if field == "plazas" else 40
+                number = counted[0] or (3 if counted[1] and word not in ("garden", "lawn") else 1)
+                self.plan[field] = max(self.plan[field], self._within(f"number of {word}s", number, 1, most))
+        self._take_words(",".join(WORDS["water"]))
+        if "bridge" in objects:
+            self.plan["bridges"] = self._within("number of bridges", objects["bridge"], 1, 10)
+            self.plan["river_m"] = self.plan["river_m"] or WORDS["water"]["river"][1]
+        places = {OBJECTS[name].where for name in objects}
+        if "quay" in places or ("water" in places and not self.plan["river_m"]):
+            self.plan["shore_m"] = self.plan["shore_m"] or 90.0
+
+    def _set_buildings(self, buildings: list[dict[str, Any]], entry: dict[str, Any], choices: dict[str, str]) -> None:
+        """Set the kinds of buildings. Where one that the settlement consists of is counted, there are no others."""
+        factor = WORDS["groups"]["height"].get(choices.get("height"), {}).get("heights_m", 1.0)
+        for one in buildings:
+            of = WORDS["buildings"][one["name"]]
+            one["footprint_m"] = of.get("footprint_m", self.plan["footprint_m"])
+            one["heights_m"] = _scaled(of["heights_m"], factor) if "heights_m" in of else self.plan["heights_m"]
+            is_main = not of.get("landmark") or one["name"] in _words(entry.get("of", ""))
+            if one["count"] is not None and is_main and (one["count"] > 1 or len(buildings) == 1):
+                self.plan["only_these"] = True
+        if any(one["count"] is None for one in buildings):
+            self.plan["only_these"] = False
+        self.plan["buildings"] = buildings
+
+    def _set_heights(self, limits: dict[str, re.Match[str]], without: str) -> None:
+        """Set the heights of all kinds of buildings to those of the prompt."""
+        high: float | None = None
+        low = 0.0
+        for name, match in limits.items():
+            number, unit = match.groups()[-2:]
+            factor = 1.0 if unit.startswith("m") else STOREY_M
+            value = float(number) * factor
+            if name == "least":
+                low = value
+            else:
+                high = value
+            if name in ("between", "exactly"):
+                low = (
+                    float(match[1]) * factor
+                    if name == "between"
+                    else value - (0.8 if factor == 1.0 else 0.9 * STOREY_M)
+                )
+        if high is None and re.search(r"\b(?:high|tall|towers?|skyscrapers?)", without):
+            high = LOW_TOWN_M
+        if high is not None and not 3.0 <= max(low, 3.0) <= high <= 450.0:
+            got = " ".join(match[0].strip() for match in limits.values())
+            expected = "a lowest and a highest height, within 3 to 450 m"
+            raise InputError("the range of building heights is impossible", where="PROMPT", got=got, expected=expected)
+        self.plan["highest_m"] = high
+        for one in (self.plan, *self.plan["buildings"]):
+            least, most = one["heights_m"]
+            most = min(most if high is None or "between" not in limits else high, high or 450.0)
+            least = max(low, min(least, 0.6 * most if high else least), 3.0)
+            one["heights_m"] = (min(least, 450.0), max(most, 1.2 * least if low and high is None else least))
+        if re.search(r"\b(?:towers|high-rises|skyscrapers) in the (?:cent|middle)", self.prompt.lower()):
+            self.plan["high_center"] = True
+            self.plan["heights_m"] = (min(self.plan["heights_m"][0], 8.0), self.plan["heights_m"][1])
+
+    def _set_widths(self, widths: list[re.Match[str]]) -> None:
+        """Set the widths of streets to those of the prompt."""
+        for match in widths:
+            street, number, unit = match.groups() if match[1].isalpha() else (match[3], match[1], match[2])
+            field = "avenue_m" if street == "avenue" else "street_m"
+            wide_m = self._within(
+                f"{street} width, m", float(number) * _metres(unit), 5.0, 60.0 if field == "avenue_m" else 40.0
+            )
+            if field == "street_m":
+                wider = 1.0 if self.plan["pattern"] == "linear" else self.plan["avenue_m"] / self.plan["street_m"]
+                self.plan["avenue_m"] = wide_m * wider
+            self.plan[field] = wide_m
+
+    def _set_size(self, sizes: dict[str, re.Match[str]]) -> None:
+        """Set the size of the town to that of the prompt."""
+        pitch_m = self.plan["block_m"] + self.plan["street_m"]
+        for name, match in sizes.items():
+            if name == "sides":
+                unit = _metres(match[4])
+                sides = float(match[1]) * (_metres(match[2]) if match[2] else unit), float(match[3]) * unit
+            elif name == "area":
+                unit = 1e6 if re.search("k", match[2]) else 1e4 if match[2].startswith("h") else 1.0
+                sides = (math.sqrt(float(match[1]) * unit),) * 2
+            else:
+                side = float(match[1]) * _metres(match[2])
+                depth_m = (
+                    side
+                    if name == "square"
+                    else max(100.0, DEEP * pitch_m)
+                    if self.plan["pattern"] == "linear"
+                    else 0.7 * side
+                )
+                sides = (side, depth_m)
+            self.plan["size_m"] = tuple(self._within("size of the town, m", side, 80.0, 2000.0) for side in sides)
+            self.plan["river_m"] = min(self.plan["river_m"], min(self.plan["size_m"]) / 4)
+        streets = self._take(r"\b(\d+) (?:[a-z-]+ )?(avenue|boulevard|spoke|street|road)s?\b", keep=r" , \2 ,")
+        if streets and self.plan["pattern"] == "radial":
+            self.plan["spokes"] = self._within(f"number of {streets[2]}s", int(streets[1]), 3, 16)
+        elif streets:
+            self.not_used.append(self._said(streets[0]))
+
+    def _within(self, what: str, value: Any, low: Any, high: Any) -> Any:
+        """Return a value within what is possible; record one that is not."""
+        possible = min(high, max(low, value))
+        if possible != value:
+            self.not_respected.append(f"{what}: {value:g} is said, {possible:g} is possible")
+        return possible
+
+    def _left_over(self) -> list[str]:
+        """Return the phrases that are left in the text."""
+        phrases = []
+        for part in re.split(r"[.,;:()!?|'\"]", self.text):
+            phrase = list[str]()
+            for word in [*part.split(), "the"]:
+                if word in STOPS or word in ORDINARY or word.removesuffix("s") in ORDINARY:
+                    if phrase and phrase != ["1"]:
+                        phrases.append(self._said(" ".join(phrase)))
+                    phrase = []
+                elif word != "1" or phrase:
+                    phrase.append(word)
+        return phrases
+
+
+def _metres(unit: str) -> float:
+    return 1000.0 if unit.startswith("k") else 1.0
 
 
 def _scaled(value: Any, factor: float) -> Any:
     return tuple(round(v * factor, 2) for v in value) if isinstance(value, tuple | list) else round(value * factor, 2)
-
-
-def _find_objects(text: str) -> tuple[list[NamedObject], str]:
-    """Find the objects of the table, the longest names first; return also the rest of the text."""
-    objects: dict[str, NamedObject] = {}
-    names = {word: thing.name for thing in OBJECTS.values() for word in (thing.name, *thing.words)}
-    numbers = "|".join([*NUMBERS, *ARTICLES, r"\d+"])
-    for word in sorted(names, key=len, reverse=True):
-        plural = f"{word[:-1]}ies" if word.endswith("y") else f"{word}(?:e?s)?"
-        pattern = re.compile(rf"\b(?:({numbers})\s+(?:[a-z-]+\s+)??)?({word}|{plural})\b(?!-)")
-        while match := pattern.search(text):
-            number = match[1] or ""
-            is_plural = match[2] != word
-            if names[word] == "hotel" and is_plural and not number:
-                break  # hotels are ordinary buildings
-            count = SEVERAL if is_plural else 1
-            if number in NUMBERS or number.isdigit():
-                count = min(60, max(1, NUMBERS.get(number, 0) or int(number)))
-            objects[names[word]] = NamedObject(name=names[word], count=count)
-            text = f"{text[: match.start()]} , {text[match.end() :]}"
-    return [objects[name] for name in sorted(objects)], text
-
-
-def _choices(text: str) -> dict[str, str]:
-    """Return the choice of the text in each group; words of size count only in phrases about the settlement."""
-    chosen: dict[str, str] = {}
-    phrases = [re.findall(r"[a-z][a-z'-]*", phrase) for phrase in _STOPS.split(text)]
-    of_settlement = [
-        words for words in phrases if set(WORDS["sized"]) & set(words) or any(w.endswith("-scale") for w in words)
-    ]
-    for group, choices in WORDS["groups"].items():
-        words = [word for phrase in (of_settlement if group == "size" else phrases) for word in phrase]
-        found = {choice: word for word in words for choice, entry in choices.items() if word in entry["words"].split()}
-        if len(found) > 1:
-            got = " and ".join(repr(word) for word in found.values())
-            what = f"two words about {group} contradict each other"
-            raise InputError(what, where="PROMPT", got=got, fix="use only one of these words")
-        if found:
-            chosen[group] = next(iter(found))
-    return chosen
-
-
-def _open_and_water(words: list[str], objects: list[NamedObject], plan: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of a plan that change by the objects and by words for open blocks and water."""
-    changes: dict[str, Any] = {}
-    for word in words:
-        singular = word.removesuffix("s")
-        if singular in WORDS["open"] and not (word == "park" and "industrial" in words):
-            field = WORDS["open"][singular]
-            changes[field] = max(plan[field], 1 if singular == word else 3)
-        if word in WORDS["water"]:
-            field, wide = WORDS["water"][word]
-            changes[field] = wide
-    counts = {named.name: named.count for named in objects}
-    if "bridge" in counts:
-        changes |= {"bridges": min(10, counts["bridge"]), "river_m": changes.get("river_m", 40.0)}
-    if any(OBJECTS[name].where in ("quay", "water") for name in counts) and "river_m" not in changes:
-        changes.setdefault("shore_m", 90.0)
-    if "park" in words and "large" in words and "industrial" not in words:
-        changes["greens"] = max(changes.get("greens", 0), 4)
-    return changes
-
-
-def _find_unknown(text: str) -> list[str]:
-    """Return the phrases that begin with an article or a number, and of which no table has a word."""
-    unknown = []
-    for phrase in _STOPS.split(text):
-        first, *words = re.findall(r"[a-z0-9][a-z0-9'-]*", phrase) or [""]
-        is_counted = first in ARTICLES or first in NUMBERS or first.isdigit()
-        if is_counted and words and len(words[-1]) > 2 and not {*words, words[-1].removesuffix("s")} & KNOWN:
-            unknown.append(" ".join(words))
-    return unknown

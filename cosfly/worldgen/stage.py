@@ -13,6 +13,7 @@ import numpy as np
 import shapely
 import yaml
 from pydantic import Field
+from scipy.ndimage import binary_erosion
 
 from cosfly.formats.boxes import OUR_LICENCE, BoxMap
 from cosfly.formats.kinds import KINDS
@@ -40,15 +41,15 @@ CREDITS = "cosfly; sizes of assets by SimWorld, maitrix-org and contributors"
 MOST_CHARACTERS = 2000  # of a prompt
 
 AT_THE_DOOR_M = 2.0  # from a building to the pavement that leads to it
+ROAD_COST = 20  # a metre of carriageway away from crossings costs as much as 20 m of pavement
 WALK_M = 100.0  # the longest pedestrian trajectory that must fit: app:simworld:step4 samples 50 to 100 m
 OVERLAP_M = 0.05  # buildings that share less only touch
-RIDGE_M = 3.0  # highest ridge of an old house above its walls
 
 
 class WorldConfig(Config):
     """A world from text."""
 
-    prompt: str = Field("", description="description of the world, in plain English")
+    prompt: str = Field("", description="description of the world, in plain English or Chinese")
     name: str = Field("TextWorld", min_length=1, max_length=60, description="name of the world's map")
     planner: str | None = Field(
         None, description="URL of the language model that plans the world; empty: built-in rules plan it"
@@ -71,26 +72,46 @@ def check_world(town: Town, plan: WorldPlan) -> list[dict[str, Any]]:
     """Return each check of a world: its name, the measured value, the accepted range, and whether it is met."""
     world = town.boxes
     outlines, tops_m = _buildings_of(town.layout)
-    buildings, _ = _buildings_of(world)
+    buildings, all_tops_m = _buildings_of(world)
     num_reached, component_m, component_share = _reach(world, buildings)
-    low, high = plan.heights_m
+    kinds = plan.kinds_of_buildings()
+    low, high = min(kind.heights_m[0] for kind in kinds), max(kind.heights_m[1] for kind in kinds)
     heights_m = tops_m if len(tops_m) else [low]
-    ridge_m = RIDGE_M if plan.lanes else 0.0
     checks = [
         ("overlapping buildings", _num_overlaps(world), 0, 0),
         ("buildings without a pavement", len(buildings) - num_reached, 0, 0),
         ("length of the largest walkable component, m", component_m, WALK_M, 1e5),
         ("walkable ground in it", component_share, 0.8, 1.0),
         ("building share", shapely.area(outlines).sum() / town.land_m2, *plan.building_share),
-        ("lowest building, m", min(heights_m), low, high + ridge_m),
-        ("highest building, m", max(heights_m), low, high + ridge_m),
+        ("lowest building, m", min(heights_m), low, high),
+        ("highest building, m", max(heights_m), low, high),
         ("trees per hectare", trees_of(world).sum() / town.land_m2 * 1e4, *plan.trees_per_ha),
     ]
+    for kind in kinds:
+        if kind.count is not None:
+            checks.append((f"number of {kind.name}s", town.built.get(kind.name, 0), 0.9 * kind.count, 1.1 * kind.count))
+    if plan.highest_m is not None:
+        checks.append(("highest building or object, m", max(all_tops_m, default=0.0), 0.0, plan.highest_m))
     return [
         {"check": name, "got": round(float(got), 4), "least": least, "most": most,
          "is_met": bool(least - 1e-6 <= got <= most + 1e-6)}
         for name, got, least, most in checks
     ]  # fmt: skip
+
+
+def _problems(checks: list[dict[str, Any]], town: Town, trace: dict[str, Any]) -> str:
+    """Return one line that names what of a prompt the world does not respect; empty where it respects all."""
+    unmet = ["{check} ({got:g}, expected {least:g} to {most:g})".format(**one) for one in checks if not one["is_met"]]
+    missing = Counter(f"{name} ({reason})" for name, reason in town.not_placed)
+    lists = {
+        "not respected": trace.get("not_respected", []) + unmet,
+        "not placed": [f"{number} x {name}" if number > 1 else name for name, number in missing.items()],
+        "words not used": trace["not_used"],
+    }
+    parts = [f"{title}: {', '.join(names)}" for title, names in lists.items() if names]
+    if not trace.get("settlement_is_named", True):
+        parts.insert(0, f"no kind of place that the generator has is named, so this is a {trace['settlement']}")
+    return "; ".join(parts)
 
 
 def _num_overlaps(box_map: BoxMap) -> int:
@@ -113,7 +134,8 @@ def _reach(box_map: BoxMap, buildings: np.ndarray) -> tuple[int, float, float]:
     labels, sizes = connected_parts(paved & ~occupancy(box_map, like=grid).occupied, 8)
     if len(sizes) < 2:
         return 0, 0.0, 0.0
-    cells = np.argwhere(labels == np.argmax(sizes))[:, ::-1]
+    largest = labels == np.argmax(sizes)
+    cells = np.argwhere(largest & ~binary_erosion(largest))[:, ::-1]  # its edge
     near = shapely.STRtree(shapely.points(grid.centers_of(cells))).query(buildings, "dwithin", AT_THE_DOOR_M)
     length_m = grid.resolution_m * float(np.hypot(*(np.ptp(cells, axis=0) + 1)))
     return len(np.unique(near[0])), length_m, sizes.max() / sizes.sum()
@@ -123,7 +145,8 @@ TASK = """You plan a town for a generator that lays out streets, blocks and buil
 Answer with one JSON object and nothing else. It has these fields, each of them optional:
 {fields}
 In `objects`, list once, with its count, everything that the user names and this table holds: {objects}.
-What the user names and neither the table nor a field holds goes into `not_in_table`, by its name.
+In `buildings`, list the kinds of buildings that the user names, with their number if it is said.
+Words of the user that no field holds go into `not_used`.
 Choose ranges wide enough that a random town meets them, and as narrow as the user's description."""
 
 
@@ -162,7 +185,8 @@ def plan_by_model(cfg: WorldConfig, prompt: str, seed: int, answers: Path) -> tu
             got=f"{answer.reason}: {' '.join(reply.text.split())[:80]!r}", expected="a JSON object",
             fix="try another --seed, prompt or model, or omit --planner to plan by rules without a model",
         )  # fmt: skip
-    return validated(WorldPlan, answer.value, where), trace
+    plan = validated(WorldPlan, answer.value, where)
+    return plan, trace | {"not_used": plan.not_used}
 
 
 def run(cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
@@ -185,19 +209,18 @@ def run(cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same
     town = build(plan, cfg.name, seed)
     _write_world(town, out)
     checks = check_world(town, plan)
-    write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks})
+    said = {"not_respected": trace.get("not_respected", []), "words_not_used": plan.not_used}
+    write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks, **said})
     view = TopView.around(np.stack(town.boxes.bounds()), 1000)
     write_bytes(out / "map.png", png_bytes(draw_map(town.boxes, view)))
     settings = read_yaml(shipped("simworld.yaml")) | {"name": "world"}  # those of the appendix, for this world
     world = {"name": cfg.name, "world": str(product.resolve()), "licence": OUR_LICENCE, "credits": CREDITS}
+    settings["pedestrians"]["road_cost"] = ROAD_COST
     settings["maps"] = {"source": "simworld", "simworld": world}
     loop = "# cosfly run THIS_FILE --out DIR\n" + yaml.safe_dump(settings, sort_keys=False)
     write_bytes(out / LOOP_FILE, loop.encode())
-    for check in checks:
-        if not check["is_met"]:
-            log.warning("%(check)s: %(got)g, expected %(least)g to %(most)g", check)
-    for name, reason in town.not_placed:
-        log.warning("the object %s is not placed: %s", name, reason)
+    if problems := _problems(checks, town, trace):
+        log.warning("%s", problems)
     num_kept = 1 + len(town.placed)
     dropped = Counter(reason.replace(" ", "_") for _, reason in town.not_placed)
     tally = Tally(input=num_kept + len(town.not_placed), kept=num_kept, dropped=dropped)
@@ -215,8 +238,8 @@ def _write_world(town: Town, out: Path) -> None:
     missing = [{"name": name, "reason": reason} for name, reason in town.not_placed]
     placement = {"nodes": placed, "placed": [thing._asdict() for thing in town.placed], "not_placed": missing}
     write_json(out / "placement.json", placement)
-    side = round(town.plan.size_m)
-    base = {"name": town.name, "env_bin": "", "width": side, "height": side}
+    width, height = map(round, town.size_m)
+    base = {"name": town.name, "env_bin": "", "width": width, "height": height}
     write_json(out / WORLD_FILE, {"base_map": base, "nodes": layout + placed}, indent=None)
     groups: dict[str, dict[str, Any]] = {"buildings": {}, "elements": {}}
     for name in sorted({node["instance_name"] for node in layout + placed} - {"BP_Road1_C"}):

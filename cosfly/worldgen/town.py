@@ -1,4 +1,4 @@
-"""A plan to a world: the procedural layout, the objects of the prompt placed in it, and SimWorld's nodes of both.
+"""A plan to a world: streets, buildings on lots along them, the objects of the prompt, and SimWorld's nodes of all.
 
 A box of a kind without an asset of SimWorld is named after the kind, as Water_C, with a cube of 1 m as its size.
 
@@ -10,22 +10,24 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
+from shapely.affinity import rotate
+from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
-from cosfly.formats.boxes import BoxMap
+from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.maps.boxlist import BoxList
-from cosfly.maps.footprints import footprints
-from cosfly.maps.synthetic import VERGE_M, Streets, TownPlan, build_town, street_grid
-from cosfly.maps.town_blocks import LAWN_TOP_M, PAVED_TOP_M, SLAB_M
+from cosfly.maps.footprints import Rectangle, footprints, oriented_rectangle, polygons_of, rectangle_polygon
+from cosfly.maps.town_blocks import PAVED_TOP_M, SLAB_M
 from cosfly.runtime.seeding import rng_for
 from cosfly.simulators.assets import ASSETS
-from cosfly.worldgen.plan import OBJECTS, SPACE_M, Object, WorldPlan, assets, town_plan
+from cosfly.worldgen.patterns import QUAY_M, Network, network
+from cosfly.worldgen.plan import OBJECTS, VERGE_M, Buildings, Object, Range, WorldPlan, assets
+from cosfly.worldgen.streets import GROUND_TOP_M, Stretch, furnish, lay_streets, pave
 
 CM_PER_M = 100.0
 ROAD_PIECE_M = 200.0  # length of SimWorld's piece of road
@@ -33,11 +35,14 @@ ROAD_SCALE = (0.95, 0.9, 1.0)  # scale of the piece at that length
 STRETCH = 6.0  # most that an asset's box may be stretched along one side relative to another
 STEP_M = 2.0  # between places that are tried
 SCALES = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4)
-# Boxes that objects are placed around, and those that make room for them.
-HARD = ("Buildings", "Walls", "Water", "Roads", "Car", "Truck", "Bus", "TrafficLight", "TrafficSigns")
-SOFT = ("Vegetation", "Static", "Fences", "Poles")
-PATH_M = 2.4  # width of a way to a building
+SPACE_M = 4.0  # free ground around each object
 TREE_M = 2.5  # lower vegetation is a hedge
+DOOR_M = 1.6  # width of a path to a building
+BLOCK_PIECE_M = 4.0  # of pavement inside blocks, whose edges lie on that of streets
+LEAST_BLOCK_M2 = 400.0  # of a plaza or a green block
+GROW = 1.12  # factor of the sides of a town in which the buildings do not fit
+MOST_GROWTH = 12  # times
+LEAST_TOWN_M = 170.0  # side of a town without a size, so that people find a way of 100 m
 
 Size = tuple[float, ...]
 
@@ -55,13 +60,21 @@ class Placed(NamedTuple):
 
 @dataclass
 class Town:
-    """A layout and the objects placed in it. not_placed: name of a missing object -> reason, an entry for each."""
+    """A layout and the objects placed in it.
+
+    size_m: from west to east and from south to north. blocks: the ground between streets and water. open_blocks: those
+    of them that are plazas and greens. built: numbers of buildings by kind. not_placed: name of a missing object ->
+    reason, an entry for each.
+    """
 
     name: str
-    plan: TownPlan
-    streets: Streets
+    size_m: Range
+    network: Network
+    blocks: BaseGeometry
+    open_blocks: list[Polygon]
     layout: BoxMap
     placement: BoxMap
+    built: dict[str, int] = field(default_factory=dict)
     placed: list[Placed] = field(default_factory=list)
     not_placed: list[tuple[str, str]] = field(default_factory=list)
 
@@ -71,8 +84,9 @@ class Town:
 
     @property
     def land_m2(self) -> float:
-        """The area without the river."""
-        return self.plan.size_m * (self.plan.size_m - self.plan.river_m)
+        """The area without the water."""
+        town = shapely.box(-self.size_m[0] / 2, -self.size_m[1] / 2, self.size_m[0] / 2, self.size_m[1] / 2)
+        return float(shapely.difference(town, self.network.water).area)
 
 
 def of_kinds(box_map: BoxMap, *names: str) -> np.ndarray:
@@ -87,165 +101,317 @@ def trees_of(box_map: BoxMap) -> np.ndarray:
 
 
 def build(plan: WorldPlan, name: str, seed: int) -> Town:
-    """Build the town of a plan: the same plan, seed and name give the same town."""
-    settings = town_plan(plan)
-    layout = build_town(settings, name, seed)
-    town = Town(name, settings, street_grid(settings, seed), layout, BoxList().box_map())
-    town.not_placed += [(missing, "not in the object table") for missing in plan.unknown_objects()]
-    _place_objects(town, plan)
-    _set_trees(town, plan, rng_for(seed, "world", "trees"))
-    return town
+    """Build the town of a plan: the same plan, seed and name give the same town.
 
-
-def _place_objects(town: Town, plan: WorldPlan) -> None:
-    """Place the named objects, the largest first, each as near the middle of the town as there is room.
-
-    Soft boxes below an object, such as trees, are removed; hard ones block it.
+    A town without a size is as large as its blocks, or, where all buildings are counted, as these need.
     """
-    boxes = BoxList()
-    taken = list[BaseGeometry]()  # outlines of the placed objects
-    outlines = footprints(town.layout)
-    hard = outlines[of_kinds(town.layout, *HARD)]
-    pavements = shapely.union_all(outlines[of_kinds(town.layout, "Sidewalks")])
-    for thing, count in sorted(plan.known_objects(), key=lambda pair: -math.prod(pair[0].size_m)):
+    widest_m = max((max(thing.size_m) * thing.least_scale for thing, _ in plan.known_objects()), default=0.0)
+    plan = plan.model_copy(update={"block_m": max(plan.block_m, min(widest_m + 2 * SPACE_M, 150.0))})
+    if plan.size_m:
+        return _Builder(plan, plan.size_m, name, seed).build()
+    pitch_m = plan.block_m + plan.street_m
+    side_m = plan.blocks_along * pitch_m + 2 * VERGE_M + plan.avenue_m
+    if plan.river_m:
+        side_m += plan.river_m
+    width, height = _stretched(plan, side_m, seed)
+    if plan.only_these:
+        wanted = sum(group.count or 0 for group in plan.buildings)
+        fronts_m = sum((group.count or 0) * (sum(group.footprint_m) / 2 + 1.3 * plan.gap_m) for group in plan.buildings)
+        side_m = max(LEAST_TOWN_M, math.sqrt(fronts_m * pitch_m / 3) + 2 * VERGE_M + plan.river_m)
+        for _ in range(MOST_GROWTH):
+            width, height = _stretched(plan, side_m, seed)
+            town = _Builder(plan, (width, height), name, seed).build()
+            if sum(town.built.values()) >= wanted:
+                return town
+            side_m *= GROW
+        return town
+    return _Builder(plan, (width, height), name, seed).build()
+
+
+def _stretched(plan: WorldPlan, side_m: float, seed: int) -> Range:
+    """Return the sides of a town of about side_m**2; linear towns are long."""
+    ratio = rng_for(seed, "world", "ratio").uniform(1.0, 1.25) * (1.7 if plan.pattern == "linear" else 1.0)
+    is_wide = plan.pattern == "linear" or plan.shore_m or plan.river_m or rng_for(seed, "world", "wide").random() < 0.5
+    width, height = side_m * math.sqrt(ratio), side_m / math.sqrt(ratio)
+    return (width, height) if is_wide else (height, width)
+
+
+def _footprints(low: float, high: float) -> list[Range]:
+    """Return the footprints of SimWorld's buildings in a range; if fewer than four fit, scale all into it."""
+    sizes = [(size[0], size[1]) for name, size in assets().items() if name.startswith("BP_Building")]
+    fitting = [size for size in sizes if low <= min(size) and max(size) <= high]
+    if len(fitting) >= 4:
+        return fitting
+    slim = sorted(size for size in sizes if max(size) / min(size) < 2.2)
+    longest = [low + (high - low) * k / (len(slim) - 1) for k in range(len(slim))]
+    return [
+        (round(x * side / max(x, y), 1), round(max(low * 0.6, y * side / max(x, y)), 1))
+        for (x, y), side in zip(slim, longest, strict=True)
+    ]
+
+
+class _Builder:
+    """Builds one town of a size: its ground, then objects, buildings, furniture and trees on what is left."""
+
+    def __init__(self, plan: WorldPlan, size_m: Range, name: str, seed: int) -> None:
+        self.plan, self.seed = plan, seed
+        self.boxes = BoxList()
+        self.placement = BoxList()
+        self.taken = list[BaseGeometry]()  # outlines of buildings and objects
+        x, y = size_m[0] / 2, size_m[1] / 2
+        self.boxes.span("Terrain", (-x, -y), (x, y), GROUND_TOP_M - SLAB_M, GROUND_TOP_M)
+        net = network(plan, size_m, rng_for(seed, "world", "streets"))
+        self.stretches = lay_streets(self.boxes, net)
+        self.paved = strips = shapely.union_all([stretch.strip for stretch in self.stretches])
+        south = -y
+        if plan.shore_m:
+            south += QUAY_M
+            pave(self.boxes, shapely.difference(shapely.box(-x, -y, x, south), strips))
+            self.boxes.span("Walls", (-x, -y), (x, -y + 0.2), -1.2, 0.4)
+        ground = shapely.box(-x, south, x, y)
+        blocks = shapely.difference(ground, shapely.union(strips, net.water))
+        inner = shapely.box(2.0 - x, south, x - 2.0, y - 2.0)
+        self.buildable = shapely.intersection(blocks, inner)
+        empty = BoxList().box_map()
+        self.town = Town(name, size_m, net, blocks, [], empty, empty)
+        self.town.not_placed += [(missing, "not in the object table") for missing in plan.unknown_objects()]
+        closed = [
+            block for block in polygons_of(blocks)
+            if block.area > LEAST_BLOCK_M2 and ground.boundary.distance(block) > 0.1
+        ]  # fmt: skip
+        if plan.pattern == "campus":
+            self.buildable = shapely.intersection(self.buildable, shapely.union_all(closed))
+        self.closed = sorted(closed, key=lambda block: block.centroid.distance(shapely.Point(0, 0)))
+
+    def build(self) -> Town:
+        plan, town = self.plan, self.town
+        self._open_blocks()
+        for thing, count in sorted(plan.known_objects(), key=lambda pair: -math.prod(pair[0].size_m)):
+            self._place_object(thing, count)
+        self._build_houses()
+        if plan.setback_m < 2.5:
+            for block in self.closed:
+                if block.area < 4 * plan.block_m**2 and block not in town.open_blocks:
+                    pave(self.boxes, block, BLOCK_PIECE_M)
+        rng = rng_for(self.seed, "world", "furniture")
+        for stretch in self.stretches:
+            if stretch.street not in town.network.bridges:
+                furnish(self.boxes, stretch, plan.parked_share, rng)
+        source = MapSource(tool="cosfly world", version="2", seed=self.seed)
+        town.layout = self.boxes.box_map(MapHeader(name=town.name, source=source, licence=OUR_LICENCE, ground_z_m=0.0))
+        town.placement = self.placement.box_map()
+        self._set_trees(rng_for(self.seed, "world", "trees"))
+        return town
+
+    def _open_blocks(self) -> None:
+        """Choose plazas, the nearest to the middle, and greens; pave plazas, and paths across greens."""
+        plan = self.plan
+        rng = rng_for(self.seed, "world", "open")
+        has_objects = any(thing.where == "open" for thing, _ in plan.known_objects())
+        wanted = max(plan.plazas + plan.greens, int(has_objects))
+        blocks = self.closed[: max(1, len(self.closed) // 2)]
+        chosen = blocks[: plan.plazas or int(has_objects and not plan.greens)]
+        rest = [block for block in blocks if block not in chosen]
+        num_greens = min(len(rest), wanted - len(chosen))
+        chosen += [rest[k] for k in sorted(rng.permutation(len(rest))[:num_greens])]
+        side_m = 0.7 * plan.block_m
+        if len(chosen) < wanted:  # open lots along streets
+            lots = self._lots([(side_m, side_m)], rng, setback_m=0.0)
+            lots.sort(key=lambda lot: math.hypot(*lot.center))
+            chosen += [rectangle_polygon(lot) for lot in lots[: wanted - len(chosen)]]
+        paved = chosen[: plan.plazas]
+        for green in chosen[plan.plazas :]:
+            shape = oriented_rectangle(green)
+            for across, side in enumerate(shape.size):
+                bands = [(-0.6, 0.6), (-1.5 / side, 1.5 / side)]
+                paved.append(shapely.intersection(green, rectangle_polygon(shape, *bands[:: 1 if across else -1])))
+        for area in paved:
+            pave(self.boxes, area, BLOCK_PIECE_M)
+        self.paved = shapely.union_all([self.paved, *paved])
+        self.town.open_blocks = chosen
+        self.buildable = shapely.difference(self.buildable, shapely.union_all(chosen).buffer(0.1))
+        shapely.prepare(self.buildable)
+
+    def _lots(
+        self, sizes: list[Range], rng: np.random.Generator, *, setback_m: float, first: bool = False
+    ) -> list[Rectangle]:
+        """Return free lots along the streets, each with one of the sizes; its front is the side with negative y.
+
+        first: only the one that is nearest to the middle of the town.
+        """
+
+        def from_middle_m(stretch: Stretch) -> float:
+            return float(np.linalg.norm(stretch.street.at(stretch.street.length_m / 2, 0.0)))
+
+        lots = list[Rectangle]()
+        taken = [*self.taken]
+        for stretch in sorted(self.stretches, key=from_middle_m) if first else self.stretches:
+            street = stretch.street
+            near = street.width_m / 2 + 0.05 + setback_m
+            for side in (1, -1):
+                along = 0.0
+                while along < street.length_m and not (first and lots):
+                    front, depth = sizes[int(rng.integers(len(sizes)))]
+                    lot = street.rectangle((along, along + front), (side * near, side * (near + depth)))
+                    outline = rectangle_polygon(lot)
+                    is_taken = taken and shapely.dwithin(np.array(taken), outline, self.plan.gap_m).any()
+                    if is_taken or not self.buildable.contains(outline):
+                        along += STEP_M
+                        continue
+                    lots.append(lot._replace(yaw_deg=lot.yaw_deg + 90.0 * (1 - side)))
+                    taken.append(outline)
+                    along += front + self.plan.gap_m * rng.uniform(1.0, 1.6)
+        return lots
+
+    def _build_houses(self) -> None:
+        """Build the counted buildings on lots spread over the town, then fill the lots that are left."""
+        rng = rng_for(self.seed, "world", "lots")
+        kinds = self.plan.kinds_of_buildings()
+        for kind in kinds:
+            if kind.count is not None:
+                lots = self._lots(_footprints(*kind.footprint_m), rng, setback_m=self.plan.setback_m)
+                spread = np.linspace(0, len(lots) - 1, min(kind.count, len(lots))).round().astype(int)
+                for number in np.unique(spread):
+                    self._build_house(lots[number], kind, rng)
+        if fill := [kind for kind in kinds if kind.count is None]:
+            sizes = [size for kind in fill for size in _footprints(*kind.footprint_m)]
+            for lot in self._lots(sizes, rng, setback_m=self.plan.setback_m):
+                low, high = (factor * lot.size[1] for factor in (0.6, 1.0))
+                fitting = [kind for kind in fill if kind.footprint_m[0] * 0.6 <= high and low <= kind.footprint_m[1]]
+                self._build_house(lot, (fitting or fill)[int(rng.integers(len(fitting or fill)))], rng)
+
+    def _build_house(self, lot: Rectangle, kind: Buildings, rng: np.random.Generator) -> None:
+        """Build one house on a lot, and the path to its door."""
+        low, high = kind.heights_m
+        fall = 0.0
+        if self.plan.high_center:
+            fall = min(1.0, math.hypot(*lot.center) / (0.5 * min(self.town.size_m)))
+        height = low + (high - low) * rng.beta(1.3, 1.7) * (1.0 - 0.9 * fall)
+        self.boxes.add("Buildings", lot.center, lot.size, 0.0, height, lot.yaw_deg)
+        self._take(self.boxes, rectangle_polygon(lot))
+        self.town.built[kind.name] = self.town.built.get(kind.name, 0) + 1
+
+    def _take(self, boxes: BoxList, outline: BaseGeometry, *, has_door: bool = True) -> None:
+        """Record the outline of a building or object; a building gets a path to the nearest pavement."""
+        self.taken.append(outline)
+        line = shapely.shortest_line(outline, self.paved)
+        if has_door and line.length > 0.5:
+            (x, y), (to_x, to_y) = line.coords
+            yaw_deg = math.degrees(math.atan2(to_y - y, to_x - x))
+            size = (line.length + 0.5, DOOR_M)
+            boxes.add("Sidewalks", ((x + to_x) / 2, (y + to_y) / 2), size, PAVED_TOP_M - SLAB_M, PAVED_TOP_M, yaw_deg)
+
+    def _place_object(self, thing: Object, count: int) -> None:
+        """Place an object `count` times: in open blocks, at a street, on the quay or in the water."""
+        town = self.town
         if thing.where == "layout":
-            _count_bridges(town, thing, count)
-            continue
-        free = _free_area(town, thing)
+            num_built = min(count, len(town.network.bridges))
+            town.placed += [Placed(thing.name, number, (0.0, 0.0), 0.0, 1.0, (0, 0)) for number in range(num_built)]
+            town.not_placed += [(thing.name, "no street to carry it")] * (count - num_built)
+            return
+        scales = [scale for scale in SCALES if scale >= thing.least_scale - 1e-9]
         for number in range(count):
-            place = _find_place(thing, free, hard, taken)
-            if place is None:
-                town.not_placed.append((thing.name, "no water in the plan" if free.is_empty else "no room"))
+            if (found := self._find_place(thing, scales)) is None:
+                has_place = thing.where == "open" or not town.network.water.is_empty
+                town.not_placed.append((thing.name, "no room" if has_place else "no water in the plan"))
                 continue
-            outline, yaw_deg, scale = place
-            xy = (outline.centroid.x, outline.centroid.y)
-            first = len(boxes)
-            _add_object(boxes, thing, xy, yaw_deg, scale)
-            town.placed.append(Placed(thing.name, number, xy, yaw_deg, scale, (first, len(boxes))))
-            taken.append(outline)
-            if any(part[0] == "Buildings" for part in thing.parts):
-                _pave_way(boxes, outline, pavements)
-    town.placement = boxes.box_map()
-    soft = of_kinds(town.layout, *SOFT)
-    covered = shapely.intersects(outlines, shapely.union_all(taken).buffer(0.5)) if taken else np.zeros(len(soft), bool)
-    town.layout = town.layout.select(np.flatnonzero(~(soft & covered)))
+            place, scale = found
+            first = len(self.placement)
+            _add_object(self.placement, thing, place, scale)
+            rows = (first, len(self.placement))
+            town.placed.append(Placed(thing.name, number, place.center, place.yaw_deg, scale, rows))
+            is_building = any(part[0] == "Buildings" for part in thing.parts)
+            self._take(self.placement, rectangle_polygon(place), has_door=is_building)
 
-
-def _count_bridges(town: Town, thing: Object, count: int) -> None:
-    """Record which of `count` bridges the layout has: at most one where a street crosses the river."""
-    crossings = town.plan.num_blocks + 1 if town.plan.river_m else 0
-    num_built = min(count, town.plan.bridges or crossings, crossings)
-    town.placed += [Placed(thing.name, number, (0.0, 0.0), 0.0, 1.0, (0, 0)) for number in range(num_built)]
-    town.not_placed += [(thing.name, "no street to carry it")] * (count - num_built)
-
-
-def _pave_way(boxes: BoxList, outline: BaseGeometry, pavements: BaseGeometry) -> None:
-    """Add a path from a building to the nearest pavement, if there is a gap."""
-    line = shapely.shortest_line(outline, pavements)
-    if line.length > 0.5:
-        (x0, y0), (x1, y1) = line.coords
-        middle = ((x0 + x1) / 2, (y0 + y1) / 2)
-        yaw_deg = math.degrees(math.atan2(y1 - y0, x1 - x0))
-        boxes.add("Sidewalks", middle, (line.length + 2.0, PATH_M), PAVED_TOP_M - SLAB_M, PAVED_TOP_M, yaw_deg)
-
-
-def _free_area(town: Town, thing: Object) -> BaseGeometry:
-    """Return the area where an object may be placed: open blocks, the quay along the water, or the water."""
-    plan = town.plan
-    half = plan.size_m / 2
-    if thing.where == "open":
-        built = shapely.STRtree(footprints(town.layout)[of_kinds(town.layout, "Buildings")])
-        blocks = [shapely.box(*low, *high) for low, high in town.streets.blocks()]
-        return shapely.union_all([block for block in blocks if not len(built.query(block, predicate="intersects"))])
-    if plan.shore_m:
-        near, far = (-0.5, VERGE_M - 0.5) if thing.where == "quay" else (-plan.shore_m, 0.0)
-        return shapely.box(-half + 2, -half + near, half - 2, -half + far)
-    if thing.where == "water" and plan.river_m:
-        return shapely.union_all(footprints(town.layout)[of_kinds(town.layout, "Water")])
-    return shapely.Polygon()
-
-
-def _find_place(
-    thing: Object, free: BaseGeometry, hard: np.ndarray, taken: list[BaseGeometry]
-) -> tuple[BaseGeometry, float, float] | None:
-    """Return the free outline of an object that is nearest to the middle of the town, its yaw and its scale.
-
-    None if the object fits nowhere, even at its least scale.
-    """
-    if free.is_empty:
+    def _find_place(self, thing: Object, scales: list[float]) -> tuple[Rectangle, float] | None:
+        """Return the outline and the scale of an object where there is room, else None."""
+        x, y = self.town.size_m[0] / 2, self.town.size_m[1] / 2
+        areas: list[tuple[BaseGeometry, float]] = []
+        if thing.where == "open":
+            areas = [(block, oriented_rectangle(block).yaw_deg) for block in self.town.open_blocks]
+        elif self.plan.shore_m:
+            low, high = (-0.5, QUAY_M - 0.5) if thing.where == "quay" else (-self.plan.shore_m, 0.0)
+            areas = [(shapely.box(2 - x, low - y, x - 2, high - y), 0.0)]
+        elif thing.where == "water":
+            bridges = [one.strip for one in self.stretches if one.street in self.town.network.bridges]
+            areas = [(shapely.difference(self.town.network.water, shapely.union_all(bridges).buffer(1.0)), 0.0)]
+        for area, yaw_deg in areas:
+            if not area.is_empty and (place := self._place_in(thing, area, scales, yaw_deg)) is not None:
+                return place
+        for scale in scales if thing.where == "open" else ():
+            wide, deep = (side * scale for side in thing.size_m)
+            rng = rng_for(self.seed, "world", thing.name)
+            for lot in self._lots([(wide, deep)], rng, setback_m=self.plan.setback_m, first=True):
+                return lot, scale
         return None
-    shapely.prepare(free)
-    by_water = thing.where != "open"
-    tree = shapely.STRtree(taken if by_water else [*hard, *taken])
-    low_x, low_y, high_x, high_y = free.bounds
-    anchor = (0.0, high_y if by_water else 0.0)
-    x, y = np.meshgrid(np.arange(low_x, high_x, STEP_M), np.arange(low_y, high_y, STEP_M))
-    centers = np.stack([x.ravel(), y.ravel()], axis=1)
-    if by_water:  # at the upper edge of the free area: on the quay, or next to the landing
-        centers[:, 1] = high_y - thing.size_m[1] / 2 - 0.3
-    centers = centers[np.argsort(np.hypot(*(centers - anchor).T), kind="stable")]
-    x, y = centers.T
-    for scale in (step for step in SCALES if step >= thing.least_scale - 1e-9):
-        for yaw_deg in (0.0,) if by_water else (0.0, 90.0):
-            size_m = thing.size_m if yaw_deg == 0 else thing.size_m[::-1]
-            half_x, half_y = (side * scale / 2 for side in size_m)
-            outlines = shapely.box(x - half_x, y - half_y, x + half_x, y + half_y)
-            for outline in outlines[shapely.contains_properly(free, outlines)]:
-                if not len(tree.query(outline, predicate="dwithin", distance=SPACE_M / 2)):
-                    return outline, yaw_deg, scale
-    return None
+
+    def _place_in(
+        self, thing: Object, area: BaseGeometry, scales: list[float], yaw_deg: float
+    ) -> tuple[Rectangle, float] | None:
+        """Return a place of an object in an area, along its yaw or across: at the quay's edge, else near the middle."""
+        turned = rotate(area, -yaw_deg, origin=(0, 0))
+        near = [outline for outline in self.taken if outline.distance(area) < SPACE_M]
+        tree = shapely.STRtree([rotate(outline, -yaw_deg, origin=(0, 0)) for outline in near])
+        shapely.prepare(turned)
+        low_x, low_y, high_x, high_y = turned.bounds
+        x, y = np.meshgrid(np.arange(low_x, high_x, STEP_M), np.arange(low_y, high_y, STEP_M))
+        centers = np.stack([x.ravel(), y.ravel()], axis=1)
+        anchor = np.array(turned.centroid.coords[0])
+        by_water = thing.where != "open"
+        if by_water and self.plan.shore_m:
+            centers[:, 1] = high_y - thing.size_m[1] / 2 - 0.3
+        x, y = centers[np.argsort(np.hypot(*(centers - anchor).T), kind="stable")].T
+        for scale in scales:
+            for turn_deg in (0.0,) if by_water else (0.0, 90.0):
+                half_x, half_y = (side * scale / 2 for side in (thing.size_m if turn_deg == 0 else thing.size_m[::-1]))
+                outlines = shapely.box(x - half_x, y - half_y, x + half_x, y + half_y)
+                for outline in outlines[shapely.contains_properly(turned, outlines)]:
+                    if not len(tree.query(outline, predicate="dwithin", distance=SPACE_M / 2)):
+                        middle = rotate(outline.centroid, yaw_deg, origin=(0, 0))
+                        wide, deep = (side * scale for side in thing.size_m)
+                        return Rectangle((middle.x, middle.y), (wide, deep), yaw_deg + turn_deg), scale
+        return None
+
+    def _set_trees(self, rng: np.random.Generator) -> None:
+        """Fell or plant trees until their number is within the plan's range."""
+        town, (low, high) = self.town, self.plan.trees_per_ha
+        hectares = town.land_m2 / 1e4
+        trees = np.flatnonzero(trees_of(town.layout))
+        goal = round((0.65 * low + 0.35 * high) * hectares)
+        if len(trees) > high * hectares:
+            felled = rng.choice(trees, len(trees) - goal, replace=False)
+            town.layout = town.layout.select(np.setdiff1d(np.arange(len(town.layout)), felled))
+        elif len(trees) < goal:
+            town.layout = town.layout.joined(self._planted(goal - len(trees), rng))
+
+    def _planted(self, count: int, rng: np.random.Generator) -> BoxMap:
+        """Return new trees in the blocks, clear of all other boxes and of the paths to doors."""
+        world, boxes = self.town.boxes, BoxList()
+        is_ground = of_kinds(world, "Roads", "Terrain", "RoadLines") | (world.maxs[:, 2] <= 0.0)
+        is_path = of_kinds(world, "Sidewalks") & ((2 * world.half_extents[:, :2]).min(1) < 5.0)
+        outlines = footprints(world)[~is_ground | is_path]
+        obstacles = shapely.STRtree(outlines)
+        blocks = self.town.blocks
+        shapely.prepare(blocks)
+        low_x, low_y, high_x, high_y = blocks.bounds
+        for xy in rng.uniform((low_x, low_y), (high_x, high_y), (40 * count, 2)):
+            crown_m = rng.uniform(3.0, 5.5)
+            outline = shapely.box(*(xy - crown_m / 2), *(xy + crown_m / 2))
+            if blocks.contains(outline) and not len(obstacles.query(outline, predicate="dwithin", distance=0.4)):
+                boxes.add("Vegetation", xy, (crown_m, crown_m * rng.uniform(0.9, 1.1)), 0.0, rng.uniform(5.0, 11.0))
+                if len(boxes) == count:
+                    break
+        return boxes.box_map()
 
 
-def _add_object(boxes: BoxList, thing: Object, xy: tuple[float, float], yaw_deg: float, scale: float) -> None:
+def _add_object(boxes: BoxList, thing: Object, place: Rectangle, scale: float) -> None:
     """Add an object's boxes; the heights of its high parts are scaled like its footprint."""
-    cos, sin = (1.0, 0.0) if yaw_deg % 180 == 0 else (0.0, 1.0)
+    cos, sin = math.cos(math.radians(place.yaw_deg)), math.sin(math.radians(place.yaw_deg))
     for kind, x, y, wide, deep, low, high in thing.parts:
-        middle = (xy[0] + scale * (cos * x - sin * y), xy[1] + scale * (sin * x + cos * y))
+        middle = place.center[0] + scale * (cos * x - sin * y), place.center[1] + scale * (sin * x + cos * y)
         height_scale = scale if high > 1.0 else 1.0
         scaled_low = low * height_scale if low > 0 else low
-        boxes.add(kind, middle, (wide * scale, deep * scale), scaled_low, high * height_scale, yaw_deg)
-
-
-def _set_trees(town: Town, plan: WorldPlan, rng: np.random.Generator) -> None:
-    """Fell the trees in front of doors, then fell or plant until their number is within the plan's range."""
-    outlines = footprints(town.boxes)
-    sizes = 2 * town.boxes.half_extents[:, :2]
-    ways = outlines[of_kinds(town.boxes, "Sidewalks") & (sizes.min(1) <= PATH_M)]
-    if len(ways):
-        before_door = shapely.dwithin(outlines[: len(town.layout)], shapely.union_all(ways), 0.8)
-        town.layout = town.layout.select(np.flatnonzero(~(before_door & trees_of(town.layout))))
-    hectares = town.land_m2 / 1e4
-    trees = np.flatnonzero(trees_of(town.layout))
-    goal = round((0.65 * plan.trees_per_ha[0] + 0.35 * plan.trees_per_ha[1]) * hectares)
-    if len(trees) > plan.trees_per_ha[1] * hectares:
-        felled = rng.choice(trees, len(trees) - goal, replace=False)
-        town.layout = town.layout.select(np.setdiff1d(np.arange(len(town.layout)), felled))
-    elif len(trees) < goal:
-        town.layout = town.layout.joined(_planted(town, goal - len(trees), rng))
-
-
-def _planted(town: Town, count: int, rng: np.random.Generator) -> BoxMap:
-    """Return new trees on lawns and gardens, clear of all other boxes and of the ways."""
-    world = town.boxes
-    boxes = BoxList()
-    outlines = footprints(world)
-    lawns = outlines[of_kinds(world, "Terrain") & (np.abs(world.maxs[:, 2] - LAWN_TOP_M) < 0.005)]
-    standing = ~of_kinds(world, "Roads", "Sidewalks", "Terrain", "RoadLines") & (world.maxs[:, 2] > 0.0)
-    blocked = [*outlines[standing], *outlines[of_kinds(world, "Roads", "Sidewalks")], *outlines[len(town.layout) :]]
-    obstacles = shapely.STRtree(blocked)
-    weights = shapely.area(lawns)
-    if not len(lawns) or not weights.sum():
-        return boxes.box_map()
-    bounds = shapely.bounds(lawns)
-    for row in rng.choice(len(lawns), 40 * count, p=weights / weights.sum()):
-        xy = rng.uniform(bounds[row, :2], bounds[row, 2:])
-        crown_m = rng.uniform(3.0, 5.5)
-        outline = shapely.box(*(xy - crown_m / 2), *(xy + crown_m / 2))
-        if not len(obstacles.query(outline, predicate="dwithin", distance=0.4)):
-            boxes.add("Vegetation", xy, (crown_m, crown_m * rng.uniform(0.9, 1.1)), 0.0, rng.uniform(5.0, 11.0))
-            if len(boxes) == count:
-                break
-    return boxes.box_map()
+        boxes.add(kind, middle, (wide * scale, deep * scale), scaled_low, high * height_scale, place.yaw_deg)
 
 
 @cache
@@ -279,16 +445,13 @@ def asset_for(kind: str, size_m: Size) -> tuple[str, Size]:
 
 
 def layout_nodes(town: Town) -> list[dict[str, Any]]:
-    """Return SimWorld's nodes of the layout: a piece of road for each stretch of a street, and every box."""
+    """Return SimWorld's nodes of the layout: a piece of road for each street with a carriageway, and every box."""
     nodes = list[dict[str, Any]]()
-    for axis in (0, 1):
-        crossings = [strip.middle_m for strip in town.streets.along(1 - axis)]
-        for strip in town.streets.along(axis):
-            for low, high in pairwise(crossings) if strip is not town.streets.river else ():
-                middle = (low + high) / 2
-                place = (middle, -strip.middle_m, 0.0) if axis == 0 else (strip.middle_m, -middle, 0.0)
-                scale = np.array([ROAD_SCALE[0] * (high - low) / ROAD_PIECE_M, *ROAD_SCALE[1:]])
-                nodes.append(_node(f"GEN_Road_{len(nodes)}", "BP_Road1_C", place, -90.0 * axis, scale))
+    for street in town.network.streets:
+        if street.road_m:
+            x, y = street.at(street.length_m / 2, 0.0)
+            scale = np.array([ROAD_SCALE[0] * street.length_m / ROAD_PIECE_M, *ROAD_SCALE[1:]])
+            nodes.append(_node(f"GEN_Road_{len(nodes)}", "BP_Road1_C", (x, -y, 0.0), -street.yaw_deg, scale))
     kinds = [KIND_NAMES[int(kind)] for kind in town.layout.kinds]
     return nodes + [_box_node(town.layout, row, kind) for row, kind in enumerate(kinds)]
 

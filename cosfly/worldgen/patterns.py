@@ -1,0 +1,294 @@
+"""Street patterns: the centre lines of a town's streets, its river and its bridges, drawn from a plan and a seed.
+
+A pattern returns lines; `straight_streets` cuts them at their crossings and bends. Coordinates are m, the origin is the
+middle of the town, +x is east and +y north.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from shapely.geometry import LineString, Polygon
+from shapely.geometry.base import BaseGeometry
+
+from cosfly.maps.footprints import Rectangle
+from cosfly.worldgen.plan import PATH_M, VERGE_M, WorldPlan
+
+LANE_M = 9.0  # narrower streets have no carriageway
+WIDE_M = 26.0  # wider streets have wide pavements
+QUAY_M = 10.0  # between the promenade and the open water
+PARALLEL_M = 16.0  # a street that runs nearer to a bank or to the promenade is dropped
+SHORTEST_M = 1.0  # pieces of streets that are dropped
+
+Size = tuple[float, float]
+
+
+class Line(NamedTuple):
+    """The centre line of a street, (n, 2) m, and its width from front to front."""
+
+    points: np.ndarray
+    width_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Street:
+    """A straight piece of street: centre line from start to end, (2,) m; width from front to front; carriageway."""
+
+    start: np.ndarray
+    end: np.ndarray
+    width_m: float
+
+    @property
+    def road_m(self) -> float:
+        """Width of the carriageway; 0 for lanes and paths."""
+        pavement_m = 6.0 if self.width_m >= WIDE_M else max(2.5, 0.22 * self.width_m)
+        return self.width_m - 2 * pavement_m if self.width_m >= LANE_M else 0.0
+
+    @property
+    def length_m(self) -> float:
+        return float(np.linalg.norm(self.end - self.start))
+
+    @property
+    def direction(self) -> np.ndarray:
+        return (self.end - self.start) / self.length_m
+
+    @property
+    def yaw_deg(self) -> float:
+        return math.degrees(math.atan2(*self.direction[::-1]))
+
+    def at(self, along_m: float, across_m: float) -> np.ndarray:
+        """Return the point at a distance along the street and to its left."""
+        x, y = self.direction
+        return self.start + along_m * np.array([x, y]) + across_m * np.array([-y, x])
+
+    def rectangle(self, along: Size, across: Size) -> Rectangle:
+        """Return the rectangle between two distances along the street and two to its left, with the street's yaw."""
+        x, y = self.at(sum(along) / 2, sum(across) / 2)
+        return Rectangle((float(x), float(y)), (along[1] - along[0], abs(across[1] - across[0])), self.yaw_deg)
+
+
+class Network(NamedTuple):
+    """Streets, water and bridges of a town. bridges: the streets of `streets` that cross the river."""
+
+    streets: list[Street]
+    water: BaseGeometry
+    bridges: list[Street]
+
+
+def _spaced(length_m: float, pitch_m: float, unevenness: float, rng: np.random.Generator) -> np.ndarray:
+    """Return places from -length_m / 2 to length_m / 2, about pitch_m apart."""
+    shares = 1.0 + unevenness * rng.uniform(-1.0, 1.0, max(1, round(length_m / pitch_m)))
+    return np.concatenate([[0.0], np.cumsum(shares / shares.sum())]) * length_m - length_m / 2
+
+
+def grid(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> list[Line]:
+    """Return streets at right angles; the proportions of blocks, the avenues and the offsets of rows vary."""
+    stretch = rng.uniform(0.75, 1.35)
+    pitch_x, pitch_y = plan.block_m * stretch + plan.street_m, plan.block_m / stretch + plan.street_m
+    rows = _spaced(size_m[1], pitch_y, plan.unevenness, rng)
+    columns = _spaced(size_m[0], pitch_x, plan.unevenness, rng)
+    is_staggered = rng.random() < 0.4
+    avenues = rng.integers(len(rows)), rng.integers(len(columns))
+    lines = [
+        Line(np.array([[columns[0], y], [columns[-1], y]]), plan.avenue_m if k == avenues[0] else plan.street_m)
+        for k, y in enumerate(rows)
+    ]
+    for band, (low, high) in enumerate(pairwise(rows)):
+        shift = (columns[1] - columns[0]) / 2 if is_staggered and band % 2 else 0.0
+        for k, x in enumerate(columns):
+            is_inner = 0 < k < len(columns) - 1
+            at = x - shift if is_inner else x
+            width_m = plan.avenue_m if k == avenues[1] and not is_staggered else plan.street_m
+            lines.append(Line(np.array([[at, low], [at, high]]), width_m))
+    return lines
+
+
+def radial(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> list[Line]:
+    """Return avenues that meet at a ring around the middle, and streets on rings between them."""
+    half = np.array(size_m) / 2
+    count = plan.spokes or int(rng.integers(5, 9))
+    steps = 1.0 + 0.35 * plan.unevenness * rng.uniform(-1, 1, count)
+    angles = rng.uniform(0, 2 * math.pi) + np.cumsum(steps / steps.sum()) * 2 * math.pi
+    inner = max(plan.block_m / 2, count * (plan.avenue_m + 6.0) / (2 * math.pi)) / half.min()
+    num_rings = max(1, math.ceil((1.0 - inner) * half.min() / (plan.block_m + plan.street_m) - 0.3))
+    radii = np.linspace(inner, 1.0, num_rings + 1)
+    lines = []
+    for number, radius in enumerate(radii):
+        arc_m = 2 * math.pi * radius * half.min() / len(angles)
+        if number and arc_m > 1.7 * (plan.block_m + plan.street_m):  # streets between the avenues, from here outwards
+            gaps = np.diff(angles, append=angles[0] + 2 * math.pi)
+            between = angles + gaps / 2
+            lines += [Line(_polar(between[k], [radii[number], 1.0], half), plan.street_m) for k in range(len(between))]
+            angles = np.sort(np.concatenate([angles, between]))
+        lines.append(Line(_polar(np.append(angles, angles[0]), radius, half), plan.street_m))
+        if not number:
+            lines += [Line(_polar(angle, [inner, 1.0], half), plan.avenue_m) for angle in angles]
+    return lines
+
+
+def _polar(angles: float | np.ndarray, radii: float | list[float], half: np.ndarray) -> np.ndarray:
+    """Return points by angle and by radius, a share of the half sides of the town."""
+    turn, share = np.broadcast_arrays(angles, radii)
+    return np.stack([np.cos(turn), np.sin(turn)], axis=1) * share[:, None] * half
+
+
+def organic(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> list[Line]:
+    """Return streets that wind around blocks of any shape; those around the whole town are main streets."""
+    return _winding(plan, size_m, rng, plan.street_m, plan.avenue_m)
+
+
+def campus(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> list[Line]:
+    """Return footpaths that wind over lawns, and a street around them."""
+    return _winding(plan, size_m, rng, PATH_M, plan.street_m)
+
+
+def _winding(plan: WorldPlan, size_m: Size, rng: np.random.Generator, inner_m: float, outer_m: float) -> list[Line]:
+    """Return the edges of irregular cells, bent at random: inner ones, and those around all cells."""
+    pitch_m = plan.block_m + inner_m
+    half = np.array(size_m) / 2
+    counts = np.maximum(2, np.round(np.array(size_m) / pitch_m)).astype(int)
+    x, y = np.meshgrid(*(np.arange(-2, count + 2) for count in counts))
+    seeds = np.stack([x + 0.5 + 0.25 * (2 * (y % 2) - 1), y + 0.5], axis=-1).reshape(-1, 2)  # in staggered rows
+    seeds = (seeds + 0.33 * rng.uniform(-1.0, 1.0, seeds.shape)) * (2 * half / counts) - half
+    cells = shapely.get_parts(shapely.voronoi_polygons(shapely.multipoints(seeds)))
+    cells = cells[shapely.contains(shapely.box(*(-half), *half), shapely.centroid(cells))]
+    corners = list[np.ndarray]()  # those nearer to each other than a share of the pitch are one
+    sides: dict[tuple[int, int], int] = {}  # the number of cells at each edge
+    for cell in cells:
+        ring = []
+        for point in np.clip(shapely.get_coordinates(cell), -half, half):
+            near = [k for k, corner in enumerate(corners) if np.linalg.norm(corner - point) < 0.3 * pitch_m]
+            ring.append(near[0] if near else len(corners))
+            corners += [] if near else [point]
+        for edge in {(min(ends), max(ends)) for ends in pairwise(ring) if ends[0] != ends[1]}:
+            sides[edge] = sides.get(edge, 0) + 1
+    lines = []
+    for (a, b), num_cells in sides.items():
+        across = np.array([[0.0, -1.0], [1.0, 0.0]]) @ (corners[b] - corners[a])
+        bend = (corners[a] + corners[b]) / 2 + across * float(np.clip(rng.normal(0.0, 0.12), -0.2, 0.2))
+        points = np.stack([corners[a], np.clip(bend, -half, half), corners[b]])
+        lines.append(Line(points, outer_m if num_cells == 1 else inner_m))
+    return lines
+
+
+def linear(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> list[Line]:
+    """Return one long road with short streets to its sides; a river or a shore brings its own roads."""
+    width, depth = size_m
+    pitch_m = plan.block_m + plan.street_m
+    x = _spaced(width, 1.4 * pitch_m, 0.2, rng)
+    if plan.shore_m:  # the south edge of the pattern lies under the water
+        rows = [Line(np.array([[x[0], y], [x[-1], y]]), plan.street_m) for y in [2 * pitch_m - depth / 2]]
+        return rows + [
+            Line(np.array([[at, -depth / 2], [at, min(depth / 2, 3 * pitch_m - depth / 2)]]), plan.street_m) for at in x
+        ]
+    sway = 0.0 if plan.river_m else min(0.12 * depth, 0.25 * pitch_m)
+    main = np.stack([x, sway * rng.uniform(-1.0, 1.0, len(x))], axis=1)
+    lines = [] if plan.river_m else [Line(main, plan.avenue_m)]
+    side = 1.0 if rng.random() < 0.5 else -1.0
+    for number, (a, b) in enumerate(pairwise(main)):
+        foot = a + (b - a) * rng.uniform(0.35, 0.65)
+        for way in (1.0, -1.0) if plan.river_m or number % 3 == 2 else (side,):
+            reach_m = min(depth / 2, pitch_m * rng.uniform(0.9, 1.3))
+            tip = foot + np.array([rng.uniform(-0.2, 0.2) * reach_m, way * reach_m])
+            lines.append(Line(np.stack([foot, tip]), plan.street_m))
+        side = -side
+    return lines
+
+
+PATTERNS: dict[str, Callable[[WorldPlan, Size, np.random.Generator], list[Line]]] = {
+    "grid": grid, "radial": radial, "organic": organic, "linear": linear, "campus": campus,
+}  # fmt: skip
+
+
+def network(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> Network:
+    """Return the streets and the water of a town of a size."""
+    margin_m = VERGE_M + max(plan.avenue_m, plan.street_m) / 2
+    below_m = plan.block_m + plan.street_m if plan.shore_m else 0.0  # of the pattern, under the water
+    inner = size_m[0] - 2 * margin_m, size_m[1] - 2 * margin_m
+    shift = np.array([0.0, -below_m / 2])
+    drawn = PATTERNS[plan.pattern](plan, (inner[0], inner[1] + below_m), rng)
+    lines = [Line(line.points + shift, line.width_m) for line in drawn]
+    half_x, half_y = size_m[0] / 2, size_m[1] / 2
+    water: BaseGeometry = Polygon()
+    bridges: list[Line] = []
+    if plan.shore_m:
+        y = -half_y + QUAY_M + plan.avenue_m / 2
+        promenade = LineString([(-half_x + margin_m, y), (half_x - margin_m, y)])
+        beyond = shapely.box(-half_x, -half_y - plan.shore_m, half_x, y)
+        lines = [*_clipped(lines, beyond, [promenade]), Line(np.array(promenade.coords), plan.avenue_m)]
+        water = shapely.box(-half_x, -half_y - plan.shore_m, half_x, -half_y)
+    if plan.river_m:
+        x = np.linspace(-half_x, half_x, 6)
+        sway = min(0.08 * size_m[1], 12.0) * rng.uniform(-1.0, 1.0, len(x))
+        sway[0], sway[-1] = sway[1], sway[-2]
+        river = LineString(np.stack([x, rng.uniform(-0.1, 0.1) * size_m[1] + sway], axis=1))
+        width_m = plan.avenue_m if plan.pattern == "linear" else plan.street_m
+        apart_m = (plan.river_m + width_m) / 2 + 0.3
+        banks = [
+            shapely.intersection(
+                river.offset_curve(side * apart_m), shapely.box(-half_x + margin_m, -half_y, half_x - margin_m, half_y)
+            )
+            for side in (1, -1)
+        ]
+        crossings = shapely.get_coordinates([shapely.intersection(LineString(line.points), river) for line in lines])
+        lines = _clipped(lines, shapely.buffer(river, apart_m, cap_style="flat"), banks)
+        lines += [Line(np.array(bank.coords), width_m) for bank in banks]
+        bridges = _bridges(plan, river, banks, crossings, inner[0])
+        water = shapely.union(water, shapely.buffer(river, plan.river_m / 2, cap_style="flat", join_style="mitre"))
+    streets = straight_streets([*lines, *bridges])
+    crossing = [
+        street
+        for street in streets
+        if plan.river_m and water.contains(shapely.Point(street.at(street.length_m / 2, 0)))
+    ]
+    return Network(streets, water, crossing)
+
+
+def _clipped(lines: list[Line], zone: BaseGeometry, edges: list[LineString]) -> list[Line]:
+    """Return the lines outside a zone, without those that run next to one of its edges."""
+    outside = []
+    for line in lines:
+        for part in shapely.get_parts(shapely.difference(LineString(line.points), zone)):
+            if not isinstance(part, LineString) or part.length < SHORTEST_M:
+                continue
+            places = shapely.points([part.coords[0], part.interpolate(0.5, True).coords[0], part.coords[-1]])
+            away_m = [shapely.distance(places, edge) for edge in edges]
+            if not any(away.max() < PARALLEL_M and np.ptp(away) < 0.5 * part.length for away in away_m):
+                outside.append(Line(np.array(part.coords), line.width_m))
+    return outside
+
+
+def _bridges(
+    plan: WorldPlan, river: LineString, banks: list[LineString], crossings: np.ndarray, length_m: float
+) -> list[Line]:
+    """Return straight bridges from bank to bank: where streets cross the river, else evenly spaced."""
+    count = plan.bridges or int(np.clip(len(crossings), 1, 4))
+    wanted = (np.arange(count) + 0.5) / count * length_m - length_m / 2
+    lines = []
+    for x in wanted:
+        near = crossings[np.abs(crossings[:, 0] - x) < 0.3 * length_m / count] if len(crossings) else []
+        place = min(near, key=lambda point: abs(point[0] - x))[0] if len(near) else x
+        middle = shapely.intersection(river, LineString([(place, -1e4), (place, 1e4)]))
+        points = [shapely.get_coordinates(shapely.shortest_line(bank, middle))[0] for bank in banks]
+        lines.append(Line(np.array(points), plan.street_m))
+    return lines
+
+
+def straight_streets(lines: list[Line]) -> list[Street]:
+    """Cut lines at their crossings and bends. Where lines coincide, the widest one counts."""
+    shapes = np.array([LineString(line.points) for line in lines], dtype=object)
+    tree = shapely.STRtree(shapes)
+    streets = []
+    for part in shapely.get_parts(shapely.union_all(shapes, grid_size=0.01)):
+        for start, end in pairwise(shapely.get_coordinates(part)):
+            if np.linalg.norm(end - start) < SHORTEST_M:
+                continue
+            of = tree.query(shapely.Point((start + end) / 2), predicate="dwithin", distance=0.05)
+            streets.append(Street(start, end, max(lines[k].width_m for k in of)))
+    return streets
