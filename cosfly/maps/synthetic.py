@@ -19,7 +19,7 @@ from pydantic import Field, model_validator
 
 from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.maps.boxlist import BoxList, Pair
-from cosfly.maps.town_blocks import BLOCKS, ORDINARY_LOTS, ROAD_TOP_M, SLAB_M, WATER_TOP_M, Lots, Plot, Range, point
+from cosfly.maps.town_blocks import BLOCKS, ROAD_TOP_M, SLAB_M, WATER_TOP_M, Plot, Range, point
 from cosfly.runtime.config import Config, read_yaml
 from cosfly.runtime.errors import nearest
 from cosfly.runtime.seeding import rng_for
@@ -50,13 +50,9 @@ class TownPlan:
     unevenness: float = 0.0  # how much the sides of blocks differ, as a share of the mean side
     blocks: Mapping[str, float] = field(default_factory=dict)  # share of each kind, a name in BLOCKS
     center: str | None = None  # kind of the block in the middle
-    lots: Lots = ORDINARY_LOTS  # buildings of blocks of kind `lots`
     river_m: float = 0.0  # width of a river in place of a boulevard; 0: none
-    bridges: int = 0  # streets that cross the river; 0: all
-    shore_m: float = 0.0  # width of open water along the south edge; 0: none
     parked_share: float = 0.4  # of parking places that are taken
     tree_share: float = 0.85  # of places of street trees that are planted
-    tree_parts: bool = True  # trees of wide streets consist of parts, as simulators export them
 
     @property
     def narrowest_block_m(self) -> float:
@@ -163,7 +159,7 @@ def build_town(plan: TownPlan, name: str, seed: int) -> BoxMap:
     corners = ((-half, -half), (half, half))
 
     def plot_of(low: Pair, high: Pair, item: str) -> Plot:
-        return Plot(boxes, low, high, rng_for(seed, "maps", item), plan.lots)
+        return Plot(boxes, low, high, rng_for(seed, "maps", item))
 
     town = plot_of(*corners, "verge")
     town.span("Terrain", *corners, BASE_TOP_M - SLAB_M, BASE_TOP_M)
@@ -177,9 +173,6 @@ def build_town(plan: TownPlan, name: str, seed: int) -> BoxMap:
     _add_verge(town, streets)
     if streets.river is not None:
         _add_river(town, plan, streets, streets.river)
-    if plan.shore_m:
-        town.span("Water", (-half, -half - plan.shore_m), (half, -half - RAILING_M), WATER_BOTTOM_M, WATER_TOP_M)
-        town.span("Walls", (-half, -half - RAILING_M), (half, -half), WATER_BOTTOM_M, 0.4)  # the quay
     kinds = _block_kinds(plan, rng_for(seed, "maps", "plan"))
     for number, (kind, block) in enumerate(zip(kinds, streets.blocks(), strict=True)):
         row, column = divmod(number, plan.num_blocks)
@@ -233,17 +226,13 @@ def _add_surfaces(town: Plot, streets: Streets) -> None:
 def _add_river(town: Plot, plan: TownPlan, streets: Streets, river: Strip) -> None:
     """Add water from edge to edge between quays, and a bridge with railings where a street along y crosses it."""
     low, high = river.road
-    crossing = streets.columns
-    if 0 < plan.bridges < len(crossing):
-        places = [int((k + 0.5) * len(crossing) / plan.bridges) for k in range(plan.bridges)]  # spread evenly
-        crossing = [crossing[place] for place in places]
-    bridge_edges = [m for strip in crossing for m in (strip.low_m, strip.high_m)]
+    bridge_edges = [m for strip in streets.columns for m in (strip.low_m, strip.high_m)]
     edges = [-plan.size_m / 2, *bridge_edges, plan.size_m / 2]
     for start, end in zip(edges[::2], edges[1::2], strict=True):
         town.span("Water", (start, low), (end, high), WATER_BOTTOM_M, WATER_TOP_M)
         for quay in (low, high):
             town.span("Walls", (start, quay - RAILING_M), (end, quay + RAILING_M), WATER_BOTTOM_M, 0.5)
-    for strip in crossing:
+    for strip in streets.columns:
         town.lay("Roads", (strip.road[0], low), (strip.road[1], high))
         for side, kerb, edge in ((-1, strip.road[0], strip.low_m), (1, strip.road[1], strip.high_m)):
             town.lay("Sidewalks", (kerb, low), (edge, high))
@@ -295,7 +284,7 @@ def _add_lamps_and_trees(
             plot.add("Poles", arm, point(axis, 0.16, 2.0), 7.45, 7.6)
         elif (is_wide or number % 3 == 1) and rng.random() < plan.tree_share:
             crowns_m = (3.4, 4.6) if is_wide else (2.6, 3.4)
-            plot.tree(place, crowns_m, (5.5, 9.5), 1.0 if is_wide and plan.tree_parts else 0.0)
+            plot.tree(place, crowns_m, (5.5, 9.5), 1.0 if is_wide else 0.0)
         elif rng.random() < 0.5:
             plot.bench(axis, along, across)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,23 +16,8 @@ WATER_TOP_M = 0.05  # over the ground, so that water is an obstacle to pedestria
 SLAB_M = 0.3
 PASSAGE_M = 3.2  # clear height of passages and arcades
 ARCADE_M = 3.0  # depth of an arcade
-LEAST_FRONT_M = 7.0  # of a building; a shorter rest of a row of lots stays empty
 
 Range = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Lots:
-    """Building lots of blocks of kind `lots`; lengths in m."""
-
-    footprints_m: tuple[Range, ...] = ((12.0, 10.0), (18.0, 13.0), (26.0, 15.0))  # front and depth to choose from
-    heights_m: Range = (8.0, 20.0)  # of the lowest and the highest building
-    fall_m: float = 0.0  # heights fall to the lowest at this distance from the middle of the town; 0: they are mixed
-    gap_m: float = 2.0  # least gap between two buildings
-    setback_m: float = 1.0  # from the pavement to the fronts; from 2.5 on there are gardens
-
-
-ORDINARY_LOTS = Lots()
 
 
 def point(axis: int, along: float, across: float) -> tuple[float, float]:
@@ -45,12 +29,11 @@ class Plot(BoxList):
     """A rectangle of the town, from its low to its high corner, (2,) m. It adds boxes to the town's list and has a
     random generator of its own."""
 
-    def __init__(self, town: BoxList, low: Pair, high: Pair, rng: np.random.Generator, lots: Lots) -> None:
+    def __init__(self, town: BoxList, low: Pair, high: Pair, rng: np.random.Generator) -> None:
         super().__init__(town.rows, town.kinds)
         self.low = np.asarray(low)
         self.high = np.asarray(high)
         self.rng = rng
-        self.lots = lots
         self.size = self.high - self.low
         self.middle = (self.low + self.high) / 2
 
@@ -357,54 +340,7 @@ def _meadow(plot: Plot) -> None:
     plot.bench(0, middle[0], middle[1] + 2.4)
 
 
-def _lots(plot: Plot) -> None:
-    """Build two rows of lots, back to back, each with its front to a street and a path to it through its garden."""
-    style = plot.lots
-    has_gardens = style.setback_m >= 2.5
-    plot.lay("Terrain" if has_gardens else "Sidewalks")
-    rng = plot.rng
-    low, high = plot.low, plot.high
-    lowest, highest = style.heights_m
-    depth = plot.size[1] / 2 - max(2.5, 0.08 * plot.size[1]) - style.setback_m
-    fall = min(1.0, float(np.linalg.norm(plot.middle)) / style.fall_m) if style.fall_m else 0.0
-    for row, side in ((low[1], 1), (high[1], -1)):
-        x = low[0] + style.gap_m / 2
-        while (room := high[0] - style.gap_m / 2 - x) >= LEAST_FRONT_M:
-            front, deep = style.footprints_m[rng.integers(len(style.footprints_m))]
-            share = min(1.0, depth / deep)
-            front, deep = front * share, deep * share
-            if room < front + LEAST_FRONT_M + style.gap_m:
-                front = room
-            height = lowest + (highest - lowest) * rng.beta(1.3, 1.7) * (1.0 - 0.9 * fall)
-            middle = np.array([x + front / 2, row + side * (style.setback_m + deep / 2)])
-            plot.add("Buildings", middle, (front, deep), 0.0, height)
-            if has_gardens:
-                plot.lay("Sidewalks", (middle[0] - 0.8, row), (middle[0] + 0.8, row + side * style.setback_m))
-            x += front + style.gap_m * rng.uniform(1.0, 1.6)
-
-
-def _plaza(plot: Plot) -> None:
-    """Pave a square, free in the middle, with trees and benches along its edges."""
-    plot.lay("Sidewalks")
-    for x in np.arange(plot.low[0] + 6.0, plot.high[0] - 5.0, 11.0):
-        for y, inwards in ((plot.low[1] + 2.5, 1), (plot.high[1] - 2.5, -1)):
-            plot.tree((x, y), (2.8, 3.8), (5.5, 8.0))
-            if plot.rng.random() < 0.4:
-                plot.bench(0, x + 4.0, y + inwards * 1.2)
-
-
-def _green(plot: Plot) -> None:
-    """Lay a lawn between two crossing paths, free in the middle of each quarter, with trees along its edges."""
-    plot.crossing_paths(1.5)
-    for axis in (0, 1):
-        for along in np.arange(plot.low[axis] + 6.0, plot.high[axis] - 5.0, 9.0):
-            for across in (plot.low[1 - axis] + 4.0, plot.high[1 - axis] - 4.0):
-                if abs(along - plot.middle[axis]) > 4.0:
-                    plot.tree(point(axis, along, across), (3.5, 5.5), (7.0, 12.0))
-
-
 BLOCKS: dict[str, Callable[[Plot], None]] = {
     "park": _park, "square": _square, "courtyard": _courtyard, "houses": _houses, "towers": _towers, "lanes": _lanes,
     "skyscrapers": _skyscrapers, "campus": _campus, "farm": _farm, "market": _market, "meadow": _meadow,
-    "plaza": _plaza, "green": _green, "lots": _lots,
 }  # fmt: skip
