@@ -20,13 +20,13 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback import read_track, write_track
 from cosfly.formats.traces import DroneTrace, write_traces
 from cosfly.formats.tracks import find_tracks
-from cosfly.geometry.axes import mask_box
+from cosfly.geometry.axes import mask_box, wrap_deg
 from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.inspection import frames
 from cosfly.inspection.frames import check_bystanders, check_recorded
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
-from cosfly.inspection.track import check_plan, is_shifted
+from cosfly.inspection.track import check_plan, check_yaw_rate, is_shifted
 from cosfly.runtime.errors import NothingKept
 from cosfly.runtime.io import CHECKSUMS, sha256_file, write_checksums
 from cosfly.runtime.json_io import read_json, write_json
@@ -156,6 +156,19 @@ def test_plan_rules(change, code, severity):
     report = Report()
     check_plan(trace, off, report, {})
     assert {issue.code for issue in report.issues} <= {"prefiltered"}
+
+
+@pytest.mark.parametrize(("most_degps", "codes"), [(60.0, {"yaw_rate"}), (90.0, set())])
+def test_a_camera_that_turns_faster_than_its_plan_allows_is_rejected(most_degps, codes):
+    n = 10
+    rotations = np.zeros((n, 3))
+    rotations[:, 1] = wrap_deg(170.0 + 40.0 * np.arange(n))  # 80 deg/s, across the seam at 180 degrees
+    still = np.zeros((n, 3))
+    report = Report()
+    check_yaw_rate(
+        DroneTrace("p", "muco", np.arange(n) * 0.5, still, rotations, still, np.ones(n), np.ones(n)), most_degps, report
+    )
+    assert {issue.code for issue in report.issues} == codes
 
 
 def findings(workplace: Path, cfg: InspectConfig = CFG) -> dict[str, dict[str, str]]:
@@ -490,7 +503,7 @@ def test_every_check_has_a_planted_defect():
     codes = set(re.findall(r"report\.(?:error|warn)\(\s*\"(\w+)\"", sources)) | {"collision", "clearance"}
     elsewhere = {
         "acceleration", "jerk", "smoothness", "prefiltered", "collision", "clearance", "five_ray_visibility",
-        "hidden_by_shift", "no_twin", "unreadable", "not_of_this_tree",
+        "hidden_by_shift", "no_twin", "unreadable", "not_of_this_tree", "yaw_rate",
     }  # fmt: skip
     planted = {name.split()[0] for name in (*DEFECTS, *TO_REVIEW)}
     assert not planted & elsewhere

@@ -214,6 +214,47 @@ def test_perturbed_frames_keep_their_promises(sampling):
     np.testing.assert_array_equal(after.poses.rotations_deg[still], before.rotations_deg[still])
 
 
+@each("sampling", ["cubic", "spherical"])
+def test_smooth_perturbations_keep_probabilities_and_radii_and_move_as_a_drone_and_a_walker_could(sampling):
+    cfg = PerturbationConfig(sampling=sampling, correlation_s=6.0, max_roll_deg=4.0)
+    n, dt_s = 4000, 0.5
+    before, after = planned(n), perturbed(cfg, n)
+    drawn = np.array([[state["position"] != "none", state["rotation"] != "none"] for state in after.states])
+    np.testing.assert_allclose(drawn.mean(axis=0), [0.6, 0.6], atol=0.1)
+    applied = np.array([state["position"] == "applied" for state in after.states])
+    assert applied.mean() > 0.3
+    assert not after.drone_offsets_m[~applied].any()
+    assert not after.target_offsets_m[~applied].any()
+    order = None if sampling == "spherical" else np.inf
+    for offsets_m, radius_m in (
+        (after.drone_offsets_m, cfg.drone_radius_m), (after.target_offsets_m[:, :2], cfg.pedestrian_radius_m)
+    ):  # fmt: skip
+        assert 0.8 * radius_m < np.linalg.norm(offsets_m, ord=order, axis=1).max() <= radius_m + 1e-9
+        steps = np.diff(offsets_m, axis=0)
+        speeds_mps = np.linalg.norm(steps, axis=1) / dt_s
+        accelerations_mps2 = np.linalg.norm(np.diff(steps, axis=0), axis=1) / dt_s**2
+        assert speeds_mps.max() < 2.5
+        assert np.percentile(accelerations_mps2, 95) < 1.5
+    assert 2.0 < np.abs(after.rotation_offsets_deg[:, 2]).max() <= 4.0
+    assert np.abs(after.rotation_offsets_deg).max() <= cfg.max_view_deg
+    np.testing.assert_allclose(after.poses.positions_m - before.positions_m, after.drone_offsets_m)
+
+
+def test_a_smooth_perturbation_fades_before_it_falls_back():
+    before, wall = along_a_wall(4.0)
+    cfg = PerturbationConfig(correlation_s=4.0, position_probability=1.0, rotation_probability=0.0, drone_radius_m=6.0)
+    rngs = [np.random.default_rng(1) for _ in range(2)]
+    after, again = (perturb(before, [CAMERA] * 120, Surroundings(wall), cfg, rng) for rng in rngs)
+    states = [state["position"] for state in after.states]
+    assert {"applied", "fallback: drone clearance"} <= set(states)
+    reach_m = np.linalg.norm(after.drone_offsets_m, axis=1)
+    assert not reach_m[[state != "applied" for state in states]].any()
+    assert reach_m.max() > 2.0
+    assert np.linalg.norm(np.diff(after.drone_offsets_m, axis=0), axis=1).max() < 1.5
+    np.testing.assert_array_equal(after.poses.positions_m, again.poses.positions_m)
+    assert after.states == again.states
+
+
 def test_the_four_states_come_in_the_papers_shares():
     """tab:augmentation_states: 16, 24, 24 and 36 %, before fallbacks."""
     states = perturbed(PerturbationConfig(), 3000).states

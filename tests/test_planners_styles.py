@@ -51,9 +51,10 @@ def styled(name, **more):
 
 def labels_of(trace):
     """The labels of a flight's windows; what the camera does not look at is not seen."""
-    pitch, yaw = look_at(trace.positions_m, trace.targets_m)
-    aside = np.abs(wrap_deg(np.degrees(yaw) - trace.rotations_deg[:, 1]))
-    visible = (trace.visibility > 0) & (aside < 30) & (np.abs(np.degrees(pitch) - trace.rotations_deg[:, 0]) < 17)
+    camera = Camera(640, 360, intrinsic_matrix(640, 360, 60.0))
+    poses = zip(trace.positions_m, trace.rotations_deg, trace.targets_m, strict=True)
+    in_view = [view_target(at_m, world_from_camera(place, turn), camera).in_view for place, turn, at_m in poses]
+    visible = (trace.visibility > 0) & np.array(in_view)
     found = []
     for now in range(4, len(trace.time_s) - 5):
         span, before = slice(now, now + 6), trace.positions_m[now] - trace.positions_m[now - 1]

@@ -15,6 +15,7 @@ from cosfly.formats.columns import (
     as_columns,
     column,
     columns,
+    is_number,
     read_items,
     rounded,
     step_field,
@@ -23,8 +24,9 @@ from cosfly.formats.columns import (
 )
 from cosfly.formats.pedestrian_paths import PLAIN_PACE, pace_field, pace_of
 from cosfly.formats.segments import Mission, Segment, flown_as_json, read_flown
+from cosfly.geometry.trajectory_metrics import YAW_RATE_MAX_DEGPS
 from cosfly.runtime.errors import InputError, shown
-from cosfly.runtime.json_io import MISSING, FileFormat
+from cosfly.runtime.json_io import MISSING, FileFormat, read_object
 
 TRACE_FORMAT = FileFormat("cosfly.drone_trace", "1.0", "drone traces")
 ARRAYS = ("time_s", "positions_m", "rotations_deg", "targets_m", "visibility")
@@ -65,11 +67,12 @@ class DroneTrace:
     """One drone trajectory, the product of stage 4; n points at the pedestrian's time stamps.
 
     time_s: (n,). positions_m: (n, 3) drone. rotations_deg: (n, 3) pitch, yaw, roll of the camera, which looks at the
-    target. targets_m: (n, 3) the pedestrian's tracked point (hip height). visibility: (n,) five-ray fraction in [0, 1].
-    clearances_m: (n,) signed distance to the nearest obstacle, the least on the straight way to the next point. metrics
-    and solver: JSON-able facts. segments: Styles of its parts; empty if the drone follows throughout. instead_of: The
-    style that the map did not permit, with the reason; not_held: The requested and the flown value. drop_reason: Why
-    the prefilter (sec:step6) drops it; None if it passes and is rendered. pace: Of the pedestrian trajectory.
+    target or follows it with a gimbal. targets_m: (n, 3) the pedestrian's tracked point (hip height). visibility: (n,)
+    five-ray fraction in [0, 1]. clearances_m: (n,) signed distance to the nearest obstacle, the least on the straight
+    way to the next point. metrics and solver: JSON-able facts. segments: Styles of its parts; empty if the drone
+    follows throughout. instead_of: The style that the map did not permit, with the reason; not_held: The requested and
+    the flown value. drop_reason: Why the prefilter (sec:step6) drops it; None if it passes and is rendered. pace: Of
+    the pedestrian trajectory.
     """
 
     path_id: str
@@ -186,3 +189,10 @@ def write_traces(path: Path, traces: list[DroneTrace], header: dict) -> None:
 def read_traces(path: Path) -> list[DroneTrace]:
     """Read `drone_trace.json`; raises as `read_items`."""
     return read_items(path, TRACE_FORMAT, "traces", DroneTrace.from_json)
+
+
+def read_yaw_rate_max(path: Path) -> float:
+    """Return the limit of yaw rate in the settings of `drone_trace.json`, deg/s; the default if they have none."""
+    settings = read_object(path, what=TRACE_FORMAT.what).get("settings")
+    limit: Any = settings.get("yaw_rate_max_degps") if isinstance(settings, dict) else None
+    return float(limit) if is_number(limit) else YAW_RATE_MAX_DEGPS

@@ -11,6 +11,7 @@ ACCEL_SCALE_MPS2, JERK_SCALE_MPS3 = 5.0, 10.0  # eq:smoothness_score
 
 # Bounds of a trajectory (sec:step6), for the filter of `plan` and for `inspect`.
 FIVE_RAY_MEAN_MIN, ACCEL_RMS_MAX_MPS2, JERK_RMS_MAX_MPS3 = 0.40, 5.0, 10.0
+YAW_RATE_MAX_DEGPS = 60.0  # of plans; the drone of the closed loop turns no faster
 
 # Distances to obstacles (tab:drone_params): of plans and perturbed frames, and the floor where a plan cannot keep it.
 SAFETY_DISTANCE_M, RELAXED_SAFETY_M = 3.0, 2.5

@@ -19,6 +19,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 POSE_TOLERANCE_M = 1e-3  # distance allowed between a track's pose and its plan
 ROTATION_TOLERANCE_DEG = 0.01
+YAW_RATE_TOLERANCE_DEGPS = 0.1  # of a plan above its limit, because files round angles
 REPROJECTION_TOLERANCE_PX = 0.5  # distance allowed between the recorded and the projected target
 DRONE_SPEED_MAX_MPS = 25.0  # a faster step between two frames is a teleport
 TARGET_SPEED_MAX_MPS = 10.0

@@ -23,8 +23,9 @@ from cosfly.formats.inspection import (
 )
 from cosfly.formats.issues import Report
 from cosfly.formats.playback import read_track
-from cosfly.formats.traces import DroneTrace, read_traces
+from cosfly.formats.traces import DroneTrace, read_traces, read_yaw_rate_max
 from cosfly.formats.tracks import find_tracks
+from cosfly.geometry.trajectory_metrics import YAW_RATE_MAX_DEGPS
 from cosfly.inspection.report import ReportPicture, report_html
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.track import InspectedTrack, inspect_track, trace_id
@@ -45,9 +46,10 @@ def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None
     obstacles = None if simplified is None else obstacle_index(read_boxes(simplified))
     by_id = None if traces is None else {trace.path_id: trace for trace in read_traces(traces)}
     recorded = recorded_digests(data)
+    yaw_rate_max_degps = YAW_RATE_MAX_DEGPS if traces is None else read_yaw_rate_max(traces)
 
     def work(item: Item) -> Outcome:
-        inspected = inspect_track(data / item.payload, data, by_id, obstacles, cfg, recorded)
+        inspected = inspect_track(data / item.payload, data, by_id, obstacles, cfg, recorded, yaw_rate_max_degps)
         record = inspected.record
         return Outcome(
             inspected.model_dump(mode="json"), drop_reason=record.reason if record.result == "rejected" else None

@@ -64,6 +64,7 @@ def inspect_track(
     obstacles: BoxIndex | None,
     cfg: InspectConfig,
     recorded: Mapping[str, str],
+    yaw_rate_max_degps: float,
 ) -> InspectedTrack:
     """Check one track folder.
 
@@ -71,6 +72,7 @@ def inspect_track(
         traces: Plans by id; None if the tree has none.
         obstacles: Of the map; None if there is no map.
         recorded: sha256 by path of the tree's manifest; empty if there is none.
+        yaw_rate_max_degps: Limit of the plans.
     """
     report = Report()
     track = _read(folder, report)
@@ -78,6 +80,7 @@ def inspect_track(
     metrics: Metrics = {"num_frames": len(track)}
     if trace is not None:
         check_plan(trace, cfg, report, metrics)
+        check_yaw_rate(trace, yaw_rate_max_degps, report)
         check_poses(track, trace, report)
     elif traces is not None:
         got = f"no trace {trace_id(track)!r}"
@@ -139,6 +142,15 @@ def check_plan(trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: M
         report.error("jerk", where, f"{jerk:.2f} m/s^3", f"at most {cfg.jerk_rms_max_mps3:g} m/s^3 RMS")
     if score < cfg.smoothness_min:
         report.warn("smoothness", where, f"S = {score:.3f}", f"at least {cfg.smoothness_min:g}")
+
+
+def check_yaw_rate(trace: DroneTrace, most_degps: float, report: Report) -> None:
+    """Check that the camera of a plan turns no faster than the limit of its settings."""
+    turns_deg = np.abs(wrap_deg(np.diff(trace.rotations_deg[:, 1])))
+    fastest_degps = float(turns_deg.max(initial=0.0)) / step_s(trace.time_s)
+    if fastest_degps > most_degps + limits.YAW_RATE_TOLERANCE_DEGPS:
+        expected = f"at most {most_degps:g} deg/s (plan.yaw_rate_max_degps)"
+        report.error("yaw_rate", f"plan {trace.path_id}", f"{fastest_degps:.1f} deg/s", expected)
 
 
 def check_surroundings(track: Track, obstacles: BoxIndex, cfg: InspectConfig, report: Report, metrics: Metrics) -> None:

@@ -22,8 +22,9 @@ from pydantic import Field, field_validator, model_validator
 from cosfly.formats.segments import FOLLOW
 from cosfly.geometry import trajectory_metrics as limits
 from cosfly.geometry.axes import DT_S
+from cosfly.planners.gimbal import GimbalConfig
 from cosfly.planners.styles import ALTITUDE_LEAST_M, NAMES, OTHER_SIDE, ROWS, Range, Style, with_ranges
-from cosfly.runtime.config import Config
+from cosfly.runtime.config import Config, IfChanged
 from cosfly.runtime.errors import NoPathError, nearest
 
 if TYPE_CHECKING:
@@ -149,6 +150,12 @@ class PlanConfig(Config):
     speed_max_mps: float = Field(10.0, gt=0, description="greatest speed between two waypoints, m/s")
     accel_max_mps2: float = Field(
         5.0, gt=0, description="greatest acceleration between steps, m/s^2; ignored by muco.step=paper"
+    )
+    yaw_rate_max_degps: IfChanged[float] = Field(
+        limits.YAW_RATE_MAX_DEGPS, gt=0, le=720, description="greatest yaw rate of the camera, also for inspect, deg/s"
+    )
+    gimbal: IfChanged[GimbalConfig] = Field(
+        GimbalConfig(), description="camera that follows the target imperfectly, on both tracks"
     )
     heading_smoothing_s: ClassVar[float] = 4.0  # standard deviation of the target's heading filter, s; 0: none
     five_ray_mean_min: float = Field(

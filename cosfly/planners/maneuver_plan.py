@@ -19,6 +19,7 @@ from cosfly.formats.segments import FOLLOW, MISSION_KINDS, Mission, MissionKind,
 from cosfly.geometry.axes import look_at
 from cosfly.geometry.trajectory_metrics import distances_along_m
 from cosfly.planners.contract import PlanConfig, Scenario, TrackingReference
+from cosfly.planners.gimbal import follow_direction, limit_yaw_rate
 from cosfly.planners.reference_trajectory import ROUNDING_S, finds_again, reacquire_reference, reference_of
 from cosfly.planners.styles import OTHER_SIDE, REACQUIRE, RETURN_HOME, ROWS, WHOLE, suits
 from cosfly.runtime.seeding import draw_to_quota
@@ -292,7 +293,7 @@ def _positions_along(corners_m: np.ndarray, most_mps: float, dt_s: float) -> np.
 
 # --- camera -----------------------------------------------------------------------------------------------------------
 # The camera looks at the target; on the way home, in the direction of motion; while the target is hidden, where it was
-# lost.
+# lost. It keeps the limit of yaw rate, and may follow this direction with a gimbal.
 
 TURNS_S = 0.8  # standard deviation of the smoothing of a turn during a search
 HOME_PITCH_DEG = -15.0  # on the way home
@@ -304,18 +305,24 @@ SWEEP_DEG, SWEEP_S = 18.0, 6.0  # amplitude and period
 
 
 def view_of(
-    maneuvers: ManeuverPlan, positions_m: np.ndarray, targets_m: np.ndarray, seen: np.ndarray, dt_s: float
-) -> tuple[np.ndarray, np.ndarray]:
+    maneuvers: ManeuverPlan, positions_m: np.ndarray, targets_m: np.ndarray, seen: np.ndarray, dt_s: float,
+    cfg: PlanConfig, rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return pitch and yaw of the camera, (n,) each, radians.
 
     Args:
-        positions_m, targets_m: (n, 3). seen: (n,) five-ray visibility.
+        positions_m, targets_m: (n, 3). seen: (n,) five-ray visibility. rng: Draws the aiming error of the gimbal.
     """
     if maneuvers.mission is not None:
-        return _turned_home(positions_m, targets_m, maneuvers.mission.at_frame, dt_s)
-    if maneuvers.searches:
-        return _searching(positions_m, targets_m, seen, dt_s)
-    return look_at(positions_m, targets_m)
+        direction = _turned_home(positions_m, targets_m, maneuvers.mission.at_frame, dt_s)
+    elif maneuvers.searches:
+        direction = _searching(positions_m, targets_m, seen, dt_s)
+    else:
+        direction = look_at(positions_m, targets_m)
+    direction = limit_yaw_rate(*direction, cfg.yaw_rate_max_degps, dt_s)
+    if cfg.gimbal.bandwidth_hz == 0:
+        return direction
+    return follow_direction(*direction, cfg.gimbal, cfg.yaw_rate_max_degps, dt_s, rng)
 
 
 def _turned_home(

@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 from cosfly.formats.segments import FOLLOW
 from cosfly.geometry.axes import DT_S
 from cosfly.planners.contract import PlanConfig, Scenario, TrackingReference
+from cosfly.planners.gimbal import slew
 from cosfly.planners.styles import REACQUIRE, Range, Style
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ def without_jumps(
     paper = scenario.reference
 
     def followed(values: np.ndarray, speeds_mps: np.ndarray | float) -> np.ndarray:
-        slewed = _slew(values, np.broadcast_to(np.asarray(speeds_mps) * dt_s, num))
+        slewed = slew(values, np.broadcast_to(np.asarray(speeds_mps) * dt_s, num))
         return gaussian_filter1d(slewed, ROUNDING_S / dt_s, mode="nearest")
 
     apart_m = followed(course[:, 1], paces_mps)
@@ -178,14 +179,6 @@ def _even(start: Range, end: Range | None, rates: Range, seconds: np.ndarray, rn
 def _steady(heading_rad: np.ndarray) -> np.ndarray:
     """Keep a heading until the target's differs by more than STEADY_RAD, then take the target's."""
     return np.array([*accumulate(heading_rad.tolist(), lambda now, new: new if abs(new - now) > STEADY_RAD else now)])
-
-
-def _slew(values: np.ndarray, steps_max: np.ndarray) -> np.ndarray:
-    """Return values that follow `values`, (n,), from the first on with steps of at most `steps_max`, (n,)."""
-    followed = [float(values[0])]
-    for value, step_max in zip(values[1:].tolist(), steps_max[1:].tolist(), strict=True):
-        followed.append(followed[-1] + min(max(value - followed[-1], -step_max), step_max))
-    return np.array(followed)
 
 
 # --- reacquire --------------------------------------------------------------------------------------------------------

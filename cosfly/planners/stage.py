@@ -157,11 +157,13 @@ def plan_on(
         return plan(replace(scenario, turns_back=True), obstacles, cfg, rng).positions_m
 
 
-def style_rng(pedestrian: PedestrianTrajectory, seed: int, attempt: int = 0) -> np.random.Generator:
-    """Return the random generator of a trajectory's styles; it depends on the position of the pedestrian's start,
-    because pedestrian trajectories of different maps have equal ids."""
+def style_rng(
+    pedestrian: PedestrianTrajectory, seed: int, attempt: int = 0, purpose: str = "style"
+) -> np.random.Generator:
+    """Return the random generator of a trajectory's styles or gimbal; it depends on the position of the pedestrian's
+    start, because pedestrian trajectories of different maps have equal ids."""
     x_m, y_m = np.round(pedestrian.positions_m[0, :2], 2) + 0.0
-    return rng_for(seed, "style", f"{pedestrian.path_id}/{x_m:.2f}/{y_m:.2f}" + (f"/{attempt}" if attempt else ""))
+    return rng_for(seed, purpose, f"{pedestrian.path_id}/{x_m:.2f}/{y_m:.2f}" + (f"/{attempt}" if attempt else ""))
 
 
 def _plan_once(
@@ -189,7 +191,8 @@ def _plan_once(
     seen = visibility(obstacles, positions, targets)
     is_judged = maneuvers.reference.keeps_sight
     seen_past_screens = visibility(screens, positions, targets) if maneuvers.searches else seen
-    pitch, yaw = view_of(maneuvers, positions, targets, seen_past_screens, scenario.dt_s)
+    gimbal_rng = style_rng(pedestrian, seed, purpose="gimbal")
+    pitch, yaw = view_of(maneuvers, positions, targets, seen_past_screens, scenario.dt_s, cfg, gimbal_rng)
     counted = seen[is_judged] if is_judged.any() else seen
     metrics = trajectory_metrics(positions, targets, counted, clearances, scenario.ground_m, scenario.dt_s)
     reason = drop_reason(metrics, cfg, plan.is_converged, checks_visibility=bool(is_judged.any()))

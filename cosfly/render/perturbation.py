@@ -3,6 +3,10 @@
 A position event shifts person and drone; a rotation event turns the view. An event falls back if it brings the drone
 or the person too near an obstacle, or if the person leaves the image or is hidden. The frame's state records the
 reason.
+
+In the paper every frame draws its own events and offsets. With `correlation_s` they are smooth in time, so that drone
+and person move as they could: offsets grow from zero at the begin of an event and return to zero before its end, and
+before and after a fallback.
 """
 
 from __future__ import annotations
@@ -10,25 +14,30 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
+from scipy.special import gammainc, ndtr
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import Camera
 from cosfly.formats.kinds import GROUND_KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
-from cosfly.geometry.axes import look_at, project, rotation_matrices, world_from_camera, wrap_deg
-from cosfly.geometry.kernels import obstacle_index, signed_distances
+from cosfly.formats.playback import EVENTS
+from cosfly.geometry.axes import DT_S, look_at, project, rotation_matrices, world_from_camera, wrap_deg
+from cosfly.geometry.kernels import obstacle_index, signed_distances, visibility
 from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M
 from cosfly.render.contract import NEAR_M, plane_z_m
 from cosfly.render.person import NO_BYSTANDERS, DressedBystanders
-from cosfly.runtime.config import Config
+from cosfly.runtime.config import Config, IfChanged
+from cosfly.runtime.seeding import draw_smooth
 
 HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # head from hip point: branches and signs may be in the way up there
 PERTURBED = "aug_001"  # the variant of the perturbed track
 STEP_UP_M = 0.5  # most by which a shifted person may be higher or lower than before; keeps people off roofs
+
+SEEN_LEAST = 0.3  # five-ray visibility of a target that a smooth shift must not hide
 
 # States of an event.
 NONE = "none"
@@ -49,6 +58,12 @@ class PerturbationConfig(Config):
     view_radius_m: float = Field(2.0, ge=0, description="largest distance of the camera's aim from the person, m")
     max_view_deg: float = Field(5.0, ge=0, le=45, description="largest turn in yaw and in pitch (theta_max), degrees")
     max_roll_deg: float = Field(0.0, ge=0, le=45, description="largest roll of a turned view, degrees; 0 in the paper")
+    correlation_s: IfChanged[float] = Field(
+        0.0,
+        ge=0,
+        le=60,
+        description="correlation time of events and offsets, s; 0: every frame draws its own, as in the paper",
+    )
     sampling: Literal["cubic", "spherical"] = Field(
         "spherical", description="offsets are uniform in a cube or in a ball"
     )
@@ -174,27 +189,37 @@ def perturb(
     cfg: PerturbationConfig,
     rng: np.random.Generator,
     others: DressedBystanders = NO_BYSTANDERS,
+    dt_s: float = DT_S,
 ) -> PerturbedTrack:
-    """Perturb every frame of a trajectory. Each frame takes the same number of random draws."""
+    """Perturb every frame of a trajectory. dt_s: between frames. The random draws do not depend on the map."""
     scene = _Scene(planned, cameras, surroundings, cfg, others)
-    unshifted = PerturbedTrack.unperturbed(planned)
-    track = replace(PerturbedTrack.unperturbed(planned), unshifted=unshifted)
+    if cfg.correlation_s == 0:
+        return _apply(_draw_each_frame(len(cameras), cfg, rng), scene)
+    return _apply_smoothly(_draw_smoothly(len(cameras), dt_s, cfg, rng), scene, cfg.correlation_s / dt_s)
+
+
+class _Draws(NamedTuple):
+    """The events and offsets of n frames."""
+
+    is_drawn: dict[str, np.ndarray]  # event -> (n,) bool
+    person_m: np.ndarray  # (n, 3)
+    drone_m: np.ndarray  # (n, 3)
+    view_m: np.ndarray  # (n, 3), from the person to the point to look at
+    roll: np.ndarray  # (n,), from -1 to 1, the share of max_roll_deg
+
+
+def _draw_each_frame(num: int, cfg: PerturbationConfig, rng: np.random.Generator) -> _Draws:
+    """Draw the events and offsets of each frame alone, as in the paper."""
     roll_rng = rng.spawn(1)[0]  # its own generator: the other draws are those of the paper's track, which has no roll
-    for i in range(len(track.states)):
-        is_shifted, is_turned = rng.random(2) < [cfg.position_probability, cfg.rotation_probability]
-        person_offset = _offset(rng, cfg, cfg.pedestrian_radius_m, 2)
-        drone_offset = _offset(rng, cfg, cfg.drone_radius_m, 3)
-        view_offset = _offset(rng, cfg, cfg.view_radius_m, 3)
-        roll = roll_rng.uniform(-1.0, 1.0)
-        position = NONE
-        if is_shifted:
-            position = _shift(track, i, person_offset, drone_offset, scene)
-        if is_turned:
-            _turn(unshifted, i, view_offset, roll, scene)
-            _turn(track, i, view_offset, roll, scene)
-        if position != APPLIED:
-            track.drop_shift(i, position)
-    return track
+    is_drawn = {event: np.zeros(num, dtype=bool) for event in EVENTS}
+    offsets = np.empty((3, num, 3))
+    for i in range(num):
+        events = rng.random(2) < [cfg.position_probability, cfg.rotation_probability]
+        is_drawn["position"][i], is_drawn["rotation"][i] = events
+        offsets[0, i] = _offset(rng, cfg, cfg.pedestrian_radius_m, 2)
+        offsets[1, i] = _offset(rng, cfg, cfg.drone_radius_m, 3)
+        offsets[2, i] = _offset(rng, cfg, cfg.view_radius_m, 3)
+    return _Draws(is_drawn, offsets[0], offsets[1], offsets[2], roll_rng.uniform(-1.0, 1.0, num))
 
 
 def _offset(rng: np.random.Generator, cfg: PerturbationConfig, radius_m: float, num_axes: int) -> np.ndarray:
@@ -204,6 +229,87 @@ def _offset(rng: np.random.Generator, cfg: PerturbationConfig, radius_m: float, 
     share = rng.random()
     in_ball = radius_m * direction / np.linalg.norm(direction) * share ** (1.0 / num_axes)
     return np.append(in_cube if cfg.sampling == "cubic" else in_ball, np.zeros(3 - num_axes))
+
+
+def _draw_smoothly(num: int, dt_s: float, cfg: PerturbationConfig, rng: np.random.Generator) -> _Draws:
+    """Draw events and offsets that are smooth in time, with the distribution of `_draw_each_frame` in each frame."""
+
+    def normal(num_axes: int) -> np.ndarray:
+        return draw_smooth(num, num_axes, dt_s, cfg.correlation_s, rng)
+
+    def offsets(radius_m: float, num_axes: int) -> np.ndarray:
+        drawn = normal(num_axes)
+        in_unit = 2.0 * ndtr(drawn) - 1.0
+        if cfg.sampling == "spherical":
+            squares = (drawn**2).sum(axis=1, keepdims=True)
+            in_unit = drawn / np.sqrt(squares) * gammainc(num_axes / 2.0, squares / 2.0) ** (1.0 / num_axes)
+        return np.hstack([radius_m * in_unit, np.zeros((num, 3 - num_axes))])
+
+    probabilities = {"position": cfg.position_probability, "rotation": cfg.rotation_probability}
+    return _Draws(
+        {event: ndtr(normal(1)[:, 0]) < probabilities[event] for event in EVENTS},
+        offsets(cfg.pedestrian_radius_m, 2), offsets(cfg.drone_radius_m, 3), offsets(cfg.view_radius_m, 3),
+        2.0 * ndtr(normal(1)[:, 0]) - 1.0,
+    )  # fmt: skip
+
+
+def _apply(drawn: _Draws, scene: _Scene) -> PerturbedTrack:
+    """Apply the events of all frames that pass the checks."""
+    unshifted = PerturbedTrack.unperturbed(scene.planned)
+    track = replace(PerturbedTrack.unperturbed(scene.planned), unshifted=unshifted)
+    for i in range(len(track.states)):
+        position = NONE
+        if drawn.is_drawn["position"][i]:
+            position = _shift(track, i, drawn.person_m[i], drawn.drone_m[i], scene)
+        if drawn.is_drawn["rotation"][i]:
+            _turn(unshifted, i, drawn.view_m[i], drawn.roll[i], scene)
+            _turn(track, i, drawn.view_m[i], drawn.roll[i], scene)
+        if position != APPLIED:
+            track.drop_shift(i, position)
+    return track
+
+
+def _apply_smoothly(drawn: _Draws, scene: _Scene, fade_frames: float) -> PerturbedTrack:
+    """Apply smooth events; around frames without an event and around fallbacks the offsets fade to zero.
+
+    A smaller offset may fall back too, so this is repeated until every remaining event passes the checks.
+    """
+    obstacles = scene.surroundings.obstacles
+    is_seen = visibility(obstacles, scene.planned.positions_m, scene.planned.targets_m) >= SEEN_LEAST
+    fallbacks: dict[str, dict[int, str]] = {event: {} for event in EVENTS}  # by frame
+    while True:
+        active = {event: is_drawn.copy() for event, is_drawn in drawn.is_drawn.items()}
+        for event, reasons in fallbacks.items():
+            active[event][list(reasons)] = False
+        shift, turn = (_fade(active[event], fade_frames) for event in EVENTS)
+        person_m, drone_m, view_m = drawn.person_m * shift, drawn.drone_m * shift, drawn.view_m * turn
+        track = _apply(_Draws(active, person_m, drone_m, view_m, drawn.roll * turn[:, 0]), scene)
+        hides = is_seen & (visibility(obstacles, track.poses.positions_m, track.poses.targets_m) < SEEN_LEAST)
+        found = False
+        for event, reasons in fallbacks.items():
+            for i in np.flatnonzero(active[event]).tolist():
+                state = HIDDEN if event == "position" and hides[i] else track.states[i][event]
+                if state != APPLIED:
+                    reasons[i] = state
+                    found = True
+        if not found:
+            break
+    assert track.unshifted is not None
+    for i, reason in fallbacks["position"].items():
+        track.states[i]["position"] = reason
+    for i, reason in fallbacks["rotation"].items():
+        track.states[i]["rotation"] = track.unshifted.states[i]["rotation"] = reason
+    return track
+
+
+def _fade(is_active: np.ndarray, fade_frames: float) -> np.ndarray:
+    """Return factors from 0 to 1, (n, 1), that rise from 0 at frames that are not active."""
+    frames = np.arange(len(is_active))
+    still = frames[~is_active]
+    if not len(still):
+        return np.ones((len(frames), 1))
+    share = np.minimum(np.abs(frames[:, None] - still).min(axis=1) / fade_frames, 1.0)
+    return (share**2 * (3.0 - 2.0 * share))[:, None]
 
 
 def _shift(track: PerturbedTrack, i: int, person_offset: np.ndarray, drone_offset: np.ndarray, scene: _Scene) -> str:

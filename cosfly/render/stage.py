@@ -122,7 +122,7 @@ def make_track_script(
     perturbed = PerturbedTrack.unperturbed(poses)
     if track == "perturbed":
         rng = rng_for(seed, "render", f"{trace.path_id}/{PERTURBED}")
-        perturbed = perturb(poses, cameras, surroundings, cfg.perturbation, rng, cast)
+        perturbed = perturb(poses, cameras, surroundings, cfg.perturbation, rng, cast, step_s(trace.time_s))
     return TrackScript(
         town=town,
         trajectory=f"{TRAJECTORY}{cfg.first_timestamp + number}",

@@ -32,6 +32,9 @@ C = TypeVar("C", bound=BaseModel)
 # and a stage may be resumed with another value.
 _MAY_DIFFER = "may differ on resume"
 MayDiffer = Annotated[T, _MAY_DIFFER]
+# IfChanged[int] is recorded only if it is not the default, so that products made without the setting stay the same.
+_IF_CHANGED = "recorded if changed"
+IfChanged = Annotated[T, _IF_CHANGED]
 
 
 class Config(BaseModel):
@@ -40,9 +43,15 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     def recorded(self) -> dict[str, Any]:
-        """Return the settings and constants that determine the products, JSON-able: all but those of MayDiffer."""
-        may_differ = {name for name, field in type(self).model_fields.items() if _MAY_DIFFER in field.metadata}
-        return self._values("recorded", [name for name in self._names() if name not in may_differ])
+        """Return the settings and constants that determine the products, JSON-able: all but those of MayDiffer, and
+        those of IfChanged that are the default."""
+        left_out = {
+            name
+            for name, field in type(self).model_fields.items()
+            if _MAY_DIFFER in field.metadata
+            or (_IF_CHANGED in field.metadata and getattr(self, name) == field.get_default(call_default_factory=True))
+        }
+        return self._values("recorded", [name for name in self._names() if name not in left_out])
 
     def all_values(self) -> dict[str, Any]:
         """Return all settings and constants, JSON-able."""

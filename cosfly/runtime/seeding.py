@@ -22,6 +22,19 @@ def random_bytes(seed: int, stage: str, item_id: str) -> bytes:
     return hashlib.sha256(f"{seed}/{stage}/{item_id}".encode()).digest()
 
 
+def draw_smooth(num: int, num_axes: int, step_s: float, correlation_s: float, rng: np.random.Generator) -> np.ndarray:
+    """Draw a stationary Gaussian process at times `step_s` apart, (num, num_axes), of mean 0 and variance 1.
+
+    Its covariance is exp(-(t / correlation_s)^2 / 2): white noise, averaged with Gaussian weights.
+    """
+    spread = correlation_s / step_s / 2**0.5  # of the weights, in steps
+    reach = int(np.ceil(4.0 * spread))
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / spread) ** 2)
+    weights /= np.linalg.norm(weights)
+    noise = rng.normal(size=(num_axes, num + 2 * reach))
+    return np.stack([np.convolve(row, weights, "valid") for row in noise], axis=1)
+
+
 def draw_to_quota(shares: Mapping[str, float], rng: np.random.Generator) -> Iterator[str]:
     """Yield names endlessly in random order; after any number of draws each name is within three of its share.
 
