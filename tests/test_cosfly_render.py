@@ -18,7 +18,7 @@ from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.people import Appearance, People
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
-from cosfly.geometry.axes import focal_px, intrinsic_matrix, look_at
+from cosfly.geometry.axes import focal_px, intrinsic_matrix, look_at, wrap_deg
 from cosfly.geometry.goals import SIDES, target_picture
 from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.render.camera import rendered_visibility, view_target
@@ -253,6 +253,18 @@ def test_a_smooth_perturbation_fades_before_it_falls_back():
     assert np.linalg.norm(np.diff(after.drone_offsets_m, axis=0), axis=1).max() < 1.5
     np.testing.assert_array_equal(after.poses.positions_m, again.poses.positions_m)
     assert after.states == again.states
+
+
+def test_a_smooth_shift_turns_no_camera_round_over_its_target():
+    n = 400
+    targets = np.column_stack([0.5 * np.arange(n), np.zeros(n), np.full(n, 0.9)])
+    drones = targets + np.array([-3.0, 0.0, 20.0])
+    pitch, yaw = look_at(drones, targets)
+    before = Poses(drones, np.degrees(np.stack([pitch, yaw, 0.0 * yaw], axis=1)), targets, np.full(n, 20.0))
+    cfg = PerturbationConfig(correlation_s=2.0)
+    after = perturb(before, [CAMERA] * n, Surroundings(make_box_map([], [], [], [])), cfg, np.random.default_rng(0))
+    assert "fallback: yaw rate" in {state["position"] for state in after.states}
+    assert np.abs(wrap_deg(np.diff(after.poses.rotations_deg[:, 1]))).max() / 0.5 <= 60.0 + cfg.max_view_deg
 
 
 def test_the_four_states_come_in_the_papers_shares():

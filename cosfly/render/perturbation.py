@@ -27,7 +27,7 @@ from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT
 from cosfly.formats.playback import EVENTS
 from cosfly.geometry.axes import DT_S, look_at, project, rotation_matrices, world_from_camera, wrap_deg
 from cosfly.geometry.kernels import obstacle_index, signed_distances, visibility
-from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M
+from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M, YAW_RATE_MAX_DEGPS
 from cosfly.render.contract import NEAR_M, plane_z_m
 from cosfly.render.person import NO_BYSTANDERS, DressedBystanders
 from cosfly.runtime.config import Config, IfChanged
@@ -46,6 +46,7 @@ DRONE_CLEARANCE = "fallback: drone clearance"
 PERSON_IN_OBSTACLE = "fallback: person in an obstacle"
 OUT_OF_VIEW = "fallback: target out of view"
 HIDDEN = "fallback: target hidden"
+TURNS_FAST = "fallback: yaw rate"  # of smooth perturbations: near a target below, a shift turns the camera round
 
 
 class PerturbationConfig(Config):
@@ -195,7 +196,7 @@ def perturb(
     scene = _Scene(planned, cameras, surroundings, cfg, others)
     if cfg.correlation_s == 0:
         return _apply(_draw_each_frame(len(cameras), cfg, rng), scene)
-    return _apply_smoothly(_draw_smoothly(len(cameras), dt_s, cfg, rng), scene, cfg.correlation_s / dt_s)
+    return _apply_smoothly(_draw_smoothly(len(cameras), dt_s, cfg, rng), scene, dt_s)
 
 
 class _Draws(NamedTuple):
@@ -269,26 +270,30 @@ def _apply(drawn: _Draws, scene: _Scene) -> PerturbedTrack:
     return track
 
 
-def _apply_smoothly(drawn: _Draws, scene: _Scene, fade_frames: float) -> PerturbedTrack:
+def _apply_smoothly(drawn: _Draws, scene: _Scene, dt_s: float) -> PerturbedTrack:
     """Apply smooth events; around frames without an event and around fallbacks the offsets fade to zero.
 
     A smaller offset may fall back too, so this is repeated until every remaining event passes the checks.
     """
     obstacles = scene.surroundings.obstacles
+    planned_degps = _yaw_rates_degps(scene.planned, dt_s)
     is_seen = visibility(obstacles, scene.planned.positions_m, scene.planned.targets_m) >= SEEN_LEAST
     fallbacks: dict[str, dict[int, str]] = {event: {} for event in EVENTS}  # by frame
     while True:
         active = {event: is_drawn.copy() for event, is_drawn in drawn.is_drawn.items()}
         for event, reasons in fallbacks.items():
             active[event][list(reasons)] = False
-        shift, turn = (_fade(active[event], fade_frames) for event in EVENTS)
+        shift, turn = (_fade(active[event], scene.cfg.correlation_s / dt_s) for event in EVENTS)
         person_m, drone_m, view_m = drawn.person_m * shift, drawn.drone_m * shift, drawn.view_m * turn
         track = _apply(_Draws(active, person_m, drone_m, view_m, drawn.roll * turn[:, 0]), scene)
         hides = is_seen & (visibility(obstacles, track.poses.positions_m, track.poses.targets_m) < SEEN_LEAST)
+        is_fast = _yaw_rates_degps(track.poses, dt_s) > np.maximum(planned_degps, YAW_RATE_MAX_DEGPS)
         found = False
         for event, reasons in fallbacks.items():
             for i in np.flatnonzero(active[event]).tolist():
-                state = HIDDEN if event == "position" and hides[i] else track.states[i][event]
+                state = track.states[i][event]
+                if event == "position" and state == APPLIED:
+                    state = HIDDEN if hides[i] else TURNS_FAST if is_fast[i] else APPLIED
                 if state != APPLIED:
                     reasons[i] = state
                     found = True
@@ -300,6 +305,12 @@ def _apply_smoothly(drawn: _Draws, scene: _Scene, fade_frames: float) -> Perturb
     for i, reason in fallbacks["rotation"].items():
         track.states[i]["rotation"] = track.unshifted.states[i]["rotation"] = reason
     return track
+
+
+def _yaw_rates_degps(poses: Poses, dt_s: float) -> np.ndarray:
+    """Return the greater yaw rate of the steps to and from each frame, (n,)."""
+    rates = np.abs(wrap_deg(np.diff(poses.rotations_deg[:, 1]))) / dt_s
+    return np.maximum(np.append(rates, 0.0), np.insert(rates, 0, 0.0))
 
 
 def _fade(is_active: np.ndarray, fade_frames: float) -> np.ndarray:
