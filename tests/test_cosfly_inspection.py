@@ -26,7 +26,7 @@ from cosfly.inspection import frames
 from cosfly.inspection.frames import check_bystanders, check_recorded
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
-from cosfly.inspection.track import check_plan, check_yaw_rate, is_shifted
+from cosfly.inspection.track import check_plan, is_shifted
 from cosfly.runtime.errors import NothingKept
 from cosfly.runtime.io import CHECKSUMS, sha256_file, write_checksums
 from cosfly.runtime.json_io import read_json, write_json
@@ -150,11 +150,11 @@ def test_plan_rules(change, code, severity):
         drop_reason=change.get("drop_reason"),
     )  # fmt: skip
     report = Report()
-    check_plan(trace, InspectConfig(), report, {})
+    check_plan(trace, InspectConfig(), report, {}, 60.0)
     assert {issue.code: issue.severity for issue in report.issues}.get(code) == severity
     off = InspectConfig(accel_rms_max_mps2=1e6, jerk_rms_max_mps3=1e6, smoothness_min=0)
     report = Report()
-    check_plan(trace, off, report, {})
+    check_plan(trace, off, report, {}, 60.0)
     assert {issue.code for issue in report.issues} <= {"prefiltered"}
 
 
@@ -164,10 +164,9 @@ def test_a_camera_that_turns_faster_than_its_plan_allows_is_rejected(most_degps,
     rotations = np.zeros((n, 3))
     rotations[:, 1] = wrap_deg(170.0 + 40.0 * np.arange(n))  # 80 deg/s, across the seam at 180 degrees
     still = np.zeros((n, 3))
+    trace = DroneTrace("p", "muco", np.arange(n) * 0.5, still, rotations, still, np.ones(n), np.ones(n))
     report = Report()
-    check_yaw_rate(
-        DroneTrace("p", "muco", np.arange(n) * 0.5, still, rotations, still, np.ones(n), np.ones(n)), most_degps, report
-    )
+    check_plan(trace, InspectConfig(), report, {}, most_degps)
     assert {issue.code for issue in report.issues} == codes
 
 

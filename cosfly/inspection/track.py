@@ -79,8 +79,7 @@ def inspect_track(
     trace = None if traces is None else traces.get(trace_id(track))
     metrics: Metrics = {"num_frames": len(track)}
     if trace is not None:
-        check_plan(trace, cfg, report, metrics)
-        check_yaw_rate(trace, yaw_rate_max_degps, report)
+        check_plan(trace, cfg, report, metrics, yaw_rate_max_degps)
         check_poses(track, trace, report)
     elif traces is not None:
         got = f"no trace {trace_id(track)!r}"
@@ -127,8 +126,10 @@ def _read(folder: Path, report: Report) -> Track:
         return track
 
 
-def check_plan(trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: Metrics) -> None:
-    """Check the smoothness of the plan and the result of its prefilter."""
+def check_plan(
+    trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: Metrics, yaw_rate_max_degps: float
+) -> None:
+    """Check the smoothness of the plan, the yaw rate of its camera, and the result of its prefilter."""
     dt_s = step_s(trace.time_s)
     accel, jerk = (derivative_rms(trace.positions_m, order, dt_s) for order in (2, 3))
     score = smoothness_score(accel, jerk)
@@ -142,15 +143,10 @@ def check_plan(trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: M
         report.error("jerk", where, f"{jerk:.2f} m/s^3", f"at most {cfg.jerk_rms_max_mps3:g} m/s^3 RMS")
     if score < cfg.smoothness_min:
         report.warn("smoothness", where, f"S = {score:.3f}", f"at least {cfg.smoothness_min:g}")
-
-
-def check_yaw_rate(trace: DroneTrace, most_degps: float, report: Report) -> None:
-    """Check that the camera of a plan turns no faster than the limit of its settings."""
-    turns_deg = np.abs(wrap_deg(np.diff(trace.rotations_deg[:, 1])))
-    fastest_degps = float(turns_deg.max(initial=0.0)) / step_s(trace.time_s)
-    if fastest_degps > most_degps + limits.YAW_RATE_TOLERANCE_DEGPS:
-        expected = f"at most {most_degps:g} deg/s (plan.yaw_rate_max_degps)"
-        report.error("yaw_rate", f"plan {trace.path_id}", f"{fastest_degps:.1f} deg/s", expected)
+    turn_degps = float(np.abs(wrap_deg(np.diff(trace.rotations_deg[:, 1]))).max(initial=0.0)) / dt_s
+    if turn_degps > yaw_rate_max_degps + limits.YAW_RATE_TOLERANCE_DEGPS:
+        expected = f"at most {yaw_rate_max_degps:g} deg/s (plan.yaw_rate_max_degps)"
+        report.error("yaw_rate", where, f"{turn_degps:.1f} deg/s", expected)
 
 
 def check_surroundings(track: Track, obstacles: BoxIndex, cfg: InspectConfig, report: Report, metrics: Metrics) -> None:

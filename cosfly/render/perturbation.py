@@ -300,10 +300,9 @@ def _apply_smoothly(drawn: _Draws, scene: _Scene, dt_s: float) -> PerturbedTrack
         if not found:
             break
     assert track.unshifted is not None
-    for i, reason in fallbacks["position"].items():
-        track.states[i]["position"] = reason
-    for i, reason in fallbacks["rotation"].items():
-        track.states[i]["rotation"] = track.unshifted.states[i]["rotation"] = reason
+    for event, reasons in fallbacks.items():
+        for i, reason in reasons.items():
+            track.states[i][event] = track.unshifted.states[i][event] = reason
     return track
 
 
@@ -315,11 +314,9 @@ def _yaw_rates_degps(poses: Poses, dt_s: float) -> np.ndarray:
 
 def _fade(is_active: np.ndarray, fade_frames: float) -> np.ndarray:
     """Return factors from 0 to 1, (n, 1), that rise from 0 at frames that are not active."""
-    frames = np.arange(len(is_active))
-    still = frames[~is_active]
-    if not len(still):
-        return np.ones((len(frames), 1))
-    share = np.minimum(np.abs(frames[:, None] - still).min(axis=1) / fade_frames, 1.0)
+    frames = np.arange(len(is_active), dtype=np.float64)
+    away = np.abs(frames[:, None] - frames[~is_active]).min(axis=1, initial=len(frames) + fade_frames)
+    share = np.minimum(away / fade_frames, 1.0)
     return (share**2 * (3.0 - 2.0 * share))[:, None]
 
 

@@ -48,8 +48,7 @@ class Config(BaseModel):
         left_out = {
             name
             for name, field in type(self).model_fields.items()
-            if _MAY_DIFFER in field.metadata
-            or (_IF_CHANGED in field.metadata and getattr(self, name) == field.get_default(call_default_factory=True))
+            if _MAY_DIFFER in field.metadata or (_IF_CHANGED in field.metadata and getattr(self, name) == field.default)
         }
         return self._values("recorded", [name for name in self._names() if name not in left_out])
 
