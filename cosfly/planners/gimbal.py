@@ -85,5 +85,5 @@ def follow_direction(
             angle += rate * part_s
             angles.append(angle)
         followed.append(np.degrees(angles[::num_parts]))
-    pitch_deg = np.clip(followed[0], LOWEST_PITCH_DEG, HIGHEST_PITCH_DEG)
-    return np.radians(pitch_deg), np.radians(wrap_deg(followed[1]))
+    pitch_deg, yaw_deg = followed
+    return np.radians(np.clip(pitch_deg, LOWEST_PITCH_DEG, HIGHEST_PITCH_DEG)), np.radians(wrap_deg(yaw_deg))

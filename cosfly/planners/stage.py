@@ -158,7 +158,7 @@ def plan_on(
 
 
 def style_rng(
-    pedestrian: PedestrianTrajectory, seed: int, attempt: int = 0, purpose: str = "style"
+    pedestrian: PedestrianTrajectory, seed: int, attempt: int = 0, *, purpose: str = "style"
 ) -> np.random.Generator:
     """Return the random generator of a trajectory's styles or gimbal; it depends on the position of the pedestrian's
     start, because pedestrian trajectories of different maps have equal ids."""

@@ -234,23 +234,21 @@ def _offset(rng: np.random.Generator, cfg: PerturbationConfig, radius_m: float, 
 
 def _draw_smoothly(num: int, dt_s: float, cfg: PerturbationConfig, rng: np.random.Generator) -> _Draws:
     """Draw events and offsets that are smooth in time, with the distribution of `_draw_each_frame` in each frame."""
+    drawn = draw_smooth(num, 11, dt_s, cfg.correlation_s, rng)
+    events, person, drone, view, roll = np.split(drawn, [2, 4, 7, 10], axis=1)
 
-    def normal(num_axes: int) -> np.ndarray:
-        return draw_smooth(num, num_axes, dt_s, cfg.correlation_s, rng)
-
-    def offsets(radius_m: float, num_axes: int) -> np.ndarray:
-        drawn = normal(num_axes)
-        in_unit = 2.0 * ndtr(drawn) - 1.0
+    def offsets(normal: np.ndarray, radius_m: float) -> np.ndarray:
+        num_axes = normal.shape[1]
+        in_unit = 2.0 * ndtr(normal) - 1.0
         if cfg.sampling == "spherical":
-            squares = (drawn**2).sum(axis=1, keepdims=True)
-            in_unit = drawn / np.sqrt(squares) * gammainc(num_axes / 2.0, squares / 2.0) ** (1.0 / num_axes)
+            squares = (normal**2).sum(axis=1, keepdims=True)
+            in_unit = normal / np.sqrt(squares) * gammainc(num_axes / 2.0, squares / 2.0) ** (1.0 / num_axes)
         return np.hstack([radius_m * in_unit, np.zeros((num, 3 - num_axes))])
 
-    probabilities = {"position": cfg.position_probability, "rotation": cfg.rotation_probability}
+    is_drawn = ndtr(events) < [cfg.position_probability, cfg.rotation_probability]
     return _Draws(
-        {event: ndtr(normal(1)[:, 0]) < probabilities[event] for event in EVENTS},
-        offsets(cfg.pedestrian_radius_m, 2), offsets(cfg.drone_radius_m, 3), offsets(cfg.view_radius_m, 3),
-        2.0 * ndtr(normal(1)[:, 0]) - 1.0,
+        dict(zip(EVENTS, is_drawn.T, strict=True)), offsets(person, cfg.pedestrian_radius_m),
+        offsets(drone, cfg.drone_radius_m), offsets(view, cfg.view_radius_m), 2.0 * ndtr(roll[:, 0]) - 1.0,
     )  # fmt: skip
 
 
