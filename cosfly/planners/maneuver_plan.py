@@ -293,7 +293,7 @@ def _positions_along(corners_m: np.ndarray, most_mps: float, dt_s: float) -> np.
 
 # --- camera -----------------------------------------------------------------------------------------------------------
 # The camera looks at the target; on the way home, in the direction of motion; while the target is hidden, where it was
-# lost. It keeps the limit of yaw rate, and may follow this direction with a gimbal.
+# lost.
 
 TURNS_S = 0.8  # standard deviation of the smoothing of a turn during a search
 HOME_PITCH_DEG = -15.0  # on the way home

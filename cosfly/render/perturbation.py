@@ -60,10 +60,7 @@ class PerturbationConfig(Config):
     max_view_deg: float = Field(5.0, ge=0, le=45, description="largest turn in yaw and in pitch (theta_max), degrees")
     max_roll_deg: float = Field(0.0, ge=0, le=45, description="largest roll of a turned view, degrees; 0 in the paper")
     correlation_s: IfChanged[float] = Field(
-        0.0,
-        ge=0,
-        le=60,
-        description="correlation time of events and offsets, s; 0: every frame draws its own, as in the paper",
+        0.0, ge=0, le=60, description="correlation time of the offsets, s; 0: each frame draws its own, as in the paper"
     )
     sampling: Literal["cubic", "spherical"] = Field(
         "spherical", description="offsets are uniform in a cube or in a ball"
@@ -313,8 +310,7 @@ def _yaw_rates_degps(poses: Poses, dt_s: float) -> np.ndarray:
 def _fade(is_active: np.ndarray, fade_frames: float) -> np.ndarray:
     """Return factors from 0 to 1, (n, 1), that rise from 0 at frames that are not active."""
     frames = np.arange(len(is_active), dtype=np.float64)
-    away = np.abs(frames[:, None] - frames[~is_active]).min(axis=1, initial=len(frames) + fade_frames)
-    share = np.minimum(away / fade_frames, 1.0)
+    share = np.minimum(np.abs(frames[:, None] - frames[~is_active]).min(axis=1, initial=np.inf) / fade_frames, 1.0)
     return (share**2 * (3.0 - 2.0 * share))[:, None]
 
 
