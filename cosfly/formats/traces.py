@@ -24,7 +24,6 @@ from cosfly.formats.columns import (
 )
 from cosfly.formats.pedestrian_paths import PLAIN_PACE, pace_field, pace_of
 from cosfly.formats.segments import Mission, Segment, flown_as_json, read_flown
-from cosfly.geometry.trajectory_metrics import YAW_RATE_MAX_DEGPS
 from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.json_io import MISSING, FileFormat, read_object
 
@@ -191,8 +190,8 @@ def read_traces(path: Path) -> list[DroneTrace]:
     return read_items(path, TRACE_FORMAT, "traces", DroneTrace.from_json)
 
 
-def read_yaw_rate_max(path: Path) -> float:
+def read_yaw_rate_max(path: Path, default_degps: float) -> float:
     """Return the limit of yaw rate in the settings of `drone_trace.json`, deg/s; the default if they have none."""
     settings = read_object(path, what=TRACE_FORMAT.what).get("settings")
     limit: Any = settings.get("yaw_rate_max_degps") if isinstance(settings, dict) else None
-    return float(limit) if is_number(limit) else YAW_RATE_MAX_DEGPS
+    return float(limit) if is_number(limit) else default_degps

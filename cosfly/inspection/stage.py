@@ -46,7 +46,7 @@ def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None
     obstacles = None if simplified is None else obstacle_index(read_boxes(simplified))
     by_id = None if traces is None else {trace.path_id: trace for trace in read_traces(traces)}
     recorded = recorded_digests(data)
-    limit_degps = YAW_RATE_MAX_DEGPS if traces is None else read_yaw_rate_max(traces)
+    limit_degps = YAW_RATE_MAX_DEGPS if traces is None else read_yaw_rate_max(traces, YAW_RATE_MAX_DEGPS)
 
     def work(item: Item) -> Outcome:
         inspected = inspect_track(data / item.payload, data, by_id, obstacles, cfg, recorded, limit_degps)
