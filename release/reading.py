@@ -5,7 +5,7 @@ Memory holds a row group and the points of one shard, however large the release 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, groupby
 from operator import itemgetter
 from pathlib import Path
@@ -32,15 +32,17 @@ def bounded(value: float) -> float:
 
 
 def row_lists(
-    shard: Path, columns: Sequence[str], *, strict: bool = True, wanted: Collection[int] | None = None
+    shard: Path, columns: Sequence[str], *, strict: bool = True, part: tuple[int, int, int] | None = None
 ) -> Iterator[list[dict[str, Any]]]:
     """Yield the rows of a parquet file of a release, a row group at a time.
 
     Args:
         strict: Raise InputError if a column is not that of a release, a value that must be there is null, or a number
-            is not finite. wanted: Numbers of the row groups; None: all.
+            is not finite. part: Number of a row group, and its first row and the one after its last that are wanted.
     """
-    for group in row_groups(shard, list(columns), tree=shard.parents[1], wanted=wanted):
+    for group in row_groups(shard, list(columns), tree=shard.parents[1], wanted=part and part[:1]):
+        if part is not None:
+            group = group.slice(part[1], part[2] - part[1])
         if strict:
             check_columns(group, columns, shard)
             _check_values(group, shard)

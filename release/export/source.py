@@ -119,7 +119,7 @@ class SourceTrack:
         if not data:
             raise InputError("the frame has no picture", where=where, got="no data")
         if file == "depth":
-            height, width = parse_array(data, where, dtype=np.float32, ndim=2, what="depth image").shape
+            height, width = parse_array(data, where, dtype=np.float32, ndim=2, what="depth image", copy=False).shape
         elif (size := png_size(data)) is None:
             raise InputError("the frame has no picture", where=where, got="data that are not a PNG")
         else:
@@ -246,8 +246,9 @@ def _released_rows(spans: list[Span], columns: Sequence[str], numbers: Sequence[
         size = span.stop - span.start
         wanted = [number - first for number in numbers if first <= number < first + size]
         if wanted:
-            (rows,) = row_lists(span.shard, columns, wanted=[span.group])
-            yield from (rows[span.start + number] for number in wanted)
+            part = span.group, span.start + wanted[0], span.start + wanted[-1] + 1
+            (rows,) = row_lists(span.shard, columns, part=part)
+            yield from (rows[number - wanted[0]] for number in wanted)
         first += size
 
 
