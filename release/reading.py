@@ -38,13 +38,15 @@ def row_lists(
 
     Args:
         strict: Raise InputError if a column is not that of a release, a value that must be there is null, or a number
-            is not finite. part: Number of a row group, and its first row and the one after its last that are wanted.
+            is not finite. part: Number of a row group, and its first row and the one after its last that are wanted,
+            of a file whose columns are known to be those of a release.
     """
     for group in row_groups(shard, list(columns), tree=shard.parents[1], wanted=part and part[:1]):
         if part is not None:
             group = group.slice(part[1], part[2] - part[1])
-        if strict:
+        elif strict:
             check_columns(group, columns, shard)
+        if strict:
             _check_values(group, shard)
         with arrow_errors(shard):  # text that is no UTF-8 shows here
             rows = group.to_pylist()

@@ -33,6 +33,7 @@ from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.io import inside, open_file, read_bytes, sha256_file
 from cosfly.runtime.png import png_size
 from cosfly.runtime.run_dir import fingerprint
+from cosfly.runtime.tables import open_table
 from release.columns import (
     CONTRACT,
     PICTURES,
@@ -43,8 +44,9 @@ from release.columns import (
     Placement,
     SplitName,
     caption_values,
+    schema,
 )
-from release.reading import check_rows, row_lists
+from release.reading import check_columns, check_rows, row_lists
 from release.record import ReleasedMap, Strict, read_record, release_folder
 
 PLANNED = [*PLACE, "frame_index", "time_s", "decision", "goal_en", "width_px", "height_px"]  # what plans need of a row
@@ -212,6 +214,8 @@ def open_release(folder: Path) -> ExportSource:
     for shard in shards:
         path = inside(folder, shard.path)
         check_rows(path, shard.rows)
+        with open_table(path, tree=folder) as table:
+            check_columns(table.schema_arrow.empty_table(), schema(record.settings.modalities).names, path)
         for group, rows in enumerate(row_lists(path, PLANNED)):
             stop = 0
             for parts, of_track in itertools.groupby(rows, itemgetter(*PLACE)):
