@@ -77,10 +77,10 @@ NOTES = {
     "fovs": "Means over the frames. Size: of the projected box; IoU: of this box and the box of the person's pixels.",
     "weather": "Frames. The presets of the paper are all listed.",
     "augmentation_states": "Frames of perturbed tracks by their recorded offsets, after fallbacks.",
-    "actions": "Frames by their column `action`, of the planned motion: the greatest velocity until the next frame; "
+    "actions": "Frames by their column action, of the planned motion: the greatest velocity until the next frame; "
     "below 0.3 m/s a turn of at least 5 degrees/s, else hover.",
     "verdicts": "Of accepted captions, after repair; the figure of the paper shows first answers, before repair.",
-    "origin": "Values of `slots` are filled in from the measured facts, those of `prose` are compared with them: a "
+    "origin": "Values of slots are filled in from the measured facts, those of prose are compared with them: a "
     "number that equals a fact of its unit is matched (it may be the wrong quantity), one that equals none is "
     "contradicted. Words without numbers are not checked. Asks, tokens and teachers: of all captions that were read.",
     "text_lengths": "Characters. The last column is the smallest accepted length.",
@@ -142,7 +142,7 @@ def _release(record: ReleaseRecord) -> Rows:
     depth = record.depth and f"{record.depth.coding}, {record.depth.unit}, sky {record.depth.sky:g}"
     rows = {
         "trajectories": numbers.trajectories, **dict(by_track),
-        "tracks whose other track is released too (`pair`)": sum(one.pair is not None for one in record.flights),
+        "tracks whose other track is released too (column pair)": sum(one.pair is not None for one in record.flights),
         "walks": len({one.walk for one in record.flights}),
         **{f"frames of {town}": count for town, count in numbers.of("town").items()}, "frames": numbers.frames,
         f"pictures ({', '.join(pictures)})": numbers.frames * len(pictures),
@@ -151,10 +151,10 @@ def _release(record: ReleaseRecord) -> Rows:
         "time step, s": ", ".join(sorted(numbers.of("step_s"))) or None,
         **{f"frames of {size} px": count for size, count in numbers.of("image_px").items()},
         "frames that show the target": flags["target_visible"],
-        "frames that show the target legibly (`target_legible`)":
+        "frames that show the target legibly (column target_legible)":
             flags["target_legible"] if flags["legibility_known"] == numbers.frames else None,
         "frames with a perturbation": flags["is_perturbed"],
-        "frames with an action (`action`)": numbers.of("action").total(),
+        "frames with an action (column action)": numbers.of("action").total(),
         "depth": depth or "not released", "frames with a caption": flags["has_caption"],
         **{f"captions in {LANGUAGE_NAMES[language]}": flags[language] for language in LANGUAGES},
         **{f"frames without a caption: {reason}": count for reason, count in without},
