@@ -116,6 +116,16 @@ def test_parts_draw_their_styles_and_cover_the_flight():
     assert trace.segments[-1].end == len(trace.time_s)
 
 
+@each("planner", ["muco", "foresight", "track_astar"])
+def test_an_orbit_is_flown_at_the_requested_distance(planner):
+    """TA*+Smooth moves by one voxel a layer: it cuts fast orbits, which are not held, and holds slower ones."""
+    at = {"style_ranges": {"orbit_left": {"ground_distance_m": (14.5, 14.5), "altitude_m": (12.0, 12.0)}}}
+    trace = plan_trajectory(STRAIGHT, OPEN, styled("orbit_left", planner=planner, **at), 0)
+    assert trace.drop_reason is None
+    away_m = np.hypot(*(trace.positions_m - trace.targets_m)[:, :2].T)
+    assert (np.abs(away_m - 14.5) <= 0.15 * 14.5).mean() >= 0.7
+
+
 def test_a_style_that_the_map_does_not_hold_is_dropped_or_followed_and_says_why():
     dropped = plan_trajectory(STRAIGHT, OPEN, styled(REACQUIRE), 0)
     assert dropped.drop_reason == "no_hiding_place"

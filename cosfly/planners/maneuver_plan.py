@@ -1,7 +1,7 @@
 """The manoeuvre plan of a trajectory: styles drawn from the shares of the settings, mission, camera, and checks.
 
-A trajectory holds its style where the target sees the drone within HELD_DEG of the reference position and within
-HELD_RATIO of its distance.
+A trajectory holds its style where the target sees the drone within HELD_DEG of the reference position, and the distance
+in the plane is the requested one within HELD_M or HELD_SHARE_M, whichever is larger.
 """
 
 from __future__ import annotations
@@ -27,9 +27,8 @@ from cosfly.runtime.seeding import draw_to_quota
 if TYPE_CHECKING:
     from cosfly.geometry.kernels import BoxIndex
 
-# A style is held at a frame whose direction from the target is within HELD_DEG of the reference and whose distance is
-# within a factor of HELD_RATIO; a trajectory holds its styles at HELD_SHARE of its frames.
-HELD_DEG, HELD_RATIO, HELD_SHARE = 25.0, 1.4, 0.7
+HELD_DEG, HELD_M, HELD_SHARE_M = 25.0, 2.0, 0.15
+HELD_SHARE = 0.7  # of its frames at which a trajectory holds its styles
 POINTS_LEAST = 4  # points of a segment
 NOT_HELD = "style_not_held"
 
@@ -160,8 +159,9 @@ def _is_held(reference: TrackingReference, scenario: Scenario, positions_m: np.n
     planned = positions_m - scenario.targets_m
     requested_m, planned_m = np.linalg.norm(requested, axis=1), np.linalg.norm(planned, axis=1)
     cosine = (requested * planned).sum(axis=1) / np.maximum(requested_m * planned_m, 1e-9)
-    ratio = np.maximum(planned_m, 1e-9) / np.maximum(requested_m, 1e-9)
-    return (cosine >= np.cos(np.radians(HELD_DEG))) & (ratio <= HELD_RATIO) & (ratio >= 1.0 / HELD_RATIO)
+    requested_plane_m, planned_plane_m = np.hypot(*requested[:, :2].T), np.hypot(*planned[:, :2].T)
+    is_near = np.abs(planned_plane_m - requested_plane_m) <= np.maximum(HELD_M, HELD_SHARE_M * requested_plane_m)
+    return (cosine >= np.cos(np.radians(HELD_DEG))) & is_near
 
 
 def describe_not_held(
