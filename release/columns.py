@@ -417,13 +417,6 @@ def point_row(flight: Track, i: int, placement: Placement) -> dict[str, Any]:
 # --- flights ----------------------------------------------------------------------------------------------------------
 
 
-def flight_spans(rows: pa.Table) -> list[tuple[Place, int, int]]:
-    """Return the rows that stand together by flight: its PLACE, its first row, and the one after its last."""
-    places: list[Place] = list(zip(*(rows.column(name).to_pylist() for name in PLACE), strict=True))
-    begins = [i for i in range(len(places)) if i == 0 or places[i] != places[i - 1]]
-    return [(places[begin], begin, end) for begin, end in zip(begins, [*begins[1:], len(places)], strict=True)]
-
-
 def flight_name(place: Place) -> str:
     """Return the name of a flight in the records."""
     return "/".join(map(str, place))
