@@ -9,9 +9,11 @@ from specimens_rows import make_row
 
 from cosfly.geometry.trajectory_metrics import derivative_rms, length_m
 from cosfly.runtime.json_io import read_json
+from release.card.tables import tables_of
 from release.columns import POINT, POSE
 from release.counting import count_track
 from release.flight_rows import FlightRows
+from release.record import read_record
 
 
 def rows_of(positions: np.ndarray, frames: list[int], offsets: np.ndarray | None = None) -> list[dict]:
@@ -63,3 +65,12 @@ def test_the_statistics_are_those_of_the_rows(built, tmp_path):
     for outside in ("<script", 'src="http', "://"):
         assert outside not in page
     assert "<title>one</title>" in page  # the run's name
+
+
+def test_odd_numbers_of_a_record_make_tables_of_whole_rows(built):
+    record = read_record(built / "release.json")
+    odd = {key: {"x": 3} for key in ("sky", "confusion", "events", "fov", "step_s", "decision")}
+    for counts in ({}, record.numbers.counts | odd):
+        numbers = record.numbers.model_copy(update={"counts": counts, "spreads": {}, "lenses": {}})
+        for table in tables_of(record.model_copy(update={"numbers": numbers})):
+            assert {len(row) for row in table.rows} == {len(table.head)}, table.key

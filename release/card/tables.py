@@ -98,7 +98,9 @@ def tables_of(record: ReleaseRecord) -> list[Table]:
         "release": _release(record), "quality_stats": _quality(record), "dist_stats": _dist(record),
         "fovs": _fovs(numbers), "weather": _weather(numbers, times),
         "augmentation_states": _shares(numbers, "states", STATES),
-        "events": [[*event.split(TAB), count] for event, count in sorted(numbers.of("events").items())],
+        "events": [
+            [*(event + 2 * TAB).split(TAB)[:3], count] for event, count in sorted(numbers.of("events").items())
+        ],
         "actions": _shares(numbers, "action", ACTION_CLASSES),
         "decisions": _decisions(numbers),
         "confusion": [[own, *(numbers.of("confusion")[f"{own}{TAB}{other}"] for other in order)] for own in order],
