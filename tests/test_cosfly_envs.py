@@ -21,6 +21,7 @@ from cosfly.closed_loop.stage import STEP_S, watch_of
 from cosfly.envs import episodes
 from cosfly.envs.episodes import HELD_OUT, TASKS, TRAINING, read_list
 from cosfly.envs.follow import FULL_REWARD_M, LOOKS, NO_REWARD_M, reward_of
+from cosfly.formats.captions import TOKENS
 from cosfly.formats.episodes import read_episode
 from cosfly.formats.people import Appearance
 from cosfly.runtime.config import read_yaml
@@ -244,6 +245,23 @@ def test_lists_are_fixed_and_their_digests_are_those_of_the_document():
         env, episodes, digest = read_list(f"{task}/test")
         assert (env, len(episodes), len({*episodes})) == (task, 20, 20)
         assert digest[:12] in text, f"{task}: {digest[:12]}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("decision", [TOKENS.index("hover"), None])
+def test_who_hovers_or_decides_at_random_sees_the_person_in_a_fifth_of_the_frames_at_most(decision):
+    env = gymnasium.make(FOLLOW, episodes="test", size_px=SMALL).unwrapped
+    rng = np.random.default_rng(7)
+    num_seen, num_episodes = 0, len(read_list(FOLLOW)[1])
+    for episode in range(num_episodes):
+        env.reset(options={"episode": episode})
+        is_over = False
+        while not is_over:
+            *_, terminated, truncated, info = env.step(rng.integers(len(TOKENS)) if decision is None else decision)
+            num_seen += info["visible"]
+            is_over = terminated or truncated
+    env.close()
+    assert num_seen / (num_episodes * episodes.NUM_DECISIONS) <= 0.2
 
 
 POLICIES = """

@@ -58,6 +58,7 @@ from distill.inference.stage import InferConfig
 log = logging.getLogger(__name__)
 
 PLAN, TRACES, TREE, ANSWERS = "plan", "drone_trace.json", "render", "answers"
+MOST_HANGS = 2  # workers that a policy may hang, in addition to one per finished item
 STEP_S = 60.0  # for drawing a step, and for opening an episode
 HALF_SEEN = 0.5  # of five rays
 
@@ -220,9 +221,10 @@ def run(
 
 def watch_of(fly: FlyConfig, watch: Watch) -> Watch:
     """Return the limits of workers: one whose policy Python cannot interrupt is stopped, and its episode has failed."""
-    if fly.engine != "policy" or watch.item_limit_s is not None:
+    if fly.engine != "policy":
         return watch
-    return replace(watch, item_limit_s=fly.answer_limit_s + STEP_S, retries=0)
+    limit_s = fly.answer_limit_s + STEP_S if watch.item_limit_s is None else watch.item_limit_s
+    return replace(watch, item_limit_s=limit_s, retries=0, restarts=MOST_HANGS)
 
 
 def finish_episodes(

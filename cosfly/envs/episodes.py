@@ -221,8 +221,10 @@ def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisod
     bystanders = tuple[Bystander, ...]()
     if cfg.has_others:
         rng = rng_for(town.seed, "pedestrians", f"{name}/others")
-        bystanders = tuple(
-            replace(other, positions_m=other.positions_m[begin:end], headings_rad=other.headings_rad[begin:end])
-            for other in bystanders_of(target, world.ground, world.lanes, cfg, rng).others
-        )
+        positions_m = target.positions_m[begin:end]
+        met = replace(
+            target, polyline_m=positions_m[:, :2], time_s=plan.time_s, positions_m=positions_m,
+            speeds_mps=target.speeds_mps[begin:end],
+        )  # fmt: skip
+        bystanders = tuple(bystanders_of(met, world.ground, world.lanes, cfg, rng).others)
     return BenchmarkEpisode(task, world, number, plan, num_lead, bystanders)
