@@ -12,6 +12,7 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.config import build as build_config
 from cosfly.runtime.errors import InputError, NothingKept
+from cosfly.runtime.png import png_size
 from distill.prepare.sources import RunSource
 from release.export.stage import ExportConfig
 from release.export.stage import run as export
@@ -81,6 +82,19 @@ def test_messages_are_what_their_loaders_ask_for(run, tmp_path, shown):
     assert caption.prompt["en"].system in first[0]["text"]
     assert ("One picture is given" in first[-1]["text"]) == (shown == "last")
     assert json.loads(samples[0]["messages"][1]["content"][0]["text"])["reasoning_trace"] == ANSWER["reasoning_trace"]
+
+
+def test_pictures_have_the_pixels_of_which_the_texts_speak(tmp_path):
+    """A caption's numbers refer to the pictures that its teacher saw, which may be smaller than the frames."""
+    make_playback_tree(tmp_path / "run/render", 1, NUM_POINTS)
+    flight = read_track(find_tracks(tmp_path / "run/render")[0])
+    captions = [make_caption(flight, i).model_copy(update={"picture_px": (32, 18)}) for i in (4, 5)]
+    (tmp_path / "run/caption").mkdir()
+    write_captions(tmp_path / "run/caption/captions.jsonl", captions)
+    product = chat(tmp_path / "run", tmp_path / "out")
+    [sample, *_] = lines_of(product / "train.jsonl")
+    assert "pictures of 32 x 18 px" in json.dumps(sample)
+    assert {png_size((product / name).read_bytes()) for name in sample["images"]} == {(32, 18)}
 
 
 def test_sharegpt_is_one_file_a_split_with_its_entry(two_splits, tmp_path):

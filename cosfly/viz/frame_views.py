@@ -147,18 +147,18 @@ def read_view(
         max_side_px: scale down to this longest side; None keeps the size.
     """
     if view == "rgb":
-        return _bounded(read_rgb(frame), max_side_px)
+        return bounded(read_rgb(frame), max_side_px)
     if view == "middle":
         return _middle(read_rgb(frame), max_side_px)
     if view == "depth":
-        return depth_colors(_bounded(read_depth(frame), max_side_px, nearest=True), depth_range_m)
+        return depth_colors(bounded(read_depth(frame), max_side_px, nearest=True), depth_range_m)
     kinds, ids = read_instance(frame)
     with contextlib.suppress(InputError):  # a tree of other software has no annotation
         bystanders = read_meta(frame).others
         bystander_ids = [] if bystanders is None else [other.instance_id for other in bystanders.others]
         is_other_pedestrian = np.isin(ids, bystander_ids) & (kinds == KINDS["Pedestrians"])
         kinds = np.where(is_other_pedestrian, KINDS["Rider"], kinds)  # only the target is red
-    return segmentation_colors(_bounded(kinds, max_side_px, nearest=True), _bounded(ids, max_side_px, nearest=True))
+    return segmentation_colors(bounded(kinds, max_side_px, nearest=True), bounded(ids, max_side_px, nearest=True))
 
 
 def _middle(rgb: np.ndarray, max_side_px: int | None) -> np.ndarray:
@@ -242,7 +242,8 @@ def _palette() -> np.ndarray:
 _PALETTE = _palette()
 
 
-def _bounded(image: np.ndarray, max_side_px: int | None, *, nearest: bool = False) -> np.ndarray:
+def bounded(image: np.ndarray, max_side_px: int | None, *, nearest: bool = False) -> np.ndarray:
+    """Return a picture, (h, w) or (h, w, 3), scaled down to a longest side."""
     height, width = image.shape[:2]
     size = scaled_size(width, height, max_side_px)
     if size == (width, height):

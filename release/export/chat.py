@@ -19,8 +19,9 @@ from cosfly.formats.captions import FIELDS, Language, Prompt
 from cosfly.runtime.errors import NothingKept
 from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import dump_json
+from cosfly.runtime.png import colours_of, colours_png
 from cosfly.runtime.worker import advance
-from cosfly.viz.frame_views import Pictures, frame_label
+from cosfly.viz.frame_views import Pictures, bounded, frame_label
 from release.columns import LANGUAGES, PICTURE_PX, PICTURES, SPLIT_NAMES, WINDOW
 from release.export.source import ExportSource, Row, SourceTrack
 from release.export.stage import Done, ExportConfig, ExportUnit, FormatFacts, track_units, write_joined
@@ -49,10 +50,17 @@ def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfi
     track, skipped = unit.track, Counter[str]()
     samples = list(_samples(track, cfg, skipped))
     names = {name for sample in samples for name in sample["images"]}
+    # The texts refer to pixels of the pictures that the teacher saw.
+    sides_px = [max(row[PICTURE_PX]) for row in track.rows([PICTURE_PX]) if row[PICTURE_PX]]
+    most_px = max(sides_px, default=0)
+    is_scaled = most_px < max(track.size_px)
     for row in track.rows(["sample_id", "frame_index", PICTURES["rgb"].name]) if names else ():
         name = _picture_name(track, row["frame_index"])
         if name in names:
-            write_bytes(folder / name, track.picture(row, "rgb"))
+            data = track.picture(row, "rgb")
+            if is_scaled:
+                data = colours_png(bounded(colours_of(data, row["sample_id"]), most_px))
+            write_bytes(folder / name, data)
         advance()
     return {"samples": len(samples), "skipped": skipped}
 
@@ -150,7 +158,10 @@ def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) ->
         opened = "# llamafactory-cli train --dataset_dir . --media_dir . --dataset cosfly_train ..."
     return FormatFacts(
         format_version="messages and images" if cfg.format == "chat" else "ShareGPT",
-        codings={"images": "PNG, the released bytes", "answer": "JSON text of the three fields of a caption"},
+        codings={
+            "images": "PNG; the released bytes, or scaled down to the size of the teacher's pictures",
+            "answer": "JSON text of the three fields of a caption",
+        },
         notes=[f"{total} samples, one per window and language. Skipped: {reasons or 'none'}.", run_here],
         how_to_open=opened,
     )
