@@ -1,6 +1,7 @@
 """Maps of one's own: tables and GeoJSON of boxes as people write them, and what is wrong with others, all at once."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -82,17 +83,168 @@ def test_outlines_and_points_of_geojson(tmp_path):
     assert_allclose(box_map.maxs[box_map.kinds == 1][0], [120, -4, 0])
 
 
-def test_longitude_and_latitude_become_metres(tmp_path):
+def square(x: float, y: float, side: float = 12.0, height: float | None = None) -> list:
+    ring = [[x, y], [x + side, y], [x + side, y + side], [x, y + side], [x, y]]
+    return [[[*place, height] for place in ring] if height is not None else ring]
+
+
+def houses(x: float = 0.0, y: float = 0.0, scale: float = 1.0, **properties: object) -> list[dict]:
+    """Nine houses of 12 m, 40 m apart."""
+    properties = {"type": "Buildings", "height_m": 9} | properties
+    corners = [(x + 40 * scale * (k // 3), y + 40 * scale * (k % 3)) for k in range(9)]
+    return [feature("Polygon", square(*corner, 12 * scale), **properties) for corner in corners]
+
+
+DEGREES = 1 / 111_320  # of latitude in a metre
+
+
+def test_longitude_and_latitude_become_metres(tmp_path, subtests):
     """At 52 degrees north a degree of latitude is 111,267 m, one of longitude 68,677 m (tables of WGS 84)."""
     ring = [[4.0, 52.0], [4.001, 52.0], [4.001, 52.001], [4.0, 52.001], [4.0, 52.0]]
-    text = collection(feature("Polygon", [ring], type="Buildings", height_m=9))
+    town = [feature("Polygon", [ring], type="Buildings", height_m=9)]
+    for settings, more in (({}, {}), ({"units": "degrees"}, {}), ({}, {"crs": crs("urn:ogc:def:crs:OGC:1.3:CRS84")})):
+        box_map = loaded(tmp_path, collection(*town, **more), ".geojson", **settings)
+        assert_allclose(sorted(box_map.half_extents[0, :2] * 2), [68.677, 111.267], rtol=2e-4)
     with pytest.raises(InputError, match=r"do not look like metres;.*maps\.boxes\.units=degrees"):
-        loaded(tmp_path, text, ".geojson")
+        loaded(tmp_path, collection(*town), ".geojson", units="m")
     with pytest.raises(InputError, match="do not look like degrees"):
-        loaded(tmp_path, text.replace("52.001", "58.001"), ".geojson", units="degrees")
-    box_map = loaded(tmp_path, text, ".geojson", units="degrees")
-    size = sorted(box_map.half_extents[0, :2] * 2)
-    assert_allclose(size, [68.677, 111.267], rtol=2e-4)
+        loaded(tmp_path, collection(*houses()), ".geojson", units="degrees")
+    with pytest.raises(InputError, match="may be metres or degrees"):
+        loaded(tmp_path, collection(*houses(scale=0.01)), ".geojson")
+    table = "type,x,y,length,width,height\n" + "".join(f"Buildings,4.{k},52.{k},9,9,9\n" for k in (3001, 3002, 3004))
+    with pytest.raises(InputError, match=r"do not look like metres;.*maps\.boxes\.units=degrees"):
+        loaded(tmp_path, table)
+    assert len(loaded(tmp_path, table, units="degrees")) == 3
+    across = loaded(tmp_path, collection(*houses(179.9995, -17.0, DEGREES)), ".geojson")  # the date line
+    assert np.ptp(across.centers[:, 0]) < 90
+
+
+def crs(name: str) -> dict:
+    return {"type": "name", "properties": {"name": name}}
+
+
+def test_a_declared_coordinate_system_is_used_or_refused_by_name(tmp_path, subtests):
+    for name in ("EPSG:28992", "urn:ogc:def:crs:EPSG::25832", "http://www.opengis.net/def/crs/EPSG/0/32631"):
+        assert len(loaded(tmp_path, collection(*houses(85_000, 447_000), crs=crs(name)), ".geojson")) == 9
+    for declared, words in (
+        (crs("urn:ogc:def:crs:EPSG::2263"), "EPSG::2263"),
+        (crs("EPSG:3857"), "EPSG:3857"),  # metres, but not true ones
+        (crs("ESRI:102718"), "ESRI:102718"),
+        (crs("EPSG:999999"), "EPSG:999999"),
+        ({"type": "EPSG", "properties": {"code": 2263}}, "2263"),
+        ({"type": "link", "properties": {"href": "http://spatialreference.org/ref/epsg/2263/proj4/"}}, "epsg/2263"),
+        ("EPSG:2263", "EPSG:2263"),
+    ):
+        with subtests.test(words), pytest.raises(InputError, match=f"crs: the declared.*{words}.*us-ft .0.3048006 m"):
+            loaded(tmp_path, collection(*houses(985_000, 199_000), crs=declared), ".geojson")
+    in_feet = loaded(tmp_path, collection(*houses(985_000, 199_000, 3.2808), crs=crs("EPSG:2263")), ".geojson",
+                     units="us-ft")  # fmt: skip
+    assert_allclose(2 * in_feet.half_extents[0], [12, 12, 9], rtol=1e-4)
+
+
+def test_a_bad_feature_is_skipped_and_counted(tmp_path, caplog, subtests):
+    fine = houses()
+    bow = [[[500, 0], [520, 20], [520, 0], [500, 20], [500, 0]]]
+    for bad, reason, words in (
+        (feature("Point", [4e6, 4e6], type="Vegetation", name="stray", length_m=4, width_m=4, height_m=6),
+         "far_away", r"feature 10 \(stray\): it is 5,?\d*,000 km|feature 10 \(stray\): it is 4,000 km"),
+        ({"type": "Feature", "properties": {"type": "Walls"}, "geometry": None}, "bad_geometry", "geometry None"),
+        (5, "bad_geometry", "geometry None"),
+        (feature("Polygon", [], type="Walls", height_m=2), "bad_geometry", "are invalid"),
+        (feature("Polygon", [[[0, 0], [9, 0], [0, 0], [0, 0]]], type="Walls", height_m=2), "no_area", "no area"),
+        (feature("Polygon", [[[5, 5]] * 5], type="Walls", height_m=2), "no_area", "no area"),
+        (feature("Polygon", square(200, 0), type="House", height_m=2), "unknown_type", "unknown type 'House'"),
+        (feature("Polygon", square(200, 0), type="Walls", height_m=-2), "bad_value", "must be above 0"),
+        (feature("Polygon", square(200, 0), type="Walls", height="tall"), "bad_value", "'tall'"),
+        (feature("Polygon", bow, type="Buildings", height_m=9), "", "crosses itself and is repaired"),
+        (feature("Polygon", square(200, 0, 0.1), type="Poles", height_m=4), "", ""),
+    ):  # fmt: skip
+        caplog.clear()
+        with subtests.test(words):
+            box_map = loaded(tmp_path, collection(*fine, bad), ".geojson")
+            assert box_map.header.dropped_objects == ({reason: 1} if reason else {})
+            assert box_map.header.num_objects == 10
+            assert len(box_map) >= 9 + (not reason)
+            assert re.search(words, caplog.text)
+    with pytest.raises(InputError, match=r"geometry None.*at most 20% invalid rows \(maps\.boxes\.most_skipped\)"):
+        loaded(tmp_path, collection(*fine, *[{"type": "Feature", "properties": {}, "geometry": None}] * 3), ".geojson")
+    with pytest.raises(InputError, match="feature 10"):
+        loaded(tmp_path, collection(*fine, 5), ".geojson", most_skipped=0.0)
+    towns = [feature("Polygon", square(4 + k, 52, 1e-4), type="Buildings", height_m=9) for k in range(5)]
+    with pytest.raises(InputError, match=r"feature 1: it is 137 km from the middle of the map, at 4, 52"):
+        loaded(tmp_path, collection(*towns), ".geojson")
+
+
+def test_z_of_coordinates_is_reported(tmp_path, caplog):
+    outlines = [feature("Polygon", square(40 * k, 0, 12, 34 + k), type="Buildings", height_m=9) for k in range(3)]
+    assert_allclose(loaded(tmp_path, collection(*outlines), ".geojson").mins[:, 2], 0)
+    assert "z of coordinates, 34 to 36, is ignored" in caplog.text
+
+
+def test_declared_heights_are_used(tmp_path, subtests):
+    for properties, low_m, high_m in (
+        ({"height": 12}, 0, 12),
+        ({"height": "12 m"}, 0, 12),
+        ({"height": "12.5m"}, 0, 12.5),
+        ({"height": "40'"}, 0, 12.192),
+        ({"height": "40 ft"}, 0, 12.192),
+        ({"height": "39'4\""}, 0, 11.9888),
+        ({"building:levels": "3"}, 0, 9),
+        ({"num_floors": 4, "min_floor": 1}, 3, 12),
+        ({"height": "12", "min_height": "3 m"}, 3, 12),
+        ({"height_m": 8, "building:levels": "3"}, 0, 8),
+    ):
+        with subtests.test(properties):
+            house = feature("Polygon", square(0, 0), type="Buildings", **properties)
+            box_map = loaded(tmp_path, collection(house), ".geojson")
+            assert_allclose([box_map.mins[0, 2], box_map.maxs[0, 2]], [low_m, high_m])
+    for properties in ({"height": "2;3"}, {"height": True}, {"height": 3, "min_height": 12}, {"building:levels": "x"}):
+        house = feature("Polygon", square(0, 0), type="Buildings", **properties)
+        with subtests.test(properties), pytest.raises(InputError):
+            loaded(tmp_path, collection(house), ".geojson")
+
+
+def test_openstreetmap_and_overture_need_the_name_of_the_type_column(tmp_path, caplog):
+    at = 4.3, 52.0
+    way = [[4.2995, 52.0003], [4.3005, 52.0003], [4.3005, 52.0013]]
+    town = [{**one, "properties": {"@id": f"way/{k}", "building": "yes", "height": "12 m"}}
+            for k, one in enumerate(houses(*at, DEGREES))]  # fmt: skip
+    town += [
+        feature("LineString", way, highway="residential", lanes="2", name="Main street"),
+        feature("MultiLineString", [way], highway="footway", width="2 m"),
+        feature("Point", [4.3001, 52.0001], natural="tree"),
+        feature("Point", [4.3002, 52.0001], amenity="bench"),
+        feature("MultiPolygon", [square(4.302, 52.0, 1e-4)], building="church", **{"building:levels": "2"}),
+    ]
+    osm = loaded(tmp_path, collection(*town), ".geojson", type_column="building,highway,natural")
+    assert osm.counts() == {"Buildings": 10, "Roads": 2, "Sidewalks": 2, "Vegetation": 1}
+    assert_allclose(np.unique(2 * osm.half_extents[osm.kinds == 1][:, 1]), 7.0)
+    assert (osm.header.num_objects, osm.header.dropped_objects) == (14, {"unmapped_type": 1})
+    assert osm.header.extent_sources == {"file": 12, "default": 1, "levels": 1} | {"file": 13}
+    assert "default 1" in caplog.text
+    overture = [{**one, "properties": {"id": f"08-{k}", "sources": [{}], "class": "house" if k else None,
+                                       "num_floors": 3, "height": 11.5 if k % 2 else None}}
+                for k, one in enumerate(houses(*at, DEGREES))]  # fmt: skip
+    overture.append(feature("LineString", way, subtype="road", **{"class": "residential"}))
+    box_map = loaded(tmp_path, collection(*overture), ".geojson", type_column="class")
+    assert box_map.counts() == {"Buildings": 9, "Roads": 2}
+    assert box_map.header.extent_sources == {"levels": 5, "file": 4, "default": 2}
+    with pytest.raises(InputError, match="there is no type for class='x'"):
+        loaded(tmp_path, collection(feature("Point", way[0], **{"class": "x"})), ".geojson", type_column="class")
+
+
+def test_what_an_outline_asks_for_is_bounded_before_it_is_made(tmp_path):
+    def star(x: float, k: int) -> dict:
+        angles, radii = np.linspace(0, 2 * np.pi, 81), np.where(np.arange(81) % 2, 2_000.0, 900.0)
+        ring = np.column_stack([x + radii * np.cos(angles), radii * np.sin(angles) + k])
+        return feature("Polygon", [ring.tolist()], type="Roads")
+
+    assert len(loaded(tmp_path, collection(star(0, 0)), ".geojson")) < 1_000
+    with pytest.raises(InputError, match="over the limit; got outlines that need"):
+        loaded(tmp_path, collection(*(star(9 * k, k) for k in range(60))), ".geojson")
+    for row in ("Roads,0,0,1e9,1e9,", "Buildings,0,0,9,9,1e9"):
+        with pytest.raises(InputError, match="too wide or too high"):
+            loaded(tmp_path, f"type,x_m,y_m,length_m,width_m,height_m\nBuildings,0,0,9,9,9\n{row}\n")
 
 
 def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
@@ -108,13 +260,15 @@ def test_all_that_is_wrong_with_a_table_is_told(tmp_path, subtests):
             (PLAIN.replace("Vegetation", "vegetable").replace("Roads", "roads"),
              r"line 3: unknown type 'vegetable'.*line 4: unknown type 'roads' \(did you mean 'Roads'\?\); expected"),
             (PLAIN.replace(",yaw_deg", ",yaw_dge"), r"unknown column 'yaw_dge' \(did you mean 'yaw_deg'\?\)"),
-            (PLAIN.replace("type,x_m", "name,x"), r"unknown column 'x'.*column type is missing.*column x_m is missing"),
+            (PLAIN.replace("type,x_m", "name,east"),
+             r"column type is missing.*unknown column 'east'.*column x_m is missing"),
             (PLAIN.replace("height_m,yaw_deg", "height_m,z_m"), "column z_m occurs twice"),
             (PLAIN.replace(",12,8,8,30", ",12,8,8"), "line 2: 8 cells, but the first line has 9"),
             (PLAIN.replace("12,8,8,30", '"12,5",8,8,30'), r"length_m is not a finite number: '12,5'"),
             (PLAIN.replace("12,8,8,30", "-12,8,8,30").replace("4,4,6,0", "4,4,nan,0"),
              r"line 2: length_m must be above 0; line 3: height_m is not a finite number: 'nan'"),
             (PLAIN.replace("20,4,12", "20,1e18,12"), "line 2: the box has no volume"),
+            (PLAIN.replace("10,20,4", "1e12,20,4"), "line 2: it is 1,000,000,000 km from the middle of the map"),
             (PLAIN.replace("7,Buildings", "8,Buildings"), "ids must be different whole numbers"),
             (PLAIN.replace("7,Buildings", "x,Buildings"), "ids must be different whole numbers"),
             (PLAIN.replace(",", ";"), "column type is missing.*separated by commas"),
@@ -128,13 +282,13 @@ def test_all_that_is_wrong_with_a_table_is_told(tmp_path, subtests):
 def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
     for text, words in [
             (collection(feature("LineString", [[0, 0], [1, 1]], type="Walls")),
-             "feature 1: the geometry LineString is not supported; expected one of Point"),
+             "feature 1: width_m is missing, height_m is missing"),
+            (collection(feature("CurvePolygon", [], type="Walls")),
+             "feature 1: the geometry CurvePolygon is not supported; expected one of Point"),
             (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")),
              "feature 1: the coordinates of the Polygon are invalid; expected \[x, y\], at least four points in a ring"),
             (collection(feature("Polygon", [[[0, 0], [9, "x"], [9, 9], [0, 0]]], type="Walls")),
              "of the Polygon are invalid; expected"),
-            (collection(feature("Polygon", [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]], type="Buildings", height_m=3)),
-             r"feature 1: the outline crosses itself: Self-intersection\[4\.5 4\.5\]"),
             (collection(feature("Point", [5, 5], type="Vegetation", height_m=3)),
              "feature 1: length_m is missing, width_m is missing"),
             (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 0]]], type="Buildings")),
@@ -143,12 +297,13 @@ def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
                 collection(
                     {**feature("LineString", [[0, 0], [1, 1]], type="Walls"), "id": "way/7"},
                     feature("Point", [5, 5], type="Vegetation", name="old oak", height_m="tall"),
-                    feature("Point", [5, 5], type="house", levels=3, length_m=4, width_m=4, height_m=6),
+                    feature("Point", [5, 5], type="house", length_m=4, width_m=4, height_m=6),
                 ),
-                r"unknown column 'levels'.*feature 1 \(way/7\): the geometry .* is not supported.*feature 2 \(old oak\): "
+                r"feature 1 \(way/7\): width_m is missing, height_m is missing.*feature 2 \(old oak\): "
                 r"length_m is missing, width_m is missing, height_m is not a finite number: 'tall'"
-                r".*feature 3: unknown type 'house'.*expected columns .*types .*4 to fix",
+                r".*feature 3: unknown type 'house'.*expected columns .*types .*3 to fix",
             ),
+            (collection(feature("Point", [5, 5], type="Walls", colour=3)), "unknown column 'colour'"),
             (json.dumps({"type": "Topology"}), "not GeoJSON"),
             (collection(), "has no boxes"),
         ]:  # fmt: skip

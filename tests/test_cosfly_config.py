@@ -55,7 +55,14 @@ def test_bad_overrides_and_files(tmp_path):
         with pytest.raises(ConfigError):
             load(Outer, None, [override])
     file = tmp_path / "c.yaml"
-    for text, words in (("[1, 2]", "not a mapping"), ("a: [", "not valid YAML")):
+    for text, words in (
+        ("[1, 2]", "not a mapping"),
+        ("a: [", "not valid YAML"),
+        (f"seed: {':'.join('1' * 200)}.0", "not valid YAML"),  # a sexagesimal number beyond float
+        (f"seed: 0x{'F' * 5_000}", "not valid YAML"),
+        (f"seed: 1{'0' * 400}", "not valid YAML"),
+        ('name: "\\UFFFFFFFF"', "not valid YAML"),
+    ):
         file.write_text(text)
         with pytest.raises(ConfigError, match=words):
             load(Outer, file)

@@ -135,10 +135,10 @@ LEFT_OUT = {
 }
 
 
-def load(tmp_path: Path, data: bytes) -> BoxMap:
+def load(tmp_path: Path, data: bytes, **settings: object) -> BoxMap:
     path = tmp_path / "model.city"
     path.write_bytes(data)
-    return load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=path)))
+    return load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=path, **settings)))
 
 
 @pytest.mark.slow
@@ -377,3 +377,92 @@ def test_surfaces_of_a_town_do_not_share_a_plane():
     for one, other in combinations(("Roads", "Sidewalks", "RoadLines"), 2):
         tops = [boxes_of(town, kind).maxs[:, 2] for kind in (one, other)]
         assert abs(tops[0].max() - tops[1].max()) > 0.015
+
+
+def footprints(**attributes: object) -> Model:
+    """A city of footprints without heights, and a road."""
+    model = with_an_outline(city())
+    (outline,) = model["CityObjects"]["house"]["geometry"]
+    model["CityObjects"] = {
+        "a": {"type": "Building", "attributes": attributes, "geometry": [outline]},
+        "b": {"type": "Building", "attributes": {"measuredHeight": 7.5}, "geometry": [
+            outline | {"boundaries": counted_from(outline["boundaries"], 8)}]},
+        "road": model["CityObjects"]["road"],
+    }  # fmt: skip
+    return model
+
+
+def test_declared_heights_raise_footprints(tmp_path, subtests):
+    for attributes, height_m in (
+        ({"measuredHeight": 9}, 9.0),
+        ({"measuredHeight": "9 m"}, 9.0),
+        ({"measuredHeight": {"value": 30, "uom": "m"}}, 30.0),
+        ({"storeysAboveGround": 4}, 12.0),
+        ({"measuredHeight": None, "storeysAboveGround": 2}, 6.0),
+        ({}, None),
+        ({"measuredHeight": -3}, None),
+        ({"measuredHeight": "high"}, None),
+        ({"measuredHeight": 1e9}, None),
+    ):
+        with subtests.test(attributes):
+            box_map = load(tmp_path, document(footprints(**attributes)))
+            header, standing = box_map.header, box_map.select(box_map.kinds == KINDS["Buildings"])
+            heights = [7.5] if height_m is None else [height_m, 7.5]
+            np.testing.assert_allclose(2 * standing.half_extents[:, 2], heights)
+            assert header.dropped_objects == ({"no_height": 1} if height_m is None else {})
+            assert len(box_map.meshes.refs) == len(heights)
+
+
+def test_units_of_a_city_model_are_used_or_refused_by_name(tmp_path, subtests):
+    def declared(text: object) -> bytes:
+        return document(city() | {"metadata": {"referenceSystem": text}})
+
+    root = "https://www.opengis.net/def/crs/EPSG/0/"
+    for text in (f"{root}28992", "urn:ogc:def:crs:EPSG::7415", None):
+        assert len(load(tmp_path, declared(text))) > 2
+    for text in (f"{root}2263", f"{root}4979", "urn:ogc:def:crs,crs:EPSG::2263,crs:EPSG::6360", "NAD83 (ftUS)", 3857):
+        with (
+            subtests.test(text),
+            pytest.raises(InputError, match=r"referenceSystem: the declared.*maps\.cityjson\.units"),
+        ):
+            load(tmp_path, declared(text))
+    metres = load(tmp_path, declared(None))
+    feet = load(tmp_path, declared(f"{root}2263"), units="ft")
+    np.testing.assert_allclose(feet.half_extents[:2, :2], 0.3048 * metres.half_extents[:2, :2], atol=1e-6)
+
+
+def test_a_bad_object_is_skipped_and_counted_and_an_empty_map_is_an_error(tmp_path, caplog):
+    for number, spoil in enumerate((
+        lambda item: item["geometry"][0].update(boundaries=[[[[0, 1, 999]]]]),
+        lambda item: item["geometry"][0].update(boundaries="x"),
+        lambda item: item.update(type=5),
+        lambda item: item.update(geometry=None),
+    )):  # fmt: skip
+        model = city()
+        for k in range(5):
+            model["CityObjects"][f"more {k}"] = copy.deepcopy(model["CityObjects"]["other"])
+        spoil(model["CityObjects"]["more 4"])
+        header = load(tmp_path, document(model)).header
+        reason = {"no_geometry": 2} if number == 3 else {"no_geometry": 1, "invalid": 1}
+        assert header.dropped_objects == reason
+    assert "CityObjects.more 4" in caplog.text
+    model["CityObjects"] = {"wall": {"type": "Building", "geometry": [
+        {"type": "MultiSurface", "lod": "1", "boundaries": [[[0, 1, 5, 4]]]}]}}  # fmt: skip
+    (tmp_path / "upright.json").write_bytes(document(model))
+    cfg = MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=tmp_path / "upright.json"))
+    with pytest.raises(InputError, match="the map has no boxes; got 1 objects, dropped: no_footprint 1"):
+        run(cfg, tmp_path / "out")
+    assert not (tmp_path / "out/boxes_3d.json").exists()
+
+
+@pytest.mark.parametrize("kind", ["PlantCover", "Road", "WaterBody", "Bridge"])
+def test_a_vast_surface_gets_larger_pieces(tmp_path, kind):
+    """One polygon of 20 km made 65,536 boxes in 90 s, or took 7 GB."""
+    corners = [[0, 0, 9000], [19_999_000, 0, 9000], [19_999_000, 19_999_000, 9000], [0, 19_999_000, 9000]]
+    geometry = {"type": "MultiSurface", "lod": "1", "boundaries": [[[0, 1, 2, 3]]]}
+    model = city() | {"vertices": corners, "CityObjects": {"p": {"type": kind, "geometry": [geometry]}}}
+    box_map = load(tmp_path, document(model), derive_ground=False)
+    assert 500 < len(box_map) < 5_000
+    np.testing.assert_allclose(
+        np.ptp([box_map.mins.min(axis=0), box_map.maxs.max(axis=0)], axis=0)[:2], 19_999, rtol=0.01
+    )

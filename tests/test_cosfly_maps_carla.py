@@ -66,6 +66,12 @@ def test_a_server_that_is_not_there_or_is_silent_is_named(tmp_path):
             carla_export.load(cfg, 0)
 
 
+def test_a_server_that_names_a_file_outside_the_cache_is_refused(tmp_path):
+    words = r"names a file outside the client's cache; got \.\./\.\./escaped"
+    with serving(street(), tmp_path, "escape@0+") as port, pytest.raises(EnvironmentMissing, match=words):
+        carla_export.load(CarlaMapConfig(port=port), 0)
+
+
 def box(x: float, y: float, half: tuple[float, float, float], yaw: float = 0.0) -> tuple[float, ...]:
     return (x, y, half[2], *half, 0.0, yaw, 0.0)
 

@@ -160,6 +160,58 @@ def test_a_hostile_mesh_is_a_clear_error(tmp_path: Path, subtests) -> None:
             read_meshes(tmp_path / "maps" / name, tree=tmp_path / "maps")
 
 
+HOUSE = "v 0 0 0\nv 4 0 0\nv 4 0 -3\nv 0 5 0\nf 1 2 4\nf 1 4 3\n"  # y is up
+
+
+def test_appearance_never_refuses_a_mesh(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for number, before in enumerate(
+        ("", "mtllib C:\\\\x.mtl\n", "mtllib\nusemtl none\n", "vt 1\nvn x y z\n", "o h\xe4\n")
+    ):
+        (tmp_path / f"{number}.obj").write_bytes((before + HOUSE.replace("-3\n", "-3 0.5\n")).encode("latin-1"))
+        assert len(read_meshes(tmp_path / f"{number}.obj", tree=tmp_path)["mesh"]) == 2
+    assert "1.obj: materials are not read" in caplog.text
+    assert "0.obj" not in caplog.text
+    for number, changes in enumerate(
+        (
+            {"extensionsRequired": ["KHR_materials_unlit", "KHR_texture_transform", "EXT_texture_webp"]},
+            {"materials": [{"pbrMetallicRoughness": {"baseColorFactor": 0.5}}], "images": [{"uri": "none.png"}]},
+            {"accessors": [{**ONE_ACCESSOR, "count": 3}, {"sparse": {}, "count": 3, "type": "VEC2"}]},
+        )
+    ):
+        (tmp_path / f"{number}.glb").write_bytes(one_triangle(FLAT, **changes))
+        assert len(read_meshes(tmp_path / f"{number}.glb", tree=tmp_path)["0"]) == 1
+
+
+def test_the_axis_that_is_up_is_a_field_and_a_likely_mistake_is_a_warning(tmp_path, caplog) -> None:
+    (tmp_path / "house.obj").write_text(HOUSE)
+    for up, height_m in ((None, 3.0), ("y", 5.0)):
+        caplog.clear()
+        ref = MeshRef(file="house.obj", fit="world", up=up)
+        (mesh,) = Meshes({1: ref}, folder=tmp_path).resolved().values()
+        assert np.ptp(mesh[..., 2]) == height_m
+        assert ('add "up": "y"' in caplog.text) == (up is None)
+    both = Meshes({k: MeshRef(file="house.obj", fit="world", up=up) for k, up in enumerate((None, "y", "z"))}, tmp_path)
+    moved = both.relative_to(tmp_path / "out").resolved()
+    assert [round(float(np.ptp(mesh[..., 2])), 6) for mesh in moved.values()] == [3.0, 5.0, 3.0]
+
+
+def test_what_nodes_repeat_is_counted_before_it_is_placed(tmp_path: Path) -> None:
+    chain = [{"mesh": 0, "translation": [0, 0, 1], "children": [k + 1]} for k in range(2_999)]
+    (tmp_path / "chain.glb").write_bytes(one_triangle(FLAT, nodes=[*chain, {"mesh": 0}], scenes=[{"nodes": [0]}]))
+    meshes = read_meshes(tmp_path / "chain.glb", tree=tmp_path)
+    assert len(meshes) == 3_000
+    np.testing.assert_allclose(meshes["2999"][0, 0], [0, -2_999, 0])  # +z of glTF is -y
+    many = [{"primitives": [{"attributes": {"POSITION": 0}}] * 2_000}]
+    for changes in ({"nodes": [{"mesh": 0}] * 1_500, "meshes": many}, {"meshes": many * 1_500}):
+        (tmp_path / "many.glb").write_bytes(one_triangle(FLAT, **changes))
+        with pytest.raises(InputError, match="got 3,000,000 triangles"):
+            read_meshes(tmp_path / "many.glb", tree=tmp_path)
+    scaled = [{"mesh": 0, "scale": [9, 9, 9], "children": [k + 1]} for k in range(399)]
+    (tmp_path / "scaled.glb").write_bytes(one_triangle(FLAT, nodes=[*scaled, {"mesh": 0}]))
+    with pytest.raises(InputError, match="not finite or is more than"):
+        read_meshes(tmp_path / "scaled.glb", tree=tmp_path)
+
+
 def test_missing_linked_and_large_files_are_clear_errors(tmp_path: Path) -> None:
     (tmp_path / "maps").mkdir()
     (tmp_path / "ball.glb").write_bytes(one_triangle(FLAT))

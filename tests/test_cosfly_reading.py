@@ -161,6 +161,17 @@ def test_very_many_equal_rows_are_refused_before_they_are_read(tmp_path, monkeyp
     assert len(list(tables.rows_of(path))) == 10_000
 
 
+@pytest.mark.parametrize("items", [pa.array([0]).take(pa.array([0] * 2_000_000)), pa.nulls(2_000_000, pa.int32())])
+def test_a_long_list_of_equal_items_is_refused_before_it_is_read(tmp_path, items):
+    lists = pa.ListArray.from_arrays(pa.array([0, len(items)], pa.int32()), items)
+    for column in (lists, pa.StructArray.from_arrays([lists], ["x"]), pa.ListArray.from_arrays([0, 1], lists)):
+        path = tmp_path / "shard.parquet"
+        pq.write_table(pa.table({"a": column}), path)
+        assert path.stat().st_size < 10_000
+        with pytest.raises(InputError, match=r"row group 0: the input is over the limit; got lists of 1,999,999 items"):
+            next(tables.rows_of(path))
+
+
 @pytest.mark.parametrize("within", [lambda texts: texts, lambda texts: pa.StructArray.from_arrays([texts], ["x"]),
     lambda texts: pa.ListArray.from_arrays(range(3_001), texts)])  # fmt: skip
 @pytest.mark.parametrize("kind", [pa.string(), pa.binary()])

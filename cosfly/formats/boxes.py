@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from cosfly.formats.columns import LARGEST, rounded
+from cosfly.formats.columns import FARTHEST_M, LARGEST, rounded
 from cosfly.formats.kinds import GROUND_KINDS, KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.formats.meshes import Meshes, MeshRef
 from cosfly.geometry.axes import axis_aligned_half_extents
@@ -209,9 +209,8 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
         ("extent", box_map.half_extents),
         ("rotation", box_map.rotations_deg),
     ):
-        check(
-            name, rows, np.abs(rows) <= LARGEST, "the box has a number that is not finite", "finite numbers"
-        )  # NaN fails
+        what, expected = "the box has a number that is not finite or too large", f"at most {FARTHEST_M:,.0f}"
+        check(name, rows, np.abs(rows) <= FARTHEST_M, what, expected)  # NaN fails
     half = box_map.half_extents
     check("extent", half, half >= 0, "the box has a negative extent", "half sizes of at least 0 m")
     unknown = [int(kind) for kind in np.unique(box_map.kinds) if int(kind) not in KIND_NAMES]
@@ -254,7 +253,7 @@ class _Box(BaseModel):
     extent: Vector
     rotation: Vector
     semantic_id: int | None = None
-    color: str | None = None
+    color: Any = None  # not read: the colour follows from the type
     min: Vector | None = None
     max: Vector | None = None
     mesh: MeshRef | None = None

@@ -16,6 +16,7 @@ Item = TypeVar("Item")
 
 XYZ, ANGLES = ("x", "y", "z"), ("pitch", "yaw", "roll")
 POSE = XYZ + ANGLES
+FARTHEST_M = 1e7  # of a place from the origin of its map: coordinates of a country, which no kernel was made beyond
 LARGEST = 1e18  # no length or time is larger in any unit, and no square or sum of such numbers overflows
 
 
@@ -95,6 +96,9 @@ def columns(record: dict, names: Iterable[str], where: str, length: int | None =
     arrays: list[np.ndarray] = []
     for name in names:
         arrays.append(column(record, name, where, len(arrays[0]) if arrays else length))
+        if name in XYZ and not (np.abs(arrays[-1]) <= FARTHEST_M).all():
+            got, expected = f"{np.abs(arrays[-1]).max():g}", f"at most {FARTHEST_M:,.0f} m"
+            raise InputError("a place is too far from the origin", where=f"{where}.{name}", got=got, expected=expected)
     return np.stack(arrays, axis=1)
 
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import re
 import struct
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
@@ -20,8 +22,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import MB, decoded, over_limit, read_bytes, write_bytes
+from cosfly.runtime.io import MB, over_limit, read_bytes, write_bytes
 from cosfly.runtime.json_io import parse_document
+
+log = logging.getLogger(__name__)
 
 MOST_TRIANGLES = 2_000_000  # of a file, and of all meshes of a map
 FILE_MB = MOST_TRIANGLES * 256 / MB  # an OBJ takes some 100 bytes for a triangle
@@ -32,6 +36,9 @@ GLB_MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 GLB_HEADER_BYTES = 12
 TRIANGLES, STRIP = 4, 5  # modes of primitives that are drawn
 LARGEST_M = 1e7
+START_M = 1e-3  # a mesh that stands on the ground of its axes begins this near to 0
+# Extensions of glTF that change colours, light and records, but no vertex.
+APPEARANCE = re.compile(r"[A-Z]+_(materials|texture|lights|techniques|xmp|animation|audio)")
 # What trimesh raises on a file that contradicts itself.
 NOT_READ = (ValueError, LookupError, TypeError, AttributeError, AssertionError, ArithmeticError, NotImplementedError)
 
@@ -53,7 +60,8 @@ def read_meshes(path: Path, *, tree: Path) -> dict[str, np.ndarray]:
         what, fix = "the file type of the mesh is not supported", "export the mesh again with one of these file types"
         raise InputError(what, where=path, got=path.suffix, expected=" or ".join(SUFFIXES), fix=fix)
     try:
-        meshes = _read_obj(data, path) if suffix == ".obj" else _read_gltf(*_chunks_of(data, path), path)
+        with np.errstate(all="ignore"):  # a chain of scales overflows; the corners are checked below
+            meshes = _read_obj(data, path) if suffix == ".obj" else _read_gltf(*_chunks_of(data, path), path)
     except NOT_READ as error:
         got, fix = f"{type(error).__name__}: {error}"[:120], "open the file in a mesh viewer, and export the mesh again"
         raise InputError("the mesh file cannot be parsed", where=path, got=got, fix=fix) from None
@@ -90,16 +98,18 @@ def _chunks_of(data: bytes, path: Path) -> tuple[bytes, bytes]:
 def _read_gltf(text: bytes, binary: bytes, path: Path) -> dict[str, np.ndarray]:
     """Read the meshes of a glTF document by the names of their nodes; trimesh gets its triangles only."""
     document = parse_document(text, path)
-    accessors, views, nodes, meshes = (
-        document.get(name, []) for name in ("accessors", "bufferViews", "nodes", "meshes")
+    accessors, views, nodes, meshes, buffers = (
+        document.get(name) or [] for name in ("accessors", "bufferViews", "nodes", "meshes", "buffers")
     )
-    is_plain = not document.get("extensionsRequired") and all(
-        "bufferView" in a and "sparse" not in a for a in accessors
-    )
-    if not is_plain or any("uri" in buffer for buffer in document.get("buffers", ())):
+    drawn = [_triangles_of(mesh) for mesh in meshes]
+    used = list(dict.fromkeys(k for mesh in drawn for primitive in mesh for k in _accessors_of(primitive)))
+    packed = [name for name in document.get("extensionsRequired") or [] if not APPEARANCE.match(name)]
+    is_plain = not packed and all("bufferView" in accessors[k] and "sparse" not in accessors[k] for k in used)
+    if not is_plain or any("uri" in buffer for buffer in buffers):
         raise InputError(
             "the mesh file uses an unsupported feature: a glTF extension, a sparse accessor, or data in another file",
             where=path,
+            got=", ".join(packed)[:80] or None,
             expected="glTF 2.0 without these features, in one file",
             fix="export the mesh again as .glb without compression and other extensions",
         )
@@ -113,30 +123,71 @@ def _read_gltf(text: bytes, binary: bytes, path: Path) -> dict[str, np.ndarray]:
     if repeated := [node for node, count in Counter([*children, *roots]).items() if count > 1]:  # also a cycle
         what, got = "a node of the mesh file has two parents", f"node {repeated[0]}"
         raise InputError(what, where=path, got=got, expected="one parent at most", fix="export the mesh again")
-    counts = [*(a["count"] for a in accessors), *(view["byteLength"] for view in views)]
+    counts = [*(accessors[k]["count"] for k in used), *(view["byteLength"] for view in views)]
     most = int(MOST_NUMBERS + FILE_MB * MB)
     if min(counts, default=0) < 0 or sum(counts) > most:
         expected = f"no negative number, and at most {most:,} values and bytes in all"
         what = "the mesh file declares a negative number of values, or too many values"
         got, fix = f"{sum(counts):,} values and bytes in all", "export the mesh again with fewer triangles"
         raise InputError(what, where=path, got=got, expected=expected, fix=fix)
+    sizes = [sum(_num_triangles(primitive, accessors) for primitive in mesh) for mesh in drawn]
+    check_num_triangles(path, sum(sizes))
+    check_num_triangles(path, sum(sizes[node["mesh"]] for node in nodes if "mesh" in node))
+    if document.get("materials"):
+        _warn_of_materials(path)
+    new_index = {k: index for index, k in enumerate(used)}
     plain_document = {
-        "asset": {"version": "2.0"}, "scenes": [{"nodes": roots}], "accessors": accessors, "bufferViews": views,
-        "nodes": [{key: value for key, value in node.items() if key != "camera"} for node in nodes],
-        "meshes": [{"primitives": _triangles_of(mesh)} for mesh in meshes],
+        "asset": {"version": "2.0"}, "scenes": [{"nodes": list(range(len(meshes)))}],
+        "accessors": [accessors[k] for k in used], "bufferViews": views,
+        "nodes": [{"name": f"mesh {k}", "mesh": k} for k in range(len(meshes))],
+        "meshes": [{"primitives": [_renumbered(primitive, new_index) for primitive in mesh]} for mesh in drawn],
         "buffers": [{"uri": "binary"}],
     }  # fmt: skip
     scene = _scene(json.dumps(plain_document).encode(), "gltf", resolver={"binary": binary})
-    placed = {frame: scene.graph[frame] for frame in scene.graph.nodes_geometry}
-    check_num_triangles(path, sum(len(scene.geometry[key].faces) for _, key in placed.values()))
-    parts: dict[str, list[np.ndarray]] = {}
-    for frame, (world, key) in placed.items():
-        corners = scene.geometry[key].triangles @ world[:3, :3].T + world[:3, 3]
-        is_mirrored = np.linalg.det(world[:3, :3]) < 0
+    corners_of: dict[str, list[np.ndarray]] = {}
+    for frame in scene.graph.nodes_geometry:
         parent = scene.graph.transforms.parents[frame]  # of one of several primitives: the node
         name = parent if frame.startswith(f"{parent}_") else frame
-        parts.setdefault(name, []).append((corners[:, ::-1] if is_mirrored else corners) @ Z_UP.T)
-    return {name: np.concatenate(corners) for name, corners in parts.items()}
+        corners_of.setdefault(name, []).append(scene.geometry[scene.graph[frame][1]].triangles)
+    names = _node_names(nodes)
+    parts: dict[str, np.ndarray] = {}
+    for k, world in _world_matrices(nodes, roots).items():
+        corners = np.concatenate(corners_of.get(f"mesh {nodes[k].get('mesh')}", [np.zeros((0, 3, 3))]))
+        if len(corners):
+            placed = corners @ world[:3, :3].T + world[:3, 3]
+            is_mirrored = np.linalg.det(world[:3, :3]) < 0
+            parts[names[k]] = (placed[:, ::-1] if is_mirrored else placed) @ Z_UP.T
+    return parts
+
+
+def _node_names(nodes: list[dict]) -> list[str]:
+    """Return a different name for each node: its own, or its number."""
+    from trimesh.util import unique_name
+
+    names: dict[str, int] = {}
+    counts: dict[str, int] = {}
+    for k, node in enumerate(nodes):
+        names[unique_name(node.get("name", str(k)), names, counts=counts)] = k
+    return list(names)
+
+
+def _world_matrices(nodes: list[dict], roots: list[int]) -> dict[int, np.ndarray]:
+    """Return the matrix (4, 4) from each node to the world; a chain of nodes may be of any length."""
+    from trimesh.transformations import quaternion_matrix
+
+    matrices: dict[int, np.ndarray] = {}
+    waiting = [(root, np.eye(4)) for root in reversed(roots)]
+    while waiting:
+        k, parent = waiting.pop()
+        node = nodes[k]
+        local = np.reshape(node.get("matrix", np.eye(4)), (4, 4)).T.astype(float)
+        local[:3, 3] += np.array(node.get("translation", (0.0, 0.0, 0.0)), dtype=float)
+        if "rotation" in node:
+            local @= quaternion_matrix(np.array(node["rotation"], dtype=float)[[3, 0, 1, 2]])
+        local @= np.diag([*node.get("scale", (1.0, 1.0, 1.0)), 1.0])
+        matrices[k] = parent @ local
+        waiting += [(child, matrices[k]) for child in reversed(node.get("children", ()))]
+    return matrices
 
 
 def _triangles_of(mesh: dict) -> list[dict]:
@@ -149,6 +200,26 @@ def _triangles_of(mesh: dict) -> list[dict]:
     ]
 
 
+def _accessors_of(primitive: dict) -> list[int]:
+    return [primitive["attributes"]["POSITION"], *([primitive["indices"]] if "indices" in primitive else [])]
+
+
+def _renumbered(primitive: dict, new_index: dict[int, int]) -> dict:
+    """Return a primitive with other numbers of accessors."""
+    position, *indices = (new_index[k] for k in _accessors_of(primitive))
+    return primitive | {"attributes": {"POSITION": position}} | ({"indices": indices[0]} if indices else {})
+
+
+def _num_triangles(primitive: dict, accessors: list[dict]) -> int:
+    num_corners = int(accessors[_accessors_of(primitive)[-1]]["count"])
+    return max(num_corners - 2, 0) if primitive.get("mode") == STRIP else num_corners // 3
+
+
+@cache
+def _warn_of_materials(path: Path) -> None:
+    log.warning("%s: materials are not read; the mesh has the colours of the type of its box", path)
+
+
 def _scene(data: bytes, file_type: str, **options: Any) -> Any:
     import trimesh
 
@@ -156,19 +227,29 @@ def _scene(data: bytes, file_type: str, **options: Any) -> Any:
 
 
 def _read_obj(data: bytes, path: Path) -> dict[str, np.ndarray]:
-    """Read the triangles of an OBJ; its materials are not read."""
-    if re.search(r"(?m)^[ \t]*f[ \t].*-", text := decoded(data, path)):
-        raise InputError(
-            "the OBJ file uses negative vertex indices, which are not supported",
-            where=path,
-            expected="indices from 1",
-            fix="export the mesh with absolute indices",
-        )
+    """Read the triangles of an OBJ: vertices and faces; names, normals, colours and materials are not read."""
+    text = data.decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
+    if re.search(r"(?m)^[ \t]*mtllib\b", text):
+        _warn_of_materials(path)
+    lines = []
+    for kind, rest in re.findall(r"(?m)^[ \t]*([vf])[ \t]+([^#\r\n]+)", text):
+        words = rest.split()
+        lines.append(" ".join([kind, *(words[:3] if kind == "v" else (word.partition("/")[0] for word in words))]))
+        if kind == "f" and "-" in lines[-1]:
+            raise InputError(
+                "the OBJ file uses negative vertex indices, which are not supported",
+                where=path,
+                expected="indices from 1",
+                fix="export the mesh with absolute indices",
+            )
     shapes = [
-        shape for shape in _scene(text.encode(), "obj", process=False).geometry.values() if hasattr(shape, "faces")
+        shape
+        for shape in _scene("\n".join(lines).encode(), "obj", process=False).geometry.values()
+        if hasattr(shape, "faces")
     ]
     check_num_triangles(path, sum(len(shape.faces) for shape in shapes))
-    return {"mesh": np.concatenate([np.asarray(shape.triangles) for shape in shapes])} if shapes else {}
+    corners = np.concatenate([np.zeros((0, 3, 3)), *(np.asarray(shape.triangles) for shape in shapes)])
+    return {"mesh": corners}
 
 
 MESHES_FILE = "meshes.glb"
@@ -180,6 +261,8 @@ class MeshRef(BaseModel):
 
     fit `box`: The bounds of the mesh are stretched to the box, axis by axis. fit `world`: Its vertices are positions in
     the map, in metres; if several boxes name the same mesh, it is drawn once, with the id of the first box.
+
+    up: The axis that points up in the file; without it y in glTF and z in an OBJ.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -187,6 +270,7 @@ class MeshRef(BaseModel):
     file: str = Field(min_length=1, max_length=1024)
     node: str | None = None
     fit: Literal["box", "world"] = "box"
+    up: Literal["y", "z"] | None = None
 
     @field_validator("file")
     @classmethod
@@ -230,11 +314,24 @@ class Meshes:
                     expected=f"the name of a node in this file, such as {', '.join(list(nodes)[:8])}",
                 )
             if ref not in meshes:
-                meshes[ref] = np.concatenate(list(nodes.values())) if ref.node is None else nodes[ref.node]
+                mesh = np.concatenate(list(nodes.values())) if ref.node is None else nodes[ref.node]
+                meshes[ref] = self._turned(mesh, ref)
         num_triangles = sum(len(meshes[ref]) for ref in self.refs.values() if ref.fit == "box")
         num_triangles += sum(len(mesh) for ref, mesh in meshes.items() if ref.fit == "world")
         check_num_triangles(self.folder or "map", num_triangles)
         return meshes
+
+    def _turned(self, mesh: np.ndarray, ref: MeshRef) -> np.ndarray:
+        """Return a mesh with the axis `up` of its reference up."""
+        usual = "z" if ref.file.lower().endswith(".obj") else "y"
+        if ref.up not in (None, usual):
+            return mesh @ (Z_UP.T if ref.up == "y" else Z_UP)
+        low = mesh.min(axis=(0, 1)) if len(mesh) else np.zeros(3)
+        if ref.up is None and usual == "z" and abs(low[1]) < START_M < abs(low[2]):
+            log.warning(
+                '%s: y begins at 0 and z does not; if y is up in this file, add "up": "y" to the mesh', ref.file
+            )
+        return mesh
 
     def relative_to(self, folder: Path) -> Meshes:
         """Return the meshes moved to MESHES_FILE of a folder, writing it where needed."""
@@ -244,7 +341,7 @@ class Meshes:
         loaded = self.resolved()
         for ref in loaded:
             name = ref.node if self.made and ref.node else f"{ref.file}#{ref.node or ''}"
-            names[ref] = name if name not in names.values() else f"{name} ({ref.fit})"
+            names[ref] = name if name not in names.values() else f"{name} ({ref.fit}{f', {ref.up}' if ref.up else ''})"
         write_meshes(folder / MESHES_FILE, {names[ref]: mesh for ref, mesh in loaded.items()})
         moved = {ref: MeshRef(file=MESHES_FILE, node=name, fit=ref.fit) for ref, name in names.items()}
         return replace(self, refs={box_id: moved[ref] for box_id, ref in self.refs.items()}, folder=folder, made={})

@@ -1,8 +1,9 @@
-"""Boxes of your own: a `boxes_3d.json`, a table (CSV), or GeoJSON.
+"""Boxes of your own: a `boxes_3d.json`, a table (CSV), or GeoJSON, also of OpenStreetMap and Overture.
 
-A row of a table is a box with the fields of COLUMNS. A feature of GeoJSON is a point with these properties, or an
-outline with a height; an outline that is not a rectangle becomes the rectangles that cover it. The names of columns
-carry the meaning and the unit: nothing is guessed, and extent, heights, yaws and overlaps are logged for the user.
+A row of a table is a box with the fields of COLUMNS. A feature of GeoJSON is a point with these properties, an outline
+or a line; an outline that is not a rectangle becomes the rectangles that cover it, a line a box for each straight
+piece. A row that cannot be used is skipped and counted; too many of them refuse the file. Extent, heights, yaws and
+overlaps are logged for the user.
 """
 
 from __future__ import annotations
@@ -11,43 +12,71 @@ import csv
 import io
 import logging
 import math
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from fnmatch import fnmatchcase
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
 import shapely.errors
 from pydantic import Field, field_validator
-from shapely.geometry import Polygon, shape
+from shapely.geometry import LineString, Point, Polygon, shape
 
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource, read_boxes
 from cosfly.formats.columns import LARGEST
 from cosfly.formats.kinds import GROUND_KINDS, KINDS, SURFACE_KINDS
-from cosfly.maps.boxlist import BoxList, origin_m, required
-from cosfly.maps.footprints import CUT_SHARES, Rectangle, cover, with_derived_ground
-from cosfly.runtime.config import Config
-from cosfly.runtime.errors import ConfigError, InputError, nearest
+from cosfly.maps.boxlist import WIDEST_M, BoxList, origin_m, required
+from cosfly.maps.footprints import (
+    CUT_SHARES,
+    THINNEST_M,
+    Rectangle,
+    check_outline,
+    cover,
+    num_cuts,
+    oriented_rectangle,
+    polygons_of,
+    with_derived_ground,
+)
+from cosfly.maps.units import METRES, UNITS_HELP, Units, declared_units, length_m, seen_units, to_metres
+from cosfly.runtime.config import Config, read_yaml
+from cosfly.runtime.errors import MOST_NAMED, ConfigError, InputError, counts_text, nearest
 from cosfly.runtime.io import read_text
 from cosfly.runtime.json_io import read_json
 
 log = logging.getLogger(__name__)
 
 NUMBERS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_deg")
-COLUMNS = ("type", "id", "name", *NUMBERS)
+# Names of OpenStreetMap and Overture, and columns without a unit: x, y and z in `maps.boxes.units`, sizes in metres.
+OTHER_NAMES = {name.rpartition("_")[0]: name for name in NUMBERS} | {
+    "lon": "x_m", "lat": "y_m", "num_floors": "building:levels", "levels": "building:levels",
+    "min_floor": "building:min_level",
+}  # fmt: skip
+DECLARED = ("min_height", "building:levels", "building:min_level", "lanes")
+COLUMNS = ("type", "id", "name", *NUMBERS, *DECLARED)
+SIZES = ("length_m", "width_m", "height_m", "min_height")  # numbers in metres, or texts with a unit
+OTHERS = ("x_m", "y_m", "z_m", "yaw_deg", "building:levels", "building:min_level", "lanes")
 PLACE = ("x_m", "y_m", "length_m", "width_m")  # every table has them; and height_m, except of surfaces
 TYPES = [kind for kind in KINDS if kind != "NONE"]
-GEOMETRIES = ("Point", "Polygon", "MultiPolygon")  # of GeoJSON
-LARGEST_PLACE = 1e9  # absolute value of a coordinate of GeoJSON
+TYPE_RULES = read_yaml(Path(__file__).with_name("feature_rules.yaml"))["rules"]
+GEOMETRIES = ("Point", "LineString", "Polygon", "MultiPoint", "MultiLineString", "MultiPolygon")  # of GeoJSON
+LARGEST_PLACE = 1e8  # absolute value of a coordinate of GeoJSON, in any unit
 MOST_NAME = 40  # characters of a name in messages
+LINE_M = 0.1  # farthest that a corner of a line may be moved
 SLAB_M = 0.3  # thickness of a surface without a height: its top is the ground
+STOREY_M, LANE_M = 3.0, 3.5
+# Width of a line, sides of a point, and height of a thing where `type_column` names the types and nothing is declared.
+DEFAULT_SIZES_M = {
+    "Buildings": (10.0, 6.0), "Roads": (7.0, SLAB_M), "Sidewalks": (2.0, SLAB_M), "RailTrack": (3.0, SLAB_M),
+    "Water": (4.0, SLAB_M), "Vegetation": (4.0, 6.0), "Poles": (0.3, 5.0), "TrafficLight": (0.4, 4.0),
+    "Walls": (0.3, 2.0), "Fences": (0.2, 1.5), "GuardRail": (0.3, 0.8), "Static": (1.0, 1.0), "Terrain": (2.0, SLAB_M),
+}  # fmt: skip
 FAR_M = 10_000.0  # a map with its middle farther from the origin is moved there
 OUTLINE_FILL, OUTLINE_PIECE_M = 0.9, 3.0  # share of its boxes that an outline fills; shortest piece that is cut
 OVERLAP_M = 0.05  # boxes that share less than this only touch
-WIDEST_DEG = 2.0  # of a map in longitude and latitude: beyond this a plane that touches the Earth is no map of it
-EARTH_M, EARTH_E2 = 6_378_137.0, 0.00669437999014  # WGS 84: equatorial radius, squared eccentricity
 
 
 class BoxesConfig(Config):
@@ -57,11 +86,18 @@ class BoxesConfig(Config):
         "Boxes", min_length=1, description="name of the map, with which folder names in the playback tree begin"
     )
     path: Path | None = Field(None, description="boxes_3d.json, .csv or .geojson file; docs/files.md lists the columns")
-    units: Literal["m", "degrees"] = Field(
-        "m", description="unit of the coordinates of GeoJSON: m, or degrees of longitude and latitude"
+    units: Units = Field("auto", description=UNITS_HELP)
+    type_column: str = Field(
+        "type",
+        min_length=1,
+        description="column of the type; building,highway,natural for OpenStreetMap: the first with a value counts, "
+        "values become types by a list, other columns are ignored and sizes have defaults; class for Overture",
     )
     types: dict[str, str] = Field(
         {}, description="type names of the file and their types in cosfly, such as {house: Buildings}"
+    )
+    most_skipped: float = Field(
+        0.2, ge=0, le=1, description="largest share of rows or features that may be skipped because they are invalid"
     )
     ignore: list[str] = Field([], description="columns or properties to ignore; ['*']: all unknown ones")
     ground_z_m: float = Field(0.0, description="height of the flat ground, in the file's coordinates, m")
@@ -79,17 +115,35 @@ class BoxesConfig(Config):
             raise ValueError(f"{'; '.join(problems)}; expected one of {', '.join(TYPES)}")
         return types
 
+    @property
+    def type_columns(self) -> list[str]:
+        return [column.strip() for column in self.type_column.split(",")]
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the columns are those of cosfly, and each must be known."""
+        return self.type_column == "type"
+
     def inputs(self) -> dict[str, Path]:
         return {"boxes": required(self.path, "maps.boxes.path")}
 
 
 class _Row(NamedTuple):
-    """One row of a table, a feature or one part of it; `problem` is empty if it could be read."""
+    """One row of a table or a feature; `problem` is empty if it could be read."""
 
     where: str
     values: Mapping[str, Any]
-    outline: Any = None  # a geometry of shapely
+    shape: Any = None  # a geometry of shapely; None in a table
     problem: str = ""
+    reason: str = "bad_geometry"
+
+
+class _Skipped(Exception):
+    """The row is not used: the reason for the counts, and the problem in words."""
+
+    def __init__(self, reason: str, problem: str) -> None:
+        super().__init__(problem)
+        self.reason = reason
 
 
 def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
@@ -111,8 +165,8 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     source = MapSource(tool=box_map.header.source.tool or "boxes", file=path.name)
     header = box_map.header.model_copy(update={**settings, "source": source})
     low, high = box_map.bounds()
-    if np.abs((low + high)[:2] / 2).max() > FAR_M and header.ground is None:
-        origin = origin_m(low, high, path)
+    origin = origin_m(low, high, path)
+    if np.abs(origin).max() > FAR_M and header.ground is None:
         log.info("%s: the middle of the map, %s, becomes the origin", path.name, origin[:2].tolist())
         header = header.model_copy(update={"offset_m": dict(zip("xyz", origin.tolist(), strict=True))})
         box_map = replace(box_map, centers=box_map.centers - origin)
@@ -143,28 +197,131 @@ def plausibility(box_map: BoxMap) -> str:
 
 
 def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
-    rows = list(_table_rows(cfg, path) if suffix == ".csv" else _feature_rows(cfg, path))
+    rows = _table_rows(cfg, path) if suffix == ".csv" else _feature_rows(cfg, path)
     if not rows:
         raise InputError("the file has no boxes", where=path, expected="at least one row or feature with a box")
     boxes = BoxList()
-    rows_by_problem = dict[str, list[str]]()  # so that each problem is listed once
-    for row in rows:
-        if problem := row.problem or _add(boxes, row, cfg):
-            rows_by_problem.setdefault(problem, []).append(row.where)
-    ids = _ids_of(rows)
-    if len(set(ids)) < len(ids) or not all(0 <= number < 2**63 for number in ids):
-        rows_by_problem["the ids must be different whole numbers"] = [""]
-    if rows_by_problem:
-        problems = []
-        for problem, places in rows_by_problem.items():
-            more = f" (and {len(places) - 1} more)" if len(places) > 1 else ""
-            problems.append(f"{places[0]}: {problem}{more}".removeprefix(": "))
-        expected = f"columns {', '.join(COLUMNS)}; types {', '.join(TYPES)}, or types listed in maps.boxes.types"
+    sources = Counter[str]()
+    rows_by_problem = defaultdict[tuple[str, str], list[str]](list)  # so that each problem is listed once
+    notes = defaultdict[str, list[str]](list)
+    for row in _in_metres(rows, cfg, path):
+        num_before = len(boxes)
+        try:
+            source = _add(boxes, row, cfg, notes)
+            if len(boxes) == num_before:
+                raise _Skipped("no_area", "the outline has no area")
+            sources[source] += len(boxes) - num_before
+        except _Skipped as error:
+            del boxes.rows[num_before:], boxes.kinds[num_before:]
+            rows_by_problem[error.reason, str(error)].append(row.where)
+    dropped = Counter[str]()
+    for (reason, _), places in rows_by_problem.items():
+        dropped[reason] += len(places)
+    problems = [_listed(places, problem) for (_, problem), places in rows_by_problem.items()]
+    ids = _ids_of(rows) if cfg.is_plain else []
+    if are_bad_ids := len(set(ids)) < len(ids) or not all(0 <= number < 2**63 for number in ids):
+        problems.append("the ids must be different whole numbers")
+    num_unmapped = dropped["unmapped_type"]
+    is_too_bad = dropped.total() - num_unmapped > cfg.most_skipped * (len(rows) - num_unmapped)
+    if are_bad_ids or is_too_bad or not len(boxes):
+        expected = (
+            f"at most {cfg.most_skipped:.0%} invalid rows (maps.boxes.most_skipped); columns {', '.join(COLUMNS)}; "
+            f"types {', '.join(TYPES)}, or types listed in maps.boxes.types"
+        )
         raise InputError.of_all(problems, where=path, expected=expected)
-    box_map = boxes.box_map(MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows)))
+    for problem in problems[:MOST_NAMED]:
+        log.warning("%s: skipped: %s", path.name, problem)
+    for note, places in notes.items():
+        log.warning("%s: %s", path.name, _listed(places, note))
+    if sources["levels"] or sources["default"]:
+        log.warning("%s: sources of the sizes of boxes: %s", path.name, counts_text(sources))
+    header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows))
+    update: dict[str, Any] = {"dropped_objects": dict(dropped)} if dropped else {}
+    if set(sources) != {"file"}:
+        update["extent_sources"] = dict(sources)
+    box_map = boxes.box_map(header.model_copy(update=update))
     if len(box_map) == len(ids):  # no outline became several boxes
         return replace(box_map, ids=np.array(ids, dtype=np.uint64))
     return box_map
+
+
+def _listed(places: list[str], problem: str) -> str:
+    return f"{places[0]}: {problem}" + (f" (and {len(places) - 1} more)" if len(places) > 1 else "")
+
+
+def _in_metres(rows: list[_Row], cfg: BoxesConfig, path: Path) -> list[_Row]:
+    """Return rows with their places in metres, with a problem if they are far from the middle of the others."""
+    shapes = [row.shape if row.shape is not None else _point_of(row) for row in rows]
+    places = shapely.get_coordinates(shapes)
+    if not len(places):
+        return rows
+    units = _units_of(rows, shapes, places, cfg, path)
+    project = to_metres(units, places)
+    middle = np.median(project(places), axis=0)
+    moved_rows: list[_Row] = []
+    used: list[np.ndarray] = []
+    for row, geometry in zip(rows, shapes, strict=True):
+        if row.problem or geometry is None:
+            moved_rows.append(row)
+            continue
+        moved = shapely.transform(geometry, project)
+        corners = shapely.get_coordinates(moved)
+        farthest_m = float(np.abs(corners - middle).max())
+        if farthest_m > WIDEST_M:
+            problem = f"it is {farthest_m / 1000:,.0f} km from the middle of the map, at {places_text(geometry)}"
+            moved_rows.append(row._replace(problem=problem, reason="far_away"))
+            continue
+        used.append(corners)
+        if row.shape is None:
+            numbers = {"x_m": moved.x, "y_m": moved.y}
+            if "z_m" in row.values:
+                numbers["z_m"] = _number(row.values["z_m"]) * METRES.get(units, 1.0)
+            moved_rows.append(row._replace(values={**row.values, **numbers}))
+        else:
+            moved_rows.append(row._replace(shape=moved))
+    if used:
+        all_corners = np.concatenate(used)
+        origin_m(all_corners.min(axis=0), all_corners.max(axis=0), path)  # refuses a map that is too wide
+    return moved_rows
+
+
+def places_text(geometry: Any) -> str:
+    """Return the first coordinates of a geometry for a message."""
+    return ", ".join(f"{value:.6g}" for value in shapely.get_coordinates(geometry)[0])
+
+
+def _point_of(row: _Row) -> Point | None:
+    x, y = (_number(row.values.get(name)) for name in ("x_m", "y_m"))
+    return None if row.problem or math.isnan(x + y) else Point(x, y)
+
+
+def _units_of(rows: list[_Row], shapes: list[Any], places: np.ndarray, cfg: BoxesConfig, path: Path) -> Units:
+    """Return the unit of the coordinates: that of the setting, or what they look like."""
+    is_table = all(row.shape is None for row in rows)
+    corners = shapely.bounds([geometry for geometry in shapes if geometry is not None])
+    sizes = np.maximum(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    if not sizes.any():  # points only
+        from scipy.spatial import cKDTree  # imported here: half a second that every command would spend
+
+        sizes = cKDTree(places).query(places, 2)[0][:, 1]  # infinite for a single point
+    seen = seen_units(places, sizes)
+    if cfg.units == "auto" and seen is None:
+        what, fix = "the coordinates may be metres or degrees", "pass --set maps.boxes.units=m, or degrees"
+        raise InputError(what, where=path, got=f"outlines of {np.median(sizes):.3g} units", fix=fix)
+    if cfg.units == "auto" and seen is not None and not (is_table and seen == "degrees"):
+        return seen
+    if seen is not None and len(places) > 1 and (seen == "degrees") != (cfg.units == "degrees"):
+        low, high = places.min(axis=0), places.max(axis=0)
+        raise InputError(
+            f"the coordinates in the file do not look like {'degrees' if cfg.units == 'degrees' else 'metres'}",
+            where=path,
+            got=f"{low.tolist()} to {high.tolist()}",
+            expected="longitude and latitude of one town"
+            if cfg.units == "degrees"
+            else "outlines or distances of metres",
+            fix=f"if the unit of the coordinates is {seen}, pass --set maps.boxes.units={seen}",
+        )
+    return cfg.units
 
 
 def _ids_of(rows: Sequence[_Row]) -> list[int]:
@@ -175,7 +332,8 @@ def _ids_of(rows: Sequence[_Row]) -> list[int]:
     return [int(text) if text.isascii() and text.isdecimal() else -1 for text in texts]
 
 
-def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
+def _table_rows(cfg: BoxesConfig, path: Path) -> list[_Row]:
+    rows: list[_Row] = []
     lines = csv.reader(io.StringIO(read_text(path, what="table of boxes").removeprefix("\ufeff")), strict=True)
     names: list[str] = []
     try:
@@ -184,9 +342,11 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
             if not any(cells):
                 continue
             if not names:
-                names = cells
+                names = [OTHER_NAMES.get(cell, cell) for cell in cells]
                 problems = _unknown(names, cfg)
-                problems += [f"the column {name} is missing" for name in ("type", *PLACE) if name not in names]
+                problems += [f"the column {name} is missing" for name in PLACE if name not in names]
+                if not set(cfg.type_columns) & set(names):
+                    problems.insert(0, f"the column {cfg.type_column} is missing")
                 problems += [f"the column {name} occurs twice" for name, count in Counter(names).items() if count > 1]
                 if problems:
                     raise InputError.of_all(
@@ -194,42 +354,48 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
                     )
                 continue
             problem = "" if len(cells) == len(names) else f"{len(cells)} cells, but the first line has {len(names)}"
-            values = {name: cell for name, cell in zip(names, cells, strict=False) if cell and name in COLUMNS}
-            yield _Row(f"line {lines.line_num}", values, problem=problem)
+            values = {name: cell for name, cell in zip(names, cells, strict=False) if cell}
+            rows.append(_Row(f"line {lines.line_num}", values, problem=problem, reason="bad_value"))
     except csv.Error as error:
         where, fix = f"{path}: line {lines.line_num}", "export the table again as CSV"
         raise InputError("the file is not a CSV table", where=where, got=str(error), fix=fix) from None
+    return rows
 
 
-def _feature_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
+def _feature_rows(cfg: BoxesConfig, path: Path) -> list[_Row]:
     value = read_json(path, what="map")
     if not isinstance(value, dict) or value.get("type") not in ("FeatureCollection", "Feature", *GEOMETRIES):
         expected, fix = f"FeatureCollection, Feature, {', '.join(GEOMETRIES)}", "export the file again as GeoJSON"
         raise InputError("the file is not GeoJSON", where=f"{path}: type", expected=f"one of {expected}", fix=fix)
     items = value.get("features") if value["type"] == "FeatureCollection" else [value]
-    if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
+    if not isinstance(items, list):
         what, fix = "the FeatureCollection has no list of features", "export the file again as GeoJSON"
         raise InputError(what, where=f"{path}: features", expected="a list of Feature objects", fix=fix)
+    if cfg.units == "auto":
+        declared = [value.get("crs"), *(item.get("crs") for item in items if isinstance(item, dict))]
+        units = declared_units(
+            list({str(text): text for text in declared if text is not None}.values()), f"{path}: crs"
+        )
+        if units is not None:
+            cfg = cfg.model_copy(update={"units": units})
     features = [_feature(item, number) for number, item in enumerate(items, 1)]
-    names = dict.fromkeys(name for feature in features for name in feature.values)
-    yield from (_Row("", {}, problem=problem) for problem in _unknown(list(names), cfg))
-    places = shapely.get_coordinates([feature.outline for feature in features])
-    project = _to_metres(cfg, places, path) if len(places) else None
-    for feature in features:
-        row = {k: value for k, value in feature.values.items() if value is not None and k in COLUMNS}
-        if feature.problem or project is None:
-            yield feature._replace(values=row)
-            continue
-        for part in shapely.get_parts(shapely.transform(feature.outline, project)):
-            if isinstance(part, Polygon):
-                yield _Row(feature.where, row, part)
-            else:
-                yield _Row(feature.where, {**row, "x_m": part.x, "y_m": part.y})
+    if problems := _unknown(list(dict.fromkeys(name for feature in features for name in feature.values)), cfg):
+        raise InputError.of_all(problems, where=path, expected=f"columns {', '.join(COLUMNS)}")
+    heights = shapely.get_coordinates([feature.shape for feature in features], include_z=True)[:, 2]
+    if len(heights := heights[np.isfinite(heights) & (heights != 0)]):
+        log.warning(
+            "%s: z of coordinates, %.4g to %.4g, is ignored; all is on the ground, at %g m (z_m of a feature counts)",
+            path.name, heights.min(), heights.max(), cfg.ground_z_m,
+        )  # fmt: skip
+    return features
 
 
-def _feature(item: dict[str, Any], number: int) -> _Row:
+def _feature(item: Any, number: int) -> _Row:
     """Return a Feature or a bare geometry with its properties; `number` counts from 1."""
+    item = item if isinstance(item, dict) else {}
     properties = item["properties"] if isinstance(item.get("properties"), dict) else {}
+    values = {OTHER_NAMES[name]: value for name, value in properties.items() if name in OTHER_NAMES}
+    values |= {name: value for name, value in properties.items() if name not in OTHER_NAMES}
     where = f"feature {number}"
     names = (properties.get("name"), item.get("id"), properties.get("id"))
     if name := next((str(value)[:MOST_NAME] for value in names if value not in (None, "")), None):
@@ -238,88 +404,121 @@ def _feature(item: dict[str, Any], number: int) -> _Row:
     kind = geometry.get("type") if isinstance(geometry, dict) else None
     if kind not in GEOMETRIES:
         problem = f"the geometry {str(kind)[:MOST_NAME]} is not supported; expected one of {', '.join(GEOMETRIES)}"
-        return _Row(where, properties, problem=problem)
+        return _Row(where, values, problem=problem)
     try:
-        outline = shapely.force_2d(shape(geometry))
+        outline = shape(geometry)
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, shapely.errors.ShapelyError):
         outline = Polygon()
     places = shapely.get_coordinates(outline)
     if len(places) == 0 or not (np.abs(places) <= LARGEST_PLACE).all():  # NaN fails
         problem = f"the coordinates of the {kind} are invalid; expected [x, y], at least four points in a ring"
-        return _Row(where, properties, problem=problem)
-    return _Row(where, properties, outline)
-
-
-def _to_metres(cfg: BoxesConfig, places: np.ndarray, path: Path) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the function that converts coordinates of the file, (n, 2), to metres east and north.
-
-    Degrees are projected on the plane that touches the Earth in the middle of all coordinates of the file, `places`.
-    """
-    low, high = places.min(axis=0), places.max(axis=0)
-    size = float((high - low).max())
-    may_be_degrees = size <= WIDEST_DEG and (np.abs(places) <= [180.0, 90.0]).all()
-    if (cfg.units == "degrees" and not may_be_degrees) or (cfg.units == "m" and may_be_degrees and size > 0):
-        other_unit = "degrees" if cfg.units == "m" else "m"
-        raise InputError(
-            f"the coordinates in the file do not look like {'metres' if cfg.units == 'm' else cfg.units}",
-            where=path,
-            got=f"{low.tolist()} to {high.tolist()}",
-            expected="a map wider than 2 m" if cfg.units == "m" else "longitude and latitude of one town",
-            fix=f"if the unit of the coordinates is {other_unit}, pass --set maps.boxes.units={other_unit}",
-        )
-    if cfg.units == "m":
-        return lambda ring: ring
-    middle = (low + high) / 2
-    log.info("longitude and latitude are converted to metres east and north of %.6f, %.6f", *middle)
-    latitude = math.radians(middle[1])
-    curvature = 1 - EARTH_E2 * math.sin(latitude) ** 2
-    east_m = EARTH_M / math.sqrt(curvature) * math.cos(latitude)  # metres in a radian of longitude
-    north_m = EARTH_M * (1 - EARTH_E2) / curvature**1.5  # metres in a radian of latitude
-    return lambda ring: np.radians(ring - middle) * [east_m, north_m]
+        return _Row(where, values, problem=problem)
+    return _Row(where, values, outline)
 
 
 def _unknown(names: Sequence[str], cfg: BoxesConfig) -> list[str]:
-    if "*" in cfg.ignore:
+    if "*" in cfg.ignore or not cfg.is_plain:
         return []
     accepted = {*COLUMNS, *cfg.ignore}
     return [f"unknown column {name!r}{nearest(name, COLUMNS)}" for name in names if name not in accepted]
 
 
-def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> str:
-    """Add the boxes of a row; return its problems, an empty text if there are none."""
-    type_name = str(row.values.get("type", ""))
-    kind = cfg.types.get(type_name, type_name)
-    numbers = {name: _number(row.values[name]) for name in NUMBERS if name in row.values}
-    is_slab = "height_m" not in numbers and kind in TYPES and KINDS[kind] in GROUND_KINDS
-    needed = list(PLACE) if row.outline is None else []
-    if not is_slab:
-        needed.append("height_m")
-    sizes = [name for name in needed if name not in ("x_m", "y_m")]
-    problems = [] if kind in TYPES else [f"unknown type {type_name[:40]!r}{nearest(type_name, [*TYPES, *cfg.types])}"]
-    problems += [f"{name} is missing" for name in needed if name not in numbers]
-    not_finite = [name for name, number in numbers.items() if math.isnan(number)]
+def _kind_of(row: _Row, cfg: BoxesConfig) -> str:
+    """Return the kind of a row; raise _Skipped if its type is unknown."""
+    values = {column: str(row.values.get(column) or "") for column in cfg.type_columns}
+    column, name = next(((column, name) for column, name in values.items() if name), (cfg.type_columns[0], ""))
+    kind = cfg.types.get(name, name)
+    if kind in TYPES:
+        return kind
+    if cfg.is_plain:
+        raise _Skipped("unknown_type", f"unknown type {name[:40]!r}{nearest(name, [*TYPES, *cfg.types])}")
+    for rule in TYPE_RULES:
+        is_meant = any(fnmatchcase(column, pattern) for pattern in rule["column"].split("|"))
+        if is_meant and rule.get("geometry", "") in getattr(row.shape, "geom_type", "Point"):
+            for patterns, kind in rule["kinds"].items():
+                if any(fnmatchcase(name, pattern) for pattern in patterns.split("|")):
+                    if kind in TYPES:
+                        return kind
+                    break
+    raise _Skipped("unmapped_type", f"there is no type for {column}={name[:40]!r}; maps.boxes.types can name one")
+
+
+def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig, notes: dict[str, list[str]]) -> str:
+    """Add the boxes of a row; return the source of their sizes. _Skipped says why a row cannot be used."""
+    if row.problem:
+        raise _Skipped(row.reason, row.problem)
+    kind = _kind_of(row, cfg)
+    lengths = {name: length_m(value) for name in SIZES if (value := row.values.get(name)) is not None}
+    others = {name: _number(value) for name in OTHERS if (value := row.values.get(name)) is not None}
+    numbers = {name: number for name, number in (lengths | others).items() if not math.isnan(number)}
+    not_finite = [name for name in lengths | others if name not in numbers] if cfg.is_plain else []
+    source = "file"
+    if "height_m" not in numbers and "building:levels" in numbers:
+        numbers["height_m"] = numbers["building:levels"] * STOREY_M
+        source = "levels"
+    above_m = numbers.get("min_height", numbers.get("building:min_level", 0.0) * STOREY_M)
+    parts = [None] if row.shape is None else list(shapely.get_parts(row.shape))
+    is_line, is_point = (any(isinstance(part, form) for part in parts) for form in (LineString, Point | None))
+    is_slab = "height_m" not in numbers and KINDS[kind] in GROUND_KINDS
+    needed = ["x_m", "y_m"] * (row.shape is None) + ["length_m"] * is_point + ["width_m"] * (is_point or is_line)
+    needed += ["height_m"] * (not is_slab)
+    if is_line and "lanes" in numbers:
+        numbers.setdefault("width_m", numbers["lanes"] * LANE_M)
+    if not cfg.is_plain and kind in DEFAULT_SIZES_M:
+        width, height = DEFAULT_SIZES_M[kind]
+        defaults = {"length_m": width, "width_m": width, "height_m": above_m + height}
+        source = "default" if any(name in defaults and name not in numbers for name in needed) else source
+        is_slab = is_slab or ("height_m" not in numbers and height == SLAB_M)
+        numbers = defaults | numbers
+    problems = [f"{name} is missing" for name in needed if name not in numbers and name not in not_finite]
     problems += [f"{name} is not a finite number: {str(row.values[name])[:40]!r}" for name in not_finite]
-    problems += [f"{name} must be above 0" for name in sizes if numbers.get(name, 1.0) <= 0]
-    if row.outline is not None and not row.outline.is_valid:
-        problems.append(f"the outline crosses itself: {shapely.is_valid_reason(row.outline)}")
+    problems += [f"{name} must be above 0" for name in needed if name[0] in "lwh" and numbers.get(name, 1.0) <= 0]
+    if above_m and numbers.get("height_m", math.inf) <= above_m:
+        problems.append(f"height_m must be above the minimum height, {above_m:g} m")
     if problems:
-        return ", ".join(problems)
-    height_m = SLAB_M if is_slab else numbers["height_m"]
+        raise _Skipped("bad_value", ", ".join(problems))
+    height_m = SLAB_M if is_slab else numbers["height_m"] - above_m
+    low_m = cfg.ground_z_m - SLAB_M if is_slab else cfg.ground_z_m + above_m
     if "z_m" in numbers:
         low_m = numbers["z_m"] - height_m / 2
-    else:
-        low_m = cfg.ground_z_m - SLAB_M if is_slab else cfg.ground_z_m
-    if row.outline is None:
-        x_m, y_m, length_m, width_m = (numbers[name] for name in PLACE)
-        rectangles = [Rectangle((x_m, y_m), (length_m, width_m), numbers.get("yaw_deg", 0.0))]
-    else:
-        rectangles = cover(row.outline, min_fill=OUTLINE_FILL, min_size_m=OUTLINE_PIECE_M, shares=CUT_SHARES)
     try:
-        for center, size, yaw_deg in rectangles:
-            boxes.add(kind, center, size, low_m, low_m + height_m, yaw_deg)
+        for part in parts:
+            for center, size, yaw_deg in _rectangles(boxes, part, numbers, row, notes):
+                boxes.add(kind, center, size, low_m, low_m + height_m, yaw_deg)
     except ValueError as error:  # so far from the origin that its size is lost
-        return str(error)
-    return ""
+        raise _Skipped("bad_value", str(error)) from None
+    return source
+
+
+def _rectangles(
+    boxes: BoxList, part: Any, numbers: Mapping[str, float], row: _Row, notes: dict[str, list[str]]
+) -> Iterator[Rectangle]:
+    """Yield the rectangles of a point, a line or an outline; without any, of the row's own place."""
+    if part is None or isinstance(part, Point):
+        x_m, y_m = (numbers["x_m"], numbers["y_m"]) if part is None else (part.x, part.y)
+        yield Rectangle((x_m, y_m), (numbers["length_m"], numbers["width_m"]), numbers.get("yaw_deg", 0.0))
+    elif isinstance(part, LineString):
+        width_m = numbers["width_m"]
+        for start, end in pairwise(np.asarray(part.simplify(LINE_M).coords)):
+            piece = end - start
+            if (length := float(np.hypot(*piece))) > 0:  # half of the width more, so that a bend has no gap
+                yaw_deg = float(np.degrees(np.arctan2(piece[1], piece[0])))
+                yield Rectangle(tuple((start + end) / 2), (length + width_m / 2, width_m), yaw_deg)
+    else:
+        polygons = [part]
+        if not part.is_valid:
+            try:
+                check_outline(part, row.where)
+            except InputError as error:
+                raise _Skipped("bad_geometry", f"{error.what}: {error.got}") from None
+            polygons = polygons_of(shapely.make_valid(part))
+            if polygons:
+                notes["the outline crosses itself and is repaired"].append(row.where)
+        for polygon in polygons:
+            boxes.reserve(num_cuts(polygon, OUTLINE_PIECE_M, np.inf, CUT_SHARES), len(polygon.exterior.coords))
+            pieces = cover(polygon, min_fill=OUTLINE_FILL, min_size_m=OUTLINE_PIECE_M, shares=CUT_SHARES)
+            small = [oriented_rectangle(polygon)] if not pieces and polygon.area > 0 else []
+            yield from pieces or (rectangle for rectangle in small if min(rectangle.size) > THINNEST_M)
 
 
 def _number(value: Any) -> float:

@@ -11,9 +11,11 @@ import numpy as np
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map
 from cosfly.formats.kinds import KINDS
 from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.io import over_limit
 
 Pair = Sequence[float] | np.ndarray  # x and y
 WIDEST_M = 20_000.0  # of a map
+MOST_CUTS, MOST_CUTS_PER_CORNER = 30_000, 50  # of the polygons of a map; a city model needs 3 for each corner
 
 
 @dataclass
@@ -22,6 +24,8 @@ class BoxList:
 
     rows: list[tuple[float, ...]] = field(default_factory=list)  # center 3, half extent 3, yaw_deg
     kinds: list[int] = field(default_factory=list)
+    num_cuts: float = 0.0
+    most_cuts: float = MOST_CUTS
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -34,6 +38,14 @@ class BoxList:
         center = (float(center_xy[0]), float(center_xy[1]), (low_m + high_m) / 2)
         self.rows.append((*center, size_xy[0] / 2, size_xy[1] / 2, (high_m - low_m) / 2, float(yaw_deg)))
         self.kinds.append(KINDS[kind])
+
+    def reserve(self, num_cuts: float, num_corners: int) -> None:
+        """Count the work for a polygon before it is done; raise InputError if it is out of proportion to the file."""
+        self.num_cuts += num_cuts
+        self.most_cuts += MOST_CUTS_PER_CORNER * num_corners
+        if self.num_cuts > self.most_cuts:
+            got, fix = f"outlines that need {self.num_cuts:,.0f} cuts", "cut out a part of the map, or simplify it"
+            raise over_limit("map", got, f"{self.most_cuts:,.0f} cuts for this number of corners", fix)
 
     def span(self, kind: str, a: Pair, b: Pair, low_m: float, high_m: float) -> None:
         """Add an unturned box by two opposite corners of its footprint, in any order."""

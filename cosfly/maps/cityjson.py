@@ -8,6 +8,7 @@ they rise over the ground.
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,19 +22,23 @@ from shapely.geometry import Polygon
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, GroundGrid, LicenceId, MapHeader, MapSource
 from cosfly.formats.meshes import MESHES_FILE, Meshes, MeshRef
 from cosfly.geometry.ground import Ground
-from cosfly.maps.boxlist import BoxList, origin_m, required
-from cosfly.maps.cityjson_file import CityObject, Surface, read_model
+from cosfly.maps.boxlist import WIDEST_M, BoxList, origin_m, required
+from cosfly.maps.cityjson_file import CityModel, CityObject, Surface, read_model
 from cosfly.maps.footprints import (
     CUT_SHARES,
+    MIN_AREA_M2,
     Rectangle,
     check_outline,
     cover,
+    num_cuts,
     polygons_of,
     rectangle_polygon,
     united,
     with_derived_ground,
 )
+from cosfly.maps.units import UNITS_HELP, Units
 from cosfly.runtime.config import Config
+from cosfly.runtime.errors import MOST_NAMED, InputError
 
 log = logging.getLogger(__name__)
 
@@ -49,6 +54,10 @@ class CityJsonConfig(Config):
         UNKNOWN_LICENCE, description="licence of the model, as spelled on the Hugging Face Hub (cc-by-4.0)"
     )
     credits: str = Field("", description="attribution of the model's makers, in one or more sentences")
+    units: Units = Field("auto", description=UNITS_HELP)
+    most_skipped: float = Field(
+        0.2, ge=0, le=1, description="largest share of objects that may be skipped because they are invalid"
+    )
     tool: str = Field("CityJSON", description="tool and version that made the file, for the records")
     solids: bool = Field(True, description="draw solids with their own roofs and walls; planners use the boxes")
     derive_ground: bool = Field(True, description="derive streets, pavements and lawn for a model that has no streets")
@@ -77,8 +86,8 @@ class CityBoxes:
 def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     """Read a city model; the seed changes nothing."""
     path = cfg.inputs()["city_model"]
-    model = read_model(path)
-    objects, origin = _centred(model.objects, path)
+    model = read_model(path, cfg.units, cfg.most_skipped)
+    objects, origin = _centred(_near(model, cfg, path), path)
     ground = ground_of(objects)
 
     def lowered(ring: np.ndarray) -> np.ndarray:
@@ -86,7 +95,7 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
 
     if not ground.is_flat:  # heights over the ground below each vertex; solids keep theirs, or their roofs would slope
         objects = [item if item.rule.form == "solid" else item.moved(lowered) for item in objects]
-    city = _boxes_of(objects, cfg, ground)
+    city = _boxes_of(objects, cfg, ground, model.dropped)
     footprint_m2 = city.footprint_m2
     header = MapHeader(
         name=cfg.name, source=MapSource(tool=cfg.tool, version=f"CityJSON {model.version}", file=path.name),
@@ -94,7 +103,7 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
         offset_m=dict(zip("xyz", origin.tolist(), strict=True)), building_footprint_m2=round(footprint_m2, 1),
         building_area_ratio=round(city.boxes_m2 / footprint_m2, 4) if footprint_m2 else None,
         building_covered_share=round(city.covered_m2 / footprint_m2, 4) if footprint_m2 else None,
-        num_objects=model.num_objects, dropped_objects=model.dropped,
+        num_objects=model.num_objects, dropped_objects=dict(model.dropped),
     )  # fmt: skip
     if not ground.is_flat:
         header = header.model_copy(update={"ground": GroundGrid.of(ground)})
@@ -105,13 +114,35 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     return with_derived_ground(box_map) if cfg.derive_ground else box_map
 
 
-def _boxes_of(objects: list[CityObject], cfg: CityJsonConfig, ground: Ground) -> CityBoxes:
-    """Return the boxes of all objects by the forms of their rules: solid, wall, surface, green."""
+def _near(model: CityModel, cfg: CityJsonConfig, path: Path) -> list[CityObject]:
+    """Return the objects near the middle of the map; the others are counted, and too many of them refuse the file."""
+    centers = np.array([item.corners().mean(axis=0) for item in model.objects])
+    is_far = (np.abs(centers - np.median(centers, axis=0)) > WIDEST_M).any(axis=1)
+    far = [item.object_id for item, far in zip(model.objects, is_far, strict=True) if far]
+    if not far:
+        return model.objects
+    where = f"{path}: {', '.join(far[:MOST_NAMED])}"
+    if len(far) > cfg.most_skipped * model.num_objects:
+        expected = f"at most {cfg.most_skipped:.0%} invalid objects (maps.cityjson.most_skipped)"
+        raise InputError("objects are more than 20 km from the middle of the map", where=where, expected=expected)
+    log.warning("%s: skipped, because these %d objects are more than 20 km from the others", where, len(far))
+    model.dropped["far_away"] += len(far)
+    return [item for item, far in zip(model.objects, is_far, strict=True) if not far]
+
+
+def _boxes_of(objects: list[CityObject], cfg: CityJsonConfig, ground: Ground, dropped: Counter[str]) -> CityBoxes:
+    """Return the boxes of all objects by the forms of their rules: solid, wall, surface, green.
+
+    An object without a box is counted in `dropped`.
+    """
     facets = {item.object_id: _facets(item) for item in objects}
     footprints = {key: united([polygon for polygon, _ in value]) for key, value in facets.items()}
+    greens = [item for item in objects if item.rule.form == "green" and facets[item.object_id]]
+    cell_m = _canopy_cell_m(greens)
     city = CityBoxes()
     for item in objects:
         footprint, kind, form = footprints[item.object_id], item.rule.kind, item.rule.form
+        num_before = len(city.boxes)
         if form == "solid":
             _add_solid(city, cfg, item, footprint, ground)
         elif form == "wall":
@@ -119,10 +150,18 @@ def _boxes_of(objects: list[CityObject], cfg: CityJsonConfig, ground: Ground) ->
         elif kind != "Water":  # all water is added last
             _add_surface(city.boxes, kind, footprint)
             if form == "green" and facets[item.object_id]:
-                _add_trees(city.boxes, item, facets[item.object_id])
+                _add_trees(city.boxes, item, facets[item.object_id], cell_m)
         if kind == "Bridge":
             _add_surface(city.boxes, "Sidewalks", footprint)  # for pedestrians
-    _add_surface(city.boxes, "Water", _open_water(objects, footprints))
+        dropped["no_footprint"] += kind != "Water" and len(city.boxes) == num_before
+    water = _open_water(objects, footprints)
+    _add_surface(city.boxes, "Water", water)
+    for item in objects:
+        if item.rule.kind == "Water":
+            is_open = shapely.intersection(footprints[item.object_id], water).area > MIN_AREA_M2
+            dropped["under_other_surfaces"] += not is_open
+    for reason in [reason for reason, count in dropped.items() if not count]:
+        del dropped[reason]
     return city
 
 
@@ -166,10 +205,13 @@ def _facets(item: CityObject) -> list[Facet]:
     return facets
 
 
-def _pieces(footprint: Any, tolerance_m: float, **cover_settings: Any) -> Iterator[Rectangle]:
-    """Yield the rectangles that cover each polygon of a footprint, simplified."""
+def _pieces(boxes: BoxList, footprint: Any, tolerance_m: float, **settings: Any) -> Iterator[Rectangle]:
+    """Yield the rectangles that cover each polygon of a footprint, simplified; their number is bounded before."""
     for polygon in polygons_of(footprint):
-        yield from cover(polygon.simplify(tolerance_m), **cover_settings)
+        sizes = settings["min_size_m"], settings.get("max_size_m", np.inf)
+        simple = polygon.simplify(tolerance_m)
+        boxes.reserve(num_cuts(simple, *sizes, settings.get("shares", (0.5,))), shapely.count_coordinates(simple))
+        yield from cover(simple, **settings)
 
 
 # Share of its boxes that a shape fills; pieces of at most this length are not cut again, m.
@@ -193,7 +235,9 @@ def _add_solid(city: CityBoxes, cfg: CityJsonConfig, item: CityObject, footprint
     mesh = solid_mesh(item.detailed, bottom_m) if cfg.solids else None
     first_row = len(city.boxes)
     outlines = []
-    for rectangle in _pieces(footprint, 0.05, min_fill=SOLID_FILL, min_size_m=SOLID_PIECE_M, shares=CUT_SHARES):
+    for rectangle in _pieces(
+        city.boxes, footprint, 0.05, min_fill=SOLID_FILL, min_size_m=SOLID_PIECE_M, shares=CUT_SHARES
+    ):
         high_m = max(top_m if mesh is None else _top_within(mesh, rectangle, top_m), bottom_m + 0.1)
         city.boxes.add(item.rule.kind, rectangle.center, rectangle.size, bottom_m, high_m, rectangle.yaw_deg)
         outlines.append(rectangle_polygon(rectangle))
@@ -230,7 +274,7 @@ def _add_wall(boxes: BoxList, item: CityObject, footprint: Any, *, is_flat: bool
     """Add a wall as boxes that are as high as the upper quartile of its vertices."""
     top_m = float(np.clip(np.percentile(item.corners()[:, 2], 75), 0.3, WALL_MAX_M))
     longest_m, bottom_m = (np.inf, -SLAB_M) if is_flat else (SLOPED_WALL_M, -SLOPED_WALL_DEPTH_M)
-    for piece in _pieces(footprint, 0.02, min_fill=WALL_FILL, min_size_m=WALL_PIECE_M, max_size_m=longest_m):
+    for piece in _pieces(boxes, footprint, 0.02, min_fill=WALL_FILL, min_size_m=WALL_PIECE_M, max_size_m=longest_m):
         boxes.add(item.rule.kind, piece.center, piece.size, bottom_m, top_m, piece.yaw_deg)
 
 
@@ -292,6 +336,7 @@ SURFACE_TOPS_M = {
 
 CANOPY_M, CANOPY_MAX_M = 2.5, 40.0  # green that rises higher over the ground is a tree; tallest tree
 CANOPY_CELL_M = 2.0  # raster cell of canopies
+MOST_CELLS = 400_000  # of all canopies; vast ones get larger cells
 CROWN_CELLS, CROWN_MIN_M = 3, 3.6  # cells along a tree's side at most; least width of a crown: plots are smaller
 
 
@@ -299,25 +344,35 @@ def _add_surface(boxes: BoxList, kind: str, footprint: Any) -> None:
     """Add a surface as slabs at the height of its kind, so that it never obstructs a pedestrian."""
     top_m = SURFACE_TOPS_M.get(kind, -0.1)
     fill, piece_m = (WATER_FILL, WATER_PIECE_M) if kind == "Water" else (SURFACE_FILL, SURFACE_PIECE_M)
-    for piece in _pieces(footprint, 0.05, min_fill=fill, min_size_m=piece_m, max_size_m=SURFACE_MAX_M):
+    for piece in _pieces(boxes, footprint, 0.05, min_fill=fill, min_size_m=piece_m, max_size_m=SURFACE_MAX_M):
         boxes.add(kind, piece.center, piece.size, top_m - SLAB_M, top_m, piece.yaw_deg)
 
 
-def _add_trees(boxes: BoxList, item: CityObject, facets: list[Facet]) -> None:
+def _canopy_cell_m(greens: list[CityObject]) -> float:
+    """Return the raster cell of canopies, so that all of them together have at most about MOST_CELLS."""
+    cell_m = CANOPY_CELL_M
+    spans = np.array([np.ptp(item.corners()[:, :2], axis=0) for item in greens]).reshape(-1, 2)
+    while (spans / cell_m + 1).prod(axis=1).sum() > MOST_CELLS + len(greens):
+        cell_m += CANOPY_CELL_M
+    if cell_m > CANOPY_CELL_M:
+        log.warning("plants cover so large an area that trees are made of cells of %g m", cell_m)
+    return cell_m
+
+
+def _add_trees(boxes: BoxList, item: CityObject, facets: list[Facet], cell_m: float) -> None:
     """Add a vegetation box for every patch of raster cells where the green rises over CANOPY_M."""
-    heights_m, first_cell = _canopy_heights(item, facets)
+    heights_m, first_cell = _canopy_heights(item, facets, cell_m)
     for x0, y0, x1, y1, top_m in _crowns(heights_m):
         begin, end = np.add(first_cell, (x0, y0)), np.add(first_cell, (x1, y1))
-        size_m = np.maximum((end - begin) * CANOPY_CELL_M, CROWN_MIN_M)
-        boxes.add("Vegetation", (begin + end) / 2 * CANOPY_CELL_M, size_m, 0.0, min(top_m, CANOPY_MAX_M))
+        size_m = np.maximum((end - begin) * cell_m, CROWN_MIN_M)
+        boxes.add("Vegetation", (begin + end) / 2 * cell_m, size_m, 0.0, min(top_m, CANOPY_MAX_M))
 
 
-def _canopy_heights(item: CityObject, facets: list[Facet]) -> tuple[np.ndarray, np.ndarray]:
+def _canopy_heights(item: CityObject, facets: list[Facet], cell_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Rasterise a surface: the highest corner in each cell, and the height over the cell's middle.
 
-    Return heights (nx, ny) m, 0 off the surface, and the indices (2,) of the first cell: low corner / CANOPY_CELL_M.
+    Return heights (nx, ny) m, 0 off the surface, and the indices (2,) of the first cell: low corner / cell_m.
     """
-    cell_m = CANOPY_CELL_M
     bounds = np.array([polygon.bounds for polygon, _ in facets])
     corners = item.corners()
     first_cell = np.floor(np.minimum(bounds[:, :2].min(axis=0), corners[:, :2].min(axis=0)) / cell_m).astype(int)

@@ -6,6 +6,8 @@ One document or a text sequence (CityJSONSeq: the document first, then one featu
 from __future__ import annotations
 
 import logging
+import math
+from collections import Counter
 from collections.abc import Callable
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -15,8 +17,9 @@ import numpy as np
 from pydantic import AliasPath, BaseModel, Field, FiniteFloat
 
 from cosfly.formats.columns import numbers
+from cosfly.maps.units import METRES, Units, declared_units, length_m, refused
 from cosfly.runtime.config import read_yaml
-from cosfly.runtime.errors import InputError, counts_text, json_type, shown
+from cosfly.runtime.errors import MOST_NAMED, ConfigError, InputError, counts_text, json_type, shown
 from cosfly.runtime.io import over_limit, read_unpacked
 from cosfly.runtime.json_io import parse_document, parse_json, validated
 
@@ -24,6 +27,7 @@ log = logging.getLogger(__name__)
 
 CITY_MB = 16_384  # on disk and unpacked; as values of Python it takes ten times that
 MOST_VERTICES = 100_000  # of a surface, its holes included
+FLAT_M, STOREY_M, HIGHEST_M = 0.01, 3.0, 2_000.0  # a footprint is flatter; of a storey; of a building
 VERSIONS = ("1.1", "2.0")
 RECORD_SEPARATOR = b"\x1e"  # before each text of a sequence of RFC 7464
 # Nesting of `boundaries` above the surfaces. Of a Solid's shells only the outer one counts.
@@ -45,7 +49,7 @@ class ObjectRule(NamedTuple):
 
     def covers(self, item: _Object) -> bool:
         """Return whether the rule applies to an object. Extension types (a leading +) count as their base name."""
-        value = str((item.attributes or {}).get(self.attribute, ""))
+        value = str(item.attribute(self.attribute) or "")
         return fnmatchcase(item.type.removeprefix("+"), self.type) and fnmatchcase(value, self.value)
 
 
@@ -81,7 +85,7 @@ class CityModel(NamedTuple):
     """The objects that a rule covers, and the number of dropped objects by reason."""
 
     objects: list[CityObject]
-    dropped: dict[str, int]
+    dropped: Counter[str]
     num_objects: int
     version: str
 
@@ -101,19 +105,25 @@ class _Geometry(BaseModel):
 
 class _Object(BaseModel):
     type: str
-    attributes: dict[str, Any] | None = None
-    geometry: list[_Geometry] = []
-    children: list[str] | None = None
+    attributes: Any = None
+    geometry: list[_Geometry] | None = None
+    children: Any = None
+
+    def attribute(self, *names: str) -> Any:
+        """Return the first of these attributes that has a value."""
+        values = self.attributes if isinstance(self.attributes, dict) else {}
+        return next((values[name] for name in names if values.get(name) is not None), None)
 
 
 class _Part(BaseModel):
     """City objects and the vertices that their indices refer to: a document, or one feature of a sequence."""
 
-    objects: dict[str, _Object] = Field(alias="CityObjects")
+    objects: dict[str, Any] = Field(alias="CityObjects")
     vertices: list[Any]
 
 
 class _Document(_Part):
+    metadata: Any = None
     scale: Vector = Field(validation_alias=AliasPath("transform", "scale"))
     translate: Vector = Field(validation_alias=AliasPath("transform", "translate"))
 
@@ -122,22 +132,38 @@ class _Dropped(Exception):
     """The object is not used; the text is the reason."""
 
 
-def read_model(path: Path) -> CityModel:
-    """Read a CityJSON file or text sequence, plain or gzipped; coordinates stay the file's."""
+def read_model(path: Path, units: Units, most_skipped: float) -> CityModel:
+    """Read a CityJSON file or text sequence, plain or gzipped; coordinates are in metres, in the file's axes.
+
+    most_skipped: The largest share of objects that may be skipped because they are invalid.
+    """
     version, head, features = _read_parts(path)
+    if units == "auto":
+        declared = head.metadata.get("referenceSystem") if isinstance(head.metadata, dict) else None
+        units = declared_units(declared, f"{path}: metadata.referenceSystem") or "m"
+        if units == "degrees":
+            raise refused(str(declared), f"{path}: metadata.referenceSystem")
+    if units == "degrees":
+        raise ConfigError("CityJSON cannot be read in degrees", where="maps.cityjson.units", fix="use cjio reproject")
     objects = dict[str, CityObject]()
     seen_ids = set[str]()
     num_objects = 0
-    dropped = dict.fromkeys(("unmapped_type", "group", "no_geometry", "outline_of_parts", "repeated_id"), 0)
+    dropped = Counter[str]()
+    problems: list[str] = []
     for where, part in [(str(path), head), *features] if head.objects else features:
-        vertices = _vectors(part.vertices, f"{where}: vertices") * head.scale + head.translate
+        scale = np.multiply(head.scale, METRES[units])
+        vertices = _vectors(part.vertices, f"{where}: vertices") * scale + np.multiply(head.translate, METRES[units])
         num_objects += len(part.objects)
-        for object_id, item in part.objects.items():
+        for object_id, value in part.objects.items():
+            place = f"{where}: CityObjects.{object_id}"
             reason = ""
             try:
-                candidate = _city_object(object_id, item, part, vertices, f"{where}: CityObjects.{object_id}")
+                candidate = _city_object(object_id, validated(_Object, value, place), part, vertices, place)
             except _Dropped as error:
                 reason = str(error)
+            except InputError as error:
+                reason = "invalid"
+                problems.append(str(error))
             if object_id in seen_ids:
                 reason = "repeated_id"
             seen_ids.add(object_id)
@@ -145,7 +171,11 @@ def read_model(path: Path) -> CityModel:
                 dropped[reason] += 1
             else:
                 objects[object_id] = candidate
-    dropped = {reason: count for reason, count in dropped.items() if count}
+    if len(problems) > most_skipped * num_objects:
+        expected = f"at most {most_skipped:.0%} invalid objects (maps.cityjson.most_skipped)"
+        raise InputError.of_all(problems, where=path, expected=expected)
+    for problem in problems[:MOST_NAMED]:
+        log.warning("skipped: %s", problem)
     if not objects:
         counts = f"dropped objects: {counts_text(dropped)}" if dropped else "no objects"
         expected = "an object with a geometry and a supported type, such as Building"
@@ -213,15 +243,16 @@ def _city_object(object_id: str, item: _Object, part: _Part, vertices: np.ndarra
     if rule is None:
         log.warning("%s: dropped, because cosfly has no rule for the type %s", object_id, item.type)
         raise _Dropped("unmapped_type")
-    usable = [k for k, geometry in enumerate(item.geometry) if geometry.type in NESTING]
+    geometries = item.geometry or []
+    usable = [k for k, geometry in enumerate(geometries) if geometry.type in NESTING]
     if not usable:
         raise _Dropped("no_geometry")
 
     def level(k: int) -> float:
-        return item.geometry[k].level
+        return geometries[k].level
 
     def surfaces_of(k: int) -> list[Surface]:
-        return _surfaces(item.geometry[k], vertices, f"{where}.geometry[{k}].boundaries")
+        return _surfaces(geometries[k], vertices, f"{where}.geometry[{k}].boundaries")
 
     coarsest = min(usable, key=lambda k: (level(k) < 1, level(k)))  # level 0 has no height
     finest = max(usable, key=level)
@@ -230,9 +261,39 @@ def _city_object(object_id: str, item: _Object, part: _Part, vertices: np.ndarra
         raise _Dropped("no_geometry")
     if rule.form != "solid":
         return CityObject(object_id, rule, surfaces, [])
-    if level(coarsest) < 1 and any(child in part.objects for child in item.children or []):
+    children = item.children if isinstance(item.children, list) else []
+    if level(coarsest) < 1 and any(isinstance(child, str) and child in part.objects for child in children):
         raise _Dropped("outline_of_parts")  # its parts have the walls; the outline would hide their courtyards
+    heights = np.concatenate([ring[:, 2] for surface in surfaces for ring in surface])
+    if np.ptp(heights) < FLAT_M and (height_m := _height_of(item, is_needed=rule.kind == "Buildings")):
+        surfaces = _raised(surfaces, height_m)
+        return CityObject(object_id, rule, surfaces, surfaces)
     return CityObject(object_id, rule, surfaces, surfaces if finest == coarsest else surfaces_of(finest))
+
+
+def _height_of(item: _Object, *, is_needed: bool) -> float:
+    """Return the declared height of a footprint, m; 0 if there is none, or _Dropped if it is needed."""
+    value = item.attribute("measuredHeight", "height")
+    height_m = length_m(value.get("value") if isinstance(value, dict) else value)
+    if math.isnan(height_m):
+        height_m = length_m(item.attribute("storeysAboveGround")) * STOREY_M
+    if 0 < height_m <= HIGHEST_M:
+        return height_m
+    if is_needed:
+        raise _Dropped("no_height")
+    return 0.0
+
+
+def _raised(surfaces: list[Surface], height_m: float) -> list[Surface]:
+    """Return footprints as solids: their roofs, and a wall under each edge."""
+    solids = list[Surface]()
+    for surface in surfaces:
+        roof = [np.add(ring, (0.0, 0.0, height_m)) for ring in surface]
+        solids += [surface, roof]
+        for low, high in zip(surface, roof, strict=True):
+            walls = zip(low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high, strict=True)
+            solids += [[np.stack(wall)] for wall in walls]
+    return solids
 
 
 def _surfaces(geometry: _Geometry, vertices: np.ndarray, where: str) -> list[Surface]:

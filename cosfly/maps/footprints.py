@@ -26,7 +26,9 @@ MIN_AREA_M2 = 0.02  # smaller pieces are rounding errors of a cut
 THINNEST_M = 1e-3  # thinner rectangles are rounding errors too
 MOST_CROSSINGS = 500  # of an outline with itself; 1,000 take a second to resolve
 PAIRS_AT_ONCE = 1_000_000  # pairs of edges that are compared before the count is checked
-MAX_DEPTH = 16  # of cuts: up to 65,536 pieces of a polygon
+MAX_DEPTH = 16  # of cuts
+# Pieces of a polygon by its outline, and by its area: a larger one gets larger pieces. Cuts at shares take longer.
+MOST_PIECES, MOST_PIECES_OF_SHARES = 1_000, 400
 
 CUT_SHARES = (0.25, 0.4, 0.5, 0.6, 0.75)  # where houses may be cut
 
@@ -92,11 +94,13 @@ def cover(
 
     A piece is done when its rectangle's longer side is at most `min_size_m`, or at most `max_size_m` and the piece
     fills it to `min_fill`. Otherwise it is cut across the longer side, at the share of it (with several shares: across
-    the side and at the share) that leaves the least empty area.
+    the side and at the share) that leaves the least empty area. Both sizes grow with a very large polygon, so that a
+    few corners cannot ask for a million pieces.
     """
     if not 0 < min_fill <= 1 or not min_size_m > 0 or not all(0 < share < 1 for share in shares):
         got = f"got min_fill {min_fill}, min_size_m {min_size_m}, shares {shares}"
         raise ValueError(f"min_fill and shares must be between 0 and 1, and min_size_m must be above 0 m; {got}")
+    min_size_m, max_size_m = _sizes_for(polygon, min_size_m, max_size_m, shares)
     done: list[Rectangle] = []
     waiting = [(piece, 0) for piece in polygons_of(polygon)]
     while waiting:
@@ -110,6 +114,18 @@ def cover(
         elif min(rectangle.size) > THINNEST_M:
             done.append(rectangle)
     return done
+
+
+def _sizes_for(polygon: Polygon, min_size_m: float, max_size_m: float, shares: Sequence[float]) -> tuple[float, float]:
+    most = MOST_PIECES if len(shares) == 1 else MOST_PIECES_OF_SHARES
+    min_size_m = max(min_size_m, polygon.length / most)
+    return min_size_m, max(max_size_m, min_size_m, float(np.sqrt(polygon.area / most)))
+
+
+def num_cuts(polygon: Polygon, min_size_m: float, max_size_m: float, shares: Sequence[float]) -> float:
+    """Return a bound on the cuts that `cover` tries: of its pieces along the outline and inside, times the shares."""
+    min_size_m, max_size_m = _sizes_for(polygon, min_size_m, max_size_m, shares)
+    return len(shares) * (polygon.length / min_size_m + polygon.area / max_size_m**2)
 
 
 def _cut(piece: Polygon, rectangle: Rectangle, shares: Sequence[float]) -> list[Polygon]:
@@ -151,6 +167,8 @@ def num_crossings(polygon: Polygon) -> int:
         edges.append(np.stack([corners[:-1], corners[1:]], axis=1))
         neighbours.append(num_edges + np.roll(np.arange(len(corners) - 1), 1))
         num_edges += len(corners) - 1
+    if not num_edges:
+        return 0
     lines = shapely.linestrings(np.concatenate(edges))
     previous = np.concatenate(neighbours)
     tree = shapely.STRtree(lines)

@@ -21,6 +21,7 @@ from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig
 from cosfly.runtime.config import Config
+from cosfly.runtime.errors import InputError, counts_text
 from cosfly.runtime.io import LinkedPath, write_bytes
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.viz.topview import TopView, draw_map, png_bytes
@@ -65,6 +66,14 @@ def load_map(cfg: MapsConfig, *, seed: int = 0, follow_links: bool = False) -> B
     follow_links: also read meshes through links that lead out of the map's folder.
     """
     box_map = SOURCES[cfg.source](getattr(cfg, cfg.source), seed)
+    header = box_map.header
+    if not len(box_map):
+        raise InputError(
+            "the map has no boxes",
+            where=", ".join(str(path) for path in getattr(cfg, cfg.source).inputs().values()) or cfg.source,
+            got=f"{header.num_objects} objects, dropped: {counts_text(header.dropped_objects)}",
+            expected="at least one object with an area",
+        )
     if not follow_links or box_map.meshes.folder is None:
         return box_map
     return replace(box_map, meshes=replace(box_map.meshes, folder=LinkedPath(box_map.meshes.folder)))

@@ -24,6 +24,7 @@ MOST_BYTES = 1_000_000  # the settings of a run take some 10 kB, the longest shi
 MOST_LISTED = 15  # names of settings in a message
 MOST_ELSEWHERE = 3  # settings in other groups in a message, as in "did you mean plan.x or render.x"
 MOST_PARTS = 32  # of the name of a setting
+MOST_PROBLEM = 400  # characters of the parser's message, which quotes the text
 
 T = TypeVar("T")
 C = TypeVar("C", bound=BaseModel)
@@ -84,12 +85,18 @@ class _Loader(yaml.SafeLoader):
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
+    def construct_yaml_int(self, node: Any) -> int:
+        number = super().construct_yaml_int(node)
+        float(number)  # an OverflowError for a number that JSON and messages cannot hold either
+        return number
+
 
 # Only the types of JSON; without the resolver a date stays text.
 _KINDS = {f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float", "str", "seq", "map", "merge")}
 _Loader.yaml_constructors = {
     tag: constructor for tag, constructor in yaml.SafeLoader.yaml_constructors.items() if tag is None or tag in _KINDS
 }
+_Loader.yaml_constructors["tag:yaml.org,2002:int"] = _Loader.construct_yaml_int
 _Loader.yaml_implicit_resolvers = {
     first: [(tag, pattern) for tag, pattern in resolvers if tag in _KINDS]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
@@ -103,8 +110,8 @@ def parse_yaml(text: str, where: str | Path, *, what: str = "configuration") -> 
         raise ConfigError(f"the {what} is too long", where=where, got=f"{len(text) / 1e6:.1f} MB", expected=expected)
     try:
         return yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ConfigError(f"the {what} is not valid YAML", where=where, got=str(error)) from None
+    except (yaml.YAMLError, ValueError, ArithmeticError, RecursionError) as error:
+        raise ConfigError(f"the {what} is not valid YAML", where=where, got=str(error)[:MOST_PROBLEM]) from None
 
 
 def read_yaml(path: Path) -> dict:

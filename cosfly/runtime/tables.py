@@ -23,6 +23,7 @@ from cosfly.runtime.io import FILE_MB, MB, SMALL_UNPACKED_MB, UNPACK_FACTOR, ope
 MOST_FOOTER_BYTES = 100 * MB  # of the strings and lists of a footer; ours have some 10 kB
 WORTH_THREADS_BYTES = 8 * MB  # of a row group; for smaller ones a single thread is faster and needs less memory
 LEAST_ROW_BYTES = 1_000  # of a row as Python values; a million equal rows take only a few kB in the file
+ITEM_BYTES = 40  # of an item of a list as a Python value; a list of a hundred million equal items takes 600 bytes
 GROUPS_HELD = 4  # row groups that reading single rows keeps in memory
 SMALLER_GROUPS = "write the file again with smaller row groups (row_group_size in pyarrow)"
 
@@ -129,6 +130,13 @@ def _check_size(path: Path | str, table: _Table, k: int) -> None:
     size = max(metadata.total_byte_size, metadata.num_rows * LEAST_ROW_BYTES)
     if size > FILE_MB * MB:
         raise over_limit(f"{path}: row group {k}", f"{size / MB:,.0f} MB", f"{FILE_MB:,} MB", SMALLER_GROUPS)
+    chunks = [metadata.column(j) for j in range(metadata.num_columns)]
+    num_items = sum(chunk.num_values - metadata.num_rows for chunk in chunks)  # a list of n items counts n - 1
+    most = (
+        max(SMALL_UNPACKED_MB * MB, UNPACK_FACTOR * sum(chunk.total_compressed_size for chunk in chunks)) / ITEM_BYTES
+    )
+    if num_items > most:
+        raise over_limit(f"{path}: row group {k}", f"lists of {num_items:,} items", f"{most:,.0f}", SMALLER_GROUPS)
 
 
 def rows_of(path: Path, columns: list[str] | None = None, *, tree: Path | None = None) -> Iterator[dict[str, Any]]:

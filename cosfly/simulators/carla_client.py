@@ -6,6 +6,7 @@ import contextlib
 import socket
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 from typing import Any
 
 from pydantic import Field
@@ -64,6 +65,7 @@ def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:
             fix=f"run a server of version {client_version}, because other versions crash this client",
         )
     with _server_errors("CARLA did not return its world", endpoint, version):
+        _check_files(client.get_required_files("", False), endpoint)
         world = client.get_world()
         loaded = _short(world.get_map().name)
         towns = sorted({_short(name) for name in client.get_available_maps()})
@@ -74,6 +76,19 @@ def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:
                 raise ConfigError(what, where=where, got=cfg.town, expected=f"one of {', '.join(towns)}")
             world = client.load_world(cfg.town)
     return CarlaConnection(carla, client, world, endpoint, version, cfg.town or loaded)
+
+
+def _check_files(names: list[str], endpoint: str) -> None:
+    """Raise EnvironmentMissing if a file of the server's town would leave the folder where the client caches them."""
+    for name in names:
+        path = PurePosixPath(name.replace("\\", "/"))
+        if path.is_absolute() or ".." in path.parts or "\0" in name:
+            raise EnvironmentMissing(
+                "the CARLA server names a file outside the client's cache",
+                where=endpoint,
+                got=name[:80],
+                fix="use a server that you trust; the client would write this file",
+            )
 
 
 def read_attributes(parameters: Any) -> dict[str, Any]:
