@@ -36,8 +36,9 @@ from cosfly.geometry.axes import box_corners
 from cosfly.inspection.report import report_html
 from cosfly.inspection.stage import run as inspect
 from cosfly.llm.answers import BudgetConfig
+from cosfly.llm.protocol import check_url
 from cosfly.runtime import console as shared
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.escaping import LONGEST, for_terminal
 from cosfly.runtime.json_io import read_json
 from cosfly.viz.scene_page import run
@@ -85,6 +86,28 @@ def test_an_error_is_one_short_line_whatever_it_names():
     assert len(str(error)) < 5 * LONGEST
     assert not OBEYED.search(str(error))
     assert "\n" not in str(error)
+
+
+def test_a_key_in_an_address_is_never_shown():
+    for address in (
+        "http://user:SECRET99@host/v1", "user:SECRET99@host", "https://user%3ASECRET99%40host/v1",
+        "http://host/v1?api_key=SECRET99", "http://host/v1;key=SECRET99", "http://host/v1&key=SECRET99",
+        "http://host/v1#access_token=SECRET99", "http://host/v1%3Fkey%3DSECRET99", "http://host/sk-SECRET99/v1",
+        "http://host/v1/token/SECRET99", "http://host/hf_SECRET99/v1", "s3://host/x?X-Amz-Signature=SECRET99",
+        "http://host/api-key-SECRET99/v1", "wss://user:SECRET99@host",
+    ):  # fmt: skip
+        shown = str(ConfigError("no answer", where=address, got=f"see '{address}' again", fix=f"try {address}"))
+        assert "SECRET99" not in shown
+        assert shown.count("***") == 3
+        with pytest.raises(ValueError, match="must not contain a user") as refused:
+            check_url(address)
+        assert "SECRET99" not in str(refused.value)
+    for address in ("http://host:SECRET99/v1", "ftp://host/SECRET99", "SECRET99", "Bearer SECRET99"):
+        with pytest.raises(ValueError, match="must start with http") as refused:
+            check_url(address)
+        assert "SECRET99" not in str(refused.value)
+    for text in ("https://host.org:8000/openai/deployments/gpt-4o-mini/v1", "expected key=value", "10:30 at Delft"):
+        assert for_terminal(text) == text
 
 
 class Tags(HTMLParser):

@@ -12,6 +12,7 @@ import httpx
 
 from cosfly.formats.captions import Usage
 from cosfly.llm.contract import MOST_TOKENS, Reply, Request
+from cosfly.runtime.escaping import without_keys
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.model_json import DECLINED
 
@@ -32,9 +33,10 @@ def check_url(url: str) -> None:
 
     The message of the ValueError omits the parts of the URL that may be secret.
     """
-    got = "" if "@" in url else f", got {re.split('[?#]', url)[0][:200]!r}"
-    if re.search("[@?#]", url):
-        problem = "the URL must not contain a user, password, query or fragment, because it is recorded"
+    host = re.match(r"https?://[\w.-]{1,200}(?=[:/]|$)", url)  # what follows may be a key
+    got = f", got {host[0]!r}" if host and "@" not in url else ""
+    if re.search("[@?#]", url) or without_keys(url) != url:
+        problem = "the URL must not contain a user, password, query, fragment or key, because it is recorded"
         raise ValueError(f"{problem}{got}; set the key in the environment variable {KEY_VARIABLE}")
     try:
         parts = httpx.URL(url)

@@ -16,6 +16,27 @@ _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u2
 _MARKDOWN = re.compile(r"([\\`*\[\]|~#]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9]))")  # within a word, _ means itself
 
 
+# What may be a key in an address: user and password, query, parameters, and a part of the path that names itself a key.
+_ADDRESS = re.compile(r"\b[A-Za-z][\w+.-]*://[^\s'\"<>]+|\b[\w.+-]+:[^\s@/'\"<>]+@(?=\w)")
+_KEYS = (
+    (re.compile(r"(^|//)[^/]*(@|%40)"), r"\1***@"),
+    (re.compile(r"(?i)([?;&]|%3f|%3b|%26|#(?=[^#]*=)).*"), "?***"),
+    (re.compile(r"(?i)((?<![a-z])(sk|hf|gsk|key|token|secret|password|bearer)([-_=/]|%3d))[\w.~%+-]{6,}"), r"\1***"),
+)
+
+
+def without_keys(text: str) -> str:
+    """Return text with `***` for what may be an access key in an address."""
+
+    def masked(match: re.Match[str]) -> str:
+        address = match[0]
+        for pattern, replacement in _KEYS:
+            address = pattern.sub(replacement, address)
+        return address
+
+    return _ADDRESS.sub(masked, text)
+
+
 def cut(text: str, longest: int = LONGEST) -> str:
     """Return a text of about `longest` characters at most: the middle of a longer one is replaced by its length."""
     if len(text) <= longest:
@@ -25,8 +46,8 @@ def cut(text: str, longest: int = LONGEST) -> str:
 
 
 def for_terminal(text: str, longest: int = LONGEST) -> str:
-    """Return text with control characters as `\\x1b`, which a terminal prints."""
-    return _CONTROLS.sub(lambda match: ascii(match[0])[1:-1], cut(text, longest))
+    """Return text with control characters as `\\x1b`, which a terminal prints, and without keys in addresses."""
+    return _CONTROLS.sub(lambda match: ascii(match[0])[1:-1], without_keys(cut(text, longest)))
 
 
 def for_markdown(text: str) -> str:

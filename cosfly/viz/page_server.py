@@ -30,7 +30,7 @@ class PageServer:
 
     def __init__(self, site: Site, port: int) -> None:
         self.site = site
-        self.token = secrets.token_urlsafe(24)
+        self.token = secrets.token_hex(24)
         try:
             self.http = ThreadingHTTPServer((HOST, port), type("Handler", (_Handler,), {"server_of_page": self}))
         except OSError as error:
