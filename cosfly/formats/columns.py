@@ -102,6 +102,16 @@ def columns(record: dict, names: Iterable[str], where: str, length: int | None =
     return np.stack(arrays, axis=1)
 
 
+def times(record: dict, where: str) -> np.ndarray:
+    """Read `t`, the time stamps of a trajectory, (n,) s; raises InputError if they do not increase."""
+    time_s = column(record, "t", where, None)
+    if not (np.diff(time_s) > 0).all():
+        k = int(np.argmin(np.diff(time_s)))
+        got = f"{time_s[k]:g}, then {time_s[k + 1]:g}"
+        raise InputError("the times do not increase", where=f"{where}.t", got=got, expected="increasing seconds")
+    return time_s
+
+
 def as_columns(values: np.ndarray, names: Iterable[str]) -> dict[str, list[float]]:
     """Return columns in the form that `columns` reads, to four decimals."""
     return {name: rounded(values[:, k], 4) for k, name in enumerate(names)}

@@ -9,7 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.formats.columns import as_columns, column, columns, read_items, rounded, step_field, text_id, write_items
+from cosfly.formats.columns import (
+    as_columns,
+    column,
+    columns,
+    read_items,
+    rounded,
+    step_field,
+    text_id,
+    times,
+    write_items,
+)
 from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.json_io import FileFormat
 from cosfly.runtime.seeding import draw_to_quota, rng_for
@@ -53,7 +63,7 @@ class PedestrianTrajectory:
 
     @classmethod
     def from_json(cls, record: dict, where: str) -> PedestrianTrajectory:
-        time_s = column(record, "t", where, None)
+        time_s = times(record, where)
         polyline = column(record, "polyline", where, None, 2)
         positions = columns(record, "xyz", where, len(time_s))
         speeds = column(record, "speed", where, len(time_s))

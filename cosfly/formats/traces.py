@@ -20,6 +20,7 @@ from cosfly.formats.columns import (
     rounded,
     step_field,
     text_id,
+    times,
     write_items,
 )
 from cosfly.formats.pedestrian_paths import PLAIN_PACE, pace_field, pace_of
@@ -155,7 +156,7 @@ class DroneTrace:
 
     @classmethod
     def from_json(cls, record: dict, where: str) -> DroneTrace:
-        time_s = column(record, "t", where, None)
+        time_s = times(record, where)
         groups: list[np.ndarray] = []
         for group, names in (("drone", XYZ), ("drone", ANGLES), ("target", XYZ)):
             if not isinstance(record.get(group), dict):
