@@ -204,13 +204,15 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
     sources = Counter[str]()
     rows_by_problem = defaultdict[tuple[str, str], list[str]](list)  # so that each problem is listed once
     notes = defaultdict[str, list[str]](list)
-    for row in _in_metres(rows, cfg, path):
+    row_of_box: list[int] = []
+    for k, row in enumerate(_in_metres(rows, cfg, path)):
         num_before = len(boxes)
         try:
             source = _add(boxes, row, cfg, notes)
             if len(boxes) == num_before:
                 raise _Skipped("no_area", "the outline has no area")
             sources[source] += len(boxes) - num_before
+            row_of_box += [k] * (len(boxes) - num_before)
         except _Skipped as error:
             del boxes.rows[num_before:], boxes.kinds[num_before:]
             rows_by_problem[error.reason, str(error)].append(row.where)
@@ -240,8 +242,8 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
     if set(sources) != {"file"}:
         update["extent_sources"] = dict(sources)
     box_map = boxes.box_map(header.model_copy(update=update))
-    if len(box_map) == len(ids):  # no outline became several boxes
-        return replace(box_map, ids=np.array(ids, dtype=np.uint64))
+    if ids and len(set(row_of_box)) == len(box_map):  # no row became several boxes
+        return replace(box_map, ids=np.array([ids[k] for k in row_of_box], dtype=np.uint64))
     return box_map
 
 
