@@ -239,7 +239,6 @@ def test_what_an_outline_asks_for_is_bounded_before_it_is_made(tmp_path):
         ring = np.column_stack([x + radii * np.cos(angles), radii * np.sin(angles) + k])
         return feature("Polygon", [ring.tolist()], type="Roads")
 
-    assert len(loaded(tmp_path, collection(star(0, 0)), ".geojson")) < 1_000
     with pytest.raises(InputError, match="over the limit; got outlines that need"):
         loaded(tmp_path, collection(*(star(9 * k, k) for k in range(60))), ".geojson")
     for row in ("Roads,0,0,1e9,1e9,", "Buildings,0,0,9,9,1e9"):
@@ -301,7 +300,7 @@ def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
                 ),
                 r"feature 1 \(way/7\): width_m is missing, height_m is missing.*feature 2 \(old oak\): "
                 r"length_m is missing, width_m is missing, height_m is not a finite number: 'tall'"
-                r".*feature 3: unknown type 'house'.*expected columns .*types .*3 to fix",
+                r".*feature 3: unknown type 'house'.*expected .*columns .*types .*3 to fix",
             ),
             (collection(feature("Point", [5, 5], type="Walls", colour=3)), "unknown column 'colour'"),
             (json.dumps({"type": "Topology"}), "not GeoJSON"),

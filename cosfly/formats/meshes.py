@@ -1,13 +1,12 @@
-"""Meshes: binary glTF 2.0 (.glb) and Wavefront OBJ (.obj) read through trimesh, and `meshes.glb` next to a map.
+"""Meshes: binary glTF 2.0 (.glb) and Wavefront OBJ (.obj), and `meshes.glb` next to a map.
 
 A mesh is its triangles, corners (k, 3, 3) float64 m, z up, counter-clockwise from outside; its colour is that of the
 kind of its box. +y is up in glTF and becomes +z; in an OBJ +z is up. A mesh is one file: what it names is not read, and
-counts are bounded before trimesh loads it. Planners and visibility use boxes.
+counts are bounded before anything is made of it. Planners and visibility use boxes.
 """
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 import re
@@ -15,8 +14,9 @@ import struct
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -39,8 +39,9 @@ LARGEST_M = 1e7
 START_M = 1e-3  # a mesh that stands on the ground of its axes begins this near to 0
 # Extensions of glTF that change colours, light and records, but no vertex.
 APPEARANCE = re.compile(r"[A-Z]+_(materials|texture|lights|techniques|xmp|animation|audio)")
-# What trimesh raises on a file that contradicts itself.
-NOT_READ = (ValueError, LookupError, TypeError, AttributeError, AssertionError, ArithmeticError, NotImplementedError)
+NUMBERS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}  # component types of glTF
+# What a file that contradicts itself raises.
+NOT_READ = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError)
 
 
 def check_num_triangles(where: object, num_triangles: int) -> None:
@@ -96,13 +97,13 @@ def _chunks_of(data: bytes, path: Path) -> tuple[bytes, bytes]:
 
 
 def _read_gltf(text: bytes, binary: bytes, path: Path) -> dict[str, np.ndarray]:
-    """Read the meshes of a glTF document by the names of their nodes; trimesh gets its triangles only."""
+    """Read the triangles of a glTF document by the names of their nodes."""
     document = parse_document(text, path)
     accessors, views, nodes, meshes, buffers = (
         document.get(name) or [] for name in ("accessors", "bufferViews", "nodes", "meshes", "buffers")
     )
-    drawn = [_triangles_of(mesh) for mesh in meshes]
-    used = list(dict.fromkeys(k for mesh in drawn for primitive in mesh for k in _accessors_of(primitive)))
+    drawn = [[one for one in mesh["primitives"] if one.get("mode", TRIANGLES) in (TRIANGLES, STRIP)] for mesh in meshes]
+    used = {k for mesh in drawn for primitive in mesh for k in _accessors_of(primitive)}
     packed = [name for name in document.get("extensionsRequired") or [] if not APPEARANCE.match(name)]
     is_plain = not packed and all("bufferView" in accessors[k] and "sparse" not in accessors[k] for k in used)
     if not is_plain or any("uri" in buffer for buffer in buffers):
@@ -130,31 +131,35 @@ def _read_gltf(text: bytes, binary: bytes, path: Path) -> dict[str, np.ndarray]:
         what = "the mesh file declares a negative number of values, or too many values"
         got, fix = f"{sum(counts):,} values and bytes in all", "export the mesh again with fewer triangles"
         raise InputError(what, where=path, got=got, expected=expected, fix=fix)
-    sizes = [sum(_num_triangles(primitive, accessors) for primitive in mesh) for mesh in drawn]
-    check_num_triangles(path, sum(sizes))
-    check_num_triangles(path, sum(sizes[node["mesh"]] for node in nodes if "mesh" in node))
+    sizes = [sum(accessors[_accessors_of(primitive)[-1]]["count"] for primitive in mesh) for mesh in drawn]
+    check_num_triangles(path, sum(sizes) // 3)
+    check_num_triangles(path, sum(sizes[node["mesh"]] for node in nodes if "mesh" in node) // 3)
     if document.get("materials"):
         _warn_of_materials(path)
-    new_index = {k: index for index, k in enumerate(used)}
-    plain_document = {
-        "asset": {"version": "2.0"}, "scenes": [{"nodes": list(range(len(meshes)))}],
-        "accessors": [accessors[k] for k in used], "bufferViews": views,
-        "nodes": [{"name": f"mesh {k}", "mesh": k} for k in range(len(meshes))],
-        "meshes": [{"primitives": [_renumbered(primitive, new_index) for primitive in mesh]} for mesh in drawn],
-        "buffers": [{"uri": "binary"}],
-    }  # fmt: skip
-    scene = _scene(json.dumps(plain_document).encode(), "gltf", resolver={"binary": binary})
-    corners_of: dict[str, list[np.ndarray]] = {}
-    for frame in scene.graph.nodes_geometry:
-        parent = scene.graph.transforms.parents[frame]  # of one of several primitives: the node
-        name = parent if frame.startswith(f"{parent}_") else frame
-        corners_of.setdefault(name, []).append(scene.geometry[scene.graph[frame][1]].triangles)
+
+    def numbers(k: int) -> np.ndarray:
+        accessor = accessors[k]
+        view, kind = views[accessor["bufferView"]], np.dtype(NUMBERS[accessor["componentType"]])
+        shape = (accessor["count"], 3 if accessor["type"] == "VEC3" else 1)
+        strides = (view.get("byteStride") or shape[1] * kind.itemsize, kind.itemsize)
+        return np.ndarray(shape, kind, binary, view.get("byteOffset", 0) + accessor.get("byteOffset", 0), strides)
+
+    def triangles(primitive: dict) -> np.ndarray:
+        corners = numbers(primitive["attributes"]["POSITION"]).astype(np.float64)
+        if "indices" in primitive:
+            corners = corners[numbers(primitive["indices"])[:, 0]]
+        if primitive.get("mode") != STRIP:
+            return corners[: len(corners) // 3 * 3].reshape(-1, 3, 3)
+        order = np.arange(max(len(corners) - 2, 0))[:, None] + [0, 1, 2]
+        order[1::2] = order[1::2, ::-1]
+        return corners[order]
+
+    corners_of = [np.concatenate([np.zeros((0, 3, 3)), *map(triangles, mesh)]) for mesh in drawn]
     names = _node_names(nodes)
     parts: dict[str, np.ndarray] = {}
     for k, world in _world_matrices(nodes, roots).items():
-        corners = np.concatenate(corners_of.get(f"mesh {nodes[k].get('mesh')}", [np.zeros((0, 3, 3))]))
-        if len(corners):
-            placed = corners @ world[:3, :3].T + world[:3, 3]
+        if "mesh" in nodes[k]:
+            placed = corners_of[nodes[k]["mesh"]] @ world[:3, :3].T + world[:3, 3]
             is_mirrored = np.linalg.det(world[:3, :3]) < 0
             parts[names[k]] = (placed[:, ::-1] if is_mirrored else placed) @ Z_UP.T
     return parts
@@ -162,18 +167,20 @@ def _read_gltf(text: bytes, binary: bytes, path: Path) -> dict[str, np.ndarray]:
 
 def _node_names(nodes: list[dict]) -> list[str]:
     """Return a different name for each node: its own, or its number."""
-    from trimesh.util import unique_name
-
+    counts = Counter[str]()
     names: dict[str, int] = {}
-    counts: dict[str, int] = {}
     for k, node in enumerate(nodes):
-        names[unique_name(node.get("name", str(k)), names, counts=counts)] = k
+        name = unique = str(node.get("name", k))
+        while unique in names:
+            counts[name] += 1
+            unique = f"{name}_{counts[name]}"
+        names[unique] = k
     return list(names)
 
 
 def _world_matrices(nodes: list[dict], roots: list[int]) -> dict[int, np.ndarray]:
     """Return the matrix (4, 4) from each node to the world; a chain of nodes may be of any length."""
-    from trimesh.transformations import quaternion_matrix
+    from scipy.spatial.transform import Rotation  # imported here: most commands need no mesh
 
     matrices: dict[int, np.ndarray] = {}
     waiting = [(root, np.eye(4)) for root in reversed(roots)]
@@ -183,36 +190,16 @@ def _world_matrices(nodes: list[dict], roots: list[int]) -> dict[int, np.ndarray
         local = np.reshape(node.get("matrix", np.eye(4)), (4, 4)).T.astype(float)
         local[:3, 3] += np.array(node.get("translation", (0.0, 0.0, 0.0)), dtype=float)
         if "rotation" in node:
-            local @= quaternion_matrix(np.array(node["rotation"], dtype=float)[[3, 0, 1, 2]])
-        local @= np.diag([*node.get("scale", (1.0, 1.0, 1.0)), 1.0])
+            local[:3, :3] @= Rotation.from_quat(node["rotation"]).as_matrix()
+        local[:3, :3] *= node.get("scale", (1.0, 1.0, 1.0))
         matrices[k] = parent @ local
         waiting += [(child, matrices[k]) for child in reversed(node.get("children", ()))]
     return matrices
 
 
-def _triangles_of(mesh: dict) -> list[dict]:
-    """Return the primitives of a mesh that are triangles, without normals, colours and extensions."""
-    return [
-        {key: primitive[key] for key in ("mode", "indices") if key in primitive}
-        | {"attributes": {"POSITION": primitive["attributes"]["POSITION"]}}
-        for primitive in mesh["primitives"]
-        if primitive.get("mode", TRIANGLES) in (TRIANGLES, STRIP)
-    ]
-
-
 def _accessors_of(primitive: dict) -> list[int]:
+    """Return the accessors of a primitive: its positions, and its indices if it has some."""
     return [primitive["attributes"]["POSITION"], *([primitive["indices"]] if "indices" in primitive else [])]
-
-
-def _renumbered(primitive: dict, new_index: dict[int, int]) -> dict:
-    """Return a primitive with other numbers of accessors."""
-    position, *indices = (new_index[k] for k in _accessors_of(primitive))
-    return primitive | {"attributes": {"POSITION": position}} | ({"indices": indices[0]} if indices else {})
-
-
-def _num_triangles(primitive: dict, accessors: list[dict]) -> int:
-    num_corners = int(accessors[_accessors_of(primitive)[-1]]["count"])
-    return max(num_corners - 2, 0) if primitive.get("mode") == STRIP else num_corners // 3
 
 
 @cache
@@ -220,36 +207,29 @@ def _warn_of_materials(path: Path) -> None:
     log.warning("%s: materials are not read; the mesh has the colours of the type of its box", path)
 
 
-def _scene(data: bytes, file_type: str, **options: Any) -> Any:
-    import trimesh
-
-    return trimesh.load_scene(io.BytesIO(data), file_type=file_type, skip_materials=True, **options)
-
-
 def _read_obj(data: bytes, path: Path) -> dict[str, np.ndarray]:
     """Read the triangles of an OBJ: vertices and faces; names, normals, colours and materials are not read."""
     text = data.decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
     if re.search(r"(?m)^[ \t]*mtllib\b", text):
         _warn_of_materials(path)
-    lines = []
+    vertices: list[list[float]] = []
+    faces: list[tuple[int, int, int]] = []
     for kind, rest in re.findall(r"(?m)^[ \t]*([vf])[ \t]+([^#\r\n]+)", text):
         words = rest.split()
-        lines.append(" ".join([kind, *(words[:3] if kind == "v" else (word.partition("/")[0] for word in words))]))
-        if kind == "f" and "-" in lines[-1]:
+        if kind == "v":
+            vertices.append([float(word) for word in words[:3]])
+            continue
+        corners = [int(word.partition("/")[0]) - 1 for word in words]
+        if min(corners) < 0:
             raise InputError(
                 "the OBJ file uses negative vertex indices, which are not supported",
                 where=path,
                 expected="indices from 1",
                 fix="export the mesh with absolute indices",
             )
-    shapes = [
-        shape
-        for shape in _scene("\n".join(lines).encode(), "obj", process=False).geometry.values()
-        if hasattr(shape, "faces")
-    ]
-    check_num_triangles(path, sum(len(shape.faces) for shape in shapes))
-    corners = np.concatenate([np.zeros((0, 3, 3)), *(np.asarray(shape.triangles) for shape in shapes)])
-    return {"mesh": corners}
+        faces += [(corners[0], *pair) for pair in pairwise(corners[1:])]
+    check_num_triangles(path, len(faces))
+    return {"mesh": np.reshape(vertices, (-1, 3))[np.reshape(faces, (-1, 3)).astype(int)]}
 
 
 MESHES_FILE = "meshes.glb"

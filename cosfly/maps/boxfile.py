@@ -205,7 +205,11 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
     rows_by_problem = defaultdict[tuple[str, str], list[str]](list)  # so that each problem is listed once
     notes = defaultdict[str, list[str]](list)
     row_of_box: list[int] = []
-    for k, row in enumerate(_in_metres(rows, cfg, path)):
+    metric_rows = _in_metres(rows, cfg, path)
+    for part in shapely.get_parts([row.shape for row in metric_rows if not row.problem]):
+        if isinstance(part, Polygon):
+            boxes.reserve(num_cuts(part, OUTLINE_PIECE_M, np.inf, CUT_SHARES), len(part.exterior.coords))
+    for k, row in enumerate(metric_rows):
         num_before = len(boxes)
         try:
             source = _add(boxes, row, cfg, notes)
@@ -485,16 +489,14 @@ def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig, notes: dict[str, list[str]
         low_m = numbers["z_m"] - height_m / 2
     try:
         for part in parts:
-            for center, size, yaw_deg in _rectangles(boxes, part, numbers, row, notes):
+            for center, size, yaw_deg in _rectangles(part, numbers, row, notes):
                 boxes.add(kind, center, size, low_m, low_m + height_m, yaw_deg)
     except ValueError as error:  # so far from the origin that its size is lost
         raise _Skipped("bad_value", str(error)) from None
     return source
 
 
-def _rectangles(
-    boxes: BoxList, part: Any, numbers: Mapping[str, float], row: _Row, notes: dict[str, list[str]]
-) -> Iterator[Rectangle]:
+def _rectangles(part: Any, numbers: Mapping[str, float], row: _Row, notes: dict[str, list[str]]) -> Iterator[Rectangle]:
     """Yield the rectangles of a point, a line or an outline; without any, of the row's own place."""
     if part is None or isinstance(part, Point):
         x_m, y_m = (numbers["x_m"], numbers["y_m"]) if part is None else (part.x, part.y)
@@ -517,7 +519,6 @@ def _rectangles(
             if polygons:
                 notes["the outline crosses itself and is repaired"].append(row.where)
         for polygon in polygons:
-            boxes.reserve(num_cuts(polygon, OUTLINE_PIECE_M, np.inf, CUT_SHARES), len(polygon.exterior.coords))
             pieces = cover(polygon, min_fill=OUTLINE_FILL, min_size_m=OUTLINE_PIECE_M, shares=CUT_SHARES)
             small = [oriented_rectangle(polygon)] if not pieces and polygon.area > 0 else []
             yield from pieces or (rectangle for rectangle in small if min(rectangle.size) > THINNEST_M)
