@@ -32,6 +32,7 @@ plain = bench.load
 bench.load = lambda model, path, told: plain(model, path, [*told, "pedestrians.num_paths=1"])
 bench.FITTED_ON = 200
 """),
+    ("bench_camera", "--num-paths 1", r"\| own towns \| perturbed \| \d+\.\d\d, "),
     ("bench_client", "--windows 40 --concurrency 8", r"encoded on the way .* requests/s .* ratio 0\.\d+"),
     ("bench_flying", "--flights 2 --decisions 4 --workers 1", r"\d+ decisions in .* a second", HERE),
     ("bench_flying", "--envs", r"2 side by side: .* steps a second",
