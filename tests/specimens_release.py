@@ -137,7 +137,7 @@ def all_bytes(folder: Path) -> dict[str, bytes]:
 
 SMALL_RUN = [
     "pedestrians.num_paths=2", "pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25", "render.width_px=256",
-    "render.height_px=144", "render.fovs_deg=[60, 90]", "caption.window.stride=2", "workers=1",
+    "render.height_px=144", "render.fovs_deg=[60, 90]", "inspect.legible_min=0", "caption.window.stride=2", "workers=1",
 ]  # fmt: skip
 
 

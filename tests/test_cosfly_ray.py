@@ -87,7 +87,7 @@ def test_workers_that_die_and_stall_once_cost_nothing_but_time(tmp_path, nodes, 
 
 SETTINGS = (
     "pedestrians.num_paths=4", "pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25", "workers=2",
-    "render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]", "release.licence=cc-by-4.0",
+    "render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]", "inspect.legible_min=0", "release.licence=cc-by-4.0",
 )  # fmt: skip
 
 

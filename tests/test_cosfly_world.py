@@ -221,7 +221,10 @@ def test_a_models_plan_is_followed_and_its_trace_kept(tmp_path):
 
 @pytest.mark.slow
 def test_worlds_go_on_to_releases_with_the_settings_that_are_told(tmp_path, in_this_process):
-    small = ("pedestrians.num_paths=1", "render.width_px=160", "render.height_px=90", "render.frame_stride=8")
+    small = (
+        *("pedestrians.num_paths=1", "render.width_px=160", "render.height_px=90", "render.frame_stride=8"),
+        "inspect.legible_min=0",
+    )
     told = [word for setting in small for word in ("--set", setting)]
     result = invoke("world", ["a small village"], "--count 2 --seed 5 --out", [tmp_path / "many"])
     assert result.exit_code == 0, result.output

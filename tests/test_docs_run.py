@@ -67,12 +67,13 @@ SMALL = {
     "maps": _set("maps.synthetic.size_m=150", "maps.synthetic.num_blocks=1"),
     "pedestrians": _set("pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25"),
     "render": _set("render.width_px=160", "render.height_px=90"),
+    "inspect": _set("inspect.legible_min=0"),
     "fly": _set("render.width_px=160", "render.height_px=90", "fly.most_decisions=5"),
     "study weather": _set("render.width_px=160", "render.height_px=90"),
     "study zoom": _set("render.width_px=160", "render.height_px=90"),
     "run work/village/loop.yaml": _set(
         *("pedestrians.num_paths=1", "pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25"),
-        *("render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]"),
+        *("render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]", "inspect.legible_min=0"),
     ),
     "run quickstart --out runs/five": _set("pedestrians.num_paths=2"),
     "bench": ["--workers", "2"],
@@ -195,6 +196,7 @@ def small_run(name: str) -> dict[str, Any]:
     value = yaml.safe_load(shipped(f"{name}.yaml").read_text(encoding="utf-8"))
     value.setdefault("pedestrians", {}).update(num_paths=2, min_distance_m=15, max_distance_m=25)
     value.setdefault("render", {}).update(width_px=160, height_px=90)
+    value.setdefault("inspect", {}).update(legible_min=0)
     if "towns" in value:
         value["render"].update(frame_stride=2)
     value.setdefault("maps", {}).setdefault("synthetic", {}).update(size_m=150, num_blocks=1)

@@ -257,7 +257,10 @@ def test_two_workers_give_the_same_products(small_run, tmp_path, stage):
     assert products(out / stage) == products(small_run / stage)
 
 
-OF_TOWNS = ("render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]", "caption.window.stride=4")
+OF_TOWNS = (
+    "render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]", "inspect.legible_min=0",
+    "caption.window.stride=4",
+)  # fmt: skip
 TOWNS = """
 towns={
   one: {maps: {synthetic: {size_m: 150, num_blocks: 1}}},

@@ -69,7 +69,8 @@ def weather(name: str, time_of_day: str) -> list[str]:
     ]  # fmt: skip
 
 
-SMALL, HD = ["render.width_px=160", "render.height_px=90"], ["render.width_px=1280", "render.height_px=720"]
+SMALL = ["render.width_px=160", "render.height_px=90", "inspect.legible_min=0"]
+HD = ["render.width_px=1280", "render.height_px=720"]
 NARROW = ["render.fovs_deg=[30]"]
 ZOOM = ["render.fovs_deg=[30, 60, 90]", "render.zoom.mode=dynamic", "render.zoom.part_s=5", "render.zoom.ramp_s=2"]
 FAR = [
