@@ -18,6 +18,7 @@ PLAN_FORMAT = FileFormat("cosfly.world_plan", "2", "plan of a world")
 
 VERGE_M = 10.0  # of lawn around the town
 PATH_M = 4.0  # width of a footpath
+LEAST_INSIDE_M = 30.0  # side of a town without its edges, its river and its widest street
 LOW_PART_M = 3.0  # parts of a quay that begin above this height are over the water
 
 
@@ -134,8 +135,10 @@ class WorldPlan(BaseModel):
                 )
         if self.size_m and not 80.0 <= min(self.size_m) <= max(self.size_m) <= 2000.0:
             raise ValueError(f"size_m is {self.size_m[0]:g} x {self.size_m[1]:g}, but must lie within 80 to 2000")
-        if self.size_m and self.river_m > min(self.size_m) / 3:
-            raise ValueError(f"river_m is {self.river_m:g}, but must be at most a third of the town's side")
+        edges_m = 2 * VERGE_M + max(self.avenue_m, self.street_m) + self.river_m
+        if self.size_m and min(self.size_m) < edges_m + LEAST_INSIDE_M:
+            expected = f"{edges_m + LEAST_INSIDE_M:g} m for its edges, river and widest street"
+            raise ValueError(f"size_m is {self.size_m[0]:g} x {self.size_m[1]:g}, but needs at least {expected}")
         return self
 
     def kinds_of_buildings(self) -> list[Buildings]:

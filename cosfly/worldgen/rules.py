@@ -29,6 +29,10 @@ LIMITS = (
     ("blocks_along", 2.0, 9.0), ("block_m", 30.0, 180.0), ("gap_m", 0.5, 40.0), ("street_m", 5.0, 40.0),
     ("avenue_m", 5.0, 60.0), ("parked_share", 0.0, 0.9),
 )  # fmt: skip
+AMOUNTS = {
+    "no": "no", "without": "no", "without any": "no", "few": "few", "almost no": "few", "hardly any": "few",
+    "many": "many", "lots of": "many", "plenty of": "many",
+}  # fmt: skip
 SEVERAL = 4  # objects of a plural without a number
 STOREY_M = 3.2
 LOW_TOWN_M = 16.0  # highest building of a town without high-rises
@@ -81,18 +85,14 @@ class _Reader:
         for plain, pattern in (("1-stor", r"\bsingle[- ]stor"), ("hotel-buildings", r"(?<!\d )\bhotels\b")):
             text = re.sub(pattern, plain, text)
         text = re.sub(r"\b([2-9]0)[- ]([1-9])\b", lambda match: str(int(match[1]) + int(match[2])), text)
-        amount = (
-            r"\b(no|without(?: any)?|few|many|hardly any|almost no|lots of|plenty of) (trees|vegetation|greenery|cars)"
-        )
-        self.text = " " + re.sub(rf"{amount}\b", self._amount, text) + " "
+        amounts = "|".join(sorted(AMOUNTS, key=len, reverse=True))
+        pattern = rf"\b({amounts}) (trees|vegetation|greenery|cars)\b"
+        self.text = " " + re.sub(pattern, self._amount, text) + " "
 
     @staticmethod
     def _amount(match: re.Match[str]) -> str:
-        word = "trees" if match[2] != "cars" else "cars"
-        much = {"without": "no", "without any": "no", "almost no": "few", "plenty of": "lots-of"}.get(
-            match[1], match[1]
-        )
-        return f"{much} {word}".replace(" ", "-") if (much, word) != ("no", "cars") else "no cars"
+        word = "cars" if match[2] == "cars" else "trees"
+        return f"{AMOUNTS[match[1]]}-{word}"
 
     def _in_english(self, text: str) -> str:
         """Return a Chinese text as English words in the order of the Chinese; unknown characters stay."""
@@ -153,6 +153,8 @@ class _Reader:
             rf"{_NUMBER} ?{_LENGTH}[- ]wide {_STREET}",
         ) if (match := self._take(pattern))]  # fmt: skip
         limits = {name: match for name, pattern in _LIMITS.items() if (match := self._take(pattern))}
+        for second in [name for name in limits if name != "least"][1:]:
+            self.not_used.append(self._said(limits.pop(second)[0]))
         without = ""
         while match := self._take(r"\b(?:no|without(?: any)?)\s+((?:(?! (?:but|and|with) )[^.,;:()])+)"):
             without += f"{match[1]} "
@@ -183,8 +185,8 @@ class _Reader:
             self.plan[name] = _scaled(self.plan[name], rng_for(seed, "world", name).uniform(low, high))
         self._set_heights(limits, without)
         self._set_widths(widths)
-        self._set_size(sizes)
-        if re.search(r"\b(?:cars?|vehicles?|traffic)\b", without):
+        self._set_size(sizes, widths)
+        if re.search(r"\b(?:vehicles?|traffic)\b", without):
             self.plan["parked_share"] = 0.0
         self.not_used += self._left_over()
         for name, low, high in LIMITS:
@@ -303,16 +305,11 @@ class _Reader:
             number, unit = match.groups()[-2:]
             factor = 1.0 if unit.startswith("m") else STOREY_M
             value = float(number) * factor
-            if name == "least":
-                low = value
-            else:
-                high = value
-            if name in ("between", "exactly"):
-                low = (
-                    float(match[1]) * factor
-                    if name == "between"
-                    else value - (0.8 if factor == 1.0 else 0.9 * STOREY_M)
-                )
+            if name == "between":
+                low = float(match[1]) * factor
+            elif name == "exactly":
+                low = value - 0.9 * factor
+            low, high = (value, high) if name == "least" else (low, value)
         if high is None and re.search(r"\b(?:high|tall|towers?|skyscrapers?)", without):
             high = LOW_TOWN_M
         if high is not None and not 3.0 <= max(low, 3.0) <= high <= 450.0:
@@ -334,16 +331,15 @@ class _Reader:
         for match in widths:
             street, number, unit = match.groups() if match[1].isalpha() else (match[3], match[1], match[2])
             field = "avenue_m" if street == "avenue" else "street_m"
-            wide_m = self._within(
-                f"{street} width, m", float(number) * _metres(unit), 5.0, 60.0 if field == "avenue_m" else 40.0
-            )
+            most = 60.0 if field == "avenue_m" else 40.0
+            wide_m = self._within(f"{street} width, m", float(number) * _metres(unit), 5.0, most)
             if field == "street_m":
                 wider = 1.0 if self.plan["pattern"] == "linear" else self.plan["avenue_m"] / self.plan["street_m"]
                 self.plan["avenue_m"] = wide_m * wider
             self.plan[field] = wide_m
 
-    def _set_size(self, sizes: dict[str, re.Match[str]]) -> None:
-        """Set the size of the town to that of the prompt."""
+    def _set_size(self, sizes: dict[str, re.Match[str]], widths: list[re.Match[str]]) -> None:
+        """Set the size of the town, and the number of avenues, to those of the prompt."""
         pitch_m = self.plan["block_m"] + self.plan["street_m"]
         for name, match in sizes.items():
             if name == "sides":
@@ -354,16 +350,15 @@ class _Reader:
                 sides = (math.sqrt(float(match[1]) * unit),) * 2
             else:
                 side = float(match[1]) * _metres(match[2])
-                depth_m = (
-                    side
-                    if name == "square"
-                    else max(100.0, DEEP * pitch_m)
-                    if self.plan["pattern"] == "linear"
-                    else 0.7 * side
-                )
-                sides = (side, depth_m)
+                depth_m = max(100.0, DEEP * pitch_m) if self.plan["pattern"] == "linear" else 0.7 * side
+                sides = (side, side if name == "square" else depth_m)
             self.plan["size_m"] = tuple(self._within("size of the town, m", side, 80.0, 2000.0) for side in sides)
-            self.plan["river_m"] = min(self.plan["river_m"], min(self.plan["size_m"]) / 4)
+            most = min(self.plan["size_m"]) / 4  # so that blocks remain
+            self.plan["river_m"] = min(self.plan["river_m"], most / 2)
+            for name in ("street_m", "avenue_m"):
+                if self.plan[name] > most and widths:
+                    self.not_respected.append(f"street width in so small a town: {most:g} m is possible")
+                self.plan[name] = min(self.plan[name], most)
         streets = self._take(r"\b(\d+) (?:[a-z-]+ )?(avenue|boulevard|spoke|street|road)s?\b", keep=r" , \2 ,")
         if streets and self.plan["pattern"] == "radial":
             self.plan["spokes"] = self._within(f"number of {streets[2]}s", int(streets[1]), 3, 16)

@@ -90,6 +90,8 @@ def check_world(town: Town, plan: WorldPlan) -> list[dict[str, Any]]:
     for kind in kinds:
         if kind.count is not None:
             checks.append((f"number of {kind.name}s", town.built.get(kind.name, 0), 0.9 * kind.count, 1.1 * kind.count))
+    num_open = plan.plazas + plan.greens
+    checks.append(("plazas and green blocks", len(town.open_blocks), num_open, max(num_open, len(town.open_blocks))))
     if plan.highest_m is not None:
         checks.append(("highest building or object, m", max(all_tops_m, default=0.0), 0.0, plan.highest_m))
     return [

@@ -40,8 +40,8 @@ TREE_M = 2.5  # lower vegetation is a hedge
 DOOR_M = 1.6  # width of a path to a building
 BLOCK_PIECE_M = 4.0  # of pavement inside blocks, whose edges lie on that of streets
 LEAST_BLOCK_M2 = 400.0  # of a plaza or a green block
-GROW = 1.12  # factor of the sides of a town in which the buildings do not fit
-MOST_GROWTH = 12  # times
+GROW = 1.15  # factor of the sides of a town in which buildings or objects find no room
+MOST_GROWTH = 10  # times
 LEAST_TOWN_M = 170.0  # side of a town without a size, so that people find a way of 100 m
 
 Size = tuple[float, ...]
@@ -110,22 +110,18 @@ def build(plan: WorldPlan, name: str, seed: int) -> Town:
     if plan.size_m:
         return _Builder(plan, plan.size_m, name, seed).build()
     pitch_m = plan.block_m + plan.street_m
-    side_m = plan.blocks_along * pitch_m + 2 * VERGE_M + plan.avenue_m
-    if plan.river_m:
-        side_m += plan.river_m
-    width, height = _stretched(plan, side_m, seed)
+    edges_m = 2 * VERGE_M + plan.avenue_m + plan.river_m
+    side_m = plan.blocks_along * pitch_m + edges_m
+    counts = [(kind.count or 0, sum(kind.footprint_m) / 2 + 1.3 * plan.gap_m) for kind in plan.kinds_of_buildings()]
     if plan.only_these:
-        wanted = sum(group.count or 0 for group in plan.buildings)
-        fronts_m = sum((group.count or 0) * (sum(group.footprint_m) / 2 + 1.3 * plan.gap_m) for group in plan.buildings)
-        side_m = max(LEAST_TOWN_M, math.sqrt(fronts_m * pitch_m / 3) + 2 * VERGE_M + plan.river_m)
-        for _ in range(MOST_GROWTH):
-            width, height = _stretched(plan, side_m, seed)
-            town = _Builder(plan, (width, height), name, seed).build()
-            if sum(town.built.values()) >= wanted:
-                return town
-            side_m *= GROW
-        return town
-    return _Builder(plan, (width, height), name, seed).build()
+        fronts_m = sum(count * front_m for count, front_m in counts)
+        side_m = max(LEAST_TOWN_M, math.sqrt(fronts_m * pitch_m / 3) + edges_m)
+    for growth in range(MOST_GROWTH):
+        town = _Builder(plan, _stretched(plan, side_m * GROW**growth, seed), name, seed).build()
+        is_full = sum(town.built.values()) < sum(count for count, _ in counts)
+        if not is_full and not any(reason == "no room" for _, reason in town.not_placed):
+            break
+    return town
 
 
 def _stretched(plan: WorldPlan, side_m: float, seed: int) -> Range:
