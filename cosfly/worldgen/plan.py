@@ -146,7 +146,7 @@ class WorldPlan(BaseModel):
         ordinary = Buildings(name="building", footprint_m=self.footprint_m, heights_m=self.heights_m)
         fill = [group for group in self.buildings if group.count is None]
         counted = [group for group in self.buildings if group.count is not None]
-        return counted + (fill or ([] if self.only_these else [ordinary]))
+        return counted + (fill or ([] if self.only_these and counted else [ordinary]))
 
     def known_objects(self) -> list[tuple[Object, int]]:
         """Return the named objects of the table with their counts, summed over equal names."""
