@@ -152,6 +152,7 @@ class _Reader:
             rf"{_STREET}(?: (?:width|are|is|of))* {_NUMBER} ?{_LENGTH}(?: wide| in width)?",
             rf"{_NUMBER} ?{_LENGTH}[- ]wide {_STREET}",
         ) if (match := self._take(pattern))]  # fmt: skip
+        streets = self._take(r"\b(\d+) ([a-z-]+ )?(avenue|boulevard|spoke|street|road)s?\b", keep=r", \2 \3 ,")
         limits = {name: match for name, pattern in _LIMITS.items() if (match := self._take(pattern))}
         for second in [name for name in limits if name != "least"][1:]:
             self.not_used.append(self._said(limits.pop(second)[0]))
@@ -173,7 +174,7 @@ class _Reader:
             for name, factor in WORDS["groups"][group][choice].items():
                 if name != "words":
                     self.plan[name] = _scaled(self.plan[name], factor)
-        self._set_open_and_water(objects)
+        has_open = self._set_open_and_water(objects)
         for words in (entry["words"], WORDS["settlements"]["city"]["words"], WORDS["settlements"]["town"]["words"],
                       WORDS["patterns"].get(pattern, "")):  # fmt: skip
             self._take_words(words)
@@ -181,11 +182,17 @@ class _Reader:
             self._refuse()
         self.plan["pattern"] = pattern or entry["patterns"][seed % len(entry["patterns"])]
         self._set_buildings(buildings, entry, choices)
+        if self.plan["only_these"] and not has_open:
+            self.plan |= {"plazas": 0, "greens": 0}
         for name, low, high in (("blocks_along", 0.92, 1.08), ("block_m", 0.85, 1.2), ("gap_m", 0.92, 1.08)):
             self.plan[name] = _scaled(self.plan[name], rng_for(seed, "world", name).uniform(low, high))
         self._set_heights(limits, without)
         self._set_widths(widths)
         self._set_size(sizes, widths)
+        if streets and self.plan["pattern"] == "radial":
+            self.plan["spokes"] = self._within(f"number of {streets[3]}s", int(streets[1]), 3, 16)
+        elif streets and streets[1] != "1":
+            self.not_used.append(f"{streets[1]} {streets[3]}s")
         if re.search(r"\b(?:vehicles?|traffic)\b", without):
             self.plan["parked_share"] = 0.0
         self.not_used += self._left_over()
@@ -265,8 +272,9 @@ class _Reader:
                 self._take_words(entries[chosen[group]]["words"])
         return chosen
 
-    def _set_open_and_water(self, objects: dict[str, int]) -> None:
-        """Take words of open blocks and of water; objects in the water need some too."""
+    def _set_open_and_water(self, objects: dict[str, int]) -> bool:
+        """Take words of open blocks and of water; return whether there are some of the former."""
+        before = self.text
         for word, (field, wide) in WORDS["water"].items():
             if self._has(word):
                 self.plan[field] = wide
@@ -275,6 +283,7 @@ class _Reader:
                 most = 20 if field == "plazas" else 40
                 number = counted[0] or (3 if counted[1] and word not in ("garden", "lawn") else 1)
                 self.plan[field] = max(self.plan[field], self._within(f"number of {word}s", number, 1, most))
+        has_open = self.text != before
         self._take_words(",".join(WORDS["water"]))
         if "bridge" in objects:
             self.plan["bridges"] = self._within("number of bridges", objects["bridge"], 1, 10)
@@ -282,6 +291,7 @@ class _Reader:
         places = {OBJECTS[name].where for name in objects}
         if "quay" in places or ("water" in places and not self.plan["river_m"]):
             self.plan["shore_m"] = self.plan["shore_m"] or 90.0
+        return has_open
 
     def _set_buildings(self, buildings: list[dict[str, Any]], entry: dict[str, Any], choices: dict[str, str]) -> None:
         """Set the kinds of buildings. Where one that the settlement consists of is counted, there are no others."""
@@ -339,7 +349,7 @@ class _Reader:
             self.plan[field] = wide_m
 
     def _set_size(self, sizes: dict[str, re.Match[str]], widths: list[re.Match[str]]) -> None:
-        """Set the size of the town, and the number of avenues, to those of the prompt."""
+        """Set the size of the town to that of the prompt."""
         pitch_m = self.plan["block_m"] + self.plan["street_m"]
         for name, match in sizes.items():
             if name == "sides":
@@ -359,11 +369,6 @@ class _Reader:
                 if self.plan[name] > most and widths:
                     self.not_respected.append(f"street width in so small a town: {most:g} m is possible")
                 self.plan[name] = min(self.plan[name], most)
-        streets = self._take(r"\b(\d+) (?:[a-z-]+ )?(avenue|boulevard|spoke|street|road)s?\b", keep=r" , \2 ,")
-        if streets and self.plan["pattern"] == "radial":
-            self.plan["spokes"] = self._within(f"number of {streets[2]}s", int(streets[1]), 3, 16)
-        elif streets:
-            self.not_used.append(self._said(streets[0]))
 
     def _within(self, what: str, value: Any, low: Any, high: Any) -> Any:
         """Return a value within what is possible; record one that is not."""
