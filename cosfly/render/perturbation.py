@@ -287,8 +287,8 @@ def _apply_smoothly(drawn: _Draws, scene: _Scene, dt_s: float) -> PerturbedTrack
         for event, reasons in fallbacks.items():
             for i in np.flatnonzero(active[event]).tolist():
                 state = track.states[i][event]
-                if event == "position" and state == APPLIED:
-                    state = HIDDEN if hides[i] else TURNS_FAST if is_fast[i] else APPLIED
+                if state == APPLIED:
+                    state = TURNS_FAST if is_fast[i] else HIDDEN if event == "position" and hides[i] else APPLIED
                 if state != APPLIED:
                     reasons[i] = state
                     found = True
