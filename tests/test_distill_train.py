@@ -203,7 +203,7 @@ def test_a_model_trained_in_full_is_a_whole_folder(place, tmp_path):
 def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path, monkeypatch):
     losses = iter([4.0, 3.0, 1.0, 2.0, 1.5, 0.5])  # before the first step, then after each: the best is step 2
     monkeypatch.setattr(fit, "validate", lambda *_: Validation(samples=4, loss=next(losses)))
-    settings = {"validate_every_steps": 1, "patience": 2, "keep_checkpoints": 1}
+    settings = {"validate_every_steps": 1, "patience": 2}
     out = tmp_path / "out"
     run(place, out, **settings)
     manifest = json.loads((out / "manifest.json").read_text())

@@ -168,7 +168,7 @@ class PrepareConfig(SplitConfig):
         ("en", "zh"), min_length=1, description="languages of the answers; each gives its own samples"
     )
     decision: Place = Field(
-        "last", description="place of the decision among the fields of an answer; a student answers in this order"
+        "first", description="place of the decision among the fields of an answer; a student answers in this order"
     )
     modalities: tuple[View, ...] = Field(
         ("rgb",),

@@ -53,6 +53,7 @@ from distill.training.settings import (
     learning_rate_at,
     share_of,
 )
+from distill.training.trackers import Track
 
 log = logging.getLogger(__name__)
 
@@ -229,11 +230,11 @@ def train_step(lesson: Lesson, optimizer: Any, ready: ReadyStep, rate: float) ->
     return {"loss": total / weight, "gradient_norm": norm, **{name: int(count) for name, count in counts.items()}}
 
 
-def fit(lesson: Lesson, out: Path) -> Progress:
+def fit(lesson: Lesson, out: Path, track: Track = lambda record: None) -> Progress:
     """Train, from the newest checkpoint of `out` if there is one, and leave the student with the weights that are the
     product.
 
-    Writes `log.jsonl` and `checkpoints/` in `out`.
+    Writes `log.jsonl` and `checkpoints/` in `out`; `track` is given each record of the log.
     """
     ranks, cfg, folder = lesson.ranks, lesson.cfg, out / CHECKPOINTS
     optimizer = make_optimizer(lesson.student, cfg)
@@ -242,7 +243,7 @@ def fit(lesson: Lesson, out: Path) -> Progress:
     if progress.step:
         log.info("%s: resumed after step %d of %d", STAGE, progress.step, lesson.steps.num_steps)
     ranks.first_does(partial(cut_log, out / LOG, progress.step if newest else -1))
-    with _notebook(out / LOG if ranks.is_first else None) as note:
+    with _notebook(out / LOG if ranks.is_first else None, track) as note:
         if newest is None and (found := lesson.validate()) is not None:
             note({"step": 0, "validation": found.model_dump()})
             log.info("%s: before the first step: %s", STAGE, found)
@@ -327,7 +328,7 @@ def _speed(lesson: Lesson, facts: dict[str, Any], seconds: float, left_s: float)
 
 
 @contextlib.contextmanager
-def _notebook(path: Path | None) -> Iterator[Callable[[dict[str, Any]], None]]:
+def _notebook(path: Path | None, track: Track) -> Iterator[Callable[[dict[str, Any]], None]]:
     """Return a function that appends a record to the log; None: it keeps nothing, as in all processes but the first."""
     if path is None:
         yield lambda record: None
@@ -337,5 +338,6 @@ def _notebook(path: Path | None) -> Iterator[Callable[[dict[str, Any]], None]]:
         def note(record: dict[str, Any]) -> None:
             file.write(dump_json(record) + "\n")
             file.flush()
+            track(record)
 
         yield note

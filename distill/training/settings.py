@@ -42,7 +42,7 @@ class TrainConfig(Config):
     warmup_fraction: float = Field(0.03, ge=0, lt=1, description="share of the steps with a rising rate; 0: none")
     weight_decay: float = Field(0.0, ge=0, description="AdamW's decoupled weight decay")
     decision_weight: float = Field(
-        1.0, gt=0, le=1000, description="weight of the decision's tokens in the loss; other tokens have weight 1"
+        20.0, gt=0, le=1000, description="weight of the decision's tokens in the loss; other tokens have weight 1"
     )
     reason_weight: float = Field(
         1.0, ge=0, le=1000, description="weight of the tokens of the reasoning trace in the loss; 0: not learnt"
@@ -78,10 +78,15 @@ class TrainConfig(Config):
     data_workers: MayDiffer[int] = Field(
         -1, ge=-1, description="number of processes that read pictures; -1: one per core, at most 16"
     )
-    save_every_steps: MayDiffer[int] = Field(50, ge=1, description="steps between checkpoints")
-    keep_checkpoints: MayDiffer[int] = Field(
-        2, ge=1, description="number of newest checkpoints to keep, besides the best one"
+    compile: MayDiffer[bool] = Field(
+        False,
+        description="compile the layers of the language model: faster after some minutes; needs a C compiler",
     )
+    report_to: MayDiffer[tuple[str, ...]] = Field(
+        (), description="loggers of accelerate that get the curves, such as tensorboard or wandb; empty: none"
+    )
+    save_every_steps: MayDiffer[int] = Field(50, ge=1, description="steps between checkpoints")
+    keep_checkpoints: ClassVar[int] = 2  # newest checkpoints that are kept, besides the best one
     device: MayDiffer[Device] = Field("auto", description="auto, cpu or cuda")
 
     @model_validator(mode="after")

@@ -32,6 +32,7 @@ from distill.training.loading import Census, Supply, choose_over_all, num_worker
 from distill.training.preflight import GB, findings, memory_errors, tell
 from distill.training.ranks import Ranks, joined
 from distill.training.settings import FEATURE_MEMORY_GB, STAGE, TrainConfig
+from distill.training.trackers import trackers
 
 
 def taught_by(samples: Iterable[Sample], max_pixels: int) -> ChatFormat:
@@ -116,6 +117,9 @@ def prepared_student(cfg: TrainConfig, base: Path, seed: int, device: str) -> St
         student = add_adapter(load_student(base, **given), cfg, seed)
     else:
         student = free_weights(load_student(base, **given, is_trained=True), cfg)
+    if cfg.compile:
+        for layer in student.core.get_decoder().layers:
+            layer.compile(dynamic=True)
     if cfg.gradient_checkpointing:
         student.model.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
     return student
@@ -177,7 +181,8 @@ def run(
             ranks.first_does(lambda: str(made_student(cfg, open_split(dataset, "train"), base, seed)))
         with memory_errors(cfg), reader_errors():
             lesson, taught = _lesson(cfg, dataset, trees, base, out, seed, ranks)
-            progress = fit(lesson, out)
+            with trackers(cfg, out, is_first=ranks.is_first) as track:
+                progress = fit(lesson, out, track)
         ranks.first_does(lambda: _write_product(lesson, progress, taught, product, base, base_name, opened[0]))
     return product
 
