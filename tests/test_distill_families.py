@@ -85,7 +85,8 @@ def test_a_family_trains_resumes_merges_and_answers(place, family, tmp_path):
     adapter = run(place, tmp_path / "out", family, **settings)
     run(place, tmp_path / "whole", family, **settings)
     assert log_of(tmp_path / "out") == log_of(tmp_path / "whole")
-    assert losses_of(tmp_path / "out")[-1] < losses_of(tmp_path / "out")[0]
+    validations = [record["validation"]["loss"] for record in log_of(tmp_path / "out", "validation")]
+    assert validations[-1] < validations[0]
     merged = merge.run(family, adapter, tmp_path / "merged")
     cfg = infer.InferConfig(split="train", max_samples=3, max_new_tokens=6, device="cpu", batch_size=3)
     given = (cfg, place / "set", [place / "tree"])

@@ -176,6 +176,8 @@ def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
         student = add_adapter(student, cfg, 0)
         if shape in TOWERS and not arguments.library_norms:
             fuse_norms(student.core)
+    for layer in student.core.get_decoder().layers if arguments.compile else ():
+        layer.compile(dynamic=True)
     student.model.train()
     optimizer = make_optimizer(student, cfg)
     parameters = [p for p in student.model.parameters() if p.requires_grad]
@@ -262,6 +264,7 @@ def main() -> None:
     parser.add_argument("--dtype", choices=("auto", "float32", "bfloat16"), default="auto")
     parser.add_argument("--same", action="store_true", help="the same samples in every step: all features are kept")
     parser.add_argument("--plain", action="store_true", help="plain transformers and peft, for comparison")
+    parser.add_argument("--compile", action="store_true", help="compile the layers of the language model")
     parser.add_argument("--library-norms", action="store_true", help="the norms of transformers, for comparison")
     parser.add_argument("--check", action="store_true")
     parser.add_argument("--kept", help="a safetensors file of a float32 check's gradients and adapter")
