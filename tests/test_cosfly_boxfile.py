@@ -111,6 +111,10 @@ def test_longitude_and_latitude_become_metres(tmp_path, subtests):
         loaded(tmp_path, collection(*houses()), ".geojson", units="degrees")
     with pytest.raises(InputError, match="may be metres or degrees"):
         loaded(tmp_path, collection(*houses(scale=0.01)), ".geojson")
+    lake = feature("Polygon", square(4.0, 52.0, 0.03), type="Roads")
+    assert loaded(tmp_path, collection(lake, crs=crs("EPSG:4326")), ".geojson").half_extents.max() > 1_000
+    with pytest.raises(InputError, match="do not look like degrees"):
+        loaded(tmp_path, collection(*houses(), crs=crs("EPSG:4326")), ".geojson")
     table = "type,x,y,length,width,height\n" + "".join(f"Buildings,4.{k},52.{k},9,9,9\n" for k in (3001, 3002, 3004))
     with pytest.raises(InputError, match=r"do not look like metres;.*maps\.boxes\.units=degrees"):
         loaded(tmp_path, table)

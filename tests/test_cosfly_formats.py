@@ -90,6 +90,17 @@ def test_path_and_trace_round_trip(tmp_path, subtests):
             path.write_text(json.dumps(value))
             with pytest.raises(InputError, match=rf"{group}\[0\]\.t"):
                 read(path)
+            value[group][0]["t"][1] = value[group][0]["t"][0]
+            path.write_text(json.dumps(value))
+            with pytest.raises(InputError, match=rf"{group}\[0\]\.t: the times do not increase; got 0, then 0"):
+                read(path)
+            write(path, [make()], {})
+            value = json.loads(path.read_text())
+            record = value[group][0]
+            record.get("target", record)["y"][1] = 1e9
+            path.write_text(json.dumps(value))
+            with pytest.raises(InputError, match=rf"{group}\[0\].*y: a place is too far from the origin; got 1e\+09"):
+                read(path)
 
 
 def test_a_drawn_person_is_read_back_as_written():

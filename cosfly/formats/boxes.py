@@ -29,6 +29,7 @@ AXES = "right-handed, metres, x east, y north, z up; degrees"
 CORNER_M, CORNER_SHARE = 0.05, 1e-6
 # Fields of a file that are computed from the boxes; a header does not keep them.
 COMPUTED = {"schema", "schema_version", "axes", "bounds", "num_boxes", "counts"}
+UNIT_FIELDS = {"unit", "units", "crs", "epsg", "srs", "coordinate_system", "up_axis", "up"}  # of other tools
 VECTORS = ("centers", "half_extents", "rotations_deg")  # fields of a BoxMap, (n, 3)
 ARRAYS = (*VECTORS, "kinds", "ids")  # fields of a BoxMap with one row per box
 
@@ -325,6 +326,15 @@ def read_boxes(path: Path) -> BoxMap:
     records: Any = value
     if not isinstance(value, list):
         records = check_schema(value, BOXES_FORMAT, path).pop("boxes", None)
+        for name in UNIT_FIELDS & value.keys():
+            if str(value[name]).lower() not in ("m", "metre", "metres", "meter", "meters", "none"):
+                raise InputError(
+                    "the map declares a unit or a coordinate system, which this format does not have",
+                    where=f"{path}: {name}",
+                    got=value[name],
+                    expected=AXES,
+                    fix="convert the boxes to metres, z up, and remove this field",
+                )
         header = validated(MapHeader, {key: field for key, field in value.items() if key not in COMPUTED}, path)
         if records is None:
             raise InputError(MISSING, where=f"{path}: boxes", expected="a list of boxes")

@@ -18,6 +18,7 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import is_below, real_path
 
 TOWN = "Town"  # prefix of the name of a town's folder
+MOST_NAME = 120  # characters of the name of a folder
 
 TrackName = Literal["clean", "perturbed"]
 TRACKS: tuple[TrackName, ...] = get_args(TrackName)
@@ -54,7 +55,7 @@ class Place:
 
 def folder_name(text: str) -> str:
     """Return a text as the name of a folder."""
-    return re.sub(r"[^\w.-]+", "_", text, flags=re.ASCII).lstrip(".") or "map"
+    return re.sub(r"[^\w.-]+", "_", text, flags=re.ASCII).lstrip(".")[:MOST_NAME] or "map"
 
 
 def town_folder(name: str) -> str:

@@ -197,7 +197,7 @@ def plausibility(box_map: BoxMap) -> str:
 
 
 def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
-    rows = _table_rows(cfg, path) if suffix == ".csv" else _feature_rows(cfg, path)
+    rows, units = (_table_rows(cfg, path), cfg.units) if suffix == ".csv" else _feature_rows(cfg, path)
     if not rows:
         raise InputError("the file has no boxes", where=path, expected="at least one row or feature with a box")
     boxes = BoxList()
@@ -205,7 +205,7 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
     rows_by_problem = defaultdict[tuple[str, str], list[str]](list)  # so that each problem is listed once
     notes = defaultdict[str, list[str]](list)
     row_of_box: list[int] = []
-    metric_rows = _in_metres(rows, cfg, path)
+    metric_rows = _in_metres(rows, units, path)
     for part in shapely.get_parts([row.shape for row in metric_rows if not row.problem]):
         if isinstance(part, Polygon):
             boxes.reserve(num_cuts(part, OUTLINE_PIECE_M, np.inf, CUT_SHARES), len(part.exterior.coords))
@@ -255,13 +255,13 @@ def _listed(places: list[str], problem: str) -> str:
     return f"{places[0]}: {problem}" + (f" (and {len(places) - 1} more)" if len(places) > 1 else "")
 
 
-def _in_metres(rows: list[_Row], cfg: BoxesConfig, path: Path) -> list[_Row]:
+def _in_metres(rows: list[_Row], units: Units, path: Path) -> list[_Row]:
     """Return rows with their places in metres, with a problem if they are far from the middle of the others."""
     shapes = [row.shape if row.shape is not None else _point_of(row) for row in rows]
     places = shapely.get_coordinates(shapes)
     if not len(places):
         return rows
-    units = _units_of(rows, shapes, places, cfg, path)
+    units = _units_of(rows, shapes, places, units, path)
     project = to_metres(units, places)
     middle = np.median(project(places), axis=0)
     moved_rows: list[_Row] = []
@@ -301,9 +301,8 @@ def _point_of(row: _Row) -> Point | None:
     return None if row.problem or math.isnan(x + y) else Point(x, y)
 
 
-def _units_of(rows: list[_Row], shapes: list[Any], places: np.ndarray, cfg: BoxesConfig, path: Path) -> Units:
-    """Return the unit of the coordinates: that of the setting, or what they look like."""
-    is_table = all(row.shape is None for row in rows)
+def _units_of(rows: list[_Row], shapes: list[Any], places: np.ndarray, units: Units, path: Path) -> Units:
+    """Return the unit of the coordinates: the one that is set or declared, or what they look like."""
     corners = shapely.bounds([geometry for geometry in shapes if geometry is not None])
     sizes = np.maximum(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
     if not sizes.any():  # points only
@@ -311,23 +310,22 @@ def _units_of(rows: list[_Row], shapes: list[Any], places: np.ndarray, cfg: Boxe
 
         sizes = cKDTree(places).query(places, 2)[0][:, 1]  # infinite for a single point
     seen = seen_units(places, sizes)
-    if cfg.units == "auto" and seen is None:
+    if units == "auto" and seen is None:
         what, fix = "the coordinates may be metres or degrees", "pass --set maps.boxes.units=m, or degrees"
         raise InputError(what, where=path, got=f"outlines of {np.median(sizes):.3g} units", fix=fix)
-    if cfg.units == "auto" and seen is not None and not (is_table and seen == "degrees"):
+    is_table = all(row.shape is None for row in rows)
+    if units == "auto" and seen is not None and not (is_table and seen == "degrees"):
         return seen
-    if seen is not None and len(places) > 1 and (seen == "degrees") != (cfg.units == "degrees"):
-        low, high = places.min(axis=0), places.max(axis=0)
+    if seen is not None and len(places) > 1 and (seen == "degrees") != (units == "degrees"):
+        name = "degrees" if units == "degrees" else "metres"
         raise InputError(
-            f"the coordinates in the file do not look like {'degrees' if cfg.units == 'degrees' else 'metres'}",
+            f"the coordinates in the file do not look like {name}",
             where=path,
-            got=f"{low.tolist()} to {high.tolist()}",
-            expected="longitude and latitude of one town"
-            if cfg.units == "degrees"
-            else "outlines or distances of metres",
+            got=f"{places.min(axis=0).tolist()} to {places.max(axis=0).tolist()}",
+            expected=f"outlines or distances of {name}",
             fix=f"if the unit of the coordinates is {seen}, pass --set maps.boxes.units={seen}",
         )
-    return cfg.units
+    return units
 
 
 def _ids_of(rows: Sequence[_Row]) -> list[int]:
@@ -368,7 +366,8 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> list[_Row]:
     return rows
 
 
-def _feature_rows(cfg: BoxesConfig, path: Path) -> list[_Row]:
+def _feature_rows(cfg: BoxesConfig, path: Path) -> tuple[list[_Row], Units]:
+    """Return the features, and the unit that is set or that the file declares."""
     value = read_json(path, what="map")
     if not isinstance(value, dict) or value.get("type") not in ("FeatureCollection", "Feature", *GEOMETRIES):
         expected, fix = f"FeatureCollection, Feature, {', '.join(GEOMETRIES)}", "export the file again as GeoJSON"
@@ -377,13 +376,9 @@ def _feature_rows(cfg: BoxesConfig, path: Path) -> list[_Row]:
     if not isinstance(items, list):
         what, fix = "the FeatureCollection has no list of features", "export the file again as GeoJSON"
         raise InputError(what, where=f"{path}: features", expected="a list of Feature objects", fix=fix)
-    if cfg.units == "auto":
-        declared = [value.get("crs"), *(item.get("crs") for item in items if isinstance(item, dict))]
-        units = declared_units(
-            list({str(text): text for text in declared if text is not None}.values()), f"{path}: crs"
-        )
-        if units is not None:
-            cfg = cfg.model_copy(update={"units": units})
+    systems = [value.get("crs"), *(item.get("crs") for item in items if isinstance(item, dict))]
+    declared = list({str(system): system for system in systems if system is not None}.values())
+    units = (declared_units(declared, f"{path}: crs") or "auto") if cfg.units == "auto" else cfg.units
     features = [_feature(item, number) for number, item in enumerate(items, 1)]
     if problems := _unknown(list(dict.fromkeys(name for feature in features for name in feature.values)), cfg):
         raise InputError.of_all(problems, where=path, expected=f"columns {', '.join(COLUMNS)}")
@@ -393,7 +388,7 @@ def _feature_rows(cfg: BoxesConfig, path: Path) -> list[_Row]:
             "%s: z of coordinates, %.4g to %.4g, is ignored; all is on the ground, at %g m (z_m of a feature counts)",
             path.name, heights.min(), heights.max(), cfg.ground_z_m,
         )  # fmt: skip
-    return features
+    return features, units
 
 
 def _feature(item: Any, number: int) -> _Row:

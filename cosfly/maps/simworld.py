@@ -9,6 +9,7 @@ own surfaces, such as those of `cosfly world`, gets none added. `header.extent_s
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -152,7 +153,7 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
     stand_m = 0.0 if has_surfaces else STAND_M
     boxes = BoxList()
     sources = {"road": 0, "bbox": 0, "engine": 0, "default": 0}
-    num_dropped = 0
+    dropped = Counter[str]()
     road_nodes: list[_Node] = []
     for node in nodes:
         asset = asset_of(node.instance_name)
@@ -164,9 +165,11 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
         size = sizes.get(node.instance_name)
         if asset is None or size is None:
             _check_unknown(cfg, node, "kind" if asset is None else "size")
-            num_dropped += 1
+            dropped["unknown_asset"] += 1
             continue
         sources[_add_node(boxes, node, asset, size, stand_m, world)] += 1
+    if has_surfaces and road_nodes:  # the world has its roads as surfaces
+        dropped["road_piece"] = len(road_nodes)
     widths: dict[str, float] = {}
     num_asset_boxes = len(boxes)
     if not has_surfaces:
@@ -180,7 +183,7 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
         name=cfg.name, source=MapSource(tool=tool, version="world file", file=world.name), licence=cfg.licence,
         credits=cfg.credits, ground_z_m=0.0, extent_sources=sources, roads=widths,
         added_boxes=len(boxes) - num_asset_boxes, num_objects=len(nodes),
-        dropped_objects={"unknown_asset": num_dropped} if num_dropped else {},
+        dropped_objects=dict(dropped),
     )  # fmt: skip
     return boxes.box_map(header)
 
