@@ -244,7 +244,13 @@ def test_what_an_outline_asks_for_is_bounded_before_it_is_made(tmp_path):
         return feature("Polygon", [ring.tolist()], type="Roads")
 
     with pytest.raises(InputError, match="over the limit; got outlines that need"):
-        loaded(tmp_path, collection(*(star(9 * k, k) for k in range(60))), ".geojson")
+        loaded(tmp_path, collection(*(star(9 * k, k) for k in range(200))), ".geojson")
+    halls = [square(60 * (k % 40), 60 * (k // 40), 50)[0] for k in range(400)]  # many, but simple
+    for ring in halls:
+        ring[2] = [ring[2][0] - 10, ring[2][1]]
+        ring[3:3] = [[ring[2][0], ring[2][1] - 9], [ring[0][0], ring[2][1] - 9]]
+    town = collection(*(feature("Polygon", [ring], type="Buildings", height_m=9) for ring in halls[:20]))
+    assert len(loaded(tmp_path, town, ".geojson")) >= 20
     for row in ("Roads,0,0,1e9,1e9,", "Buildings,0,0,9,9,1e9"):
         with pytest.raises(InputError, match="too wide or too high"):
             loaded(tmp_path, f"type,x_m,y_m,length_m,width_m,height_m\nBuildings,0,0,9,9,9\n{row}\n")

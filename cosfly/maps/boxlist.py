@@ -15,7 +15,7 @@ from cosfly.runtime.io import over_limit
 
 Pair = Sequence[float] | np.ndarray  # x and y
 WIDEST_M = 20_000.0  # of a map
-MOST_CUTS, MOST_CUTS_PER_CORNER = 30_000, 10  # of the polygons of a map; a city model needs 3 for each corner
+MOST_CUTS, MOST_CUTS_PER_CORNER = 30_000, 20  # of the polygons of a map; a city model needs 1 for each corner
 
 
 @dataclass

@@ -26,6 +26,7 @@ MIN_AREA_M2 = 0.02  # smaller pieces are rounding errors of a cut
 THINNEST_M = 1e-3  # thinner rectangles are rounding errors too
 MOST_CROSSINGS = 500  # of an outline with itself; 1,000 take a second to resolve
 PAIRS_AT_ONCE = 1_000_000  # pairs of edges that are compared before the count is checked
+MOST_NEW_CORNERS = 50_000  # of merged outlines that cross each other
 MAX_DEPTH = 16  # of cuts
 # Pieces of a polygon by its outline, and by its area: a larger one gets larger pieces. Cuts at shares take longer.
 MOST_PIECES, MOST_PIECES_OF_SHARES = 1_000, 400
@@ -123,9 +124,13 @@ def _sizes_for(polygon: Polygon, min_size_m: float, max_size_m: float, shares: S
 
 
 def num_cuts(polygon: Polygon, min_size_m: float, max_size_m: float, shares: Sequence[float]) -> float:
-    """Return a bound on the cuts that `cover` tries: of its pieces along the outline and inside, times the shares."""
+    """Estimate the cuts that `cover` tries besides those at corners: along slanted edges and of large areas."""
     min_size_m, max_size_m = _sizes_for(polygon, min_size_m, max_size_m, shares)
-    return len(shares) * (polygon.length / min_size_m + polygon.area / max_size_m**2)
+    yaw = np.radians(oriented_rectangle(polygon).yaw_deg) if polygon.area > 0 else 0.0
+    axes = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    rings = [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
+    slanted_m = sum(float(np.abs(np.diff(ring, axis=0) @ axes).min(axis=1).sum()) for ring in rings)
+    return len(shares) * (2 * slanted_m / min_size_m + polygon.area / max_size_m**2)
 
 
 def _cut(piece: Polygon, rectangle: Rectangle, shares: Sequence[float]) -> list[Polygon]:
@@ -184,8 +189,15 @@ def num_crossings(polygon: Polygon) -> int:
 
 
 def united(polygons: list[Polygon]) -> BaseGeometry:
-    """Merge polygons that may be invalid."""
-    return shapely.union_all(shapely.make_valid(np.array(polygons, dtype=object))) if polygons else MultiPolygon()
+    """Merge polygons that may be invalid; raise InputError if they cross so often that the result is vast."""
+    if not polygons:
+        return MultiPolygon()
+    merged = shapely.union_all(shapely.make_valid(np.array(polygons, dtype=object)))
+    num_corners = shapely.count_coordinates(merged)
+    if num_corners > max(MOST_NEW_CORNERS, 3 * shapely.count_coordinates(polygons)):
+        most = f"{MOST_NEW_CORNERS:,} corners, or three times as many as before"
+        raise over_limit("map", f"outlines that cross at {num_corners:,} corners", most, "correct the outlines")
+    return merged
 
 
 # --- derived ground: pavement along facades, asphalt between near buildings, lawn elsewhere ---------------------------
