@@ -260,8 +260,13 @@ def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
     write_boxes(tmp_path / "own.json", town())
     box_map = load(BoxesConfig(path=tmp_path / "own.json", name="Mine", licence="mit"))
     assert (box_map.name, box_map.header.licence, len(box_map)) == ("Mine", "mit", len(town()))
-    with pytest.raises(ConfigError, match="its own types and ground height"):
+    with pytest.raises(ConfigError, match="its own types, units and ground height"):
         load(BoxesConfig(path=tmp_path / "own.json", ignore=["*"]))
+    text = (tmp_path / "own.json").read_text()
+    for declared in ('"units": "ft"', '"crs": "EPSG:2263"', '"up_axis": "y"'):
+        (tmp_path / "own.json").write_text(text.replace("{", f"{{{declared},", 1))
+        with pytest.raises(InputError, match="declares a unit or a coordinate system"):
+            load(BoxesConfig(path=tmp_path / "own.json"))
 
 
 def test_all_that_is_wrong_with_a_table_is_told(tmp_path, subtests):

@@ -446,6 +446,11 @@ def test_a_bad_object_is_skipped_and_counted_and_an_empty_map_is_an_error(tmp_pa
         reason = {"no_geometry": 2} if number == 3 else {"no_geometry": 1, "invalid": 1}
         assert header.dropped_objects == reason
     assert "CityObjects.more 4" in caplog.text
+    model["vertices"].append([10**10, 0, 0])
+    model["CityObjects"]["more 4"] |= {"type": "Building", "geometry": [
+        {"type": "MultiSurface", "lod": "1", "boundaries": [[[0, 1, len(model["vertices"]) - 1]]]}]}  # fmt: skip
+    assert load(tmp_path, document(model)).header.dropped_objects == {"no_geometry": 1, "far_away": 1}
+    assert "more 4: skipped, because" in caplog.text
     model["CityObjects"] = {"wall": {"type": "Building", "geometry": [
         {"type": "MultiSurface", "lod": "1", "boundaries": [[[0, 1, 5, 4]]]}]}}  # fmt: skip
     (tmp_path / "upright.json").write_bytes(document(model))

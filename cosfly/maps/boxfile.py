@@ -41,7 +41,7 @@ from cosfly.maps.footprints import (
     polygons_of,
     with_derived_ground,
 )
-from cosfly.maps.units import METRES, UNITS_HELP, Units, declared_units, length_m, seen_units, to_metres
+from cosfly.maps.units import METRES, Units, declared_units, length_m, seen_units, to_metres
 from cosfly.runtime.config import Config, read_yaml
 from cosfly.runtime.errors import MOST_NAMED, ConfigError, InputError, counts_text, nearest
 from cosfly.runtime.io import read_text
@@ -86,7 +86,11 @@ class BoxesConfig(Config):
         "Boxes", min_length=1, description="name of the map, with which folder names in the playback tree begin"
     )
     path: Path | None = Field(None, description="boxes_3d.json, .csv or .geojson file; docs/files.md lists the columns")
-    units: Units = Field("auto", description=UNITS_HELP)
+    units: Units = Field(
+        "auto",
+        description="unit of the coordinates: m, degrees (longitude, latitude), ft (0.3048 m) or us-ft (0.3048006 m); "
+        "auto: what the file declares, and without that what its outlines look like",
+    )
     type_column: str = Field(
         "type",
         min_length=1,
@@ -154,11 +158,12 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
         raise InputError(
             "the file type of the map is not supported", where=path, got=path.suffix, expected=".json, .csv or .geojson"
         )
-    if suffix == ".json" and (cfg.types or cfg.ignore or cfg.ground_z_m):
+    of_tables = {"types", "ignore", "ground_z_m", "units", "type_column"}
+    if suffix == ".json" and cfg.model_dump(include=of_tables) != BoxesConfig().model_dump(include=of_tables):
         raise ConfigError(
-            "boxes_3d.json contains its own types and ground height, so settings for them would have no effect",
+            "boxes_3d.json contains its own types, units and ground height, so settings for them would have no effect",
             where="maps.boxes",
-            fix="remove maps.boxes.types, maps.boxes.ignore and maps.boxes.ground_z_m",
+            fix=f"remove {', '.join(f'maps.boxes.{name}' for name in sorted(of_tables))}",
         )
     box_map = read_boxes(path) if suffix == ".json" else _read_rows(cfg, path, suffix)
     settings = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})

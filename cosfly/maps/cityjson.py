@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import shapely
@@ -36,7 +36,6 @@ from cosfly.maps.footprints import (
     united,
     with_derived_ground,
 )
-from cosfly.maps.units import UNITS_HELP, Units
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import MOST_NAMED, InputError
 
@@ -54,7 +53,11 @@ class CityJsonConfig(Config):
         UNKNOWN_LICENCE, description="licence of the model, as spelled on the Hugging Face Hub (cc-by-4.0)"
     )
     credits: str = Field("", description="attribution of the model's makers, in one or more sentences")
-    units: Units = Field("auto", description=UNITS_HELP)
+    units: Literal["auto", "m", "ft", "us-ft"] = Field(
+        "auto",
+        description="unit of the coordinates: m, ft (0.3048 m) or us-ft (0.3048006 m); auto: what `referenceSystem` "
+        "declares, and without that metres",
+    )
     most_skipped: float = Field(
         0.2, ge=0, le=1, description="largest share of objects that may be skipped because they are invalid"
     )
@@ -116,18 +119,17 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
 
 def _near(model: CityModel, cfg: CityJsonConfig, path: Path) -> list[CityObject]:
     """Return the objects near the middle of the map; the others are counted, and too many of them refuse the file."""
-    centers = np.array([item.corners().mean(axis=0) for item in model.objects])
-    is_far = (np.abs(centers - np.median(centers, axis=0)) > WIDEST_M).any(axis=1)
-    far = [item.object_id for item, far in zip(model.objects, is_far, strict=True) if far]
+    middle = np.median([item.corners().mean(axis=0) for item in model.objects], axis=0)
+    far = {item.object_id for item in model.objects if (np.abs(item.corners() - middle) > WIDEST_M).any()}
     if not far:
         return model.objects
-    where = f"{path}: {', '.join(far[:MOST_NAMED])}"
+    where = f"{path}: {', '.join(sorted(far)[:MOST_NAMED])}"
     if len(far) > cfg.most_skipped * model.num_objects:
         expected = f"at most {cfg.most_skipped:.0%} invalid objects (maps.cityjson.most_skipped)"
         raise InputError("objects are more than 20 km from the middle of the map", where=where, expected=expected)
     log.warning("%s: skipped, because these %d objects are more than 20 km from the others", where, len(far))
     model.dropped["far_away"] += len(far)
-    return [item for item, far in zip(model.objects, is_far, strict=True) if not far]
+    return [item for item in model.objects if item.object_id not in far]
 
 
 def _boxes_of(objects: list[CityObject], cfg: CityJsonConfig, ground: Ground, dropped: Counter[str]) -> CityBoxes:

@@ -19,7 +19,7 @@ from pydantic import AliasPath, BaseModel, Field, FiniteFloat
 from cosfly.formats.columns import numbers
 from cosfly.maps.units import METRES, Units, declared_units, length_m, refused
 from cosfly.runtime.config import read_yaml
-from cosfly.runtime.errors import MOST_NAMED, ConfigError, InputError, counts_text, json_type, shown
+from cosfly.runtime.errors import MOST_NAMED, InputError, counts_text, json_type, shown
 from cosfly.runtime.io import over_limit, read_unpacked
 from cosfly.runtime.json_io import parse_document, parse_json, validated
 
@@ -143,8 +143,6 @@ def read_model(path: Path, units: Units, most_skipped: float) -> CityModel:
         units = declared_units(declared, f"{path}: metadata.referenceSystem") or "m"
         if units == "degrees":
             raise refused(str(declared), f"{path}: metadata.referenceSystem")
-    if units == "degrees":
-        raise ConfigError("CityJSON cannot be read in degrees", where="maps.cityjson.units", fix="use cjio reproject")
     objects = dict[str, CityObject]()
     seen_ids = set[str]()
     num_objects = 0

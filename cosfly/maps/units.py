@@ -19,10 +19,6 @@ from cosfly.runtime.errors import InputError, shown
 log = logging.getLogger(__name__)
 
 Units = Literal["auto", "m", "degrees", "ft", "us-ft"]
-UNITS_HELP = (
-    "unit of the coordinates: m, degrees (longitude, latitude), ft (0.3048 m) or us-ft (0.3048006 m); auto: what the "
-    "file declares, and without that what its outlines look like"
-)
 METRES = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
 # EPSG codes with east and north in metres at (nearly) true scale; first and last of each range.
 METRIC = (
