@@ -52,8 +52,8 @@ log = logging.getLogger(__name__)
 NUMBERS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_deg")
 # Names of OpenStreetMap and Overture, and columns without a unit: x, y and z in `maps.boxes.units`, sizes in metres.
 OTHER_NAMES = {name.rpartition("_")[0]: name for name in NUMBERS} | {
-    "lon": "x_m", "lat": "y_m", "num_floors": "building:levels", "levels": "building:levels",
-    "min_floor": "building:min_level",
+    "lon": "x_m", "longitude": "x_m", "lat": "y_m", "latitude": "y_m",
+    "num_floors": "building:levels", "levels": "building:levels", "min_floor": "building:min_level",
 }  # fmt: skip
 DECLARED = ("min_height", "building:levels", "building:min_level", "lanes")
 COLUMNS = ("type", "id", "name", *NUMBERS, *DECLARED)
