@@ -209,6 +209,10 @@ def takes_one_sampling_parameter(body: dict) -> Sent | None:
     return error(400, words)({}) if {"temperature", "top_p"} <= body.keys() else None
 
 
+def refuses_roles(body: dict) -> Sent:
+    return error(400, "Conversation roles must alternate user/assistant/user/assistant/...")(body)
+
+
 # A server that has to be understood: what it sends, settings, what becomes of the window, words of the report.
 UNDERSTOOD: dict[str, tuple] = {
     "streams in spite of stream: false": (events, {}, "accepted", ""),
@@ -216,6 +220,7 @@ UNDERSTOOD: dict[str, tuple] = {
     "a gateway: 200 with a code": (once(page(200, '{"code": 429, "msg": "concurrency limit exceeded"}')),
         {"max_tries": 2}, "accepted", ""),
     "no system role": (refuses_system, {}, "accepted", ""),
+    "refuses all roles": (refuses_roles, {}, "refused", "roles must alternate"),
     "temperature or top_p": (takes_one_sampling_parameter, {"extra_body": {"top_p": None}}, "accepted", ""),
     "declines": (message(content=None, refusal=DECLINED_WORDS), {}, "declined", DECLINED_WORDS),
 }  # fmt: skip
@@ -235,7 +240,8 @@ def test_a_server_is_understood(tree, tmp_path, name):
     assert all(json.loads(body)["stream"] is False for body in server.bodies)
     report = json.loads((out / "caption_report.json").read_text(encoding="utf-8"))
     assert report["windows"]["kept"] == (outcome == "accepted")
-    assert report["windows"]["dropped"] == ({} if outcome == "accepted" else {outcome: 1})
+    windows = report["windows"]
+    assert windows["dropped"] | windows["failed"] == ({} if outcome == "accepted" else {outcome: 1})
     assert words in str(report["refusals"])
 
 

@@ -106,6 +106,8 @@ BODIES: list[tuple[str, bytes, str | tuple[str]]] = [
     ("routers: no message", completion(None), ("no text",)),
     ("proxies: a page", b"<html><body>502 Bad Gateway</body></html>", ("not JSON",)),
     ("proxies: events though none were asked for", b'data: {"choices": []}\n\n', ("not JSON",)),
+    ("proxies: events without a choice", b'data: {"choices": [null]}\n\ndata: [DONE]\n', ("no text",)),
+    ("proxies: events without a delta", b'data: {"choices": [{"delta": ["x"]}]}\n\ndata: [DONE]\n', ("no text",)),
     ("proxies: a list", b"[1]", ("no choices",)),
     ("proxies: nothing", b"", ("not JSON",)),
     ("vLLM: NaN among the logprobs", completion({"content": TEXT}, logprobs=[float("nan")]), ("not JSON",)),

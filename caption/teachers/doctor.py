@@ -48,6 +48,7 @@ MIN_TOKENS = 64  # the smallest `max_tokens`
 BLOCK_PX = 8  # the JPEG of a random picture with such blocks takes 44 kB at 640 x 360 px, a rendered frame 49 to 57 kB
 PADDING = "Nothing has to change. " * 100  # makes a prompt longer by several hundred tokens
 READY = "Reply with the one word: ready"
+NO_SYSTEM = "the instructions are sent with the question"
 NO_THINKING = "endpoint.extra_body={chat_template_kwargs: {enable_thinking: false}}"
 
 
@@ -143,14 +144,15 @@ class _Examination:
             raise _LimitReached
         self.num_requests += 1
         self.advance(1, f"{self.num_requests} requests sent")
+        had_system = not self.client.joins_system
         try:
             response, reply = await self.client.ask_once(request, schema)
         except (TimeoutError, httpx.RequestError) as error:
             return _Probe(None, self.client.message_of(error))
         except RefusedRequest as error:
             refusal = error.refusal
-            if self.client.leaves_out_system(refusal, request):
-                self._add("system role", "warning", f"refused ({refusal.summary}); {refusal.meaning.fix}")
+            if had_system and self.client.leaves_out_system(refusal, request):
+                self._add("system role", "warning", f"refused ({refusal.summary}); {NO_SYSTEM}")
                 return await self._ask(messages, max_tokens, schema)
             fix = "" if refusal.kind == "unknown" else f"; {refusal.meaning.fix}"
             return _Probe(None, refusal.summary + fix, refusal.kind == "schema")

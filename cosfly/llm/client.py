@@ -77,15 +77,17 @@ class ConcurrencyLimit:
     """A limit on requests in flight, which finds what a server can take.
 
     It begins low and is raised by one per answer until the server is busy for the first time; then it is halved, and
-    raised by one per round of answers. It is not raised while answers are slow: a server with one slot answers no
-    sooner if more requests wait in its queue, and they would time out there. A Retry-After holds back all requests,
-    not only the one that received it.
+    raised by one per round of answers. A server that is busy at FIRST_LIMIT is starting, so this does not count as the
+    first time. The limit is not raised while answers are slow: a server with one slot answers no sooner if more
+    requests wait in its queue, and they would time out there. A Retry-After holds back all requests, not only the one
+    that received it.
     """
 
     def __init__(self, ceiling: int) -> None:
         self.ceiling = ceiling
         self.limit = float(min(ceiling, FIRST_LIMIT))
         self.num_active = 0
+        self._doubles = True  # per round of answers
         self._held_until_s = 0.0
         self._decreased_s = -math.inf
         self._changed = asyncio.Condition()
@@ -108,14 +110,14 @@ class ConcurrencyLimit:
 
     def succeeded(self, is_quick: bool) -> None:
         """Record an answer; a slow one does not raise the limit."""
-        was_never_busy = self._decreased_s == -math.inf
         if is_quick:
-            self.limit = min(float(self.ceiling), self.limit + (1.0 if was_never_busy else 1.0 / self.limit))
+            self.limit = min(float(self.ceiling), self.limit + (1.0 if self._doubles else 1.0 / self.limit))
 
     def was_busy(self, sent_s: float, retry_after_s: float | None) -> None:
         """Record that the server is overloaded. Requests sent before the last decrease do not count again."""
         now_s = time.monotonic()
         if sent_s >= self._decreased_s:
+            self._doubles = self._doubles and self.limit <= FIRST_LIMIT
             self.limit = max(1.0, self.limit / 2.0)
             self._decreased_s = now_s
         if retry_after_s is not None:
@@ -146,7 +148,7 @@ class ChatClient:
         self.context: int | None = None  # most tokens of prompt and answer together, if the server reports it
         self._asks_for_schema = cfg.json_schema
         self.joins_system = False  # whether the system text begins the first question
-        self._has_warned_of_context = self._has_warned_of_cuts = False
+        self._has_warned_of_context = self._has_warned_of_cuts = self._has_reported_slowness = False
         self._prompts: dict[int, deque[tuple[int, int]]] = {}  # tokens and characters of the last, by pictures
         self._key = os.environ.get(KEY_VARIABLE, "")
         if not (self._key.isascii() and self._key.isprintable()):  # an error of httpx would quote it
@@ -213,7 +215,15 @@ class ChatClient:
             raise NoAnswer("bad_reply", str(error)) from None
         except RefusedRequest as error:
             raise self._refused(error.refusal, sent_s, error.wait_s) from None
-        self.concurrency.succeeded(time.monotonic() - sent_s < HEADROOM * self.cfg.timeout_s)
+        seconds = time.monotonic() - sent_s
+        is_quick = seconds < HEADROOM * self.cfg.timeout_s
+        self.concurrency.succeeded(is_quick)
+        num_at_once = int(self.concurrency.limit)
+        if not is_quick and num_at_once < self.cfg.concurrency and not self._has_reported_slowness:
+            self._has_reported_slowness = True
+            limit = f"at most {num_at_once} requests are sent at once until answers take less than a third of "
+            limit += "endpoint.timeout_s; raise it if the server can answer more requests at once"
+            log.info("%s: an answer took %.0f s, so %s", self.where, seconds, limit)
         self._watch_prompts(reply, request)
         return self._with_full_context(reply, request)
 
@@ -225,13 +235,14 @@ class ChatClient:
         schema = request.schema if self._asks_for_schema else None
         refused_schema = None
         while True:
+            had_system = not self.joins_system
             try:
                 _, reply = await self.ask_once(request, schema)
                 break
             except RefusedRequest as error:
                 if error.refusal.kind == "schema" and schema is not None:
                     schema, refused_schema = None, error.refusal
-                elif not self.leaves_out_system(error.refusal, request):
+                elif not (had_system and self.leaves_out_system(error.refusal, request)):
                     raise
         if refused_schema is not None and self._asks_for_schema:
             change = "the server refuses a JSON schema (%s); requests are sent without one"
@@ -242,7 +253,7 @@ class ChatClient:
     def leaves_out_system(self, refusal: Refusal, request: Request) -> bool:
         """Return whether a request that was refused for its system role is sent again without one, as all later ones.
 
-        Requests in flight at the first refusal are refused, too.
+        Requests in flight at the first refusal are refused, too. Call it only if the request was sent with the role.
         """
         if refusal.kind != "no_system" or request.messages[0]["role"] != "system":
             return False
@@ -278,12 +289,12 @@ class ChatClient:
         if refusal.meaning.ends_run:
             return self._error(refusal.meaning.what, got=refusal.summary, fix=refusal.meaning.fix)
         if refusal.may_pass:
+            if refusal.is_loading:
+                return NoAnswer(LOADING, refusal.summary, wait_s=LOADING_PAUSE_S)
             # A longer wait ends this request, but does not delay the others.
             is_long = wait_s is not None and wait_s > TOTAL_TIMEOUT_S
             if refusal.status in BUSY_STATUS:
                 self.concurrency.was_busy(sent_s, None if is_long else wait_s)
-            if refusal.is_loading:
-                return NoAnswer(LOADING, refusal.summary, wait_s=LOADING_PAUSE_S)
             asked = f" (the server asks to wait {wait_s:.0f} s)" if is_long else ""
             return NoAnswer(f"http_{refusal.status}", refusal.summary + asked, wait_s=wait_s)
         return NoAnswer(refusal.code, refusal.summary, fix=refusal.meaning.fix, is_final=True)

@@ -159,11 +159,12 @@ def _joined_events(content: bytes, reject: Callable[[str], float]) -> dict[str, 
         if not isinstance(choices, list):
             return event if isinstance(event, dict) else {}  # an error, for instance
         usage = event.get("usage") or usage
-        for choice in choices[:1]:
-            finish_reason = choice.get("finish_reason") or finish_reason
-            for name, piece in (choice.get("delta") or {}).items():
-                if isinstance(piece, str):
-                    texts[name] = texts.get(name, "") + piece
+        choice = choices[0] if choices and isinstance(choices[0], dict) else {}
+        finish_reason = choice.get("finish_reason") or finish_reason
+        delta = choice.get("delta")
+        for name, piece in delta.items() if isinstance(delta, dict) else ():
+            if isinstance(piece, str):
+                texts[name] = texts.get(name, "") + piece
     if finish_reason is None:
         raise ValueError("the event stream ends before the answer does")
     return {"choices": [{"message": texts, "finish_reason": finish_reason}], "usage": usage}
