@@ -29,8 +29,10 @@ class Problems:
         try:
             yield
         except (InputError, VerifyError) as error:
+            if len(self.failures) == self._most:
+                raise  # the error that names all of them
             self.add(name, error)
-            if self._most is not None and len(self.failures) >= self._most:
+            if len(self.failures) == self._most:
                 self.raise_any("the material has {} or more")
 
     def raise_any(self, what: str, more: str = "", **context: Any) -> None:
