@@ -22,20 +22,32 @@ NO_REASON = "no reason given"
 @dataclass
 class TrackCaptions:
     """The captions of a track, by frame. spans: First byte and size of the accepted ones in the file. dropped: Why the
-    others were dropped."""
+    others were dropped. before, after: The greatest number of frames that a caption needs before and after its own."""
 
     path: Path
     spans: dict[int, tuple[int, int]] = field(default_factory=dict)
     dropped: dict[int, str] = field(default_factory=dict)
+    before: int = 0
+    after: int = 0
 
-    def why_none(self, frame: int) -> str:
-        """Return why a frame has no accepted caption."""
-        asked = self.spans.keys() | self.dropped.keys()
-        if not asked:
+    def add(self, caption: Caption, span: tuple[int, int]) -> None:
+        """Note where a caption is stored, or why it was dropped."""
+        frame = caption.frame_index
+        self.before = max(self.before, frame - min(caption.window, default=frame))
+        self.after = max(self.after, max(caption.future, default=frame) - frame)
+        if caption.status == "accepted":
+            self.spans[frame] = span
+        else:
+            self.dropped.setdefault(frame, caption.drop_reason or NO_REASON)
+
+    def why_none(self, frame: int, num_frames: int) -> str:
+        """Return why a frame of a track of so many frames has no accepted caption."""
+        if not self.spans and not self.dropped:
             return "the track has no captions"
         if frame in self.dropped:
             return f"dropped: {self.dropped[frame]}"
-        return "not asked for" if min(asked) <= frame <= max(asked) else "no whole window, at an end of the track"
+        is_whole = self.before <= frame < num_frames - self.after
+        return "not asked for" if is_whole else "no whole window, at an end of the track"
 
     def read(self, frame: int) -> Caption:
         """Read the accepted caption of a frame; InputError if it cannot be read any more."""
@@ -98,10 +110,8 @@ def index_captions(
             problems.add(caption.sample_id, error)
             continue
         account.add(caption)
-        if key in found and is_accepted:
-            found[key].spans[caption.frame_index] = begin, size
-        elif key in found:
-            found[key].dropped.setdefault(caption.frame_index, caption.drop_reason or NO_REASON)
+        if key in found:
+            found[key].add(caption, (begin, size))
         elif is_accepted:
             account.of_no_flight += 1
 

@@ -143,7 +143,7 @@ def _history(plan: ReleasePlan, tracks: list[Chosen]) -> History:
     account, candidates = plan.account, plan.material.candidates
     without = Counter[str]()
     for one in tracks:
-        without.update(one.captions.why_none(i) for i in {*one.selected} - {*one.captioned})
+        without.update(one.captions.why_none(i, one.num_frames) for i in {*one.selected} - {*one.captioned})
     num_released = sum(len(one.captioned) for one in tracks)
     captions = CaptionHistory(
         read=account.accepted + account.dropped.total(),
