@@ -183,7 +183,7 @@ def check_points(flight: FlightRows, points: FlightRows, findings: Findings) -> 
 
 def check_captions(flight: FlightRows, window_frames: int, findings: Findings) -> None:
     """Check that captions are whole or null, their windows, and the verdict against label and decision. window_frames:
-    Of every window, as the record says."""
+    Of every window of the track."""
     for i, row in enumerate(flight.rows):
         has_caption, index, decision = row["has_caption"], row["frame_index"], row["decision"]
         odd = [
@@ -238,6 +238,11 @@ class Context:
         stages = max(sources, key=lambda one: len(one.run)).stages if sources else []
         configs = [stage.config for stage in stages if stage.stage == "caption"]
         return configs[0] if len(configs) == 1 else {}
+
+    def window_frames(self, flight: FlightRows) -> int:
+        """Return the frames of a window of a track; captions of several sources may differ in it."""
+        window = self.caption_settings(flight).get("window", {})
+        return window.get("num_frames", self.record.settings.window_frames)
 
     def pictures(self, shard: Shard) -> Iterator[Pictures]:
         """Yield the pictures of the rows of a shard."""
@@ -311,7 +316,7 @@ def _check_track(
         lambda: check_values(frames, FREE, findings),
         *(partial(check, points, findings) for check in (check_camera, check_projection, check_boxes, check_flags)),
         lambda: check_points(frames, points, findings),
-        lambda: check_captions(frames, context.record.settings.window_frames, findings),
+        lambda: check_captions(frames, context.window_frames(frames), findings),
         read_captions,
     ]
     if context.level == "pixels":

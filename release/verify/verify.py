@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -220,6 +221,7 @@ def check_record(record: ReleaseRecord, findings: Findings) -> None:
 def check_tracks(record: ReleaseRecord, tracks: Sequence[TrackCount], findings: Findings) -> None:
     """Compare the tracks of the rows with release.json, whose splits are checked, and with each other in pairs."""
     found, asked = {track.name: track for track in tracks}, record.settings
+    sizes = Counter(track.trajectory for track in found.values())
     if len(found) < len(tracks):
         findings.error("flight", RECORD, f"{len(tracks) - len(found)} tracks in two places", "each track once")
     findings.compare("flight", RECORD, sorted(found), sorted(entry.flight for entry in record.flights))
@@ -230,7 +232,8 @@ def check_tracks(record: ReleaseRecord, tracks: Sequence[TrackCount], findings: 
             findings.compare("flight", f"{track.name}: {key}", getattr(track, key), getattr(entry, key))
         twin, place = found.get(track.pair or ""), (track.trajectory, track.split, track.walk, track.name)
         if track.pair is None:
-            is_right, expected = asked.pairs == "any" or len(asked.tracks) < 2, "both tracks (settings.pairs)"
+            is_right = sizes[track.trajectory] == 1 and (asked.pairs == "any" or len(asked.tracks) < 2)
+            expected = "both tracks, each the pair of the other, or one track where settings.pairs is any"
         else:
             is_right = twin is not None and (twin.trajectory, twin.split, twin.walk, twin.pair) == place
             expected = "the other track of the trajectory, of the same split, whose pair is this track"
