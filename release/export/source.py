@@ -30,7 +30,7 @@ from cosfly.formats.town import read_town_map
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.arrays import parse_array
 from cosfly.runtime.errors import InputError, shown
-from cosfly.runtime.io import inside, open_file, read_bytes, sha256_file
+from cosfly.runtime.io import inside, open_file, read_bytes, sha256_bytes, sha256_file
 from cosfly.runtime.png import png_size
 from cosfly.runtime.run_dir import fingerprint
 from cosfly.runtime.tables import open_table
@@ -310,12 +310,17 @@ def open_trees(folder: Path, trees: list[Tree]) -> ExportSource:
         track.add(track.rows(PLANNED, 0, len(read_track(path, strict=False))))
         tracks.append(track)
     facts = SourceFacts(
-        source=folder.absolute().name, source_made_by=f"cosfly {cosfly.__version__}", digest=fingerprint(trees[0].data),
+        source=folder.absolute().name, source_made_by=f"cosfly {cosfly.__version__}", digest=_digest_of(trees),
         licence=licences.pop() if len(licences) == 1 else UNKNOWN_LICENCE, credits=" ".join(credits).strip(),
         maps=[ReleasedMap(town=town.name, **one.model_dump()) for town, one in maps.items()], coordinates=CONTRACT,
     )  # fmt: skip
     modalities = tuple(file for file, name in FILE_NAMES.items() if frame_path(first, name).is_file())
     return ExportSource(folder, facts, inputs, modalities, tracks)
+
+
+def _digest_of(trees: list[Tree]) -> str:
+    digests = [fingerprint(tree.data) for tree in trees]
+    return digests[0] if len(digests) == 1 else sha256_bytes("\n".join(digests).encode())
 
 
 Line = tuple[Path, int]  # the file of a caption, and the byte at which its line begins
