@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from release_tampering import errors_in, forge
 from specimens_foreign import write_foreign_tree
 from specimens_png import png_around
 from specimens_release import CFG, FREE, all_bytes, build, make_caption, make_inspection, rewrite_captions, source_of
@@ -115,6 +116,12 @@ def test_neither_twin_goes_without_the_other_unless_asked(copy, tmp_path):
     assert (len(alone.flights), [flight.pair for flight in alone.flights].count(None)) == (3, 1)
     clean = record_of(copy, tmp_path / "clean", split_cfg(tracks=("clean",)))
     assert (len(clean.flights), {flight.pair for flight in clean.flights}) == (1, {None})
+
+
+def test_tracks_of_a_trajectory_that_no_row_calls_a_pair_are_found(built, tmp_path):
+    assert read_record(built / "release.json").settings.pairs == "any"
+    forged = forge(built, tmp_path / "forged", lambda rows: [row.update(pair=None) for row in rows])
+    assert errors_in(forged, "rows")["pair"] == 2
 
 
 def test_a_public_tree_without_an_inspection_is_released(tmp_path):
@@ -266,6 +273,13 @@ def test_material_that_cannot_be_released_is_refused_by_name(copy, tmp_path, dam
     assert not (tmp_path / "r/manifest.json").exists()
 
 
+def test_the_first_twenty_problems_of_a_shard_are_counted_once(copy, tmp_path):
+    for picture in first_flight(copy).parent.rglob("rgb.png"):
+        cut(picture, 20)
+    with pytest.raises(InputError, match=r"the material has 20 problems or more.* and 10 more"):
+        run(split_cfg(num_frames=40), [source_of(copy)], tmp_path / "r")
+
+
 def test_captions_that_nothing_binds_to_the_tree_are_refused(few, tmp_path):
     with pytest.raises(
         InputError, match=r"the playback tree of these captions is not recorded.*release\.unbound=accept"
@@ -314,6 +328,9 @@ def test_windows_keep_the_pictures_of_captions(tmp_path):
         assert sum(b - a > 1 for a, b in pairwise(sorted(frames))) == 1  # two runs of thirty
         released = [row for row in own if row["has_caption"]]
         assert sum(set(row["caption_window"]) <= frames for row in released) >= 0.8 * len(released) > 30
+    card = (folder / "README.md").read_text(encoding="utf-8")
+    assert "is one of the first 4 of a run" in card
+    assert "are not all in the release" not in card
     everything = run(split_cfg(selection="all"), [source_of(tmp_path)], tmp_path / "all")
     assert read_record(everything / "release.json").history.captions.released == 2 * 86
 
@@ -336,6 +353,34 @@ def test_a_long_track_is_released_as_in_the_paper(tmp_path):
     assert report.is_ok, str(report)
     with pytest.raises(InputError, match=r"release\.selection=windows"):
         Windows(folder)
+
+
+def test_captions_of_several_lengths_of_windows_are_verified(tmp_path):
+    """Each source has its own window: the settings of its caption stage say which."""
+    sources = []
+    for name, num_frames in (("long", 5), ("short", 3)):
+        tree = make_playback_tree(tmp_path / name / "tree", 1, 14, width_px=32, height_px=18)
+        caption_cfg = CaptionConfig(window={"num_frames": num_frames})
+        sources.append(Source(name, tree, caption_stage.run(caption_cfg, tree, tmp_path / name / "caption")))
+    folder = run(ReleaseConfig(**FREE), sources, tmp_path / "r")
+    windows = {len(row["caption_window"]) for row in table_of(folder, ["caption_window"]) if row["caption_window"]}
+    assert windows == {3, 5}
+    report = verify(folder, level="rows", reader=read_released)
+    assert report.is_ok, str(report)
+
+
+def test_a_frame_between_captions_was_not_asked_for(tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 1, 30, width_px=32, height_px=18)
+    captions = [
+        make_caption(flight, i, future=list(range(i + 1, i + 6)))
+        for flight in map(read_track, find_tracks(tree))
+        for i in range(4, 25, 3)
+    ]
+    write_captions(tmp_path / "captions.jsonl", captions)
+    write_inspection(tmp_path / "inspect.json", make_inspection(tree, {}))
+    without = record_of(tmp_path, tmp_path / "r", split_cfg(num_frames=30)).history.captions.frames_without
+    # Of 30 frames the first 4 and the last 5 have no whole window, 4, 7, ... 22 have a caption.
+    assert without == {"no whole window, at an end of the track": 2 * 9, "not asked for": 2 * 14}
 
 
 UNLICENSED = CFG.model_copy(update={"licence": None})
