@@ -86,7 +86,8 @@ def test_lies_about_goals_are_found(flights):
         "who is not on record": changed(flight, people=replace(flight.people, others={})),
         "no people": changed(flight, people=None) and [{**row, "people": None} for row in flight.rows],
         "another picture": [
-            {**row, "target_picture": row["target_picture"] and other.rows[0]["target_picture"]} for row in flight.rows
+            {**row, "target_picture": row["target_picture"] and flights[0][0].rows[0]["target_picture"]}
+            for row in flight.rows
         ],
         "no picture": [{**row, "target_picture": row["target_picture"] and {"bytes": b"x"}} for row in flight.rows],
     }
