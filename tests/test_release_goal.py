@@ -73,9 +73,9 @@ def test_a_goal_that_is_true_of_others_is_found(flights):
 
 
 def test_lies_about_goals_are_found(flights):
-    flight, folder = next(
-        pair for pair in flights if not {*pair[0].goal.says} & {*SIDES}
-    )  # no position tells them apart
+    # A goal without positions: nothing but looks tells the people apart.
+    flight, folder = next(pair for pair in flights if not {*pair[0].goal.says} & {*SIDES})
+    other = next(found for found, _ in flights if found is not flight)
     target, others = flight.people.target, flight.people.others
     alike = next(one for one in others.values() if len(target.differences(one)) == 1)
     lies = {
