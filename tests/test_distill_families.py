@@ -161,6 +161,40 @@ def test_a_student_that_cannot_be_used_is_refused_in_one_line(place, tmp_path, c
     assert "\n" not in str(told.value)
 
 
+def test_a_family_without_image_features_is_refused(place, built_once, tmp_path, monkeypatch):
+    from transformers import InternVLModel
+
+    folder = built_once("family_internvl", lambda root: make_family("internvl", root / "internvl")) / "internvl"
+    monkeypatch.delattr(InternVLModel, "get_image_features")
+    with pytest.raises(InputError, match=r"encodes no pictures apart.*InternVL.*modalities=\[\]"):
+        run(place, tmp_path / "out", folder, max_steps=1)
+
+
+def test_a_head_that_scales_its_logits_is_refused(place, built_once, tmp_path, monkeypatch):
+    """The chunked loss would be another one than the model's."""
+    from transformers import LlamaForCausalLM
+
+    folder = built_once("family_llama", lambda root: make_family("llama", root / "llama")) / "llama"
+    plain = LlamaForCausalLM.forward
+
+    def scaled(self: Any, *given: Any, **more: Any) -> Any:
+        found = plain(self, *given, **more)
+        found.logits = found.logits / 8
+        return found
+
+    monkeypatch.setattr(LlamaForCausalLM, "forward", scaled)
+    with pytest.raises(InputError, match=r"head: LlamaForCausalLM changes its logits after the head"):
+        run(place, tmp_path / "out", folder, max_steps=1)
+
+
+def test_an_adapter_of_another_base_is_refused(place, tmp_path):
+    folders = [make_family("llama", tmp_path / f"student_{seed}", seed) for seed in (0, 1)]
+    adapter = run(place, tmp_path / "out", folders[0], max_steps=1)
+    given = (infer.InferConfig(split="train", device="cpu"), place / "set", [place / "tree"], folders[1])
+    with pytest.raises(InputError, match="the adapter was trained on another model"):
+        infer.run(*given, tmp_path / "answers", adapter=adapter)
+
+
 def test_a_gguf_file_that_cannot_be_read_is_refused(place, tmp_path):
     (tmp_path / "broken.gguf").write_bytes(b"GGUF" + bytes(60))
     has_reader = importlib.util.find_spec("gguf") is not None

@@ -140,6 +140,10 @@ def encode(student: Student, loaded: Sequence[PictureData]) -> list[Encoded]:
     """Encode pictures of one size together."""
     import torch
 
+    if not student.has_image_features:
+        words, got = "the family of the student encodes no pictures apart", type(student.core).__name__
+        fix = "use another student, or a training set without pictures (distill.prepare.modalities=[])"
+        raise InputError(words, where="get_image_features", got=got, fix=fix)
     inputs = {n: torch.cat([item.inputs[n] for item in loaded]).to(student.device) for n in loaded[0].inputs}
     with student.computing():
         found = student.core.base_model.get_image_features(**inputs)

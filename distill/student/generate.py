@@ -98,13 +98,15 @@ def _answering(student: Student, max_tokens: int) -> Iterator[None]:
     from transformers import GenerationConfig
 
     core = student.core
+    # Under autocast keys and values may be of different types, which a static cache does not hold.
+    is_one_type = core.get_input_embeddings().weight.dtype == student.dtype
     before, was_training = core.generation_config, student.model.training
     core.generation_config = GenerationConfig(
         do_sample=False,
         max_new_tokens=max_tokens,
         eos_token_id=student.end_token_id,
         pad_token_id=student.pad_token_id,
-        cache_implementation="static",
+        cache_implementation="static" if is_one_type else "dynamic",
         disable_compile=True,  # a compiled step holds for one batch size and length, and costs a minute
     )
     student.model.eval()

@@ -22,7 +22,7 @@ from distill.student.chat import EncodedSample, Processor
 from distill.student.features import VisionFeatures
 from distill.student.model import FAST_FAMILIES, Student
 from distill.training.loading import Census
-from distill.training.loss import answer_loss
+from distill.training.loss import answer_loss, output_head
 from distill.training.settings import LOGIT_CHUNK, Steps, TrainConfig
 
 log = logging.getLogger(__name__)
@@ -188,6 +188,7 @@ def findings(
         Precheck("validation", f"{len(validation)} samples of {len(validation.decisions)} decisions"),
         *_about_decisions(census, validation),
         _about_chat(student, samples[int(census.indices[0])]),
+        *_about_head(student),
         _about_memory(cfg, student, census, features),
         _about_features(census, validation, features),
         *_about_kernels(student),
@@ -217,6 +218,21 @@ def _about_chat(processor: Processor, sample: Sample) -> Precheck:
     at = next((i for i, pair in enumerate(zip(taught, whole, strict=False)) if len(set(pair)) > 1), len(taught))
     words = f"at character {at}, {taught[at : at + 40]!r} instead of {whole[at : at + 40]!r}"
     return Precheck("chat template", f"the training text differs from that of the template: {words}", "error")
+
+
+def _about_head(student: Student) -> list[Precheck]:
+    """Check that logits are the product of the last hidden state and the head, from which the loss is computed."""
+    import torch
+
+    ids = torch.full((1, 4), student.end_token_id, device=student.device)
+    with torch.no_grad(), student.computing():
+        logits = student.core(input_ids=ids, use_cache=False).logits.float()
+        hidden = student.core.base_model(input_ids=ids, use_cache=False).last_hidden_state
+        plain = (hidden.to(student.dtype) @ output_head(student).to(student.dtype).T).float()
+    if torch.allclose(logits, plain, rtol=0.05, atol=0.05 * float(logits.abs().max())):
+        return []
+    words = f"{type(student.core).__name__} changes its logits after the head, which the loss does not know"
+    return [Precheck("head", words, "error")]
 
 
 def _about_memory(cfg: TrainConfig, student: Student, census: Census, features: VisionFeatures) -> Precheck:
