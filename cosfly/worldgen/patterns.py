@@ -163,7 +163,8 @@ def _winding(plan: WorldPlan, size_m: Size, rng: np.random.Generator, inner_m: f
     for cell in cells:
         ring = []
         for point in np.clip(shapely.get_coordinates(cell), -half, half):
-            near = [k for k, corner in enumerate(corners) if np.linalg.norm(corner - point) < 0.3 * pitch_m]
+            away_m = np.linalg.norm(np.array(corners).reshape(-1, 2) - point, axis=1)
+            near = np.flatnonzero(away_m < 0.3 * pitch_m).tolist()
             ring.append(near[0] if near else len(corners))
             corners += [] if near else [point]
         for edge in {(min(ends), max(ends)) for ends in pairwise(ring) if ends[0] != ends[1]}:
@@ -257,7 +258,7 @@ def _clipped(lines: list[Line], zone: BaseGeometry, edges: list[LineString]) -> 
         for part in shapely.get_parts(shapely.difference(LineString(line.points), zone)):
             if not isinstance(part, LineString) or part.length < SHORTEST_M:
                 continue
-            places = shapely.points([part.coords[0], part.interpolate(0.5, True).coords[0], part.coords[-1]])
+            places = shapely.points([part.coords[0], part.interpolate(0.5, normalized=True).coords[0], part.coords[-1]])
             away_m = [shapely.distance(places, edge) for edge in edges]
             if not any(away.max() < PARALLEL_M and np.ptp(away) < 0.5 * part.length for away in away_m):
                 outside.append(Line(np.array(part.coords), line.width_m))

@@ -38,10 +38,10 @@ SCALES = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4)
 SPACE_M = 4.0  # free ground around each object
 TREE_M = 2.5  # lower vegetation is a hedge
 DOOR_M = 1.6  # width of a path to a building
-BLOCK_PIECE_M = 4.0  # of pavement inside blocks, whose edges lie on that of streets
+BLOCK_PIECE_M = 6.0  # of pavement inside blocks, whose edges lie on that of streets
 LEAST_BLOCK_M2 = 400.0  # of a plaza or a green block
-GROW = 1.15  # factor of the sides of a town in which buildings or objects find no room
-MOST_GROWTH = 10  # times
+GROW = 1.25  # factor of the sides of a town in which objects find no room
+MOST_GROWTH = 5  # times
 LEAST_TOWN_M = 170.0  # side of a town without a size, so that people find a way of 100 m
 
 Size = tuple[float, ...]
@@ -112,14 +112,18 @@ def build(plan: WorldPlan, name: str, seed: int) -> Town:
     pitch_m = plan.block_m + plan.street_m
     edges_m = 2 * VERGE_M + plan.avenue_m + plan.river_m
     side_m = plan.blocks_along * pitch_m + edges_m
-    counts = [(kind.count or 0, sum(kind.footprint_m) / 2 + 1.3 * plan.gap_m) for kind in plan.kinds_of_buildings()]
-    if plan.only_these:
-        fronts_m = sum(count * front_m for count, front_m in counts)
+    counted = {kind.name: kind.count for kind in plan.buildings if kind.count}
+    if plan.only_these and counted:
+        fronts_m = sum((one.count or 0) * (sum(one.footprint_m) / 2 + 1.3 * plan.gap_m) for one in plan.buildings)
         side_m = max(LEAST_TOWN_M, math.sqrt(fronts_m * pitch_m / 3) + edges_m)
-    for growth in range(MOST_GROWTH):
-        town = _Builder(plan, _stretched(plan, side_m * GROW**growth, seed), name, seed).build()
-        is_full = sum(town.built.values()) < sum(count for count, _ in counts)
-        if not is_full and not any(reason == "no room" for _, reason in town.not_placed):
+    for _ in range(MOST_GROWTH):
+        town = _Builder(plan, _stretched(plan, side_m, seed), name, seed).build()
+        wanted, num_built = sum(counted.values()), sum(town.built.get(kind, 0) for kind in counted)
+        if num_built < wanted:
+            side_m *= min(2.0, 1.05 * math.sqrt(wanted / max(1, num_built)))
+        elif any(reason == "no room" for _, reason in town.not_placed):
+            side_m *= GROW
+        else:
             break
     return town
 
@@ -158,7 +162,8 @@ class _Builder:
         self.boxes.span("Terrain", (-x, -y), (x, y), GROUND_TOP_M - SLAB_M, GROUND_TOP_M)
         net = network(plan, size_m, rng_for(seed, "world", "streets"))
         self.stretches = lay_streets(self.boxes, net)
-        self.paved = strips = shapely.union_all([stretch.strip for stretch in self.stretches])
+        self.paved = shapely.STRtree([stretch.strip for stretch in self.stretches])  # where paths to doors begin
+        strips = shapely.union_all(self.paved.geometries)
         south = -y
         if plan.shore_m:
             south += QUAY_M
@@ -223,7 +228,7 @@ class _Builder:
                 paved.append(shapely.intersection(green, rectangle_polygon(shape, *bands[:: 1 if across else -1])))
         for area in paved:
             pave(self.boxes, area, BLOCK_PIECE_M)
-        self.paved = shapely.union_all([self.paved, *paved])
+        self.paved = shapely.STRtree([*self.paved.geometries, *paved])
         self.town.open_blocks = chosen
         self.buildable = shapely.difference(self.buildable, shapely.union_all(chosen).buffer(0.1))
         shapely.prepare(self.buildable)
@@ -243,19 +248,23 @@ class _Builder:
         taken = [*self.taken]
         for stretch in sorted(self.stretches, key=from_middle_m) if first else self.stretches:
             street = stretch.street
-            near = street.width_m / 2 + 0.05 + setback_m
+            front_m = street.width_m / 2 + 0.05 + setback_m
+            reach_m = max(depth for _, depth in sizes) + setback_m + self.plan.gap_m
+            is_near = shapely.dwithin(np.array(taken, dtype=object), stretch.strip, reach_m)
+            near = [outline for outline, flag in zip(taken, is_near, strict=True) if flag]
             for side in (1, -1):
                 along = 0.0
                 while along < street.length_m and not (first and lots):
                     front, depth = sizes[int(rng.integers(len(sizes)))]
-                    lot = street.rectangle((along, along + front), (side * near, side * (near + depth)))
+                    lot = street.rectangle((along, along + front), (side * front_m, side * (front_m + depth)))
                     outline = rectangle_polygon(lot)
-                    is_taken = taken and shapely.dwithin(np.array(taken), outline, self.plan.gap_m).any()
+                    is_taken = shapely.dwithin(np.array(near, dtype=object), outline, self.plan.gap_m).any()
                     if is_taken or not self.buildable.contains(outline):
                         along += STEP_M
                         continue
                     lots.append(lot._replace(yaw_deg=lot.yaw_deg + 90.0 * (1 - side)))
                     taken.append(outline)
+                    near.append(outline)
                     along += front + self.plan.gap_m * rng.uniform(1.0, 1.6)
         return lots
 
@@ -290,7 +299,7 @@ class _Builder:
     def _take(self, boxes: BoxList, outline: BaseGeometry, *, has_door: bool = True) -> None:
         """Record the outline of a building or object; a building gets a path to the nearest pavement."""
         self.taken.append(outline)
-        line = shapely.shortest_line(outline, self.paved)
+        line = shapely.shortest_line(outline, self.paved.geometries[self.paved.nearest(outline)])
         if has_door and line.length > 0.5:
             (x, y), (to_x, to_y) = line.coords
             yaw_deg = math.degrees(math.atan2(to_y - y, to_x - x))
