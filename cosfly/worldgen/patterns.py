@@ -1,4 +1,4 @@
-"""Street patterns: the centre lines of a town's streets, its river and its bridges, drawn from a plan and a seed.
+"""StraightStreet patterns: the centre lines of a town's streets, its river and its bridges, drawn from a plan and a seed.
 
 A pattern returns lines; `straight_streets` cuts them at their crossings and bends. Coordinates are m, the origin is the
 middle of the town, +x is east and +y north.
@@ -37,7 +37,7 @@ class Line(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Street:
+class StraightStreet:
     """A straight piece of street: centre line from start to end, (2,) m; width from front to front; carriageway."""
 
     start: np.ndarray
@@ -76,9 +76,9 @@ class Street:
 class Network(NamedTuple):
     """Streets, water and bridges of a town. bridges: the streets of `streets` that cross the river."""
 
-    streets: list[Street]
+    streets: list[StraightStreet]
     water: BaseGeometry
-    bridges: list[Street]
+    bridges: list[StraightStreet]
 
 
 def _spaced(length_m: float, pitch_m: float, unevenness: float, rng: np.random.Generator) -> np.ndarray:
@@ -281,7 +281,7 @@ def _bridges(
     return lines
 
 
-def straight_streets(lines: list[Line]) -> list[Street]:
+def straight_streets(lines: list[Line]) -> list[StraightStreet]:
     """Cut lines at their crossings and bends. Where lines coincide, the widest one counts."""
     shapes = np.array([LineString(line.points) for line in lines], dtype=object)
     tree = shapely.STRtree(shapes)
@@ -291,5 +291,5 @@ def straight_streets(lines: list[Line]) -> list[Street]:
             if np.linalg.norm(end - start) < SHORTEST_M:
                 continue
             of = tree.query(shapely.Point((start + end) / 2), predicate="dwithin", distance=0.05)
-            streets.append(Street(start, end, max(lines[k].width_m for k in of)))
+            streets.append(StraightStreet(start, end, max(lines[k].width_m for k in of)))
     return streets

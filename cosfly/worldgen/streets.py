@@ -16,7 +16,7 @@ from shapely.geometry.base import BaseGeometry
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.footprints import Rectangle, cover, polygons_of, rectangle_polygon
 from cosfly.maps.town_blocks import ROAD_TOP_M, SLAB_M, TOPS_M, WATER_TOP_M
-from cosfly.worldgen.patterns import Network, Size, Street
+from cosfly.worldgen.patterns import Network, Size, StraightStreet
 
 GROUND_TOP_M = ROAD_TOP_M - 0.02  # two centimetres: a depth buffer separates them at 300 m
 PAINT_TOP_M = ROAD_TOP_M + 0.03
@@ -39,7 +39,7 @@ class Stretch:
     clear: the stretch along it without carriageways of other streets. crossings: middles of zebra crossings.
     """
 
-    street: Street
+    street: StraightStreet
     reach_m: Size
     clear: Size
     crossings: list[float]
@@ -55,7 +55,7 @@ class Stretch:
         return self.street.rectangle((low_m, high_m), (-half, half))
 
 
-def _ends(streets: list[Street]) -> list[tuple[list[float], list[int]]]:
+def _ends(streets: list[StraightStreet]) -> list[tuple[list[float], list[int]]]:
     """Return of each street the tangent of half the turn at either end, and the number of other streets there.
 
     A street that ends there alone has the tangent 0.
@@ -112,7 +112,7 @@ def lay_streets(boxes: BoxList, net: Network) -> list[Stretch]:
     return stretches
 
 
-def _clear_of(street: Street, crossed: BaseGeometry) -> Size:
+def _clear_of(street: StraightStreet, crossed: BaseGeometry) -> Size:
     """Return the longest stretch of a street between the parts of it that other carriageways cross."""
     low, high = 0.0, street.length_m
     for part in polygons_of(crossed):
@@ -124,7 +124,7 @@ def _clear_of(street: Street, crossed: BaseGeometry) -> Size:
     return low, high
 
 
-def _crossings(street: Street, clear: Size, counts: list[int]) -> list[float]:
+def _crossings(street: StraightStreet, clear: Size, counts: list[int]) -> list[float]:
     """Return the middles of the zebra crossings along a street: at its junctions, and evenly between them."""
     low, high = clear
     if not street.road_m or high - low < 4 * CROSSING_M:
@@ -163,7 +163,13 @@ def _lay(boxes: BoxList, kind: str, piece: Rectangle) -> None:
 
 
 def add_along(
-    boxes: BoxList, street: Street, kind: str, place: tuple[float, float], size: Size, low_m: float, high_m: float
+    boxes: BoxList,
+    street: StraightStreet,
+    kind: str,
+    place: tuple[float, float],
+    size: Size,
+    low_m: float,
+    high_m: float,
 ) -> None:
     """Add a box at a place along and across a street, with the street's yaw."""
     boxes.add(kind, street.at(*place), size, low_m, high_m, street.yaw_deg)
