@@ -1,4 +1,4 @@
-"""StraightStreet patterns: the centre lines of a town's streets, its river and its bridges, drawn from a plan and a seed.
+"""Street patterns: centre lines of streets, a river and bridges, drawn from a plan and a seed.
 
 A pattern returns lines; `straight_streets` cuts them at their crossings and bends. Coordinates are m, the origin is the
 middle of the town, +x is east and +y north.
