@@ -39,7 +39,9 @@ LOADING, LOADING_PAUSE_S = "loading", 5.0  # a server that loads its model is wa
 FIRST_LIMIT = 2  # requests in flight until the first answer: a small server answers one after the other
 HEADROOM = 1 / 3  # more requests are sent while answers take less than this share of the time limit
 MOST_DOUBLINGS = 60  # keeps the power of two finite; the pause has reached its maximum long before
-NUM_EQUAL_PROMPTS = 8  # token counts in a row that are equal by chance in no run
+# A server cuts prompts if so many token counts in a row are equal, though the texts differ by so many characters. Texts
+# that differ in a few digits count equal tokens anyway: many tokenizers make one token of up to three digits.
+NUM_EQUAL_PROMPTS, LEAST_SPREAD = 8, 50
 MOST_REPLY_MB = 4.0  # of one answer, uncompressed
 MOST_ERROR_TEXT = 300  # characters of a server's error text; the rest is dropped
 HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
@@ -325,11 +327,11 @@ class ChatClient:
         num_characters = sum(_num_characters(message["content"]) for message in request.messages)
         seen = self._prompts.setdefault(len(request.digests), deque(maxlen=NUM_EQUAL_PROMPTS))
         seen.append((reply.usage.prompt_tokens, num_characters))
-        tokens, lengths = {counted for counted, _ in seen}, {length for _, length in seen}
-        if len(seen) == NUM_EQUAL_PROMPTS and len(tokens) == 1 and len(lengths) >= NUM_EQUAL_PROMPTS // 2:
+        tokens, lengths = {counted for counted, _ in seen}, [length for _, length in seen]
+        if len(seen) == NUM_EQUAL_PROMPTS and len(tokens) == 1 and max(lengths) - min(lengths) >= LEAST_SPREAD:
             self._has_warned_of_cuts = True
             count = reply.usage.prompt_tokens
-            problem = f"{len(lengths)} prompts of different lengths all count {count} tokens: the server drops the rest"
+            problem = f"{len(seen)} prompts of different lengths all count {count} tokens: the server drops the rest"
             log.warning("%s: %s; %s", self.where, problem, MEANINGS["too_long"].fix)
 
     async def start(self) -> None:
