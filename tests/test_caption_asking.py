@@ -102,6 +102,17 @@ def test_a_budget_stops_the_run_before_it_is_passed_and_a_larger_one_goes_on(tre
     assert len(server.bodies) == 44
 
 
+def test_a_share_of_a_flight_in_an_unfinished_product_is_not_taken_for_all_of_it(tree, tmp_path, whole):
+    out = tmp_path / "out"
+    with deciding() as server:
+        with pytest.raises(TeacherError):
+            run(settings(server.url, budget={"max_tokens": 16_000}, endpoint={"concurrency": 1}), tree, out)
+        assert len(list(read_captions(out / "captions.jsonl"))) > 0
+        for gap in (out / "parts").glob("*.gap"):  # as a run does that is killed before it writes the product again
+            gap.unlink()
+        assert run(settings(server.url), tree, out).read_bytes() == whole
+
+
 def test_the_quarantine_is_asked_about_again(tree, tmp_path, whole):
     out = tmp_path / "out"
     bad: set[int] = set()
@@ -204,5 +215,10 @@ def test_a_trial_shows_questions_answers_and_outcomes_and_keeps_the_answers(tree
     assert text.count("--- answer ") == 3
     assert "because" in text  # the words of the wrong answer
     assert lines[lines.index("--- outcome ---") + 1] == "accepted"
+    with deciding(fault=lambda index, body: "500" if index == 0 else None) as server:
+        cfg = settings(server.url, endpoint={"max_tries": 1, "concurrency": 1})
+        text = "\n".join(show_windows(cfg, tree, tmp_path / "other", 2))
+    assert text.count("--- outcome ---") == 2
+    assert text.count("no answer: http_500") == 1
     with pytest.raises(ConfigError, match="asks no model"):
         list(show_windows(CaptionConfig(), tree, tmp_path / "out", 1))

@@ -15,7 +15,7 @@ from teacher_server import MODEL, is_mirror, refusal
 
 from caption.stage.stage import run
 from cosfly.formats.captions import read_captions
-from cosfly.runtime.errors import TeacherError
+from cosfly.runtime.errors import NothingKept, TeacherError
 from specimens import make_playback_tree
 
 TOO_LONG = "This model's maximum context length is 8192 tokens. However, you requested 8203 tokens."
@@ -136,6 +136,43 @@ def test_what_is_a_windows_fault_costs_that_window_and_is_kept_in_the_servers_wo
         page = (out / "report.html").read_text(encoding="utf-8")
         assert "<script>" not in page
         assert reason in page
+
+
+def test_a_retry_that_stops_loses_and_doubles_nothing(tree, tmp_path, whole):
+    out, status = tmp_path / "out", 400
+
+    def respond(body: dict) -> tuple[int, dict] | None:
+        return refusal(status, TOO_LONG) if body["seed"] == whole[1][0] else None
+
+    with deciding(respond=respond) as server:
+        first = run(settings(server.url), tree, out).read_bytes()
+        status = 401
+        with pytest.raises(TeacherError):
+            run(settings(server.url), tree, out, retry_failed=True)
+        ids = [caption.sample_id for caption in read_captions(out / "captions.jsonl")]
+        assert 5 <= len(ids) == len(set(ids))
+        flights = report_of(out)["flights"]
+        assert flights["input"] == flights["kept"]
+        status = 400
+        assert run(settings(server.url), tree, out).read_bytes() == first
+
+
+def test_what_a_model_declined_is_asked_again(tree, tmp_path, whole):
+    message = {"content": None, "refusal": "I cannot help with that."}
+    completion = {"choices": [{"message": message, "finish_reason": "stop"}], "usage": None}
+    out, answer = tmp_path / "out", (200, completion)
+    with deciding(respond=lambda body: answer) as server:
+        for retry_failed in (False, True):
+            with pytest.raises(NothingKept, match=r"10 declined \(the model declined to answer"):
+                run(settings(server.url), tree, out, retry_failed=retry_failed)
+        answer = None
+        assert run(settings(server.url), tree, out, retry_failed=True).read_bytes() == whole[0]
+
+
+def test_an_error_about_refused_windows_alone_names_the_cause(tree, tmp_path):
+    cause = r"fix the causes \(10 refused \(the server or engine refused"
+    with deciding(respond=lambda body: refusal(400, TOO_LONG)) as server, pytest.raises(NothingKept, match=cause):
+        run(settings(server.url), tree, tmp_path / "out")
 
 
 @each(("status", "text"), [

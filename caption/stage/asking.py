@@ -62,7 +62,7 @@ class Asking:
         self.outcome = AskingOutcome()
         self.failures: list[Failed] = []  # tracks that cannot be read
         self.quarantine = read_quarantine(stage.path)
-        # An answer that had filled the context is asked for again.
+        # An answer that had filled the context, or in which the model declined, is asked for again.
         self.retried = frozenset(self.quarantine) if retry_failed else frozenset[str]()
         most_in_flight = max(cfg.most_in_flight, cfg.judge.concurrency if cfg.judge.url else 0)
         self.slots = asyncio.Semaphore(most_in_flight + WAITING_WINDOWS)  # one for each window in work
@@ -146,6 +146,7 @@ class Asking:
             log.error("caption: %s: %s", track.name, error)
             return
         except BaseException:
+            tally.kept += 1
             self._write_gap(track, windows)
             raise
         if windows or is_cut:
@@ -162,21 +163,24 @@ class Asking:
             self._write_gap(track, windows)
             raise
         captions = [caption for caption in answers if caption is not None]
-        has_gap = is_cut or len(captions) < len(windows)
-        part, gap = track.part(self.stage.path), track.gap(self.stage.path)
-        if captions:
-            write_captions(gap if has_gap else part, captions)
-        if not has_gap:
-            gap.unlink(missing_ok=True)
+        if is_cut or len(captions) < len(windows):
+            self._write_gap(track, windows)
+        else:
+            if captions:
+                write_captions(track.part(self.stage.path), captions)
+            track.gap(self.stage.path).unlink(missing_ok=True)
         for book in self.books:
             book.forget(track.name)
 
     def _write_gap(self, track: TrackInput, windows: list[asyncio.Task[Caption | None]]) -> None:
-        """Write the captions of a track in whose middle the run stops, for the report."""
+        """Write the captions of a track that stays unfinished, for the report."""
+        gap = track.gap(self.stage.path)
         done = [window for window in windows if window.done() and not window.cancelled() and not window.exception()]
         captions = [caption for caption in (window.result() for window in done) if caption is not None]
         if captions:
-            write_captions(track.gap(self.stage.path), captions)
+            write_captions(gap, captions)
+        elif done:  # a window without an answer may have a caption of an earlier run there
+            gap.unlink(missing_ok=True)
 
     async def _ask_window(self, window: Window, teacher: Teacher) -> Caption | None:
         """Return the caption of a window; None without an answer."""
@@ -208,7 +212,7 @@ class Asking:
         self._count_failure(f"{common_causes(self.outcome.unanswered)}; the last: {failure.message}")
 
     def _record_refusal(self, caption: Caption) -> None:
-        """Keep a window that the server refused, or that did not fit its context, for `--retry-failed`."""
+        """Keep a window that was refused or declined, or that did not fit the context, for `--retry-failed`."""
         refusal, sample_id = caption.checks.refusal, caption.sample_id
         if refusal is None or caption.status == "accepted":
             self.num_failed_in_row = 0

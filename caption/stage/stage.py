@@ -78,7 +78,9 @@ def run(
             shutil.rmtree(out / PARTS, ignore_errors=True)  # the process was killed before it removed them
         return out / PRODUCT
     tracks, is_cut = find_inputs(cfg, data)
-    restore_parts(stage.path, out / PRODUCT, tracks)
+    if stage.is_complete:  # otherwise the product may hold a share of a track
+        restore_parts(stage.path, out / PRODUCT, tracks)
+        stage.reopen()
     if cfg.teacher_kind in EMBEDDED and cfg.judge.url is None:
         items = [Item(track.item_id, track) for track in tracks]
         args = (cfg, vocabulary, stage.path, seed)
@@ -88,8 +90,8 @@ def run(
         if retry_failed:  # the tracks of windows in quarantine are unfinished again
             names = {flight_of(sample_id) for sample_id in read_quarantine(stage.path)}
             for track in tracks:
-                if track.name in names:
-                    track.part(stage.path).unlink(missing_ok=True)
+                if track.name in names and track.part(stage.path).exists():
+                    track.part(stage.path).replace(track.gap(stage.path))
         asking = Asking(stage, cfg, vocabulary, seed, retry_failed=retry_failed)
         outcome = asking.outcome
         try:
@@ -149,7 +151,8 @@ def _finish(
         num_frames = cfg.window.num_frames + cfg.window.future_frames
         raise stage.nothing_kept(outcome.tracks, expected=f"a track of at least {num_frames} frames")
     if not tally.kept:
-        fix = f"fix the causes ({explain_drops(tally.dropped)}), or change the settings and choose another --out"
+        causes = explain_drops(tally.dropped + tally.failed)
+        fix = f"fix the causes ({causes}), or change the settings and choose another --out"
         raise stage.nothing_kept(tally, where=out / PRODUCT, fix=fix)
     outputs = [out / PRODUCT, out / REPORT, out / PAGE, *sorted((out / ANSWERS).glob("*.jsonl"))]
     outputs += keep_own_prompts(out, vocabulary)
@@ -168,11 +171,7 @@ def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Res
 
 
 def _has_more(stage: StageFolder, cfg: CaptionConfig, retry_failed: bool) -> bool:
-    """Reopen a complete directory whose limit was smaller, or whose refused windows are asked about again.
-
-    Returns:
-        Whether it was reopened.
-    """
+    """Return whether a complete directory is continued: its limit was smaller, or refused windows are asked again."""
     manifest, refused = read_manifest(stage.path), read_quarantine(stage.path) if retry_failed else {}
     limit = manifest.facts.get("limit")
     is_larger = limit is not None and (cfg.limit is None or cfg.limit > limit)
@@ -184,7 +183,6 @@ def _has_more(stage: StageFolder, cfg: CaptionConfig, retry_failed: bool) -> boo
             got=f"{manifest.counts.input} windows", expected=f"at most {cfg.limit} (caption.limit)",
             fix="remove --limit, or raise it",
         )  # fmt: skip
-    stage.reopen()
     return True
 
 

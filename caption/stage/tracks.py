@@ -104,7 +104,7 @@ def parts_of(stage_path: Path, tracks: Sequence[TrackInput], with_gaps: bool) ->
 def restore_parts(stage_path: Path, product: Path, tracks: Sequence[TrackInput]) -> None:
     """Cut the product of a finished stage into its parts again, so that a run that resumes keeps its captions.
 
-    A track with any part is skipped: the product may hold only a share of it.
+    A track with any part is skipped: under a limit, the product may hold only a share of it.
     """
     begun = {path.name.removesuffix(".cut").rsplit(".", 1)[0] for path in (stage_path / PARTS).glob("*")}
     lost = {track.name: track for track in tracks if track.max_windows is None and track.name not in begun}

@@ -24,9 +24,9 @@ from caption.teachers.teacher import EMBEDDED, AskingTeacher, first_budget, open
 from cosfly.formats.captions import Caption, Usage
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook
-from cosfly.llm.contract import Reply, Request, run_until_interrupted
+from cosfly.llm.contract import NoAnswer, Reply, Request, run_until_interrupted
 from cosfly.runtime.console import duration
-from cosfly.runtime.errors import ConfigError, InputError, TeacherError
+from cosfly.runtime.errors import ConfigError, CosflyError, InputError, TeacherError
 from cosfly.runtime.escaping import LONGEST_LOG, for_terminal
 from cosfly.runtime.run_dir import Resume
 
@@ -35,12 +35,16 @@ PLAN_WINDOWS = 6
 
 @dataclass
 class _Trial:
-    """The captions of a few windows. num_all, num_left: Windows of the tree, and those without a caption."""
+    """The captions of a few windows.
+
+    num_all, num_left: Windows of the tree, and those without a caption. unanswered: Sample id -> error.
+    """
 
     num_all: int
     num_left: int
     seconds: float = 0.0
     captions: list[Caption] = field(default_factory=list)
+    unanswered: dict[str, str] = field(default_factory=dict)
     exchanges: dict[str, list[tuple[Request, Reply]]] = field(default_factory=dict)  # by sample id, in order
 
 
@@ -74,8 +78,13 @@ def _try_windows(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: R
 
     found = run_until_interrupted(ask())
     trial.captions = [one for one in found if isinstance(one, Caption)]
+    for window, one in zip(windows, found, strict=True):
+        if isinstance(one, NoAnswer | CosflyError):
+            trial.unanswered[window.observed.sample_id] = str(one)
+        elif isinstance(one, BaseException):
+            raise one
     if not trial.captions:
-        what, got = "none of the trial windows got an answer", str(found[0]) if found else None
+        what, got = "none of the trial windows got an answer", next(iter(trial.unanswered.values()), None)
         raise TeacherError(what, where=cfg.teacher, got=got)
     return trial
 
@@ -118,19 +127,11 @@ def show_windows(
         what = "a trial shows questions and answers, and this teacher asks no model"
         raise ConfigError(what, where="--try", got=cfg.teacher, expected="--teacher URL or vllm:MODEL_DIR")
     trial = _try_windows(cfg, data, out, seed, resume, num_windows)
+    for sample_id, message in trial.unanswered.items():
+        yield from _exchanges_of(trial, sample_id)
+        yield f"no answer: {for_terminal(message)}"
     for caption in trial.captions:
-        yield f"=== {caption.sample_id} ==="
-        for number, (request, reply) in enumerate(trial.exchanges.get(caption.sample_id, ()), 1):
-            for message in request.messages:
-                yield f"--- request {number}, {message['role']} ---"
-                yield from _text_of(message["content"])
-            usage = reply.usage
-            tokens = (
-                f"{usage.prompt_tokens} tokens in, {usage.completion_tokens} out" if usage else "tokens not reported"
-            )
-            yield f"--- answer {number} ({tokens}) ---"
-            yield for_terminal(reply.text, LONGEST_LOG)
-        yield "--- outcome ---"
+        yield from _exchanges_of(trial, caption.sample_id)
         reason = caption.drop_reason
         yield caption.status if reason is None else f"dropped because of {reason}: {REASONS[reason]}"
         for name, value in (
@@ -146,6 +147,20 @@ def show_windows(
             if answer is not None:
                 texts = (answer.critical_components, answer.reasoning_trace, answer.flight_decision)
                 yield from (f"{language}: {for_terminal(text)}" for text in texts)
+
+
+def _exchanges_of(trial: _Trial, sample_id: str) -> Iterator[str]:
+    """Yield the lines of the questions and answers about a window, and the title of its outcome."""
+    yield f"=== {sample_id} ==="
+    for number, (request, reply) in enumerate(trial.exchanges.get(sample_id, ()), 1):
+        for message in request.messages:
+            yield f"--- request {number}, {message['role']} ---"
+            yield from _text_of(message["content"])
+        usage = reply.usage
+        tokens = f"{usage.prompt_tokens} tokens in, {usage.completion_tokens} out" if usage else "tokens not reported"
+        yield f"--- answer {number} ({tokens}) ---"
+        yield for_terminal(reply.text, LONGEST_LOG)
+    yield "--- outcome ---"
 
 
 def _text_of(content: str | list[dict]) -> Iterator[str]:

@@ -233,7 +233,7 @@ class _WindowLoop:
             answer = await self._answer(asked)
             if isinstance(answer, Draft):
                 self._accept(answer, asked)
-                self.checks.structure, self.checks.refusal = "ok", None
+                self.checks.structure = "ok"
                 return None
             refused = answer
             if refused.complaint or refused.reason == CONTEXT_FULL:
@@ -275,6 +275,7 @@ class _WindowLoop:
         self._structured = reply.structured
         fields = self.terms.fields if language == "en" else ()
         parsed = parse_answer(reply.text, language, fields, reply.finish_reason)
+        self.checks.refusal = None  # of an earlier answer
         if parsed.reason == DECLINED:
             self.checks.refusal = f"{DECLINED}: {' '.join(reply.text.split())[:MOST_REFUSAL_TEXT]}"
         if parsed.reason == CONTEXT_FULL:

@@ -29,7 +29,7 @@ from cosfly.runtime.errors import CosflyError, TeacherError
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.json_io import dump_json
-from cosfly.runtime.model_json import CONTEXT_FULL
+from cosfly.runtime.model_json import CONTEXT_FULL, DECLINED
 
 log = logging.getLogger(__name__)
 
@@ -285,7 +285,7 @@ class KeptAnswers:
         """
         Args:
             book: None records nothing. budget: None sets no limit.
-            retried: Ids of the samples that are asked again where a recorded answer had filled the context.
+            retried: Ids of the samples that are asked again where a recorded answer had filled the context or declined.
 
         `listener` is called with each sample id, request and reply.
         """
@@ -310,7 +310,7 @@ class KeptAnswers:
         async with self._asking.setdefault(key, asyncio.Lock()):
             recorded = None if self.book is None else self.book.get(track, key)
             is_retried = sample_id in self.retried  # the context may be larger now
-            if recorded is not None and not (is_retried and recorded.finish_reason == CONTEXT_FULL):
+            if recorded is not None and not (is_retried and recorded.finish_reason in (CONTEXT_FULL, DECLINED)):
                 return recorded.reply
             async with self.budget.request(num_pictures) if self.budget else contextlib.nullcontext():
                 start_s = time.monotonic()
