@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import shapely
@@ -58,9 +58,8 @@ class CityJsonConfig(Config):
         description="unit of the coordinates: m, ft (0.3048 m) or us-ft (0.3048006 m); auto: what `referenceSystem` "
         "declares, and without that metres",
     )
-    most_skipped: float = Field(
-        0.2, ge=0, le=1, description="largest share of objects that may be skipped because they are invalid"
-    )
+    # largest share of objects that may be skipped because they are invalid or far away
+    most_skipped: ClassVar[float] = 0.2
     tool: str = Field("CityJSON", description="tool and version that made the file, for the records")
     solids: bool = Field(True, description="draw solids with their own roofs and walls; planners use the boxes")
     derive_ground: bool = Field(True, description="derive streets, pavements and lawn for a model that has no streets")
@@ -125,7 +124,7 @@ def _near(model: CityModel, cfg: CityJsonConfig, path: Path) -> list[CityObject]
         return model.objects
     where = f"{path}: {', '.join(sorted(far)[:MOST_NAMED])}"
     if len(far) > cfg.most_skipped * model.num_objects:
-        expected = f"at most {cfg.most_skipped:.0%} invalid objects (maps.cityjson.most_skipped)"
+        expected = f"at most {cfg.most_skipped:.0%} of the objects"
         raise InputError("objects are more than 20 km from the middle of the map", where=where, expected=expected)
     log.warning("%s: skipped, because these %d objects are more than 20 km from the others", where, len(far))
     model.dropped["far_away"] += len(far)

@@ -170,7 +170,7 @@ def read_model(path: Path, units: Units, most_skipped: float) -> CityModel:
             else:
                 objects[object_id] = candidate
     if len(problems) > most_skipped * num_objects:
-        expected = f"at most {most_skipped:.0%} invalid objects (maps.cityjson.most_skipped)"
+        expected = f"at most {most_skipped:.0%} invalid objects"
         raise InputError.of_all(problems, where=path, expected=expected)
     for problem in problems[:MOST_NAMED]:
         log.warning("skipped: %s", problem)
