@@ -116,6 +116,8 @@ def test_neither_twin_goes_without_the_other_unless_asked(copy, tmp_path):
     assert (len(alone.flights), [flight.pair for flight in alone.flights].count(None)) == (3, 1)
     clean = record_of(copy, tmp_path / "clean", split_cfg(tracks=("clean",)))
     assert (len(clean.flights), {flight.pair for flight in clean.flights}) == (1, {None})
+    card = (tmp_path / "clean/dataset/README.md").read_text(encoding="utf-8")
+    assert "All tracks of this release are clean: the other track of each trajectory is not released" in card
 
 
 def test_tracks_of_a_trajectory_that_no_row_calls_a_pair_are_found(built, tmp_path):
