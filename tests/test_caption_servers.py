@@ -7,7 +7,6 @@ server is mended, and the same command is run again.
 
 import gzip
 import json
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -264,19 +263,6 @@ def test_thoughts_that_use_up_all_tokens_are_an_answer_that_was_cut(tree, tmp_pa
     assert len(server.bodies) == 3
     report = json.loads((tmp_path / "out" / "caption_report.json").read_text(encoding="utf-8"))
     assert report["structure"] == {"cut_short": 1}
-
-
-def test_a_server_with_one_slot_answers_every_window(tree, tmp_path):
-    slot = threading.Lock()
-
-    def respond(body: dict) -> None:
-        with slot:
-            time.sleep(0.2)
-
-    with deciding(respond=respond) as server:
-        endpoint = {"timeout_s": 1.2, "concurrency": 16, "max_tries": 6}
-        run(settings(server.url, endpoint=endpoint, limit=10), tree, tmp_path / "out")
-    assert server.most_at_once <= 6  # not 16, of which most would time out in the queue
 
 
 def test_prompts_that_a_server_cuts_in_silence_are_reported(tmp_path, caplog):

@@ -1,8 +1,10 @@
 """The endpoint teacher against a real server that misbehaves: fault -> what the run must do."""
 
 import asyncio
+import heapq
 import json
 import logging
+import math
 import socket
 import time
 from contextlib import nullcontext
@@ -17,7 +19,7 @@ from teacher_server import TeacherServer
 from caption.schema import CaptionConfig
 from caption.stage.stage import run
 from cosfly.formats.captions import read_captions
-from cosfly.llm.client import KEY_VARIABLE, ConcurrencyLimit
+from cosfly.llm.client import HEADROOM, KEY_VARIABLE, ConcurrencyLimit
 from cosfly.runtime.errors import CosflyError, NothingKept, TeacherError
 
 KEEP = {"hard_conflict": "keep"}
@@ -150,6 +152,35 @@ def test_the_limit_on_concurrency_halves_and_recovers():
     for _ in range(10_000):
         limit.succeeded(is_quick=True)
     assert limit.limit == 64
+
+
+def waits_of(limit: ConcurrencyLimit, num_slots: int, answer_s: float, timeout_s: float) -> tuple[list[float], float]:
+    """Return how long 500 answers take, waits in the server's queue included, and when the limit is reached."""
+    free_s, in_flight, waits, now_s, full_s = [0.0] * num_slots, [], [], 0.0, math.inf
+    while len(waits) < 500:
+        while len(in_flight) < int(limit.limit):
+            end_s = max(now_s, heapq.heappop(free_s)) + answer_s
+            heapq.heappush(free_s, end_s)
+            heapq.heappush(in_flight, (end_s, now_s))
+        now_s, sent_s = heapq.heappop(in_flight)
+        waits.append(now_s - sent_s)
+        limit.succeeded(waits[-1] < HEADROOM * timeout_s)
+        if limit.limit == limit.ceiling:
+            full_s = min(full_s, now_s)
+    return waits, full_s
+
+
+@each(("num_slots", "answer_s"), [(1, 1.0), (1, 5.0), (1, 30.0), (1, 55.0), (4, 20.0)])
+def test_no_request_times_out_in_the_queue_of_a_small_server(num_slots, answer_s):
+    waits, _ = waits_of(ConcurrencyLimit(256), num_slots, answer_s, timeout_s=120.0)
+    assert max(waits) < 120.0
+
+
+@each("num_slots", [64, 256])
+def test_all_slots_of_a_large_server_are_soon_in_use(num_slots):
+    waits, full_s = waits_of(ConcurrencyLimit(num_slots), num_slots, 1.0, timeout_s=120.0)
+    assert max(waits) == 1.0
+    assert full_s <= math.log2(num_slots)
 
 
 def test_a_timeout_of_the_first_requests_does_not_slow_the_rise():

@@ -170,7 +170,7 @@ def check(job: Job, config: Annotated[Path, Argument(help="YAML file, or the nam
 
     check_with_files(job.cfg)
     lines = caveats(job.cfg)
-    verdict = f"valid, with {len(lines)} remarks" if lines else "ok"
+    verdict = "valid; read the remarks above" if lines else "ok"
     options.print_lines([*lines, f"{config}: {verdict}"])
 
 

@@ -206,7 +206,8 @@ def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
 def take_sample(cfg: RunConfig, out: Path) -> RunSample:
     """Plan the first trajectories of a run without towns in a temporary folder, and draw some of their frames.
 
-    Stages that are complete in `out` are copied. The first trajectories of a run do not depend on their number.
+    Stages that are complete in `out` are copied. The first pedestrian trajectories of a run do not depend on their
+    number; which styles they get does, so sizes and counts are estimates.
 
     Raises:
         EnvironmentMissing: If the map comes from a simulator that does not answer, and `out` has no map.

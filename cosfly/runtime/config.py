@@ -44,14 +44,16 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     def recorded(self) -> dict[str, Any]:
-        """Return the settings and constants that determine the products, JSON-able: all but those of MayDiffer, and
-        those of IfChanged that are the default."""
-        left_out = {
+        """Return the settings and constants that determine the products, JSON-able.
+
+        These are all but those of MayDiffer, and those of IfChanged that have the default.
+        """
+        skipped = {
             name
             for name, field in type(self).model_fields.items()
             if _MAY_DIFFER in field.metadata or (_IF_CHANGED in field.metadata and getattr(self, name) == field.default)
         }
-        return self._values("recorded", [name for name in self._names() if name not in left_out])
+        return self._values("recorded", [name for name in self._names() if name not in skipped])
 
     def all_values(self) -> dict[str, Any]:
         """Return all settings and constants, JSON-able."""
