@@ -1,6 +1,7 @@
 """Captions as conversations: what TRL, transformers, ms-swift and LLaMA-Factory would make of them."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from cosfly.runtime.png import png_size
 from distill.prepare.sources import RunSource
 from release.export.stage import ExportConfig
 from release.export.stage import run as export
+from release.record import read_record
 from specimens import make_playback_tree
 
 NUM_POINTS = 9
@@ -52,6 +54,27 @@ def accepted(run: Path) -> list:
 
 def chat(source: Path, out: Path, format: str = "chat", **settings) -> Path:
     return export(build_config(ExportConfig, {"format": format, **settings}, "test"), source, out)
+
+
+@pytest.mark.parametrize("format", ["chat", "sharegpt"])
+def test_the_last_frame_alone_needs_no_consecutive_frames(run, tmp_path, format):
+    stride = build(run, tmp_path / "r", CFG.model_copy(update={"num_frames": 5}))
+    with pytest.raises(InputError, match=r"needs consecutive frames.*release\.selection=windows"):
+        chat(stride, tmp_path / "windows", format)
+    folder = chat(stride, tmp_path / "last", format, frames="last", languages=["en"])
+    about = json.loads((folder / "export.json").read_text(encoding="utf-8"))["notes"][0]
+    released = read_record(stride / "release.json").history.captions.released
+    assert about == f"{released} samples, one per window and language. Skipped: none."
+    assert released > 0
+
+
+def test_a_run_of_several_towns_is_read_as_its_trees(run, tmp_path):
+    for name in ("a", "b"):
+        for part in ("render", "caption"):
+            shutil.copytree(run / part, tmp_path / "towns" / name / part)
+    build(run, tmp_path / "towns/release", CFG.model_copy(update={"num_frames": 5}))
+    folder = chat(tmp_path / "towns", tmp_path / "out")
+    assert len(lines_of(folder / "train.jsonl")) == 2 * 2 * len(accepted(run))
 
 
 def lines_of(path: Path) -> list[dict]:

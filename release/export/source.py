@@ -156,18 +156,19 @@ class ExportSource:
     tracks: list[SourceTrack]
 
 
-def open_source(folder: Path, *, consecutive: str = "") -> ExportSource:
+def open_source(folder: Path, *, prefer_tree: bool = False, consecutive: str = "") -> ExportSource:
     """Open a release, the folder around it, a run directory or a playback tree.
 
-    consecutive: What needs consecutive frames, if something does: of a run directory it gets the playback tree, which
-    has all frames, instead of the release.
+    Args:
+        prefer_tree: Open the playback tree of a run directory, which has all frames, instead of its release.
+        consecutive: What needs consecutive frames, if something does.
 
     Raises:
         InputError: If the folder is none of them, if the release is incomplete (lists all that is wrong), or if it
             lacks consecutive frames that are needed.
     """
-    dataset = release_folder(folder)
-    if (dataset / "release.json").is_file() and not (consecutive and (folder / "render").is_dir()):
+    dataset, is_run = release_folder(folder), any(any(folder.glob(name)) for name in ("render", "*/render"))
+    if (dataset / "release.json").is_file() and not (prefer_tree and is_run):
         if consecutive:
             read_record(dataset / "release.json").require_whole_tracks(consecutive, dataset)
         return open_release(dataset)

@@ -54,7 +54,7 @@ class Export(NamedTuple):
     pictures: tuple[FrameFile, ...] = ()
     carries: tuple[FrameFile, ...] = tuple(FILE_NAMES)
     default: tuple[FrameFile, ...] = tuple(FILE_NAMES)
-    needs_consecutive: bool = False
+    needs_consecutive: bool = False  # chat: but for samples of the last frame alone
     needs_one_size: bool = False
 
 
@@ -250,8 +250,9 @@ def run(
     cfg: ExportConfig, folder: Path, out: Path, *, workers: int = 0, watch: Watch = Watch(), resume: Resume = "if-same"
 ) -> Path:
     """Read a release, a run or a playback tree; write it in the format of the settings and return its folder."""
-    consecutive = f"the {cfg.format} export" if EXPORTS[cfg.format].needs_consecutive else ""
-    source = check_needs(open_source(folder, consecutive=consecutive), cfg)
+    reads_tree, is_of_windows = EXPORTS[cfg.format].needs_consecutive, cfg.frames == "all" or cfg.format == "lerobot"
+    consecutive = f"the {cfg.format} export" if reads_tree and is_of_windows else ""
+    source = check_needs(open_source(folder, prefer_tree=reads_tree, consecutive=consecutive), cfg)
     stage = StageFolder.open(out, "export", config=cfg, inputs=source.inputs, seed=0, resume=resume)
     product, parts = out / cfg.format, out / "parts"
     if stage.is_complete:
