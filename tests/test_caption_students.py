@@ -92,8 +92,13 @@ def test_requests_are_those_of_infer_to_the_byte(place, tmp_path, constrained):
 def test_unlabelled_flights_are_captioned_and_marked(place, tmp_path):
     with TeacherServer(decision=label_of(place)) as server:
         words = ["caption", "--teacher", server.url, "--as-student", place / "trained", "--data", place / "tree"]
+        tried = invoke([*words, "--out", tmp_path / "out", "--try", "1"])
+        assert "--- outcome ---\naccepted" in tried.output
+        num_tried = len(server.bodies)
         result = invoke([*words, "--out", tmp_path / "out"])
         assert result.exit_code == 0, result.output
+        assert num_tried == 2  # in two languages
+        assert len(set(server.bodies)) == len(server.bodies)  # nothing is asked twice
         assert {json.loads(body)["temperature"] for body in server.bodies} == {0.0}
     captions = list(read_captions(tmp_path / "out" / "captions.jsonl"))
     accepted = [caption for caption in captions if caption.status == "accepted"]

@@ -53,9 +53,12 @@ def _try_windows(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: R
     vocabulary = vocabulary_of(cfg)
     cfg = student_settings(cfg, vocabulary)
     stage = open_stage(cfg, data, out, seed, resume)
+    if stage.is_complete:
+        what, fix = "the directory is complete, so no window is left to try", "choose another --out"
+        raise InputError(what, where=out, fix=fix)
     tracks, _ = find_inputs(cfg, data)
     guesses = {track: track.guess_num_windows(cfg.window) for track in tracks}
-    left = [track for track in tracks if guesses[track] and not stage.is_complete and not track.part(out).exists()]
+    left = [track for track in tracks if guesses[track] and not track.part(out).exists()]
     trial = _Trial(sum(guesses.values()), sum(guesses[track] for track in left))
     if not trial.num_left:
         raise InputError("no window is left to caption", where=data, got=f"{len(left)} unfinished tracks")

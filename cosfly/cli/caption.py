@@ -56,6 +56,8 @@ def caption(
     check: Annotated[bool, Option(help="Test the server before the first request of a directory.")] = True,
 ) -> None:
     """Ask a teacher for the reason of every manoeuvre, verify it against geometry, regenerate, translate (step 7)."""
+    if plan_only and num_tried is not None:
+        raise typer.BadParameter("pass either --plan or --try")
     cfg = job.cfg.caption
     tree = job.tree(data)
     target = out or tree.resolve().parent / "caption"
