@@ -32,7 +32,7 @@ from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback import read_track
 from cosfly.formats.town import write_town_map
 from cosfly.formats.tracks import find_tracks
-from cosfly.runtime.errors import ConfigError, InputError, VerifyError
+from cosfly.runtime.errors import ConfigError, InputError, NothingKept, VerifyError
 from cosfly.runtime.json_io import read_json
 from cosfly.runtime.png import colours_of
 from distill.windows import Windows
@@ -532,6 +532,17 @@ def test_runs_of_other_towns_go_into_one_release_under_ids_of_their_own(release_
     (other / "tree").rename(other / "second")
     _, record = joined(tmp_path / "trees", source_of(release_inputs), replace(source_of(other), data=other / "second"))
     assert {one.flight.partition("/")[0] for one in record.flights} == {"one_tree", "one_second"}
+
+
+def test_what_is_not_chosen_is_counted_as_that_whatever_the_inspection_found(release_inputs, tmp_path):
+    chosen = CFG.model_copy(update={"flights": ("Town01/*/ORI",)})
+    history = read_record(build(release_inputs, tmp_path / "r", chosen) / "release.json").history.flights
+    found = [folder.relative_to(release_inputs / "tree") for folder in find_tracks(release_inputs / "tree")]
+    num_chosen = sum(folder.match("Town01/*/ORI") for folder in found)
+    assert 0 < num_chosen < history.found == len(found)
+    assert history.left_out["not chosen"] == len(found) - num_chosen
+    with pytest.raises(NothingKept, match=r"not chosen 6\).*change --flights"):
+        build(release_inputs, tmp_path / "none", CFG.model_copy(update={"flights": ("Town09",)}))
 
 
 @given(st.lists(st.integers(1, 50), max_size=30), st.integers(1, 120))

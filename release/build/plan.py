@@ -20,7 +20,7 @@ from cosfly.runtime.run_dir import StageFolder, Tally, write_failures
 from release.build.captions import CaptionAccount, FlightKey, TrackCaptions, index_captions
 from release.build.config import ReleaseConfig
 from release.build.problems import Problems
-from release.build.sources import IN_REVIEW, Candidate, Material, Source, choose_licence, gather, maps_of
+from release.build.sources import IN_REVIEW, NOT_CHOSEN, Candidate, Material, Source, choose_licence, gather, maps_of
 from release.columns import SPLIT_NAMES, Placement, SplitName
 from release.record import ReleasedMap
 from release.rules import select_frames, split_flights
@@ -235,6 +235,8 @@ def _no_track(sources: list[Source], material: Material, dropped: Counter[str], 
     """Return the error that no track is left, and what to do: most often a person has to decide."""
     tally = Tally(input=len(material.candidates), dropped=dropped)
     waiting = [one.source for one in material.candidates if (one.dropped or "").startswith(IN_REVIEW)]
+    if dropped[NOT_CHOSEN] == len(material.candidates):
+        return stage.nothing_kept(tally, expected="a track that release.flights names", fix="change --flights")
     inspected = next((s.inspect for s in [*(sources[k] for k in waiting), *sources] if s.inspect), None)
     choose = "choose other tracks with release.tracks, release.pairs or release.flights"
     if dropped[NO_TWIN]:

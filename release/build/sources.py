@@ -162,9 +162,9 @@ def gather(
             continue
         inspections.append(read_settled(source.inspect))
         for one in inspections[-1].flights:
-            dropped = None if choice.names(one.folder) else NOT_CHOSEN
-            if one.result not in wanted:
-                dropped = f"{one.result}: {one.reason}"
+            dropped = None if one.result in wanted else f"{one.result}: {one.reason}"
+            if not choice.names(one.folder):
+                dropped = NOT_CHOSEN
             folder, five_ray = inside(source.data, one.folder, in_parent=True), one.metrics.get("five_ray_mean")
             place = _place(source, Path(one.folder))
             found.append(Candidate(number, place, folder, "", dropped, one.sha256, five_ray))
