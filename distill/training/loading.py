@@ -20,6 +20,7 @@ from cosfly.formats.places import flight_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import CosflyError, EnvironmentMissing, InputError
 from cosfly.runtime.io import inside
+from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.worker import end_with_parent
 from cosfly.viz.frame_views import VIEW_FILES
 from distill.schema import Sample
@@ -45,8 +46,8 @@ ResultT = TypeVar("ResultT")
 
 
 def num_workers(wanted: int) -> int:
-    """Return how many workers to start: one a core, at most MOST_WORKERS, unless told otherwise."""
-    return wanted if wanted >= 0 else min(MOST_WORKERS, len(os.sched_getaffinity(0)))
+    """Return the number of workers: the wanted one; if it is negative, one per CPU, at most MOST_WORKERS."""
+    return wanted if wanted >= 0 else min(MOST_WORKERS, num_cpus())
 
 
 @dataclass(frozen=True)
