@@ -298,7 +298,7 @@ def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
             (collection(feature("CurvePolygon", [], type="Walls")),
              "feature 1: the geometry CurvePolygon is not supported; expected one of Point"),
             (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")),
-             "feature 1: the coordinates of the Polygon are invalid; expected \[x, y\], at least four points in a ring"),
+             r"feature 1: the coordinates of the Polygon are invalid; expected \[x, y\], at least four points in a ring"),
             (collection(feature("Polygon", [[[0, 0], [9, "x"], [9, 9], [0, 0]]], type="Walls")),
              "of the Polygon are invalid; expected"),
             (collection(feature("Point", [5, 5], type="Vegetation", height_m=3)),

@@ -149,8 +149,9 @@ def read_model(path: Path, units: Units, most_skipped: float) -> CityModel:
     dropped = Counter[str]()
     problems: list[str] = []
     for where, part in [(str(path), head), *features] if head.objects else features:
-        scale = np.multiply(head.scale, METRES[units])
-        vertices = _vectors(part.vertices, f"{where}: vertices") * scale + np.multiply(head.translate, METRES[units])
+        with np.errstate(all="ignore"):  # each ring is checked for finite numbers
+            vertices = _vectors(part.vertices, f"{where}: vertices") * head.scale + head.translate
+            vertices *= METRES[units]
         num_objects += len(part.objects)
         for object_id, value in part.objects.items():
             place = f"{where}: CityObjects.{object_id}"
