@@ -167,6 +167,11 @@ def gather(
                 dropped = NOT_CHOSEN
             folder, five_ray = inside(source.data, one.folder, in_parent=True), one.metrics.get("five_ray_mean")
             place = _place(source, Path(one.folder))
+            if Path(one.folder).parts[-2:] not in ((one.trajectory, one.variant), (one.variant,)):
+                raise InputError(
+                    "the record of a track has the folder of another track", where=source.inspect, got=one.folder,
+                    expected=f"a folder that ends in {one.trajectory}/{one.variant}", fix="run cosfly inspect again",
+                )  # fmt: skip
             found.append(Candidate(number, place, folder, "", dropped, one.sha256, five_ray))
     # Dropped tracks make no name longer: `release verify` knows the released ones alone.
     ids = flight_ids([one.place for one in found])
