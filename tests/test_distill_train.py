@@ -229,6 +229,7 @@ def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path, monkeyp
 @pytest.mark.slow
 def test_bfloat16_computes_with_float32_weights_that_learn(place, tmp_path):
     settings = {"method": "full", "max_steps": 4, "learning_rate": 1e-3, "validation_answers": True}
+    settings |= {"decision_weight": 1.0}  # the mean of few tokens rounds more
     for dtype in ("float32", "bfloat16"):
         run(place, tmp_path / dtype, dtype=dtype, max_new_tokens=4, **settings)
     found, wanted = losses_of(tmp_path / "bfloat16"), losses_of(tmp_path / "float32")
