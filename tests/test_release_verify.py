@@ -113,6 +113,7 @@ RECORD_LIES = {
     "another rule of splits": lambda r: r["splits"].update(rule="by taste"),
     "another seed of splits": lambda r: r["splits"].update(seed=_seed_of_other_splits(r)),
     "shares above one": lambda r: r["splits"]["fractions"].update(test=1.5),
+    "each shard twice": lambda r: r.update(shards=2 * r["shards"]),
     "a sky of 999 m": lambda r: r["depth"].update(sky=999.0),
 }
 

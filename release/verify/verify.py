@@ -149,7 +149,8 @@ def check_checksums(folder: Path, record: ReleaseRecord, good: Sequence[str], fi
 
 
 def check_footers(folder: Path, record: ReleaseRecord, good: Sequence[str], findings: Findings) -> bool:
-    """Open every parquet file; return whether all have the columns and number of rows of the release."""
+    """Open every parquet file; return whether all have the columns and number of rows of the release, and each is
+    listed once."""
     frames, points = columns.schema(record.settings.modalities), columns.points_schema()
     num_good = 0
     for file in (file for file in record.files if file.path in good):
@@ -168,7 +169,7 @@ def check_footers(folder: Path, record: ReleaseRecord, good: Sequence[str], find
             findings.error("rows", file.path, num_rows, str(file.rows))
         else:
             num_good += 1
-    return num_good == len(record.files)
+    return num_good == len(record.files) == len({file.path for file in record.files})
 
 
 def check_card(folder: Path, record: ReleaseRecord, findings: Findings) -> None:
