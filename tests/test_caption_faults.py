@@ -136,6 +136,7 @@ def test_what_is_a_windows_fault_costs_that_window_and_is_kept_in_the_servers_wo
         page = (out / "report.html").read_text(encoding="utf-8")
         assert "<script>" not in page
         assert reason in page
+    assert run(settings(server.url), tree, out) == path  # complete: the server, which is gone, is not asked
 
 
 def test_a_retry_that_stops_loses_and_doubles_nothing(tree, tmp_path, whole):

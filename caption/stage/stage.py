@@ -167,7 +167,9 @@ def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Res
     if cfg.student.folder is not None:
         inputs |= student_files(cfg.student.folder)
     files = PACKAGE_FILES | {"prompts": cfg.prompts or PROMPTS}
-    return StageFolder.open(out, "caption", config=cfg, inputs=inputs, seed=seed, resume=resume, package_files=files)
+    return StageFolder.open(
+        out, "caption", config=cfg, inputs=inputs, seed=seed, resume=resume, package_files=files, retries=False
+    )
 
 
 def _has_more(stage: StageFolder, cfg: CaptionConfig, retry_failed: bool) -> bool:

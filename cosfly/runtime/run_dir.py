@@ -267,7 +267,7 @@ class StageFolder:
     """The output folder of a stage, opened for one set of settings and inputs.
 
     `open` writes `stage.json`; `finish` writes `manifest.json`. If the folder is already complete for the same settings
-    and inputs, and no item failed, `is_complete` is true and the stage has nothing to do.
+    and inputs, and no item is tried again, `is_complete` is true and the stage has nothing to do.
     """
 
     def __init__(self, path: Path, stage: str, is_complete: bool, lock: FolderLock | None = None) -> None:
@@ -290,6 +290,7 @@ class StageFolder:
         package_files: Mapping[str, Path] = MappingProxyType({}),
         audited: Collection[str] = (),
         begun: Collection[str] = (),
+        retries: bool = True,
     ) -> StageFolder:
         """Start or resume a stage.
 
@@ -299,6 +300,7 @@ class StageFolder:
             package_files: Name -> file or flat folder of the package that determines the products.
             audited: Names of inputs that the stage itself compares with their records, item by item.
             begun: Files and folders that this stage writes before any item is finished, in addition to BEGUN.
+            retries: Whether every run tries failed items again; otherwise a folder with failed items is complete.
         """
         record = StageRecord(
             stage=stage,
@@ -313,7 +315,7 @@ class StageFolder:
         if (out / "manifest.json").exists():
             manifest = read_manifest(out)
             _check_same(out, record, resume)
-            if not manifest.counts.failed:
+            if not (retries and manifest.counts.failed):
                 _check_outputs_exist(out, manifest)
                 # A kill has left the lock file, unless it is held or the disk is read-only.
                 if (out / LOCK).exists():
