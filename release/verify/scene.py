@@ -14,13 +14,7 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.geometry.goals import SeenFrame, meant, target_picture, words_of
-from cosfly.geometry.reprojection import (
-    LEAST_SEEN,
-    Agreement,
-    View,
-    compare_views,
-    median_of,
-)
+from cosfly.geometry.reprojection import LEAST_SEEN, Agreement, View, compare_views, median_of
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.png import colours_of

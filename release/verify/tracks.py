@@ -164,11 +164,9 @@ def _check_number(
 def check_points(flight: FlightRows, points: FlightRows, findings: Findings) -> None:
     """Check ids, that a track has all of its points in time, and that each row has the values of its point."""
     for i, row in enumerate(flight.rows):
-        expected = f"{flight.given_id}_frame_{row['frame_index'] or 0:05d}"
-        if flight.given_id is not None and row["sample_id"] != expected:
-            findings.error(
-                "sample_id", flight.where(i, "sample_id"), repr(row["sample_id"]), f"{expected}, by its track"
-            )
+        found, expected = row["sample_id"], f"{flight.given_id}_frame_{row['frame_index'] or 0:05d}"
+        if flight.given_id is not None and found != expected:
+            findings.error("sample_id", flight.where(i, "sample_id"), repr(found), f"{expected}, by its track")
     if (points.time_s[1:] <= points.time_s[:-1]).any():
         findings.error("time", points.where(0, "time_s"), "times that do not increase", "increasing times")
     if not np.array_equal(points.index, np.arange(len(points))):
