@@ -162,7 +162,8 @@ class Job:
                 where=where,
                 got="; ".join(f"{stage}: {counts_text(counts)}" for stage, counts in failed.items()),
                 expected=f"at most {self.cfg.max_failed} failed items",
-                fix="remove the causes that failures.jsonl names, and run the command again for the failed items",
+                fix="remove the causes that failures.jsonl names, and run the command again for the failed items; for "
+                "refused captions see quarantine.jsonl, and run cosfly caption --retry-failed",
             )
 
 
