@@ -52,6 +52,7 @@ NOT_HERE = {
     "--out work/round1": "two short flights are too few walks to split; tests/test_distill_dataset.py has more",
     "roi edit work/": "it serves until it is stopped; tests/test_cosfly_roi_editor.py draws on its page",
     "render.carla.server_command=": "CARLA itself; tests/test_render_carla.py starts a server of ours by that setting",
+    "SmolLM2-135M-Instruct.Q4_1.gguf": "a file of 98 MB; tests/test_distill_families.py trains it where it is",
     "--teacher vllm:": "vLLM needs an accelerator; tests/test_engines_contract.py holds its engine to the documents",
     "--engine vllm": "the same",
     "--out work/students-captions": "of a random student nothing is kept; docs/distillation.md has one that answers",
@@ -67,7 +68,8 @@ SMALL = {
     "maps": _set("maps.synthetic.size_m=150", "maps.synthetic.num_blocks=1"),
     "pedestrians": _set("pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25"),
     "render": _set("render.width_px=160", "render.height_px=90"),
-    "inspect": _set("inspect.legible_min=0"),
+    "inspect --map": _set("inspect.legible_min=0"),
+    "inspect --data": _set("inspect.legible_min=0"),
     "fly": _set("render.width_px=160", "render.height_px=90", "fly.most_decisions=5"),
     "study weather": _set("render.width_px=160", "render.height_px=90"),
     "study zoom": _set("render.width_px=160", "render.height_px=90"),
@@ -153,6 +155,15 @@ def _geojson(root: Path, target: Path) -> None:
     target.write_text(json.dumps({"type": "FeatureCollection", "features": [house]}))
 
 
+def _tagged(root: Path, target: Path) -> None:
+    west, south, size = 4.36, 52.01, 0.0004  # degrees
+    corners = [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]
+    ring = [[west + size * x, south + size * y] for x, y in corners]
+    properties = {"building": "yes", "class": "residential", "height": 9}
+    house = {"type": "Feature", "properties": properties, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+    target.write_text(json.dumps({"type": "FeatureCollection", "features": [house]}))
+
+
 def _world(root: Path, target: Path) -> None:
     roads = [node("BP_Road1_C", x, y) for x in range(-6000, 6001, 2000) for y in (-3000, 3000)]
     houses = [node("BP_Building_01_C", x, 0) for x in range(-5000, 5001, 2500)]
@@ -177,7 +188,8 @@ def _others_captions(root: Path, target: Path) -> None:
 # What a reader brings: path, as a command names it -> what makes it. The longer path before the shorter.
 BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "CosFly-Track": lambda root, target: write_foreign_tree(target, trajectories=("trajectory_1", "trajectory_2")),
-    "town.csv": _table, "town.geojson": _geojson, "file:captions.jsonl": _others_captions,
+    "town.csv": _table, "town.geojson": _geojson,
+    "osm.geojson": _tagged, "buildings.geojson": _tagged, "file:captions.jsonl": _others_captions,
     "../shared/data/simworld-progen/progen_world.json": _world, "../shared/data/delft-bgt-lod1/delft.json.gz": _delft,
     "data/a/progen_world.json": _world, "data/b/progen_world.json": _world, "data/a/Bbox.json": _world,
     "data/b/Bbox_total.json": copy_of("data/b/Bbox.json"), "runs/town1": copy_of("runs/diverse/grid"),

@@ -14,7 +14,7 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.geometry.goals import SeenFrame, meant, target_picture, words_of
-from cosfly.geometry.reprojection import LEAST_SEEN, Agreement, View, compare_views, median_of
+from cosfly.geometry.reprojection import LEAST_SEEN, SHARED_ID, Agreement, View, compare_views, median_of
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.png import colours_of
@@ -27,6 +27,7 @@ SURFACE_M = PERSON_HALF_EXTENTS_M[2] + 0.3  # between the hip and the visible su
 PERSON, SKY, MOST_KIND = KINDS["Pedestrians"], KINDS["Sky"], max(KINDS.values())
 NOTHING = np.empty((0, 0), np.float32)
 NO_IDS = np.empty((0, 0, 3), np.uint8)
+NUM_IDS, GRID = 65536, 64  # instance ids; rows and columns of points at which kinds are compared
 Pictures = dict[FrameFile, bytes | memoryview | None]  # of a frame
 Decoded = tuple[np.ndarray, np.ndarray]  # depth, instance
 
@@ -182,7 +183,7 @@ Pair = tuple[int, int, Agreement]  # of neighbouring frames: row of the later on
 
 def check_pictures(flight: FlightRows, pictures: Iterator[Pictures], findings: Findings) -> None:
     """Check all pictures of a flight, one after the other; memory holds two frames."""
-    pairs = list[Pair]()
+    pairs, kinds = list[Pair](), np.full(NUM_IDS, -1, np.int64)
     before: tuple[int, View] | None = None
     for i, files in enumerate(pictures):
         advance()
@@ -190,6 +191,8 @@ def check_pictures(flight: FlightRows, pictures: Iterator[Pictures], findings: F
         if decoded is None or not check_picture(flight, i, decoded, findings):
             before = None
             continue
+        if decoded[1].size and not flight.is_foreign:
+            _check_kinds(flight, i, decoded[1], kinds, findings)
         check_goal(flight, i, decoded, files.get("rgb"), findings)
         rotation = np.ascontiguousarray(flight.rotations[i] @ BODY_FROM_CAMERA)
         view = View(*decoded, rotation, flight.pose[i, :3].copy())
@@ -200,6 +203,19 @@ def check_pictures(flight: FlightRows, pictures: Iterator[Pictures], findings: F
         before = (i, view)
     if pairs and not flight.is_foreign:  # depth of others may be rough
         _judge_pairs(flight, pairs, findings)
+
+
+def _check_kinds(flight: FlightRows, i: int, instance: np.ndarray, kinds: np.ndarray, findings: Findings) -> None:
+    """Check at a grid of points that a thing has one kind in all frames. kinds: (NUM_IDS,), -1: not seen yet."""
+    rows, columns = (np.linspace(0, size - 1, GRID).astype(int) for size in instance.shape[:2])
+    kind, low, high = np.moveaxis(instance[np.ix_(rows, columns)].astype(np.int64), 2, 0)
+    ids = low | high << 8
+    is_new = (ids != 0) & (ids != SHARED_ID) & (kinds[ids] != kind)
+    for own, found in np.unique(np.stack([ids, kind], axis=-1)[is_new], axis=0):
+        if kinds[own] >= 0:
+            got, expected = f"instance {own} of kind {found}", f"kind {kinds[own]}, as in the frames before"
+            findings.error("instance_kind", flight.where(i, "instance"), got, expected)
+        kinds[own] = found
 
 
 def _judge_pairs(flight: FlightRows, pairs: list[Pair], findings: Findings) -> None:
