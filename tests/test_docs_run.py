@@ -223,7 +223,8 @@ def answer(body: dict) -> tuple[int, dict] | None:
         verdict = json.dumps({"verdict": "FIX_LABEL", "reason": "the text argues for the label"})
         choice = {"message": {"role": "assistant", "content": verdict}, "finish_reason": "stop"}
         return 200, {"choices": [choice], "usage": {"prompt_tokens": 9, "completion_tokens": 9}}
-    return None if "flight_decision" in text else patient()(body)
+    is_doctors = "Nothing has to change." in text  # the largest prompt, whose tokens must be counted
+    return None if "flight_decision" in text and not is_doctors else patient()(body)
 
 
 @pytest.fixture
