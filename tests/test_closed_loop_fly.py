@@ -73,7 +73,8 @@ def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(t
         assert all(frame.answer == "ok" and frame.words and frame.action for frame in record.decisions)
     simple, traces = f"{town}/simplify/step2_simplified.json", f"{tmp_path}/drone_trace.json"
     for words in (
-        f"inspect {TINY} --workers 1 --map {simple} --traces {traces} --data {tmp_path}/render --out {tmp_path}/inspect",
+        f"inspect {TINY} --workers 1 --map {simple} --traces {traces} --data {tmp_path}/render --out {tmp_path}/inspect "
+        "--set inspect.legible_min=0",
         f"caption {TINY} --workers 1 --data {tmp_path}/render --out {tmp_path}/caption",
         f"release build {TINY} --workers 1 --data {tmp_path}/render --captions {tmp_path}/caption/captions.jsonl "
         f"--inspect {tmp_path}/inspect/inspect.json --out {tmp_path}/release --set release.licence=cc-by-4.0 "
