@@ -28,8 +28,6 @@ SIZES_PX = ((64, 36), (320, 180), (224, 126), (160, 90))
 @pytest.fixture(params=FAMILIES)
 def family(request, built_once) -> Path:
     name = request.param
-    if name == "smolvlm" and importlib.util.find_spec("num2words") is None:
-        pytest.skip("the processor of SmolVLM needs num2words")
     return built_once(f"family_{name}", lambda root: make_family(name, root / name)) / name
 
 
