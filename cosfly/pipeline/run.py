@@ -111,7 +111,9 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "
     out = cfg.opened(out)
     num_stages = STAGES.index(until) + 1
     check_out(out)
-    towns = check(cfg)
+    towns = cfg.all_towns()
+    if until == "release":
+        check(cfg)
     if not towns:
         return _run_town(cfg, out, stages(cfg, out, resume=resume)[:num_stages])
     for name in (*towns, "release"):
@@ -145,9 +147,9 @@ def _run_directory(cfg: RunConfig, out: Path) -> Iterator[None]:
             _save_run(cfg, out)
 
 
-def check(cfg: RunConfig) -> dict[str, RunConfig]:
-    """Check, before the first stage, the requirements of the last one; return the settings of each town."""
-    towns = {name: cfg.of_town(name) for name in cfg.towns}
+def check(cfg: RunConfig) -> None:
+    """Check, before the first stage, the requirements of the release."""
+    towns = cfg.all_towns()
     maps = [(name, town.maps.licence) for name, town in towns.items()] or [(cfg.maps.source, cfg.maps.licence)]
     choose_licence(cfg.release.licence, maps)
     for town in towns.values() or [cfg]:
@@ -168,7 +170,6 @@ def check(cfg: RunConfig) -> dict[str, RunConfig]:
                 got=f"{rendered}, without {absent}",
                 fix=f"add {absent} to render.tracks, or pass --set 'release.tracks=[{rendered}]'",
             )
-    return towns
 
 
 def begun_run(config: Path, cfg: RunConfig) -> Path | None:
@@ -197,7 +198,7 @@ def check_out(out: Path) -> None:
 
 def check_with_files(cfg: RunConfig) -> None:
     """Check the requirements of the last stage, and that the files of all maps exist."""
-    towns = [cfg.of_town(name) for name in cfg.towns] or [cfg]
+    towns = cfg.all_towns().values() or [cfg]
     run_checks([partial(check, cfg), *(partial(_check_files, town) for town in towns)], cfg.name)
 
 

@@ -195,8 +195,7 @@ def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
         sample = take_sample(cfg, out)
         return [*_estimates(cfg, out, sample, STAGES[:-1]), _release(cfg, out, [sample])]
     rows, samples = list[StageEstimate](), list[RunSample]()
-    for name in cfg.towns:
-        town = cfg.of_town(name)
+    for name, town in cfg.all_towns().items():
         samples.append(take_sample(town, out / name))
         town_rows = _estimates(town, out / name, samples[-1], STAGES[:-1])
         rows += [replace(row, name=f"{name}/{row.name}") for row in town_rows]
@@ -349,7 +348,7 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
 def caveats(cfg: RunConfig) -> list[str]:
     """Return remarks on settings that apply to some trajectories only, and on targets too small or too dark to see."""
     lines = [*cfg.plan.remarks(), *small_targets(cfg)]
-    towns = {name: cfg.of_town(name) for name in cfg.towns} or {cfg.name: cfg}
+    towns = cfg.all_towns() or {cfg.name: cfg}
     for name, town in towns.items():
         num_paths = town.pedestrians.num_paths
         if dark := dark_trajectories(town.render, num_paths, partial(load_map, town.maps, seed=town.seed)):

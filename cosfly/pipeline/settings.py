@@ -68,6 +68,10 @@ class RunConfig(CommandConfig):
             raise ConfigError("a town cannot have this name", where="towns", got=name, expected=expected)
         self.of_town(name)
 
+    def all_towns(self) -> dict[str, RunConfig]:
+        """Return the settings of each town's run; empty for a run without towns."""
+        return {name: self.of_town(name) for name in self.towns}
+
     def of_town(self, name: str) -> RunConfig:
         """Return the settings of one town's run.
 
