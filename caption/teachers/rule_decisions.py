@@ -88,6 +88,16 @@ def decide(f: Facts) -> str:
     return str(f.found["decision"])
 
 
+def ranked(f: Facts) -> list[str]:
+    """Return the decisions that the observed frames lead to, that of `decide` first."""
+    first = decide(f)
+    if f.mission is not None or not f.is_visible_now:
+        return [first]
+    sizes = expected_sizes(f)
+    others = sorted((token for token in sizes if sizes[token] >= 1.0), key=sizes.__getitem__, reverse=True)
+    return list(dict.fromkeys([first, *others, "track_straight"]))
+
+
 def _strongest(sizes: dict[str, float]) -> str:
     for tokens in (("hover",), ("circle_left", "circle_right"), tuple(sizes)):
         token = max(tokens, key=sizes.__getitem__)

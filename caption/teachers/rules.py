@@ -15,13 +15,13 @@ from functools import cache
 from itertools import islice
 from pathlib import Path
 
-from caption.teachers.rule_decisions import LEAST_TURN_DEG, decide, expected_sizes, is_shaken, sight_rate_dps
+from caption.teachers.rule_decisions import LEAST_TURN_DEG, decide, expected_sizes, is_shaken, ranked, sight_rate_dps
 from caption.verification.facts import Facts, wrapped
 from caption.verification.references import Fact, look_up, parse_reference
 from cosfly.formats.segments import MISSION_KINDS
 from cosfly.runtime.config import read_yaml
 
-MODEL = "rules-13"  # its name in the records; counts changes of decisions and wording
+MODEL = "rules-14"  # its name in the records; counts changes of decisions and wording
 Both = tuple[str, str]  # English, Chinese
 Condition = Callable[[Facts, int], bool]  # of the facts and the side of the decision: 1 left, -1 right, 0 neither
 
@@ -32,10 +32,15 @@ STEEP_DEG = 55.0
 NEAR_M, COMING_M = 3.0, 6.0  # from the target to a bystander at its side, to one on the way to it
 MOST_DIFFERENCES = 1  # in appearance, of a person who is similar
 SLOW_MPS, SLIDING_MPS, CRAWLING_MPS, DRIFTING_MPS = 0.3, 0.5, 0.7, 0.2
+STILL_MPS, DAWDLING_MPS = 0.15, 0.5  # a slower pedestrian stands; moves slowly
 TURNING_DPS, SLIGHT_DPS, CLIMBING_MPS = 1.0, 3.0, 0.2  # slower turns and climbs are not worth a sentence; are slight
 SIDES = (("left", "right"), ("left",), ("right",))  # by the side of the decision
 HIDDEN = ("occluded", "out_of_view")
-CLOSE_M = 30.0  # a target that comes nearer than this leaves the drone little room
+CLOSE_M = 15.0  # a target that comes nearer than this leaves the drone little room
+LITTLE_DEG, LITTLE_TURN_DEG = 5.0, 40.0  # bearings and turns of the target that hardly matter
+DRIFT_DEG = 1.5  # a smaller change of the bearing is not worth a sentence
+WIDE_DEG = 15.0  # a target further from the axis does not stay in the picture by itself
+ACROSS_SIGHT_DEG = 2.0  # a target further on the other side comes to the middle without a turn of the nose
 # Topics of critical_components: what decisions rest on where the target is visible, hidden, and under an order.
 TOPICS = ("heading", "height", "drone", "motion")
 TOPICS_HIDDEN = ("view", "cover", "last", "drone", "height")
@@ -116,7 +121,7 @@ def is_close(f: Facts) -> bool:
 
 
 def sets_off(f: Facts, side: int) -> bool:
-    return hurries(f, side) and (f.target_speeds_mps[0] or 0.0) < SLOW_MPS
+    return hurries(f, side) and (f.target_speeds_mps[0] or 0.0) < DRIFTING_MPS
 
 
 def turns(f: Facts, side: int) -> bool:
@@ -137,7 +142,7 @@ def crosses(f: Facts, side: int) -> bool:
     off_deg, walk = _walk_deg(f), f.target_velocity_mps
     if off_deg is None or walk is None or side * walk[1] < 0.0 or abs(walk[1]) < SLIDING_MPS:
         return False
-    return abs(off_deg - 90.0) < (25.0 if is_shaken(f) else 45.0)
+    return abs(off_deg - 90.0) < (25.0 if is_shaken(f) else 35.0)
 
 
 def comes(f: Facts, side: int) -> bool:
@@ -146,7 +151,7 @@ def comes(f: Facts, side: int) -> bool:
 
 def walks_away(f: Facts, side: int) -> bool:
     off_deg = _walk_deg(f)
-    return off_deg is not None and off_deg < 45.0
+    return off_deg is not None and off_deg < 35.0
 
 
 def off_centre(f: Facts, side: int) -> bool:
@@ -160,7 +165,7 @@ def is_turning(f: Facts, side: int) -> bool:
 def turn_ends(f: Facts, side: int) -> bool:
     """Return whether the nose is expected to turn the other way."""
     turn = expected_sizes(f)["yaw_left_to_follow"]
-    return is_turning(f, side) and abs(turn) >= 1.0 and turn * (f.yaw_rate_dps[-1] or 0.0) < 0.0
+    return is_turning(f, side) and is_slowing(f) and abs(turn) >= 1.0 and turn * (f.yaw_rate_dps[-1] or 0.0) < 0.0
 
 
 def sight_swings(f: Facts, side: int) -> bool:
@@ -168,12 +173,43 @@ def sight_swings(f: Facts, side: int) -> bool:
     return f.is_visible_now and (side * turn if side else abs(turn)) >= 1.0
 
 
+def is_across(f: Facts, side: int) -> bool:
+    """Return whether the target is on the other side of the camera's axis."""
+    return side * (f.bearing_deg[-1] or 0.0) < -ACROSS_SIGHT_DEG
+
+
 def sight_turns(f: Facts, side: int) -> bool:
-    return sight_swings(f, side) and side * sight_rate_dps(f) >= TURNING_DPS
+    """Return whether the line of sight turns to a side, so that the nose has to follow it."""
+    return f.is_visible_now and not is_across(f, side) and side * sight_rate_dps(f) >= TURNING_DPS
+
+
+def drifts(f: Facts, side: int) -> bool:
+    """Return whether the target moves to a side in the picture, and is not on the other one."""
+    first_deg, last_deg = f.bearing_deg[0], f.bearing_deg[-1]
+    if first_deg is None or last_deg is None or is_shaken(f) or not f.is_legible_now:
+        return False
+    return side * (last_deg - first_deg) >= DRIFT_DEG and not is_across(f, side)
+
+
+def strafes_on(f: Facts, side: int) -> bool:
+    """Return whether a strafe goes on, and the target does not drift out of the picture on the other side."""
+    first_deg, last_deg = f.bearing_deg[0], f.bearing_deg[-1]
+    if first_deg is None or last_deg is None or not expects(FAMILIES["strafe"])(f, side):
+        return False
+    return abs(last_deg) <= WIDE_DEG and (is_shaken(f) or side * (last_deg - first_deg) >= -3 * DRIFT_DEG)
+
+
+def circles_on(f: Facts, side: int) -> bool:
+    return f.is_visible_now and expects(FAMILIES["circle"])(f, side)
 
 
 def nose_turns(f: Facts, side: int) -> bool:
-    return not is_shaken(f) and abs(f.yaw_deg[-1]) >= LEAST_TURN_DEG and word_of(f, "side:yaw") in SIDES[side]
+    return sight_turns(f, side) and side * f.yaw_deg[-1] >= LEAST_TURN_DEG
+
+
+def is_slowing(f: Facts) -> bool:
+    """Return whether the nose turned less in the last step than in the one before."""
+    return abs(f.yaw_deg[-1] - f.yaw_deg[-2]) < abs(f.yaw_deg[-2] - f.yaw_deg[-3])
 
 
 def slides(f: Facts, side: int) -> bool:
@@ -188,8 +224,9 @@ def gap_scatters(f: Facts, side: int) -> bool:
 
 
 def bystander_closes(f: Facts, side: int) -> bool:
+    before_m, now_m = (distance or math.inf for distance in f.other_distance_m[-2:])
     is_coming = f.is_visible_now and word_of(f, "trend:other_distance") == "decreasing"
-    return is_coming and (f.other_distance_m[-1] or math.inf) <= COMING_M
+    return is_coming and now_m < before_m and now_m <= COMING_M
 
 
 @dataclass(frozen=True)
@@ -231,12 +268,22 @@ def is_ordered(kind: str) -> Condition:
 # The names by which rule_sentences.yaml refers to conditions.
 CONDITIONS: dict[str, Condition] = {
     "always": lambda f, side: True,
-    "stands": says("target_motion", "standing", is_walk_known, lambda f, side: not sets_off(f, side)),
+    "stands": says("target_motion", "standing", is_walk_known, lambda f, side: max(f.target_speed_mps or 0.0, f.target_speeds_mps[-1] or 0.0) < STILL_MPS),
+    "lingers": lambda f, side: is_walk_known(f, side) and (f.target_speeds_mps[-1] or 0.0) < DAWDLING_MPS,
     "sets_off": sets_off, "turns": turns, "crosses": crosses, "comes": comes, "walks_away": walks_away, "walks": walks,
     "slows": slows, "stops": lambda f, side: slows(f, side) and (f.target_speeds_mps[-1] or 0.0) < SLOW_MPS,
-    "hurries": hurries, "off_centre": off_centre, "sight_swings": sight_swings,
-    "sight_turns": sight_turns, "swings_through_jitter": lambda f, side: is_shaken(f) and sight_turns(f, side),
+    "hurries": hurries, "off_centre": off_centre, "sight_turns": sight_turns, "swings_through_jitter": lambda f, side: is_shaken(f) and sight_turns(f, side),
+    "crosses_sight": lambda f, side: crosses(f, side) and sight_turns(f, side),
     "off_axis": lambda f, side: sight_swings(f, side) and side * (f.bearing_deg[-1] or 0.0) >= 1.0,
+    "off_centre_little": lambda f, side: off_centre(f, side) and abs(f.bearing_deg[-1] or 0.0) <= LITTLE_DEG
+    and not is_turning(f, side),
+    "turns_little": lambda f, side: turns(f, side) and abs(f.target_turn_deg or 0.0) <= LITTLE_TURN_DEG,
+    "turn_goes_on": lambda f, side: side * (f.yaw_rate_dps[-1] or 0.0) >= TURNING_DPS and not is_across(f, side),
+    "turns_with_sight": lambda f, side: side * (f.yaw_rate_dps[-1] or 0.0) >= TURNING_DPS
+    and f.is_visible_now and side * sight_rate_dps(f) >= TURNING_DPS,
+    "strafes_on": strafes_on, "circles_on": circles_on,
+    "drifts": drifts,
+    "turned": lambda f, side: abs(f.yaw_deg[-1]) >= LEAST_TURN_DEG,
     "off_centre_no_turn": lambda f, side: off_centre(f, side) and (side != 0 or not is_turning(f, side)),
     "on_axis": lambda f, side: centred(f, side) and not sight_swings(f, 0) and not is_turning(f, side),
     "gap_steady": says("trend:distance", "steady"),
@@ -258,13 +305,13 @@ CONDITIONS: dict[str, Condition] = {
     "drone_slides": lambda f, side: slides(f, side) and not is_crawling(f, side),
     "drone_lingers": lambda f, side: max(map(abs, f.velocity_mps[:2])) < DRIFTING_MPS,
     "drone_shifts": lambda f, side: abs(f.velocity_mps[1]) >= abs(f.velocity_mps[0]),
-    "climbing": lambda f, side: (f.climb_mps[-1] or 0.0) >= CLIMBING_MPS,
-    "sinking": lambda f, side: (f.climb_mps[-1] or 0.0) <= -CLIMBING_MPS,
+    "climbing": lambda f, side: f.velocity_mps[2] >= CLIMBING_MPS,
+    "sinking": lambda f, side: f.velocity_mps[2] <= -CLIMBING_MPS,
     "drone_drifts": lambda f, side: f.velocity_mps[0] >= 0.0 and abs(f.velocity_mps[1]) >= DRIFTING_MPS,
     "comes_near": lambda f, side: comes(f, side) and is_close(f) and not gap_opens(f, side),
     "gap_closes_near": lambda f, side: gap_closes(f, side) and is_close(f),
     "goes_along": lambda f, side: slides(f, side) and crosses(f, side),
-    "slides_past": lambda f, side: slides(f, -side),
+    "slides_past": lambda f, side: slides(f, -side) and sight_turns(f, side),
     "drone_climbs": says("trend:altitude", "increasing", is_smooth),
     "drone_sinks": says("trend:altitude", "decreasing", is_smooth),
     "steep": lambda f, side: (f.depression_deg[-1] or 0.0) >= STEEP_DEG,
@@ -278,7 +325,8 @@ CONDITIONS: dict[str, Condition] = {
     "seen_at_first": lambda f, side: not f.is_visible_now and f.distance_m[0] is not None,
     "bystander_near": lambda f, side: f.is_visible_now and (f.other_distance_m[-1] or math.inf) <= NEAR_M,
     "bystander_closes": bystander_closes,
-    "similar_near": lambda f, side: f.is_visible_now and f.alike_differences[-1] in range(MOST_DIFFERENCES + 1),
+    "similar_near": lambda f, side: f.is_visible_now and f.alike_differences[-1] in range(MOST_DIFFERENCES + 1)
+    and (f.other_distance_m[-1] or math.inf) <= COMING_M,
     **{f"expects_{name}": expects(family) for name, family in FAMILIES.items()},
     **{kind: is_ordered(kind) for kind in MISSION_KINDS},
 }  # fmt: skip
@@ -343,17 +391,18 @@ def write_templates(
 
     Args:
         draws: random bytes, at least 24.
-        decision: the decision to justify (anchored); None decides freely.
+        decision: the decision to justify (anchored); None takes the strongest one that has a reason.
 
     Returns:
-        None where the observed frames hold no reason for the given decision.
+        None where the observed frames hold no reason.
     """
-    token = decision or decide(facts)
-    side = ("left" in token) - ("right" in token)
-    name = FAMILY_OF[token]
     choose = Chooser(facts, draws)
-    reasons = list(choose.holding(sentences()["reasons"][name], side))
-    if not reasons:
+    for token in [decision] if decision else ranked(facts):
+        side = ("left" in token) - ("right" in token)
+        name = FAMILY_OF[token]
+        if reasons := list(choose.holding(sentences()["reasons"][name], side)):
+            break
+    else:
         return None
     components, trace = _critical_components(choose, side), _reasoning_trace(choose, name, side, reasons)
     texts = [(" ".join([en for en, _ in both]), "".join([zh for _, zh in both])) for both in (components, trace)]

@@ -236,7 +236,11 @@ def _relation(reference: Reference, facts: Facts, at: int) -> str | None:
 def _over_span(reference: Reference, facts: Facts) -> float | None:
     """Return a number over a span, not rounded."""
     name, aspect, first, last = reference
-    whole = {"speed": facts.mean_speed_mps, "target_speed": facts.target_speed_mps}
+    climb_mps = facts.velocity_mps[2]
+    whole = {
+        "speed": facts.mean_speed_mps, "target_speed": facts.target_speed_mps,
+        "climb_rate": climb_mps, "sink_rate": 0.0 - climb_mps,
+    }  # fmt: skip
     if aspect == "mean" and name in whole and first is last is None:
         return whole[name]  # of the straight line through all positions, not of its jitter
     values = _span(reference, facts)
