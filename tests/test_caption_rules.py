@@ -7,14 +7,13 @@ import pytest
 
 from caption.schema import WindowConfig
 from caption.stage.windows import cut_windows
-from caption.teachers.rule_decisions import is_shaken
+from caption.teachers.rule_decisions import is_shaken, ranked
 from caption.teachers.rules import (
     FAMILIES,
     STRIKING_TOPICS,
     TOPICS,
     TOPICS_HIDDEN,
     TOPICS_ORDERED,
-    decide,
     sentences,
     write_templates,
 )
@@ -65,7 +64,8 @@ def test_both_languages_of_a_sentence_agree():
 def test_a_caption_has_few_facts_a_reason_and_known_values(facts):
     for i, one in enumerate(facts):
         english, chinese = write_templates(one, random_bytes(0, "rules", str(i)))
-        assert english["flight_decision"] == chinese["flight_decision"] == decide(one)
+        assert english["flight_decision"] == chinese["flight_decision"]
+        assert english["flight_decision"] in ranked(one)
         for name in FIELDS:
             assert len(cut_sentences(english[name])) == len(cut_sentences(chinese[name]))
             for slot in set(SLOT.findall(english[name])) - {"decision", "side:decision"}:

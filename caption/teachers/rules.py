@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 
 from caption.teachers.rule_decisions import LEAST_TURN_DEG, decide, expected_sizes, is_shaken, ranked, sight_rate_dps
@@ -29,6 +29,7 @@ CLEAR_WALK_MPS, CLEAR_GAP_M = 0.9, 4.0  # less is taken for shaking on a perturb
 BEND_DEG = 15.0  # a change of the target's heading that is worth a sentence
 SMALL_SHARE, LARGE_SHARE = 0.04, 0.4  # of the picture's height
 STEEP_DEG = 55.0
+STRIDE_M = 3.0  # the most that two people come nearer to each other between frames
 NEAR_M, COMING_M = 3.0, 6.0  # from the target to a bystander at its side, to one on the way to it
 MOST_DIFFERENCES = 1  # in appearance, of a person who is similar
 SLOW_MPS, SLIDING_MPS, CRAWLING_MPS, DRIFTING_MPS = 0.3, 0.5, 0.7, 0.2
@@ -191,6 +192,11 @@ def drifts(f: Facts, side: int) -> bool:
     return side * (last_deg - first_deg) >= DRIFT_DEG and not is_across(f, side)
 
 
+def is_bearing_steady(f: Facts) -> bool:
+    first_deg, last_deg = f.bearing_deg[0], f.bearing_deg[-1]
+    return first_deg is not None and last_deg is not None and abs(last_deg - first_deg) < 2 * DRIFT_DEG
+
+
 def strafes_on(f: Facts, side: int) -> bool:
     """Return whether a strafe goes on, and the target does not drift out of the picture on the other side."""
     first_deg, last_deg = f.bearing_deg[0], f.bearing_deg[-1]
@@ -224,9 +230,10 @@ def gap_scatters(f: Facts, side: int) -> bool:
 
 
 def bystander_closes(f: Facts, side: int) -> bool:
-    before_m, now_m = (distance or math.inf for distance in f.other_distance_m[-2:])
-    is_coming = f.is_visible_now and word_of(f, "trend:other_distance") == "decreasing"
-    return is_coming and now_m < before_m and now_m <= COMING_M
+    """Return whether the nearest bystander comes nearer from frame to frame; a jump is another person."""
+    steps_m = [a - b if a and b else 0.0 for a, b in pairwise(f.other_distance_m[-3:])]
+    is_near = f.is_visible_now and (f.other_distance_m[-1] or math.inf) <= COMING_M
+    return is_near and all(0.0 < step_m < STRIDE_M for step_m in steps_m)
 
 
 @dataclass(frozen=True)
@@ -258,7 +265,12 @@ FAMILY_OF = {token: name for name, family in FAMILIES.items() for token in famil
 
 def expects(family: Family) -> Condition:
     """Return the condition that the observed frames themselves lead to a decision of a family, on its side."""
-    return lambda f, side: decide(f) == family.tokens[side < 0]
+
+    def holds(f: Facts, side: int) -> bool:
+        token = family.tokens[side < 0]
+        return token in ranked(f) and (token != "track_straight" or token == decide(f))
+
+    return holds
 
 
 def is_ordered(kind: str) -> Condition:
@@ -278,10 +290,14 @@ CONDITIONS: dict[str, Condition] = {
     "off_centre_little": lambda f, side: off_centre(f, side) and abs(f.bearing_deg[-1] or 0.0) <= LITTLE_DEG
     and not is_turning(f, side),
     "turns_little": lambda f, side: turns(f, side) and abs(f.target_turn_deg or 0.0) <= LITTLE_TURN_DEG,
-    "turn_goes_on": lambda f, side: side * (f.yaw_rate_dps[-1] or 0.0) >= TURNING_DPS and not is_across(f, side),
+    "turn_goes_on": lambda f, side: side * (f.yaw_rate_dps[-1] or 0.0) >= TURNING_DPS,
+    "turns_sight": lambda f, side: turns(f, side) and sight_turns(f, side),
+    "slides_steadily": lambda f, side: slides(f, side) and not is_crawling(f, side) and is_bearing_steady(f),
+    "turns_steadily": lambda f, side: abs(f.yaw_rate_dps[-1] or 0.0) >= SLIGHT_DPS and is_bearing_steady(f),
+    "hovers_on": lambda f, side: (f.target_speed_mps or 0.0) < DAWDLING_MPS and expects(FAMILIES["hover"])(f, side),
     "turns_with_sight": lambda f, side: side * (f.yaw_rate_dps[-1] or 0.0) >= TURNING_DPS
     and f.is_visible_now and side * sight_rate_dps(f) >= TURNING_DPS,
-    "strafes_on": strafes_on, "circles_on": circles_on,
+    "strafes_on": strafes_on, "circles_on": circles_on, "bearing_steady": lambda f, side: is_bearing_steady(f),
     "drifts": drifts,
     "turned": lambda f, side: abs(f.yaw_deg[-1]) >= LEAST_TURN_DEG,
     "off_centre_no_turn": lambda f, side: off_centre(f, side) and (side != 0 or not is_turning(f, side)),
@@ -291,7 +307,7 @@ CONDITIONS: dict[str, Condition] = {
     "pace_matched": says("comparison:speed", "matching", is_smooth, walks, walks_evenly),
     "outrun": says("comparison:speed", "slower", is_smooth, walks, walks_evenly, gap_moves),
     "overtakes": lambda f, side: is_smooth(f, side) and walks_evenly(f, side)
-    and f.velocity_mps[0] > (f.target_speed_mps or math.inf),
+    and f.velocity_mps[0] > max(f.target_speed_mps or math.inf, f.target_speeds_mps[-1] or math.inf),
     "nose_turns": nose_turns,
     "drone_hovers": says("drone_motion", "hovering", lambda f, side: (f.speed_mps[-1] or 0.0) < SLOW_MPS),
     "drone_brakes": says("trend:speed", "decreasing", is_smooth, is_crawling),
@@ -302,7 +318,6 @@ CONDITIONS: dict[str, Condition] = {
     "turning": lambda f, side: abs(f.yaw_rate_dps[-1] or 0.0) >= SLIGHT_DPS,
     "turns_back": lambda f, side: side * (f.yaw_rate_dps[-1] or 0.0) <= -TURNING_DPS,
     "drone_backs": lambda f, side: f.velocity_mps[0] <= -max(SLOW_MPS, abs(f.velocity_mps[1])),
-    "drone_slides": lambda f, side: slides(f, side) and not is_crawling(f, side),
     "drone_lingers": lambda f, side: max(map(abs, f.velocity_mps[:2])) < DRIFTING_MPS,
     "drone_shifts": lambda f, side: abs(f.velocity_mps[1]) >= abs(f.velocity_mps[0]),
     "climbing": lambda f, side: f.velocity_mps[2] >= CLIMBING_MPS,
@@ -433,8 +448,8 @@ def _reasoning_trace(choose: Chooser, name: str, side: int, reasons: list[Group]
     number = choose.below(len(reasons) if name == "straight" else min(len(reasons), 2))
     main = accounts.pop(0) if accounts else reasons.pop(number)  # what a reader would ask about is answered
     remarks = list(islice(choose.holding(sentences()["remarks"]["any"], 0), 1))
-    consequences = [sentences()["consequences"][FAMILIES[name].why]["always"]]
-    second = accounts[:1] or (remarks or consequences, [])[choose.below(2)]
+    consequences = list(choose.holding(sentences()["consequences"][FAMILIES[name].why], side))
+    second = (remarks or consequences[:1], [])[choose.below(2)]
     first, *others = [choose.sentence(group) for group in (main, *second, _conclusions(name))]
     lead = next(choose.holding(sentences()["leads"][name], side)).smooth[0]
     return [(f"{lead[0]} {first[0][0].lower()}{first[0][1:]}", lead[1] + first[1]), *others]
