@@ -40,7 +40,6 @@ HIDDEN = ("occluded", "out_of_view")
 CLOSE_M = 15.0  # a target that comes nearer than this leaves the drone little room
 LITTLE_DEG, LITTLE_TURN_DEG = 5.0, 40.0  # bearings and turns of the target that hardly matter
 DRIFT_DEG = 1.5  # a smaller change of the bearing is not worth a sentence
-WIDE_DEG = 15.0  # a target further from the axis does not stay in the picture by itself
 ACROSS_SIGHT_DEG = 2.0  # a target further on the other side comes to the middle without a turn of the nose
 # Topics of critical_components: what decisions rest on where the target is visible, hidden, and under an order.
 TOPICS = ("heading", "height", "drone", "motion")
@@ -202,7 +201,7 @@ def strafes_on(f: Facts, side: int) -> bool:
     first_deg, last_deg = f.bearing_deg[0], f.bearing_deg[-1]
     if first_deg is None or last_deg is None or not expects(FAMILIES["strafe"])(f, side):
         return False
-    return abs(last_deg) <= WIDE_DEG and (is_shaken(f) or side * (last_deg - first_deg) >= -3 * DRIFT_DEG)
+    return side * last_deg >= -LITTLE_DEG and (is_shaken(f) or side * (last_deg - first_deg) >= -2 * DRIFT_DEG)
 
 
 def circles_on(f: Facts, side: int) -> bool:
@@ -296,7 +295,9 @@ CONDITIONS: dict[str, Condition] = {
     "turns_steadily": lambda f, side: abs(f.yaw_rate_dps[-1] or 0.0) >= SLIGHT_DPS and is_bearing_steady(f),
     "hovers_on": lambda f, side: (f.target_speed_mps or 0.0) < DAWDLING_MPS and expects(FAMILIES["hover"])(f, side),
     "turns_with_sight": lambda f, side: side * (f.yaw_rate_dps[-1] or 0.0) >= TURNING_DPS
-    and f.is_visible_now and side * sight_rate_dps(f) >= TURNING_DPS,
+    and f.is_visible_now and side * sight_rate_dps(f) >= TURNING_DPS
+    and side * (f.bearing_deg[-1] or 0.0) >= -LITTLE_DEG,
+    "on_its_side": lambda f, side: side * (f.bearing_deg[-1] or 0.0) >= 1.0,
     "strafes_on": strafes_on, "circles_on": circles_on, "bearing_steady": lambda f, side: is_bearing_steady(f),
     "drifts": drifts,
     "turned": lambda f, side: abs(f.yaw_deg[-1]) >= LEAST_TURN_DEG,
