@@ -68,7 +68,6 @@ class Sample(SplitMember):
     repair: str | None  # strategy of the repair that made the answer; None: as the teacher gave it
     weight: float
     past: tuple[float, ...] = ()  # see cosfly/inspection/blind_baseline.py; () where not known
-    drawn_ahead: bool | None = None  # something was drawn within the label's future; None: not known
 
     @property
     def key(self) -> str:

@@ -120,7 +120,6 @@ INPUTS: dict[str, Callable[[Place], object]] = {
     "base": lambda place: place.do("run", place.root / "base"), "walk": _walk, "students": _students,
     "trained": lambda place: place.do("distill train", place.root / "trained"),
     "inferred": lambda place: place.do("distill infer", place.root / "inferred"),
-    "evaluated": lambda place: place.do("distill evaluate", place.root / "evaluated"),
     "flown": lambda place: place.do("fly", place.root / "flown"),
     "erred": lambda place: place.do("fly", place.root / "erred", "--student random"),
     "teacher": lambda place: _chat_server(place).url, "judge": _judge, "carla": partial(_simulator, "carla"),
@@ -225,7 +224,6 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "distill evaluate": [
         "distill evaluate --dataset {students}/set --predictions {inferred}/predictions.jsonl --out {out}"
     ],
-    "distill report": ["distill report {evaluated} --out {out}"],
     "run": ["run quickstart --out {out} {tiny}"],
     "run, towns": ["run quickstart --out {out} {tiny} {towns}"],
     "run, towns, release": ["run quickstart --out {out} {tiny} {towns}", lose_release, "run {out}"],

@@ -57,6 +57,22 @@ def test_a_past_is_the_same_wherever_and_whenever_it_was(seed):
     assert not np.array_equal(past_of(flight, range(5), True), here)
 
 
+def test_a_past_holds_what_a_prompt_may_tell():
+    """Poses as they were drawn, with their perturbation, and no place of a target that nobody sees."""
+    clean = flight_of(EVEN)
+    shifted_m = np.zeros((NUM, 3))
+    shifted_m[3] = 0.5, -0.5, 0.2
+    noisy = replace(
+        clean, is_original=False, positions_m=clean.positions_m + shifted_m,
+        perturbation=replace(clean.perturbation, drone_m=shifted_m, rotation_deg=np.zeros((NUM, 3))),
+    )  # fmt: skip
+    np.testing.assert_allclose(noisy.planned[0][:, :3], clean.positions_m, atol=1e-9)
+    assert np.abs(past_of(noisy, range(5), False) - past_of(clean, range(5), False)).max() > 0.4
+    hidden = replace(clean, target=replace(clean.target, visible=np.zeros(NUM, dtype=bool)))
+    moved = replace(hidden, targets_m=hidden.targets_m + np.random.default_rng(0).normal(size=(NUM, 3)))
+    assert np.array_equal(past_of(moved, range(5), False), past_of(hidden, range(5), False))
+
+
 @pytest.mark.parametrize(("steps_m", "first", "last"), [
     ([0.6] * 8 + [0.0] * 4, 3, 7),  # it stops on the way to frame 8
     ([0.0] * 8 + [0.6] * 4, 3, 7),  # it sets off

@@ -12,7 +12,6 @@ from hypothesis import settings as bounded
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
-from specimens_foreign import write_foreign_tree
 
 from cosfly.formats.captions import TOKENS, write_captions
 from cosfly.formats.playback import read_track
@@ -150,22 +149,12 @@ def test_run_writes_leak_free_splits_and_counts_that_add_up(tree, captions, tmp_
         assert splits["test"]
 
 
-def test_a_sample_has_its_past_and_whether_something_was_drawn_after_it(tree, captions, tmp_path):
-    """Of its own frames; both languages and, as it is without perturbation, both tracks nearly the same. Who flew a
-    foreign tree, and by what choice, nobody knows."""
+def test_a_sample_has_the_past_of_its_own_frames(tree, captions, tmp_path):
     samples = [sample for split in SPLITS for sample in open_split(prepared(tree, captions, tmp_path / "set"), split)]
-    pasts = {}
+    assert {sample.variant for sample in samples} == {"ORI", "aug_001"}
     for sample in samples:
         past = past_of(read_track(tree / sample.folder), sample.window, False)
         np.testing.assert_allclose(sample.past, past, atol=1e-4)
-        pasts.setdefault((sample.town, sample.trajectory, sample.window), []).append(past[:12])
-    assert all(np.ptp(found, axis=0).max() < 1e-3 for found in pasts.values())
-    assert {sample.drawn_ahead for sample in samples} <= {True, False}
-    foreign = write_foreign_tree(tmp_path / "foreign", trajectories=("trajectory_1", "trajectory_9"))
-    own = [make_caption("Town01", "trajectory_9", "ORI", frame, picture_px=(96, 54)) for frame in range(4, 9)]
-    write_captions(tmp_path / "captions.jsonl", own)
-    out = prepared(foreign, tmp_path / "captions.jsonl", tmp_path / "set2", val_fraction=0, test_fraction=0)
-    assert {sample.drawn_ahead for sample in open_split(out, "train")} == {None}
 
 
 def test_run_counts_what_it_leaves_out(tree, tmp_path):

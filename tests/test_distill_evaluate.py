@@ -2,23 +2,23 @@
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from specimens_distill import make_caption, write_set
 
-from cosfly.formats.captions import TOKENS
+from cosfly.formats.captions import TOKENS, ValueCounts, write_captions
 from cosfly.formats.predictions import Prediction
-from cosfly.geometry.trajectory_metrics import draw_pedestrians
 from cosfly.inspection.blind_baseline import LEAST_WINDOWS
-from cosfly.runtime.json_io import dump_json
-from distill.evaluation.bertscore import BertScoreConfig, Scorer
-from distill.evaluation.floors import Floors, coc_of, majority
-from distill.evaluation.measure import STUDENT, measure, pair_up, read_report, text_of
-from distill.evaluation.scores import VALUES, VERDICTS, ScoredAnswer, Scores, differences_of, figures_of, score_answers
-from distill.evaluation.stage import EvaluateConfig, run
+from cosfly.runtime.errors import CosflyError, InputError
+from cosfly.runtime.json_io import dump_json, read_model
+from distill.evaluation import figures
+from distill.evaluation.bertscore import Scorer
+from distill.evaluation.figures import Answers, coc_of, measure, text_of
+from distill.evaluation.floors import floors_of, majority
+from distill.evaluation.report import REPORT_FORMAT, Evaluation
+from distill.evaluation.stage import EvaluateConfig, asked_samples, run
 from distill.inference.outcome import failed_prediction, make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample
@@ -57,129 +57,130 @@ def samples() -> list[Sample]:
     return found
 
 
-def scores_of(samples, predictions=None, **more) -> Scores:
-    pairs = pair_up(samples, predictions or predictions_of(samples))
-    answers = [ScoredAnswer.of(prediction) for _, prediction in pairs]
-    return score_answers([sample for sample, _ in pairs], answers, **more)
-
-
-def figures(scores: Scores, resamples: int = 200, confidence: float = 0.95):
-    draws = draw_pedestrians(len(set(scores.walk)), resamples, np.random.default_rng(0))
-    return figures_of(scores, draws, confidence=confidence)
+def measured(samples, predictions=None, values=None):
+    predictions = predictions or predictions_of(samples)
+    answers = Answers.of_student(predictions, values or [None] * len(samples))
+    return measure(samples, {"student": answers}, ["student"], np.random.default_rng(0)).who["student"]
 
 
 def test_measured_numbers_by_hand(samples):
-    scores = scores_of(samples)
-    found, by_decision = figures(scores)
-    table = measure({STUDENT: scores}, [], resamples=100, confidence=0.9, seed=0).who[STUDENT].confusion
-    assert table["track_straight"] == {"(unparsed)": 1, "slow_down": 1, "track_straight": 2}
-    assert {name: figure.value for name, figure in found.items() if figure.value is not None} == pytest.approx(
+    counts = [ValueCounts(values_matched=3, values_contradicted=1), ValueCounts(values_matched=2), *[None] * 6]
+    found = measured(samples, values=counts)
+    assert found.confusion["track_straight"] == {"(unparsed)": 1, "slow_down": 1, "track_straight": 2}
+    assert {name: figure.value for name, figure in found.figures.items() if figure.value is not None} == pytest.approx(
         {
             "answered": 1.0,
             "parsed": 6 / 8,
-            "parsed_unmended": 5 / 8,
+            "parsed_unchanged": 5 / 8,
             "accuracy": 4 / 8,
             "accuracy_parsed": 4 / 6,
             # slow_down: 1 hit of 2 references, 2 answers; track_straight: 2 of 4, 3; yaw_left_to_follow: 1 of 2, 1.
             "macro_f1": (2 * 1 / (2 + 2) + 2 * 2 / (4 + 3) + 2 * 1 / (2 + 1)) / 3,
             "accuracy_on_labels": 3 / 6,  # frames 4, 10, 11 of 4, 5, 7, 8, 10, 11, which are no multiples of 3
+            "values_matched": 5 / 6,
+            "values_contradicted": 1 / 6,
             "tokens": 9.0,
         }
     )
-    assert (found["accuracy"].count, found["accuracy_parsed"].count) == (8, 6)
-    assert (found["accuracy"].low, found["accuracy"].high) == (None, None)  # of one walk
-    told = {name: (figure.value, figure.count) for name, figure in by_decision.items()}
+    accuracy = found.figures["accuracy"]
+    assert (accuracy.count, found.figures["accuracy_parsed"].count) == (8, 6)
+    assert (accuracy.low, accuracy.high) == (None, None)  # of one walk
+    told = {name: (figure.value, figure.count) for name, figure in found.by_decision.items()}
     assert told == {"track_straight": (2 / 4, 4), "yaw_left_to_follow": (1 / 2, 2), "slow_down": (1 / 2, 2)}
 
 
 def test_failures_are_no_wrong_answers(samples):
     predictions = predictions_of(samples)
     predictions[7] = failed_prediction(samples[7], "test", "damaged_picture")  # was right
-    found, _ = figures(scores_of(samples, predictions))
+    found = measured(samples, predictions).figures
     assert (found["answered"].value, found["answered"].count) == (7 / 8, 8)
     assert (found["accuracy"].value, found["accuracy"].count) == (3 / 7, 7)
     assert found["parsed"].value == 5 / 7
-    report = measure({STUDENT: scores_of(samples, predictions)}, predictions, resamples=100, confidence=0.9, seed=0)
-    assert report.failed == {"failed_damaged_picture": 1}
-    assert report.unparsed == {"broken_json": 1, "no_json_object": 1}
 
 
 def test_verdicts_are_those_of_the_true_future(samples):
     futures = [("slow_down", ()), ("hover", ()), (None, ("track_straight",)), (None, ()), ("hover", ("hover",))]
-    futures += [(None, None)] * 3
+    futures += [("track_straight", ()), ("hover", ("yaw_left_to_follow",)), (None, None)]
     known = [
         sample.model_copy(update={"label": label, "contradicted": contradicted})
         for sample, (label, contradicted) in zip(samples, futures, strict=True)
     ]
-    scores = scores_of(known, predictions_of(samples))
-    # Answers: slow_down, slow_down, track_straight, then two that do not parse; of the last three nothing is known.
-    words = [VERDICTS[number] if number >= 0 else None for number in scores.verdict]
-    assert words == ["CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", *[None] * 5]
-    found, _ = figures(scores)
-    assert (found["consistent"].value, found["hard_conflict"].count) == (1 / 3, 3)
+    found = measured(known, predictions_of(samples)).figures
+    # Answers: slow_down, slow_down, track_straight, two that do not parse, track_straight, yaw_left_to_follow; of the
+    # future of the last nothing is known.
+    values = {name: found[name].value for name in ("consistent", "soft_conflict", "hard_conflict", "abstain")}
+    assert values == {"consistent": 2 / 5, "soft_conflict": 1 / 5, "hard_conflict": 2 / 5, "abstain": 0}
+    assert found["hard_conflict"].count == 5
 
 
-def made_up(num_walks: int, rng: np.random.Generator, *, size: int = 6, skill: float = 0.6) -> Scores:
-    """Scores of walks of some size, in which right answers come in clumps."""
-    sizes = rng.integers(2, 2 * size, num_walks)
-    walk = np.repeat([f"walk_{i}" for i in range(num_walks)], sizes).astype(object)
-    count = len(walk)
-    right = rng.random(count) < np.repeat(rng.beta(2 * skill, 2 * (1 - skill), num_walks), sizes)
-    reference = rng.integers(0, 3, count).astype(np.int8)
-    texts = {name: np.full(count, "x", dtype=object) for name in ("language", "against")}
-    texts |= {"key": np.array([f"{name}/{i}" for i, name in enumerate(walk)], dtype=object), "walk": walk}
-    unknown = {name: np.full(count, np.nan) for name in ("precision", "recall", "f1", "drawn_ahead", *VALUES)}
-    codes = {name: np.full(count, -1, dtype=np.int8) for name in ("label", "verdict")}
-    flags = {name: np.ones(count, dtype=bool) for name in ("answered", "unmended")}
-    answer, tokens = np.where(right, reference, 5).astype(np.int8), np.zeros(count, dtype=np.int64)
-    known = {"reference": reference, "answer": answer, "num_tokens": tokens}
-    return Scores(**known, **texts, **unknown, **codes, **flags)
+def made_up(num_walks: int, rng: np.random.Generator) -> tuple[list[Sample], np.ndarray]:
+    """Samples of walks of some size, and decisions of a student whose right answers come in clumps."""
+    sizes = rng.integers(2, 12, num_walks)
+    right = rng.random(sizes.sum()) < np.repeat(rng.beta(1.2, 0.8, num_walks), sizes)
+    reference = rng.integers(0, 3, sizes.sum())
+    base = sample_of(4)
+    walks = np.repeat([f"walk_{i}" for i in range(num_walks)], sizes).tolist()
+    found = [
+        base.model_copy(update={"walk": walk, "sample_id": f"{walk}/{i}", "decision": TOKENS[number]})
+        for i, (walk, number) in enumerate(zip(walks, reference.tolist(), strict=True))
+    ]
+    return found, np.where(right, reference, 5)
 
 
-def test_intervals_agree_with_the_bootstrap_of_scipy():
+def test_intervals_agree_with_the_bootstrap_of_scipy(monkeypatch):
     from scipy.stats import bootstrap
 
-    scores = made_up(60, np.random.default_rng(1))
-    right = scores.answer == scores.reference
-    walks = [right[scores.walk == name] for name in dict.fromkeys(scores.walk)]
-    sums, counts = np.array([walk.sum() for walk in walks]), np.array([len(walk) for walk in walks])
+    samples, decisions = made_up(60, np.random.default_rng(1))
+    right = np.array([TOKENS.index(sample.decision) for sample in samples]) == decisions
+    walk = np.array([sample.walk for sample in samples])
+    walks = [right[walk == name] for name in dict.fromkeys(walk)]
+    sums, counts = np.array([own.sum() for own in walks]), np.array([len(own) for own in walks])
     expected = bootstrap(
         (sums, counts), lambda s, n, axis: s.sum(axis=axis) / n.sum(axis=axis), paired=True, method="percentile",
-        n_resamples=9999, confidence_level=0.9, rng=np.random.default_rng(2),
+        n_resamples=9999, rng=np.random.default_rng(2),
     ).confidence_interval  # fmt: skip
-    found = figures(scores, 9999, 0.9)[0]["accuracy"]
+    monkeypatch.setattr(figures, "RESAMPLES", 9999)
+    everyone = {"student": Answers.of(decisions)}
+    found = measure(samples, everyone, ["student"], np.random.default_rng(0)).who["student"].figures["accuracy"]
     assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=4e-3)
     assert found.value == right.mean()
 
 
-def test_paired_differences(samples):
+def test_paired_differences():
     rng = np.random.default_rng(5)
-    one = made_up(50, rng)
-    worse = replace(one, answer=np.where(rng.random(len(one)) < 0.3, 7, one.answer).astype(np.int8))
+    samples, decisions = made_up(50, rng)
+    worse = np.where(rng.random(len(samples)) < 0.3, 7, decisions)
+    everyone = {"one": Answers.of(decisions), "worse": Answers.of(worse), "same": Answers.of(decisions)}
+    found = measure(samples, everyone, [*everyone], np.random.default_rng(0))
+    pairs = {(pairing.first, pairing.second): pairing.differences["accuracy"] for pairing in found.pairings}
+    assert [*pairs] == [("one", "worse"), ("one", "same"), ("worse", "same")]
+    one, other = (found.who[name].figures["accuracy"] for name in ("one", "worse"))
+    difference = pairs["one", "worse"]
+    assert difference.value == pytest.approx(one.value - other.value)
+    # On the same draws a difference is known better than from the two intervals.
+    assert 0 < difference.low < difference.high < one.high - other.low
+    assert (pairs["one", "same"].value, pairs["one", "same"].low, pairs["one", "same"].high) == (0, 0, 0)
 
-    def compared(other: Scores, resamples: int = 2000) -> tuple:
-        return differences_of(one, other, resamples=resamples, confidence=0.95, rng=np.random.default_rng(0))
 
-    count, found = compared(worse)
-    accuracy, right = found["accuracy"], [(each.answer == each.reference).mean() for each in (one, worse)]
-    assert (count, accuracy.value) == (len(one), pytest.approx(right[0] - right[1]))
-    assert (accuracy.low > 0, accuracy.p) == (True, 1 / 2000)
-    # The same samples in another order, and a few of them: keys pair, not places.
-    order = rng.permutation(len(one))
-    assert compared(worse.at(order)) == (count, found)
-    same = compared(one.at(order[:40]), 200)
-    assert (same[0], same[1]["accuracy"].value, same[1]["accuracy"].p) == (40, 0.0, 1.0)
-    assert compared(replace(one, key=one.key + "x"), 200)[0] == 0
+def test_students_are_measured_on_the_samples_of_all(samples):
+    found = {"a": {p.key: p for p in predictions_of(samples)}, "b": {p.key: p for p in predictions_of(samples)[2:]}}
+    assert asked_samples(samples, found) == samples[2:]
+    with pytest.raises(InputError, match="does not contain the sample"):
+        asked_samples(samples[1:], found)
+
+
+def decisions_of(answers: Answers) -> list[str]:
+    return [TOKENS[number] for number in answers.decision]
 
 
 def test_floors_by_hand(samples):
     train = [sample.model_copy(update={"decision": "hover"}) for sample in samples[:3]] + samples[3:5]
-    answers = Floors(train, "en", 0).answers(samples, [coc_of(sample) for sample in samples])
-    decisions = {name: [answer.coc.flight_decision for answer in own] for name, own in answers.items()}
-    assert set(decisions["majority"]) == {"hover"}
-    assert sorted(decisions["shuffled"]) == sorted(DECISIONS)
-    assert len({answer.coc.reasoning_trace for answer in answers["constant"]}) == 1
-    assert list(Floors([], "en", 0).answers(samples[:1], [coc_of(samples[0])])) == ["teacher"]
+    answers = floors_of(train, samples, "en", 0)
+    assert set(decisions_of(answers["majority"])) == {"hover"}
+    assert len(set(answers["majority"].texts)) == 1
+    assert answers["majority"].texts[0] in {text_of(coc_of(sample)) for sample in samples[:3]}
+    assert decisions_of(answers["teacher"]) == DECISIONS
+    assert list(floors_of([], samples[:1], "en", 0)) == ["teacher"]
     assert majority(["slow_down", "track_straight"]) == "track_straight"  # a tie goes to the first of the action table
 
 
@@ -196,44 +197,33 @@ def test_a_rule_and_a_network_that_see_no_picture_beat_the_majority(samples):
             found.append(samples[0].model_copy(update={"past": past, "decision": decision}))
         return found
 
-    floors, asked = Floors(told(400), "en", 0), told(100)
-    answers = floors.answers(asked, [coc_of(sample) for sample in asked])
-    decisions = {name: np.array([answer.coc.flight_decision for answer in own]) for name, own in answers.items()}
+    train, asked = told(400), told(100)
+    answers = floors_of(train, asked, "en", 0)
     wanted = np.array([sample.decision for sample in asked])
-    assert (decisions["rule"] == wanted).sum() >= 97
-    assert (decisions["blind"] == wanted).sum() >= 90
-    assert (decisions["majority"] == wanted).sum() < 60
+    right = {name: (np.array(decisions_of(own)) == wanted).sum() for name, own in answers.items()}
+    assert right["rule"] >= 97
+    assert right["blind"] >= 90
+    assert right["majority"] < 60
     few, mixed = told(LEAST_WINDOWS - 1), [*told(400), samples[0]]
     for train, left_out in ((few, {"blind"}), (mixed, {"rule", "blind"}), (samples, {"rule", "blind"})):
-        found = Floors(train, "en", 0).answers(asked, [coc_of(sample) for sample in asked])
-        assert answers.keys() - found.keys() == left_out
-
-
-def test_what_was_drawn_after_the_window_is_counted_apart(samples):
-    ahead = [None, True, True, True, True, False, False, False]
-    wrong = [sample.model_copy(update={"drawn_ahead": a}) for sample, a in zip(samples, ahead, strict=True)]
-    answers = [ScoredAnswer(coc_of(sample)) for sample in wrong]
-    other = next(token for token in TOKENS if token not in DECISIONS)
-    for place in (1, 2, 3):
-        answers[place] = ScoredAnswer(answers[place].coc.model_copy(update={"flight_decision": other}))
-    figures, _ = figures_of(score_answers(wrong, answers), np.ones((1, 1)), confidence=0.9)
-    assert (figures["drawn_ahead"].value, figures["drawn_ahead"].count) == (4 / 7, 7)
-    assert (figures["accuracy_settled"].value, figures["accuracy_settled"].count) == (1.0, 3)
-    figures, _ = figures_of(score_answers(samples, answers), np.ones((1, 1)), confidence=0.9)
-    assert figures["drawn_ahead"].value is figures["accuracy_settled"].value is None
+        assert answers.keys() - floors_of(train, asked, "en", 0).keys() == left_out
 
 
 @pytest.fixture
 def place(tmp_path, samples) -> Path:
+    """set/ in both languages, of two walks; predictions of the students `one` and `other`."""
     both = [*samples, *(sample_of(frame, "zh") for frame in FRAMES)]
     known = {"contradicted": ("ascend",)}
     both = [sample.model_copy(update={"walk": f"walk_{k % 2}", **known}) for k, sample in enumerate(both)]
     write_set(tmp_path / "set", {"train": both, "val": both, "test": both})
-    write_predictions(tmp_path, predictions_of(both[:8]) + predictions_of(both[8:]))
+    write_predictions(tmp_path / "one", predictions_of(both[:8]) + predictions_of(both[8:]))
+    right = [make_prediction(sample, "test", sample.answer, 9, True) for sample in both]
+    write_predictions(tmp_path / "other", right)
     return tmp_path
 
 
 def write_predictions(place: Path, records: list[Prediction]) -> None:
+    place.mkdir()
     lines = [dump_json(record.model_dump(mode="json")) for record in records]
     (place / "predictions.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
@@ -241,23 +231,58 @@ def write_predictions(place: Path, records: list[Prediction]) -> None:
 CFG = EvaluateConfig()
 
 
-def test_without_a_model_the_report_says_so_and_gives_no_number(place):
-    path = run(CFG, place / "predictions.jsonl", place / "set", place / "out")
+def read_report(folder: Path) -> Evaluation:
+    return read_model(folder / "report.json", Evaluation, REPORT_FORMAT, tree=folder)
+
+
+def test_without_an_encoder_the_report_says_so_and_gives_no_number(place):
+    path = run(CFG, [place / "one/predictions.jsonl"], place / "set", place / "out")
     report = read_report(path.parent)
     assert report.metrics == {"en": None, "zh": None}
-    student, teacher = report.languages["zh"].who[STUDENT].figures, report.all.who["teacher"].figures
+    student, teacher = report.languages["zh"].who["one"].figures, report.all.who["teacher"].figures
     assert (student["parsed"].value, student["bertscore_f1"].value) == (0.75, None)
     accuracy = {name: own.figures["accuracy"].value for name, own in report.all.who.items()}
-    assert (accuracy.pop(STUDENT), accuracy.pop("majority"), accuracy.pop("teacher")) == (8 / 16, 8 / 16, 1)
-    assert accuracy.keys() == {"shuffled", "constant"}  # no sample has a past
+    assert accuracy == {"one": 8 / 16, "majority": 8 / 16, "teacher": 1}  # no rule: no sample has a past
     assert (teacher["accuracy_on_labels"].value, teacher["bertscore_f1"].value) == (1, None)
+    assert report.students["one"].unparsed == {"broken_json": 2, "no_json_object": 2}
     page = (place / "out" / "evaluation.md").read_text()
-    assert "BERTScore of en: not computed, because no model folder" in page
-    assert re.search(r"\| answers that parse \| 75\.00% \(.*to.*\) \| 100\.00% \|", page)
+    assert "BERTScore of en was not computed, because no encoder was passed" in page
     assert len(report.examples) == 12
-    again = run(CFG, place / "predictions.jsonl", place / "set", place / "again")
-    for name in ("report.json", "evaluation.md", "evaluation.html", "scores.parquet"):
+    again = run(CFG, [place / "one"], place / "set", place / "again")
+    for name in ("report.json", "evaluation.md", "evaluation.html"):
         assert (again.parent / name).read_bytes() == (path.parent / name).read_bytes()
+
+
+def test_the_table_has_everybody_side_by_side(place):
+    """Students, teacher, baselines and the paper, in one row of a figure; and who is better."""
+    out = run(CFG, [place / "one", place / "other"], place / "set", place / "out").parent
+    page = (out / "evaluation.md").read_text()
+    header, *rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.split("\n") if line[:1] == "|"]
+    columns = ["one", "other", "teacher", "baseline: majority", "paper: Qwen3.5-2B + LoRA", "paper: Qwen3.5-4B + LoRA"]
+    assert header[1:] == columns
+    table = {row[0]: [cell.split(" ")[0] for cell in row[1:]] for row in rows[: len(figures.FIGURES)]}
+    assert table["answers that parse"] == ["75.0%", "100.0%", "100.0%", "100.0%", "100.0%", "100.0%"]
+    assert table["decision is the teacher's, parsed answers"][-2:] == ["68.7%", "70.1%"]
+    assert table["verdict: hard conflict"] == ["0.0%"] * 4 + ["-"] * 2
+    assert re.search(r"\| decision is the teacher's, all answers \| 50\.0% \(\d.*% to .*%\) \| 100\.0% \(", page)
+    assert "### one minus other" in page
+    difference = next(row for row in rows if row[0].startswith("decision is the teacher's, all") and len(row) == 3)
+    assert (difference[1].split(" ")[0], difference[2]) == ("-50.0%", "other")
+
+
+def test_values_of_a_students_texts_come_from_the_captions_made_of_them(place, tmp_path):
+    texts = json.loads(sample_of(11).answer)
+    checks = {"values": {"en": {"values_matched": 3, "values_contradicted": 1}}}
+    kept = make_caption("Town01", "trajectory_1", "ORI", 11, en=texts, checks=checks)
+    other = make_caption(
+        "Town01", "trajectory_1", "ORI", 10, checks=checks
+    )  # `one` has answered this; not with this text
+    # The student answered this window too, but not with this text.
+    other.en = other.en.model_copy(update={"reasoning_trace": "Something else."})
+    write_captions(tmp_path / "captions.jsonl", [kept, other])
+    out = run(CFG, [place / "one"], place / "set", place / "out", judged=[tmp_path / "captions.jsonl"]).parent
+    found = read_report(out).all.who["one"].figures
+    assert (found["values_matched"].value, found["values_matched"].count) == (3 / 4, 4)
 
 
 def make_encoder(folder: Path) -> Path:
@@ -287,22 +312,52 @@ def make_encoder(folder: Path) -> Path:
     return folder
 
 
-def test_scores_are_those_of_the_library(tmp_path_factory):
-    encoder = make_encoder(tmp_path_factory.mktemp("bert") / "encoder")
+@pytest.fixture(scope="module")
+def encoder(tmp_path_factory) -> Path:
+    return make_encoder(tmp_path_factory.mktemp("bert") / "encoder")
+
+
+def test_scores_are_those_of_the_library(encoder):
     import bert_score
 
     texts = [text for frame in FRAMES for text in (text_of(coc_of(sample_of(frame))), sample_of(frame, "zh").answer)]
     texts += ["short one", "a " * 700, texts[0]]
     candidates = [*texts[1:], texts[0]]
-    cfg = BertScoreConfig.model_validate({"en": {"layer": 2}})
-    own = Scorer(cfg, "en", encoder, texts)
+    own = Scorer(encoder, 2, texts)
     plain = bert_score.BERTScorer(model_type=str(encoder), num_layers=2, device="cpu", nthreads=1)
     plain._tokenizer.model_max_length = 512
     expected = np.stack([part.numpy() for part in plain.score(candidates, texts)], axis=1)
-    found = own.score(list(zip(candidates, texts, strict=True)))
-    assert np.abs(found - expected).max() < 1e-5
+    found = own.score({"student": candidates, "silent": [""] * len(texts)}, texts)
+    assert np.abs(found["student"] - expected).max() < 1e-6
+    assert not found["silent"].any()
     assert expected.std() > 0.01
     assert own.metric.cut == 1
-    alone = own.score([(candidates[3], texts[3])])
-    assert np.abs(alone - found[3]).max() < 1e-5
-    assert own.score([("", texts[0]), (" ", "")]).tolist() == [[0, 0, 0], [0, 0, 0]]
+    assert Scorer(encoder, None, texts).metric.layer == 3  # the last: the library does not know the folder's name
+
+
+def test_an_evaluation_with_an_encoder_names_it(place, encoder):
+    cfg = EvaluateConfig.model_validate({"bertscore": {"en": {"layer": 2}}})
+    out = run(cfg, [place / "one"], place / "set", place / "out", encoders={"en": encoder, "zh": encoder}).parent
+    report = read_report(out)
+    f1 = {name: own.figures["bertscore_f1"].value for name, own in report.languages["en"].who.items()}
+    assert 0 < f1["one"] < 1
+    assert 0 < f1["majority"] < 1
+    assert f1["teacher"] is None
+    assert sum(report.languages["en"].histograms["one"]) == 6  # of parsed answers
+    page = (out / "evaluation.md").read_text()
+    assert f"BERTScore F1 ({encoder.parent.name}/encoder layer 2, {encoder.parent.name}/encoder layer 3)" in page
+
+
+@pytest.mark.parametrize(("name", "config", "layer", "words"), [
+    ("empty", None, None, "not an encoder"), ("vision", '{"model_type": "vit_mae_unknown"}', None, "cannot be loaded"),
+    ("encoder", "", 9, "does not have this layer"), ("t5-small", "", None, "T5"),
+])  # fmt: skip
+def test_a_folder_that_is_no_encoder_is_named(encoder, tmp_path, name, config, layer, words):
+    folder = encoder
+    if name != "encoder":
+        folder = tmp_path / name
+        folder.mkdir()
+        if config is not None:
+            (folder / "config.json").write_text(config)
+    with pytest.raises(CosflyError, match=words):
+        Scorer(folder, layer, ["a text"])

@@ -96,35 +96,26 @@ def merge(
     job.run("distill.inference.merge", model, adapter, out)
 
 
-@command("cosfly distill evaluate --dataset dataset --predictions predictions --out scores", "distill", "seed resume")
+@command("cosfly distill evaluate --dataset dataset --predictions student-2B --out scores", "distill", "seed resume")
 def evaluate(
     job: Job,
     dataset: Dataset,
-    predictions: Annotated[Path, Option(help="Predictions: the output of `distill infer`.")],
+    predictions: Annotated[
+        list[Path], Option(help="Output folder of `distill infer`; repeat it for several students.")
+    ],
     out: options.Out,
     data: Annotated[list[Path] | None, Option(help="Playback tree, for the page's pictures; repeat it.")] = None,
-    bertscore_en: Annotated[Path | None, Option(help="Folder of roberta-large, for BERTScore of English.")] = None,
-    bertscore_zh: Annotated[Path | None, Option(help="Folder of bert-base-chinese, for BERTScore of Chinese.")] = None,
+    bertscore_en: Annotated[
+        Path | None, Option(help="Encoder for BERTScore of English: roberta-large's folder.")
+    ] = None,
+    bertscore_zh: Annotated[Path | None, Option(help="Encoder for Chinese: bert-base-chinese's folder.")] = None,
     judged: Annotated[list[Path] | None, Option(help=JUDGED)] = None,
 ) -> None:
-    """Score predictions: parse rate, decisions, verdicts, BERTScore and evidence, with baselines and intervals."""
+    """Score and compare students: decisions, verdicts, BERTScore and values, with baselines and intervals."""
     folders = {"en": bertscore_en, "zh": bertscore_zh}
-    extras = {
-        "bertscore_models": {language: folder for language, folder in folders.items() if folder is not None},
-        "data": data or [],
-        "judged": judged or [],
-    }
-    job.run("distill.evaluation.stage", job.cfg.distill.evaluate, predictions, dataset, out, **extras)
-
-
-@command("cosfly distill report evaluation-2B evaluation-4B --out report", common="seed resume")
-def report(
-    job: Job,
-    evaluations: Annotated[list[Path], Argument(help="Output directories of `distill evaluate`, one per student.")],
-    out: options.Out,
-) -> None:
-    """Compare students: the trade-off table, and differences by paired bootstrap over pedestrians."""
-    job.run("distill.evaluation.compare", evaluations, out)
+    encoders = {language: folder for language, folder in folders.items() if folder is not None}
+    files = {"data": data or [], "encoders": encoders, "judged": judged or []}
+    job.run("distill.evaluation.stage", job.cfg.distill.evaluate, predictions, dataset, out, **files)
 
 
 FLYING = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR; baselines: track_straight, random; ceiling: planner."

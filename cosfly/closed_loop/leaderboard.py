@@ -19,7 +19,6 @@ from cosfly.runtime.json_io import FileFormat, Record, write_model
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.runtime.seeding import rng_for
 from cosfly.viz.page import page
-from distill.evaluation.pages import COLORS, STYLE, bars, shown_as
 
 Role = Literal["student", "floor", "ceiling"]
 RANKED_BY = ("success", "in_view")
@@ -102,20 +101,12 @@ def tables_of(students: Sequence[tuple[str, Score]], cfg: LeaderboardConfig, see
 
 
 def _shown(name: str, figure: Figure, *, signed: bool = False) -> str:
-    digits = ".1%" if name in SHARES else ".2f"
-    return shown_as(f"{{:+{digits}}}" if signed else f"{{:{digits}}}", figure)
+    return figure.shown(("+" if signed else "") + (".1%" if name in SHARES else ".2f"))
 
 
 def page_of(board: Leaderboard) -> str:
     """Return the page."""
-    tables = []
-    for table in board.tables:
-        chart = {
-            title: {standing.name: standing.score.figures[measure] for standing in table.standings}
-            for title, measure in (("success", "success"), ("target visible", "in_view"))
-        }
-        tables.append({"table": table, "chart": bars(chart)})
     return page(
-        "cosfly/closed_loop/leaderboard.html", title="Closed loop", style=STYLE, tables=tables, measures=MEASURES,
-        headline=HEADLINE, shown=_shown, colors=COLORS,
+        "cosfly/closed_loop/leaderboard.html", title="Closed loop", tables=board.tables, measures=MEASURES,
+        headline=HEADLINE, shown=_shown,
     )  # fmt: skip

@@ -154,6 +154,13 @@ class Figure(Record):
     high: float | None
     count: int
 
+    def shown(self, digits: str) -> str:
+        """Return the figure with its interval as text, such as `62.0% (58.1% to 65.3%)` for the format `.1%`."""
+        if self.value is None:
+            return "-"
+        is_wide = self.low is not None and self.high is not None
+        return f"{self.value:{digits}}" + (f" ({self.low:{digits}} to {self.high:{digits}})" if is_wide else "")
+
 
 class EpisodeScore(Record):
     """The measures of one episode. groups: kind of group (measures.GROUPS) -> group. answers: counts of the student's

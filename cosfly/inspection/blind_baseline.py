@@ -35,18 +35,19 @@ Rule = int | tuple[int, float, "Rule", "Rule"]
 def past_of(track: Track, window: Sequence[int], is_ordered: bool) -> np.ndarray:
     """Return the geometry of the last LOOKS_BACK frames of a window as a row of numbers, (d,).
 
-    The row does not depend on the window's place and time. Poses are exact: the perturbation is removed where it is
-    known. Unknown values are 0. Axes are the level axes of the drone at the last frame; units are m, s, degrees, with
-    bearings in radians. The row holds velocities and speeds of drone and target, yaw and pitch, position, distance,
-    bearing and visibility of the target, and whether a mission's order is in force.
+    The row does not depend on the window's place and time. It holds what a prompt may tell: poses as they were drawn,
+    with their perturbation, and the target where it is visible. Unknown values are 0. Axes are the level axes of the
+    drone at the last frame; units are m, s, degrees, with bearings in radians. The row holds velocities and speeds of
+    drone and target, yaw and pitch, position, distance, bearing and visibility of the target, and whether a mission's
+    order is in force.
     """
     frames = [window[0]] * (LOOKS_BACK - len(window)) + list(window[-LOOKS_BACK:])
-    planned = track.planned[0][frames]
-    walked_m = track.walked_m[frames]
-    poses = np.where(np.isnan(planned), np.hstack([track.positions_m[frames], track.rotations_deg[frames]]), planned)
-    yaw_deg = float(poses[-1, 4])
-    drone_m = in_axes_of(yaw_deg, poses[:, :3] - poses[-1, :3])
-    target_m = in_axes_of(yaw_deg, np.where(np.isnan(walked_m), track.targets_m[frames], walked_m) - poses[-1, :3])
+    positions_m, rotations_deg = track.positions_m[frames], track.rotations_deg[frames]
+    yaw_deg = float(rotations_deg[-1, 1])
+    drone_m = in_axes_of(yaw_deg, positions_m - positions_m[-1])
+    is_seen = (track.target.visible & track.target.in_view)[frames]
+    targets_m = np.where(is_seen[:, None], track.targets_m[frames], np.nan)
+    target_m = in_axes_of(yaw_deg, targets_m - positions_m[-1])
     step_s = np.diff(track.time_s[frames])[:, None]
     step_s[step_s == 0] = np.nan  # a repeated frame
     drone_mps = np.diff(drone_m, axis=0) / step_s
@@ -59,7 +60,7 @@ def past_of(track: Track, window: Sequence[int], is_ordered: bool) -> np.ndarray
     moves = target_speeds[-1] > STANDS_MPS
     parts = [drone_mps, np.linalg.norm(drone_mps, axis=1), target_mps, target_speeds]
     parts += [offsets_m[-1], distances_m, np.diff(distances_m)]
-    parts += [np.asarray(wrap_deg(poses[:-1, 4] - yaw_deg)), poses[:, 3], track.target.visible[frames]]
+    parts += [np.asarray(wrap_deg(rotations_deg[:-1, 1] - yaw_deg)), rotations_deg[:, 0], is_seen]
     parts.append(np.array([bearing, moves * np.cos(aspect), moves * np.sin(aspect), is_ordered], dtype=float))
     return np.nan_to_num(np.concatenate([part.ravel() for part in parts]))
 

@@ -26,7 +26,7 @@ from cosfly.formats.places import TrackChoice
 from cosfly.formats.playback import read_track
 from cosfly.formats.predictions import Split
 from cosfly.geometry.splits import SPLITS
-from cosfly.inspection.blind_baseline import is_drawn_ahead, past_of
+from cosfly.inspection.blind_baseline import past_of
 from cosfly.llm.answer_text import parse_answer
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
@@ -316,17 +316,14 @@ class _Windows:
             elif reason := self._unfit(flight, sample):
                 window.left_out.append(reason)
             else:
-                window.samples.append(sample.model_copy(update=self._without_pictures(flight, caption)))
+                window.samples.append(sample.model_copy(update={"past": self._past_of(flight, caption)}))
         return window
 
-    def _without_pictures(self, flight: CaptionedFlight, caption: Caption) -> dict[str, Any]:
-        """Return what is known of a window beside its pictures: its past in numbers, and whether any was drawn
-        after."""
-        read, now = self._read(flight), caption.window[-1]
-        is_ordered = read.mission is not None and read.mission.order_at(now) is not None
-        ahead = is_drawn_ahead(read, now, max(caption.future), is_ordered) if read.is_ours and caption.future else None
-        past = past_of(read, caption.window, is_ordered).round(DIGITS)
-        return {"past": tuple(past.tolist()), "drawn_ahead": ahead}
+    def _past_of(self, flight: CaptionedFlight, caption: Caption) -> tuple[float, ...]:
+        """Return the geometry of the last frames, for the baselines without pictures."""
+        track = self._read(flight)
+        is_ordered = track.mission is not None and track.mission.order_at(caption.window[-1]) is not None
+        return tuple(past_of(track, caption.window, is_ordered).round(DIGITS).tolist())
 
     def _unfit(self, flight: CaptionedFlight, sample: Sample) -> str | None:
         """Return why the frames of a flight are not those that a sample speaks of."""

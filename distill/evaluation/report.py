@@ -1,0 +1,275 @@
+"""The report of an evaluation: `report.json`, and its tables as a page of Markdown and of HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from cosfly.formats.captions import FIELDS, TOKENS, Coc, Language
+from cosfly.formats.episodes import Figure
+from cosfly.formats.predictions import Split
+from cosfly.runtime.escaping import for_markdown
+from cosfly.runtime.json_io import FileFormat, Record
+from cosfly.viz.page import page
+from cosfly.viz.tables import TextTable
+from distill.evaluation.bertscore import Metric
+from distill.evaluation.figures import BERTSCORE, BINS, FIGURES, UNPARSED_NAME, FigureSet, Measurement, Pairing
+from distill.evaluation.floors import TEACHER
+
+REPORT, REPORT_FORMAT = "report.json", FileFormat("cosfly.distill_report", "4.0", "report")
+LESS_IS_BETTER = ("hard_conflict", "values_contradicted")
+NEITHER = ("soft_conflict", "abstain", "tokens")  # more of it is neither better nor worse
+# The paper's students: tab:distillation_summary, and the accuracies in the text of
+# sec:appendix_f_caption_distillation.
+PAPER: dict[str, dict[str, float]] = {
+    "paper: Qwen3.5-2B + LoRA": {
+        "parsed": 1.0, "accuracy": 0.6870, "accuracy_parsed": 0.6870, "bertscore_precision": 0.9282,
+        "bertscore_recall": 0.9217, "bertscore_f1": 0.9249, "track_straight": 0.836, "yaw_left_to_follow": 0.481,
+        "yaw_right_to_follow": 0.452, "search_to_reacquire_target": 0.999,
+    },
+    "paper: Qwen3.5-4B + LoRA": {
+        "parsed": 0.9999, "accuracy_parsed": 0.7007, "bertscore_precision": 0.9284, "bertscore_recall": 0.9231,
+        "bertscore_f1": 0.9257, "track_straight": 0.781, "yaw_left_to_follow": 0.566, "yaw_right_to_follow": 0.575,
+        "search_to_reacquire_target": 0.999,
+    },
+}  # fmt: skip
+NOTES = [
+    "The teacher's accepted answer is the reference. An answer that does not parse is wrong and scores 0 in BERTScore. "
+    "A sample without an answer is not wrong; it counts under `answered` only.",
+    "Verdicts and the label come from the motion after the window, by the same rules as for captions.",
+    "`majority` gives one answer of the training split to every sample. `rule` is a decision tree of depth two, and "
+    "`blind` a small network, on the poses and positions of the last frames as they were drawn, which the prompt "
+    "describes; both are fitted on the decisions of the training split and see no picture.",
+    "The paper's columns were measured on 10,000 samples of its own data, with layer 17 of roberta-large and another "
+    "teacher, so only the distance to the baselines can be compared.",
+]
+
+
+class StudentRecord(Record):
+    """The predictions of a student. not_asked: Samples of the split without one. failed, unparsed: By reason.
+
+    samples_per_s: Of the last run of `distill infer`; None if unknown.
+    """
+
+    model: str
+    not_asked: int
+    failed: dict[str, int]
+    unparsed: dict[str, int]
+    samples_per_s: float | None
+
+
+class ExampleAnswer(Record):
+    """The answer of one student in an example. raw: Its text, cut."""
+
+    coc: Coc | None
+    raw: str
+    f1: float | None
+
+
+class Example(Record):
+    """A sample with its reference and the answer of each student."""
+
+    key: str
+    walk: str
+    label: str | None
+    reference: Coc
+    answers: dict[str, ExampleAnswer]
+
+
+class Evaluation(Record):
+    """`report.json`. metrics: None if BERTScore was not computed. all: None if there is only one language."""
+
+    split: Split
+    seed: int
+    confidence: float
+    resamples: int
+    students: dict[str, StudentRecord]
+    metrics: dict[Language, Metric | None]
+    languages: dict[Language, Measurement]
+    all: Measurement | None
+    examples: list[Example]
+
+    @property
+    def parts(self) -> dict[str, Measurement]:
+        """The measurements, that of all samples first."""
+        whole = {} if self.all is None else {"all": self.all}
+        return whole | {str(language): part for language, part in self.languages.items()}
+
+
+def _paper() -> dict[str, FigureSet]:
+    found = {}
+    for who, values in PAPER.items():
+        own = {name: Figure(value=values.get(name), low=None, high=None, count=10_000) for name in (*FIGURES, *TOKENS)}
+        figures, by_decision = ({name: own[name] for name in names} for names in (FIGURES, TOKENS))
+        found[who] = FigureSet(figures=figures, by_decision=by_decision, confusion={})
+    return found
+
+
+def _shown(name: str, figure: Figure | None, *, signed: bool = False) -> str:
+    digits = ".4f" if name in (*BERTSCORE, "macro_f1") else ".1f" if name == "tokens" else ".1%"
+    return "-" if figure is None else figure.shown(f"{'+' if signed else ''}{digits}")
+
+
+def _columns(report: Evaluation, part: Measurement) -> dict[str, FigureSet]:
+    """Return the columns of every table: students, teacher, baselines, and the paper's students."""
+    own = {
+        name if name in report.students or name == TEACHER else f"baseline: {name}": found
+        for name, found in part.who.items()
+    }
+    return own | _paper()
+
+
+def _encoders(report: Evaluation, title: str) -> str:
+    metrics = report.metrics.items() if title == "all" else [(title, report.metrics[title])]  # type: ignore[index]
+    return ", ".join(f"{metric.model} layer {metric.layer}" for _, metric in metrics if metric is not None)
+
+
+def main_table(report: Evaluation, title: str, part: Measurement) -> TextTable:
+    """Return the figures of everybody on one part of the samples, with intervals."""
+    columns, encoders = _columns(report, part), _encoders(report, title)
+    rows = []
+    for name, words in FIGURES.items():
+        if any(own.figures[name].value is not None for own in part.who.values()):
+            words = f"{words} ({encoders})" if name in BERTSCORE else words
+            rows.append([words, *(_shown(name, own.figures[name]) for own in columns.values())])
+    speeds = [student.samples_per_s for student in report.students.values()]
+    if any(speeds):
+        rows.append(["answers per second", *("-" if speed is None else f"{speed:.2f}" for speed in speeds)])
+        rows[-1] += ["-"] * (len(columns) - len(speeds))
+    heading = f"{title}: {part.samples} samples of {part.walks} pedestrian trajectories"
+    return TextTable(heading, ["", *columns], rows)
+
+
+def decision_table(report: Evaluation, part: Measurement) -> TextTable:
+    """Return everybody's share of right answers by the teacher's decision, the most frequent decision first."""
+    columns = _columns(report, part)
+    counts = {token: figure.count for token, figure in part.who[TEACHER].by_decision.items()}
+    ranked = sorted(counts, key=lambda token: -counts[token])
+    rows = [
+        [f"{token} ({counts[token]})", *(_shown(token, own.by_decision.get(token)) for own in columns.values())]
+        for token in ranked
+    ]
+    return TextTable("Accuracy by the teacher's decision", ["", *columns], rows)
+
+
+def pairing_table(pairing: Pairing) -> TextTable:
+    """Return the differences of two students, and who is better where the interval excludes 0."""
+    rows = []
+    for name, found in pairing.differences.items():
+        if found.value is not None:
+            is_clear = found.low is not None and found.high is not None and (found.low > 0 or found.high < 0)
+            leader = pairing.first if (found.value > 0) != (name in LESS_IS_BETTER) else pairing.second
+            better = "-" if name in NEITHER else leader if is_clear else "not clear"
+            rows.append([FIGURES[name], _shown(name, found, signed=True), better])
+    return TextTable(f"{pairing.first} minus {pairing.second}", ["", "difference", "better"], rows)
+
+
+def notes_of(report: Evaluation) -> list[str]:
+    """Return how the figures were measured."""
+    walks = next(iter(report.parts.values())).walks
+    notes = [
+        f"Intervals: {report.confidence:.0%}, bootstrap of {walks} pedestrian trajectories, {report.resamples} draws.",
+        *NOTES,
+    ]
+    for language, metric in report.metrics.items():
+        if metric is None:
+            notes.append(f"BERTScore of {language} was not computed, because no encoder was passed.")
+            continue
+        weights = [digest[:12] for name, digest in metric.sha256.items() if name.endswith((".safetensors", ".bin"))]
+        versions = ", ".join(f"{name} {number}" for name, number in metric.versions.items())
+        notes.append(
+            f"BERTScore of {language}: {metric.model}, layer {metric.layer}, weights {', '.join(weights)}, not "
+            f"rescaled; {versions}; {metric.cut} references are longer than {metric.max_tokens} tokens."
+        )
+    for name, student in report.students.items():
+        facts = {"no answer": student.failed, "unparsed": student.unparsed}
+        reasons = [f"{what}: {reason} {n}" for what, counts in facts.items() for reason, n in counts.items()]
+        if student.not_asked:
+            reasons.append(f"{student.not_asked} samples of the split have no prediction")
+        notes.append(f"{name} is {student.model}" + "".join(f"; {reason}" for reason in reasons) + ".")
+    if all(own.figures["values_matched"].value is None for part in report.parts.values() for own in part.who.values()):
+        notes.append("Values were not checked; pass the captions of cosfly caption --teacher student:PATH as --judged.")
+    return notes
+
+
+def markdown_of(report: Evaluation) -> str:
+    """Return the report as a page of Markdown."""
+    lines = [f"# {', '.join(map(for_markdown, report.students))} on {report.split}", ""]
+    for title, part in report.parts.items():
+        tables = [decision_table(report, part), *map(pairing_table, part.pairings)]
+        for level, table in [("##", main_table(report, title, part)), *(("###", table) for table in tables)]:
+            escaped = [[for_markdown(cell) for cell in row] for row in [table.columns, *table.rows]]
+            text = TextTable(table.title, escaped[0], escaped[1:]).markdown()
+            lines += [f"{level} {for_markdown(table.title)}", "", text]
+    lines += ["## How it was measured", "", *(f"- {for_markdown(note)}" for note in notes_of(report))]
+    return "\n".join(lines) + "\n"
+
+
+# --- the HTML page ----------------------------------------------------------------------------------------------------
+
+
+def page_of(report: Evaluation, pictures: Mapping[str, Sequence[str]]) -> str:
+    """Return the report as a self-contained page.
+
+    Args:
+        pictures: key of an example -> the frames of its window, JPEG in base64.
+    """
+    parts = [
+        {
+            "main": main_table(report, title, part),
+            "tables": [decision_table(report, part), *map(pairing_table, part.pairings)],
+            "plots": [*_confusions(report, part), *_histograms(part)],
+        }
+        for title, part in report.parts.items()
+    ]
+    look = {"shown": _cell, "numeric_columns": lambda table: table["numeric"], "greatest": lambda table: table["most"]}
+    return page(
+        "distill/evaluation/evaluation.html", title=", ".join(report.students), report=report, parts=parts,
+        tiles=_tiles(report), notes=notes_of(report), fields=FIELDS, pictures=pictures, look=look,
+    )  # fmt: skip
+
+
+def _cell(cell: Any) -> str:
+    return f"{cell:.0%}" if isinstance(cell, float) else str(cell)
+
+
+def _tiles(report: Evaluation) -> list[tuple[str, str]]:
+    """Return the first figures that a reader wants: those of each student next to the best baseline and the teacher."""
+    part = next(iter(report.parts.values()))
+    names = [*report.students, *(name for name in ("blind", "rule", "majority") if name in part.who)]
+    tiles = [(part.who[name].figures["accuracy"], f"{name}: the teacher's decision") for name in names]
+    names = [*report.students, TEACHER]
+    tiles += [(part.who[name].figures["accuracy_on_labels"], f"{name}: the geometric label") for name in names]
+    tiles += [(part.who[name].figures["parsed"], f"{name}: answers parse") for name in report.students]
+    return [(f"{figure.value:.0%}", words) for figure, words in tiles if figure.value is not None]
+
+
+def _confusions(report: Evaluation, part: Measurement) -> list[dict[str, Any]]:
+    """Return the confusion of decisions of each student: rows are the teacher's, in shares of the row."""
+    plots = []
+    for name in report.students:
+        table = part.who[name].confusion
+        given = {answer for row in table.values() for answer in row}
+        answers = [answer for answer in (*TOKENS, UNPARSED_NAME) if answer in given or answer in table]
+        rows = []
+        for token, row in table.items():
+            total = sum(row.values())
+            rows.append([f"{token} ({total})", *(row.get(answer, 0) / total for answer in answers)])
+        plots.append({
+            "title": f"{name}: the teacher's decision (rows) against the answer", "head": ["", *answers], "rows": rows,
+            "plot": "heat", "most": 1.0,
+        })  # fmt: skip
+    return plots
+
+
+def _histograms(part: Measurement) -> list[dict[str, Any]]:
+    """Return the distribution of the F1 of each student's parsed answers, without the empty bins at either end."""
+    plots = []
+    for name, counts in part.histograms.items():
+        filled = [k for k, count in enumerate(counts) if count]
+        rows = [[f"{k / BINS:.2f}", counts[k]] for k in range(filled[0], filled[-1] + 1)]
+        plots.append({
+            "title": f"{name}: BERTScore F1 of parsed answers", "head": ["from", "answers"], "rows": rows,
+            "plot": "bars", "most": max(counts), "numeric": [False, True],
+        })  # fmt: skip
+    return plots
