@@ -211,8 +211,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "release export chat": ["release export {base} --format chat --out {out} --workers 1"],
     "release export coco": ["release export {base} --format coco --out {out} --workers 1"],
     "distill prepare": [
-        "distill prepare --captions {students}/captions.jsonl --data {students}/tree --out {out} "
-        "--set distill.prepare.unbound=accept"
+        "distill prepare --captions {students}/captions.jsonl --data {students}/tree --out {out}"
     ],
     "distill dual-track": [
         "distill dual-track --data {students}/tree --out {out} "

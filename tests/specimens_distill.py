@@ -10,12 +10,12 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.predictions import Split
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.student_chat import ChatFormat, FrameFormat, write_chat_format
-from cosfly.runtime.json_io import write_json
+from cosfly.runtime.json_io import write_json, write_model
 from cosfly.runtime.run_dir import fingerprint
 from distill.prepare import stage as prepare
 from distill.prepare.sources import RunSource
 from distill.prepare.stage import PrepareConfig
-from distill.schema import Sample, SourceTree, TrainingSetWriter
+from distill.schema import RECORD, RECORD_FORMAT, Sample, SourceTree, SplitWriter, TrainingSet
 
 WINDOW = 5
 DECISIONS = ("track_straight", "yaw_left_to_follow", "track_straight", "slow_down")
@@ -59,19 +59,19 @@ def make_caption(town: str, trajectory: str, variant: str, frame: int, **changes
 
 
 def prepared(tree: Path, captions: Path, out: Path, *, seed: int = 0, **settings: Any) -> Path:
-    cfg = PrepareConfig.model_validate({"unbound": "accept", **settings})
+    cfg = PrepareConfig.model_validate(settings)
     return prepare.run(cfg, [RunSource.of_files(tree, captions)], out, seed=seed)
 
 
 def write_set(out: Path, splits: Mapping[Split, Iterable[Sample]], trees: Iterable[Path] = ()) -> Path:
     """Write a training set of given samples; the trees are of the run that each stands in."""
     out.mkdir(parents=True, exist_ok=True)
-    with TrainingSetWriter(out).writing() as writer:
+    with SplitWriter(out, Sample).writing() as writer:
         for split, samples in splits.items():
             for sample in samples:
-                writer.add_sample(split, sample)
+                writer.add(split, sample)
     sources = [SourceTree(run=tree.parent.name, sha256=fingerprint(tree)) for tree in trees]
-    writer.finish("walk", sources)
+    write_model(out / RECORD, TrainingSet(split_by="walk", trees=sources, samples=writer.counts), RECORD_FORMAT)
     return out
 
 

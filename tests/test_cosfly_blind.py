@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from benchmarks.bench_blind import is_drawn_ahead
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from markupsafe import escape
@@ -14,7 +15,7 @@ from cosfly.formats.segments import Segment
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import rotation_matrices
 from cosfly.geometry.coverage import AXES, Coverage, azimuths_deg
-from cosfly.inspection.blind_baseline import is_drawn_ahead, past_of
+from cosfly.inspection.blind_baseline import past_of
 from cosfly.viz.coverage_page import coverage_html, ranges, shares
 from specimens import make_flight, make_playback_tree
 

@@ -11,8 +11,10 @@ from tables import each
 from cosfly.formats.playback import read_track
 from cosfly.geometry.splits import SPLITS
 from cosfly.runtime.run_dir import read_failures, read_manifest
+from cosfly.runtime.tables import rows_of
 from distill.prepare import dual_track
-from distill.prepare.dual_track import DualTrackConfig, TrackSample, read_track_samples, read_track_set, windows_of
+from distill.prepare.dual_track import DualTrackConfig, TrackSample, windows_of
+from distill.schema import split_path
 from specimens import make_playback_tree
 
 NUM_POINTS = 24
@@ -31,11 +33,11 @@ def dataset(tree, tmp_path_factory) -> Path:
 
 
 def samples(dataset: Path) -> dict[str, list[TrackSample]]:
-    return {split: list(read_track_samples(dataset, split)) for split in SPLITS}
+    return {split: [TrackSample(**row) for row in rows_of(split_path(dataset, split))] for split in SPLITS}
 
 
 def run(tree: Path, out: Path, **settings: object) -> Path:
-    return dual_track.run(DualTrackConfig.model_validate({"too_few": "fill", **settings}), [tree], out)
+    return dual_track.run(DualTrackConfig.model_validate(settings), [tree], out)
 
 
 @each(("num_frames", "expected"), [(9, []), (10, [0]), (12, [0]), (13, [0, 3]), (170, 54), (200, 64)])
@@ -92,4 +94,7 @@ def test_no_walk_is_in_two_splits(dataset):
     walks = [{sample.walk for sample in found} for found in samples(dataset).values()]
     assert all(walks)
     assert sum(map(len, walks)) == len(set.union(*walks)) == 4
-    assert read_track_set(dataset).samples == {split: len(found) for split, found in samples(dataset).items()}
+    splits = json.loads((dataset / "manifest.json").read_text())["splits"]
+    assert {split: facts["samples"] for split, facts in splits.items()} == {
+        split: len(found) for split, found in samples(dataset).items()
+    }

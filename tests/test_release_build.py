@@ -35,7 +35,7 @@ from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import ConfigError, InputError, NothingKept, VerifyError
 from cosfly.runtime.json_io import read_json
 from cosfly.runtime.png import colours_of
-from distill.windows import Windows
+from distill.windows import WindowDataset
 from release.build.config import ReleaseConfig
 from release.build.plan import plan_shards
 from release.build.shards import points_part
@@ -354,7 +354,7 @@ def test_a_long_track_is_released_as_in_the_paper(tmp_path):
     report = verify(folder, level="rows", reader=read_released)
     assert report.is_ok, str(report)
     with pytest.raises(InputError, match=r"release\.selection=windows"):
-        Windows(folder)
+        WindowDataset(folder)
 
 
 def test_captions_of_several_lengths_of_windows_are_verified(tmp_path):

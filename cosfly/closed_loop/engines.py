@@ -266,5 +266,4 @@ class LocalEngine(PromptedEngine):
             trajectory=window.trajectory, variant=window.variant, walk="", window=window.indices, language="en",
             views=pictures.views, picture_px=pictures.size_px, depth_range_m=pictures.depth_range_m,
             prompt=question.asked["en"], answer="", decision="", label=None, contradicted=None,
-            values_contradicted=None, repair=None, weight=1.0,
         )  # fmt: skip

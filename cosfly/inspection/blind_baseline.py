@@ -1,7 +1,6 @@
 """Baselines that predict a decision without pictures, from the geometry of the past frames.
 
 `past_of` makes a row of numbers from a window; a network and a decision tree (the rule) are fitted on such rows.
-`is_drawn_ahead` reports whether a label may depend on a random event after the window.
 """
 
 from __future__ import annotations
@@ -22,11 +21,6 @@ HIDDEN = 32  # units of the network's hidden layer
 ROUNDS = 120  # iterations of its optimiser
 PENALTY = 1e-3  # on the squares of its weights
 STANDS_MPS = 0.2  # below this speed the target stands
-TURNS_DEG = 45.0  # a larger change of heading is a turn
-DRAWN_AHEAD = (
-    "another part of the drone trajectory begins, or the target stops, starts to walk or turns by more than "
-    f"{TURNS_DEG:g} degrees"
-)
 Decider = Callable[[np.ndarray], np.ndarray]  # pasts (n, d) -> numbers of decisions (n,)
 # A decision's number; or a column, its threshold, the rule for values up to the threshold, and the rule above it.
 Rule = int | tuple[int, float, "Rule", "Rule"]
@@ -63,26 +57,6 @@ def past_of(track: Track, window: Sequence[int], is_ordered: bool) -> np.ndarray
     parts += [np.asarray(wrap_deg(rotations_deg[:-1, 1] - yaw_deg)), rotations_deg[:, 0], is_seen]
     parts.append(np.array([bearing, moves * np.cos(aspect), moves * np.sin(aspect), is_ordered], dtype=float))
     return np.nan_to_num(np.concatenate([part.ravel() for part in parts]))
-
-
-def is_drawn_ahead(track: Track, now: int, last: int, is_ordered: bool) -> bool | None:
-    """Return whether DRAWN_AHEAD holds after frame `now`, up to frame `last`, the last one that the label depends on.
-
-    Random events within a part, such as the times of hops, are not recorded and not counted. While a mission's order is
-    in force there are no random events. None means that the target's exact positions are not known.
-    """
-    if is_ordered:
-        return False
-    span = slice(max(0, now - 1), last + 1)
-    steps_m = np.diff(track.walked_m[span, :2], axis=0)
-    steps_s = np.diff(track.time_s[span])
-    if now < 1 or not np.isfinite(steps_m).all():
-        return None
-    moves = np.hypot(*steps_m.T) > STANDS_MPS * steps_s
-    headings_deg = np.degrees(np.arctan2(steps_m[:, 1], steps_m[:, 0]))
-    turns = moves & moves[0] & (np.abs(wrap_deg(headings_deg - float(headings_deg[0]))) > TURNS_DEG)
-    begins = any(now < part.begin <= last for part in track.segments)
-    return bool(begins or (moves != moves[0]).any() or turns.any())
 
 
 def fit_network(table: np.ndarray, labels: np.ndarray, rng: np.random.Generator) -> Decider:

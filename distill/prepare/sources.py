@@ -1,30 +1,25 @@
-"""Runs that a training set is made of, with their playback trees and captions, and the flights of these captions."""
+"""The runs that a set of samples is made from, and how their tracks are assigned to splits."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from cosfly.formats.captions import Caption
-from cosfly.formats.frames import frame_name, frame_path
-from cosfly.formats.places import TRACKS, Place, TrackChoice, flight_ids, folder_name, sample_id
-from cosfly.formats.playback import read_track
-from cosfly.formats.tracks import find_tracks, track_of
-from cosfly.geometry.splits import Course, walks_of
-from cosfly.runtime.errors import InputError, VerifyError
-from cosfly.runtime.io import check_stays_below, inside
-from cosfly.runtime.run_dir import record_of
-from cosfly.viz.frame_views import VIEW_FILES, View
+from pydantic import Field, model_validator
 
-log = logging.getLogger(__name__)
+from cosfly.formats.places import folder_name
+from cosfly.formats.predictions import Split
+from cosfly.geometry.splits import assign_splits, town_family
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.io import check_stays_below
 
 
 @dataclass(frozen=True)
 class RunSource:
-    """One run's part of a training set: its name, playback tree and captions."""
+    """The part of one run: its name, playback tree and captions."""
 
     run: str
     data: Path
@@ -32,14 +27,11 @@ class RunSource:
 
     @classmethod
     def of_run(cls, folder: Path) -> RunSource:
-        """Take a run folder as `cosfly run` makes it."""
+        """Return the source of a run directory, the output of `cosfly run`."""
         if not (folder / "render").is_dir():
             what, fix = "the folder is not a run directory", "pass --data and --captions if they are in other folders"
             if any((folder / name).is_file() for name in ("release.json", "dataset/release.json")):
-                what, fix = (
-                    "a release is not a run directory",
-                    "pass the run that the release was built from",
-                )
+                what, fix = "a release is not a run directory", "pass the run that the release was built from"
             raise InputError(what, where=folder, expected="the folders render/ and caption/", fix=fix)
         captions = folder / "caption/captions.jsonl"
         check_stays_below(captions, captions.parent)
@@ -51,7 +43,7 @@ class RunSource:
 
 
 def inputs_of(sources: Sequence[RunSource]) -> dict[str, Path]:
-    """Name what a stage reads: `data`, `captions`; of several runs with a number."""
+    """Return the inputs of a stage by name: `data` and `captions`, with a number in front if there are several runs."""
     inputs: dict[str, Path] = {}
     for number, source in enumerate(sources, 1):
         files = {"data": source.data, "captions": source.captions}
@@ -60,117 +52,47 @@ def inputs_of(sources: Sequence[RunSource]) -> dict[str, Path]:
 
 
 def run_of(tree: Path) -> str:
-    """Name the run of a playback tree by the folder that it stands in."""
+    """Return the name of the run of a playback tree: that of the folder that contains it."""
     return folder_name(tree.absolute().parent.name)
 
 
 def check_names(runs: Sequence[str]) -> None:
-    """Check that no two runs have one name."""
+    """Check that no two runs have the same name."""
     if len(set(runs)) < len(runs):
         fix = "rename the folder that contains one of the trees"
         raise InputError("two runs have the same name", got=", ".join(runs), fix=fix)
 
 
-def check_sources(sources: Sequence[RunSource], unbound: Literal["refuse", "accept"]) -> None:
-    """Check that run names differ, and that the captions are recorded as made from a tree; the stage checks which."""
-    check_names([source.run for source in sources])
-    for source in sources:
-        if (record := record_of(source.captions)) is not None and "data" in record.inputs:
-            continue
-        if unbound == "refuse":
-            words = "the playback tree of these captions is not recorded"
-            fix = "pass the output of cosfly caption, or accept them with --set distill.prepare.unbound=accept"
-            raise VerifyError(words, where=source.captions, got="no stage.json next to the captions", fix=fix)
-        log.warning("%s: used as captions of %s, although this is not recorded", source.captions, source.data)
+class SplitConfig(Config):
+    """What splits must not share, and how large they are."""
 
+    split_by: Literal["walk", "town"] = Field(
+        "walk",
+        description="what two splits must not share: a pedestrian trajectory (walk), or a town",
+    )
+    val_fraction: float = Field(
+        0.1, ge=0, lt=1, description="share of pedestrian trajectories (or towns) for validation; 0: none"
+    )
+    test_fraction: float = Field(
+        0.1, ge=0, lt=1, description="share of pedestrian trajectories (or towns) for the test; 0: none"
+    )
 
-@dataclass(frozen=True)
-class CaptionedFlight:
-    """A flight that captions are of.
+    @model_validator(mode="after")
+    def _fractions_leave_something(self) -> SplitConfig:
+        if self.val_fraction + self.test_fraction >= 1.0:
+            raise ValueError("val_fraction + test_fraction must be below 1, so that samples are left for training")
+        return self
 
-    flight_id: unique among all runs, None for the captions' own. key: of its walk, before these are known. num_frames,
-    size_px: of its frames, (width, height); None where it stands in no tree.
-    """
+    def assigned(self, keys: Collection[str], walks: Mapping[str, str], seed: int) -> dict[str, Split]:
+        """Return the split of each track's key, `run/town/trajectory`: all keys of a walk, or of a town, share it.
 
-    source: RunSource
-    town: str
-    trajectory: str
-    variant: str
-    flight_id: str | None
-    size_px: tuple[int, int] | None
-    num_frames: int
+        With fewer walks (or towns) than splits, train is filled first, then val.
 
-    @property
-    def key(self) -> str:
-        return f"{self.source.run}/{self.town}/{self.trajectory}"
-
-    @property
-    def folder(self) -> Path:
-        return self.source.data / self.town / self.trajectory / self.variant
-
-    def is_chosen(self, choice: TrackChoice) -> bool:
-        return choice.names(f"{self.town}/{self.trajectory}/{self.variant}") and (
-            len(choice.tracks) == len(TRACKS) or track_of(self.folder) in choice.tracks
-        )
-
-    def sample_id(self, caption: Caption) -> str:
-        return caption.sample_id if self.flight_id is None else sample_id(self.flight_id, caption.frame_index)
-
-    def whole_frames(self, views: Sequence[View]) -> set[int]:
-        """Return the frames that have the files of all views; without views, those of the flight's record."""
-        if not views:
-            return set(range(self.num_frames))
-        found = set()
-        for folder in (self.folder / frame_name(0)).parent.glob("frame_*"):
-            if folder.name[6:].isdigit() and all(frame_path(folder, VIEW_FILES[view]).is_file() for view in views):
-                found.add(int(folder.name[6:]))
-        return found
-
-
-class Flights:
-    """The flights of several trees by their names in captions, each read when it is first asked for."""
-
-    def __init__(self, sources: Sequence[RunSource]) -> None:
-        self._ids = _ids_of(sources) if len(sources) > 1 else None
-        self._found: dict[tuple[str, str, str, str], CaptionedFlight] = {}
-        self._courses: list[Course] = []
-
-    def of(self, source: RunSource, caption: Caption) -> CaptionedFlight:
-        """Find the flight of a caption."""
-        names = (caption.town, caption.trajectory, caption.variant)
-        key = (source.run, *names)
-        if key not in self._found:
-            if bad := [name for name in names if name != Path(name).name or name in ("", ".", "..")]:
-                raise InputError(
-                    "a name in the caption is not a folder name",
-                    where=f"{source.captions}: {caption.sample_id}",
-                    got=bad[0],
-                )
-            self._found[key] = self._read(source, inside(source.data, "/".join(names), in_parent=True))
-        return self._found[key]
-
-    def _read(self, source: RunSource, folder: Path) -> CaptionedFlight:
-        town, trajectory, variant = folder.parts[-3:]  # the tree may have been converted since
-        flight_id, size_px, num_frames = None, None, 0
-        if (folder / "trajectory.json").exists():
-            flight = read_track(folder, strict=False)
-            name = f"{source.run}/{town}/{trajectory}"
-            self._courses.append(Course(name, town, flight.time_s, flight.walked_m).at_seconds())
-            size_px, num_frames = (flight.camera.width_px, flight.camera.height_px), len(flight)
-        if self._ids is not None:
-            flight_id = self._ids.get(Place(source.run, town, trajectory, variant))
-        return CaptionedFlight(source, town, trajectory, variant, flight_id, size_px, num_frames)
-
-    def walks(self) -> dict[str, str]:
-        """Tell the walks of the flights that were read since this was last asked, by key; what tells them is let go."""
-        courses, self._courses = self._courses, []
-        return walks_of(courses)
-
-
-def _ids_of(sources: Sequence[RunSource]) -> dict[Place, str]:
-    places = [
-        Place(source.run, *folder.relative_to(source.data).parts[-3:])
-        for source in sources
-        for folder in find_tracks(source.data)
-    ]
-    return flight_ids(places)
+        Args:
+            walks: key -> walk.
+        """
+        by_town = self.split_by == "town"
+        group_of = {key: town_family(key.split("/")[1]) if by_town else walks[key] for key in keys}
+        fractions: dict[Split, float] = {"val": self.val_fraction, "test": self.test_fraction}
+        split_of = assign_splits(group_of.values(), fractions, seed, too_few="fill")
+        return {key: split_of[group] for key, group in group_of.items()}

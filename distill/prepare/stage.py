@@ -1,163 +1,46 @@
-"""Captions to a training set: one sample per window and language, in splits that share no walk.
+"""Captions to a training set: one sample per window and language, in splits that share no pedestrian trajectory.
 
-Needs no torch. Images are not copied: a sample names frames of a playback tree relative to its root. Its prompt is that
-of the caption with the sentence about the pictures made anew, for those that the student gets. Memory grows by the
-flights, and by some bytes a window.
+Needs no torch. Pictures are not copied: a sample names frames of a playback tree. Its prompt is that of the caption,
+with the sentence about the pictures that the student gets.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
-import math
-from array import array
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-import numpy as np
 from pydantic import Field, model_validator
 
 from cosfly.formats.captions import PICTURES_MARK, TOKENS, Caption, Language, Place, Verdict, not_in_set, read_captions
-from cosfly.formats.places import TrackChoice
-from cosfly.formats.playback import read_track
+from cosfly.formats.frames import frame_name, frame_path
+from cosfly.formats.places import Place as TrackPlace
+from cosfly.formats.places import TrackChoice, flight_ids, sample_id
+from cosfly.formats.playback import Track, read_track
 from cosfly.formats.predictions import Split
-from cosfly.geometry.splits import SPLITS
+from cosfly.formats.tracks import find_tracks, track_of
+from cosfly.geometry.splits import SPLITS, Course, walks_of
 from cosfly.inspection.blind_baseline import past_of
 from cosfly.llm.answer_text import parse_answer
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.json_io import dump_json
-from cosfly.runtime.run_dir import Resume, StageFolder, Tally, fingerprint
-from cosfly.viz.frame_views import DEPTH_RANGE_M, Pictures, View, scaled_size
-from distill.prepare.sources import CaptionedFlight, Flights, RunSource, check_sources, inputs_of
-from distill.prepare.splitting import SplitConfig, check_no_leak
-from distill.schema import Sample, SourceTree, TrainingSetWriter, open_split
-
-
-def _rank(sample_id: str, seed: int) -> int:
-    return int.from_bytes(hashlib.sha256(f"{seed}/distill.balance/{sample_id}".encode()).digest()[:8])
-
-
-def keeps(last_rank: Mapping[str, int], seed: int, decision: str, sample_id: str) -> bool:
-    """Return whether a window stays; last_rank: decision -> rank of the last window that does, none where all do."""
-    return decision not in last_rank or _rank(sample_id, seed) <= last_rank[decision]
-
-
-class WindowRanks:
-    """The 64-bit ranks of the windows by flight and decision, which is all that is held of them.
-
-    Twelve bytes a window in two long arrays, not a short one for each flight and decision: the system takes long ones
-    back.
-    """
-
-    def __init__(self, seed: int) -> None:
-        self.seed = seed
-        self._kinds: dict[tuple[str, str], int] = {}  # flight and decision -> their number
-        self._kind_of, self._ranks = array("I"), array("Q")  # of each window
-
-    @property
-    def flights(self) -> list[str]:
-        return list(dict.fromkeys(flight for flight, _ in self._kinds))
-
-    def add(self, flight: str, decision: str, sample_id: str) -> None:
-        self._kind_of.append(self._kinds.setdefault((flight, decision), len(self._kinds)))
-        self._ranks.append(_rank(sample_id, self.seed))
-
-    def by_kind(self) -> Iterator[tuple[str, str, np.ndarray]]:
-        """Yield each flight and decision with the ranks of its windows; needs a window."""
-        kind_of, ranks = np.frombuffer(self._kind_of, np.uint32), np.frombuffer(self._ranks, np.uint64)
-        parts = np.split(ranks[np.argsort(kind_of, kind="stable")], np.cumsum(np.bincount(kind_of))[:-1])
-        return ((*kind, part) for kind, part in zip(self._kinds, parts, strict=True))
-
-
-def _last(ranks: list[np.ndarray], count: int) -> int:
-    """Return the rank of the window that is the last of so many; -1 for none."""
-    return int(np.partition(np.concatenate(ranks), count - 1)[count - 1]) if count else -1
-
-
-@dataclass(frozen=True)
-class Balance:
-    """What stays of the training split. most_windows: of a decision. windows: decision -> how many there were.
-
-    last_rank: decision that has too many -> rank of the last window that stays.
-    """
-
-    most_windows: int
-    windows: Mapping[str, int]
-    last_rank: Mapping[str, int]
-
-    def cost(self, samples_left_out: int) -> dict[str, Any]:
-        """Return `balance` of the manifest. effective_decisions: as many equally frequent ones have the same
-        entropy."""
-        after = {decision: min(count, self.most_windows) for decision, count in self.windows.items()}
-        return {
-            "most_windows": self.most_windows,
-            "windows": dict(self.windows),
-            "windows_left_out": {name: n - after[name] for name, n in self.windows.items() if n > after[name]},
-            "samples_left_out": samples_left_out,
-            "effective_decisions": [_effective(self.windows), _effective(after)],
-            "absent": [action for action in TOKENS if action not in self.windows],
-        }
-
-
-def balance_of(ranks: WindowRanks, train: Collection[str]) -> Balance:
-    """Keep of each decision at most an equal share of the windows, and at least one.
-
-    An equal share is the windows over the decisions that occur. The median or the least of the counts would be no
-    measure: a few stray decisions of one or two windows bring them down, and nearly all of the others with them.
-
-    Args:
-        train: flights of the training split, at least one.
-    """
-    found: dict[str, list[np.ndarray]] = defaultdict(list)
-    for flight, decision, own in ranks.by_kind():
-        if flight in train:
-            found[decision].append(own)
-    windows = {decision: sum(map(len, own)) for decision, own in sorted(found.items())}
-    most = max(1, sum(windows.values()) // len(windows))
-    last_rank = {decision: _last(own, most) for decision, own in found.items() if windows[decision] > most}
-    return Balance(most, windows, last_rank)
-
-
-def limit_to(
-    ranks: WindowRanks, num_windows: int, train: Collection[str], balance: Balance | None
-) -> Mapping[str, int] | None:
-    """Choose exactly so many windows, of each decision its share, rounded by largest remainders.
-
-    Args:
-        train: flights of the training split, of which `balance` has left out what it does.
-    Returns:
-        decision -> rank of the last window that stays, -1 where none does; None where there are no more anyway.
-    """
-    left: dict[str, list[np.ndarray]] = defaultdict(list)
-    for flight, decision, own in ranks.by_kind():
-        last = balance.last_rank.get(decision) if balance is not None and flight in train else None
-        left[decision].append(own if last is None else own[own <= np.uint64(last)])
-    counts = {decision: sum(map(len, own)) for decision, own in left.items()}
-    total = sum(counts.values())
-    if num_windows >= total:
-        return None
-    wanted = {decision: num_windows * count // total for decision, count in counts.items()}
-    by_remainder = sorted(counts, key=lambda name: (-(num_windows * counts[name] % total), _rank(name, ranks.seed)))
-    for decision in by_remainder[: num_windows - sum(wanted.values())]:
-        wanted[decision] += 1
-    return {decision: _last(own, wanted[decision]) for decision, own in left.items()}
-
-
-def _effective(counts: Mapping[str, int]) -> float:
-    """Return the effective number of kinds, the exponential of Shannon's entropy (Hill 1973, order 1)."""
-    total = sum(counts.values())
-    return round(math.exp(-sum(count / total * math.log(count / total) for count in counts.values())), 2)
-
+from cosfly.runtime.io import inside
+from cosfly.runtime.json_io import dump_json, write_model
+from cosfly.runtime.run_dir import Resume, StageFolder, Tally, fingerprint, record_of
+from cosfly.viz.frame_views import DEPTH_RANGE_M, VIEW_FILES, Pictures, View, scaled_size
+from distill.prepare.sources import RunSource, SplitConfig, check_names, inputs_of
+from distill.schema import RECORD, RECORD_FORMAT, Sample, SourceTree, SplitWriter, TrainingSet, write_page
 
 log = logging.getLogger(__name__)
 
 STAGE = "distill.prepare"
 DIGITS = 4  # of a past: a tenth of a millimetre, as trees have it
+PAGE_TEXT = "`prompt` is the question, `answer` the expected answer. No two splits share a {}."
 
 
 class PrepareConfig(SplitConfig):
@@ -175,16 +58,8 @@ class PrepareConfig(SplitConfig):
         description="pictures of each frame, in this order; middle: the middle third of rgb; empty: only text",
     )
     text_state: bool = Field(True, description="the prompt contains the measured flight data; false: only pictures")
-    unbound: Literal["refuse", "accept"] = Field(
-        "refuse",
-        description="captions whose playback tree is not recorded, such as a copied file",
-    )
-    repaired: Literal["keep", "exclude"] = Field("keep", description="treatment of regenerated captions")
     verdicts: tuple[Verdict, ...] = Field(
         ("CONSISTENT", "SOFT_CONFLICT", "ABSTAIN"), min_length=1, description="verdicts of the captions to use"
-    )
-    contradicted: Literal["keep", "exclude"] = Field(
-        "exclude", description="treatment of answers with a value that contradicts the measured facts"
     )
     balance: Literal["none", "decisions"] = Field(
         "none", description="decisions: drop training windows of a decision beyond an equal share"
@@ -200,43 +75,47 @@ class PrepareConfig(SplitConfig):
         return self
 
 
+# --- samples ----------------------------------------------------------------------------------------------------------
+
+
 def make_sample(
-    caption: Caption,
-    language: Language,
-    cfg: PrepareConfig,
-    *,
-    run: str = "",
-    walk: str = "",
-    sample_id: str = "",
+    caption: Caption, language: Language, cfg: PrepareConfig, *, run: str = "", walk: str = "", sample_id: str = ""
 ) -> Sample | str:
-    """Return the sample of a caption in one language, or the word for why there is none.
+    """Return the sample of a caption in one language, or the reason why there is none.
 
     Args:
-        run, walk: of its flight. sample_id: unique among the samples of all runs; "" takes the caption's.
+        run, walk: of its track. sample_id: unique among the samples of all runs; "": that of the caption.
     """
-    if reason := _reason_to_leave_out(caption, language, cfg):
-        return reason
+    values = (caption.checks.values or {}).get(language)
+    if caption.status != "accepted":
+        return f"dropped_{caption.drop_reason or 'unknown'}"
+    if caption.verdict not in cfg.verdicts:
+        return f"verdict_{str(caption.verdict).lower()}"
+    if values is not None and values.values_contradicted:
+        return "contradicted"
     coc = caption.en if language == "en" else caption.zh
     if coc is None or language not in caption.prompt:
         return f"no_{language}"
     answer = dump_json(coc.ordered(cfg.decision))
     parsed = parse_answer(answer, language)
-    if parsed.coc is None:  # nothing may be taught that evaluation would call wrong
+    if parsed.coc is None:  # the evaluation would call it wrong
         return f"answer_{parsed.reason}"
     if PICTURES_MARK not in caption.prompt[language].user:
         where, expected = f"{caption.sample_id}: prompt.{language}", f"{PICTURES_MARK} in the prompt"
         what, fix = "the prompt has no mark for the pictures", "run cosfly caption again"
         raise InputError(what, where=where, expected=expected, fix=fix)
     pictures = Pictures(cfg.modalities, caption.picture_px, depth_range_m=caption.depth_range_m or DEPTH_RANGE_M)
-    values = (caption.checks.values or {}).get(language)
-    is_noisy = caption.label_from == "perturbed"  # and so is what that future rules out
-    place = {"town": caption.town, "trajectory": caption.trajectory, "variant": caption.variant, "walk": walk}
+    is_noisy = caption.label_from == "perturbed"  # and so are the decisions that this future rules out
+    ruled_out = caption.checks.contradicted
     return Sample(
         sample_id=sample_id or caption.sample_id,
         language=language,
         run=run,
         window_id=caption.sample_id,
-        **place,
+        town=caption.town,
+        trajectory=caption.trajectory,
+        variant=caption.variant,
+        walk=walk,
         window=tuple(caption.window),
         views=pictures.views,
         picture_px=pictures.size_px,
@@ -245,111 +124,161 @@ def make_sample(
         answer=answer,
         decision=parsed.coc.flight_decision,
         label=None if is_noisy else caption.label,
-        contradicted=None if is_noisy or (ruled_out := caption.checks.contradicted) is None else tuple(ruled_out),
-        repair=None if caption.repair is None else caption.repair.rung or caption.repair.strategy,
-        values_contradicted=None if values is None else values.values_contradicted,
-        weight=1.0,
+        contradicted=None if is_noisy or ruled_out is None else tuple(ruled_out),
     )
 
 
-def _reason_to_leave_out(caption: Caption, language: Language, cfg: PrepareConfig) -> str | None:
-    """Return the word for why the settings leave a caption out, by its record alone; None: they take it."""
-    if caption.status != "accepted":
-        return f"dropped_{caption.drop_reason or 'unknown'}"
-    if caption.repair is not None and cfg.repaired == "exclude":
-        return "repaired"
-    if caption.verdict not in cfg.verdicts:
-        return f"verdict_{str(caption.verdict).lower()}"
-    values = (caption.checks.values or {}).get(language)
-    if cfg.contradicted == "exclude" and values is not None and values.values_contradicted:
-        return "contradicted"
-    return None
-
-
 @dataclass(frozen=True)
-class _Window:
-    """What the languages of one caption give: samples, and the reasons for leaving others out."""
+class _CaptionedTrack:
+    """What is known of the track of captions. name: unique among all runs. frames: that have all files of the views.
 
-    flight: CaptionedFlight
-    sample_id: str
+    size_px: (width, height); None if the tree does not have the track. key: `run/town/trajectory`.
+    """
+
+    key: str
+    name: str | None
+    size_px: tuple[int, int] | None
+    frames: frozenset[int]
+    is_chosen: bool
+
+
+class _Window(NamedTuple):
+    """The samples of one caption in all languages, and the reasons for missing ones."""
+
+    track: _CaptionedTrack
     samples: list[Sample]
-    left_out: list[str]
-
-    @property
-    def decision(self) -> str:
-        """That of the first language, should they differ."""
-        return self.samples[0].decision
+    reasons: list[str]
 
 
 class _Windows:
-    """All windows of all sources, as often as they are asked for."""
+    """The windows of all sources; can be iterated repeatedly. walks: known after `find_walks`."""
 
     def __init__(self, cfg: PrepareConfig, sources: Sequence[RunSource]) -> None:
         self._cfg, self._sources = cfg, sources
-        self.flights = Flights(sources)
-        self._frames_of = lru_cache(maxsize=16)(lambda flight: flight.whole_frames(cfg.modalities))
-        self._read = lru_cache(maxsize=16)(lambda flight: read_track(flight.folder, strict=False))
-        self._is_chosen = lru_cache(maxsize=16)(lambda flight: flight.is_chosen(cfg.flights))
+        self._tracks: dict[tuple[str, Path], _CaptionedTrack] = {}
+        self._courses: list[Course] = []
+        self._read = lru_cache(maxsize=4)(lambda folder: read_track(folder, strict=False))
+        places = [
+            TrackPlace(source.run, *folder.relative_to(source.data).parts[-3:])
+            for source in (sources if len(sources) > 1 else ())
+            for folder in find_tracks(source.data)
+        ]
+        self._ids = flight_ids(places)
         self.walks: Mapping[str, str] = {}
-        self.count = 0
 
     def __iter__(self) -> Iterator[_Window]:
         for source in self._sources:
             for caption in read_captions(source.captions):
                 yield self._window(source, caption)
 
+    def find_walks(self) -> None:
+        """Find the walks of the tracks that were read."""
+        self.walks, self._courses = walks_of(self._courses), []
+
     def _window(self, source: RunSource, caption: Caption) -> _Window:
-        flight = self.flights.of(source, caption)
+        names = (caption.town, caption.trajectory, caption.variant)
+        folder = inside(source.data, "/".join(names), in_parent=True)
+        if (source.run, folder) not in self._tracks:
+            self._tracks[source.run, folder] = self._track(source, folder, names)
+        track = self._tracks[source.run, folder]
         if caption.en is not None and caption.en.flight_decision not in TOKENS:
             raise not_in_set(caption.en.flight_decision, f"{source.captions}: {caption.sample_id}")
-        caption.town = flight.town  # the tree may have been converted since
-        window = _Window(flight, flight.sample_id(caption), [], [])
-        if not self._is_chosen(flight):
-            window.left_out.extend(["not_chosen"] * len(self._cfg.languages))
-            return window
-        walk = self.walks.get(flight.key, "")
+        window = _Window(track, [], [])
+        own: dict[str, Any] = {"run": source.run, "walk": self.walks.get(track.key, "")}
+        if track.name is not None:
+            own["sample_id"] = sample_id(track.name, caption.frame_index)
         for language in self._cfg.languages:
-            named = {"run": source.run, "walk": walk, "sample_id": window.sample_id}
-            sample = make_sample(caption, language, self._cfg, **named)
-            if isinstance(sample, str):
-                window.left_out.append(sample)
-            elif reason := self._unfit(flight, sample):
-                window.left_out.append(reason)
+            sample = make_sample(caption, language, self._cfg, **own) if track.is_chosen else "not_chosen"
+            if isinstance(sample, Sample):
+                sample = _unfit(track, sample) or sample
+            if isinstance(sample, Sample):
+                past = _past_of(self._read(folder), sample.window)
+                window.samples.append(sample.model_copy(update={"past": past}))
             else:
-                window.samples.append(sample.model_copy(update={"past": self._past_of(flight, caption)}))
+                window.reasons.append(sample)
         return window
 
-    def _past_of(self, flight: CaptionedFlight, caption: Caption) -> tuple[float, ...]:
-        """Return the geometry of the last frames, for the baselines without pictures."""
-        track = self._read(flight)
-        is_ordered = track.mission is not None and track.mission.order_at(caption.window[-1]) is not None
-        return tuple(past_of(track, caption.window, is_ordered).round(DIGITS).tolist())
+    def _track(self, source: RunSource, folder: Path, names: tuple[str, str, str]) -> _CaptionedTrack:
+        key, size_px, frames = f"{source.run}/{names[0]}/{names[1]}", None, frozenset[int]()
+        if (folder / "trajectory.json").exists():
+            track = self._read(folder)
+            self._courses.append(Course(key, names[0], track.time_s, track.walked_m).at_seconds())
+            size_px = (track.camera.width_px, track.camera.height_px)
+            frames = frozenset(
+                index
+                for index in range(len(track))
+                if all(frame_path(folder / frame_name(index), VIEW_FILES[v]).is_file() for v in self._cfg.modalities)
+            )
+        choice = self._cfg.flights
+        is_chosen = choice.names("/".join(names)) and track_of(folder) in choice.tracks
+        return _CaptionedTrack(key, self._ids.get(TrackPlace(source.run, *names)), size_px, frames, is_chosen)
 
-    def _unfit(self, flight: CaptionedFlight, sample: Sample) -> str | None:
-        """Return why the frames of a flight are not those that a sample speaks of."""
-        if not self._frames_of(flight).issuperset(sample.window):
-            return "missing_image"
-        assert flight.size_px is not None, "frames of a flight that nobody read"
-        fits = not sample.views or scaled_size(*flight.size_px, max(sample.picture_px)) == sample.picture_px
-        return None if fits else "picture_of_another_size"
+
+def _past_of(track: Track, window: Sequence[int]) -> tuple[float, ...]:
+    """Return the geometry of the last frames, for the baselines without pictures."""
+    is_ordered = track.mission is not None and track.mission.order_at(window[-1]) is not None
+    return tuple(past_of(track, window, is_ordered).round(DIGITS).tolist())
 
 
-@dataclass(frozen=True)
-class _Selection:
-    """What goes where: walks (or towns) to splits, and which windows stay."""
+def _unfit(track: _CaptionedTrack, sample: Sample) -> str | None:
+    """Return why the frames of a track are not those of a sample; None if they are."""
+    if track.size_px is None or not track.frames.issuperset(sample.window):
+        return "missing_image"
+    fits = not sample.views or scaled_size(*track.size_px, max(sample.picture_px)) == sample.picture_px
+    return None if fits else "picture_of_another_size"
 
-    split_of: Mapping[str, Split]  # by key of the flight
-    num_groups: Counter[Split]  # walks (or towns) of each split
-    balance: Balance | None
-    limit: Mapping[str, int] | None
-    seed: int
 
-    def left_out(self, window: _Window) -> str | None:
-        """Return the reason for which a window is left out of its split."""
-        balance = self.balance if self.split_of[window.flight.key] == "train" else None
-        if balance is not None and not keeps(balance.last_rank, self.seed, window.decision, window.sample_id):
-            return "balance"
-        return None if keeps(self.limit or {}, self.seed, window.decision, window.sample_id) else "limit"
+# --- selection --------------------------------------------------------------------------------------------------------
+
+
+def rank_of(sample_id: str, seed: int) -> int:
+    """Return a random number of a window, which does not depend on the other windows."""
+    return int.from_bytes(hashlib.sha256(f"{seed}/distill.balance/{sample_id}".encode()).digest()[:8])
+
+
+class RankedWindow(NamedTuple):
+    """A window before it is selected. key: of its track. decision: of its first language."""
+
+    key: str
+    decision: str
+    rank: int
+
+
+def dropped_windows(
+    windows: Sequence[RankedWindow], split_of: Mapping[str, Split], *, is_balanced: bool, limit: int
+) -> dict[int, str]:
+    """Return which windows are not selected: rank -> `balance` or `limit`. Of a decision the lowest ranks stay.
+
+    Args:
+        split_of: key of a track -> its split.
+        is_balanced: of each decision, train keeps at most an equal share: its windows over the decisions that occur.
+        limit: number of windows that stay, each decision's share rounded by largest remainders; 0: all.
+    """
+    dropped: dict[int, str] = {}
+    ranks = _by_decision(window for window in windows if split_of[window.key] == "train") if is_balanced else {}
+    most = sum(map(len, ranks.values())) // max(1, len(ranks))
+    for own in ranks.values():
+        dropped |= dict.fromkeys(own[max(1, most) :], "balance")
+    ranks = _by_decision(window for window in windows if window.rank not in dropped)
+    total = sum(map(len, ranks.values()))
+    if limit and limit < total:
+        counts = {decision: limit * len(own) // total for decision, own in ranks.items()}
+        by_remainder = sorted(ranks, key=lambda decision: (-(limit * len(ranks[decision]) % total), decision))
+        for decision in by_remainder[: limit - sum(counts.values())]:
+            counts[decision] += 1
+        for decision, own in ranks.items():
+            dropped |= dict.fromkeys(own[counts[decision] :], "limit")
+    return dropped
+
+
+def _by_decision(windows: Iterator[RankedWindow]) -> dict[str, list[int]]:
+    ranks = defaultdict(list)
+    for window in windows:
+        ranks[window.decision].append(window.rank)
+    return {decision: sorted(own) for decision, own in ranks.items()}
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
 
 
 def run(
@@ -358,108 +287,97 @@ def run(
     """Read the captions and playback trees of some runs; write a training set (distill/schema.py) into `out`.
 
     Returns:
-        `out`, the training set.
+        `out`.
+
     Raises:
-        NothingKept: no caption can be used. InputError: there are too few walks to split. VerifyError: captions are of
-            another tree.
+        NothingKept: no caption can be used. VerifyError: captions are of another tree.
     """
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs_of(sources), seed=seed, resume=resume)
     if stage.is_complete:
         return out
-    check_sources(sources, cfg.unbound)
+    check_names([source.run for source in sources])
+    for source in sources:
+        record = record_of(source.captions)
+        if record is None or "data" not in record.inputs:
+            log.warning("%s: no record tells that these are captions of %s", source.captions, source.data)
     windows = _Windows(cfg, sources)
-    # Two passes: the splits, and what is too much, must be known before the first sample is written.
-    ranks, excluded = _survey(windows, seed)
-    if not ranks.flights:
-        tally = Tally(input=excluded.total(), dropped=excluded)
+    # Two passes: the splits and the selection must be known before the first sample is written.
+    ranked, left_out = _survey(windows, seed)
+    if not ranked:
+        tally = Tally(input=left_out.total(), dropped=left_out)
         raise stage.nothing_kept(tally, expected="accepted captions with images below --data")
-    chosen = _choose(cfg, windows, ranks, seed)
-    del ranks  # of a million windows they take as much as the writing
-    with TrainingSetWriter(out).writing() as writer:
-        facts, left_out = _write(windows, chosen, writer)
-    writer.finish(cfg.split_by, [SourceTree(run=s.run, sha256=fingerprint(s.data)) for s in sources])
-    counts = check_no_leak({split: open_split(out, split) for split in SPLITS}, cfg.split_by)
-    excluded += left_out
-    if chosen.balance is not None:
-        facts["train"]["balance"] = cost = chosen.balance.cost(left_out["balance"])
-        log.info("%s: balance of train: %s", STAGE, ", ".join(f"{name} {value}" for name, value in cost.items()))
-    _warn(facts)
-    tally = Tally(input=sum(counts.values()) + excluded.total(), kept=sum(counts.values()), dropped=excluded)
-    stage.finish(writer.files, tally, splits=facts, split_by=cfg.split_by)
+    windows.find_walks()
+    split_of = cfg.assigned({window.key for window in ranked}, windows.walks, seed)
+    dropped = dropped_windows(ranked, split_of, is_balanced=cfg.balance == "decisions", limit=cfg.limit)
+    counters: dict[Split, dict[str, Counter[str]]] = {
+        split: {"language": Counter(), "decision": Counter(), "walk": Counter(), "track": Counter()} for split in SPLITS
+    }
+    with SplitWriter(out, Sample).writing() as writer:
+        for sample in _selected(windows, dropped, left_out, len(ranked) + left_out.total(), seed):
+            key = f"{sample.run}/{sample.town}/{sample.trajectory}"
+            values = {"walk": sample.walk, "track": f"{key}/{sample.variant}"}
+            for name, counter in counters[split_of[key]].items():
+                counter[values.get(name) or getattr(sample, name)] += 1
+            writer.add(split_of[key], sample)
+    trees = [SourceTree(run=source.run, sha256=fingerprint(source.data)) for source in sources]
+    write_model(out / RECORD, TrainingSet(split_by=cfg.split_by, trees=trees, samples=writer.counts), RECORD_FORMAT)
+    page = write_page(out, "Training set", writer.counts, trees, PAGE_TEXT.format(cfg.split_by))
+    num_kept = sum(writer.counts.values())
+    tally = Tally(input=num_kept + left_out.total(), kept=num_kept, dropped=left_out)
+    stage.finish([*writer.paths, out / RECORD, page], tally, splits=_facts(counters), split_by=cfg.split_by)
     return out
 
 
-def _survey(windows: _Windows, seed: int) -> tuple[WindowRanks, Counter[str]]:
-    """Go over all windows once: the ranks of those that can be used, and why samples are left out."""
-    ranks, excluded = WindowRanks(seed), Counter[str]()
+def _survey(windows: _Windows, seed: int) -> tuple[list[RankedWindow], Counter[str]]:
+    """Return the usable windows, and the reasons for missing samples.
+
+    Raises:
+        InputError: two captions are of one window.
+    """
+    ranked: dict[int, RankedWindow] = {}
+    reasons = Counter[str]()
     with progress_bar(f"{STAGE}: reading", total=None) as advance:
         for window in windows:
-            windows.count += 1
-            excluded.update(window.left_out)
-            if window.samples:
-                ranks.add(f"{window.flight.key}/{window.flight.variant}", window.decision, window.sample_id)
             advance(1)
-    return ranks, excluded
+            reasons.update(window.reasons)
+            if window.samples:
+                first = window.samples[0]
+                rank = rank_of(first.sample_id, seed)
+                if rank in ranked:
+                    fix = "remove one of the two lines from the captions"
+                    raise InputError("two captions are of the same window", where=first.sample_id, fix=fix)
+                ranked[rank] = RankedWindow(window.track.key, first.decision, rank)
+    return list(ranked.values()), reasons
 
 
-def _choose(cfg: PrepareConfig, windows: _Windows, ranks: WindowRanks, seed: int) -> _Selection:
-    windows.walks = windows.flights.walks()
-    keys = {flight: flight.rpartition("/")[0] for flight in ranks.flights}
-    fix = "caption more trajectories, set a fraction to 0, or --set distill.prepare.too_few=fill"
-    owners = cfg.assigned(set(keys.values()), windows.walks, seed, "usable captions", fix)
-    split_of = {key: split for key, (_, split) in owners.items()}
-    train = {flight for flight, key in keys.items() if split_of[key] == "train"}
-    balance = balance_of(ranks, train) if cfg.balance == "decisions" else None
-    limit = limit_to(ranks, cfg.limit, train, balance) if cfg.limit else None
-    return _Selection(split_of, Counter(split for _, split in set(owners.values())), balance, limit, seed)
-
-
-def _write(
-    windows: _Windows, chosen: _Selection, writer: TrainingSetWriter
-) -> tuple[dict[str, dict[str, Any]], Counter[str]]:
-    """Write the samples.
-
-    Returns:
-        split -> counts of its samples, by language, by decision, repaired; reason -> samples that were not chosen.
-    """
-    names = ("language", "decision", "repair")
-    counters: dict[Split, dict[str, Counter[str]]] = {split: {name: Counter() for name in names} for split in SPLITS}
-    flights: dict[str, set[str]] = {split: set() for split in SPLITS}
-    left_out = Counter[str]()
-    with progress_bar(f"{STAGE}: writing", total=windows.count) as advance:
+def _selected(
+    windows: _Windows, dropped: Mapping[int, str], left_out: Counter[str], total: int, seed: int
+) -> Iterator[Sample]:
+    """Yield the selected samples; count the others in `left_out`."""
+    with progress_bar(f"{STAGE}: writing", total=total) as advance:
         for window in windows:
             advance(1)
-            reason = chosen.left_out(window) if window.samples else None
-            for sample in window.samples:
-                if reason is not None:
-                    left_out[reason] += 1
-                    continue
-                split = chosen.split_of[window.flight.key]
-                writer.add_sample(split, sample)
-                flights[split].add(f"{window.flight.key}/{window.flight.variant}")
-                counter = counters[split]
-                counter["language"][sample.language] += 1
-                counter["decision"][sample.decision] += 1
-                counter["repair"][sample.repair or "none"] += 1
-    facts: dict[str, dict[str, Any]] = {
-        split: {
-            "samples": found["language"].total(),
-            "groups": chosen.num_groups[split],
-            "flights": len(flights[split]),
-            **{f"by_{name}": dict(sorted(counter.items())) for name, counter in found.items()},
-        }
-        for split, found in counters.items()
-    }
-    return facts, left_out
+            reason = dropped.get(rank_of(window.samples[0].sample_id, seed)) if window.samples else None
+            if reason is None:
+                yield from window.samples
+            else:
+                left_out[reason] += len(window.samples)
 
 
-def _warn(facts: Mapping[str, dict[str, Any]]) -> None:
-    """Tell of splits that are empty, and of decisions that are asked for and never taught; both stand in the facts."""
-    taught = facts["train"]["by_decision"]
-    for split in SPLITS:
-        if not facts[split]["samples"]:
+def _facts(counters: Mapping[Split, Mapping[str, Counter[str]]]) -> dict[str, dict[str, Any]]:
+    """Return the counts of the manifest; warn of empty splits and of decisions that training does not have."""
+    facts: dict[str, dict[str, Any]] = {}
+    for split, own in counters.items():
+        unseen = {name: n for name, n in own["decision"].items() if name not in counters["train"]["decision"]}
+        if not own["decision"]:
             log.warning("%s: the split %s is empty", STAGE, split)
-        unseen = {name: count for name, count in facts[split]["by_decision"].items() if name not in taught}
-        facts[split]["not_in_train"] = unseen
         if unseen:
             log.warning("%s: %s has decisions that train does not have: %s", STAGE, split, unseen)
+        facts[split] = {
+            "samples": own["language"].total(),
+            "walks": len(own["walk"]),
+            "tracks": len(own["track"]),
+            **{f"by_{name}": dict(sorted(own[name].items())) for name in ("language", "decision")},
+            "not_in_train": unseen,
+        }
+    return facts

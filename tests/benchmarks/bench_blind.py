@@ -35,9 +35,9 @@ from cosfly.formats.frames import Camera
 from cosfly.formats.pedestrian_paths import walk_id
 from cosfly.formats.playback import Perturbation, TargetRecord, Track
 from cosfly.formats.traces import DroneTrace
-from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
+from cosfly.geometry.axes import intrinsic_matrix, world_from_camera, wrap_deg
 from cosfly.geometry.kernels import obstacle_index
-from cosfly.inspection.blind_baseline import FITTED_ON, fit_deciders, fit_network, is_drawn_ahead, past_of
+from cosfly.inspection.blind_baseline import FITTED_ON, STANDS_MPS, fit_deciders, fit_network, past_of
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import walkable_ground
@@ -53,6 +53,7 @@ from specimens import make_flight
 UNSEEN = ("old_town", "market")
 SIZE_PX, FOV_DEG = (640, 360), 50.0
 TRACKS = ("clean", "perturbed")
+TURNS_DEG = 45.0  # a larger change of heading is a turn
 
 
 class Windows(NamedTuple):
@@ -127,6 +128,28 @@ def row_of(facts: Facts) -> np.ndarray:
         *(word in ("visible", "partly_occluded") for word in facts.visibility[-3:]), facts.mission is not None,
     ]  # fmt: skip
     return np.array([0.0 if number is None else float(number) for number in numbers])
+
+
+def is_drawn_ahead(track: Track, now: int, last: int, is_ordered: bool) -> bool | None:
+    """Return whether the label may depend on a random event after frame `now`, up to its last frame `last`.
+
+    Another part of the drone trajectory begins, or the target stops, starts to walk or turns by more than TURNS_DEG.
+
+    Random events within a part, such as the times of hops, are not recorded and not counted. While a mission's order is
+    in force there are no random events. None means that the target's exact positions are not known.
+    """
+    if is_ordered:
+        return False
+    span = slice(max(0, now - 1), last + 1)
+    steps_m = np.diff(track.walked_m[span, :2], axis=0)
+    steps_s = np.diff(track.time_s[span])
+    if now < 1 or not np.isfinite(steps_m).all():
+        return None
+    moves = np.hypot(*steps_m.T) > STANDS_MPS * steps_s
+    headings_deg = np.degrees(np.arctan2(steps_m[:, 1], steps_m[:, 0]))
+    turns = moves & moves[0] & (np.abs(wrap_deg(headings_deg - float(headings_deg[0]))) > TURNS_DEG)
+    begins = any(now < part.begin <= last for part in track.segments)
+    return bool(begins or (moves != moves[0]).any() or turns.any())
 
 
 def windows_of(cfg: RunConfig, names: list[str]) -> Windows:
