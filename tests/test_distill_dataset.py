@@ -7,20 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import settings as bounded
-from hypothesis import strategies as st
 from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
 
-from cosfly.formats.captions import TOKENS, write_captions
+from cosfly.formats.captions import write_captions
 from cosfly.formats.playback import read_track
 from cosfly.geometry.splits import SPLITS
 from cosfly.inspection.blind_baseline import past_of
 from cosfly.runtime.errors import InputError, ResumeError
 from distill.prepare import stage
 from distill.prepare.sources import RunSource
-from distill.prepare.stage import PrepareConfig, RankedWindow, dropped_windows, make_sample, rank_of
+from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split, resolve_trees, split_path
 from specimens import make_playback_tree
 
@@ -181,49 +178,20 @@ def test_with_few_walks_train_comes_first(tmp_path, caplog):
     assert "the split test is empty" in caplog.text
 
 
-# Windows of five tracks, of which the first two are in train.
-SPLIT_OF = {f"track_{i}": "train" if i < 2 else "test" for i in range(5)}
+def test_a_limit_keeps_so_many_windows_whole_and_more_with_a_larger_limit(tree, captions, tmp_path):
+    def kept(limit: int) -> dict[str, set[str]]:
+        out = prepared(tree, captions, tmp_path / str(limit), limit=limit)
+        languages: dict[str, set[str]] = {}
+        for sample in (sample for split in SPLITS for sample in open_split(out, split)):
+            languages.setdefault(sample.sample_id, set()).add(sample.language)
+        counts = json.loads((out / "manifest.json").read_text())["counts"]
+        assert counts["dropped"].get("limit", 0) == 2 * (40 - len(languages))
+        return languages
 
-
-def ranked(counts: dict[str, int], seed: int) -> list[RankedWindow]:
-    found = [(decision, f"{decision}_{i}") for decision, count in counts.items() for i in range(count)]
-    return [RankedWindow(f"track_{i % 5}", name, rank_of(own, seed)) for i, (name, own) in enumerate(found)]
-
-
-def counts_of(windows: list[RankedWindow]) -> Counter:
-    return Counter(window.decision for window in windows)
-
-
-COUNTS = st.dictionaries(st.sampled_from(TOKENS), st.integers(1, 60), min_size=1)
-
-
-@given(counts=COUNTS, seed=st.integers(0, 3))
-@bounded(max_examples=40)
-def test_each_decision_keeps_what_it_has_up_to_the_bound_in_any_order(counts, seed):
-    windows = ranked(counts, seed)
-    dropped = dropped_windows(windows, SPLIT_OF, is_balanced=True, limit=0)
-    assert dropped == dropped_windows(windows[::-1], SPLIT_OF, is_balanced=True, limit=0)
-    assert set(dropped.values()) <= {"balance"}
-    train = [window for window in windows if SPLIT_OF[window.key] == "train"]
-    most = max(1, len(train) // len(counts_of(train)))
-    kept = [window for window in train if window.rank not in dropped]
-    assert counts_of(kept) == {name: min(count, most) for name, count in counts_of(train).items()}
-    assert len(dropped) == len(train) - len(kept)  # other splits stay whole
-
-
-@given(counts=COUNTS, part=st.floats(0.0, 1.2), seed=st.integers(0, 2), is_balanced=st.booleans())
-@bounded(max_examples=40)
-def test_a_limit_is_exact_and_each_decision_has_its_share_in_any_order(counts, part, seed, is_balanced):
-    windows = ranked(counts, seed)
-    balanced = dropped_windows(windows, SPLIT_OF, is_balanced=is_balanced, limit=0)
-    left = [window for window in windows if window.rank not in balanced]
-    limit = int(part * len(left))
-    dropped = dropped_windows(windows, SPLIT_OF, is_balanced=is_balanced, limit=limit)
-    kept = [window for window in windows if window.rank not in dropped]
-    assert len(kept) == (min(limit, len(left)) or len(left))  # 0 is no limit
-    before, after = counts_of(left), counts_of(kept)
-    assert all(abs(after[name] - len(kept) / len(left) * count) < 1 for name, count in before.items())
-    assert dropped == dropped_windows(windows[::-1], SPLIT_OF, is_balanced=is_balanced, limit=limit)
+    few, more, everything = kept(7), kept(16), kept(0)
+    assert (len(few), len(more), len(everything)) == (7, 16, 40)
+    assert few.keys() < more.keys() < everything.keys()
+    assert all(languages == {"en", "zh"} for languages in few.values())
 
 
 def test_run_twice_gives_the_same_bytes(tree, captions, tmp_path):

@@ -16,7 +16,7 @@ options.add_group("distill", "Train a small student: training set, LoRA, inferen
 Dataset = Annotated[Path, Option(help="Training set: the output of `distill prepare`.")]
 STUDENTS = "Model folder, repository such as Qwen/Qwen3.5-2B, or random weights: tiny, tiny:small, tiny:medium, random."
 JUDGED = "captions.jsonl of `caption --teacher student:PATH`, one per tree; repeat it."
-LIMIT = SettingOption("distill.prepare.limit", "Windows in all splits, shared by the decisions; 0 for all.", int)
+LIMIT = SettingOption("distill.prepare.limit", "Windows in all splits, chosen at random; 0 for all.", int)
 
 
 @command(
@@ -96,7 +96,7 @@ def merge(
     job.run("distill.inference.merge", model, adapter, out)
 
 
-@command("cosfly distill evaluate --dataset dataset --predictions student-2B --out scores", "distill", "seed resume")
+@command("cosfly distill evaluate --dataset dataset --predictions student-2B --out scores", common="seed resume")
 def evaluate(
     job: Job,
     dataset: Dataset,
@@ -115,7 +115,7 @@ def evaluate(
     folders = {"en": bertscore_en, "zh": bertscore_zh}
     encoders = {language: folder for language, folder in folders.items() if folder is not None}
     files = {"data": data or [], "encoders": encoders, "judged": judged or []}
-    job.run("distill.evaluation.stage", job.cfg.distill.evaluate, predictions, dataset, out, **files)
+    job.run("distill.evaluation.stage", predictions, dataset, out, **files)
 
 
 FLYING = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR; baselines: track_straight, random; ceiling: planner."

@@ -22,7 +22,6 @@ from cosfly.runtime.errors import ConfigError, CosflyError
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig
 from cosfly.worldgen.stage import WorldConfig
-from distill.evaluation.stage import EvaluateConfig
 from distill.inference.stage import InferConfig
 from distill.prepare.dual_track import DualTrackConfig
 from distill.prepare.stage import PrepareConfig
@@ -39,7 +38,6 @@ class DistillConfig(Config):
     dual_track: DualTrackConfig = Field(default_factory=DualTrackConfig, description="windows over both tracks")
     train: TrainConfig = Field(default_factory=TrainConfig, description="LoRA training")
     infer: InferConfig = Field(default_factory=InferConfig, description="answers of the student")
-    evaluate: EvaluateConfig = Field(default_factory=EvaluateConfig, description="scores")
 
 
 class RunConfig(CommandConfig):

@@ -10,11 +10,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field
 
-from cosfly.runtime.config import Config
 from cosfly.runtime.console import progress_bar
-from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_file
 from cosfly.runtime.json_io import Record
 from distill.student.model import pick_device, quiet_transformers, require
@@ -22,21 +20,6 @@ from distill.student.model import pick_device, quiet_transformers, require
 BATCH_SIZE = 64  # texts embedded together
 GROUP = 1024  # references whose embeddings are in memory at the same time
 UNLIMITED = 10**6  # a tokenizer without a limit of its own has a larger number
-
-
-class LanguageMetric(Config):
-    """BERTScore of one language; the encoder's folder is an argument of the command."""
-
-    layer: int | None = Field(
-        None, ge=1, description="layer of the embeddings; null: that of the library for the folder's name, or the last"
-    )
-
-
-class BertScoreConfig(Config):
-    """Settings of BERTScore within `distill evaluate`."""
-
-    en: LanguageMetric = Field(LanguageMetric(), description="English: layer 17 of roberta-large, as in the paper")
-    zh: LanguageMetric = Field(LanguageMetric(), description="Chinese: layer 8 of bert-base-chinese")
 
 
 class Metric(Record):
@@ -62,11 +45,13 @@ def encoder_files(folder: Path) -> list[Path]:
 class Scorer:
     """BERTScore with one encoder."""
 
-    def __init__(self, folder: Path, layer: int | None, references: Sequence[str]) -> None:
+    def __init__(self, folder: Path, references: Sequence[str]) -> None:
         """Load the encoder.
 
+        The layer is that of the library for the folder's name (17 for `roberta-large`, 8 for `bert-base-chinese`). For
+        a name that the library does not know, or an encoder with fewer layers, it is the last one.
+
         Args:
-            layer: None for that of the library for the folder's name, or the last one.
             references: texts that are counted if they are too long.
         """
         require("torch", "transformers", "bert_score")
@@ -82,14 +67,10 @@ class Scorer:
         try:
             config = transformers.AutoConfig.from_pretrained(folder)
             layers = config.num_hidden_layers
-            self.layer = layer or bert_score.utils.model2layers.get(folder.name, layers)
-            if self.layer > layers:
-                what, fix = "the encoder does not have this layer", "set distill.evaluate.bertscore.LANGUAGE.layer"
-                raise ConfigError(what, where=folder, got=self.layer, expected=f"at most {layers}", fix=fix)
+            layer = min(bert_score.utils.model2layers.get(folder.name, layers), layers)
             self._library = bert_score.BERTScorer(
-                model_type=str(folder), num_layers=self.layer, batch_size=BATCH_SIZE, nthreads=1,
-                device=pick_device("auto"),
-            )  # fmt: skip
+                model_type=str(folder), num_layers=layer, batch_size=BATCH_SIZE, nthreads=1, device=pick_device("auto")
+            )
         except (OSError, ValueError, RuntimeError, AttributeError) as error:
             raise InputError("the encoder cannot be loaded", where=folder, got=str(error)[:300]) from error
         tokenizer = self._library._tokenizer
@@ -98,7 +79,7 @@ class Scorer:
         limit = tokenizer.model_max_length
         self.metric = Metric(
             model="/".join(folder.absolute().parts[-2:]),
-            layer=self.layer,
+            layer=layer,
             max_tokens=limit,
             cut=sum(len(tokenizer(text, truncation=False)["input_ids"]) > limit for text in references),
             sha256={path.name: sha256_file(path) for path in files},

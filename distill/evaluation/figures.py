@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -67,7 +67,7 @@ class Pairing(Record):
 
 
 class Measurement(Record):
-    """Figures on the samples of one language, or on all. who: students, teacher, baselines.
+    """Figures on the samples of one language. who: students, teacher, baselines.
 
     histograms: student -> number of parsed answers by F1, in BINS equal bins from 0 to 1.
     """
@@ -141,18 +141,6 @@ class Answers:
             scores=np.full((len(cocs), 3), np.nan),
             texts=np.array([text_of(coc) for coc in cocs], dtype=object),
         )  # fmt: skip
-
-
-def join(parts: Sequence[Mapping[str, Answers]]) -> dict[str, Answers]:
-    """Concatenate the answers of several languages; who is missing in one of them is skipped."""
-
-    def joined(name: str) -> Answers:
-        columns: Any = {
-            f.name: np.concatenate([getattr(part[name], f.name) for part in parts]) for f in fields(Answers)
-        }
-        return Answers(**columns)
-
-    return {name: joined(name) for name in parts[0] if all(name in part for part in parts)}
 
 
 Ratios = dict[str, tuple[np.ndarray, np.ndarray]]  # figure -> what each sample adds to numerator and denominator, (n,)

@@ -17,6 +17,7 @@ from distill.evaluation.figures import BERTSCORE, BINS, FIGURES, UNPARSED_NAME, 
 from distill.evaluation.floors import TEACHER
 
 REPORT, REPORT_FORMAT = "report.json", FileFormat("cosfly.distill_report", "4.0", "report")
+LANGUAGES: dict[Language, str] = {"en": "English", "zh": "Chinese"}
 LESS_IS_BETTER = ("hard_conflict", "values_contradicted")
 NEITHER = ("soft_conflict", "abstain", "tokens")  # more of it is neither better nor worse
 # The paper's students: tab:distillation_summary, and the accuracies in the text of
@@ -46,15 +47,14 @@ NOTES = [
 
 
 class StudentRecord(Record):
-    """The predictions of a student. not_asked: Samples of the split without one. failed, unparsed: By reason.
+    """The predictions of a student. not_asked: Samples of the split without one. without_decision: By reason.
 
     samples_per_s: Of the last run of `distill infer`; None if unknown.
     """
 
     model: str
     not_asked: int
-    failed: dict[str, int]
-    unparsed: dict[str, int]
+    without_decision: dict[str, int]
     samples_per_s: float | None
 
 
@@ -77,7 +77,7 @@ class Example(Record):
 
 
 class Evaluation(Record):
-    """`report.json`. metrics: None if BERTScore was not computed. all: None if there is only one language."""
+    """`report.json`. metrics: None if BERTScore was not computed."""
 
     split: Split
     seed: int
@@ -86,14 +86,7 @@ class Evaluation(Record):
     students: dict[str, StudentRecord]
     metrics: dict[Language, Metric | None]
     languages: dict[Language, Measurement]
-    all: Measurement | None
     examples: list[Example]
-
-    @property
-    def parts(self) -> dict[str, Measurement]:
-        """The measurements, that of all samples first."""
-        whole = {} if self.all is None else {"all": self.all}
-        return whole | {str(language): part for language, part in self.languages.items()}
 
 
 def _paper() -> dict[str, FigureSet]:
@@ -119,24 +112,16 @@ def _columns(report: Evaluation, part: Measurement) -> dict[str, FigureSet]:
     return own | _paper()
 
 
-def _encoders(report: Evaluation, title: str) -> str:
-    metrics = report.metrics.items() if title == "all" else [(title, report.metrics[title])]  # type: ignore[index]
-    return ", ".join(f"{metric.model} layer {metric.layer}" for _, metric in metrics if metric is not None)
-
-
-def main_table(report: Evaluation, title: str, part: Measurement) -> TextTable:
-    """Return the figures of everybody on one part of the samples, with intervals."""
-    columns, encoders = _columns(report, part), _encoders(report, title)
+def main_table(report: Evaluation, language: Language) -> TextTable:
+    """Return the figures of everybody on the samples of one language, with intervals."""
+    part, metric = report.languages[language], report.metrics[language]
+    columns = _columns(report, part)
     rows = []
     for name, words in FIGURES.items():
         if any(own.figures[name].value is not None for own in part.who.values()):
-            words = f"{words} ({encoders})" if name in BERTSCORE else words
+            words += f" ({metric.model} layer {metric.layer})" if metric and name in BERTSCORE else ""
             rows.append([words, *(_shown(name, own.figures[name]) for own in columns.values())])
-    speeds = [student.samples_per_s for student in report.students.values()]
-    if any(speeds):
-        rows.append(["answers per second", *("-" if speed is None else f"{speed:.2f}" for speed in speeds)])
-        rows[-1] += ["-"] * (len(columns) - len(speeds))
-    heading = f"{title}: {part.samples} samples of {part.walks} pedestrian trajectories"
+    heading = f"{LANGUAGES[language]}: {part.samples} samples of {part.walks} pedestrian trajectories"
     return TextTable(heading, ["", *columns], rows)
 
 
@@ -166,9 +151,8 @@ def pairing_table(pairing: Pairing) -> TextTable:
 
 def notes_of(report: Evaluation) -> list[str]:
     """Return how the figures were measured."""
-    walks = next(iter(report.parts.values())).walks
     notes = [
-        f"Intervals: {report.confidence:.0%}, bootstrap of {walks} pedestrian trajectories, {report.resamples} draws.",
+        f"Intervals: {report.confidence:.0%}, bootstrap over pedestrian trajectories, {report.resamples} draws.",
         *NOTES,
     ]
     for language, metric in report.metrics.items():
@@ -182,12 +166,15 @@ def notes_of(report: Evaluation) -> list[str]:
             f"rescaled; {versions}; {metric.cut} references are longer than {metric.max_tokens} tokens."
         )
     for name, student in report.students.items():
-        facts = {"no answer": student.failed, "unparsed": student.unparsed}
-        reasons = [f"{what}: {reason} {n}" for what, counts in facts.items() for reason, n in counts.items()]
+        facts = [f"{reason}: {count}" for reason, count in student.without_decision.items()]
+        if student.samples_per_s is not None:
+            facts.append(f"{student.samples_per_s:.2f} answers per second")
         if student.not_asked:
-            reasons.append(f"{student.not_asked} samples of the split have no prediction")
-        notes.append(f"{name} is {student.model}" + "".join(f"; {reason}" for reason in reasons) + ".")
-    if all(own.figures["values_matched"].value is None for part in report.parts.values() for own in part.who.values()):
+            facts.append(f"{student.not_asked} samples of the split have no prediction")
+        notes.append("; ".join([f"{name} is {student.model}", *facts]) + ".")
+    if all(
+        own.figures["values_matched"].value is None for part in report.languages.values() for own in part.who.values()
+    ):
         notes.append("Values were not checked; pass the captions of cosfly caption --teacher student:PATH as --judged.")
     return notes
 
@@ -195,9 +182,9 @@ def notes_of(report: Evaluation) -> list[str]:
 def markdown_of(report: Evaluation) -> str:
     """Return the report as a page of Markdown."""
     lines = [f"# {', '.join(map(for_markdown, report.students))} on {report.split}", ""]
-    for title, part in report.parts.items():
+    for language, part in report.languages.items():
         tables = [decision_table(report, part), *map(pairing_table, part.pairings)]
-        for level, table in [("##", main_table(report, title, part)), *(("###", table) for table in tables)]:
+        for level, table in [("##", main_table(report, language)), *(("###", table) for table in tables)]:
             escaped = [[for_markdown(cell) for cell in row] for row in [table.columns, *table.rows]]
             text = TextTable(table.title, escaped[0], escaped[1:]).markdown()
             lines += [f"{level} {for_markdown(table.title)}", "", text]
@@ -216,11 +203,11 @@ def page_of(report: Evaluation, pictures: Mapping[str, Sequence[str]]) -> str:
     """
     parts = [
         {
-            "main": main_table(report, title, part),
+            "main": main_table(report, language),
             "tables": [decision_table(report, part), *map(pairing_table, part.pairings)],
             "plots": [*_confusions(report, part), *_histograms(part)],
         }
-        for title, part in report.parts.items()
+        for language, part in report.languages.items()
     ]
     look = {"shown": _cell, "numeric_columns": lambda table: table["numeric"], "greatest": lambda table: table["most"]}
     return page(
@@ -235,7 +222,7 @@ def _cell(cell: Any) -> str:
 
 def _tiles(report: Evaluation) -> list[tuple[str, str]]:
     """Return the first figures that a reader wants: those of each student next to the best baseline and the teacher."""
-    part = next(iter(report.parts.values()))
+    part = next(iter(report.languages.values()))
     names = [*report.students, *(name for name in ("blind", "rule", "majority") if name in part.who)]
     tiles = [(part.who[name].figures["accuracy"], f"{name}: the teacher's decision") for name in names]
     names = [*report.students, TEACHER]

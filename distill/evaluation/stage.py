@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 
 from cosfly.formats.captions import Language, ValueCounts, read_captions
-from cosfly.formats.predictions import FAILED, PREDICTIONS, Prediction, read_predictions
+from cosfly.formats.predictions import PREDICTIONS, Prediction, read_predictions
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import inside, write_bytes
@@ -23,7 +22,7 @@ from cosfly.runtime.json_io import validated, write_model
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally, read_manifest
 from cosfly.runtime.seeding import rng_for
 from cosfly.viz.frame_views import thumbnail
-from distill.evaluation.bertscore import BertScoreConfig, Metric, Scorer, encoder_files
+from distill.evaluation.bertscore import Metric, Scorer, encoder_files
 from distill.evaluation.figures import (
     CONFIDENCE,
     RESAMPLES,
@@ -32,7 +31,6 @@ from distill.evaluation.figures import (
     Measurement,
     coc_of,
     decision_number,
-    join,
     measure,
     text_of,
 )
@@ -58,14 +56,7 @@ Predictions = Mapping[str, Mapping[str, Prediction]]  # student -> sample's key 
 JudgedValues = dict[tuple[str | None, str, str, str], ValueCounts]
 
 
-class EvaluateConfig(Config):
-    """Settings of `distill evaluate`."""
-
-    bertscore: BertScoreConfig = Field(BertScoreConfig(), description="semantic similarity of the texts")
-
-
 def run(
-    cfg: EvaluateConfig,
     predictions: Sequence[Path],
     dataset: Path,
     out: Path,
@@ -102,7 +93,7 @@ def run(
         for language, folder in encoders.items()
         for path in encoder_files(folder)
     }
-    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, STAGE, config=Config(), inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return out / REPORT
     found = {name: {p.key: p for p in read_predictions(path)} for name, path in files.items()}
@@ -116,7 +107,7 @@ def run(
         name: _student_record(asked, own, len(samples) - len(own), _samples_per_s(files[name].parent))
         for name, own in found.items()
     }
-    report = evaluate(cfg, asked, students, found, dataset, encoders, read_judged(judged), seed)
+    report = evaluate(asked, students, found, dataset, encoders, read_judged(judged), seed)
     write_model(out / REPORT, report, REPORT_FORMAT)
     write_bytes(out / "evaluation.md", markdown_of(report).encode())
     of_key = {sample.key: sample for sample in asked}
@@ -188,7 +179,6 @@ def _values_of(sample: Sample, prediction: Prediction, judged: JudgedValues) -> 
 
 
 def evaluate(
-    cfg: EvaluateConfig,
     samples: Sequence[Sample],
     students: dict[str, StudentRecord],
     predictions: Predictions,
@@ -197,12 +187,12 @@ def evaluate(
     judged: JudgedValues,
     seed: int,
 ) -> Evaluation:
-    """Measure students, teacher and baselines on samples that all students were asked, by language and in all."""
-    parts: list[dict[str, Answers]] = []
+    """Measure students, teacher and baselines on samples that all students were asked, in each language."""
     metrics: dict[Language, Metric | None] = {}
     measurements: dict[Language, Measurement] = {}
-    ordered: list[Sample] = []
-    for language in sorted({sample.language for sample in samples}):
+    examples: list[Example] = []
+    languages = sorted({sample.language for sample in samples})
+    for language in languages:
         own = [sample for sample in samples if sample.language == language]
         everyone: dict[str, Answers] = {}
         for name, of_key in predictions.items():
@@ -213,15 +203,13 @@ def evaluate(
         metrics[language] = None
         if language in encoders:
             references = [text_of(coc_of(sample)) for sample in own]
-            scorer = Scorer(encoders[language], getattr(cfg.bertscore, language).layer, references)
+            scorer = Scorer(encoders[language], references)
             metrics[language] = scorer.metric
             written = {name: answers.texts.tolist() for name, answers in everyone.items() if any(answers.texts)}
             for name, scores in scorer.score(written, references).items():
                 everyone[name].scores[:] = np.where(everyone[name].is_answered[:, None], scores, np.nan)
         measurements[language] = measure(own, everyone, predictions, rng_for(seed, STAGE, "draws"))
-        parts.append(everyone)
-        ordered += own
-    everyone, is_split = join(parts), len(parts) > 1
+        examples += _examples(own, predictions, everyone, NUM_EXAMPLES // len(languages), seed)
     return Evaluation(
         split=next(iter(next(iter(predictions.values())).values())).split,
         seed=seed,
@@ -230,8 +218,7 @@ def evaluate(
         students=students,
         metrics=metrics,
         languages=measurements,
-        all=measure(ordered, everyone, predictions, rng_for(seed, STAGE, "draws")) if is_split else None,
-        examples=_examples(ordered, predictions, everyone, seed),
+        examples=examples,
     )
 
 
@@ -240,15 +227,14 @@ def _student_record(
 ) -> StudentRecord:
     answers = [own[sample.key] for sample in samples]
     reasons = Counter(answer.reason or "unknown" for answer in answers if answer.coc is None)
-    failed = {reason: count for reason, count in sorted(reasons.items()) if reason.startswith(FAILED)}
-    unparsed = {reason: count for reason, count in sorted(reasons.items()) if reason not in failed}
     model = ", ".join(sorted({answer.model or "unknown" for answer in answers}))
-    facts: dict[str, Any] = {"not_asked": not_asked, "samples_per_s": samples_per_s}
-    return StudentRecord(model=model, failed=failed, unparsed=unparsed, **facts)
+    return StudentRecord(
+        model=model, not_asked=not_asked, without_decision=dict(sorted(reasons.items())), samples_per_s=samples_per_s
+    )
 
 
 def _examples(
-    samples: Sequence[Sample], predictions: Predictions, everyone: Mapping[str, Answers], seed: int
+    samples: Sequence[Sample], predictions: Predictions, everyone: Mapping[str, Answers], most: int, seed: int
 ) -> list[Example]:
     """Choose samples to show: by the first student's outcome (no answer, unparsed, wrong, right) in turn."""
     first = everyone[next(iter(predictions))]
@@ -258,7 +244,7 @@ def _examples(
     for place in rng_for(seed, STAGE, "examples").permutation(len(samples)).tolist():
         kinds[int(outcomes[place])].append(place)
     chosen: list[int] = []
-    while len(chosen) < min(NUM_EXAMPLES, len(samples)):
+    while len(chosen) < min(most, len(samples)):
         chosen += [places.pop() for places in kinds.values() if places]
     return [
         Example(
@@ -271,7 +257,7 @@ def _examples(
                 for name, own in predictions.items()
             },
         )
-        for place in chosen[:NUM_EXAMPLES]
+        for place in chosen[:most]
     ]
 
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from pydantic import Field, model_validator
 
@@ -61,10 +61,7 @@ class PrepareConfig(SplitConfig):
     verdicts: tuple[Verdict, ...] = Field(
         ("CONSISTENT", "SOFT_CONFLICT", "ABSTAIN"), min_length=1, description="verdicts of the captions to use"
     )
-    balance: Literal["none", "decisions"] = Field(
-        "none", description="decisions: drop training windows of a decision beyond an equal share"
-    )
-    limit: int = Field(0, ge=0, description="number of windows in all splits, with the share of each decision; 0: all")
+    limit: int = Field(0, ge=0, description="number of windows in all splits, chosen at random; 0: all")
 
     @model_validator(mode="after")
     def _there_is_something_to_learn(self) -> PrepareConfig:
@@ -228,56 +225,6 @@ def _unfit(track: _CaptionedTrack, sample: Sample) -> str | None:
     return None if fits else "picture_of_another_size"
 
 
-# --- selection --------------------------------------------------------------------------------------------------------
-
-
-def rank_of(sample_id: str, seed: int) -> int:
-    """Return a random number of a window, which does not depend on the other windows."""
-    return int.from_bytes(hashlib.sha256(f"{seed}/distill.balance/{sample_id}".encode()).digest()[:8])
-
-
-class RankedWindow(NamedTuple):
-    """A window before it is selected. key: of its track. decision: of its first language."""
-
-    key: str
-    decision: str
-    rank: int
-
-
-def dropped_windows(
-    windows: Sequence[RankedWindow], split_of: Mapping[str, Split], *, is_balanced: bool, limit: int
-) -> dict[int, str]:
-    """Return which windows are not selected: rank -> `balance` or `limit`. Of a decision the lowest ranks stay.
-
-    Args:
-        split_of: key of a track -> its split.
-        is_balanced: of each decision, train keeps at most an equal share: its windows over the decisions that occur.
-        limit: number of windows that stay, each decision's share rounded by largest remainders; 0: all.
-    """
-    dropped: dict[int, str] = {}
-    ranks = _by_decision(window for window in windows if split_of[window.key] == "train") if is_balanced else {}
-    most = sum(map(len, ranks.values())) // max(1, len(ranks))
-    for own in ranks.values():
-        dropped |= dict.fromkeys(own[max(1, most) :], "balance")
-    ranks = _by_decision(window for window in windows if window.rank not in dropped)
-    total = sum(map(len, ranks.values()))
-    if limit and limit < total:
-        counts = {decision: limit * len(own) // total for decision, own in ranks.items()}
-        by_remainder = sorted(ranks, key=lambda decision: (-(limit * len(ranks[decision]) % total), decision))
-        for decision in by_remainder[: limit - sum(counts.values())]:
-            counts[decision] += 1
-        for decision, own in ranks.items():
-            dropped |= dict.fromkeys(own[counts[decision] :], "limit")
-    return dropped
-
-
-def _by_decision(windows: Iterator[RankedWindow]) -> dict[str, list[int]]:
-    ranks = defaultdict(list)
-    for window in windows:
-        ranks[window.decision].append(window.rank)
-    return {decision: sorted(own) for decision, own in ranks.items()}
-
-
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
@@ -302,18 +249,18 @@ def run(
             log.warning("%s: no record tells that these are captions of %s", source.captions, source.data)
     windows = _Windows(cfg, sources)
     # Two passes: the splits and the selection must be known before the first sample is written.
-    ranked, left_out = _survey(windows, seed)
-    if not ranked:
+    ranks, keys, left_out = _survey(windows, seed)
+    if not ranks:
         tally = Tally(input=left_out.total(), dropped=left_out)
         raise stage.nothing_kept(tally, expected="accepted captions with images below --data")
     windows.find_walks()
-    split_of = cfg.assigned({window.key for window in ranked}, windows.walks, seed)
-    dropped = dropped_windows(ranked, split_of, is_balanced=cfg.balance == "decisions", limit=cfg.limit)
+    split_of = cfg.assigned(keys, windows.walks, seed)
+    last_rank = sorted(ranks)[cfg.limit - 1] if 0 < cfg.limit < len(ranks) else max(ranks)
     counters: dict[Split, dict[str, Counter[str]]] = {
         split: {"language": Counter(), "decision": Counter(), "walk": Counter(), "track": Counter()} for split in SPLITS
     }
     with SplitWriter(out, Sample).writing() as writer:
-        for sample in _selected(windows, dropped, left_out, len(ranked) + left_out.total(), seed):
+        for sample in _selected(windows, last_rank, left_out, seed):
             key = f"{sample.run}/{sample.town}/{sample.trajectory}"
             values = {"walk": sample.walk, "track": f"{key}/{sample.variant}"}
             for name, counter in counters[split_of[key]].items():
@@ -328,40 +275,41 @@ def run(
     return out
 
 
-def _survey(windows: _Windows, seed: int) -> tuple[list[RankedWindow], Counter[str]]:
-    """Return the usable windows, and the reasons for missing samples.
+def _rank(window: _Window, seed: int) -> int:
+    """Return a random number of a window with samples, which does not depend on the other windows."""
+    return int.from_bytes(hashlib.sha256(f"{seed}/{STAGE}/{window.samples[0].sample_id}".encode()).digest()[:8])
+
+
+def _survey(windows: _Windows, seed: int) -> tuple[set[int], set[str], Counter[str]]:
+    """Return the ranks of the usable windows, the keys of their tracks, and the reasons for missing samples.
 
     Raises:
         InputError: two captions are of one window.
     """
-    ranked: dict[int, RankedWindow] = {}
-    reasons = Counter[str]()
+    ranks, keys, reasons = set[int](), set[str](), Counter[str]()
     with progress_bar(f"{STAGE}: reading", total=None) as advance:
         for window in windows:
             advance(1)
             reasons.update(window.reasons)
             if window.samples:
-                first = window.samples[0]
-                rank = rank_of(first.sample_id, seed)
-                if rank in ranked:
-                    fix = "remove one of the two lines from the captions"
-                    raise InputError("two captions are of the same window", where=first.sample_id, fix=fix)
-                ranked[rank] = RankedWindow(window.track.key, first.decision, rank)
-    return list(ranked.values()), reasons
+                rank = _rank(window, seed)
+                if rank in ranks:
+                    where, fix = window.samples[0].sample_id, "remove one of the two lines from the captions"
+                    raise InputError("two captions are of the same window", where=where, fix=fix)
+                ranks.add(rank)
+                keys.add(window.track.key)
+    return ranks, keys, reasons
 
 
-def _selected(
-    windows: _Windows, dropped: Mapping[int, str], left_out: Counter[str], total: int, seed: int
-) -> Iterator[Sample]:
-    """Yield the selected samples; count the others in `left_out`."""
-    with progress_bar(f"{STAGE}: writing", total=total) as advance:
+def _selected(windows: _Windows, last_rank: int, left_out: Counter[str], seed: int) -> Iterator[Sample]:
+    """Yield the samples of the windows up to a rank; count the others in `left_out`."""
+    with progress_bar(f"{STAGE}: writing", total=None) as advance:
         for window in windows:
             advance(1)
-            reason = dropped.get(rank_of(window.samples[0].sample_id, seed)) if window.samples else None
-            if reason is None:
-                yield from window.samples
+            if window.samples and _rank(window, seed) > last_rank:
+                left_out["limit"] += len(window.samples)
             else:
-                left_out[reason] += len(window.samples)
+                yield from window.samples
 
 
 def _facts(counters: Mapping[Split, Mapping[str, Counter[str]]]) -> dict[str, dict[str, Any]]:
