@@ -118,22 +118,18 @@ def read_training_set(dataset: Path) -> TrainingSet:
 
 def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
     """Return which of the given playback trees belongs to which run of a training set: run -> tree."""
-    record = read_training_set(dataset)
-    run_of = {tree.sha256: tree.run for tree in record.trees}
-    trees: dict[str, Path] = {}
-    for path in data:
-        run = run_of.get(fingerprint(path))
-        if run is None:
-            words = "the training set was not made of this playback tree"
-            expected = ", ".join(f"{tree.run}: {tree.sha256}" for tree in record.trees)
+    wanted = {tree.sha256: tree.run for tree in read_training_set(dataset).trees}
+    found = {fingerprint(path): path for path in data}
+    for digest, path in found.items():
+        if digest not in wanted:
+            what = "the training set was not made of this playback tree"
+            expected = ", ".join(f"{run}: {sha256}" for sha256, run in wanted.items())
             fix = "pass the unchanged trees of the training set, or prepare a training set from this tree"
-            raise InputError(words, where=path, got=fingerprint(path), expected=expected, fix=fix)
-        trees[run] = path
-    if missing := [tree.run for tree in record.trees if tree.run not in trees]:
-        words, fix = "a playback tree of the training set is missing", "pass --data once for each of its trees"
-        expected = f"--data also for the runs {', '.join(missing)}"
-        raise InputError(words, where=dataset, got=", ".join(map(str, data)) or "none", expected=expected, fix=fix)
-    return {tree.run: trees[tree.run] for tree in record.trees}
+            raise InputError(what, where=path, got=digest, expected=expected, fix=fix)
+    if missing := [run for digest, run in wanted.items() if digest not in found]:
+        what, fix = "a playback tree of the training set is missing", "pass --data once for each of its trees"
+        raise InputError(what, where=dataset, expected=f"--data also for the runs {', '.join(missing)}", fix=fix)
+    return {run: found[digest] for digest, run in wanted.items()}
 
 
 def tree_inputs(trees: Mapping[str, Path]) -> dict[str, Path]:
@@ -189,8 +185,7 @@ class Samples(Sequence[Sample]):
             return [self[i] for i in range(*index.indices(len(self)))]
         if self._rows is None or not -len(self) <= index < len(self):
             raise IndexError(index)
-        number = index % len(self)
-        return self._sample(number, self._rows[number])
+        return self._sample(index % len(self), self._rows[index % len(self)])
 
     def _sample(self, number: int, row: dict[str, Any]) -> Sample:
         sample = validated(Sample, row, f"{self.path}: row {number}")

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypedDict, get_args
+from typing import Any, TypedDict
 
 import cv2
 import numpy as np
@@ -56,8 +56,9 @@ class WindowData(TypedDict):
     """One window of k frames.
 
     flight: run/town/trajectory/variant. window: (k,) int64, frames of the track, the caption's own last. frames: (k, 3,
-    h, w) uint8 RGB. facts: FACTS, (k, members) or (k,) float64, NaN if unknown; FLAGS (k,) bool; pixels refer to the
-    unscaled frame. prompt: system and user. caption: the three texts, `label` and `verdict`; "" if there is none.
+    h, w) uint8 RGB, in the size to which pixels in prompt and caption refer. facts: FACTS, (k, members) or (k,)
+    float64, NaN if unknown; FLAGS (k,) bool; pixels refer to the unscaled frame. prompt: system and user. caption: the
+    three texts, `label` and `verdict`; "" if there is none.
     """
 
     sample_id: str
@@ -85,21 +86,10 @@ class _Shard(BaseModel):
     split: str
 
 
-class _Settings(BaseModel):
-    selection: str
-
-
-class _ReleasedTrack(BaseModel):
-    frames: int
-    frames_available: int
-
-
 class _Record(BaseModel):
     """The fields of `release.json` that are read."""
 
     shards: list[_Shard]
-    settings: _Settings
-    flights: list[_ReleasedTrack]
 
 
 class WindowDataset(Sequence[WindowData]):
@@ -109,20 +99,10 @@ class WindowDataset(Sequence[WindowData]):
         source: a release, its `dataset/`, or a run directory with a release.
         language: of prompt and caption.
         split: `train`, `validation` or `test`; None takes all.
-        max_side_px: longest side that frames are scaled down to; None takes the size to which pixels in prompt and
-            caption refer.
     """
 
-    def __init__(
-        self, source: str | Path, *, language: Language = "en", split: str | None = None, max_side_px: int | None = None
-    ) -> None:
-        if language not in get_args(Language):
-            expected = ", ".join(get_args(Language))
-            raise ConfigError("there are no captions in this language", got=str(language), expected=expected)
-        if max_side_px is not None and max_side_px < 1:
-            what = "the picture size is not positive"
-            raise ConfigError(what, where="max_side_px", got=max_side_px, expected="1 or more")
-        self.language, self.max_side_px = language, max_side_px
+    def __init__(self, source: str | Path, *, language: Language = "en", split: str | None = None) -> None:
+        self.language = language
         self.folder = _release_folder(Path(source))
         names = _shards_of(self.folder, split)
         texts = [f"caption_{language}_{field}" for field in FIELDS]
@@ -135,8 +115,9 @@ class WindowDataset(Sequence[WindowData]):
         ]
         if not self._places:
             why = ", ".join(f"{reason} {count}" for reason, count in self.left_out.items()) or "no captions"
-            expected = f"accepted captions in {language!r} whose frames exist"
-            raise InputError("the source has no usable window", where=source, got=why, expected=expected)
+            what, expected = "the source has no usable window", f"accepted captions in {language!r} whose frames exist"
+            fix = "build the release with --set release.selection=windows, which keeps consecutive frames"
+            raise InputError(what, where=source, got=why, expected=expected, fix=fix)
 
     def _places_in(self, shard: int, path: Path) -> Iterator[WindowPlace]:
         """Yield the windows of a shard, which contains whole tracks."""
@@ -175,7 +156,7 @@ class WindowDataset(Sequence[WindowData]):
             raise InputError("the frames of a window differ in size", where=place.sample_id)
         height_px, width_px = frames[0].shape[:2]
         picture_px = tuple(last["caption_picture_px"] or (width_px, height_px))[:2]
-        size = scaled_size(width_px, height_px, self.max_side_px or max(picture_px))
+        size = scaled_size(width_px, height_px, max(picture_px))
         if size != (width_px, height_px):
             frames = [cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames]
         pictures = Pictures(("rgb",), (picture_px[0], picture_px[1])).sentence(language)
@@ -203,9 +184,6 @@ def _shards_of(folder: Path, split: str | None) -> list[str]:
     """Return the names of the shards of one split, or of all."""
     path = folder / "release.json"
     record = validated(_Record, read_object(path, what="release", tree=folder), path)
-    if record.settings.selection == "stride" and any(f.frames < f.frames_available for f in record.flights):
-        what = "windows need consecutive frames, of which this release has a uniform stride only"
-        raise InputError(what, where=folder, fix="build the release with --set release.selection=windows")
     splits = sorted({shard.split for shard in record.shards})
     if split is not None and split not in splits:
         near, expected = nearest(split, splits), ", ".join(splits)

@@ -83,16 +83,25 @@ def test_splits_of_a_release_share_no_walk_and_make_up_the_whole(place):
 
 def test_pytorch_loads_them_with_two_workers(place):
     torch = pytest.importorskip("torch")
-    windows = WindowDataset(place / "release", max_side_px=48)
+    windows = WindowDataset(place / "release")
     assert len(pickle.loads(pickle.dumps(windows))) == len(windows)
     loader = torch.utils.data.DataLoader(windows, batch_size=4, num_workers=2)
     seen = []
     for batch in loader:
-        assert (batch["frames"].shape[1:], batch["frames"].dtype) == ((5, 3, 27, 48), torch.uint8)
+        assert (batch["frames"].shape[1:], batch["frames"].dtype) == ((5, 3, 54, 96), torch.uint8)
         assert batch["facts"]["target"].shape[1:] == (5, 3)
         assert batch["facts"]["target_visible"].dtype == torch.bool
         seen += batch["sample_id"]
     assert seen == [windows[i]["sample_id"] for i in range(len(windows))]
+
+
+def test_frames_are_scaled_to_the_size_that_pixels_in_the_texts_refer_to(place, tmp_path):
+    small = [caption.model_copy(update={"picture_px": (48, 27)}) for caption in read_captions(place / "captions.jsonl")]
+    (tmp_path / "tree").symlink_to(place / "tree")
+    write_captions(tmp_path / "captions.jsonl", small)
+    write_inspection(tmp_path / "inspect.json", make_inspection(place / "tree", {}))
+    build(tmp_path, tmp_path / "release", CFG.model_copy(update={"selection": "all"}))
+    assert WindowDataset(tmp_path / "release")[0]["frames"].shape == (5, 3, 27, 48)
 
 
 def test_what_is_no_release_is_refused(place):

@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import STAGE, Job, SettingOption, command, track_options
+from cosfly.cli.options import STAGE, Job, SettingOption, command
 
 options.add_group("distill", "Train a small student: training set, LoRA, inference, evaluation.")
 
@@ -19,10 +19,7 @@ JUDGED = "captions.jsonl of `caption --teacher student:PATH`, one per tree; repe
 LIMIT = SettingOption("distill.prepare.limit", "Windows in all splits, chosen at random; 0 for all.", int)
 
 
-@command(
-    "cosfly distill prepare runs/diverse --out dataset", "distill", "seed resume",
-    **track_options("distill.prepare"), limit=LIMIT,
-)  # fmt: skip
+@command("cosfly distill prepare runs/diverse --out dataset", "distill", "seed resume", limit=LIMIT)
 def prepare(
     job: Job,
     out: options.Out,
@@ -104,7 +101,6 @@ def evaluate(
         list[Path], Option(help="Output folder of `distill infer`; repeat it for several students.")
     ],
     out: options.Out,
-    data: Annotated[list[Path] | None, Option(help="Playback tree, for the page's pictures; repeat it.")] = None,
     bertscore_en: Annotated[
         Path | None, Option(help="Encoder for BERTScore of English: roberta-large's folder.")
     ] = None,
@@ -114,8 +110,7 @@ def evaluate(
     """Score and compare students: decisions, verdicts, BERTScore and values, with baselines and intervals."""
     folders = {"en": bertscore_en, "zh": bertscore_zh}
     encoders = {language: folder for language, folder in folders.items() if folder is not None}
-    files = {"data": data or [], "encoders": encoders, "judged": judged or []}
-    job.run("distill.evaluation.stage", predictions, dataset, out, **files)
+    job.run("distill.evaluation.stage", predictions, dataset, out, encoders=encoders, judged=judged or [])
 
 
 FLYING = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR; baselines: track_straight, random; ceiling: planner."

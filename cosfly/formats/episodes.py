@@ -155,10 +155,10 @@ class Figure(Record):
     count: int
 
     def shown(self, digits: str) -> str:
-        """Return the figure with its interval as text, such as `62.0% (58.1% to 65.3%)` for the format `.1%`."""
+        """Return the figure as text, `62.0% (58.1% to 65.3%)` for the format `.1%`, without an interval of width 0."""
         if self.value is None:
             return "-"
-        is_wide = self.low is not None and self.high is not None
+        is_wide = self.low is not None and self.high is not None and self.low < self.high
         return f"{self.value:{digits}}" + (f" ({self.low:{digits}} to {self.high:{digits}})" if is_wide else "")
 
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import sha256_file
 from cosfly.runtime.json_io import Record
 from distill.student.model import pick_device, quiet_transformers, require
 
@@ -23,13 +22,12 @@ UNLIMITED = 10**6  # a tokenizer without a limit of its own has a larger number
 
 
 class Metric(Record):
-    """What a score was measured with. sha256: of the encoder's files. cut: references longer than max_tokens."""
+    """What a score was measured with; `stage.json` has the digests. cut: References longer than max_tokens."""
 
     model: str
     layer: int
     max_tokens: int
     cut: int
-    sha256: dict[str, str]
     versions: dict[str, str]
 
 
@@ -63,7 +61,7 @@ class Scorer:
         if "t5" in str(folder) or str(folder).startswith("scibert"):
             what = "bert-score takes every path with 't5' for a T5 model, and every 'scibert' for a download"
             raise InputError(what, where=folder, fix="rename the folder")
-        files = encoder_files(folder)
+        encoder_files(folder)
         try:
             config = transformers.AutoConfig.from_pretrained(folder)
             layers = config.num_hidden_layers
@@ -82,7 +80,6 @@ class Scorer:
             layer=layer,
             max_tokens=limit,
             cut=sum(len(tokenizer(text, truncation=False)["input_ids"]) > limit for text in references),
-            sha256={path.name: sha256_file(path) for path in files},
             versions={"bert-score": version("bert-score"), "torch": torch.__version__}
             | {"transformers": transformers.__version__},
         )

@@ -27,6 +27,7 @@ RESAMPLES = 2000  # draws of pedestrian trajectories
 BINS = 100  # of the histogram of F1, from 0 to 1
 UNPARSED = -1  # the number of the decision of an answer that does not parse
 UNPARSED_NAME = "(unparsed)"
+TEACHER = "teacher"
 VERDICTS: tuple[Verdict, ...] = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
 BERTSCORE = ("bertscore_precision", "bertscore_recall", "bertscore_f1")
 FIGURES = {
@@ -119,9 +120,8 @@ class Answers:
     def of(cls, decision: np.ndarray, texts: Sequence[str] = ()) -> Self:
         """Return the answers of a baseline."""
         n = len(decision)
-        known, unknown = np.ones(n, dtype=bool), np.full((n, 3), np.nan)
-        written = np.array(texts or [""] * n, dtype=object)
-        return cls(decision, known, known, np.zeros(n), unknown[:, :2], unknown, written)
+        known, values, scores = np.ones(n, dtype=bool), np.full((n, 2), np.nan), np.full((n, 3), np.nan)
+        return cls(decision, known, known, np.zeros(n), values, scores, np.array(texts or [""] * n, dtype=object))
 
     @classmethod
     def of_student(cls, predictions: Sequence[Prediction], values: Sequence[ValueCounts | None]) -> Self:

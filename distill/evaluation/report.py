@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cosfly.formats.captions import FIELDS, TOKENS, Coc, Language
 from cosfly.formats.episodes import Figure
-from cosfly.formats.predictions import Split
+from cosfly.formats.predictions import Prediction, Split
 from cosfly.runtime.escaping import for_markdown
 from cosfly.runtime.json_io import FileFormat, Record
 from cosfly.viz.page import page
 from cosfly.viz.tables import TextTable
 from distill.evaluation.bertscore import Metric
-from distill.evaluation.figures import BERTSCORE, BINS, FIGURES, UNPARSED_NAME, FigureSet, Measurement, Pairing
-from distill.evaluation.floors import TEACHER
+from distill.evaluation.figures import BERTSCORE, BINS, FIGURES, TEACHER, UNPARSED_NAME, FigureSet, Measurement, Pairing
 
 REPORT, REPORT_FORMAT = "report.json", FileFormat("cosfly.distill_report", "4.0", "report")
 LANGUAGES: dict[Language, str] = {"en": "English", "zh": "Chinese"}
-LESS_IS_BETTER = ("hard_conflict", "values_contradicted")
-NEITHER = ("soft_conflict", "abstain", "tokens")  # more of it is neither better nor worse
 # The paper's students: tab:distillation_summary, and the accuracies in the text of
 # sec:appendix_f_caption_distillation.
 PAPER: dict[str, dict[str, float]] = {
@@ -36,10 +32,10 @@ PAPER: dict[str, dict[str, float]] = {
 }  # fmt: skip
 NOTES = [
     "The teacher's accepted answer is the reference. An answer that does not parse is wrong and scores 0 in BERTScore. "
-    "A sample without an answer is not wrong; it counts under `answered` only.",
+    "A sample without an answer is not wrong; it counts in the first row only.",
     "Verdicts and the label come from the motion after the window, by the same rules as for captions.",
-    "`majority` gives one answer of the training split to every sample. `rule` is a decision tree of depth two, and "
-    "`blind` a small network, on the poses and positions of the last frames as they were drawn, which the prompt "
+    "The majority gives one answer of the training split to every sample. The rule is a decision tree of depth two, "
+    "and blind a small network, on the poses and positions of the last frames as they were drawn, which the prompt "
     "describes; both are fitted on the decisions of the training split and see no picture.",
     "The paper's columns were measured on 10,000 samples of its own data, with layer 17 of roberta-large and another "
     "teacher, so only the distance to the baselines can be compared.",
@@ -58,14 +54,6 @@ class StudentRecord(Record):
     samples_per_s: float | None
 
 
-class ExampleAnswer(Record):
-    """The answer of one student in an example. raw: Its text, cut."""
-
-    coc: Coc | None
-    raw: str
-    f1: float | None
-
-
 class Example(Record):
     """A sample with its reference and the answer of each student."""
 
@@ -73,7 +61,7 @@ class Example(Record):
     walk: str
     label: str | None
     reference: Coc
-    answers: dict[str, ExampleAnswer]
+    answers: dict[str, Prediction]
 
 
 class Evaluation(Record):
@@ -138,15 +126,13 @@ def decision_table(report: Evaluation, part: Measurement) -> TextTable:
 
 
 def pairing_table(pairing: Pairing) -> TextTable:
-    """Return the differences of two students, and who is better where the interval excludes 0."""
-    rows = []
-    for name, found in pairing.differences.items():
-        if found.value is not None:
-            is_clear = found.low is not None and found.high is not None and (found.low > 0 or found.high < 0)
-            leader = pairing.first if (found.value > 0) != (name in LESS_IS_BETTER) else pairing.second
-            better = "-" if name in NEITHER else leader if is_clear else "not clear"
-            rows.append([FIGURES[name], _shown(name, found, signed=True), better])
-    return TextTable(f"{pairing.first} minus {pairing.second}", ["", "difference", "better"], rows)
+    """Return the differences of two students."""
+    rows = [
+        [FIGURES[name], _shown(name, found, signed=True)]
+        for name, found in pairing.differences.items()
+        if found.value is not None
+    ]
+    return TextTable(f"{pairing.first} minus {pairing.second}", ["", "difference"], rows)
 
 
 def notes_of(report: Evaluation) -> list[str]:
@@ -159,11 +145,10 @@ def notes_of(report: Evaluation) -> list[str]:
         if metric is None:
             notes.append(f"BERTScore of {language} was not computed, because no encoder was passed.")
             continue
-        weights = [digest[:12] for name, digest in metric.sha256.items() if name.endswith((".safetensors", ".bin"))]
         versions = ", ".join(f"{name} {number}" for name, number in metric.versions.items())
         notes.append(
-            f"BERTScore of {language}: {metric.model}, layer {metric.layer}, weights {', '.join(weights)}, not "
-            f"rescaled; {versions}; {metric.cut} references are longer than {metric.max_tokens} tokens."
+            f"BERTScore of {language}: {metric.model}, layer {metric.layer}, not rescaled; {versions}; "
+            f"{metric.cut} references are longer than {metric.max_tokens} tokens."
         )
     for name, student in report.students.items():
         facts = [f"{reason}: {count}" for reason, count in student.without_decision.items()]
@@ -195,12 +180,8 @@ def markdown_of(report: Evaluation) -> str:
 # --- the HTML page ----------------------------------------------------------------------------------------------------
 
 
-def page_of(report: Evaluation, pictures: Mapping[str, Sequence[str]]) -> str:
-    """Return the report as a self-contained page.
-
-    Args:
-        pictures: key of an example -> the frames of its window, JPEG in base64.
-    """
+def page_of(report: Evaluation) -> str:
+    """Return the report as a self-contained page."""
     parts = [
         {
             "main": main_table(report, language),
@@ -212,23 +193,12 @@ def page_of(report: Evaluation, pictures: Mapping[str, Sequence[str]]) -> str:
     look = {"shown": _cell, "numeric_columns": lambda table: table["numeric"], "greatest": lambda table: table["most"]}
     return page(
         "distill/evaluation/evaluation.html", title=", ".join(report.students), report=report, parts=parts,
-        tiles=_tiles(report), notes=notes_of(report), fields=FIELDS, pictures=pictures, look=look,
+        notes=notes_of(report), fields=FIELDS, look=look,
     )  # fmt: skip
 
 
 def _cell(cell: Any) -> str:
     return f"{cell:.0%}" if isinstance(cell, float) else str(cell)
-
-
-def _tiles(report: Evaluation) -> list[tuple[str, str]]:
-    """Return the first figures that a reader wants: those of each student next to the best baseline and the teacher."""
-    part = next(iter(report.languages.values()))
-    names = [*report.students, *(name for name in ("blind", "rule", "majority") if name in part.who)]
-    tiles = [(part.who[name].figures["accuracy"], f"{name}: the teacher's decision") for name in names]
-    names = [*report.students, TEACHER]
-    tiles += [(part.who[name].figures["accuracy_on_labels"], f"{name}: the geometric label") for name in names]
-    tiles += [(part.who[name].figures["parsed"], f"{name}: answers parse") for name in report.students]
-    return [(f"{figure.value:.0%}", words) for figure, words in tiles if figure.value is not None]
 
 
 def _confusions(report: Evaluation, part: Measurement) -> list[dict[str, Any]]:

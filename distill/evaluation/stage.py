@@ -6,27 +6,27 @@ the motion after the window are measured too.
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel
 
-from cosfly.formats.captions import Language, ValueCounts, read_captions
+from cosfly.formats.captions import TOKENS, Language, ValueCounts, read_captions
 from cosfly.formats.predictions import PREDICTIONS, Prediction, read_predictions
+from cosfly.inspection.blind_baseline import FITTED_ON, fit_deciders
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import inside, write_bytes
-from cosfly.runtime.json_io import validated, write_model
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.json_io import write_model
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally, read_manifest
 from cosfly.runtime.seeding import rng_for
-from cosfly.viz.frame_views import thumbnail
 from distill.evaluation.bertscore import Metric, Scorer, encoder_files
 from distill.evaluation.figures import (
     CONFIDENCE,
     RESAMPLES,
-    UNPARSED,
+    TEACHER,
     Answers,
     Measurement,
     coc_of,
@@ -34,23 +34,19 @@ from distill.evaluation.figures import (
     measure,
     text_of,
 )
-from distill.evaluation.floors import floors_of
 from distill.evaluation.report import (
     REPORT,
     REPORT_FORMAT,
     Evaluation,
     Example,
-    ExampleAnswer,
     StudentRecord,
     markdown_of,
     page_of,
 )
-from distill.schema import Sample, open_split, resolve_trees, tree_inputs
+from distill.schema import Sample, open_split
 
 STAGE = "distill.evaluate"
 NUM_EXAMPLES = 12  # samples that the page shows with their answers
-THUMBNAIL_PX = 256  # width of a frame on the page
-MOST_RAW = 2000  # characters of an answer in an example
 Predictions = Mapping[str, Mapping[str, Prediction]]  # student -> sample's key -> its prediction
 # (run or None, window, language, text) -> values of this text
 JudgedValues = dict[tuple[str | None, str, str, str], ValueCounts]
@@ -61,7 +57,6 @@ def run(
     dataset: Path,
     out: Path,
     *,
-    data: Sequence[Path] = (),
     encoders: Mapping[Language, Path] | None = None,
     judged: Sequence[Path] = (),
     seed: int = 0,
@@ -85,8 +80,8 @@ def run(
     if len(files) < len(predictions):
         fix = "rename the folder of one of them, because it is the name of a column"
         raise InputError("two students have the same name", got=", ".join(map(str, predictions)), fix=fix)
-    encoders, trees = dict(encoders or {}), resolve_trees(dataset, data) if data else {}
-    inputs = {"dataset": dataset, **{f"predictions/{name}": path for name, path in files.items()}, **tree_inputs(trees)}
+    encoders = dict(encoders or {})
+    inputs = {"dataset": dataset, **{f"predictions/{name}": path for name, path in files.items()}}
     inputs |= {f"judged/{n}": path for n, path in enumerate(judged, 1)}
     inputs |= {
         f"bertscore/{language}/{path.name}": path
@@ -110,9 +105,7 @@ def run(
     report = evaluate(asked, students, found, dataset, encoders, read_judged(judged), seed)
     write_model(out / REPORT, report, REPORT_FORMAT)
     write_bytes(out / "evaluation.md", markdown_of(report).encode())
-    of_key = {sample.key: sample for sample in asked}
-    pictures = {example.key: _pictures_of(of_key[example.key], trees) for example in report.examples if trees}
-    write_bytes(out / "evaluation.html", page_of(report, pictures).encode())
+    write_bytes(out / "evaluation.html", page_of(report).encode())
     num_left = len(samples) - len(asked)
     tally = Tally(input=len(samples), kept=len(asked), dropped={"not_asked": num_left} if num_left else {})
     products = [out / name for name in (REPORT, "evaluation.md", "evaluation.html")]
@@ -124,26 +117,12 @@ def _folder_of(predictions: Path) -> Path:
     return predictions if predictions.is_dir() else predictions.parent
 
 
-class _Speed(BaseModel):
-    """Facts of the last run in the manifest of `distill infer`."""
-
-    seconds: float = 0
-    answers: int = 0
-
-
 def _samples_per_s(folder: Path) -> float | None:
     """Return the speed of the last run of `distill infer`; None if there is no record."""
-    path = folder / "manifest.json"
-    if not path.is_file():
+    if not (folder / "manifest.json").is_file():
         return None
-    speed = validated(_Speed, read_manifest(folder).facts.get("speed", {}), path)
-    return speed.answers / speed.seconds if speed.seconds and speed.answers else None
-
-
-def _pictures_of(sample: Sample, trees: Mapping[str, Path]) -> list[str]:
-    """Return the readable frames of a sample's window as small JPEGs in base64."""
-    found = (thumbnail(inside(trees[sample.run], frame), THUMBNAIL_PX) for frame in sample.frames)
-    return [picture for picture in found if picture is not None]
+    speed = read_manifest(folder).facts.get("speed") or {}
+    return speed["answers"] / speed["seconds"] if speed.get("answers") and speed.get("seconds") else None
 
 
 def asked_samples(samples: Sequence[Sample], predictions: Predictions) -> list[Sample]:
@@ -209,7 +188,7 @@ def evaluate(
             for name, scores in scorer.score(written, references).items():
                 everyone[name].scores[:] = np.where(everyone[name].is_answered[:, None], scores, np.nan)
         measurements[language] = measure(own, everyone, predictions, rng_for(seed, STAGE, "draws"))
-        examples += _examples(own, predictions, everyone, NUM_EXAMPLES // len(languages), seed)
+        examples += _examples(own, predictions, NUM_EXAMPLES // len(languages), seed)
     return Evaluation(
         split=next(iter(next(iter(predictions.values())).values())).split,
         seed=seed,
@@ -233,33 +212,54 @@ def _student_record(
     )
 
 
-def _examples(
-    samples: Sequence[Sample], predictions: Predictions, everyone: Mapping[str, Answers], most: int, seed: int
-) -> list[Example]:
-    """Choose samples to show: by the first student's outcome (no answer, unparsed, wrong, right) in turn."""
-    first = everyone[next(iter(predictions))]
-    right = first.decision == np.array([decision_number(sample.decision, sample.key) for sample in samples])
-    outcomes = np.where(~first.is_answered, 0, np.where(first.decision == UNPARSED, 1, np.where(right, 3, 2)))
-    kinds: dict[int, list[int]] = {kind: [] for kind in range(4)}
-    for place in rng_for(seed, STAGE, "examples").permutation(len(samples)).tolist():
-        kinds[int(outcomes[place])].append(place)
-    chosen: list[int] = []
-    while len(chosen) < min(most, len(samples)):
-        chosen += [places.pop() for places in kinds.values() if places]
-    return [
-        Example(
-            key=samples[place].key,
-            walk=samples[place].walk,
-            label=samples[place].label,
-            reference=coc_of(samples[place]),
-            answers={
-                name: _example_answer(own[samples[place].key], everyone[name].scores[place, 2])
-                for name, own in predictions.items()
-            },
-        )
-        for place in chosen[:most]
-    ]
+def _examples(samples: Sequence[Sample], predictions: Predictions, most: int, seed: int) -> Iterator[Example]:
+    """Yield samples with everybody's answers, chosen by the seed."""
+    for place in rng_for(seed, STAGE, "examples").permutation(len(samples))[:most].tolist():
+        sample = samples[place]
+        answers = {name: own[sample.key] for name, own in predictions.items()}
+        yield Example(key=sample.key, walk=sample.walk, label=sample.label, reference=coc_of(sample), answers=answers)
 
 
-def _example_answer(prediction: Prediction, f1: float) -> ExampleAnswer:
-    return ExampleAnswer(coc=prediction.coc, raw=prediction.raw[:MOST_RAW], f1=None if np.isnan(f1) else float(f1))
+# --- baselines --------------------------------------------------------------------------------------------------------
+
+# They see no picture. majority: one answer of the training split, with its most frequent decision, for every sample.
+# rule: a decision tree of depth two on the geometry of the past frames, fitted on the training split. blind: a small
+# network on the same numbers (cosfly/inspection/blind_baseline.py).
+
+
+def majority(decisions: Iterable[str]) -> str | None:
+    """Return the most frequent decision; a tie goes to the first in the order of the action table."""
+    counts = Counter(decisions)
+    return max(TOKENS, key=lambda action: counts[action]) if counts else None
+
+
+def floors_of(
+    train: Collection[Sample], samples: Sequence[Sample], language: Language, seed: int
+) -> dict[str, Answers]:
+    """Return the answers of the teacher and of each baseline to samples of one language.
+
+    Args:
+        train: samples of the training split, in any language. Without one in `language` there are no baselines; without
+            the geometry of the past there is no rule and no network.
+    """
+    counts, typical, fitted = Counter[str](), dict[str, tuple[bytes, Sample]](), list[Sample]()
+    share = FITTED_ON / max(1, len(train))
+    for sample in train:
+        if sample.language == language:
+            counts[sample.decision] += 1
+            rank = hashlib.sha256(f"{seed}/distill.floor/{sample.sample_id}".encode()).digest()
+            if sample.decision not in typical or rank < typical[sample.decision][0]:
+                typical[sample.decision] = rank, sample
+            if int.from_bytes(rank[:8]) <= share * 2**64:
+                fitted.append(sample)
+    found = {TEACHER: Answers.of(np.array([decision_number(s.decision, s.key) for s in samples]))}
+    decision = majority(counts.elements())
+    if decision is not None:
+        constant = np.full(len(samples), TOKENS.index(decision))
+        found["majority"] = Answers.of(constant, [text_of(coc_of(typical[decision][1]))] * len(samples))
+    if fitted and all(sample.past for sample in (*fitted, *samples)):
+        pasts, asked = (np.array([sample.past for sample in part]) for part in (fitted, samples))
+        decisions = np.array([decision_number(sample.decision, sample.key) for sample in fitted])
+        deciders = fit_deciders(pasts, decisions, rng_for(seed, "distill.floor", "blind"))
+        found |= {name: Answers.of(decide(asked)) for name, decide in deciders.items()}
+    return found

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from cosfly.formats.places import Place, flight_ids, place_of, sample_id
 from cosfly.formats.playback import ORIGINAL, Track, read_track
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.geometry.axes import step_s
-from cosfly.geometry.splits import SPLITS, Course, walks_of
+from cosfly.geometry.splits import Course, walks_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, fingerprint, write_failures
@@ -26,8 +26,6 @@ from distill.prepare.sources import SplitConfig, check_names, run_of
 from distill.schema import SourceTree, SplitMember, SplitWriter, tree_inputs, write_page
 
 STAGE = "distill.dual_track"
-NO_TWIN, OTHER_FRAMES, SHORT = "no_clean_flight", "clean_flight_of_other_frames", "shorter_than_a_window"
-UNEVEN = "uneven_steps"
 STEP_TOLERANCE_S = 1e-3
 PAGE_TEXT = """\
 Windows of {cfg.observed} frames of a perturbed track (`observed_*`), with the unperturbed poses of drone and target in
@@ -72,17 +70,8 @@ class DualTrackConfig(SplitConfig):
         return self.observed + self.predicted
 
 
-@dataclass(frozen=True)
-class _PairedTrack:
-    """A perturbed track that gives windows, and its id among all tracks."""
-
-    folder: Path
-    place: Place
-    flight_id: str
-
-    @property
-    def key(self) -> str:
-        return f"{self.place.run}/{self.place.town}/{self.place.trajectory}"
+def _key(place: Place) -> str:
+    return f"{place.run}/{place.town}/{place.trajectory}"
 
 
 def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
@@ -100,59 +89,53 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
     if stage.is_complete:
         return out
     # Two passes: the splits must be known before the first window is written.
-    paired, courses, tally = _survey(stage, cfg, runs)
+    folders = {place_of(folder, run): folder for run, tree in runs.items() for folder in find_tracks(tree)}
+    ids = flight_ids(folders)
+    paired, courses, tally = _survey(stage, cfg, folders)
     walks = walks_of(courses)
-    split_of = cfg.assigned({track.key for track in paired}, walks, seed)
-    num_uneven = 0
+    split_of = cfg.assigned({_key(place) for place in paired}, walks, seed)
+    num_windows = 0
     with SplitWriter(out, TrackSample).writing() as writer, progress_bar(f"{STAGE}: writing", len(paired)) as advance:
-        for track in paired:
+        for place in paired:
             advance(1)
-            pair = _read_pair(track.folder, cfg)
+            pair = _read_pair(folders[place], cfg)
             assert isinstance(pair, tuple), "the track was changed while it was read"
-            for sample in samples_of(track, *pair, walks[track.key], cfg):
-                if sample is None:
-                    num_uneven += 1
-                else:
-                    writer.add(split_of[track.key], sample)
+            num_windows += len(windows_of(len(pair[0]), cfg))
+            for sample in samples_of(place, ids[place], *pair, walks[_key(place)], cfg):
+                writer.add(split_of[_key(place)], sample)
     sources = [SourceTree(run=name, sha256=fingerprint(tree)) for name, tree in runs.items()]
     page = write_page(out, "Windows over two tracks", writer.counts, sources, PAGE_TEXT.format(cfg=cfg))
-    own = {split: [track for track in paired if split_of[track.key] == split] for split in SPLITS}
-    facts = {
-        split: {
-            "samples": writer.counts[split],
-            "tracks": len(own[split]),
-            "walks": len({walks[t.key] for t in own[split]}),
-        }
-        for split in SPLITS
-    }
-    stage.finish([*writer.paths, page], tally, splits=facts, windows_left_out={UNEVEN: num_uneven})
+    facts = {}
+    for split, count in writer.counts.items():
+        keys = [_key(place) for place in paired if split_of[_key(place)] == split]
+        facts[split] = {"samples": count, "tracks": len(keys), "walks": len({walks[key] for key in keys})}
+    num_uneven = num_windows - sum(writer.counts.values())
+    stage.finish([*writer.paths, page], tally, splits=facts, windows_left_out={"uneven_steps": num_uneven})
     return out
 
 
 def _survey(
-    stage: StageFolder, cfg: DualTrackConfig, runs: Mapping[str, Path]
-) -> tuple[list[_PairedTrack], list[Course], Tally]:
+    stage: StageFolder, cfg: DualTrackConfig, folders: Mapping[Place, Path]
+) -> tuple[list[Place], list[Course], Tally]:
     """Return the perturbed tracks that give windows, their courses, and the counts of all tracks."""
-    folders = [(folder, place_of(folder, run)) for run, tree in runs.items() for folder in find_tracks(tree)]
-    ids = flight_ids([place for _, place in folders])
-    paired: list[_PairedTrack] = []
+    paired: list[Place] = []
     courses: list[Course] = []
     dropped: Counter[str] = Counter()
     failures: list[Failed] = []
     with progress_bar(f"{STAGE}: reading", total=len(folders)) as advance:
-        for folder, place in folders:
+        for place, folder in folders.items():
             advance(1)
-            track = _PairedTrack(folder, place, ids[place])
             try:
                 pair = None if folder.name == ORIGINAL else _read_pair(folder, cfg)
             except InputError as error:
-                failures.append(Failed(id=f"{track.key}/{place.variant}", code=error.code, message=str(error)))
+                name = f"{_key(place)}/{place.variant}"
+                failures.append(Failed(id=name, code=error.code, message=str(error)))
                 continue
             if isinstance(pair, str):
                 dropped[pair] += 1
             elif pair is not None:
-                paired.append(track)
-                courses.append(Course(track.key, place.town, pair[1].time_s, pair[1].walked_m).at_seconds())
+                paired.append(place)
+                courses.append(Course(_key(place), place.town, pair[1].time_s, pair[1].walked_m).at_seconds())
     write_failures(stage.path / "failures.jsonl", failures)
     failed = Counter(failure.code for failure in failures)
     tally = Tally(input=len(paired) + dropped.total() + len(failures), kept=len(paired), dropped=dropped, failed=failed)
@@ -169,10 +152,10 @@ def _read_pair(folder: Path, cfg: DualTrackConfig) -> tuple[Track, Track] | str 
     try:
         twin = read_twin(track)
     except VerifyError:
-        return OTHER_FRAMES
+        return "clean_flight_of_other_frames"
     if twin is None:
-        return NO_TWIN
-    return (track, twin) if windows_of(len(track), cfg) else SHORT
+        return "no_clean_flight"
+    return (track, twin) if windows_of(len(track), cfg) else "shorter_than_a_window"
 
 
 def windows_of(num_frames: int, cfg: DualTrackConfig) -> range:
@@ -181,15 +164,14 @@ def windows_of(num_frames: int, cfg: DualTrackConfig) -> range:
 
 
 def samples_of(
-    found: _PairedTrack, track: Track, twin: Track, walk: str, cfg: DualTrackConfig
-) -> Iterator[TrackSample | None]:
-    """Cut a pair of tracks into windows; None for one whose frames are not evenly apart in time."""
-    step, place = step_s(track.time_s), found.place
+    place: Place, flight_id: str, track: Track, twin: Track, walk: str, cfg: DualTrackConfig
+) -> Iterator[TrackSample]:
+    """Cut a pair of tracks into windows, without those whose frames are not evenly apart in time."""
+    step = step_s(track.time_s)
     for first in windows_of(len(track), cfg):
         now, end = first + cfg.observed, first + cfg.length
         time_s = track.time_s[first:end]
         if len(time_s) > 1 and np.abs(np.diff(time_s) - step).max() > STEP_TOLERANCE_S:
-            yield None
             continue
         seen, after = slice(first, now), slice(now, end)
         vectors: dict[str, Any] = {}
@@ -198,8 +180,8 @@ def samples_of(
             vectors[f"{part}_rotation_deg"] = _vectors(source.rotations_deg[rows])
             vectors[f"{part}_target_m"] = _vectors(source.targets_m[rows])
         yield TrackSample(
-            sample_id=sample_id(found.flight_id, now - 1),
-            **{name: getattr(place, name) for name in ("run", "town", "trajectory", "variant")},
+            sample_id=sample_id(flight_id, now - 1),
+            **asdict(place),
             walk=walk,
             window=tuple(range(first, now)),
             future=tuple(range(now, end)),

@@ -30,8 +30,6 @@ class RunSource:
         """Return the source of a run directory, the output of `cosfly run`."""
         if not (folder / "render").is_dir():
             what, fix = "the folder is not a run directory", "pass --data and --captions if they are in other folders"
-            if any((folder / name).is_file() for name in ("release.json", "dataset/release.json")):
-                what, fix = "a release is not a run directory", "pass the run that the release was built from"
             raise InputError(what, where=folder, expected="the folders render/ and caption/", fix=fix)
         captions = folder / "caption/captions.jsonl"
         check_stays_below(captions, captions.parent)

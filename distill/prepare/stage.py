@@ -17,13 +17,13 @@ from typing import Any, NamedTuple
 
 from pydantic import Field, model_validator
 
-from cosfly.formats.captions import PICTURES_MARK, TOKENS, Caption, Language, Place, Verdict, not_in_set, read_captions
+from cosfly.formats.captions import Caption, Language, Place, Verdict, read_captions
 from cosfly.formats.frames import frame_name, frame_path
 from cosfly.formats.places import Place as TrackPlace
-from cosfly.formats.places import TrackChoice, flight_ids, sample_id
+from cosfly.formats.places import flight_ids, sample_id
 from cosfly.formats.playback import Track, read_track
 from cosfly.formats.predictions import Split
-from cosfly.formats.tracks import find_tracks, track_of
+from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.splits import SPLITS, Course, walks_of
 from cosfly.inspection.blind_baseline import past_of
 from cosfly.llm.answer_text import parse_answer
@@ -46,7 +46,6 @@ PAGE_TEXT = "`prompt` is the question, `answer` the expected answer. No two spli
 class PrepareConfig(SplitConfig):
     """Settings of `distill prepare`."""
 
-    flights: TrackChoice = Field(TrackChoice(), description="tracks to use")
     languages: tuple[Language, ...] = Field(
         ("en", "zh"), min_length=1, description="languages of the answers; each gives its own samples"
     )
@@ -97,10 +96,6 @@ def make_sample(
     parsed = parse_answer(answer, language)
     if parsed.coc is None:  # the evaluation would call it wrong
         return f"answer_{parsed.reason}"
-    if PICTURES_MARK not in caption.prompt[language].user:
-        where, expected = f"{caption.sample_id}: prompt.{language}", f"{PICTURES_MARK} in the prompt"
-        what, fix = "the prompt has no mark for the pictures", "run cosfly caption again"
-        raise InputError(what, where=where, expected=expected, fix=fix)
     pictures = Pictures(cfg.modalities, caption.picture_px, depth_range_m=caption.depth_range_m or DEPTH_RANGE_M)
     is_noisy = caption.label_from == "perturbed"  # and so are the decisions that this future rules out
     ruled_out = caption.checks.contradicted
@@ -136,7 +131,6 @@ class _CaptionedTrack:
     name: str | None
     size_px: tuple[int, int] | None
     frames: frozenset[int]
-    is_chosen: bool
 
 
 class _Window(NamedTuple):
@@ -178,14 +172,12 @@ class _Windows:
         if (source.run, folder) not in self._tracks:
             self._tracks[source.run, folder] = self._track(source, folder, names)
         track = self._tracks[source.run, folder]
-        if caption.en is not None and caption.en.flight_decision not in TOKENS:
-            raise not_in_set(caption.en.flight_decision, f"{source.captions}: {caption.sample_id}")
         window = _Window(track, [], [])
         own: dict[str, Any] = {"run": source.run, "walk": self.walks.get(track.key, "")}
         if track.name is not None:
             own["sample_id"] = sample_id(track.name, caption.frame_index)
         for language in self._cfg.languages:
-            sample = make_sample(caption, language, self._cfg, **own) if track.is_chosen else "not_chosen"
+            sample = make_sample(caption, language, self._cfg, **own)
             if isinstance(sample, Sample):
                 sample = _unfit(track, sample) or sample
             if isinstance(sample, Sample):
@@ -206,9 +198,7 @@ class _Windows:
                 for index in range(len(track))
                 if all(frame_path(folder / frame_name(index), VIEW_FILES[v]).is_file() for v in self._cfg.modalities)
             )
-        choice = self._cfg.flights
-        is_chosen = choice.names("/".join(names)) and track_of(folder) in choice.tracks
-        return _CaptionedTrack(key, self._ids.get(TrackPlace(source.run, *names)), size_px, frames, is_chosen)
+        return _CaptionedTrack(key, self._ids.get(TrackPlace(source.run, *names)), size_px, frames)
 
 
 def _past_of(track: Track, window: Sequence[int]) -> tuple[float, ...]:
@@ -256,22 +246,20 @@ def run(
     windows.find_walks()
     split_of = cfg.assigned(keys, windows.walks, seed)
     last_rank = sorted(ranks)[cfg.limit - 1] if 0 < cfg.limit < len(ranks) else max(ranks)
-    counters: dict[Split, dict[str, Counter[str]]] = {
-        split: {"language": Counter(), "decision": Counter(), "walk": Counter(), "track": Counter()} for split in SPLITS
-    }
+    decisions: dict[Split, Counter[str]] = {split: Counter() for split in SPLITS}
+    tracks: dict[Split, set[tuple[str, ...]]] = {split: set() for split in SPLITS}
     with SplitWriter(out, Sample).writing() as writer:
         for sample in _selected(windows, last_rank, left_out, seed):
-            key = f"{sample.run}/{sample.town}/{sample.trajectory}"
-            values = {"walk": sample.walk, "track": f"{key}/{sample.variant}"}
-            for name, counter in counters[split_of[key]].items():
-                counter[values.get(name) or getattr(sample, name)] += 1
-            writer.add(split_of[key], sample)
+            split = split_of[f"{sample.run}/{sample.town}/{sample.trajectory}"]
+            decisions[split][sample.decision] += 1
+            tracks[split].add((sample.walk, sample.run, sample.town, sample.trajectory, sample.variant))
+            writer.add(split, sample)
     trees = [SourceTree(run=source.run, sha256=fingerprint(source.data)) for source in sources]
     write_model(out / RECORD, TrainingSet(split_by=cfg.split_by, trees=trees, samples=writer.counts), RECORD_FORMAT)
     page = write_page(out, "Training set", writer.counts, trees, PAGE_TEXT.format(cfg.split_by))
     num_kept = sum(writer.counts.values())
     tally = Tally(input=num_kept + left_out.total(), kept=num_kept, dropped=left_out)
-    stage.finish([*writer.paths, out / RECORD, page], tally, splits=_facts(counters), split_by=cfg.split_by)
+    stage.finish([*writer.paths, out / RECORD, page], tally, splits=_facts(decisions, tracks), split_by=cfg.split_by)
     return out
 
 
@@ -312,20 +300,20 @@ def _selected(windows: _Windows, last_rank: int, left_out: Counter[str], seed: i
                 yield from window.samples
 
 
-def _facts(counters: Mapping[Split, Mapping[str, Counter[str]]]) -> dict[str, dict[str, Any]]:
+def _facts(
+    decisions: Mapping[Split, Counter[str]], tracks: Mapping[Split, set[tuple[str, ...]]]
+) -> dict[str, dict[str, Any]]:
     """Return the counts of the manifest; warn of empty splits and of decisions that training does not have."""
     facts: dict[str, dict[str, Any]] = {}
-    for split, own in counters.items():
-        unseen = {name: n for name, n in own["decision"].items() if name not in counters["train"]["decision"]}
-        if not own["decision"]:
+    for split, own in decisions.items():
+        if not own:
             log.warning("%s: the split %s is empty", STAGE, split)
-        if unseen:
+        if unseen := {name: count for name, count in own.items() if name not in decisions["train"]}:
             log.warning("%s: %s has decisions that train does not have: %s", STAGE, split, unseen)
-        facts[split] = {
-            "samples": own["language"].total(),
-            "walks": len(own["walk"]),
-            "tracks": len(own["track"]),
-            **{f"by_{name}": dict(sorted(own[name].items())) for name in ("language", "decision")},
-            "not_in_train": unseen,
+        counts = {
+            "samples": own.total(),
+            "walks": len({walk for walk, *_ in tracks[split]}),
+            "tracks": len(tracks[split]),
         }
+        facts[split] = {**counts, "by_decision": dict(sorted(own.items())), "not_in_train": unseen}
     return facts
