@@ -21,7 +21,7 @@ from distill.evaluation.report import REPORT_FORMAT, Evaluation
 from distill.evaluation.stage import asked_samples, floors_of, majority, run
 from distill.inference.outcome import failed_prediction, make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
-from distill.schema import Sample
+from distill.schema import Sample, open_split
 
 
 def sample_of(frame: int, language: str = "en") -> Sample:
@@ -250,6 +250,15 @@ def test_without_an_encoder_the_report_says_so_and_gives_no_number(place):
         assert (again.parent / name).read_bytes() == (path.parent / name).read_bytes()
 
 
+def test_a_student_is_not_named_like_another_column(place):
+    for name in ("teacher", "rule"):
+        shutil.copytree(place / "one", place / name)
+        with pytest.raises(InputError, match="same name"):
+            run([place / name], place / "set", place / "out")
+    with pytest.raises(InputError, match="same name"):
+        run([place / "one", place / "one/predictions.jsonl"], place / "set", place / "out")
+
+
 def test_the_table_has_everybody_side_by_side(place):
     """Students, teacher, baselines and the paper, in one row of a figure; and the differences of students."""
     out = run([place / "one", place / "other"], place / "set", place / "out").parent
@@ -337,11 +346,16 @@ def test_scores_are_those_of_the_library(encoder):
 
 
 def test_an_evaluation_with_an_encoder_names_it(place, encoder):
-    out = run([place / "one"], place / "set", place / "out", encoders={"en": encoder, "zh": encoder}).parent
+    """A student whose answers do not parse scores 0."""
+    silent = [make_prediction(sample, "test", "Well.", 2, True) for sample in open_split(place / "set", "test")]
+    write_predictions(place / "silent", silent)
+    students = [place / "one", place / "silent"]
+    out = run(students, place / "set", place / "out", encoders={"en": encoder, "zh": encoder}).parent
     report = read_report(out)
     f1 = {name: own.figures["bertscore_f1"].value for name, own in report.languages["en"].who.items()}
     assert 0 < f1["one"] < 1
     assert 0 < f1["majority"] < 1
+    assert f1["silent"] == 0
     assert f1["teacher"] is None
     assert report.languages["en"].who["majority"].figures["values_matched"].value is None
     assert sum(report.languages["en"].histograms["one"]) == 6  # of parsed answers

@@ -24,7 +24,7 @@ from distill.schema import Sample
 
 CONFIDENCE = 0.95  # level of the intervals
 RESAMPLES = 2000  # draws of pedestrian trajectories
-BINS = 100  # of the histogram of F1, from 0 to 1
+BINS = 50  # of the histogram of F1, from 0 to 1
 UNPARSED = -1  # the number of the decision of an answer that does not parse
 UNPARSED_NAME = "(unparsed)"
 TEACHER = "teacher"

@@ -46,6 +46,7 @@ from distill.evaluation.report import (
 from distill.schema import Sample, open_split
 
 STAGE = "distill.evaluate"
+BASELINES = ("majority", "rule", "blind")
 NUM_EXAMPLES = 12  # samples that the page shows with their answers
 Predictions = Mapping[str, Mapping[str, Prediction]]  # student -> sample's key -> its prediction
 # (run or None, window, language, text) -> values of this text
@@ -76,10 +77,14 @@ def run(
     Raises:
         InputError: an input is missing, or predictions and training set do not belong together.
     """
-    files = {folder.absolute().name: folder / PREDICTIONS for folder in map(_folder_of, predictions)}
-    if len(files) < len(predictions):
-        fix = "rename the folder of one of them, because it is the name of a column"
-        raise InputError("two students have the same name", got=", ".join(map(str, predictions)), fix=fix)
+    paths = [path / PREDICTIONS if path.is_dir() else path for path in predictions]
+    files = {path.absolute().parent.name: path for path in paths}
+    if len(files) < len(paths) or files.keys() & {TEACHER, *BASELINES}:
+        what, fix = (
+            "two columns of the table have the same name",
+            "rename the folder of a student, which names its column",
+        )
+        raise InputError(what, got=", ".join(files), fix=fix)
     encoders = dict(encoders or {})
     inputs = {"dataset": dataset, **{f"predictions/{name}": path for name, path in files.items()}}
     inputs |= {f"judged/{n}": path for n, path in enumerate(judged, 1)}
@@ -111,10 +116,6 @@ def run(
     products = [out / name for name in (REPORT, "evaluation.md", "evaluation.html")]
     stage.finish(products, tally, split=splits[0], models={name: one.model for name, one in report.students.items()})
     return out / REPORT
-
-
-def _folder_of(predictions: Path) -> Path:
-    return predictions if predictions.is_dir() else predictions.parent
 
 
 def _samples_per_s(folder: Path) -> float | None:
@@ -184,7 +185,7 @@ def evaluate(
             references = [text_of(coc_of(sample)) for sample in own]
             scorer = Scorer(encoders[language], references)
             metrics[language] = scorer.metric
-            written = {name: answers.texts.tolist() for name, answers in everyone.items() if any(answers.texts)}
+            written = {name: everyone[name].texts.tolist() for name in (*predictions, "majority") if name in everyone}
             for name, scores in scorer.score(written, references).items():
                 everyone[name].scores[:] = np.where(everyone[name].is_answered[:, None], scores, np.nan)
         measurements[language] = measure(own, everyone, predictions, rng_for(seed, STAGE, "draws"))
