@@ -108,12 +108,7 @@ class TrainingSet(Record):
 
 def read_training_set(dataset: Path) -> TrainingSet:
     """Read the record of a training set."""
-    path = dataset / RECORD
-    if not path.exists():
-        raise InputError(
-            "the folder is not a training set", where=dataset, got=f"no {RECORD}", fix="run cosfly distill prepare"
-        )
-    return read_model(path, TrainingSet, RECORD_FORMAT, tree=dataset)
+    return read_model(dataset / RECORD, TrainingSet, RECORD_FORMAT, tree=dataset)
 
 
 def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:

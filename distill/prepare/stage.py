@@ -142,12 +142,15 @@ class _Window(NamedTuple):
 
 
 class _Windows:
-    """The windows of all sources; can be iterated repeatedly. walks: known after `find_walks`."""
+    """The windows of all sources; can be iterated repeatedly.
+
+    courses: of the tracks that were read. walks: key of a track -> its walk, set after the first iteration.
+    """
 
     def __init__(self, cfg: PrepareConfig, sources: Sequence[RunSource]) -> None:
         self._cfg, self._sources = cfg, sources
         self._tracks: dict[tuple[str, Path], _CaptionedTrack] = {}
-        self._courses: list[Course] = []
+        self.courses: list[Course] = []
         self._read = lru_cache(maxsize=4)(lambda folder: read_track(folder, strict=False))
         places = [
             TrackPlace(source.run, *folder.relative_to(source.data).parts[-3:])
@@ -161,10 +164,6 @@ class _Windows:
         for source in self._sources:
             for caption in read_captions(source.captions):
                 yield self._window(source, caption)
-
-    def find_walks(self) -> None:
-        """Find the walks of the tracks that were read."""
-        self.walks, self._courses = walks_of(self._courses), []
 
     def _window(self, source: RunSource, caption: Caption) -> _Window:
         names = (caption.town, caption.trajectory, caption.variant)
@@ -191,7 +190,7 @@ class _Windows:
         key, size_px, frames = f"{source.run}/{names[0]}/{names[1]}", None, frozenset[int]()
         if (folder / "trajectory.json").exists():
             track = self._read(folder)
-            self._courses.append(Course(key, names[0], track.time_s, track.walked_m).at_seconds())
+            self.courses.append(Course(key, names[0], track.time_s, track.walked_m).at_seconds())
             size_px = (track.camera.width_px, track.camera.height_px)
             frames = frozenset(
                 index
@@ -243,7 +242,7 @@ def run(
     if not ranks:
         tally = Tally(input=left_out.total(), dropped=left_out)
         raise stage.nothing_kept(tally, expected="accepted captions with images below --data")
-    windows.find_walks()
+    windows.walks = walks_of(windows.courses)
     split_of = cfg.assigned(keys, windows.walks, seed)
     last_rank = sorted(ranks)[cfg.limit - 1] if 0 < cfg.limit < len(ranks) else max(ranks)
     decisions: dict[Split, Counter[str]] = {split: Counter() for split in SPLITS}
