@@ -77,6 +77,7 @@ def test_splits_of_a_release_share_no_walk_and_make_up_the_whole(place):
     names = sorted({shard["split"] for shard in record["shards"]})
     parts = [WindowDataset(place / "release/dataset", split=name) for name in names]
     assert sum(map(len, parts)) == len(WindowDataset(place / "release/dataset"))
+    assert len(WindowDataset(place)) == sum(map(len, parts))  # a run directory has its release below it
     trajectories = [{found.flight[2] for found in part._places} for part in parts]
     assert sum(map(len, trajectories)) == len(set().union(*trajectories))
 
