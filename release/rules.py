@@ -63,7 +63,7 @@ def split_flights(
     """
     shares: dict[Split, float] = {"val": fractions["validation"], "test": fractions["test"]}
     groups = {name: walk if by == "walk" else town_family(town) for name, (walk, town) in flights.items()}
-    splits = assign_splits(groups.values(), shares, seed, too_few="fill", what=f"{by}s")
+    splits = assign_splits(groups.values(), shares, seed)
     return {name: NAME_OF[splits[group]] for name, group in groups.items()}
 
 

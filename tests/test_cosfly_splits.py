@@ -4,13 +4,11 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cosfly.formats.playback import read_track, write_track
 from cosfly.geometry.splits import SPLITS, Course, assign_splits, walks_of
-from cosfly.runtime.errors import InputError
 from specimens import make_flight
 
 STEP_S = 0.5
@@ -87,22 +85,18 @@ def test_walks_agree_with_a_slow_plain_comparison():
 def test_splits_cover_all_and_none_is_empty(num_groups, val, test, seed):
     shares = {"val": val, "test": test}
     names = [f"walk_{i}" for i in range(num_groups)]
-    split_of = assign_splits(names, shares, seed, too_few="refuse")
+    split_of = assign_splits(names, shares, seed)
     assert set(split_of) == set(names)
     counts = Counter(split_of.values())
     assert set(counts) == {split for split in SPLITS if split == "train" or shares[split] > 0}
     assert abs(counts["val"] - val * num_groups) <= 1
-    assert split_of == assign_splits(list(reversed(names)) * 2, shares, seed, too_few="refuse")  # order, repeats
+    assert split_of == assign_splits(list(reversed(names)) * 2, shares, seed)  # order, repeats
     if num_groups > 30 and min(val, test) > 0.05:
-        assert split_of != assign_splits(names, shares, seed + 1, too_few="refuse")
+        assert split_of != assign_splits(names, shares, seed + 1)
 
 
-def test_too_few_groups_are_refused_unless_told():
+def test_with_few_groups_train_comes_first():
     shares = {"val": 0.1, "test": 0.1}
-    with pytest.raises(InputError, match=r"fewer towns than splits.*got 2.*expected at least 3.*fewer splits"):
-        assign_splits(["a", "b"], shares, 0, too_few="refuse", what="towns", fix="ask for fewer splits")
-    assert sorted(assign_splits(["a", "b"], shares, 0, too_few="fill").values()) == ["train", "val"]
-    assert assign_splits(["a"], shares, 0, too_few="fill") == {"a": "train"}
-    assert assign_splits(["a"], {}, 0, too_few="refuse") == {"a": "train"}
-    with pytest.raises(InputError):
-        assign_splits([], shares, 0, too_few="fill")
+    assert sorted(assign_splits(["a", "b"], shares, 0).values()) == ["train", "val"]
+    assert assign_splits(["a"], shares, 0) == assign_splits(["a"], {}, 0) == {"a": "train"}
+    assert assign_splits([], shares, 0) == {}

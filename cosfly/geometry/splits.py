@@ -12,12 +12,10 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
 from cosfly.formats.predictions import Split
-from cosfly.runtime.errors import InputError
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")  # the order in which scarce groups are handed out
 
@@ -130,35 +128,19 @@ def _near_pairs(courses: list[Course]) -> list[tuple[str, str]]:
 # --- splits -----------------------------------------------------------------------------------------------------------
 
 
-def assign_splits(
-    groups: Iterable[str],
-    fractions: Mapping[Split, float],
-    seed: int,
-    *,
-    too_few: Literal["refuse", "fill"],
-    what: str = "pedestrian trajectories",
-    fix: str = "provide more of them, or set the fraction of a split to 0",
-) -> dict[str, Split]:
+def assign_splits(groups: Iterable[str], fractions: Mapping[Split, float], seed: int) -> dict[str, Split]:
     """Assign groups to splits: group -> split.
 
     Groups are ranked by a hash of (seed, group). The first go to test, the next to val, the others to train; the
-    numbers are the rounded fractions, and at least one for each split that has a share.
+    numbers are the rounded fractions, and at least one for each split that has a share. With fewer groups than splits,
+    train gets one first, then val.
 
     Args:
         fractions: shares of `val` and `test`, together below 1; 0 or none: no such split.
-        too_few: with fewer groups than splits, refuse, or fill train, then val, and leave the others empty.
-        what, fix: for the message.
     """
     ranked = sorted(set(groups), key=lambda group: hashlib.sha256(f"{seed}/distill.split/{group}".encode()).digest())
     requested = [split for split in SPLITS if split == "train" or fractions.get(split, 0.0) > 0]
     if len(ranked) < len(requested):
-        if too_few == "refuse" or not ranked:
-            raise InputError(
-                f"there are fewer {what} than splits, and each split needs at least one",
-                got=f"{len(ranked)} {what}",
-                expected=f"at least {len(requested)}, one for each of {', '.join(requested)}",
-                fix=fix,
-            )
         return dict(zip(ranked, requested, strict=False))
     num_test, num_val = (
         max(1, round(share * len(ranked))) if share else 0

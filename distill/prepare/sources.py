@@ -92,5 +92,5 @@ class SplitConfig(Config):
         by_town = self.split_by == "town"
         group_of = {key: town_family(key.split("/")[1]) if by_town else walks[key] for key in keys}
         fractions: dict[Split, float] = {"val": self.val_fraction, "test": self.test_fraction}
-        split_of = assign_splits(group_of.values(), fractions, seed, too_few="fill")
+        split_of = assign_splits(group_of.values(), fractions, seed)
         return {key: split_of[group] for key, group in group_of.items()}
