@@ -260,7 +260,7 @@ class ReleaseRecord(Strict):
             raise InputError(
                 f"{what} needs consecutive frames, which this release does not have", where=where,
                 got=f"a uniform stride of {self.settings.num_frames} frames per track",
-                fix="build the release with --set release.selection=windows, or use the run",
+                fix="build another release of the run with --set release.selection=windows",
             )  # fmt: skip
 
 

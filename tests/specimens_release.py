@@ -108,9 +108,9 @@ def make_release(root: Path, num_frames: int = 400, window: int = 5, **change) -
     return release_of(root, window=window, num_frames=num_frames, **change)
 
 
-def release_of(root: Path, window: int = 5, **change) -> Path:
+def release_of(root: Path, window: int = 5, picture_px: tuple[int, int] = (96, 54), **change) -> Path:
     captions = [
-        make_caption(flight, i, window=list(range(i - window + 1, i + 1)))
+        make_caption(flight, i, window=list(range(i - window + 1, i + 1)), picture_px=picture_px)
         for flight in map(read_track, find_tracks(root / "tree"))
         for i in range(4, len(flight) - 1)
     ]

@@ -1,18 +1,17 @@
 """Captions as conversations: what TRL, transformers, ms-swift and LLaMA-Factory would make of them."""
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
-from specimens_release import CFG, build, make_caption, make_inspection
+from specimens_release import CFG, build, make_caption, make_inspection, release_of
 
 from cosfly.formats.captions import Coc, read_captions, write_captions
 from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.config import build as build_config
-from cosfly.runtime.errors import InputError, NothingKept
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.png import png_size
 from distill.prepare.sources import RunSource
 from release.export.stage import ExportConfig
@@ -68,15 +67,6 @@ def test_the_last_frame_alone_needs_no_consecutive_frames(run, tmp_path, format)
     assert released > 0
 
 
-def test_a_run_of_several_towns_is_read_as_its_trees(run, tmp_path):
-    for name in ("a", "b"):
-        for part in ("render", "caption"):
-            shutil.copytree(run / part, tmp_path / "towns" / name / part)
-    build(run, tmp_path / "towns/release", CFG.model_copy(update={"num_frames": 5}))
-    folder = chat(tmp_path / "towns", tmp_path / "out")
-    assert len(lines_of(folder / "train.jsonl")) == 2 * 2 * len(accepted(run))
-
-
 def lines_of(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
@@ -109,12 +99,9 @@ def test_messages_are_what_their_loaders_ask_for(run, tmp_path, shown):
 
 def test_pictures_have_the_pixels_of_which_the_texts_speak(tmp_path):
     """A caption's numbers refer to the pictures that its teacher saw, which may be smaller than the frames."""
-    make_playback_tree(tmp_path / "run/render", 1, NUM_POINTS)
-    flight = read_track(find_tracks(tmp_path / "run/render")[0])
-    captions = [make_caption(flight, i).model_copy(update={"picture_px": (32, 18)}) for i in (4, 5)]
-    (tmp_path / "run/caption").mkdir()
-    write_captions(tmp_path / "run/caption/captions.jsonl", captions)
-    product = chat(tmp_path / "run", tmp_path / "out")
+    make_playback_tree(tmp_path / "tree", 1, NUM_POINTS, width_px=96, height_px=54)
+    dataset = release_of(tmp_path, picture_px=(32, 18))
+    product = chat(dataset, tmp_path / "out")
     [sample, *_] = lines_of(product / "train.jsonl")
     assert "pictures of 32 x 18 px" in json.dumps(sample)
     assert {png_size((product / name).read_bytes()) for name in sample["images"]} == {(32, 18)}
@@ -141,9 +128,3 @@ def test_sharegpt_is_one_file_a_split_with_its_entry(two_splits, tmp_path):
 def test_a_training_set_is_not_made_of_a_release(run):
     with pytest.raises(InputError, match=r"release: a release is not a run directory.*pass the run"):
         RunSource.of_run(run / "release")
-
-
-def test_a_source_without_captions_is_refused(run, tmp_path):
-    with pytest.raises(NothingKept, match="no caption to export"):
-        chat(run / "render", tmp_path / "out")
-    assert not (tmp_path / "out/chat").exists()

@@ -191,9 +191,9 @@ def test_the_same_bytes_with_one_process_and_with_two(format, dataset, tmp_path)
 def test_an_export_says_where_it_came_from_and_whose_it_is(format, dataset, tmp_path):
     product = export(config(format), dataset, tmp_path / "out")
     about, source = read_model(product / "export.json", ExportRecord, EXPORT_FORMAT), open_release(dataset)
-    assert about.digest == source.facts.digest
+    assert about.digest == source.record.content_digest
     for name in ("licence", "credits", "maps"):
-        assert getattr(about, name) == getattr(source.facts, name)
+        assert getattr(about, name) == getattr(source.record, name)
     assert about.frames == sum(map(len, source.tracks))
     readme = (product / "README.md").read_text()
     assert "license: cc-by-4.0" in readme

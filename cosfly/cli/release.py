@@ -87,7 +87,7 @@ Format = Literal["tree", "lerobot", "webdataset", "coco", "chat", "sharegpt"]
 @command("cosfly release export release --format webdataset --out shards", common=f"{WORKERS} resume")
 def export(
     job: Job,
-    source: Annotated[Path, Argument(help="Release, run directory or playback tree.")],
+    source: Annotated[Path, Argument(help="Release, or run directory with a release.")],
     out: Annotated[Path, Option(help="Output directory.")],
     format: Annotated[Format, Option(help=FORMATS)],
     modalities: Annotated[str, Option(help="Pictures: rgb,depth,instance; LeRobot has rgb alone by default.")] = "",
@@ -95,7 +95,7 @@ def export(
     language: Annotated[Literal["en", "zh", "both"], Option(help="Conversations: languages.")] = "both",
     frames: Annotated[Literal["all", "last"], Option(help="Conversations: pictures of these frames.")] = "all",
 ) -> None:
-    """Write a release, a run or a playback tree in another format."""
+    """Write a release in another format."""
     from cosfly.runtime.config import build
     from release.columns import LANGUAGES
     from release.export.stage import ExportConfig
@@ -106,10 +106,10 @@ def export(
     job.run("release.export.stage", build(ExportConfig, choice, "options"), source, out)
 
 
-@command("cosfly view release --out release.html", "inspect", "", **track_options("inspect"))
+@command("cosfly view runs/quickstart --out view.html", "inspect", "", **track_options("inspect"))
 def view(
     job: Job,
-    source: Annotated[Path, Argument(help="Map (a file), playback tree, run directory or release.")],
+    source: Annotated[Path, Argument(help="Map (a file), playback tree or run directory.")],
     out: Annotated[Path, Option(help="Page (.html), or of a playback tree a .png or .gif.")],
     paths: Annotated[Path | None, Option(help="With a map: pedestrian trajectories, path.json.")] = None,
     traces: Annotated[list[Path] | None, Option(help="With a map: drone_trace.json; repeat it.")] = None,
@@ -119,7 +119,7 @@ def view(
     map_: Annotated[Path | None, Option("--map", help="With --frame: boxes_3d.json that was drawn.")] = None,
     picture_px: Annotated[int, Option(min=32, max=1280, help="Width of a frame on a page, px.")] = 320,
 ) -> None:
-    """Make a page or a picture of a map, a playback tree, a run or a release; pages work offline."""
+    """Make a page or a picture of a map, a playback tree or a run; pages work offline."""
     if source.is_file():
         job.call(
             "cosfly.viz.scene_page", source, out, paths=paths, traces=traces or [], data=data, picture_px=picture_px
@@ -137,7 +137,5 @@ def view(
         else:
             gallery.preview_gif(source, out, choice)
     else:
-        from release.viewer.page import run
-
-        run(source, out, captions, picture_px=picture_px)
+        job.call("cosfly.viz.viewer", source, out, captions, picture_px=picture_px)
     typer.echo(f"{out}: {out.stat().st_size / 1e6:,.1f} MB")

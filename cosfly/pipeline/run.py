@@ -34,8 +34,8 @@ from cosfly.runtime.io import refuse_link, write_bytes
 from cosfly.runtime.json_io import read_object, validated, write_json
 from cosfly.runtime.run_dir import Manifest, Resume, hold_folder, read_manifest
 from cosfly.viz.gallery import contact_sheet
+from cosfly.viz.viewer import run as write_viewer
 from release.build.sources import Source, choose_licence
-from release.viewer.page import run as write_viewer
 
 log = logging.getLogger(__name__)
 

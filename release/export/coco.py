@@ -121,10 +121,10 @@ def run_lengths(mask: np.ndarray) -> list[int]:
 
 def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) -> FormatFacts:
     """Write the annotations, one file a split."""
-    facts = source.facts
+    record = source.record
     about = {
-        "info": {"description": facts.source, "contributor": facts.credits, "version": facts.digest},
-        "licenses": [{"id": 1, "name": facts.licence, "url": ""}], "categories": CATEGORIES,
+        "info": {"description": record.name, "contributor": record.credits, "version": record.content_digest},
+        "licenses": [{"id": 1, "name": record.licence, "url": ""}], "categories": CATEGORIES,
     }  # fmt: skip
     used = [split for split in SPLIT_NAMES if any(unit.split == split for unit, _ in done)]
     for split in used:

@@ -1,7 +1,7 @@
-"""`cosfly release export`: a release, a run or a playback tree in another format.
+"""`cosfly release export`: a release in another format.
 
-Reads a source (`release/export/source.py`); writes `<format>/` with the format's files, `export.json` (what it was made
-of, how things are stored), README.md and checksums.sha256. A format is a module with three functions and a line in
+Reads a release (`release/export/source.py`); writes `<format>/` with the format's files, `export.json` (what it was
+made of, how things are stored), README.md and checksums.sha256. A format is a module with three functions and a line in
 EXPORTS:
 
     plan(source, cfg) -> list[ExportUnit]                  cuts the work into units that can be done in any order
@@ -36,8 +36,8 @@ from cosfly.runtime.run_dir import Resume, StageFolder
 from cosfly.runtime.worker import Item, Outcome, Work
 from cosfly.viz.page import markdown
 from release.columns import LANGUAGES, SPLIT_NAMES, SplitName
-from release.export.source import ExportSource, SourceFacts, SourceTrack, open_source
-from release.record import Strict
+from release.export.source import ExportSource, SourceTrack, open_release
+from release.record import ReleasedMap, Strict
 
 FormatName = Literal["tree", "lerobot", "webdataset", "coco", "chat", "sharegpt"]
 EXPORT_FORMAT = FileFormat("cosfly.export", "2.0", "record of an export")
@@ -55,12 +55,11 @@ class Export(NamedTuple):
     carries: tuple[FrameFile, ...] = tuple(FILE_NAMES)
     default: tuple[FrameFile, ...] = tuple(FILE_NAMES)
     needs_consecutive: bool = False  # chat: but for samples of the last frame alone
-    needs_one_size: bool = False
 
 
 EXPORTS: dict[FormatName, Export] = {
     "tree": Export("release.export.tree", pictures=("rgb",)),
-    "lerobot": Export("release.export.lerobot", default=("rgb",), needs_consecutive=True, needs_one_size=True),
+    "lerobot": Export("release.export.lerobot", default=("rgb",), needs_consecutive=True),
     "webdataset": Export("release.export.webdataset"),
     "coco": Export("release.export.coco", ("rgb", "instance"), ("rgb",), ("rgb",)),
     "chat": Export("release.export.chat", ("rgb",), ("rgb",), ("rgb",), needs_consecutive=True),
@@ -173,9 +172,18 @@ def scratch_of(folder: Path) -> Path:
 # --- the record -------------------------------------------------------------------------------------------------------
 
 
-class ExportRecord(SourceFacts):
-    """`export.json`: what was exported, and what its format states about itself."""
+class ExportRecord(Strict):
+    """`export.json`: what was exported, and what its format states about itself. digest: Of the release's content.
+    prompts: As in `release.json`."""
 
+    source: str
+    source_made_by: str
+    digest: str
+    licence: str
+    credits: str
+    maps: list[ReleasedMap]
+    coordinates: dict[str, Any]
+    prompts: dict[str, dict[str, str]] = Field(default_factory=dict)
     format: str
     format_version: str
     made_by: str
@@ -194,10 +202,12 @@ def _write_records(source: ExportSource, frames: int, facts: FormatFacts, folder
     listed = [path for path in paths if path.name == CHECKSUMS or with_list.isdisjoint(path.parents)]
     with ThreadPoolExecutor() as pool:
         digests = dict(zip(listed, pool.map(sha256_file, listed), strict=True))
+    of = source.record
     record = ExportRecord(
-        **dict(source.facts) | facts.model_dump() | {"coordinates": facts.coordinates or source.facts.coordinates},
-        format=cfg.format, made_by=f"cosfly {cosfly.__version__}", frames=frames,
-        bytes=sum(path.stat().st_size for path in paths),
+        source=of.name, source_made_by=of.made_by, digest=of.content_digest, licence=of.licence, credits=of.credits,
+        maps=of.maps, coordinates=facts.coordinates or of.coordinates, prompts=of.prompts, format=cfg.format,
+        made_by=f"cosfly {cosfly.__version__}", frames=frames, bytes=sum(path.stat().st_size for path in paths),
+        **facts.model_dump(),
     )  # fmt: skip
     write_model(folder / RECORD, record, EXPORT_FORMAT)
     digests[folder / RECORD] = sha256_file(folder / RECORD)
@@ -231,12 +241,6 @@ def check_needs(source: ExportSource, cfg: ExportConfig) -> ExportSource:
     if unused := set(chosen) - set(export.carries):
         what = f"the {cfg.format} export holds no {' and no '.join(sorted(unused))} pictures"
         raise InputError(what, where="--modalities", expected=", ".join(export.carries))
-    sizes = sorted({track.size_px for track in source.tracks})
-    if export.needs_one_size and len(sizes) > 1:
-        raise InputError(
-            f"the {cfg.format} export needs pictures of one size", where=source.folder,
-            got=", ".join(f"{width} x {height} px" for width, height in sizes), fix="build one release per size",
-        )  # fmt: skip
     return replace(source, modalities=chosen)
 
 
@@ -249,11 +253,11 @@ def make_worker(source: ExportSource, parts: Path, cfg: ExportConfig) -> Work:
 def run(
     cfg: ExportConfig, folder: Path, out: Path, *, workers: int = 0, watch: Watch = Watch(), resume: Resume = "if-same"
 ) -> Path:
-    """Read a release, a run or a playback tree; write it in the format of the settings and return its folder."""
-    reads_tree, is_of_windows = EXPORTS[cfg.format].needs_consecutive, cfg.frames == "all" or cfg.format == "lerobot"
-    consecutive = f"the {cfg.format} export" if reads_tree and is_of_windows else ""
-    source = check_needs(open_source(folder, prefer_tree=reads_tree, consecutive=consecutive), cfg)
-    stage = StageFolder.open(out, "export", config=cfg, inputs=source.inputs, seed=0, resume=resume)
+    """Read a release, also of a run; write it in the format of the settings and return its folder."""
+    is_of_windows = EXPORTS[cfg.format].needs_consecutive and (cfg.frames == "all" or cfg.format == "lerobot")
+    source = check_needs(open_release(folder, f"the {cfg.format} export" if is_of_windows else ""), cfg)
+    inputs = {"release": source.folder / "release.json"}
+    stage = StageFolder.open(out, "export", config=cfg, inputs=inputs, seed=0, resume=resume)
     product, parts = out / cfg.format, out / "parts"
     if stage.is_complete:
         return product

@@ -86,7 +86,7 @@ def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfi
 def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) -> FormatFacts:
     """Write each town's `map.json`, and count the tracks of which strict readers will miss something."""
     towns = {(unit.extra[0].rpartition("/trajectory_")[0], unit.track.place.town) for unit, _ in done}
-    maps = {entry.town: entry for entry in source.facts.maps}
+    maps = {entry.town: entry for entry in source.record.maps}
     for place, town in sorted(towns):
         shown = maps.get(town)
         about = TownMap(name=shown.name, licence=shown.licence, credits=shown.credits) if shown else None

@@ -15,7 +15,6 @@ const captionOf = (sample) => flightOf(sample).frames[sample.frame].caption;
 const ofCaption = (name) => (sample) => { const caption = captionOf(sample); return caption ? caption[name] || NONE : null; };
 const FACETS = [
   ["town", "town", (sample) => flightOf(sample).town],
-  ["split", "split", (sample) => flightOf(sample).split || NONE],
   ["track", "track", (sample) => flightOf(sample).track],
   ["verdict", "verdict", ofCaption("verdict")],
   ["decision", "decision", ofCaption("decision")],
@@ -31,7 +30,7 @@ function valuesOf(caption) {
 }
 const textOf = (sample) => {
   const flight = flightOf(sample), frame = flight.frames[sample.frame], caption = frame.caption;
-  const texts = caption ? Object.values(caption.texts).flat().map((sentence) => sentence.text) : [];
+  const texts = caption ? Object.values(caption.texts).flatMap((texts) => Object.values(texts)) : [];
   return [flight.name, `frame ${frame.index}`, ...Object.values(frame.facts), ...texts, ...(caption ? Object.values(caption.facts) : [])].join(" ").toLowerCase();
 };
 
@@ -96,7 +95,7 @@ function drawFilters() {
 function drawLead() {
   const frames = data.flights.reduce((sum, flight) => sum + flight.num_frames, 0);
   const captions = data.flights.reduce((sum, flight) => sum + flight.num_captions, 0);
-  byId("lead").textContent = `A ${data.kind}: ${data.flights.length} tracks with ${frames.toLocaleString("en")} frames and ` +
+  byId("lead").textContent = `${data.flights.length} tracks with ${frames.toLocaleString("en")} frames and ` +
     `${captions.toLocaleString("en")} captions; ${samples.length.toLocaleString("en")} frames are shown here. Keys: \u2190 \u2192 frame, \u2191 \u2193 track.`;
 }
 
@@ -106,7 +105,7 @@ function drawFlights() {
   const rows = data.flights.map((flight, number) => {
     if (!counts.has(number)) return null;
     const [head, tail] = [flight.name.split("/").slice(0, -2).join("/"), flight.name.split("/").slice(-2).join(" / ")];
-    const facts = [flight.track, flight.split, flight.result, `${[...new Set(flight.fovs_deg)].join(" to ")}\u00b0`].filter(Boolean).join(" \u00b7 ");
+    const facts = [flight.track, flight.result, `${[...new Set(flight.fovs_deg)].join(" to ")}\u00b0`].filter(Boolean).join(" \u00b7 ");
     const row = make("button", { type: "button", class: number === state.flight ? "here" : "", "aria-current": number === state.flight },
       make("small", {}, head), make("b", {}, tail), make("small", {}, `${facts} \u00b7 ${counts.get(number)} of ${flight.frames.length} frames`));
     row.addEventListener("click", () => { state.flight = number; state.index = null; update(); });
@@ -191,13 +190,9 @@ function drawCaption(sample) {
     caption.dropped && make("span", { class: "tag bad" }, `dropped: ${words(caption.dropped)}`),
   ].filter(Boolean);
   const columns = Object.entries(LANGUAGES).map(([language, title], number) => {
-    const sentences = caption.texts[language] || [];
-    const fields = Object.entries(FIELDS).flatMap(([field, names]) => {
-      const mine = sentences.filter((sentence) => sentence.field === field);
-      if (!mine.length) return [];
-      const parts = mine.flatMap((sentence) => [make("span", {}, sentence.text), " "]);
-      return [make("h4", {}, names[number]), make("p", {}, ...parts)];
-    });
+    const texts = caption.texts[language] || {};
+    const fields = Object.entries(FIELDS).flatMap(([field, names]) =>
+      texts[field] ? [make("h4", {}, names[number]), make("p", {}, texts[field])] : []);
     return make("div", { lang: language === "zh" ? "zh-CN" : "en" }, make("h3", {}, title), ...(fields.length ? fields : [make("p", { class: "nothing" }, "no text")]));
   });
   const values = Object.entries(caption.values).map(([name, count]) => `${name.replace("values_", "")} ${count}`).join(", ");

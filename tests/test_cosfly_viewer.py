@@ -17,10 +17,7 @@ from cosfly.formats.captions import write_captions
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
-from cosfly.runtime.tables import rows_of
-from release.columns import PLACE, POINT
-from release.record import read_record
-from release.viewer.page import run
+from cosfly.viz.viewer import run
 from specimens import make_playback_tree
 
 NUM_POINTS = 24
@@ -82,8 +79,8 @@ def test_a_run_is_shown_as_it_is(page):
     assert {flight["map"] for flight in data["flights"]} == {"one/Town01", "one/Town02"}
     assert {box["kind"] for box in data["maps"]["one/Town01"]} == {"Buildings", "Vegetation"}  # the third is 900 m away
     flight = data["flights"][1]
-    found = flight["track"], flight["num_frames"], flight["num_captions"], flight["split"]
-    assert found == ("perturbed", NUM_POINTS, 19, None)
+    found = flight["track"], flight["num_frames"], flight["num_captions"]
+    assert found == ("perturbed", NUM_POINTS, 19)
     by_index = {frame["index"]: frame["caption"] for frame in flight["frames"]}
     assert (len(by_index), by_index[7]["verdict"]) == (12, "HARD_CONFLICT")
     assert by_index[9]["dropped"] == "hard_conflict"
@@ -108,30 +105,11 @@ def test_the_page_asks_for_nothing_and_names_its_script(page):
     assert all(f"{word}(" not in script[-1] for word in ("insertAdjacentHTML", "document.write", "eval", "fetch"))
 
 
-def test_a_release_is_shown_as_its_rows_say(built, tmp_path):
-    record = read_record(built / "release.json")
-    page = run(built.parent, tmp_path / "page.html", most_frames=3, picture_px=32)
-    data = data_of(page.read_text(encoding="utf-8"))
-    assert data["kind"] == "release"
-    assert {flight["name"]: (flight["split"], flight["num_frames"]) for flight in data["flights"]} == {
-        flight.flight: (flight.split, flight.frames) for flight in record.flights
-    }
-    rows = {row["sample_id"]: row for shard in record.shards for row in rows_of(built / shard.path)}
-    by_place = {("/".join(row[name] for name in PLACE), row["frame_index"]): row for row in rows.values()}
-    shown = [(flight["name"], frame) for flight in data["flights"] for frame in flight["frames"]]
-    assert {len(flight["frames"]) for flight in data["flights"]} == {3}
-    for name, frame in shown:
-        row, caption = by_place[name, frame["index"]], frame["caption"]
-        assert set(frame["pictures"]) == {"rgb", "depth", "segmentation"}
-        assert frame["drone"][:3] == [round(row["pose"][axis], 2) for axis in POINT]
-        assert bool(caption) == row["has_caption"]
-        if caption:
-            assert caption["verdict"] == row["verdict"]
-            found = [sentence["text"] for sentence in caption["texts"]["en"]]
-            assert found == [row["caption_en_critical_components"], row["caption_en_reasoning_trace"]]
-    two = data_of(run(built, tmp_path / "two.html", most_tracks=2, most_frames=1).read_text(encoding="utf-8"))
-    assert len(two["flights"]) <= 2
-    assert any("tracks are shown" in note for note in two["notes"])
+def test_of_many_tracks_whole_trajectories_are_shown(run_folder, tmp_path):
+    two = data_of(run(run_folder, tmp_path / "two.html", most_tracks=2, most_frames=1).read_text(encoding="utf-8"))
+    assert len({flight["group"] for flight in two["flights"]}) == 1
+    assert [len(flight["frames"]) for flight in two["flights"]] == [1, 1]
+    assert any("2 of 4 tracks are shown" in note for note in two["notes"])
 
 
 @pytest.fixture(scope="module")

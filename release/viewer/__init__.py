@@ -1,1 +1,0 @@
-"""One page that shows a release or a run: flights, frames, maps, captions."""
