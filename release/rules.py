@@ -75,3 +75,16 @@ def stated_rules(settings: Settings, shards: Sequence[Shard]) -> dict[str, Any]:
         "coordinates": CONTRACT,
         "content_digest": digest_of(shards),
     }
+
+
+def group_by_size(sizes: Sequence[int], target_bytes: int) -> list[list[int]]:
+    """Group consecutive things by index: a group is closed as soon as it reaches the target."""
+    groups: list[list[int]] = []
+    total = 0
+    for index, size in enumerate(sizes):
+        if not groups or total >= target_bytes:
+            groups.append([])
+            total = 0
+        groups[-1].append(index)
+        total += size
+    return groups

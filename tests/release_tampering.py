@@ -20,7 +20,7 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_file
 from release import columns
 from release.build.records import write_records
-from release.build.rows import open_writer
+from release.build.shards import open_writer
 from release.counting import count_release, numbers_of
 from release.record import (
     ReleasedFlight,

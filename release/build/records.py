@@ -143,7 +143,7 @@ def _history(plan: ReleasePlan, tracks: list[Chosen]) -> History:
     account, candidates = plan.account, plan.material.candidates
     without = Counter[str]()
     for one in tracks:
-        without.update(one.captions.why_none(i, one.num_frames) for i in {*one.selected} - {*one.captioned})
+        without.update(one.captions.why_none(i) for i in {*one.selected} - {*one.captioned})
     num_released = sum(len(one.captioned) for one in tracks)
     captions = CaptionHistory(
         read=account.accepted + account.dropped.total(),
@@ -163,17 +163,6 @@ def _history(plan: ReleasePlan, tracks: list[Chosen]) -> History:
 DATASET, PARTS = "dataset", "parts"  # in the folder of the stage: what gets published, and shards on the way there
 
 
-def check_parts(parts: Sequence[tuple[Path, Shard]], out: Path) -> None:
-    """Check that the finished shards are there, also those of an earlier run. out: The folder of the stage."""
-    for path, shard in parts:
-        for place, stored in ((path, shard), (points_part(path), shard.points)):
-            if not place.is_file() or place.stat().st_size != stored.bytes:
-                raise VerifyError(
-                    "a finished shard is missing or has another size", where=place,
-                    expected=f"{stored.bytes} bytes", fix=f"remove {out} and run the same command again",
-                )  # fmt: skip
-
-
 def name_shards(parts: Sequence[tuple[Path, Shard]], folder: Path) -> list[Shard]:
     """Link shards under their names in the release, so that no byte moves and a kill costs nothing.
 
@@ -187,6 +176,9 @@ def name_shards(parts: Sequence[tuple[Path, Shard]], folder: Path) -> list[Shard
     paths = shard_paths([shard.split for _, shard in parts], digest)
     for (part, shard), (frames, points) in zip(parts, paths, strict=True):
         for source, path in ((part, frames), (points_part(part), points)):
+            if not source.is_file():
+                fix = f"remove {source.parent.parent} and run the same command again"
+                raise VerifyError("a finished shard is missing", where=source, fix=fix)
             try:
                 os.link(source, folder / path)
             except OSError:  # the file system has no links

@@ -6,12 +6,14 @@ A worker writes whole shards, so that no byte is written twice.
 from __future__ import annotations
 
 import hashlib
-import struct
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from pydantic import BaseModel
 
 from cosfly.formats.frames import (
@@ -19,6 +21,7 @@ from cosfly.formats.frames import (
     FRAMES_DIR,
     SKY_DEPTH_M,
     FrameFile,
+    as_depth_npy,
     depth_values,
     frame_name,
     frame_path,
@@ -28,70 +31,20 @@ from cosfly.formats.frames import (
 from cosfly.formats.playback import TARGET_FILE, Track
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.io import CHECKSUMS, atomic_file, check_stays_below, read_bytes, read_checksums, sha256_file
-from cosfly.runtime.png import PNG_HEADER_BYTES, parse_png, png_size
+from cosfly.runtime.png import colours_of, png_size
 from cosfly.runtime.run_dir import TRACK_FILE, digest_of, folder_digests
 from cosfly.runtime.worker import advance
 from release import columns
 from release.build.plan import Chosen, open_track
-from release.build.problems import Problems
-from release.build.rows import Rows, open_writer, points_writer
 from release.build.sources import Candidate
-from release.columns import caption_values
+from release.columns import PICTURES, caption_values
 from release.record import StoredFile
 
-# Bits a channel; colour type, RGB or RGBA; interlacing: bytes 24, 25 and 28 of a PNG. What the readers of a release
-# take.
-KIND = struct.Struct(">BBxxB")
-KINDS = ((8, 2, 0), (8, 6, 0))
-CONVERT = (
-    "convert it without loss, for instance with Pillow: Image.open(FILE).convert('RGB').save(FILE), and inspect again"
-)
-PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
-RENDER = "render the track again, or restore the file"
-
-
-def check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where: Path, *, is_known: bool) -> None:
-    """Check that a file is whole and has the size of its track.
-
-    Args:
-        size_px: width, height. is_known: Its digest was compared, so that the checksums of a PNG need not be.
-    """
-    if file == "depth":
-        _check_depth(depth_values(data, where), size_px, where)
-        return
-    found = png_size(data[:PNG_HEADER_BYTES])
-    if found is None or data[-len(PNG_END) :] != PNG_END:
-        got = f"{len(data)} bytes that do not {'begin' if found is None else 'end'} as a PNG"
-        raise InputError("the picture is damaged or cut short", where=where, got=got, fix=RENDER)
-    if found != size_px:
-        got, expected = (f"{width} x {height} px" for width, height in (found, size_px))
-        raise InputError("the picture has the wrong size", where=where, got=got, expected=expected, fix=RENDER)
-    bits, colour_type, interlace = KIND.unpack_from(data, PNG_HEADER_BYTES)
-    if (bits, colour_type, interlace) not in KINDS:
-        got = f"{bits} bits, colour type {colour_type}{', interlaced' if interlace else ''}"
-        expected = "8 bits, RGB or RGBA (2 or 6), not interlaced"
-        raise InputError("the kind of PNG is not supported", where=where, got=got, expected=expected, fix=CONVERT)
-    if not is_known:
-        parse_png(data, where)
-
-
-def _check_depth(values: np.ndarray, size_px: tuple[int, int], where: Path) -> None:
-    if values.shape[::-1] != size_px:
-        got, expected = (f"{width} x {height} px" for width, height in (values.shape[::-1], size_px))
-        raise InputError("the depth image has the wrong size", where=where, got=got, expected=expected, fix=RENDER)
-    low, high = float(values.min(initial=0.0)), float(values.max(initial=0.0))  # NaN if any is
-    if not 0.0 <= low <= high <= SKY_DEPTH_M:
-        raise InputError(
-            "the depth image has values that are not depths",
-            where=where,
-            got=f"{low:g} to {high:g} m",
-            expected=f"0 to {SKY_DEPTH_M:g} m",
-            fix=RENDER,
-        )
-
-
-MOST_PROBLEMS = 20  # of one shard: after so many the others need not be looked for
+# Values between two looks at the size of a page: with more a page takes a whole row group, twice in memory.
+VALUES_A_BATCH = 4
+MOST_ROWS = 1000  # of a row group: of small pictures it would hold more rows than memory should
 META = "meta.json"
+RENDER = "render the track again, or restore the file"
 RESTORE = "restore the file, or inspect and caption the changed tree"
 
 
@@ -105,24 +58,25 @@ class ShardResult(BaseModel):
 def write_shard(
     path: Path, tracks: Sequence[Chosen], files: Collection[FrameFile], row_group_bytes: int
 ) -> ShardResult:
-    """Write the selected frames of some tracks.
+    """Write the selected frames of some tracks, and all of their points, a row group each.
 
     Raises:
-        InputError, VerifyError: Names everything that is wrong with them.
+        InputError, VerifyError: Names the first file that cannot be released.
     """
-    problems = Problems(MOST_PROBLEMS)
-    of_points = points_part(path)
-    with atomic_file(of_points) as points, atomic_file(path) as file:
-        with open_writer(file, columns.schema(files)) as writer, points_writer(points) as add_points:
-            rows = Rows(writer, row_group_bytes)
-            for chosen in tracks:
-                with problems.collected(chosen.name):
-                    track = open_track(chosen.candidate)
-                    _write_track(chosen, track, files, rows, problems)
-                    if not problems.failures:
-                        add_points(track, chosen.placement)
-            rows.flush()
-        problems.raise_any("the tracks have {}")
+    of_points, schema = points_part(path), columns.points_schema()
+    with (
+        atomic_file(of_points) as points_file,
+        atomic_file(path) as file,
+        pq.ParquetWriter(points_file, schema, compression="zstd", version="2.6", write_page_index=True) as points,
+        open_writer(file, columns.schema(files)) as writer,
+    ):
+        rows = _Rows(writer, row_group_bytes)
+        for chosen in tracks:
+            track = open_track(chosen.candidate)
+            _write_track(chosen, track, files, rows)
+            of_track = [columns.point_row(track, i, chosen.placement) for i in range(len(track))]
+            points.write_table(pa.Table.from_pylist(of_track, schema=schema))
+        rows.flush()
     frames = _stored(path, sum(len(chosen.selected) for chosen in tracks))
     return ShardResult(frames=frames, points=_stored(of_points, sum(chosen.num_frames for chosen in tracks)))
 
@@ -136,27 +90,83 @@ def _stored(path: Path, rows: int) -> StoredFile:
     return StoredFile(path=path.name, rows=rows, bytes=path.stat().st_size, sha256=sha256_file(path))
 
 
-def _write_track(chosen: Chosen, track: Track, files: Collection[FrameFile], rows: Rows, problems: Problems) -> None:
+# --- rows -------------------------------------------------------------------------------------------------------------
+
+
+class _Rows:
+    """Rows on their way into row groups of a size that viewers load one at a time."""
+
+    def __init__(self, writer: pq.ParquetWriter, row_group_bytes: int) -> None:
+        self._writer, self._most_bytes = writer, row_group_bytes
+        self._rows: list[dict[str, Any]] = []
+        self._num_bytes = 0
+
+    def add(self, row: dict[str, Any], num_bytes: int) -> None:
+        """Add a frame, whose pictures have so many bytes."""
+        self._rows.append(row)
+        self._num_bytes += num_bytes
+        if self._num_bytes >= self._most_bytes or len(self._rows) >= MOST_ROWS:
+            self.flush()
+
+    def flush(self) -> None:
+        if self._rows:
+            table = pa.Table.from_pylist(self._rows, schema=self._writer.schema)
+            self._writer.write_table(table, row_group_size=table.num_rows)
+            self._rows, self._num_bytes = [], 0
+
+
+def open_writer(sink: str | IO[bytes], schema: pa.Schema) -> pq.ParquetWriter:
+    """Open a parquet file whose bytes depend on the rows alone.
+
+    PNG files do not compress, so they are stored as they are; everything else is zstd. Statistics of pictures would
+    only repeat their first bytes. The page index lets the hub's viewer read one row without its row group.
+    """
+    leaves: list[str] = []  # parquet's paths of the primitive columns
+    for member in schema:
+        inner = [child.name for child in member.type] if pa.types.is_struct(member.type) else []
+        inner = ["list.element"] if pa.types.is_list(member.type) else inner
+        leaves += [f"{member.name}.{name}" for name in inner] or [member.name]
+    compression = {name: "none" if name.endswith(".bytes") else "zstd" for name in leaves}
+    small = [name for name in leaves if name != PICTURES["depth"].name and not name.endswith(".bytes")]
+    repeated = [name for name in small if name in schema.names and schema.field(name).type == pa.string()]
+    return pq.ParquetWriter(
+        sink,
+        schema,
+        compression=compression,
+        use_dictionary=repeated,
+        write_statistics=small,
+        version="2.6",
+        write_page_index=True,
+        write_batch_size=VALUES_A_BATCH,
+    )
+
+
+def _write_track(chosen: Chosen, track: Track, files: Collection[FrameFile], rows: _Rows) -> None:
     folder = chosen.candidate.folder
     digests = _digests(chosen.candidate)
     tree = tree_of(track.frame_folder(0))
     check_stays_below(folder / FRAMES_DIR, tree)
     for i in chosen.selected:
-        with problems.collected(chosen.name):
-            frame = track.frame_folder(i)
-            if frame.is_symlink():
-                check_stays_below(frame, tree)
-            _check_digest(folder, f"{frame_name(i)}/{META}", None, digests)
-            placement = replace(chosen.placement, look=_look_of(track, i))
-            pictures = dict[FrameFile, bytes]()
-            for file in files:
-                path = frame_path(frame, FILE_NAMES[file])
-                pictures[file] = _read_picture(track, path, file, tree, is_known=bool(digests))
-                _check_digest(folder, f"{frame_name(i)}/{path.name}", pictures[file], digests)
-            caption = caption_values(chosen.captions.read(i)) if i in chosen.captions.spans else None
-            scalars = columns.scalar_row(track, i, caption, placement)
-            if not problems.failures:  # else nothing will be written any more
-                rows.add(scalars, pictures, track, i)
+        frame = track.frame_folder(i)
+        if frame.is_symlink():
+            check_stays_below(frame, tree)
+        _check_digest(folder, f"{frame_name(i)}/{META}", None, digests)
+        placement = replace(chosen.placement, look=_look_of(track, i))
+        caption = caption_values(chosen.captions.read(i)) if i in chosen.captions.spans else None
+        row, num_bytes = columns.scalar_row(track, i, caption, placement), 0
+        for file in files:
+            path = frame_path(frame, FILE_NAMES[file])
+            inside = tree if path.is_symlink() else None  # its folder was looked at
+            data = read_bytes(path, what="file of the frame", fix="render the track again", tree=inside)
+            size_px = (track.camera.width_px, track.camera.height_px)
+            _check_picture(file, data, size_px, path, is_inspected=chosen.candidate.sha256 is not None)
+            _check_digest(folder, f"{frame_name(i)}/{path.name}", data, digests)
+            if file == "depth":
+                row[PICTURES[file].name] = data = as_depth_npy(data, path)
+            else:
+                row[PICTURES[file].name] = {"bytes": data, "path": f"{row['sample_id']}_{FILE_NAMES[file]}"}
+            num_bytes += len(data)
+        rows.add(row, num_bytes)
         advance()
 
 
@@ -170,6 +180,27 @@ def _look_of(track: Track, i: int) -> np.ndarray | None:
         what, got = "the annotation belongs to another frame", f"index {meta.index}"
         raise InputError(what, where=folder / META, got=got)
     return None if meta.look is None else np.array(list(meta.look.model_dump().values()))
+
+
+# --- checks of the files ----------------------------------------------------------------------------------------------
+
+
+def _check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where: Path, *, is_inspected: bool) -> None:
+    """Check that a file has the (width, height) of its track. The inspection has unpacked the pictures that it saw, and
+    `_check_digest` finds those that have changed since."""
+    if file == "depth":
+        depth = depth_values(data, where)
+        low, high = float(depth.min(initial=0.0)), float(depth.max(initial=0.0))  # NaN if any is
+        if not 0.0 <= low <= high <= SKY_DEPTH_M:
+            what, expected = "the depth image has values that are not depths", f"0 to {SKY_DEPTH_M:g} m"
+            raise InputError(what, where=where, got=f"{low:g} to {high:g} m", expected=expected, fix=RENDER)
+        found: tuple[int, ...] | None = depth.shape[::-1]
+    else:
+        found = png_size(data) if is_inspected else colours_of(data, where).shape[1::-1]
+    if found != size_px:
+        got = "no PNG" if found is None else "{} x {} px".format(*found)
+        expected = "{} x {} px".format(*size_px)
+        raise InputError("the picture has the wrong size", where=where, got=got, expected=expected, fix=RENDER)
 
 
 def _digests(candidate: Candidate) -> dict[str, str]:
@@ -199,15 +230,3 @@ def _check_digest(folder: Path, name: str, data: bytes | None, digests: Mapping[
         expected = digests.get(name, "a recorded digest")
         what = "the file differs from the recorded digest"
         raise VerifyError(what, where=folder / name, got=got, expected=expected, fix=RESTORE)
-
-
-def _read_picture(track: Track, path: Path, file: FrameFile, tree: Path, *, is_known: bool) -> bytes:
-    """Read a picture and check it.
-
-    Args:
-        is_known: Its digest will be compared.
-    """
-    inside = tree if path.is_symlink() else None  # its folder was looked at
-    data = read_bytes(path, what="file of the frame", fix="render the track again", tree=inside)
-    check_picture(file, data, (track.camera.width_px, track.camera.height_px), path, is_known=is_known)
-    return data

@@ -11,18 +11,16 @@ import shutil
 from pathlib import Path
 
 from cosfly.formats.frames import FrameFile
-from cosfly.runtime.errors import VerifyError
+from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.io import CHECKSUMS, atomic_folder
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, read_stage_record, result_of
 from cosfly.runtime.worker import Item, Outcome, Work
 from release.build.config import ReleaseConfig
-from release.build.plan import ReleasePlan, make_plan, report_problems
-from release.build.problems import Problems
+from release.build.plan import ReleasePlan, make_plan
 from release.build.records import (
     DATASET,
     PARTS,
-    check_parts,
     make_record,
     name_shards,
     provenance_of,
@@ -103,16 +101,15 @@ def _write_parts(
     items = [Item(shard.name, shard.tracks, sum(len(one.selected) for one in shard.tracks)) for shard in plan.shards]
     how = (cfg.modalities, cfg.row_group_bytes, parts)
     finished = run_items(stage, items, make_worker, how, workers=workers, watch=watch, label="release: frames")
-    problems = Problems()
-    problems.failures += [record for record in finished.records if isinstance(record, Failed)]
-    report_problems(problems, stage)
+    if failed := [record for record in finished.records if isinstance(record, Failed)]:
+        kind = VerifyError if {one.code for one in failed} == {VerifyError.code} else InputError
+        problems = ["nothing is released, because shards have problems", *(one.message for one in failed)]
+        raise kind.of_all(problems, where=stage.path / "failures.jsonl")
     written = [result_of(record, ShardResult) for record in finished.kept]
-    found = [
+    return [
         (part_path(parts, shard.name), Shard(split=shard.split, **vars(result.frames), points=result.points))
         for shard, result in zip(plan.shards, written, strict=True)
     ]
-    check_parts(found, stage.path)
-    return found
 
 
 def _check_release(folder: Path) -> None:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import importlib
 import os
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,6 +38,7 @@ from cosfly.viz.page import markdown
 from release.columns import LANGUAGES, SPLIT_NAMES, SplitName
 from release.export.source import ExportSource, SourceTrack, open_release
 from release.record import ReleasedMap, Strict
+from release.rules import group_by_size
 
 FormatName = Literal["tree", "lerobot", "webdataset", "coco", "chat", "sharegpt"]
 EXPORT_FORMAT = FileFormat("cosfly.export", "2.0", "record of an export")
@@ -140,22 +141,15 @@ def track_units(source: ExportSource) -> list[ExportUnit]:
     return [ExportUnit(track.name, track.split, (Piece(track, 0, len(track)),)) for track in source.tracks]
 
 
-def shards(pieces: Iterable[Piece], shard_mb: int) -> list[ExportUnit]:
+def shards(pieces: Sequence[Piece], shard_mb: int) -> list[ExportUnit]:
     """Group pieces of each split into units of about `shard_mb`, and name them `train-00000`."""
-    groups: dict[SplitName, list[list[Piece]]] = {split: [] for split in SPLIT_NAMES}
-    filled = 0
-    for piece in pieces:
-        of_split = groups[piece.track.split]
-        if not of_split or filled >= shard_mb * MB:
-            of_split.append([])
-            filled = 0
-        of_split[-1].append(piece)
-        filled += piece.frames * piece.track.frame_bytes
-    return [
-        ExportUnit(f"{split}-{number:05d}", split, tuple(members))
-        for split, of_split in groups.items()
-        for number, members in enumerate(of_split)
-    ]
+    units = []
+    for split in SPLIT_NAMES:
+        own = [piece for piece in pieces if piece.track.split == split]
+        sizes = [piece.frames * piece.track.frame_bytes for piece in own]
+        for number, group in enumerate(group_by_size(sizes, shard_mb * MB)):
+            units.append(ExportUnit(f"{split}-{number:05d}", split, tuple(own[k] for k in group)))
+    return units
 
 
 def write_joined(file: IO[bytes], lines: Iterable[bytes], between: bytes) -> None:
