@@ -1,7 +1,7 @@
 """The columns of the released parquet files: one table that says all there is to say of a column.
 
 A new column is one row of FRAME or CAPTION: its type, the values that it may hold, the field that it is taken from, and
-where people see it. Schema, rows, card, viewer and `release verify` follow. Lists are flat, so that every
+how the card counts it. Schema, rows, card and `release verify` follow. Lists are flat, so that every
 reader of parquet shows plain columns.
 """
 
@@ -87,8 +87,7 @@ class Column:
     member ("" where it has none).
     required: it is null in no row (of a caption's: in no row with a caption). constant: it does not change within a
     flight.
-    title: what people call it. counted: the card counts the captions by its values. shown: the viewer shows it with
-    the frame or caption.
+    title: what the card calls it, which counts the captions by its values; empty: it does not.
     """
 
     name: str
@@ -100,8 +99,6 @@ class Column:
     required: bool = False
     constant: bool = False
     title: str = ""
-    counted: bool = False
-    shown: bool = False
 
     def cell(self, flight: Track, i: int, caption: ReleasedCaption | None, placement: Placement) -> Any:
         value: Any
@@ -181,28 +178,20 @@ FRAME = (  # everything of a frame but pictures and depth
         "track", "string", lambda f, i: "clean" if f.is_original else "perturbed",
         words=("clean", "perturbed"), required=True, constant=True,
     ),
-    Column("style", "string", lambda f, i: f.styles[i], required=True, title="style", shown=True),
-    Column("planner", "string", lambda f, i: f.planner, constant=True, title="planner", shown=True),
-    Column("pace", "string", lambda f, i: f.pace, required=True, constant=True, title="pace", shown=True),
+    Column("style", "string", lambda f, i: f.styles[i], required=True),
+    Column("planner", "string", lambda f, i: f.planner, constant=True),
+    Column("pace", "string", lambda f, i: f.pace, required=True, constant=True),
     Column("walk", "string", constant=True),
     Column("split", "string", constant=True),
     Column("pair", "string", constant=True),
     Column("people", "string", lambda f, i: f.people and dump_json(asdict(f.people)), constant=True),
-    Column(
-        "goal_en", "string", lambda f, i: f.goal and f.goal.en, constant=True, title="goal in words",
-        shown=True,
-    ),
-    Column("goal_zh", "string", lambda f, i: f.goal and f.goal.zh, constant=True, title="goal in Chinese", shown=True),
+    Column("goal_en", "string", lambda f, i: f.goal and f.goal.en, constant=True),
+    Column("goal_zh", "string", lambda f, i: f.goal and f.goal.zh, constant=True),
     Column("goal_says", "texts", lambda f, i: f.goal and list(f.goal.says), constant=True),
     Column("goal_frame", "int32", lambda f, i: f.goal and f.goal.frame, constant=True),
     Column(TARGET_PICTURE, "image", lambda f, i: f.target_picture(i)),
-    Column(
-        "weather", "string", lambda f, i: f.weather["weather"], constant=True, title="weather",
-        shown=True,
-    ),
-    Column(
-        "time_of_day", "string", lambda f, i: f.weather["time_of_day"], constant=True, title="time of day", shown=True,
-    ),
+    Column("weather", "string", lambda f, i: f.weather["weather"], constant=True),
+    Column("time_of_day", "string", lambda f, i: f.weather["time_of_day"], constant=True),
     Column(
         "weather_mode", "string", lambda f, i: f.weather_record and f.weather_record.mode, words=get_args(WeatherMode),
         constant=True,
@@ -250,22 +239,17 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("target_in_view", "bool", lambda f, i: f.target.in_view[i], required=True),
     Column("target_visible", "bool", lambda f, i: f.target.visible[i], required=True),
     Column("visibility", "float64", lambda f, i: f.target.visibility[i], ranges=NONE_TO_ONE),
-    Column(
-        "target_height_px", "float64", lambda f, i: f.legibility_at(i)["height_px"], ranges={"": (0.0, 100_000.0)},
-    ),
+    Column("target_height_px", "float64", lambda f, i: f.legibility_at(i)["height_px"], ranges={"": (0.0, 100_000.0)}),
     Column("target_contrast", "float64", lambda f, i: f.legibility_at(i)["contrast"], ranges={"": (0.0, 300.0)}),
     Column("target_legible", "bool", lambda f, i: f.legibility_at(i)["legible"]),
-    Column("others_in_view", "int32", partial(_of_company, 0), title="other people in view", shown=True),
+    Column("others_in_view", "int32", partial(_of_company, 0)),
     Column(
         "other_distance_m", "float64", lambda f, i: None if f.bystanders is None else f.bystanders[i, 1],
         ranges={"": (0.0, 1e6)},
     ),
     Column("other_id", "int32", partial(_of_company, 2), ranges={"": (0, PERSON_ID)}),
     Column("alike_id", "int32", partial(_of_company, 3), ranges={"": (0, PERSON_ID)}),
-    Column(
-        "alike_differences", "int32", partial(_of_company, 4), title="things in which the most alike differs",
-        shown=True,
-    ),
+    Column("alike_differences", "int32", partial(_of_company, 4)),
     Column("is_perturbed", "bool", lambda f, i: f.perturbation.is_perturbed[i], required=True),
     Column("perturbation", "events", lambda f, i: f.events(i)),
     Column(
@@ -282,35 +266,29 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("has_caption", "bool", of_caption=lambda c: True, required=True),
 )  # fmt: skip
 CAPTION = (  # what a row holds of an accepted caption, and nulls where there is none
-    Column(
-        "decision", "string", of_caption=_decision, words="actions", required=True, title="decision", counted=True,
-        shown=True,
-    ),
-    Column("label", "string", of_caption=lambda c: c.label, words="actions", title="label", counted=True, shown=True),
+    Column("decision", "string", of_caption=_decision, words="actions", required=True, title="decision"),
+    Column("label", "string", of_caption=lambda c: c.label, words="actions", title="label"),
     Column(
         "label_from", "string", of_caption=lambda c: c.label_from, words=get_args(LabelFrom), required=True,
-        title="label from", counted=True, shown=True,
+        title="label from",
     ),
     Column(
         "verdict", "string", of_caption=lambda c: c.verdict, words=get_args(Verdict), required=True,
-        title="verdict against the geometry", counted=True,
+        title="verdict against the geometry",
     ),
-    Column("repair_strategy", "string", of_caption=_repair, title="repair", counted=True, shown=True),
-    Column(
-        "repair_rung", "string", of_caption=lambda c: c.repair and c.repair.rung, title="repaired by", counted=True,
-        shown=True,
-    ),
+    Column("repair_strategy", "string", of_caption=_repair, title="repair"),
+    Column("repair_rung", "string", of_caption=lambda c: c.repair and c.repair.rung, title="repaired by"),
     Column(
         "teacher_kind", "string", of_caption=lambda c: c.teacher.kind, words=get_args(TeacherKind), required=True,
-        title="kind of teacher", counted=True, shown=True,
+        title="kind of teacher",
     ),
     Column(
         "teacher_model", "string", of_caption=lambda c: published_name(c.teacher.model), required=True,
-        title="teacher model", counted=True, shown=True,
+        title="teacher model",
     ),
     Column(
         "writing", "string", of_caption=lambda c: c.writing, words=get_args(Writing), required=True,
-        title="written as", counted=True, shown=True,
+        title="written as",
     ),
     *(  # numbers with a unit, and relations that fill slots; nothing else of a text is checked
         Column(name, "int32", of_caption=partial(_values, name)) for name in VALUE_COLUMNS
@@ -326,8 +304,8 @@ CAPTION = (  # what a row holds of an accepted caption, and nulls where there is
         Column(f"{name}_{language}", "string", of_caption=partial(_prompt, language, part))
         for language in LANGUAGES for name, part in (("system", "system"), ("prompt", "user"))
     ),
-    Column("evidence", "string", of_caption=_evidence, required=True, title="evidence of its values"),
-    Column(WINDOW, "indices", of_caption=lambda c: c.window, required=True, title="window", shown=True),
+    Column("evidence", "string", of_caption=_evidence, required=True),
+    Column(WINDOW, "indices", of_caption=lambda c: c.window, required=True),
     Column(PICTURE_PX, "indices", of_caption=lambda c: list(c.picture_px), required=True),
 )  # fmt: skip
 SCALARS = (*FRAME, *CAPTION)
@@ -342,9 +320,7 @@ POINT_NAMES = (
 )  # fmt: skip
 POINTS = tuple(column for column in FRAME if column.name in POINT_NAMES)
 SCALAR_NAMES = [column.name for column in SCALARS]
-COUNTED = [column.name for column in CAPTION if column.counted]
-# All but the prompts and the evidence, which are long.
-SHORT_NAMES = [name for name in SCALAR_NAMES if not name.startswith(("system_", "prompt_", "evidence"))]
+COUNTED = [column.name for column in CAPTION if column.title]
 assert len(POINTS) == len(POINT_NAMES)
 REQUIRED = frozenset(column.name for column in FRAME if column.required)
 

@@ -19,8 +19,8 @@ from cosfly.formats.frames import depth_bytes
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_file
 from release import columns
-from release.build.records import write_records
 from release.build.shards import open_writer
+from release.build.stage import write_records
 from release.counting import count_release, numbers_of
 from release.record import (
     ReleasedFlight,

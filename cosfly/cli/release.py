@@ -74,7 +74,7 @@ def stats(
     out: Annotated[Path, Option(help="Folder for stats.html and stats.json.")],
 ) -> None:
     """Draw the tables of a release, as the paper has them, and what it covers."""
-    typer.echo(job.call("release.card.stats", folder, out))
+    typer.echo(job.call("release.card.tables", folder, out))
 
 
 FORMATS = (

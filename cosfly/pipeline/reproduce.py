@@ -40,9 +40,8 @@ from cosfly.viz.frame_views import small_jpeg
 from cosfly.viz.gallery import four_panels
 from cosfly.viz.page import page, run_name
 from distill.prepare.dual_track import windows_of
-from release.card.stats import TABLE_LOOK
-from release.card.stats import run as release_stats
-from release.card.tables import Cell, Rows, Table
+from release.card.tables import TABLE_LOOK, Cell, Rows, Table
+from release.card.tables import run as release_stats
 
 log = logging.getLogger(__name__)
 

@@ -1,36 +1,78 @@
 """`cosfly release build`: flights and captions to a folder that `datasets.load_dataset` opens.
 
 Reads the playback trees, captions and inspections of one run or several; writes `dataset/` (parquet shards, README.md,
-release.json, checksums.sha256), which is published whole or not at all. The records of the stage are next to it: they
-hold local paths and are not published.
+release.json, checksums.sha256), which is published whole or not at all and holds nothing of this machine. The records
+of the stage are next to it: they hold local paths and are not published.
 """
 
 from __future__ import annotations
 
+import os
+import platform
 import shutil
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+
+import cosfly
 from cosfly.formats.frames import FrameFile
 from cosfly.runtime.errors import InputError, VerifyError
-from cosfly.runtime.io import CHECKSUMS, atomic_folder
+from cosfly.runtime.io import CHECKSUMS, atomic_folder, sha256_file, write_bytes, write_checksums
+from cosfly.runtime.json_io import dump_json, parse_json
 from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, read_stage_record, result_of
-from cosfly.runtime.worker import Item, Outcome, Work
-from release.build.config import ReleaseConfig
-from release.build.plan import ReleasePlan, make_plan
-from release.build.records import (
-    DATASET,
-    PARTS,
-    make_record,
-    name_shards,
-    provenance_of,
-    write_records,
+from cosfly.runtime.run_dir import (
+    Failed,
+    Resume,
+    StageFolder,
+    StageInput,
+    StageRecord,
+    Tally,
+    fingerprint,
+    read_stage_record,
+    record_of,
+    result_of,
 )
-from release.build.shards import ShardResult, write_shard
+from cosfly.runtime.worker import Item, Outcome, Work
+from release.build.captions import CaptionAccount
+from release.build.config import ReleaseConfig
+from release.build.plan import Chosen, ReleasePlan, make_plan
+from release.build.shards import ShardResult, points_part, write_shard
 from release.build.sources import Source, input_names, told_apart
+from release.card.render import render_card
+from release.columns import SplitName, published
 from release.counting import count_release, numbers_of
-from release.record import Shard
+from release.record import (
+    FRAMES_FOLDER,
+    POINTS_FOLDER,
+    CaptionHistory,
+    FlightHistory,
+    History,
+    MadeBy,
+    Numbers,
+    Provenance,
+    ReleasedFlight,
+    ReleasedTeacher,
+    ReleaseRecord,
+    Settings,
+    Shard,
+    SourceRecord,
+    Splits,
+    digest_of,
+    numbers_of_splits,
+    shard_paths,
+    write_record,
+)
+from release.rules import SPLIT_RULE, stated_rules
 from release.verify.verify import verify
+
+DATASET, PARTS = "dataset", "parts"  # in the folder of the stage: what gets published, and shards on the way there
+SOURCE_FILES = ("data", "captions", "inspect", "review")  # roles whose digests the record has
+
+
+# --- shards -----------------------------------------------------------------------------------------------------------
 
 
 def part_path(parts: Path, name: str) -> Path:
@@ -46,6 +88,175 @@ def make_worker(files: tuple[FrameFile, ...], row_group_bytes: int, parts: Path)
         return Outcome(write_shard(path, item.payload, files, row_group_bytes).model_dump())
 
     return work
+
+
+def _write_parts(
+    cfg: ReleaseConfig, plan: ReleasePlan, stage: StageFolder, parts: Path, workers: int, watch: Watch
+) -> list[tuple[Path, Shard]]:
+    """Write all shards that are not written yet; return all, and where they are until the release has its name."""
+    items = [Item(shard.name, shard.tracks, sum(len(one.selected) for one in shard.tracks)) for shard in plan.shards]
+    how = (cfg.modalities, cfg.row_group_bytes, parts)
+    finished = run_items(stage, items, make_worker, how, workers=workers, watch=watch, label="release: frames")
+    if failed := [record for record in finished.records if isinstance(record, Failed)]:
+        kind = VerifyError if {one.code for one in failed} == {VerifyError.code} else InputError
+        problems = ["nothing is released, because shards have problems", *(one.message for one in failed)]
+        raise kind.of_all(problems, where=stage.path / "failures.jsonl")
+    written = [result_of(record, ShardResult) for record in finished.kept]
+    return [
+        (part_path(parts, shard.name), Shard(split=shard.split, **vars(result.frames), points=result.points))
+        for shard, result in zip(plan.shards, written, strict=True)
+    ]
+
+
+def name_shards(parts: Sequence[tuple[Path, Shard]], folder: Path) -> list[Shard]:
+    """Link shards under their names in the release, so that no byte moves and a kill costs nothing.
+
+    Args:
+        parts: Where they are until the release has its name, and what they are; their paths are not read.
+    """
+    digest = digest_of([shard for _, shard in parts])
+    for place in (FRAMES_FOLDER, POINTS_FOLDER):
+        (folder / place).mkdir()
+    shards = []
+    paths = shard_paths([shard.split for _, shard in parts], digest)
+    for (part, shard), (frames, points) in zip(parts, paths, strict=True):
+        for source, path in ((part, frames), (points_part(part), points)):
+            if not source.is_file():
+                fix = f"remove {source.parent.parent} and run the same command again"
+                raise VerifyError("a finished shard is missing", where=source, fix=fix)
+            try:
+                os.link(source, folder / path)
+            except OSError:  # the file system has no links
+                shutil.copyfile(source, folder / path)
+        of_points = shard.points.model_copy(update={"path": points})
+        shards.append(shard.model_copy(update={"path": frames, "points": of_points}))
+    return shards
+
+
+# --- release.json -----------------------------------------------------------------------------------------------------
+
+
+def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], account: CaptionAccount) -> Provenance:
+    """Return what the record says of the sources and of all their captions.
+
+    Args:
+        inputs: Of the stage, by their names (`input_names`).
+    """
+    versions = {"cosfly": cosfly.__version__, "python": platform.python_version()}
+    return Provenance(
+        versions=versions | {"pyarrow": pa.__version__, "numpy": np.__version__},
+        sources=[_source(source, names, inputs) for source, names in zip(sources, input_names(sources), strict=True)],
+        teachers=[
+            ReleasedTeacher(kind=kind, model=model, settings=published(parse_json(settings)), captions=count)
+            for (kind, model, settings), count in sorted(account.teachers.items())
+        ],
+        tokens=dict(sorted(account.tokens.items())),
+        asks=account.asks,
+    )
+
+
+def _source(source: Source, names: dict[str, str], inputs: Mapping[str, StageInput]) -> SourceRecord:
+    sha256 = {f"{role}_sha256": inputs[names[role]].sha256 for role in SOURCE_FILES if role in names}
+    stages = [
+        MadeBy(stage=one.stage, code_version=one.code_version, seed=one.seed, config=published(one.config))
+        for one in stages_behind(source.files.values())
+    ]
+    return SourceRecord(run=source.run, stages=stages, **sha256)
+
+
+def stages_behind(products: Iterable[Path]) -> list[StageRecord]:
+    """Return the records of the stages that made some products, each after those of its inputs that are unchanged."""
+    found: set[str] = set()
+    ordered: list[StageRecord] = []
+
+    def visit(record: StageRecord | None) -> None:
+        if record is None:
+            return
+        made_of = sorted((name, entry.sha256) for name, entry in record.inputs.items())
+        known = dump_json([record.stage, record.seed, record.config, made_of])  # without the place on disk
+        if known in found:
+            return
+        found.add(known)
+        for entry in record.inputs.values():
+            before = Path(entry.path)
+            if before.exists() and (earlier := record_of(before)) and fingerprint(before) == entry.sha256:
+                visit(earlier)
+        ordered.append(record)
+
+    for path in products:
+        visit(record_of(path))
+    return ordered
+
+
+def make_record(
+    cfg: ReleaseConfig,
+    plan: ReleasePlan,
+    shards: list[Shard],
+    numbers: Numbers,
+    provenance: Provenance,
+    prompts: dict[str, dict[str, str]],
+) -> ReleaseRecord:
+    """Return what release.json says of its shards. prompts: As the record has them."""
+    tracks = [track for shard in plan.shards for track in shard.tracks]
+    flights = [
+        ReleasedFlight(
+            flight=one.name, frames=len(one.selected), frames_available=one.num_frames, split=one.placement.split,
+            walk=one.placement.walk, pair=one.placement.pair, five_ray_mean=one.candidate.five_ray_mean,
+        )
+        for one in tracks
+    ]  # fmt: skip
+    captions = Counter[SplitName]()
+    for one in tracks:
+        captions[one.placement.split] += len(one.captioned)
+    settings = Settings(
+        selection=cfg.selection, num_frames=cfg.num_frames, window_frames=plan.account.window_frames, pairs=cfg.pairs,
+        tracks=[*cfg.tracks], modalities=[*cfg.modalities],
+    )  # fmt: skip
+    splits = Splits(
+        by=cfg.split_by, rule=SPLIT_RULE, seed=cfg.split_seed, fractions=cfg.fractions,
+        splits=numbers_of_splits(flights, captions),
+    )  # fmt: skip
+    return ReleaseRecord(
+        name=cfg.name, licence=plan.licence, credits=cfg.credits, maps=plan.maps,
+        made_by=f"cosfly {cosfly.__version__}", settings=settings, prompts=prompts, splits=splits, numbers=numbers,
+        history=_history(plan, tracks), provenance=provenance, flights=flights, shards=shards,
+        **stated_rules(settings, shards),
+    )  # fmt: skip
+
+
+def _history(plan: ReleasePlan, tracks: list[Chosen]) -> History:
+    """Return what became of all tracks and captions; `release verify` checks that it adds up."""
+    account, candidates = plan.account, plan.material.candidates
+    without = Counter[str]()
+    for one in tracks:
+        without.update(one.captions.why_none(i) for i in {*one.selected} - {*one.captioned})
+    num_released = sum(len(one.captioned) for one in tracks)
+    captions = CaptionHistory(
+        read=account.accepted + account.dropped.total(),
+        dropped=dict(sorted(account.dropped.items())),
+        released=num_released,
+        frame_not_selected=sum(len(one.captions.spans) for one in tracks) - num_released,
+        flight_left_out=account.of_no_flight,
+        frames_without=dict(sorted(without.items())),
+    )
+    found = FlightHistory(
+        found=len(candidates), inspected=plan.material.num_inspected, released=len(tracks),
+        left_out=dict(sorted(plan.dropped.items())),
+    )  # fmt: skip
+    return History(trajectories=plan.material.trajectories, flights=found, captions=captions)
+
+
+def write_records(folder: Path, record: ReleaseRecord) -> None:
+    """Write release.json, the card and the checksums."""
+    write_record(folder / "release.json", record)
+    write_bytes(folder / "README.md", render_card(record).encode())
+    digests = {file.path: file.sha256 for file in record.files}
+    for name in ("release.json", "README.md"):
+        digests[name] = sha256_file(folder / name)
+    write_checksums(folder, digests)
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
 
 
 def run(
@@ -84,7 +295,10 @@ def run(
         prompts = {source.run: source.questions for source in sources if source.questions}
         record = make_record(cfg, plan, shards, numbers, provenance, prompts)
         write_records(folder, record)
-        _check_release(folder)
+        report = verify(folder, level="structure")  # before the release has its name
+        if not report.is_ok:
+            what = "the release does not pass its verification, so it is not published"
+            raise VerifyError(what, where=folder, got=str(report))
     # checksums.sha256 speaks for the shards: hashing them again would only cost time.
     outputs = [dataset / name for name in ("README.md", "release.json", CHECKSUMS)]
     history = record.history
@@ -92,30 +306,3 @@ def run(
     stage.finish(outputs, tally, history=history.model_dump(mode="json"))
     shutil.rmtree(parts, ignore_errors=True)
     return dataset
-
-
-def _write_parts(
-    cfg: ReleaseConfig, plan: ReleasePlan, stage: StageFolder, parts: Path, workers: int, watch: Watch
-) -> list[tuple[Path, Shard]]:
-    """Write all shards that are not written yet; return all, and where they are until the release has its name."""
-    items = [Item(shard.name, shard.tracks, sum(len(one.selected) for one in shard.tracks)) for shard in plan.shards]
-    how = (cfg.modalities, cfg.row_group_bytes, parts)
-    finished = run_items(stage, items, make_worker, how, workers=workers, watch=watch, label="release: frames")
-    if failed := [record for record in finished.records if isinstance(record, Failed)]:
-        kind = VerifyError if {one.code for one in failed} == {VerifyError.code} else InputError
-        problems = ["nothing is released, because shards have problems", *(one.message for one in failed)]
-        raise kind.of_all(problems, where=stage.path / "failures.jsonl")
-    written = [result_of(record, ShardResult) for record in finished.kept]
-    return [
-        (part_path(parts, shard.name), Shard(split=shard.split, **vars(result.frames), points=result.points))
-        for shard, result in zip(plan.shards, written, strict=True)
-    ]
-
-
-def _check_release(folder: Path) -> None:
-    """Check the structure of a release before it has its name."""
-    report = verify(folder, level="structure")
-    if not report.is_ok:
-        raise VerifyError(
-            "the release does not pass its verification, so it is not published", where=folder, got=str(report)
-        )

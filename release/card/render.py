@@ -22,8 +22,7 @@ from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.io import read_text
 from cosfly.viz.coverage_page import ranges, shares
 from cosfly.viz.page import markdown
-from release.card.stats import shown
-from release.card.tables import tables_of
+from release.card.tables import shown, tables_of
 from release.columns import PICTURES, SCALARS, SPLIT_NAMES, schema
 from release.record import FRAMES_FOLDER, POINTS_FOLDER, ReleaseRecord, SourceRecord, shard_pattern
 

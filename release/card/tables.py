@@ -7,6 +7,7 @@ All of it is in release.json, which `release verify` compares with the rows. The
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 from statistics import fmean
 from typing import Literal
 
@@ -15,10 +16,13 @@ from cosfly.formats.frames import LEVEL_NAMES
 from cosfly.formats.weather import TIMES, WEATHERS
 from cosfly.geometry.trajectory_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3
 from cosfly.llm.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
-from cosfly.runtime.json_io import Record
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.json_io import Record, write_json
+from cosfly.viz.coverage_page import coverage_html
+from cosfly.viz.page import page
 from release.columns import CAPTION, LANGUAGE_NAMES, LANGUAGES
 from release.counting import ACTION_CLASSES, LENS, REVIEW_BELOW, STATES, TAB
-from release.record import Numbers, ReleaseRecord, Spread
+from release.record import RECORD, Numbers, ReleaseRecord, Spread, read_record, release_folder
 
 Cell = str | int | float | None
 Rows = list[list[Cell]]
@@ -230,7 +234,7 @@ def _decisions(numbers: Numbers) -> Rows:
 
 def _origin(record: ReleaseRecord) -> Rows:
     numbers, made = record.numbers, record.provenance
-    columns = [one for one in CAPTION if one.counted and one.name not in OF_THEIR_OWN]
+    columns = [one for one in CAPTION if one.title and one.name not in OF_THEIR_OWN]
     rows: Rows = [[one.title, value, count] for one in columns for value, count in numbers.of(one.name).items()]
     rows += [["values of the texts", name, count] for name, count in numbers.of("values").items()]
     rows += [["captions read", f"{one.kind}: {one.model}", one.captions] for one in made.teachers]
@@ -246,3 +250,56 @@ def _lengths(numbers: Numbers) -> Rows:
             title = f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}"
             rows.append([*_spread(title, numbers.spreads.get(f"caption_{language}_{name}", Spread())), least])
     return rows
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+STYLE = """
+.tables { columns: 560px 2; column-gap: 12px; } .tables .panel { break-inside: avoid; }
+.tables .wide { column-span: all; margin-top: 12px; }
+"""
+
+
+def run(dataset: Path, out: Path) -> Path:
+    """Read the record of a release; write `stats.json` and `stats.html`, and return the page.
+
+    The numbers are those of the record; `release verify` compares them with the rows.
+
+    Raises:
+        InputError: If the folder is not a release.
+    """
+    record = read_record(release_folder(dataset) / RECORD)
+    tables, runs = tables_of(record), [source.run for source in record.provenance.sources]
+    write_json(out / "stats.json", {
+        "name": record.name, "runs": runs, "content_digest": record.content_digest,
+        "tables": [table.model_dump(mode="json") for table in tables],
+        "coverage": record.numbers.coverage.model_dump(mode="json"),
+    })  # fmt: skip
+    text = page(
+        "release/card/stats.html", title=", ".join(runs) or record.name, style=STYLE, record=record, tables=tables,
+        coverage=coverage_html(record.numbers.coverage), look=TABLE_LOOK,
+    )  # fmt: skip
+    write_bytes(out / "stats.html", text.encode())
+    return out / "stats.html"
+
+
+def _numeric_columns(table: Table) -> list[bool]:
+    return [all(isinstance(row[k], int | float | None) for row in table.rows) for k in range(len(table.head))]
+
+
+def _greatest(table: Table) -> float:
+    """Return the value of a full bar, or of a cell in full colour: the greatest number; 1 if there is none."""
+    cells = [cell for row in table.rows for cell in (row[1:] if table.plot == "heat" else row[1:2])]
+    return max((float(cell) for cell in cells if isinstance(cell, int | float)), default=0.0) or 1.0
+
+
+def shown(cell: Cell) -> str:
+    """Return a cell for people: numbers without digits that say nothing."""
+    if cell is None:
+        return "-"
+    if isinstance(cell, str):
+        return cell
+    return f"{cell:,}" if isinstance(cell, int) else f"{cell:,.4f}".rstrip("0").rstrip(".")
+
+
+TABLE_LOOK = {"shown": shown, "numeric_columns": _numeric_columns, "greatest": _greatest}  # of macros of tables.html
