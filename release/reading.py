@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.tables import arrow_errors, num_rows, row_groups
+from cosfly.runtime.tables import arrow_errors, row_groups
 from release.columns import PICTURES, PLACE, POINT_NAMES, REQUIRED, SCALAR_NAMES, flight_name, points_schema, schema
 from release.flight_rows import FlightRows
 from release.record import POINTS_FOLDER, Shard
@@ -68,14 +68,6 @@ def _check_values(group: pa.Table, shard: Path) -> None:
         for part in parts or [column]:
             if pa.types.is_floating(part.type) and pc.all(pc.is_finite(part)).as_py() is False:
                 raise InputError("a number is not finite", where=f"{shard}: {member.name}")
-
-
-def check_rows(shard: Path, rows: int) -> None:
-    """Check that a shard has as many rows as its record says, before they are read."""
-    found = num_rows(shard)
-    if found != rows:
-        expected = f"{rows} rows, as in release.json"
-        raise InputError("the shard has the wrong number of rows", where=shard, got=f"{found} rows", expected=expected)
 
 
 def check_columns(group: pa.Table, columns: Iterable[str], shard: Path) -> None:

@@ -84,7 +84,7 @@ FORMATS = (
 Format = Literal["tree", "lerobot", "webdataset", "coco", "chat", "sharegpt"]
 
 
-@command("cosfly release export release --format webdataset --out shards", common=f"{WORKERS} resume")
+@command("cosfly release export release --format webdataset --out shards", common="resume")
 def export(
     job: Job,
     source: Annotated[Path, Argument(help="Release, or run directory with a release.")],

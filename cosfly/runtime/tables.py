@@ -66,12 +66,6 @@ def open_table(path: Path, *, tree: Path | None = None) -> Iterator[_Table]:
             yield table
 
 
-def num_rows(path: Path) -> int:
-    """Return the number of rows."""
-    with open_table(path) as table:
-        return table.metadata.num_rows
-
-
 def row_groups(
     path: Path, columns: list[str] | None = None, *, tree: Path | None = None, wanted: Collection[int] | None = None
 ) -> Iterator[pa.Table]:

@@ -75,12 +75,18 @@ def told_apart(sources: list[Source]) -> list[Source]:
     """Add the name of the tree to runs that share a name, as two trees in one folder do: rows and records know a run by
     its name alone."""
     counts = Counter(source.run for source in sources)
-    return [
-        replace(source, run=folder_name(f"{source.run}_{source.data.absolute().name}"))
-        if counts[source.run] > 1
-        else source
-        for source in sources
+    named = [
+        replace(one, run=folder_name(f"{one.run}_{one.data.absolute().name}")) if counts[one.run] > 1 else one
+        for one in sources
     ]
+    name, count = Counter(source.run for source in named).most_common(1)[0]
+    if count > 1:
+        raise InputError(
+            "several runs have the same name", got=f"{count} runs with the name {name}",
+            expected="trees with different names, or in folders with different names",
+            fix="rename one of the trees, or the folder that contains it",
+        )  # fmt: skip
+    return named
 
 
 def input_names(sources: list[Source]) -> list[dict[str, str]]:
@@ -136,13 +142,6 @@ def gather(
     sources: list[Source], *, include_review: bool, accept_unbound: bool, choice: TrackChoice = ALL_TRACKS
 ) -> Material:
     """List the tracks of the runs with the results of their inspections; those that are not chosen are dropped."""
-    name, count = Counter(source.run for source in sources).most_common(1)[0]
-    if count > 1:  # rows and records know a run by its name alone
-        raise InputError(
-            "several runs have the same name", got=f"{count} runs with the name {name}",
-            expected="trees with different names, or in folders with different names",
-            fix="rename one of the trees, or the folder that contains it",
-        )  # fmt: skip
     wanted = ("accepted", "review") if include_review else ("accepted",)
     found: list[Candidate] = []
     inspections: list[Inspection] = []

@@ -8,7 +8,6 @@ prints is escaped.
 from __future__ import annotations
 
 import re
-from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -26,23 +25,12 @@ from release.card.tables import shown, tables_of
 from release.columns import PICTURES, SCALARS, SPLIT_NAMES, schema
 from release.record import FRAMES_FOLDER, POINTS_FOLDER, ReleaseRecord, SourceRecord, shard_pattern
 
-# What a map is, by what made it (`maps.source`): no more than the program knows.
-MAPS = {
-    "synthetic": "made by cosfly's generator from a seed; no real place",
-    "simworld": "a procedural SimWorld world; no real place that cosfly knows of",
-    "cityjson": "a 3D city model (CityJSON), of a real place if its makers say so; buildings are from the model, "
-    "surfaces and plants are drawn by cosfly",
-}
-UNKNOWN_MAP = "made elsewhere, with content that is unknown to cosfly; see its licence and credits"
 FEW_WALKS = 10
 
 
 def render_card(record: ReleaseRecord) -> str:
     """Return README.md for a release.json."""
     numbers, splits = record.numbers, record.splits.splits
-    by_kind: dict[str, list[str]] = defaultdict(list)
-    for source in record.provenance.sources:
-        by_kind[_map_kind(source)].append(source.run)
     decided, repairs = numbers.of("decision"), numbers.of("repair_strategy")
     return markdown(
         "release/card/template.md",
@@ -56,7 +44,6 @@ def render_card(record: ReleaseRecord) -> str:
         front_matter=_front_matter(record),
         ours=[source.run for source in record.provenance.sources if _is_rendered_by_us(source)],
         others=[source.run for source in record.provenance.sources if not _is_rendered_by_us(source)],
-        map_kinds=by_kind,
         first_split=first_split(record),
         points=sum(shard.points.rows for shard in record.shards),
         is_whole=all(one.frames == one.frames_available for one in record.flights),
@@ -73,12 +60,6 @@ def render_card(record: ReleaseRecord) -> str:
         coordinates=_coordinates(record),
         citation=read_text(Path(__file__).with_name("citation.bib")).strip(),
     )
-
-
-def _map_kind(source: SourceRecord) -> str:
-    configs = [stage.config for stage in source.stages if stage.stage == "maps"]
-    kinds = {MAPS.get(str(config.get("source")), UNKNOWN_MAP) for config in configs}
-    return kinds.pop() if len(kinds) == 1 else UNKNOWN_MAP
 
 
 def _is_rendered_by_us(source: SourceRecord) -> bool:

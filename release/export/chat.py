@@ -9,6 +9,7 @@ pictures are relative to the folder of the export.
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -16,15 +17,15 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.formats.captions import FIELDS, Language, Prompt
+from cosfly.runtime.console import Advance
 from cosfly.runtime.errors import NothingKept
 from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.png import colours_of, colours_png
-from cosfly.runtime.worker import advance
 from cosfly.viz.frame_views import Pictures, bounded, frame_label
-from release.columns import LANGUAGES, PICTURE_PX, PICTURES, SPLIT_NAMES, WINDOW
+from release.columns import LANGUAGES, PICTURE_PX, PICTURES, WINDOW
 from release.export.source import ExportSource, Row, SourceTrack
-from release.export.stage import Done, ExportConfig, ExportUnit, FormatFacts, track_units, write_joined
+from release.export.stage import ExportConfig, FormatFacts
 
 IMAGE = "<image>"  # where ShareGPT has a picture; loaders count these marks
 MARKS = (IMAGE, "<video>", "<audio>")
@@ -40,19 +41,62 @@ COLUMNS = [
 DATASET_INFO = "dataset_info.json"  # where LLaMA-Factory looks up its data sets
 
 
-def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
-    """Return one unit per track."""
-    return track_units(source)
+def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
+    """Write the pictures that the samples show, and the samples, one file a split."""
+    skipped, names, total = Counter[str](), dict[str, str](), 0
+    begin, between, end = (b"", b"\n", b"\n") if cfg.format == "chat" else (b"[\n", b",\n", b"\n]\n")
+    for split, tracks in itertools.groupby(source.tracks, lambda track: track.split):
+        name = f"{split}.jsonl" if cfg.format == "chat" else f"{split}.json"
+        num_before = total
+        with atomic_file(folder / name) as file:
+            file.write(begin)
+            for track in tracks:
+                for sample in _samples(track, folder, cfg, skipped, advance):
+                    line = json.dumps(sample, ensure_ascii=False).encode()
+                    file.write((between if total > num_before else b"") + line)
+                    total += 1
+            file.write(end)
+        if total > num_before:
+            names[split] = name
+        else:
+            (folder / name).unlink()
+    reasons = ", ".join(f"{reason}: {count}" for reason, count in sorted(skipped.items()))
+    if not total:
+        got = f"no caption; {reasons}" if reasons else "no caption"
+        what, expected = "the source has no caption to export", "accepted captions"
+        raise NothingKept(what, where=source.folder, got=got, expected=expected)
+    first = next(iter(names.values()))
+    run_here = "Names of pictures are relative to this folder: start the training in it."
+    opened = f'from datasets import load_dataset\nsamples = load_dataset("json", data_files="{first}", split="train")'
+    if cfg.format == "sharegpt":
+        columns = {"messages": "conversations", "system": "system", "images": "images"}
+        about = {
+            f"cosfly_{split}": {"file_name": name, "formatting": "sharegpt", "columns": columns}
+            for split, name in names.items()
+        }
+        write_bytes(folder / DATASET_INFO, (dump_json(about, indent=1) + "\n").encode())
+        run_here = "dataset_dir and media_dir of LLaMA-Factory are this folder, which has the dataset_info.json."
+        opened = "# llamafactory-cli train --dataset_dir . --media_dir . --dataset cosfly_train ..."
+    return FormatFacts(
+        format_version="messages and images" if cfg.format == "chat" else "ShareGPT",
+        codings={
+            "images": "PNG; the released bytes, or scaled down to the size of the teacher's pictures",
+            "answer": "JSON text of the three fields of a caption",
+        },
+        notes=[f"{total} samples, one per window and language. Skipped: {reasons or 'none'}.", run_here],
+        how_to_open=opened,
+    )
 
 
-def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> dict[str, Any]:
-    """Write the pictures that the samples of one track show; return the counts of samples and of what is skipped."""
-    track, skipped = unit.track, Counter[str]()
-    samples = list(_samples(track, cfg, skipped))
+def _samples(
+    track: SourceTrack, folder: Path, cfg: ExportConfig, skipped: Counter[str], advance: Advance
+) -> list[dict[str, Any]]:
+    """Return the samples of a track, and write their pictures; count by reason what cannot be a sample."""
+    known, rows = set(track.frame_index), [row for row in track.rows(COLUMNS) if row["has_caption"]]
+    samples = [sample for row in rows for sample in _samples_of(row, track, known, cfg, skipped)]
     names = {name for sample in samples for name in sample["images"]}
     # The texts refer to pixels of the pictures that the teacher saw.
-    sides_px = [max(row[PICTURE_PX]) for row in track.rows([PICTURE_PX]) if row[PICTURE_PX]]
-    most_px = max(sides_px, default=0)
+    most_px = max((max(row[PICTURE_PX]) for row in rows if row[PICTURE_PX]), default=0)
     is_scaled = most_px < max(track.size_px)
     for row in track.rows(["sample_id", "frame_index", PICTURES["rgb"].name]) if names else ():
         name = _picture_name(track, row["frame_index"])
@@ -61,20 +105,12 @@ def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfi
             if is_scaled:
                 data = colours_png(bounded(colours_of(data, row["sample_id"]), most_px))
             write_bytes(folder / name, data)
-        advance()
-    return {"samples": len(samples), "skipped": skipped}
+        advance(1)
+    return samples
 
 
 def _picture_name(track: SourceTrack, index: int) -> str:
     return "/".join(filter(None, ("images", *track.name.split("/"), f"frame_{index:05d}.png")))
-
-
-def _samples(track: SourceTrack, cfg: ExportConfig, skipped: Counter[str]) -> Iterator[dict[str, Any]]:
-    """Yield the samples of a track; count by reason what cannot be one."""
-    known = set(track.frame_index)
-    for row in track.rows(COLUMNS):
-        if row["has_caption"]:
-            yield from _samples_of(row, track, known, cfg, skipped)
 
 
 def _samples_of(
@@ -124,44 +160,3 @@ def _sharegpt(prompt: Prompt, labels: Sequence[str], reply: str) -> dict[str, An
     asked = "\n".join(f"{label} {IMAGE}".lstrip() for label in labels) + f"\n\n{prompt.user}"
     turns = [{"from": "human", "value": asked}, {"from": "gpt", "value": reply}]
     return {"conversations": turns, "system": prompt.system}
-
-
-def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) -> FormatFacts:
-    """Write the samples, one file a split."""
-    skipped = sum((Counter(facts["skipped"]) for _, facts in done), Counter[str]())
-    reasons = ", ".join(f"{reason}: {count}" for reason, count in sorted(skipped.items()))
-    if not (total := sum(facts["samples"] for _, facts in done)):
-        got = f"no caption; {reasons}" if reasons else "no caption"
-        what, expected = "the source has no caption to export", "accepted captions"
-        raise NothingKept(what, where=source.folder, got=got, expected=expected)
-    begin, between, end = (b"", b"\n", b"\n") if cfg.format == "chat" else (b"[\n", b",\n", b"\n]\n")
-    names = {}
-    for split in SPLIT_NAMES:
-        if tracks := [unit.track for unit, facts in done if unit.split == split and facts["samples"]]:
-            names[split] = f"{split}.jsonl" if cfg.format == "chat" else f"{split}.json"
-            samples = (sample for track in tracks for sample in _samples(track, cfg, Counter()))
-            with atomic_file(folder / names[split]) as file:
-                file.write(begin)
-                write_joined(file, (json.dumps(sample, ensure_ascii=False).encode() for sample in samples), between)
-                file.write(end)
-    first = next(iter(names.values()))
-    run_here = "Names of pictures are relative to this folder: start the training in it."
-    opened = f'from datasets import load_dataset\nsamples = load_dataset("json", data_files="{first}", split="train")'
-    if cfg.format == "sharegpt":
-        columns = {"messages": "conversations", "system": "system", "images": "images"}
-        about = {
-            f"cosfly_{split}": {"file_name": name, "formatting": "sharegpt", "columns": columns}
-            for split, name in names.items()
-        }
-        write_bytes(folder / DATASET_INFO, (dump_json(about, indent=1) + "\n").encode())
-        run_here = "dataset_dir and media_dir of LLaMA-Factory are this folder, which has the dataset_info.json."
-        opened = "# llamafactory-cli train --dataset_dir . --media_dir . --dataset cosfly_train ..."
-    return FormatFacts(
-        format_version="messages and images" if cfg.format == "chat" else "ShareGPT",
-        codings={
-            "images": "PNG; the released bytes, or scaled down to the size of the teacher's pictures",
-            "answer": "JSON text of the three fields of a caption",
-        },
-        notes=[f"{total} samples, one per window and language. Skipped: {reasons or 'none'}.", run_here],
-        how_to_open=opened,
-    )

@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,14 +28,14 @@ from cosfly.formats.frames import FrameFile
 from cosfly.geometry.axes import step_s
 from cosfly.geometry.motion import ACTION, PlannedMotion
 from cosfly.runtime.arrays import parse_array
+from cosfly.runtime.console import Advance
 from cosfly.runtime.errors import EnvironmentMissing, InputError
 from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.png import colours_of
-from cosfly.runtime.worker import advance
-from release.columns import BOX, CAPTION_FIELDS, PICTURES, POINT, POSE, SPLIT_NAMES
+from release.columns import BOX, CAPTION_FIELDS, PICTURES, POINT, POSE
 from release.export.source import ExportSource, Row
-from release.export.stage import Done, ExportConfig, ExportUnit, FormatFacts, Piece, shards
+from release.export.stage import ExportConfig, FormatFacts, Piece, shards
 from release.flight_rows import vectors
 
 VERSION = "v3.0"
@@ -186,7 +187,7 @@ def _merge_all(stats: Sequence[dict[str, Summary]]) -> dict[str, Summary]:
 
 @dataclass(frozen=True)
 class Layout:
-    """What a unit must know of the whole. file: Its number. episode, index: Numbers of its first episode and frame.
+    """What a file must know of the whole. file: Its number. episode, index: Numbers of its first episode and frame.
     tasks: All, in words."""
 
     file: int
@@ -201,8 +202,8 @@ class Layout:
         return {"chunk_index": self.file // CHUNK, "file_index": self.file % CHUNK}
 
 
-def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
-    """Index episodes and frames; a unit is a data file."""
+def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
+    """Index episodes and frames; write the data files and `meta/`."""
     pieces = [Piece(track, start, stop) for track in source.tracks for start, stop in track.runs()]
     fps, size_px = _fps(pieces), source.tracks[0].size_px
     if cfg.video and any(side % 2 for side in size_px):
@@ -212,12 +213,30 @@ def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
         raise not_in_set(", ".join(sorted(unknown))[:200], source.folder)
     decisions = ("", *TOKENS)
     tasks = tuple(dict.fromkeys(task_of(t.goal, one) for t in source.tracks for one in decisions if one in t.decisions))
-    units = list[ExportUnit]()
-    episode = index = 0
-    for number, unit in enumerate(shards(pieces, cfg.shard_mb)):
-        units.append(replace(unit, extra=Layout(number, episode, index, fps, size_px, tasks)))
-        episode, index = episode + len(unit.pieces), index + unit.frames
-    return units
+    features = features_of(source.modalities, size_px, fps, cfg.video)
+    layout, stats, counts = Layout(0, 0, 0, fps, size_px, tasks), list[dict[str, Summary]](), Counter[str]()
+    for split, _, own in shards(pieces, cfg.shard_mb):
+        stats.append(_write_file(source, own, layout, features, folder, advance))
+        counts[split] += len(own)
+        episode, index = layout.episode + len(own), layout.index + sum(piece.frames for piece in own)
+        layout = replace(layout, file=layout.file + 1, episode=episode, index=index)
+    ends = dict(zip(counts, itertools.accumulate(counts.values()), strict=True))
+    info = {
+        "codebase_version": VERSION, "robot_type": "cosfly_drone", "total_episodes": layout.episode,
+        "total_frames": layout.index, "total_tasks": len(tasks), "chunks_size": CHUNK, "fps": fps,
+        "splits": {split: f"{end - counts[split]}:{end}" for split, end in ends.items()},
+        "data_path": DATA_PATH, "video_path": VIDEO_PATH if cfg.video else None, "features": features,
+        "data_files_size_in_mb": cfg.shard_mb, "video_files_size_in_mb": cfg.shard_mb,
+    }  # fmt: skip
+    for name, content in (("stats", _merge_all(stats)), ("info", info)):
+        write_bytes(folder / f"meta/{name}.json", dump_json(content, indent=4).encode())
+    import pandas as pd
+
+    buffer = io.BytesIO()  # lerobot reads the text as the index of a data frame
+    table = pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(tasks, name="task"))
+    table.to_parquet(buffer)
+    write_bytes(folder / "meta/tasks.parquet", buffer.getvalue())
+    return _facts(source, layout, cfg)
 
 
 def _fps(pieces: list[Piece]) -> int:
@@ -239,10 +258,10 @@ def _fps(pieces: list[Piece]) -> int:
     return found.pop() if found else PAPER_FPS
 
 
-def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> dict[str, Any]:
-    """Write the data file of a unit, its videos, and its part of the table of episodes; return its statistics."""
-    layout: Layout = unit.extra
-    features = features_of(source.modalities, layout.size_px, layout.fps, cfg.video)
+def _write_file(
+    source: ExportSource, pieces: list[Piece], layout: Layout, features: dict[str, Any], folder: Path, advance: Advance
+) -> dict[str, Summary]:
+    """Write a data file, its videos, and its part of the table of episodes; return its statistics."""
     schema = schema_of(features)
     cameras = [name for name, one in features.items() if one["dtype"] == "video"]
     texts = [field.name for field in schema if pa.types.is_string(field.type)]
@@ -253,13 +272,13 @@ def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfi
         table = stack.enter_context(pq.ParquetWriter(file, schema, **options))
         paths = {name: folder / VIDEO_PATH.format(video_key=name, **layout.place) for name in cameras}
         videos = {name: stack.enter_context(video_writer(path, layout)) for name, path in paths.items()}
-        for number, piece in enumerate(unit.pieces, layout.episode):
-            episodes.append(_write_episode(source, piece, number, first, layout, features, table, videos))
+        for number, piece in enumerate(pieces, layout.episode):
+            episodes.append(_write_episode(source, piece, number, first, layout, features, table, videos, advance))
             first += piece.frames
     buffer = io.BytesIO()
     pq.write_table(pa.Table.from_pylist([_episode_row(row, layout, cameras) for row in episodes]), buffer)
     write_bytes(folder / EPISODES_PATH.format(**layout.place), buffer.getvalue())
-    return {"stats": _merge_all([row["stats"] for row in episodes])}
+    return _merge_all([row["stats"] for row in episodes])
 
 
 @contextlib.contextmanager
@@ -279,7 +298,7 @@ def video_writer(path: Path, layout: Layout) -> Iterator[Callable[[np.ndarray], 
 
 def _write_episode(
     source: ExportSource, piece: Piece, number: int, first: int, layout: Layout, features: dict[str, Any],
-    table: pq.ParquetWriter, videos: dict[str, Callable[[np.ndarray], None]],
+    table: pq.ParquetWriter, videos: dict[str, Callable[[np.ndarray], None]], advance: Advance,
 ) -> dict[str, Any]:  # fmt: skip
     """Write the rows of an episode; return what the table of episodes has of it."""
     track, n = piece.track, piece.frames
@@ -300,7 +319,7 @@ def _write_episode(
                     images[name].append(_image(data, row["sample_id"], file))
                 if i in sampled:
                     pixels[name].append(_pixels(data, row["sample_id"], file))
-            advance()
+            advance(1)
         part = slice(start, start + ROWS_HELD)
         columns = {name: images.get(name) or list(values[name][part]) for name in table.schema.names}
         table.write_table(pa.Table.from_pydict(columns, schema=table.schema))
@@ -347,31 +366,8 @@ def _episode_row(row: dict[str, Any], layout: Layout, cameras: list[str]) -> dic
     }
 
 
-def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) -> FormatFacts:
-    """Write `meta/`."""
-    layout: Layout = done[0][0].extra
-    splits, total = dict[str, str](), 0
-    for split in SPLIT_NAMES:
-        here = sum(len(unit.pieces) for unit, _ in done if unit.split == split)
-        if here:
-            splits[split] = f"{total}:{total + here}"
-        total += here
-    info = {
-        "codebase_version": VERSION, "robot_type": "cosfly_drone", "total_episodes": total,
-        "total_frames": sum(unit.frames for unit, _ in done), "total_tasks": len(layout.tasks), "chunks_size": CHUNK,
-        "fps": layout.fps, "splits": splits, "data_path": DATA_PATH, "video_path": VIDEO_PATH if cfg.video else None,
-        "features": features_of(source.modalities, layout.size_px, layout.fps, cfg.video),
-        "data_files_size_in_mb": cfg.shard_mb, "video_files_size_in_mb": cfg.shard_mb,
-    }  # fmt: skip
-    stats = _merge_all([facts["stats"] for _, facts in done])
-    for name, content in (("stats", stats), ("info", info)):
-        write_bytes(folder / f"meta/{name}.json", dump_json(content, indent=4).encode())
-    import pandas as pd
-
-    buffer = io.BytesIO()  # lerobot reads the text as the index of a data frame
-    tasks = pd.DataFrame({"task_index": range(len(layout.tasks))}, index=pd.Index(layout.tasks, name="task"))
-    tasks.to_parquet(buffer)
-    write_bytes(folder / "meta/tasks.parquet", buffer.getvalue())
+def _facts(source: ExportSource, layout: Layout, cfg: ExportConfig) -> FormatFacts:
+    """Return what the README says. layout: After the last file."""
     picture_form = f"{CODEC} in mp4, with loss" if cfg.video else "PNG, the released bytes"
     codings: dict[str, str] = dict.fromkeys(source.modalities, picture_form)
     if "depth" in codings:
@@ -381,8 +377,8 @@ def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) ->
         format_version=VERSION,
         codings=codings,
         notes=[
-            f"{total} episodes of {len(source.tracks)} tracks at {layout.fps} frames per second; a track with gaps is "
-            "cut there. meta/episodes has the track, split and first frame of each.",
+            f"{layout.episode} episodes of {len(source.tracks)} tracks at {layout.fps} frames per second; a track with "
+            "gaps is cut there. meta/episodes has the track, split and first frame of each.",
             "action and observation.state are mean velocities: forward, left, up in m/s in the drone's level axes, "
             "turn in degrees/s (counter-clockwise), and the camera's pitch: of the step to the next frame, and of the "
             "step that led here. Zero after the last frame of an episode (next.done) and before its first.",

@@ -1,26 +1,20 @@
 """`cosfly release export`: a release in another format.
 
 Reads a release (`release/export/source.py`); writes `<format>/` with the format's files, `export.json` (what it was
-made of, how things are stored), README.md and checksums.sha256. A format is a module with three functions and a line in
-EXPORTS:
+made of, how things are stored), README.md and checksums.sha256, whole or not at all. A format is a module with a
+function, and a line in EXPORTS:
 
-    plan(source, cfg) -> list[ExportUnit]                  cuts the work into units that can be done in any order
-    write(source, unit, folder, cfg) -> dict               writes the files of one unit; returns what `finish` needs
-    finish(source, done, folder, cfg) -> FormatFacts       writes what concerns all units; called once
-
-All files are written atomically. The bytes of a unit depend on source, unit and settings alone.
+    write(source, folder, cfg, advance) -> FormatFacts      advance(n): n frames are written
 """
 
 from __future__ import annotations
 
 import importlib
-import os
-import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import yaml
 from pydantic import Field
@@ -28,15 +22,15 @@ from pydantic import Field
 import cosfly
 from cosfly.formats.frames import FILE_NAMES, FrameFile
 from cosfly.runtime.config import Config
+from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.io import CHECKSUMS, sha256_file, storage_errors, write_bytes, write_checksums
+from cosfly.runtime.io import CHECKSUMS, atomic_folder, sha256_file, write_bytes, write_checksums
 from cosfly.runtime.json_io import FileFormat, write_model
-from cosfly.runtime.pool import Watch, run_items
-from cosfly.runtime.run_dir import Resume, StageFolder
-from cosfly.runtime.worker import Item, Outcome, Work
+from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.viz.page import markdown
 from release.columns import LANGUAGES, SPLIT_NAMES, SplitName
 from release.export.source import ExportSource, SourceTrack, open_release
+from release.record import RECORD as RELEASE
 from release.record import ReleasedMap, Strict
 from release.rules import group_by_size
 
@@ -93,33 +87,6 @@ class Piece(NamedTuple):
         return self.stop - self.start
 
 
-@dataclass(frozen=True)
-class ExportUnit:
-    """A piece of work. name: Unique. split: Of all its rows. extra: What the format has decided about it."""
-
-    name: str
-    split: SplitName
-    pieces: tuple[Piece, ...]
-    extra: Any = None
-
-    @property
-    def frames(self) -> int:
-        return sum(piece.frames for piece in self.pieces)
-
-    @property
-    def track(self) -> SourceTrack:
-        """Its track, if it is a whole one."""
-        return self.pieces[0].track
-
-    @property
-    def file_name(self) -> str:
-        """Its name as part of the name of a file."""
-        return self.name.replace("/", "_")
-
-
-Done = list[tuple[ExportUnit, dict[str, Any]]]  # the units, each with what `write` returned
-
-
 class FormatFacts(Strict):
     """What a format states about itself.
 
@@ -136,31 +103,13 @@ class FormatFacts(Strict):
     split_files: dict[str, str] = Field({}, exclude=True)
 
 
-def track_units(source: ExportSource) -> list[ExportUnit]:
-    """Return one unit per track."""
-    return [ExportUnit(track.name, track.split, (Piece(track, 0, len(track)),)) for track in source.tracks]
-
-
-def shards(pieces: Sequence[Piece], shard_mb: int) -> list[ExportUnit]:
-    """Group pieces of each split into units of about `shard_mb`, and name them `train-00000`."""
-    units = []
+def shards(pieces: Sequence[Piece], shard_mb: int) -> Iterator[tuple[SplitName, str, list[Piece]]]:
+    """Yield groups of pieces of each split of about `shard_mb`, each with its split and name, `train-00000`."""
     for split in SPLIT_NAMES:
         own = [piece for piece in pieces if piece.track.split == split]
         sizes = [piece.frames * piece.track.frame_bytes for piece in own]
         for number, group in enumerate(group_by_size(sizes, shard_mb * MB)):
-            units.append(ExportUnit(f"{split}-{number:05d}", split, tuple(own[k] for k in group)))
-    return units
-
-
-def write_joined(file: IO[bytes], lines: Iterable[bytes], between: bytes) -> None:
-    """Write lines with other bytes between them."""
-    for number, line in enumerate(lines):
-        file.write((between if number else b"") + line)
-
-
-def scratch_of(folder: Path) -> Path:
-    """Return the folder for files of a unit that `finish` joins; it is removed after the export."""
-    return folder.with_name("scratch")
+            yield split, f"{split}-{number:05d}", [own[k] for k in group]
 
 
 # --- the record -------------------------------------------------------------------------------------------------------
@@ -220,7 +169,7 @@ def render_readme(record: ExportRecord, split_files: dict[str, str]) -> str:
     return markdown("release/export/readme.md", record=record, front_matter=front_matter).rstrip() + "\n"
 
 
-# --- the stage ------------------------------------------------------------------------------------------------------
+# --- the stage --------------------------------------------------------------------------------------------------------
 
 
 def check_needs(source: ExportSource, cfg: ExportConfig) -> ExportSource:
@@ -238,42 +187,19 @@ def check_needs(source: ExportSource, cfg: ExportConfig) -> ExportSource:
     return replace(source, modalities=chosen)
 
 
-def make_worker(source: ExportSource, parts: Path, cfg: ExportConfig) -> Work:
-    """Return the function that writes one unit."""
-    format = importlib.import_module(EXPORTS[cfg.format].module)
-    return lambda item: Outcome(format.write(source, item.payload, parts, cfg))
-
-
-def run(
-    cfg: ExportConfig, folder: Path, out: Path, *, workers: int = 0, watch: Watch = Watch(), resume: Resume = "if-same"
-) -> Path:
+def run(cfg: ExportConfig, folder: Path, out: Path, *, resume: Resume = "if-same") -> Path:
     """Read a release, also of a run; write it in the format of the settings and return its folder."""
     is_of_windows = EXPORTS[cfg.format].needs_consecutive and (cfg.frames == "all" or cfg.format == "lerobot")
     source = check_needs(open_release(folder, f"the {cfg.format} export" if is_of_windows else ""), cfg)
-    inputs = {"release": source.folder / "release.json"}
-    stage = StageFolder.open(out, "export", config=cfg, inputs=inputs, seed=0, resume=resume)
-    product, parts = out / cfg.format, out / "parts"
+    stage = StageFolder.open(
+        out, "export", config=cfg, inputs={"release": source.folder / RELEASE}, seed=0, resume=resume
+    )
+    product, num_frames = out / cfg.format, sum(map(len, source.tracks))
     if stage.is_complete:
         return product
-    with storage_errors(parts):
-        if product.is_dir() and not parts.exists():  # a kill came between the last rename and the manifest
-            os.replace(product, parts)
     format = importlib.import_module(EXPORTS[cfg.format].module)
-    units = format.plan(source, cfg)
-    items = [Item(unit.name, unit, unit.frames) for unit in units]
-    arguments = (replace(source, tracks=[]), parts, cfg)
-    finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="export: frames")
-    if finished.tally.failed:  # nothing half is published
-        raise InputError(
-            "parts of the source could not be exported", where=out / "failures.jsonl", got=str(finished.tally),
-            fix="fix what this file lists (see cosfly release verify) and run the same command again, which repeats "
-            "only these parts",
-        )  # fmt: skip
-    done = [(unit, kept.result) for unit, kept in zip(units, finished.kept, strict=True)]
-    facts = format.finish(source, done, parts, cfg)
-    _write_records(source, sum(unit.frames for unit in units), facts, parts, cfg)
-    with storage_errors(product):
-        os.replace(parts, product)
-    stage.finish([product / name for name in OWN], finished.tally)
-    shutil.rmtree(scratch_of(parts), ignore_errors=True)
+    with atomic_folder(product) as parts, progress_bar("export: frames", num_frames) as advance:
+        facts = format.write(source, parts, cfg, advance)
+        _write_records(source, num_frames, facts, parts, cfg)
+    stage.finish([product / name for name in OWN], Tally(input=num_frames, kept=num_frames))
     return product

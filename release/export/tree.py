@@ -10,7 +10,6 @@ name.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -26,20 +25,20 @@ from cosfly.formats.places import TOWN
 from cosfly.formats.playback import DATASET_FORMAT, LEGIBILITY, TARGET_FILE, Track, write_track
 from cosfly.formats.segments import FOLLOW, Segment
 from cosfly.formats.town import TOWN_FILE, TOWN_FORMAT, TownMap
+from cosfly.runtime.console import Advance
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes, sha256_file, write_bytes, write_checksums
 from cosfly.runtime.json_io import write_model
-from cosfly.runtime.worker import advance
 from release.columns import COMPANY_COLUMNS, PICTURES, SCALAR_NAMES, TARGET_PICTURE, matrices_of
 from release.export.source import ExportSource, Row, SourceTrack
-from release.export.stage import Done, ExportConfig, ExportUnit, FormatFacts, track_units
+from release.export.stage import ExportConfig, FormatFacts
 from release.flight_rows import FlightRows
 
 VERSION = "drone_nav_traj_v7 7.0.0"
 
 
-def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
-    """Return one unit per track; its `extra` is its folder in the tree, and the number of its trajectory."""
+def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
+    """Write each track, and each town's `map.json`; count the tracks of which strict readers will miss something."""
     wrong = [
         f"{track.name}: the name of the {kind} does not begin with {begin}"
         for track in source.tracks
@@ -50,20 +49,45 @@ def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
         what = "the source cannot be written as a playback tree"
         raise InputError(what, where=source.folder, got="; ".join(wrong[:20]))
     has_runs = len({track.place.run for track in source.tracks}) > 1
-    numbers: dict[tuple[str, str, str], int] = {}
-    units = []
-    for unit in track_units(source):
-        place = unit.track.place
-        number = numbers.setdefault((place.run, place.town, place.trajectory), len(numbers))
-        folder = Path(place.run if has_runs else "", place.town, place.trajectory, place.variant)
-        units.append(replace(unit, extra=(folder.as_posix(), number)))
-    return units
+    maps = {entry.town: entry for entry in source.record.maps}
+    groups = defaultdict[tuple[str, str, str], list[SourceTrack]](list)
+    num_gaps = 0
+    for track in source.tracks:
+        at = track.place
+        group = (at.run, at.town, at.trajectory)
+        groups[group].append(track)
+        number, place = list(groups).index(group), folder / (at.run if has_runs else "") / at.town
+        num_gaps += bool((np.diff(track.frame_index) != 1).any() or track.frame_index[0] != 0)
+        _write_track(source, track, number, place / at.trajectory / at.variant, advance)
+        shown = maps.get(at.town)
+        about = TownMap(name=shown.name, licence=shown.licence, credits=shown.credits) if shown else None
+        about = about or TownMap(name=at.town, licence=UNKNOWN_LICENCE, credits="")
+        write_model(place / TOWN_FILE, about, TOWN_FORMAT)
+    notes = [
+        "Frames count from 0 as the layout asks; source.released_frames of trajectory.json has the index of each in "
+        "its track. The layout has no captions: they are in the release. meta.json and missions are not in it."
+    ]
+    if num_gaps:
+        parts = f"{num_gaps} of {len(source.tracks)} tracks are parts of a track"
+        notes.append(f"{parts}: the steps between their frames are uneven, which readers with a strict clock refuse.")
+    if num_alone := sum(len(group) < 2 for group in groups.values()):
+        notes.append(
+            f"{num_alone} of {len(groups)} trajectories have one track only; some public loaders ask for both."
+        )
+    return FormatFacts(
+        format_version=VERSION,
+        codings={file: f"{FILE_NAMES[file]}, the released bytes" for file in source.modalities},
+        coordinates=COORDINATES,
+        notes=notes,
+        how_to_open="from cosfly.formats.tracks import find_tracks\n"
+        "from cosfly.formats.playback import read_track\n"
+        "tracks = [read_track(folder, strict=False) for folder in find_tracks(Path('.'))]",
+    )
 
 
-def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> dict[str, Any]:
-    """Write one track: its pictures, then trajectory.json, then the checksums of all."""
-    track, (place, number) = unit.track, unit.extra
-    out, digests, scalars = folder / place, dict[str, str](), list[Row]()
+def _write_track(source: ExportSource, track: SourceTrack, number: int, out: Path, advance: Advance) -> None:
+    """Write the pictures of a track, then trajectory.json, then the checksums of all."""
+    digests, scalars = dict[str, str](), list[Row]()
 
     def put(name: str, data: bytes) -> None:
         write_bytes(out / name, data)
@@ -75,49 +99,10 @@ def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfi
         if row[TARGET_PICTURE] is not None:
             put(TARGET_FILE, row[TARGET_PICTURE]["bytes"])
         scalars.append({column: row[column] for column in SCALAR_NAMES})
-        advance()
+        advance(1)
     write_track(out, track_of_rows(scalars, track, number), with_flags=True)
     digests["trajectory.json"] = sha256_file(out / "trajectory.json")
     write_checksums(out, digests)
-    has_gaps = bool((np.diff(track.frame_index) != 1).any() or track.frame_index[0] != 0)
-    return {"is_original": scalars[0]["track"] == "clean", "has_gaps": has_gaps}
-
-
-def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) -> FormatFacts:
-    """Write each town's `map.json`, and count the tracks of which strict readers will miss something."""
-    towns = {(unit.extra[0].rpartition("/trajectory_")[0], unit.track.place.town) for unit, _ in done}
-    maps = {entry.town: entry for entry in source.record.maps}
-    for place, town in sorted(towns):
-        shown = maps.get(town)
-        about = TownMap(name=shown.name, licence=shown.licence, credits=shown.credits) if shown else None
-        about = about or TownMap(name=town, licence=UNKNOWN_LICENCE, credits="")
-        write_model(folder / place / TOWN_FILE, about, TOWN_FORMAT)
-    return FormatFacts(
-        format_version=VERSION,
-        codings={file: f"{FILE_NAMES[file]}, the released bytes" for file in source.modalities},
-        coordinates=COORDINATES,
-        notes=list(_notes(done)),
-        how_to_open="from cosfly.formats.tracks import find_tracks\n"
-        "from cosfly.formats.playback import read_track\n"
-        "tracks = [read_track(folder, strict=False) for folder in find_tracks(Path('.'))]",
-    )
-
-
-def _notes(done: Done) -> Iterator[str]:
-    yield (
-        "Frames count from 0 as the layout asks; source.released_frames of trajectory.json has the index of each in "
-        "its track. The layout has no captions: they are in the release. meta.json and missions are not in it."
-    )
-    if gaps := sum(facts["has_gaps"] for _, facts in done):
-        yield (
-            f"{gaps} of {len(done)} tracks are parts of a track: the steps between their frames are uneven, which "
-            "readers with a strict clock refuse."
-        )
-    tracks = defaultdict(set)
-    for unit, facts in done:
-        tracks[unit.extra[0].rpartition("/")[0]].add(facts["is_original"])
-    if alone := sum(len(found) < 2 for found in tracks.values()):
-        yield f"{alone} of {len(tracks)} trajectories have one track only; some public loaders ask for both."
 
 
 # --- trajectory.json --------------------------------------------------------------------------------------------------

@@ -15,55 +15,53 @@ from collections import Counter
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from cosfly.formats.frames import FILE_NAMES
+from cosfly.runtime.console import Advance
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file
 from cosfly.runtime.json_io import dump_json
-from cosfly.runtime.worker import advance
 from release.columns import PICTURES, SCALAR_NAMES, SCALARS, SPLIT_NAMES, TARGET_PICTURE, Column
 from release.export.source import PART, ExportSource, Row
-from release.export.stage import Done, ExportConfig, ExportUnit, FormatFacts, Piece, shards
+from release.export.stage import ExportConfig, FormatFacts, Piece, shards
 
 TEXTS = ("string", "texts", "events")
 MOST_FRAMES = 100  # of a piece, the smallest part of a shard
 
 
-def plan(source: ExportSource, cfg: ExportConfig) -> list[ExportUnit]:
-    """Cut each split into shards of about `shard_mb`."""
+def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
+    """Cut each split into shards of about `shard_mb`, and write them."""
     pieces = [
         Piece(track, start, min(start + MOST_FRAMES, len(track)))
         for track in source.tracks
         for start in range(0, len(track), MOST_FRAMES)
     ]
-    return shards(pieces, cfg.shard_mb)
+    counts = Counter[str]()
+    for split, name, own in shards(pieces, cfg.shard_mb):
+        _write_shard(source, folder / f"{name}.tar", own, advance)
+        counts[split] += 1
+    return _facts(source, counts)
 
 
-def write(source: ExportSource, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> dict[str, Any]:
-    """Write one shard."""
+def _write_shard(source: ExportSource, path: Path, pieces: list[Piece], advance: Advance) -> None:
     keys = set[str]()
     columns = [*SCALAR_NAMES, *(PICTURES[file].name for file in source.modalities)]
-    rows = ((track, row) for track, start, stop in unit.pieces for row in track.rows(columns, start, stop))
-    with (
-        atomic_file(folder / f"{unit.name}.tar") as file,
-        tarfile.open(fileobj=file, mode="w|", format=tarfile.GNU_FORMAT) as tar,
-    ):
+    rows = ((track, row) for track, start, stop in pieces for row in track.rows(columns, start, stop))
+    with atomic_file(path) as file, tarfile.open(fileobj=file, mode="w|", format=tarfile.GNU_FORMAT) as tar:
         for track, row in rows:
             key = row["sample_id"].replace(".", "_")  # a key ends at its first dot
             if key in keys or not PART.fullmatch(key):
                 what = "the sample_id of a frame is repeated or is not a file name"
-                raise InputError(what, where=unit.name, got=key)
+                raise InputError(what, where=path.name, got=key)
             keys.add(key)
             pictures: dict[str, bytes] = {FILE_NAMES[file]: track.picture(row, file) for file in source.modalities}
             for ending, data in sorted((pictures | dict(members(row))).items()):
                 header = tarfile.TarInfo(f"{key}.{ending}")  # without times and owners
                 header.size, header.mode = len(data), 0o644
                 tar.addfile(header, BytesIO(data))
-            advance()
-    return {}
+            advance(1)
 
 
 def members(row: Row) -> Iterator[tuple[str, bytes]]:
@@ -100,9 +98,8 @@ def _numbers(column: Column, value: object) -> np.ndarray:
     return np.array([value], np.float64)
 
 
-def finish(source: ExportSource, done: Done, folder: Path, cfg: ExportConfig) -> FormatFacts:
-    """Return how the shards are opened."""
-    counts = Counter(unit.split for unit, _ in done)
+def _facts(source: ExportSource, counts: Counter[str]) -> FormatFacts:
+    """Return how the shards are opened. counts: Of each split."""
     first = next(split for split in SPLIT_NAMES if counts[split])
     last = counts[first] - 1
     names = f"{first}-{{00000..{last:05d}}}.tar" if last else f"{first}-00000.tar"

@@ -11,10 +11,9 @@ import numpy as np
 
 from cosfly.formats.frames import PERSON_ID, SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.geometry.goals import SeenFrame, meant, target_picture, words_of
-from cosfly.geometry.reprojection import LEAST_SEEN, SHARED_ID, Agreement, View, compare_views, median_of
+from cosfly.geometry.reprojection import LEAST_SEEN, SHARED_ID, Agreement, View, compare_views
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.png import colours_of
@@ -23,7 +22,6 @@ from release.columns import PICTURES, TARGET_PICTURE
 from release.flight_rows import FlightRows
 from release.verify.findings import Findings
 
-SURFACE_M = PERSON_HALF_EXTENTS_M[2] + 0.3  # between the hip and the visible surface of a person along the optical axis
 PERSON, SKY, MOST_KIND = KINDS["Pedestrians"], KINDS["Sky"], max(KINDS.values())
 NOTHING = np.empty((0, 0), np.float32)
 NO_IDS = np.empty((0, 0, 3), np.uint8)
@@ -64,8 +62,6 @@ def check_picture(flight: FlightRows, i: int, decoded: Decoded, findings: Findin
         findings.error("depth_range", flight.where(i, "depth"), got, expected)
     if instance.size and not flight.is_foreign:
         _check_instance(flight, i, depth, instance, findings)
-    if instance.size and depth.size and good:
-        _check_person_depth(flight, i, instance, depth, findings)
     return good
 
 
@@ -86,26 +82,6 @@ def _check_instance(flight: FlightRows, i: int, depth: np.ndarray, instance: np.
     if depth.size and num_odd_sky:
         got = f"{num_odd_sky:,} pixels are sky in only one of instance and depth"
         findings.error("sky", where, got, "the same sky in both")
-
-
-def _check_person_depth(
-    flight: FlightRows, i: int, instance: np.ndarray, depth: np.ndarray, findings: Findings
-) -> None:
-    """The surface of the person is about as far as the row says its hip is."""
-    expected = flight.rows[i].get("target_depth_m")
-    box = flight.box[i] if flight.is_foreign or np.isnan(flight.mask_box[i]).any() else flight.mask_box[i]
-    if expected is None or np.isnan([expected, *box]).any() or not flight.rows[i].get("target_visible"):
-        return
-    size = depth.shape[::-1]
-    (x0, y0), (x1, y1) = (np.clip(end, 0, size).astype(int) for end in (np.floor(box[:2]), np.ceil(box[2:])))
-    part = instance[y0:y1, x0:x1]
-    is_person = part[..., 0] == PERSON
-    if not flight.is_foreign:
-        is_person &= (part[..., 1:] == 255).all(axis=-1)
-    surface = depth[y0:y1, x0:x1][is_person]
-    if len(surface) and abs((found := median_of(surface)) - expected) > SURFACE_M:
-        wanted = f"{expected:.2f} m (target_depth_m) within {SURFACE_M:.1f} m"
-        findings.error("depth", flight.where(i, "depth"), f"{found:.2f} m at the person", wanted)
 
 
 @njit(cache=True, nogil=True)

@@ -111,28 +111,28 @@ def check_names(folder: Path, record: ReleaseRecord, findings: Findings) -> list
     a folder."""
     expected: dict[str, int | None] = dict.fromkeys((*RECORDS, CHECKSUMS))
     expected |= {file.path: file.bytes for file in record.files}
-    found, present = dict[str, int](), set[str]()
+    found = dict[str, int | None]()
     for path in sorted(folder.rglob("*")):
-        name, is_folder = path.relative_to(folder).as_posix(), path.is_dir() and not path.is_symlink()
-        if name.split("/")[0] in ALLOWED or (is_folder and any(path.iterdir())):
+        name = path.relative_to(folder).as_posix()
+        if name.split("/")[0] in ALLOWED or (path.is_dir() and not path.is_symlink()):
             continue
-        present.add(name)
-        if is_folder or name not in (*expected, *UNLISTED):
-            got = "an empty folder" if is_folder else "a file that no record lists"
-            findings.error("unexpected", name, got, "only recorded files")
+        found[name] = None
+        if name not in (*expected, *UNLISTED):
+            findings.error("unexpected", name, "a file that no record lists", "only recorded files")
             continue
         try:
             with open_file(path, tree=folder) as file:
-                found[name] = os.fstat(file.fileno()).st_size
+                found[name] = size = os.fstat(file.fileno()).st_size
         except InputError as error:
             findings.error("unreadable", name, error.got or error.what, "a regular file of the folder")
-    for name in sorted(expected.keys() - present):
-        findings.error("missing", name, "no such file", "a file of the release")
-    for name, size in found.items():
+            continue
         if expected.get(name) not in (None, size):
             findings.error("size", name, f"{size:,} bytes", f"{expected[name]:,} bytes")
-    findings.facts.append(f"{len(found):,} files, {sum(found.values()):,} bytes")
-    return [name for name, size in found.items() if expected.get(name) in (None, size)]
+    for name in sorted(expected.keys() - found):
+        findings.error("missing", name, "no such file", "a file of the release")
+    sizes = {name: size for name, size in found.items() if size is not None}
+    findings.facts.append(f"{len(sizes):,} files, {sum(sizes.values()):,} bytes")
+    return [name for name, size in sizes.items() if expected.get(name) in (None, size)]
 
 
 def check_checksums(folder: Path, record: ReleaseRecord, good: Sequence[str], findings: Findings) -> dict[str, str]:
