@@ -15,7 +15,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from cosfly.formats.captions import KeyframeRecord, LabelFrom, Language, TeacherKind, Verdict, Writing
+from cosfly.formats.captions import LabelFrom, Language, TeacherKind, Verdict, Writing
 from cosfly.formats.places import TrackChoice
 from cosfly.formats.predictions import PREDICTIONS
 from cosfly.llm.answers import BudgetConfig
@@ -115,7 +115,6 @@ class Window:
     observed: ObservedWindow
     future: FutureMotion
     problem: str | None = None  # why no teacher may be asked, for instance a missing image
-    keyframe: KeyframeRecord | None = None  # why it was chosen, and how many windows after it were skipped
 
 
 # --- settings ---------------------------------------------------------------------------------------------------------
@@ -125,9 +124,6 @@ class WindowConfig(Config):
     num_frames: int = Field(5, ge=3, le=32, description="observed frames of a window, one time step apart")
     future_frames: int = Field(5, ge=1, le=32, description="frames after the current one that determine the label")
     stride: int = Field(1, ge=1, description="frames between the current frames of two windows; 1 takes every frame")
-    keyframes: bool = Field(
-        False, description="caption only windows at which the label changes, and every tenth after such a window"
-    )
     require_images: bool = Field(True, description="drop a window that lacks the rgb.png of an observed frame")
 
 

@@ -6,13 +6,11 @@ from types import SimpleNamespace
 from typing import Any
 
 from commands import invoke
-from specimens_captions import VOCABULARY, deciding, report_of, settings
+from specimens_captions import VOCABULARY
 from tables import each
 from teacher_server import ENGLISH, TeacherServer, refusal
 
 from caption.schema import CaptionConfig
-from caption.stage.stage import run
-from caption.stage.trial import make_forecast
 from caption.teachers.doctor import ODD_WORD, Finding, examine_endpoint
 
 TOKENS_PER_IMAGE, CONTEXT = 220, 8192
@@ -137,20 +135,3 @@ def test_the_command_exits_with_1_when_unusable():
         assert invoke("caption doctor", server.url).exit_code == 0
     with TeacherServer(respond=patient(max_images=0)) as server:
         assert invoke("caption doctor", server.url).exit_code == 1
-
-
-def test_the_plan_is_what_the_run_then_takes(tree, tmp_path):
-    budget = {"price_prompt": 2.0, "price_completion": 10.0}
-    with deciding() as server:
-        cfg = settings(server.url, budget=budget)
-        rows = dict(make_forecast(cfg, tree, tmp_path / "out"))
-        num_trial_requests = len(server.bodies)
-        run(cfg, tree, tmp_path / "out")
-        asked = len(server.bodies)
-    report = report_of(tmp_path / "out")
-    assert rows["windows"] == f"about {report['windows']['input']} left"
-    assert rows["requests"] == str(asked) == "10"
-    assert rows["tokens in"] == f"{report['tokens']['prompt_tokens']:,}" == "10,000"
-    assert rows["tokens out"] == f"{report['tokens']['completion_tokens']:,}" == "1,000"
-    assert rows["cost"] == "0.03"
-    assert num_trial_requests == asked  # the run did not ask about the trial windows again

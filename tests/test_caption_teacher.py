@@ -117,7 +117,7 @@ def test_unreachable_and_unknown_model_and_not_an_endpoint(tree, tmp_path):
 def test_no_command_takes_a_url_that_cannot_be_asked_or_holds_a_secret(tmp_path, url):
     at, data, asked = ["--out", tmp_path / "out"], ["--data", tmp_path], [url]
     commands = [
-        ("caption --teacher", asked, data), ("caption --judge", asked, data), ("caption --plan --teacher", asked, data),
+        ("caption --teacher", asked, data), ("caption --judge", asked, data),
         ("caption doctor", asked), ("caption judge-check", asked),
         ("caption compare-strategies --teacher", asked, at, data),
         ("run quickstart --set", [f"caption.teacher={json.dumps(url)}"], "--set caption.writing=prose", at),

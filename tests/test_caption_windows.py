@@ -1,4 +1,4 @@
-"""Windows, facts, prompts and pictures; above all: nothing of the future reaches a request. Missions, and keyframes."""
+"""Windows, facts, prompts and pictures; above all: nothing of the future reaches a request. Missions."""
 
 import dataclasses
 import json
@@ -7,15 +7,13 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from specimens_captions import VOCABULARY
 from tables import each
 from teacher_server import TeacherServer
 
 from caption.schema import CaptionConfig, FutureMotion, ImageConfig, ObservedWindow, WindowConfig, observed_frames
 from caption.stage.stage import run
-from caption.stage.windows import choose_keyframes, current_frames, cut_future, cut_windows, recorded_motion
+from caption.stage.windows import current_frames, cut_future, cut_windows, recorded_motion
 from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import make_question, question_messages
 from caption.verification.actions import TABLE, measure
@@ -280,16 +278,3 @@ def test_a_mission_reaches_no_request_before_its_order_stands(tree, ordered):
     for before, after in zip(plain[4:], told[4:], strict=True):
         assert after[0] == before[0] + "\nMission: the battery is down to the reserve for the way home."
         assert after[1] == before[1] + "\n任务状态：电池电量已降至返航储备。"
-
-
-LABELS = st.lists(st.sampled_from(["track_straight", "hover", None]), max_size=60)
-
-
-@given(LABELS, st.integers(1, 12))
-def test_no_change_is_missed_and_every_window_is_taken_or_counted(labels, stride):
-    chosen = choose_keyframes(labels, stride)
-    assert len(chosen) + sum(keyframe.skipped for keyframe in chosen.values()) == len(labels)
-    assert all(keyframe.skipped < stride for keyframe in chosen.values())
-    # Whoever gives each window the label of the keyframe before it gets the flight's labels back.
-    spread = [labels[max(k for k in chosen if k <= i)] for i in range(len(labels))]
-    assert spread == labels

@@ -23,7 +23,7 @@ from rich.table import Table
 from test_cosfly_inspection import plan_of
 
 from caption.schema import CaptionConfig
-from caption.stage.report import page_html
+from caption.stage.ledger import page_html
 from caption.stage.stage import run as caption
 from cosfly.formats.boxes import MapHeader, make_box_map, write_boxes
 from cosfly.formats.captions import Caption, read_captions

@@ -1,20 +1,196 @@
 """The answer formats: how a teacher writes its reasons so that their values can be compared with the facts.
 
-Slots: it names facts, and their values are filled in (slots.py). Prose: the paper's three plain fields, for teachers
-that write better freely, and for texts by somebody else; the numbers with a unit are compared with the facts.
+Slots: the teacher names facts, and cosfly fills in their values from the window, in both languages. Numbers, units,
+sides, trends and the mirror are right by construction. What a teacher writes outside slots is free; its numbers are
+compared with the facts as those of prose. Prose: the paper's three plain fields, for teachers that write better freely,
+and for texts by somebody else; the numbers with a unit are compared with the facts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from caption.answer_formats.contract import Draft, Refused
-from caption.answer_formats.slots import fact_table, fill_answer, fill_mirror
+from caption.answer_formats.templates import InvalidSlot, Sentence, Slot, read_sentence, read_slot
 from caption.verification.facts import Facts
-from caption.verification.mirror import check_mirror, check_translation
-from cosfly.formats.captions import Coc, Writing
-from cosfly.llm.answer_text import sentences_of
+from caption.verification.glossary import form_of, swapped_opposite, written_unit
+from caption.verification.mirror import TEXTS, check_mirror, check_translation, lacking
+from caption.verification.references import QUANTITIES, TURNS, Fact, Missing, look_up
+from cosfly.formats.captions import ACTIONS, Coc, Language, Template, Writing
+from cosfly.llm.answer_text import cut_sentences, sentences_of
+
+INVALID_SLOT = "invalid_slot"  # a reason
+MAX_COMPLAINTS = 6  # named at once
+
+
+def fill_answer(written: Coc, facts: Facts, language: Language = "en") -> Draft | Refused:
+    """Fill the templates of an answer, or report all faults of their sentences."""
+    filler = Filler(facts, written.flight_decision, language)
+    problems: list[str] = []
+    sentences: list[Sentence] = []
+    texts: dict[str, str] = {}
+    for name in TEXTS:
+        filled = ""
+        for number, part in enumerate(cut_sentences(getattr(written, name)), 1):
+            try:
+                sentence = read_sentence(part, language, len(facts))
+                filled += filler.fill(sentence)
+                sentences.append(sentence)
+            except InvalidSlot as error:
+                problems.append(f"{name}, sentence {number}: {error}.")
+        texts[name] = filled
+    if problems:
+        return Refused(INVALID_SLOT, " ".join(problems[:MAX_COMPLAINTS]))
+    template = Template(critical_components=written.critical_components, reasoning_trace=written.reasoning_trace)
+    coc = Coc(**texts, flight_decision=written.flight_decision)
+    outside = tuple([sentence.outside for sentence in sentences])
+    return Draft(coc, outside, template, sum([sentence.num_values for sentence in sentences]))
+
+
+def fill_mirror(written: Coc, english: Draft, facts: Facts, is_translated: bool = True) -> Draft | Refused:
+    """Make the Chinese draft, and compare it with the English one, whose translation it always is."""
+    assert english.template is not None
+    if written.flight_decision != english.coc.flight_decision:
+        return Refused("decision", f'"flight_decision" must stay {english.coc.flight_decision}.')
+    draft = _compare(english.template, written, facts) or fill_answer(written, facts, "zh")
+    if isinstance(draft, Refused):
+        return draft
+    swapped = swapped_opposite("".join(english.outside), "".join(draft.outside))
+    if swapped:
+        return Refused(f"polarity_{swapped}", f"the Chinese text swaps an opposite of the English one ({swapped}).")
+    missing = lacking("".join(english.outside), draft.coc)
+    return Refused("glossary", missing, draft) if missing else draft
+
+
+def _compare(english: Template, chinese: Coc, facts: Facts) -> Refused | None:
+    """Compare the Chinese template with the English one: the same slots in each sentence, each in its script."""
+    for name in TEXTS:
+        parts_en, parts_zh = cut_sentences(getattr(english, name)), cut_sentences(getattr(chinese, name))
+        if len(parts_en) != len(parts_zh):
+            counts = f"{len(parts_en)} sentences in English and {len(parts_zh)} in Chinese"
+            return Refused("sentences", f"{name} has {counts}; write one for each.")
+        for number, (mine, other) in enumerate(zip(parts_en, parts_zh, strict=True), 1):
+            names = read_sentence(mine, "en", len(facts)).names
+            try:
+                sentence = read_sentence(other, "zh", len(facts))
+            except InvalidSlot as error:
+                return Refused(INVALID_SLOT, f"{name}, sentence {number}: {error}.")
+            if names != sentence.names:
+                listed = "; ".join(f"{{{slot}}}" for slot in names) or "none"
+                return Refused("slots", f"{name}, sentence {number} must hold these slots and no other: {listed}.")
+            if not sentence.is_in_script:
+                return Refused("script", f"{name}, sentence {number} is not written in Chinese.")
+    return None
+
+
+# --- what a teacher is shown ------------------------------------------------------------------------------------------
+
+_SERIES = (
+    "ahead", "distance", "bearing", "offset_x", "offset_y", "box_height", "speed", "target_speed", "altitude", "yaw",
+)  # fmt: skip
+_SPANNED = ("ahead", "distance", "altitude", "yaw", "offset_x")  # shown with change and trend
+_NOW = (
+    "mean:speed", "forward_speed", "sideways_speed", "climb_rate", "mean:target_speed", "target_forward_speed",
+    "target_sideways_speed", "target_heading", "change:target_heading", "rate:distance", "growth:box_height",
+    "height_over_target", "depression", "travelled", "target_travelled", "others_in_view", "other_distance",
+    "alike_differences",
+)  # fmt: skip
+_WORDS = (
+    "target_motion", "drone_motion", "walking", "comparison:speed", "framing", "side:yaw", "side:target_heading",
+    "side:bearing", "trend:bearing", "side:offset_x", "side:offset_y", "side:sideways_speed",
+    "side:target_sideways_speed", "box@t0", "box",
+)  # fmt: skip
+
+
+def fact_table(facts: Facts) -> str:
+    """Return the facts of a window with the names of their slots, as they are filled in; unknown facts are omitted."""
+    filler, last = Filler(facts, "", "en"), len(facts) - 1
+
+    def listed(names: Iterable[str]) -> str:
+        return "; ".join(f"{{{name}}} {text}" for name in names if (text := filler.text_of(name)))
+
+    lines = []
+    for name in _SERIES:
+        values = [filler.text_of(f"{name}@t{i}") for i in range(last + 1)]
+        if not any(values):
+            continue
+        unit = f" {written_unit(QUANTITIES[name].unit, 'en')}"
+        series = ", ".join([(value or "-").removesuffix(unit) for value in values])
+        more = listed([f"change:{name}", f"trend:{name}"] if name in _SPANNED else [])
+        lines.append(f"{{{name}@t0}} to {{{name}@t{last}}}: {series}{unit}" + (f"; {more}" if more else ""))
+    seen = ", ".join([filler.text_of(f"visibility@t{i}") for i in range(last + 1)])
+    lines += [f"{{visibility@t0}} to {{visibility@t{last}}}: {seen}", listed(_NOW), listed(_WORDS)]
+    return "Table of facts (- is not known; {decision} is a slot too):\n" + "\n".join(lines)
+
+
+# --- filling ----------------------------------------------------------------------------------------------------------
+
+_DIGITS = ("%.0f", "%.1f", "%.2f")
+_NEITHER = ("straight", "centred")
+_VOWEL = re.compile(r"[aeio]|8|1[18]\b")
+
+
+class Filler:
+    """Fills sentences of one language from the facts of one window; `{decision}` stands for the decision."""
+
+    def __init__(self, facts: Facts, decision: str, language: Language) -> None:
+        self.facts, self.decision, self.language = facts, decision, language
+
+    def fill(self, sentence: Sentence) -> str:
+        """Return the plain text of a sentence; InvalidSlot: a fact is not known or does not fit."""
+        filled = sentence.pattern % tuple([self._write(slot) for slot in sentence.slots])
+        return filled[0].upper() + filled[1:] if sentence.pattern.startswith("%s") else filled
+
+    def text_of(self, name: str) -> str:
+        """Return how a slot with this name is filled in as a verb, or before what is compared; "" if not known."""
+        try:
+            return self._write(read_slot(name, "it ", " it", self.language))
+        except InvalidSlot:
+            return ""
+
+    def _write(self, slot: Slot) -> str:
+        fact = self._decision(slot) if slot.reference is None else look_up(slot.reference, self.facts)
+        if isinstance(fact, str):
+            fault = "is not known in this window; leave it out"
+            if fact == "unobserved_frame":
+                fault = f"names a frame that was not observed; frames are t0 to t{len(self.facts) - 1}"
+            raise InvalidSlot(f"{{{slot.name}}} {fault}")
+        value, unit, digits = fact
+        if value in _NEITHER and slot.is_paired:
+            value = self._side_of_number(slot) or value
+        if value in _NEITHER and slot.needs_side:
+            fix = f"it is {value} here, neither side: leave this slot out, or write `is {{{slot.name}}}`"
+            raise InvalidSlot(f"{{{slot.name}}}: {fix}")
+        if not isinstance(value, str):
+            word = _DIGITS[digits] % (abs(value) if slot.is_paired else value)
+        elif unit:  # a box
+            word = value if self.language == "en" else value.replace("x", "×")
+        else:
+            word = form_of(value, slot.form, self.language)
+        if unit:
+            word += f"{'' if unit == 'percent' else ' '}{written_unit(unit, self.language)}"
+        return f"{slot.article}{'n' if _VOWEL.match(word) else ''} {word}" if slot.article else word
+
+    def _decision(self, slot: Slot) -> Fact | Missing:
+        if slot.name == "decision":
+            action = ACTIONS[self.decision]
+            return Fact(action.en if self.language == "en" else action.zh)
+        side = next((side for side in ("left", "right") if side in self.decision), None)
+        return "unknown_fact" if side is None else Fact(side)
+
+    def _side_of_number(self, slot: Slot) -> str | None:
+        """Return the side of the number next to a slot, where "straight" or "centred" says neither."""
+        assert slot.reference is not None
+        quantity = slot.reference.quantity
+        number = look_up(slot.reference._replace(aspect="change" if quantity in TURNS else ""), self.facts)
+        if not isinstance(number, Fact) or isinstance(number.value, str) or not number.value:
+            return None
+        return QUANTITIES[quantity].side_of(number.value, 0.0)
+
+
+# --- the formats ------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ class Asking:
             with AnswerBook(path / ANSWERS) as answers, AnswerBook(path / JUDGEMENTS) as judgements:
                 self.books = (answers, judgements)
                 budget = first_budget(self.cfg, answers.totals, judgements.totals)
-                total = None if self.cfg.window.keyframes else sum(guesses)
+                total = sum(guesses)
                 with progress_bar("caption", total) as advance:
                     self.progress = RunProgress(advance, total, budget, troubles)
                     async with (
@@ -269,7 +269,7 @@ def common_causes(failures: list[Failed]) -> str:
 class RunProgress:
     """Counts the outcomes of windows and moves the progress bar."""
 
-    def __init__(self, advance: Advance, total: int | None, budget: Budget, troubles: Troubles) -> None:
+    def __init__(self, advance: Advance, total: int, budget: Budget, troubles: Troubles) -> None:
         self._advance, self.total, self.budget, self.troubles = advance, total, budget, troubles
         self.num_before = self.num_accepted = self.num_repaired = self.num_unanswered = 0
         self.dropped: Counter[str] = Counter()
@@ -318,7 +318,7 @@ class RunProgress:
         ]
         if budget.cfg.price_prompt or budget.cfg.price_completion:
             figures.append(f"cost {budget.spent - self._spent_before:.2f}")
-        if self.total is not None and self.num_now:
+        if self.num_now:
             figures.append(f"{duration((self.total - self.num_before - self.num_now) / rate_per_s)} left")
         if troubles.num:
             figures.append(f"{troubles.num:,} failed attempts")

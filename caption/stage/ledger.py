@@ -1,18 +1,25 @@
-"""What became of every window: the reasons to drop one, and counts that add up."""
+"""What became of every window: the reasons to drop one, counts that add up, and `report.html`, a page of them with some
+samples."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from operator import itemgetter
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
 
-from cosfly.formats.captions import TOKENS, Caption, Checks, TeacherRecord, Usage
-from cosfly.runtime.io import sha256_bytes
+from cosfly.formats.captions import TOKENS, Caption, Checks, TeacherRecord, Usage, ValueCounts
+from cosfly.formats.frames import frame_name
+from cosfly.formats.places import flight_of
+from cosfly.llm.answers import BudgetConfig
+from cosfly.runtime.io import read_text, sha256_bytes
 from cosfly.runtime.run_dir import Tally
+from cosfly.viz.frame_views import thumbnail
+from cosfly.viz.page import page
 
 NUM_CARDS = 24
 # The codes of `drop_reason` and their meanings, for messages and docs/captions.md.
@@ -74,16 +81,6 @@ class RepairCounts(BaseModel, extra="forbid"):
     asks: Annotated[Counter[str], PlainSerializer(_by_name)] = Counter()
 
 
-class KeyframeCounts(BaseModel, extra="forbid"):
-    """Counts of chosen windows, and of the calls and label changes that are skipped with the others."""
-
-    windows: int = 0
-    taken: int = 0
-    reasons: Counts = Counter()
-    calls_saved: int = 0
-    changes_missed: int = 0
-
-
 class CaptionReport(BaseModel):
     """`caption_report.json`: counts of captions, which are added one by one. Counts by a word are in falling order.
 
@@ -111,7 +108,6 @@ class CaptionReport(BaseModel):
     )
     repair: RepairCounts = RepairCounts()
     judgements: Counts = Counter()
-    keyframes: KeyframeCounts | None = None  # None: all windows were used
     structure: Counts = Counter()
     bilingual: Counts = Counter()
     writing: Counts = Counter()
@@ -169,12 +165,6 @@ class CaptionReport(BaseModel):
                 self.refusals[code] = message
 
     def _add_checks(self, checks: Checks) -> None:
-        if checks.keyframe is not None:
-            self.keyframes = self.keyframes or KeyframeCounts()
-            self.keyframes.windows += 1 + checks.keyframe.skipped
-            self.keyframes.taken += 1
-            self.keyframes.reasons[checks.keyframe.reason] += 1
-            self.keyframes.changes_missed += checks.keyframe.missed
         for language, counts in (checks.values or {}).items():
             self.values.setdefault(language, Counter()).update(counts.model_dump())
         self.contradicted_captions += checks.contradictions is not None
@@ -190,9 +180,6 @@ class CaptionReport(BaseModel):
         if num_unanswered:
             self.windows.failed["no_answer"] = num_unanswered
         self.windows.check()
-        if self.keyframes is not None:
-            num_skipped = self.keyframes.windows - self.keyframes.taken
-            self.keyframes.calls_saved = round(num_skipped * self.asks / self.keyframes.taken)
 
 
 # --- samples for the page ---------------------------------------------------------------------------------------------
@@ -216,3 +203,64 @@ class SampleCards:
         turns = zip_longest(*(self._kinds[kind] for kind in sorted(self._kinds)))
         captions = [card[2] for turn in turns for card in turn if card is not None]
         return sorted(captions[:NUM_CARDS], key=lambda caption: caption.sample_id)
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+PICTURE_WIDTH_PX = 240
+VERDICTS = {  # with their meanings
+    "CONSISTENT": "the decision is the label",
+    "SOFT_CONFLICT": "another decision, which the trajectory does not contradict",
+    "HARD_CONFLICT": "the trajectory contradicts the decision",
+    "ABSTAIN": "geometry cannot decide",
+}
+LANGUAGE_NAMES = {"en": "English", "zh": "Chinese"}
+STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
+
+
+def page_html(
+    report: CaptionReport, cards: Sequence[Caption], folders: Mapping[str, Path], budget: BudgetConfig, name: str
+) -> str:
+    """Return the text of the page of a run with this name.
+
+    Args:
+        cards: Captions to show. folders: Track id -> its folder, for the pictures.
+    """
+    return page(
+        "caption/stage/report.html", title=name, style=STYLE, report=report, meanings=VERDICTS,
+        values=tuple(ValueCounts.model_fields), language_names=LANGUAGE_NAMES, share=_share, most_common=most_common,
+        tokens=TOKENS, cost=_cost(report, budget), cards=[_card(caption, folders) for caption in cards],
+    )  # fmt: skip
+
+
+def _share(counts: Mapping[str, int], name: str) -> str:
+    total, count = sum(counts.values()), counts.get(name, 0)
+    return f"{count:,} ({100 * count / total:.1f} %)" if total else "-"
+
+
+def _cost(report: CaptionReport, budget: BudgetConfig) -> list[tuple[str, str]]:
+    prompt, answer = (report.tokens.get(name, 0) for name in ("prompt_tokens", "completion_tokens"))
+    accepted, judge = report.windows.kept, report.judge_tokens
+    rows = [("prompt tokens", f"{prompt:,}"), ("answer tokens", f"{answer:,}")]
+    if judge is not None:
+        rows.append(("the judge's tokens", f"{judge.prompt_tokens:,} in, {judge.completion_tokens:,} out"))
+        prompt += judge.prompt_tokens
+        answer += judge.completion_tokens
+    if accepted:
+        rows.append(("tokens per accepted caption", f"{(prompt + answer) / accepted:,.0f}"))
+    if not (budget.price_prompt or budget.price_completion):
+        return [*rows, ("cost", "no prices set")]
+    cost = budget.cost(prompt, answer)
+    rows.append(("cost", f"{cost:,.2f}"))
+    if accepted:
+        rows.append(("cost per 1,000 accepted", f"{1000 * cost / accepted:,.2f}"))
+    return rows
+
+
+def _card(caption: Caption, folders: Mapping[str, Path]) -> dict[str, Any]:
+    folder = folders.get(flight_of(caption.sample_id))
+    pictures = [
+        (index, None if folder is None else thumbnail(folder / frame_name(index), PICTURE_WIDTH_PX, jpeg_quality=75))
+        for index in caption.window[-5:]
+    ]
+    return {"caption": caption, "pictures": pictures}

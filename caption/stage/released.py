@@ -13,8 +13,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from caption.answer_formats.contract import Refused
-from caption.answer_formats.formats import FORMATS
-from caption.answer_formats.slots import fill_answer
+from caption.answer_formats.formats import FORMATS, fill_answer
 from caption.schema import FutureMotion, ObservedFrame
 from caption.stage.windows import LabelMotion, cut_future, frames_of, label_motion, observe
 from caption.verification.actions import TABLE, ActionTable, Motion, Thresholds, measure

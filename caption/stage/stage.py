@@ -15,8 +15,7 @@ from pathlib import Path
 
 from caption.schema import CaptionConfig, Window
 from caption.stage.asking import ANSWERS, Asking, AskingOutcome, common_causes, read_quarantine
-from caption.stage.ledger import CaptionReport, SampleCards, explain_drops
-from caption.stage.report import page_html
+from caption.stage.ledger import CaptionReport, SampleCards, explain_drops, page_html
 from caption.stage.tracks import PARTS, TrackInput, find_inputs, parts_of, restore_parts
 from caption.stage.window_loop import caption_prepared, prepare
 from caption.teachers.foreign import read_given

@@ -50,7 +50,7 @@ class TrackInput:
         return islice(cut_windows(track, cfg.window, _twin_of(track)), self.max_windows)
 
     def guess_num_windows(self, cfg: WindowConfig) -> int:
-        """Estimate the number of windows from the frame folders, without reading the track or choosing keyframes."""
+        """Estimate the number of windows from the frame folders, without reading the track."""
         num_frames = sum(1 for _ in (self.folder / "frames_playback").glob("frame_*"))
         count = len(current_frames(num_frames, cfg))
         return count if self.max_windows is None else min(count, self.max_windows)

@@ -1,4 +1,4 @@
-"""A few windows before a run: `--plan` estimates the rest from them, `--try` shows what is asked and answered.
+"""`--try`: a few windows before a run, with all that is asked and answered.
 
 The windows are real ones, spread over the tracks. Their answers stay in the journal, so the run does not ask for them
 again.
@@ -21,31 +21,21 @@ from caption.stage.window_loop import caption_window
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.students import student_settings
 from caption.teachers.teacher import EMBEDDED, AskingTeacher, first_budget, open_teacher
-from cosfly.formats.captions import Caption, Usage
-from cosfly.formats.places import flight_of
+from cosfly.formats.captions import Caption
 from cosfly.llm.answers import AnswerBook
 from cosfly.llm.contract import NoAnswer, Reply, Request, run_until_interrupted
-from cosfly.runtime.console import duration
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError, TeacherError
 from cosfly.runtime.escaping import LONGEST_LOG, for_terminal
 from cosfly.runtime.run_dir import Resume
 
-PLAN_WINDOWS = 6
-
 
 @dataclass
 class _Trial:
-    """The captions of a few windows.
+    """The captions of a few windows. unanswered: Sample id -> error. exchanges: By sample id, in order."""
 
-    num_all, num_left: Windows of the tree, and those without a caption. unanswered: Sample id -> error.
-    """
-
-    num_all: int
-    num_left: int
-    seconds: float = 0.0
     captions: list[Caption] = field(default_factory=list)
     unanswered: dict[str, str] = field(default_factory=dict)
-    exchanges: dict[str, list[tuple[Request, Reply]]] = field(default_factory=dict)  # by sample id, in order
+    exchanges: dict[str, list[tuple[Request, Reply]]] = field(default_factory=dict)
 
 
 def _try_windows(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Resume, num_windows: int) -> _Trial:
@@ -57,13 +47,12 @@ def _try_windows(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: R
         what, fix = "the directory is complete, so no window is left to try", "choose another --out"
         raise InputError(what, where=out, fix=fix)
     tracks, _ = find_inputs(cfg, data)
-    guesses = {track: track.guess_num_windows(cfg.window) for track in tracks}
-    left = [track for track in tracks if guesses[track] and not track.part(out).exists()]
-    trial = _Trial(sum(guesses.values()), sum(guesses[track] for track in left))
-    if not trial.num_left:
-        raise InputError("no window is left to caption", where=data, got=f"{len(left)} unfinished tracks")
+    left = [track for track in tracks if track.guess_num_windows(cfg.window) and not track.part(out).exists()]
+    if not left:
+        raise InputError("no window is left to caption", where=data, got=f"{len(tracks)} tracks")
     chosen = [left[number * len(left) // num_windows] for number in range(num_windows)]
     windows = [w for track in dict.fromkeys(chosen) for w in islice(track.windows(cfg), chosen.count(track))]
+    trial = _Trial()
 
     def record(sample_id: str, request: Request, reply: Reply) -> None:
         trial.exchanges.setdefault(sample_id, []).append((request, reply))
@@ -74,10 +63,7 @@ def _try_windows(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: R
                 assert isinstance(teacher, AskingTeacher)
                 teacher.kept.listener = record
                 asked = [caption_window(window, teacher, cfg, vocabulary) for window in windows]
-                found = await asyncio.gather(*asked, return_exceptions=True)
-            ids = [one.sample_id for one in found if isinstance(one, Caption)]
-            trial.seconds = sum(book.latency_s(flight_of(sample_id), sample_id) for sample_id in ids)
-            return found
+                return await asyncio.gather(*asked, return_exceptions=True)
 
     found = run_until_interrupted(ask())
     trial.captions = [one for one in found if isinstance(one, Caption)]
@@ -90,36 +76,6 @@ def _try_windows(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: R
         what, got = "none of the trial windows got an answer", next(iter(trial.unanswered.values()), None)
         raise TeacherError(what, where=cfg.teacher, got=got)
     return trial
-
-
-def make_forecast(
-    cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, resume: Resume = "if-same"
-) -> list[tuple[str, str]]:
-    """Return the rows of a table: calls, tokens, time and money of a run, scaled from the means of a few windows."""
-    if cfg.teacher_kind != "endpoint":
-        what = "an estimate needs a server as the teacher"
-        raise ConfigError(what, where="--plan", got=cfg.teacher, expected="--teacher URL")
-    trial = _try_windows(cfg, data, out, seed, resume, PLAN_WINDOWS)
-    captions = trial.captions
-    scale = trial.num_left / len(captions)
-    usage = sum((caption.usage for caption in captions), Usage())
-    prompt, completion = scale * usage.prompt_tokens, scale * usage.completion_tokens
-    is_priced = cfg.budget.price_prompt or cfg.budget.price_completion
-    cost = f"{cfg.budget.cost(prompt, completion):,.2f}" if is_priced else "no prices set (budget.price_prompt)"
-    num_accepted = sum(caption.status == "accepted" for caption in captions)
-    num_done = trial.num_all - trial.num_left
-    return [
-        ("windows", f"about {trial.num_left:,} left" + (f", {num_done:,} done" if num_done else "")),
-        ("trial", f"{len(captions)} windows, {num_accepted} accepted; their answers are kept"),
-        ("requests", f"{scale * sum(caption.attempts for caption in captions):,.0f}"),
-        ("tokens in", f"{prompt:,.0f}"),
-        ("tokens out", f"{completion:,.0f}"),
-        ("cost", cost),
-        (
-            "time",
-            f"{duration(scale * trial.seconds / cfg.most_in_flight)} with {cfg.most_in_flight} requests in flight",
-        ),
-    ]
 
 
 def show_windows(

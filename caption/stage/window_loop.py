@@ -157,7 +157,7 @@ class _WindowLoop:
         self._structured: str | None = None
         self._recovered: set[str] = set()
         self._refused: list[str] = []
-        self.checks = Checks(keyframe=window.keyframe, contradicted=self.contradicted)
+        self.checks = Checks(contradicted=self.contradicted)
         observed, pictures = window.observed, self.answered.pictures
         self.caption = Caption(
             sample_id=observed.sample_id,

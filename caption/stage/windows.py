@@ -14,14 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from caption.schema import FutureMotion, ObservedFrame, ObservedWindow, Window, WindowConfig, observed_frames
-from caption.verification.actions import TABLE, measure
-from cosfly.formats.captions import KeyframeRecord, LabelFrom
+from cosfly.formats.captions import LabelFrom
 from cosfly.formats.frames import files_in
 from cosfly.formats.places import sample_id
 from cosfly.formats.playback import Track
 from cosfly.formats.segments import Mission
-
-KEYFRAME_STRIDE = 10  # windows from one keyframe to the next within a label, at most
 
 
 def current_frames(num_points: int, cfg: WindowConfig) -> range:
@@ -39,34 +36,14 @@ def cut_windows(track: Track, cfg: WindowConfig, twin: Track | None = None) -> I
     folders = [track.frame_folder(i) for i in range(len(track))]
     files = [files_in(folder) for folder in folders]
     missing = {i for i, names in enumerate(files) if "rgb.png" not in names} if cfg.require_images else set()
-    currents = list(current_frames(len(track), cfg))
-    keyframes: list[KeyframeRecord | None] = [None] * len(currents)
-    if cfg.keyframes:
-        futures = (cut_future(track, motion, i, cfg.future_frames) for i in currents)
-        chosen = choose_keyframes([TABLE.label_of(measure(future)) for future in futures], KEYFRAME_STRIDE)
-        currents, keyframes = [currents[i] for i in chosen], list(chosen.values())
-    for current, keyframe in zip(currents, keyframes, strict=True):
+    for current in current_frames(len(track), cfg):
         span, mission = slice(current - cfg.num_frames + 1, current + 1), track.mission
         order = None if mission is None or mission.order_at(current) is None else mission.kind
         observed = observe(track, frames, span, order, folders, files)
         problem = "unusable_frame" if missing.intersection(observed.indices) else None
         if problem is None and order_comes_within(track.mission, current, cfg.future_frames):
             problem = "order_to_come"
-        yield Window(observed, cut_future(track, motion, current, cfg.future_frames), problem, keyframe)
-
-
-def choose_keyframes(labels: list[str | None], stride: int) -> dict[int, KeyframeRecord]:
-    """Choose the first window, those at which the label changes, and each `stride`-th after a chosen one; by index."""
-    chosen: dict[int, KeyframeRecord] = {}
-    last = -1
-    for i, label in enumerate(labels):
-        reason = "start" if i == 0 else "change" if label != labels[i - 1] else "stride" if i - last == stride else None
-        if reason is None:
-            chosen[last].skipped += 1
-        else:
-            chosen[i] = KeyframeRecord(reason=reason, skipped=0, missed=0)  # each change of the label is chosen
-            last = i
-    return chosen
+        yield Window(observed, cut_future(track, motion, current, cfg.future_frames), problem)
 
 
 def frames_of(track: Track) -> tuple[ObservedFrame, ...]:

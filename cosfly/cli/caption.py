@@ -33,9 +33,6 @@ STUDENT = "Output of `distill train` or `merge`: ask the model in the form that 
     as_student=SettingOption("caption.student.folder", STUDENT, Path),
     model=MODEL,
     judge=SettingOption("caption.judge.url", "URL of a server that judges conflicts."),
-    keyframes=SettingOption(
-        "caption.window.keyframes", "Caption only windows at which the label changes, and every tenth.", bool
-    ),
     limit=SettingOption("caption.limit", "Caption at most this many windows; a later run resumes.", int),
     max_cost=SettingOption("caption.budget.max_cost", "Stop before this cost; prices: caption.budget.price_*.", float),
     max_tokens=SettingOption("caption.budget.max_tokens", "Stop before this many tokens, over all runs.", int),
@@ -44,9 +41,6 @@ def caption(
     job: Job,
     data: options.Trees = None,
     out: Annotated[Path | None, Option(show_default="`caption` next to the tree", help="Output directory.")] = None,
-    plan_only: Annotated[
-        bool, Option("--plan", help="Caption a few windows and estimate time and cost of the rest.")
-    ] = False,
     num_tried: Annotated[
         int | None, Option("--try", min=1, help="Show this many windows: each question, answer, complaint and outcome.")
     ] = None,
@@ -56,18 +50,13 @@ def caption(
     check: Annotated[bool, Option(help="Test the server before the first request of a directory.")] = True,
 ) -> None:
     """Ask a teacher for the reason of every manoeuvre, verify it against geometry, regenerate, translate (step 7)."""
-    if plan_only and num_tried is not None:
-        raise typer.BadParameter("pass either --plan or --try")
     cfg = job.cfg.caption
     tree = job.tree(data)
     target = out or tree.resolve().parent / "caption"
     is_student = cfg.student.folder is not None  # it answers one kind of question, so the examination does not fit
     if check and cfg.teacher_kind == "endpoint" and not is_student and not (target / "answers").exists():
         _examine_endpoint(cfg.teacher, cfg)
-    if plan_only:
-        forecast = job.call("caption.stage.trial:make_forecast", cfg, tree, target)
-        options.print_table((), forecast, "What this run will take")
-    elif num_tried is not None:
+    if num_tried is not None:
         for line in job.call("caption.stage.trial:show_windows", cfg, tree, target, num_tried):
             typer.echo(line)
     else:

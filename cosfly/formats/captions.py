@@ -197,17 +197,6 @@ class RepairRecord(Record, frozen=False):
     first_verdict: Verdict | None
 
 
-class KeyframeRecord(Record, frozen=False):
-    """Why a window was chosen (start, change, stride), and the windows that were skipped until the next one.
-
-    missed: Number of label changes among the skipped windows.
-    """
-
-    reason: str
-    skipped: int
-    missed: int
-
-
 Pixels = Annotated[int, Field(ge=1, le=1 << 20)]
 
 
@@ -252,7 +241,6 @@ class Checks(Record, frozen=False):
     refusal: The message of a server that refused the window, or the reason why it cut the answer.
     """
 
-    keyframe: _Omitted[KeyframeRecord] = None
     structure: _Omitted[str] = None
     refused: _Omitted[list[str]] = None
     bilingual: _Omitted[str] = None

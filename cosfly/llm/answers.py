@@ -101,11 +101,6 @@ class AnswerBook:
         _, answers = self._open(track)
         return answers.get(key)
 
-    def latency_s(self, track: str, sample_id: str) -> float:
-        """Return the total time of the answers about one window."""
-        _, answers = self._open(track)
-        return sum(answer.latency_s for answer in answers.values() if answer.sample_id == sample_id)
-
     async def put(self, track: str, answer: Answer) -> None:
         """Write an answer, and wait until it is on the disk; StorageError if the disk is full or not writable."""
         journal, answers = self._open(track)

@@ -339,7 +339,7 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
     ]
     lines += caveats(cfg)
     if unknown:
-        lines.append("run cosfly caption --plan to estimate the time of the teacher")
+        lines.append("run cosfly caption --limit 10: its report has the tokens and cost of a caption")
     if needed > free:
         lines.append("the disk is too small: choose another --out, fewer pedestrians or smaller pictures")
     return lines
