@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,10 @@ from pydantic import BaseModel
 
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.weather import preset_token
-from cosfly.geometry.axes import box_iou
 from cosfly.geometry.coverage import Coverage
 from cosfly.geometry.trajectory_metrics import ACCEL_RMS_MAX_MPS2, JERK_RMS_MAX_MPS3, smoothness_score
 from release.columns import CAPTION_FIELDS, COUNTED, LANGUAGES, VALUE_COLUMNS
-from release.flight_rows import FlightRows
-from release.reading import bounded, read_tracks
+from release.reading import FlightRows, bounded, read_tracks
 from release.record import Counts, Numbers, Shard, Spread
 
 DIGITS = 4
@@ -35,7 +33,6 @@ REVIEW_BELOW = 0.5  # of the smoothness score (sec:step6)
 HOVER_MPS, TURN_DEGPS = 0.3, 5.0  # an action that is slower is hover; one that turns faster is a turn
 MOVES = (("forward", "backward"), ("left", "right"), ("up", "down"))  # by the sign of the velocities of an action
 ACTION_CLASSES = (*(name for pair in MOVES for name in pair), "turn left", "turn right", "hover")
-LENS = ("focal_px", "width_px", "height_px", "visibility", "iou")  # of the frames by field of view
 POOLED = ("height_m", "distance_m", "visibility")
 TAB = "\t"  # between the names of a pair that is counted
 # Columns of yes and no whose frames are counted.
@@ -138,7 +135,6 @@ def count_track(frames: FlightRows, points: FlightRows) -> TrackCount:
     offsets_m = frames.pose[:, :3] - frames.target_m
     clean_m = offsets_m - frames.drone_offset[:, :3] + frames.target_offset
     heights_px = frames.mask_box[:, 3] - frames.mask_box[:, 1]
-    seen = np.where(frames.visibility[:, None] > 0.0, frames.box, np.nan)
     fovs = frames.numbers("fov_deg")
     is_zooming = bool((np.abs(fovs - fovs[0]) > SAME_FOV_DEG).any())
     captioned = [row for row in rows if row["has_caption"]]
@@ -146,9 +142,7 @@ def count_track(frames: FlightRows, points: FlightRows) -> TrackCount:
     measured = {
         "height_m": offsets_m[:, 2], "distance_m": np.linalg.norm(offsets_m, axis=1),
         "clean_altitude_m": clean_m[:, 2] + TARGET_HEIGHT_M, "clean_distance_m": np.linalg.norm(clean_m, axis=1),
-        "visibility": frames.visibility, "width_px": seen[:, 2] - seen[:, 0], "height_px": seen[:, 3] - seen[:, 1],
-        "focal_px": frames.intrinsics[:, 0],
-        "iou": np.array([box_iou(*boxes) for boxes in zip(seen, frames.mask_box, strict=True)]),
+        "visibility": frames.visibility,
         **{name: np.array([len(text) for text in own], float) for name, own in texts.items()},
     }  # fmt: skip
     covered = np.column_stack([offsets_m, frames.numbers("target_heading_deg"), heights_px, frames.visibility])
@@ -231,9 +225,6 @@ def numbers_of(tracks: Sequence[TrackCount], num_frames: int) -> Numbers:
         tracks: The counts of all rows, of one track at least. num_frames: The largest number of frames per track.
     """
     counts = {name: _sorted(total_of(tracks, name)) for name in tracks[0].counts}
-    by_fov = defaultdict[str, list[TrackCount]](list)
-    for track in tracks:
-        by_fov[track.fov].append(track)
     for name in ("town", "track", "fov"):
         frames = Counter[str]()
         for track in tracks:
@@ -254,10 +245,6 @@ def numbers_of(tracks: Sequence[TrackCount], num_frames: int) -> Numbers:
         frames=sum(track.frames for track in tracks), flights=len(tracks), trajectories=len(trajectories),
         flights_shorter_than_num_frames=sum(track.frames < num_frames for track in tracks), counts=counts,
         spreads={name: own.spread() for name, own in spreads.items()},
-        lenses={
-            fov: {name: Sum.all(track.sums[name] for track in own).spread().mean for name in LENS}
-            for fov, own in sorted(by_fov.items())
-        },
         coverage=Coverage.total(track.coverage for track in tracks),
         example=next((track.example for track in tracks if track.example), {}),
     )  # fmt: skip

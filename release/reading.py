@@ -1,4 +1,5 @@
-"""Read a release: its rows, checked for what every reader relies on, and its tracks with frames and points, in order.
+"""Read a release: its rows, checked for what every reader relies on, and its tracks with frames and points, in order;
+and the rows of a track as arrays, which checks and exports use.
 
 Memory holds a row group and the points of one shard, however large the release is.
 """
@@ -6,21 +7,221 @@ Memory holds a row group and the points of one shard, however large the release 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain, groupby
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from cosfly.formats.captions import FIELDS
+from cosfly.formats.frames import Camera
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
+from cosfly.formats.people import Goal, People, read_goal
+from cosfly.formats.playback import EVENTS, Perturbation, TargetRecord, Track
+from cosfly.formats.shown_captions import ReleasedTrack, ShownCaption
+from cosfly.geometry.axes import BODY_FROM_CAMERA, CORNER_SIGNS, rotation_matrices
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.json_io import parse_document, validated
 from cosfly.runtime.tables import arrow_errors, row_groups
-from release.columns import PICTURES, PLACE, POINT_NAMES, REQUIRED, SCALAR_NAMES, flight_name, points_schema, schema
-from release.flight_rows import FlightRows
+from release.columns import (
+    BOX,
+    COMPANY_COLUMNS,
+    INTRINSICS,
+    LANGUAGES,
+    PICTURES,
+    PLACE,
+    POINT,
+    POINT_NAMES,
+    POSE,
+    REQUIRED,
+    SCALAR_NAMES,
+    VALUES,
+    between_of,
+    flight_name,
+    matrices_of,
+    points_schema,
+    schema,
+)
 from release.record import POINTS_FOLDER, Shard
 
+Row = dict[str, Any]
+NEAR_M = 0.3  # the renderers' near plane
+MOST_FRAMES = 10_000_000  # of a flight
+LEAST_ZOOMED = 3  # rows whose camera is not that of most rows
 LARGEST = 1e9  # of a value: beyond any town, track and picture
+
+
+def vectors(rows: Sequence[Row], name: str, members: tuple[str, ...]) -> np.ndarray:
+    """Return a column of groups, (n, members) float64, NaN where null or incomplete."""
+    groups = (row.get(name) or {} for row in rows)
+    return np.array([[group.get(m) for m in members] for group in groups], dtype=np.float64).reshape(-1, len(members))
+
+
+def _vectors(name: str, members: tuple[str, ...]) -> cached_property[np.ndarray]:
+    return cached_property(lambda flight: vectors(flight.rows, name, members))
+
+
+@dataclass(frozen=True)
+class FlightRows:
+    """The rows of one flight in the order of their frames, with the columns of a release; a column that a format lacks
+    is None everywhere.
+
+    name: `run/town/trajectory/variant`. given_id: what its sample ids must begin with, None where nobody knows.
+    is_foreign: nothing says that cosfly drew it, so that its person may be of another size.
+    """
+
+    name: str
+    rows: Sequence[Row]
+    given_id: str | None = None
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def where(self, i: Any, column: str = "") -> str:
+        """Name a row, and a column of it."""
+        row = self.rows[int(i)]
+        place = row.get("sample_id") or f"{self.name} frame {row.get('frame_index')}"
+        return f"{place}: {column}" if column else str(place)
+
+    def column(self, name: str) -> list[Any]:
+        return [row.get(name) for row in self.rows]
+
+    def numbers(self, name: str) -> np.ndarray:
+        """Return a column of numbers, (n,) float64, NaN where null."""
+        return np.array([np.nan if value is None else value for value in self.column(name)], dtype=np.float64)
+
+    def flags(self, name: str) -> np.ndarray:
+        return np.array([bool(value) for value in self.column(name)])
+
+    index = cached_property(
+        lambda self: np.array([-1 if i is None else i for i in self.column("frame_index")], np.int64)
+    )
+    time_s = cached_property(lambda self: self.numbers("time_s"))
+    visibility = cached_property(lambda self: self.numbers("visibility"))
+    pose = _vectors("pose", POSE)
+    target_m = _vectors("target", POINT)
+    drone_offset = _vectors("drone_offset", POSE)
+    target_offset = _vectors("target_offset", POINT)
+    uv = _vectors("target_uv", ("u_px", "v_px"))
+    box = _vectors("target_bbox", BOX)
+    mask_box = _vectors("target_mask_bbox", BOX)
+    intrinsics = _vectors("intrinsics", INTRINSICS)
+
+    @cached_property
+    def zooms(self) -> bool:
+        """Whether its camera changes; one or two rows that differ from all others are no zoom."""
+        _, counts = np.unique(self.intrinsics, axis=0, return_counts=True)
+        return bool(len(self) - counts.max() >= LEAST_ZOOMED)
+
+    @cached_property
+    def size_px(self) -> np.ndarray:
+        """(n, 2) width, height."""
+        return np.stack([self.numbers("width_px"), self.numbers("height_px")], axis=1)
+
+    @cached_property
+    def events(self) -> list[dict[str, str] | None]:
+        groups = self.column("perturbation")
+        return [group if group and all(group.get(event) for event in EVENTS) else None for group in groups]
+
+    @cached_property
+    def is_foreign(self) -> bool:
+        """Nothing in the rows is what only cosfly writes: the box of the person's pixels, or what became of a
+        perturbation."""
+        return bool(np.isnan(self.mask_box).all()) and not any(self.events)
+
+    @cached_property
+    def rotations(self) -> np.ndarray:
+        """world_from_body, (n, 3, 3)."""
+        return rotation_matrices(np.radians(self.pose[:, 3:]))
+
+    @cached_property
+    def projected_corners(self) -> np.ndarray:
+        """The corners of a person of ours at each row's target, (n, 8, 2) px; NaN where one lies behind the camera."""
+        corners = self.target_m[:, None, :] + CORNER_SIGNS * np.array(PERSON_HALF_EXTENTS_M)
+        body = np.einsum("nji,nkj->nki", self.rotations, corners - self.pose[:, None, :3])
+        x, y, z = np.moveaxis(body @ BODY_FROM_CAMERA, 2, 0)
+        fx, fy, cx, cy = (values[:, None] for values in self.intrinsics.T)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            uv = np.stack([fx * x / z + cx, fy * y / z + cy], axis=2)
+        uv[~(z > NEAR_M).all(axis=1)] = np.nan
+        return uv
+
+    @cached_property
+    def people(self) -> People | None:
+        """What people look like, None where nobody says. Raises InputError, as `goal` does."""
+        told, where = self.rows[0].get("people"), self.where(0, "people")
+        return None if told is None else validated(People, parse_document(told, where), where)
+
+    @cached_property
+    def goal(self) -> Goal | None:
+        """Whom to follow; its frame is that of the whole flight."""
+        told = {name: self.rows[0].get(f"goal_{name}") for name in ("frame", "en", "zh", "says")}
+        is_told = told["frame"] is not None
+        return read_goal(told, MOST_FRAMES, self.where(0, "goal_en")) if is_told else None
+
+    @property
+    def is_clean(self) -> bool:
+        return self.rows[0].get("track") == "clean"
+
+    @cached_property
+    def flight(self) -> Track:
+        """The same as a flight of the playback tree, for those who know that."""
+        first = self.rows[0]
+        matrices = matrices_of(self.intrinsics)
+        camera = Camera(int(self.size_px[0, 0]), int(self.size_px[0, 1]), matrices[0])
+        has_mask = not np.isnan(self.mask_box).all()
+        return Track(
+            town=str(first.get("town")), trajectory=str(first.get("trajectory")), variant=str(first.get("variant")),
+            camera=camera, time_s=self.time_s, positions_m=self.pose[:, :3], rotations_deg=self.pose[:, 3:],
+            targets_m=self.target_m, is_original=self.is_clean,
+            target=TargetRecord(
+                in_view=self.flags("target_in_view"), visible=self.flags("target_visible"),
+                depth_m=self.numbers("target_depth_m"), uv=self.uv, bbox=self.box,
+                visibility=self.numbers("visibility"), mask_bbox=self.mask_box if has_mask else None,
+                legible=None if None in self.column("target_legible") else self.flags("target_legible"),
+            ),
+            perturbation=Perturbation(
+                self.flags("is_perturbed"), self.drone_offset[:, :3], self.drone_offset[:, 3:], self.target_offset
+            ),
+            intrinsics=matrices if self.zooms else None, between=between_of(self.rows),
+            people=self.people, goal=self.goal, bystanders=None if None in self.column("others_in_view")
+            else np.stack([self.numbers(name) for name in COMPANY_COLUMNS], axis=1),
+        )  # fmt: skip
+
+    def shown(self, points: FlightRows, twin: FlightRows | None, settings: dict[str, Any]) -> ReleasedTrack:
+        """Return what a checker of captions needs. points, twin: All points of this track and of its clean one.
+        settings: Of the captions, as the record has them."""
+        captions = [shown_caption(row) for row in self.rows if row.get("has_caption")]
+        same = twin is not None and len(twin) == len(points)
+        return ReleasedTrack(points.flight, captions, twin.flight if twin is not None and same else None, settings)
+
+
+def shown_caption(row: Row) -> ShownCaption:
+    """Return the caption of a row. Raises KeyError and TypeError where the row has not all of one, which is found
+    elsewhere."""
+    return ShownCaption(
+        sample_id=row["sample_id"],
+        frame_index=row["frame_index"],
+        window=row["caption_window"] or [],
+        picture_px=tuple(row["caption_picture_px"]),
+        prompts={language: row[f"prompt_{language}"] for language in LANGUAGES if row.get(f"prompt_{language}")},
+        texts={language: {name: row[f"caption_{language}_{name}"] for name in FIELDS} for language in LANGUAGES},
+        writing=row["writing"],
+        values={language: tuple(row[f"{name}_{language}"] for name in VALUES) for language in LANGUAGES},
+        evidence=row["evidence"],
+        decision=row["decision"],
+        repair=row["repair_strategy"],
+        label=row["label"],
+        verdict=row["verdict"],
+    )
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
 
 
 def bounded(value: float) -> float:

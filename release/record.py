@@ -18,7 +18,7 @@ from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import FileFormat, read_model, write_model
 from release.columns import SPLIT_NAMES, SplitName
 
-RELEASE_FORMAT = FileFormat("cosfly.release", "5.0", "release record")
+RELEASE_FORMAT = FileFormat("cosfly.release", "6.0", "release record")
 RECORD = "release.json"
 
 Counts = dict[str, int]
@@ -174,8 +174,8 @@ class Spread(Strict):
 class Numbers(Strict):
     """Every number of the card and the statistics; all are computed from the shards (release/counting.py).
 
-    counts: Frames by a value of what the key names. spreads: Of frames, tracks and trajectories. lenses: Means over the
-    frames by field of view. example: The first caption's sample_id and texts, empty without captions.
+    counts: Frames by a value of what the key names. spreads: Of frames, tracks and trajectories. example: The first
+    caption's sample_id and texts, empty without captions.
     """
 
     frames: int
@@ -184,7 +184,6 @@ class Numbers(Strict):
     flights_shorter_than_num_frames: int
     counts: dict[str, Counts]
     spreads: dict[str, Spread]
-    lenses: dict[str, dict[str, float | None]]
     coverage: Coverage
     example: dict[str, str | None]
 
@@ -228,8 +227,7 @@ class History(Strict):
 
 
 class ReleaseRecord(Strict):
-    """The whole file. prompts: by run the questions
-    (`user_en`, `user_zh`) of captions that were asked with prompts of their own."""
+    """The whole file."""
 
     name: str
     licence: str
@@ -240,7 +238,6 @@ class ReleaseRecord(Strict):
     frame_selection: str
     depth: StoredDepth | None  # null: without depth
     coordinates: dict[str, Any]
-    prompts: dict[str, dict[str, str]] = Field(default_factory=dict)
     splits: Splits
     numbers: Numbers
     history: History

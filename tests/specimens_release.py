@@ -27,13 +27,13 @@ from release.build.config import ReleaseConfig
 from release.build.sources import Source
 from release.build.stage import run
 from release.columns import schema
-from release.export.source import open_release
+from release.export.stage import open_release
 from specimens import make_playback_tree
 
 NUM_POINTS = 12
 TOWNS = ("Town01", "Town02")
 TWO_SPLITS = {"split_by": "town", "validation_fraction": 0.4, "test_fraction": 0.0}
-FREE = {"licence": "cc-by-4.0", "unbound": "accept", "pairs": "any", "validation_fraction": 0, "test_fraction": 0}
+FREE = {"licence": "cc-by-4.0", "pairs": "any", "validation_fraction": 0, "test_fraction": 0}
 CFG = ReleaseConfig(num_frames=8, shard_mb=1, row_group_mb=1, credits="Map: a specimen.", **FREE)
 REPAIR = {"strategy": "anchored", "asks": 1, "first_decision": "hover", "first_verdict": "HARD_CONFLICT"}
 

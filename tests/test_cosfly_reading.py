@@ -61,7 +61,8 @@ def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path, monke
     elif kind != "missing":
         path.symlink_to("/dev/zero" if kind == "device" else path)
     for read in (
-        read_boxes, read_failures, read_yaml, read_text, png.read_picture, files.sha256_file, tables.num_rows,
+        read_boxes, read_failures, read_yaml, read_text, png.read_picture, files.sha256_file,
+            lambda path: list(tables.row_groups(path)),
     ):  # fmt: skip
         with pytest.raises((InputError, ConfigError), match=path.name):
             read(path)

@@ -74,7 +74,7 @@ def test_results_and_funnel_are_those_after_review(product):
 def test_the_release_takes_what_was_accepted(product, inspected, monkeypatch):
     tree = inspected.parent.parent / "tree"
     source = Source("run", tree, product, product)  # captions are not read here
-    take = lambda: gather([source], include_review=False, accept_unbound=True)  # noqa: E731
+    take = lambda: gather([source], include_review=False)  # noqa: E731
     assert {one.dropped for one in take().candidates} == {"review: smoothness"}
     flights = folders_of(product)
     decide(product, "accepted", *flights[:2])

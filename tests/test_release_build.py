@@ -282,13 +282,6 @@ def test_each_shard_that_cannot_be_written_is_named(copy, tmp_path, monkeypatch)
     assert "\n" not in str(caught.value)
 
 
-def test_captions_that_nothing_binds_to_the_tree_are_refused(few, tmp_path):
-    with pytest.raises(
-        InputError, match=r"the playback tree of these captions is not recorded.*release\.unbound=accept"
-    ):
-        run(split_cfg(unbound="refuse"), [source_of(few)], tmp_path / "r")
-
-
 def test_after_a_failed_flight_the_finished_shards_are_not_done_again(tmp_path, monkeypatch):
     copy = make_material(tmp_path / "material", 3)
     from release.build import config

@@ -22,7 +22,7 @@ from cosfly.geometry.axes import BODY_FROM_CAMERA
 from release.card.render import first_split, render_card
 from release.columns import CONTRACT
 from release.counting import Sum, action_class, count_track, numbers_of
-from release.flight_rows import FlightRows
+from release.reading import FlightRows
 from release.record import read_record
 from release.rules import select_frames
 

@@ -64,4 +64,4 @@ def test_a_full_disk_leaves_nothing_half_written(whole_release, tmp_path, format
     assert "\n" not in str(caught.value)
     assert not (out / format).exists()
     assert list(out.rglob("*.partial")) == []
-    assert (export(cfg, whole_release, out) / "export.json").is_file()
+    assert (export(cfg, whole_release, out) / "README.md").is_file()

@@ -18,7 +18,7 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.goals import SIDES, SLOTS, words_of
 from release.columns import SCALARS, Placement
-from release.flight_rows import FlightRows, Row
+from release.reading import FlightRows, Row
 from release.verify.findings import Findings
 from release.verify.scene import check_goal, decode
 

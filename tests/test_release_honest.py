@@ -154,7 +154,7 @@ class Runs:
         work(stages(cfg, out)[:-2])
         write_captions(out / "none.jsonl", [])
         source = Source.of_files(out / "render", out / "none.jsonl", out / "inspect/inspect.json")
-        return package.run(cfg.release.model_copy(update={"unbound": "accept"}), [source], out / "release")
+        return package.run(cfg.release, [source], out / "release")
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from cosfly.runtime.json_io import read_json
 from release.card.tables import tables_of
 from release.columns import POINT, POSE
 from release.counting import count_track
-from release.flight_rows import FlightRows
+from release.reading import FlightRows
 from release.record import read_record
 
 
@@ -71,6 +71,6 @@ def test_odd_numbers_of_a_record_make_tables_of_whole_rows(built):
     record = read_record(built / "release.json")
     odd = {key: {"x": 3} for key in ("sky", "confusion", "events", "fov", "step_s", "decision")}
     for counts in ({}, record.numbers.counts | odd):
-        numbers = record.numbers.model_copy(update={"counts": counts, "spreads": {}, "lenses": {}})
+        numbers = record.numbers.model_copy(update={"counts": counts, "spreads": {}})
         for table in tables_of(record.model_copy(update={"numbers": numbers})):
             assert {len(row) for row in table.rows} == {len(table.head)}, table.key

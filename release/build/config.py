@@ -43,11 +43,6 @@ class ReleaseConfig(Config):
         description="both: release the two tracks of a trajectory together or not at all; any: also a single track",
     )
     include_review: bool = Field(False, description="also release tracks that the inspection sends to review")
-    unbound: str = Field(
-        "refuse",
-        pattern="^(refuse|accept)$",
-        description="captions whose playback tree is not recorded: refuse or accept",
-    )
     split_by: SplitBy = Field(
         "walk", description="what two splits must not share: a pedestrian trajectory (walk), or a town"
     )

@@ -86,8 +86,7 @@ def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> 
     Raises:
         InputError, VerifyError: The material cannot be released.
     """
-    choice, accepts = TrackChoice(match=cfg.flights), cfg.unbound == "accept"
-    material = gather(sources, include_review=cfg.include_review, accept_unbound=accepts, choice=choice)
+    material = gather(sources, include_review=cfg.include_review, choice=TrackChoice(match=cfg.flights))
     tracks, walks, dropped = survey_tracks(material.candidates, sources, cfg.tracks)
     tracks, without_twin = keep_pairs(tracks, cfg)
     dropped = dropped + without_twin

@@ -7,14 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cosfly.formats.boxes import UNKNOWN_LICENCE
-from cosfly.formats.captions import OWN_PROMPTS, QUESTIONS
 from cosfly.formats.inspection import REVIEW, Inspection, TrajectoryFunnel, read_settled
 from cosfly.formats.places import ALL_TRACKS, Place, TrackChoice, flight_ids, folder_name
 from cosfly.formats.town import read_town_map
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import ConfigError, InputError
-from cosfly.runtime.io import check_stays_below, inside, read_text
-from cosfly.runtime.run_dir import record_of
+from cosfly.runtime.io import check_stays_below, inside
 from release.build.captions import FlightKey
 from release.record import ReleasedMap
 
@@ -39,17 +37,7 @@ class Source:
             files["inspect"] = self.inspect
             if (decisions := self.inspect.with_name(REVIEW)).exists():
                 files["review"] = decisions
-        own = {f"prompts/{name}": f"{OWN_PROMPTS}/{name}.txt" for name in QUESTIONS}
-        return files | {role: path for role, name in own.items() if (path := self.captions.parent / name).is_file()}
-
-    @property
-    def questions(self) -> dict[str, str]:
-        """The questions of captions that were asked with prompts of their own; empty: with those that ship."""
-        return {
-            name: read_text(path, what="prompt", tree=self.captions.parent)
-            for name in QUESTIONS
-            if (path := self.files.get(f"prompts/{name}"))
-        }
+        return files
 
     @classmethod
     def of_run(cls, folder: Path) -> Source:
@@ -138,21 +126,12 @@ class Material:
     trajectories: TrajectoryFunnel | None
 
 
-def gather(
-    sources: list[Source], *, include_review: bool, accept_unbound: bool, choice: TrackChoice = ALL_TRACKS
-) -> Material:
+def gather(sources: list[Source], *, include_review: bool, choice: TrackChoice = ALL_TRACKS) -> Material:
     """List the tracks of the runs with the results of their inspections; those that are not chosen are dropped."""
     wanted = ("accepted", "review") if include_review else ("accepted",)
     found: list[Candidate] = []
     inspections: list[Inspection] = []
     for number, source in enumerate(sources):
-        if not accept_unbound and record_of(source.captions) is None:
-            raise InputError(
-                "the playback tree of these captions is not recorded", where=source.captions,
-                expected="stage.json next to the captions",
-                fix="pass the captions in the folder of `cosfly caption`, "
-                "or accept them for this tree with --set release.unbound=accept",
-            )  # fmt: skip
         if source.inspect is None:
             for folder in find_tracks(source.data):
                 inner = folder.relative_to(source.data)

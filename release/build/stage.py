@@ -194,9 +194,8 @@ def make_record(
     shards: list[Shard],
     numbers: Numbers,
     provenance: Provenance,
-    prompts: dict[str, dict[str, str]],
 ) -> ReleaseRecord:
-    """Return what release.json says of its shards. prompts: As the record has them."""
+    """Return what release.json says of its shards."""
     tracks = [track for shard in plan.shards for track in shard.tracks]
     flights = [
         ReleasedFlight(
@@ -218,7 +217,7 @@ def make_record(
     )  # fmt: skip
     return ReleaseRecord(
         name=cfg.name, licence=plan.licence, credits=cfg.credits, maps=plan.maps,
-        made_by=f"cosfly {cosfly.__version__}", settings=settings, prompts=prompts, splits=splits, numbers=numbers,
+        made_by=f"cosfly {cosfly.__version__}", settings=settings, splits=splits, numbers=numbers,
         history=_history(plan, tracks), provenance=provenance, flights=flights, shards=shards,
         **stated_rules(settings, shards),
     )  # fmt: skip
@@ -292,8 +291,7 @@ def run(
         shards = name_shards(written, folder)
         numbers = numbers_of(count_release(folder, shards), cfg.num_frames)
         provenance = provenance_of(sources, read_stage_record(out).inputs, plan.account)
-        prompts = {source.run: source.questions for source in sources if source.questions}
-        record = make_record(cfg, plan, shards, numbers, provenance, prompts)
+        record = make_record(cfg, plan, shards, numbers, provenance)
         write_records(folder, record)
         report = verify(folder, level="structure")  # before the release has its name
         if not report.is_ok:

@@ -21,7 +21,7 @@ from cosfly.runtime.json_io import Record, write_json
 from cosfly.viz.coverage_page import coverage_html
 from cosfly.viz.page import page
 from release.columns import CAPTION, LANGUAGE_NAMES, LANGUAGES
-from release.counting import ACTION_CLASSES, LENS, REVIEW_BELOW, STATES, TAB
+from release.counting import ACTION_CLASSES, REVIEW_BELOW, STATES, TAB
 from release.record import RECORD, Numbers, ReleaseRecord, Spread, read_record, release_folder
 
 Cell = str | int | float | None
@@ -49,8 +49,7 @@ SHAPES: dict[str, tuple[str, str, str, Plot | None]] = {  # of each table: title
     "release": ("The release", "sec:dataset_stats, sec:exp_release", "|number", None),
     "quality_stats": ("From plan to release", "tab:quality_stats", "|number", None),
     "dist_stats": ("Tracks and trajectories", "tab:dist_stats", f"axis|{SPREAD}", None),
-    "fovs": ("Fields of view", "tab:zoom_config, tab:zoom_eval, sec:exp_release",
-             "degrees|tracks|frames|level|focal length, px|width, px|height, px|visibility|IoU", "bars"),
+    "fovs": ("Fields of view", "tab:zoom_config, sec:exp_release", "degrees|tracks|frames|level", "bars"),
     "weather": ("Weather and time of day", "tab:weather_coverage", "preset", "heat"),
     "augmentation_states": ("Perturbation", "tab:augmentation_states", "state|frames|%", "bars"),
     "events": ("Outcome of each perturbation", "sec:exp_render, app:dual_track", "track|event|outcome|frames", None),
@@ -78,7 +77,6 @@ SPREADS = {
 }
 NOTES = {
     "dist_stats": "Of trajectories without perturbation: of the clean track, or the perturbed one minus its offsets.",
-    "fovs": "Means over the frames. Size: of the projected box; IoU: of this box and the box of the person's pixels.",
     "weather": "Frames. The presets of the paper are all listed.",
     "augmentation_states": "Frames of perturbed tracks by their recorded offsets, after fallbacks.",
     "actions": "Frames by their column action, of the planned motion: the greatest velocity until the next frame; "
@@ -210,8 +208,7 @@ def _fovs(numbers: Numbers) -> Rows:
     tracks, rows = numbers.of("tracks_by_fov"), Rows()
     for fov, frames in sorted(numbers.of("fov").items()):
         level = next((name for lens_deg, name in LEVEL_NAMES.items() if fov == f"{lens_deg:g}"), "")
-        means = [numbers.lenses.get(fov, {}).get(name) for name in LENS]
-        rows.append([fov, tracks[fov], frames, level, *(None if mean is None else round(mean, 3) for mean in means)])
+        rows.append([fov, tracks[fov], frames, level])
     return rows
 
 

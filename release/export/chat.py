@@ -24,8 +24,8 @@ from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.png import colours_of, colours_png
 from cosfly.viz.frame_views import Pictures, bounded, frame_label
 from release.columns import LANGUAGES, PICTURE_PX, PICTURES, WINDOW
-from release.export.source import ExportSource, Row, SourceTrack
-from release.export.stage import ExportConfig, FormatFacts
+from release.export.stage import ExportConfig, ExportSource, FormatFacts, SourceTrack
+from release.reading import Row
 
 IMAGE = "<image>"  # where ShareGPT has a picture; loaders count these marks
 MARKS = (IMAGE, "<video>", "<audio>")

@@ -26,8 +26,8 @@ from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.png import colours_of
 from release.columns import PICTURES, SplitName
-from release.export.source import PART, ExportSource, Row, SourceTrack
-from release.export.stage import ExportConfig, FormatFacts
+from release.export.stage import PART, ExportConfig, ExportSource, FormatFacts, SourceTrack
+from release.reading import Row
 
 TARGET, OTHER = 1, 2
 CATEGORIES = [

@@ -34,9 +34,8 @@ from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.png import colours_of
 from release.columns import BOX, CAPTION_FIELDS, PICTURES, POINT, POSE
-from release.export.source import ExportSource, Row
-from release.export.stage import ExportConfig, FormatFacts, Piece, shards
-from release.flight_rows import vectors
+from release.export.stage import ExportConfig, ExportSource, FormatFacts, Piece, shards
+from release.reading import Row, vectors
 
 VERSION = "v3.0"
 CHUNK = 1000  # files of one folder

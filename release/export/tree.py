@@ -30,9 +30,8 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes, sha256_file, write_bytes, write_checksums
 from cosfly.runtime.json_io import write_model
 from release.columns import COMPANY_COLUMNS, PICTURES, SCALAR_NAMES, TARGET_PICTURE, matrices_of
-from release.export.source import ExportSource, Row, SourceTrack
-from release.export.stage import ExportConfig, FormatFacts
-from release.flight_rows import FlightRows
+from release.export.stage import ExportConfig, ExportSource, FormatFacts, SourceTrack
+from release.reading import FlightRows, Row
 
 VERSION = "drone_nav_traj_v7 7.0.0"
 

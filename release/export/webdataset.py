@@ -24,8 +24,8 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file
 from cosfly.runtime.json_io import dump_json
 from release.columns import PICTURES, SCALAR_NAMES, SCALARS, SPLIT_NAMES, TARGET_PICTURE, Column
-from release.export.source import PART, ExportSource, Row
-from release.export.stage import ExportConfig, FormatFacts, Piece, shards
+from release.export.stage import PART, ExportConfig, ExportSource, FormatFacts, Piece, shards
+from release.reading import Row
 
 TEXTS = ("string", "texts", "events")
 MOST_FRAMES = 100  # of a piece, the smallest part of a shard

@@ -11,7 +11,7 @@ from pydantic import ConfigDict
 
 from cosfly.formats.issues import Issue, Report, Severity, sort_key
 from cosfly.runtime.escaping import cut, for_terminal
-from release.flight_rows import FlightRows
+from release.reading import FlightRows
 
 EXAMPLES = 3  # places of a kind that are named
 Words = str | Callable[[int], Any]  # of all rows alike, or of each

@@ -19,7 +19,7 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.png import colours_of
 from cosfly.runtime.worker import advance
 from release.columns import PICTURES, TARGET_PICTURE
-from release.flight_rows import FlightRows
+from release.reading import FlightRows
 from release.verify.findings import Findings
 
 PERSON, SKY, MOST_KIND = KINDS["Pedestrians"], KINDS["Sky"], max(KINDS.values())

@@ -25,8 +25,7 @@ from cosfly.runtime.tables import open_table, row_batches
 from cosfly.runtime.worker import Item, Outcome
 from release.columns import CAPTION, LANGUAGES, PICTURES, POINT_NAMES, POINTS, SCALARS, WINDOW, Column
 from release.counting import count_track
-from release.flight_rows import FlightRows
-from release.reading import read_tracks
+from release.reading import FlightRows, read_tracks
 from release.record import ReleaseRecord, Shard
 from release.verify.findings import Findings
 from release.verify.scene import Pictures, check_pictures

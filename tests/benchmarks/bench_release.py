@@ -90,7 +90,7 @@ def cpu_seconds() -> float:
 
 
 def build(root: Path, out: Path, files: tuple[FrameFile, ...], workers: int) -> float:
-    cfg = ReleaseConfig(licence="cc0-1.0", unbound="accept", modalities=files, num_frames=FRAMES_RELEASED)
+    cfg = ReleaseConfig(licence="cc0-1.0", modalities=files, num_frames=FRAMES_RELEASED)
     start_s = time.perf_counter()
     run(cfg, [Source("bench", root / "tree", root / "captions.jsonl")], out, workers=workers)
     return time.perf_counter() - start_s
