@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cosfly.formats.captions import FIELDS
-from cosfly.formats.frames import Camera
+from cosfly.formats.frames import Camera, FrameFile
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.people import Goal, People, read_goal
 from cosfly.formats.playback import EVENTS, Perturbation, TargetRecord, Track
@@ -27,7 +27,7 @@ from cosfly.formats.shown_captions import ReleasedTrack, ShownCaption
 from cosfly.geometry.axes import BODY_FROM_CAMERA, CORNER_SIGNS, rotation_matrices
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import parse_document, validated
-from cosfly.runtime.tables import arrow_errors, row_groups
+from cosfly.runtime.tables import arrow_errors, open_table, row_batches, row_groups
 from release.columns import (
     BOX,
     COMPANY_COLUMNS,
@@ -50,6 +50,8 @@ from release.columns import (
 from release.record import POINTS_FOLDER, Shard
 
 Row = dict[str, Any]
+Pictures = dict[FrameFile, bytes | memoryview | None]  # of a frame
+BATCH_ROWS = 2  # whose pictures are in memory at once
 NEAR_M = 0.3  # the renderers' near plane
 MOST_FRAMES = 10_000_000  # of a flight
 LEAST_ZOOMED = 3  # rows whose camera is not that of most rows
@@ -232,22 +234,16 @@ def bounded(value: float) -> float:
     return value
 
 
-def row_lists(
-    shard: Path, columns: Sequence[str], *, strict: bool = True, part: tuple[int, int, int] | None = None
-) -> Iterator[list[dict[str, Any]]]:
+def row_lists(shard: Path, columns: Sequence[str], *, strict: bool = True) -> Iterator[list[dict[str, Any]]]:
     """Yield the rows of a parquet file of a release, a row group at a time.
 
     Args:
         strict: Raise InputError if a column is not that of a release, a value that must be there is null, or a number
-            is not finite. part: Number of a row group, and its first row and the one after its last that are wanted,
-            of a file whose columns are known to be those of a release.
+            is not finite.
     """
-    for group in row_groups(shard, list(columns), tree=shard.parents[1], wanted=part and part[:1]):
-        if part is not None:
-            group = group.slice(part[1], part[2] - part[1])
-        elif strict:
-            check_columns(group, columns, shard)
+    for group in row_groups(shard, list(columns), tree=shard.parents[1]):
         if strict:
+            check_columns(group, columns, shard)
             _check_values(group, shard)
         with arrow_errors(shard):  # text that is no UTF-8 shows here
             rows = group.to_pylist()
@@ -309,3 +305,14 @@ def read_tracks(
     if (more := next(points, None)) is not None:
         what = "the points of a shard are not those of its tracks"
         raise InputError(what, where=folder / shard.points.path, got=flight_name(more[0]), expected="no further track")
+
+
+def read_pictures(folder: Path, shard: Shard, files: Sequence[FrameFile]) -> Iterator[Pictures]:
+    """Yield the pictures of the rows of a shard, in order."""
+    names, path = {file: PICTURES[file].name for file in files}, folder / shard.path
+    with open_table(path, tree=folder) as table:
+        for group in range(table.num_row_groups):
+            for batch in row_batches(path, table, group, list(names.values()), BATCH_ROWS):
+                for row in batch.to_pylist():
+                    cells = ((file, row[name]) for file, name in names.items())
+                    yield {file: cell["bytes"] if isinstance(cell, dict) else cell for file, cell in cells}

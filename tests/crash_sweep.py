@@ -204,12 +204,12 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
         "caption compare-strategies --data {tree} --out {out} --teacher {teacher} --conflicts 2 {tiny}"
     ],
     "release build": ["release build {base} --out {out} --workers 1"],
-    "release export tree": ["release export {release} --format tree --out {out} --workers 1"],
-    "release export webdataset": ["release export {release} --format webdataset --out {out} --workers 1"],
-    "release export lerobot": ["release export {release} --format lerobot --out {out} --workers 1"],
+    "release export tree": ["release export {release} --format tree --out {out}"],
+    "release export webdataset": ["release export {release} --format webdataset --out {out}"],
+    "release export lerobot": ["release export {release} --format lerobot --out {out}"],
     "release stats": ["release stats {release} --out {out}"],
-    "release export chat": ["release export {base} --format chat --out {out} --workers 1"],
-    "release export coco": ["release export {base} --format coco --out {out} --workers 1"],
+    "release export chat": ["release export {base} --format chat --out {out}"],
+    "release export coco": ["release export {base} --format coco --out {out}"],
     "distill prepare": [
         "distill prepare --captions {students}/captions.jsonl --data {students}/tree --out {out}"
     ],

@@ -5,6 +5,7 @@ from collections import Counter, defaultdict
 from pathlib import Path
 from unittest import mock
 
+import pyarrow.parquet as pq
 from specimens_distill import make_caption as caption_of_frame
 
 from cosfly.formats.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
@@ -26,8 +27,8 @@ from cosfly.runtime.config import load
 from release.build.config import ReleaseConfig
 from release.build.sources import Source
 from release.build.stage import run
-from release.columns import schema
-from release.export.stage import open_release
+from release.columns import SPLIT_NAMES
+from release.record import read_record
 from specimens import make_playback_tree
 
 NUM_POINTS = 12
@@ -126,9 +127,8 @@ def rewrite_captions(root: Path, change) -> None:
 
 
 def rows_by_id(dataset: Path) -> dict[str, dict]:
-    source = open_release(dataset)
-    columns = schema(source.modalities).names
-    return {row["sample_id"]: row for track in source.tracks for row in track.rows(columns)}
+    shards = sorted(read_record(dataset / "release.json").shards, key=lambda shard: SPLIT_NAMES.index(shard.split))
+    return {row["sample_id"]: row for shard in shards for row in pq.read_table(dataset / shard.path).to_pylist()}
 
 
 def all_bytes(folder: Path) -> dict[str, bytes]:

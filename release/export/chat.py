@@ -23,7 +23,7 @@ from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.png import colours_of, colours_png
 from cosfly.viz.frame_views import Pictures, bounded, frame_label
-from release.columns import LANGUAGES, PICTURE_PX, PICTURES, WINDOW
+from release.columns import PICTURE_PX, WINDOW
 from release.export.stage import ExportConfig, ExportSource, FormatFacts, SourceTrack
 from release.reading import Row
 
@@ -33,11 +33,6 @@ LAST: dict[Language, str] = {
     "en": "One picture is given, that of the current frame: RGB. Pixel values refer to pictures of {} x {} px.",
     "zh": "仅给出当前帧的一张图像：RGB 图像。像素值以 {} × {} 像素的图像为准。",
 }
-COLUMNS = [
-    "sample_id", "frame_index", "has_caption", WINDOW, PICTURE_PX,
-    *(f"caption_{language}_{name}" for language in LANGUAGES for name in FIELDS),
-    *(f"{part}_{language}" for language in LANGUAGES for part in ("system", "prompt")),
-]  # fmt: skip
 DATASET_INFO = "dataset_info.json"  # where LLaMA-Factory looks up its data sets
 
 
@@ -45,7 +40,7 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
     """Write the pictures that the samples show, and the samples, one file a split."""
     skipped, names, total = Counter[str](), dict[str, str](), 0
     begin, between, end = (b"", b"\n", b"\n") if cfg.format == "chat" else (b"[\n", b",\n", b"\n]\n")
-    for split, tracks in itertools.groupby(source.tracks, lambda track: track.split):
+    for split, tracks in itertools.groupby(source.tracks(), lambda track: track.split):
         name = f"{split}.jsonl" if cfg.format == "chat" else f"{split}.json"
         num_before = total
         with atomic_file(folder / name) as file:
@@ -92,16 +87,15 @@ def _samples(
     track: SourceTrack, folder: Path, cfg: ExportConfig, skipped: Counter[str], advance: Advance
 ) -> list[dict[str, Any]]:
     """Return the samples of a track, and write their pictures; count by reason what cannot be a sample."""
-    known, rows = set(track.frame_index), [row for row in track.rows(COLUMNS) if row["has_caption"]]
+    known, rows = set(track.frame_index), [row for row in track.rows if row["has_caption"]]
     samples = [sample for row in rows for sample in _samples_of(row, track, known, cfg, skipped)]
     names = {name for sample in samples for name in sample["images"]}
     # The texts refer to pixels of the pictures that the teacher saw.
     most_px = max((max(row[PICTURE_PX]) for row in rows if row[PICTURE_PX]), default=0)
     is_scaled = most_px < max(track.size_px)
-    for row in track.rows(["sample_id", "frame_index", PICTURES["rgb"].name]) if names else ():
-        name = _picture_name(track, row["frame_index"])
+    for row, pictures in track.frames() if names else ():
+        name, data = _picture_name(track, row["frame_index"]), pictures["rgb"]
         if name in names:
-            data = track.picture(row, "rgb")
             if is_scaled:
                 data = colours_png(bounded(colours_of(data, row["sample_id"]), most_px))
             write_bytes(folder / name, data)

@@ -18,15 +18,15 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.formats.frames import PERSON_ID
+from cosfly.formats.frames import PERSON_ID, FrameFile
 from cosfly.formats.kinds import KINDS
 from cosfly.runtime.console import Advance
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.png import colours_of
-from release.columns import PICTURES, SplitName
-from release.export.stage import PART, ExportConfig, ExportSource, FormatFacts, SourceTrack
+from release.columns import BOX, SplitName
+from release.export.stage import PART, ExportConfig, ExportSource, FormatFacts
 from release.reading import Row
 
 TARGET, OTHER = 1, 2
@@ -35,9 +35,6 @@ CATEGORIES = [
     {"id": OTHER, "name": "other person", "supercategory": "person"},
 ]
 IDS = 1 << 16  # of instances in a picture; the id of an annotation is that of its picture times this, plus its instance
-COLUMNS = [
-    "sample_id", "frame_index", "width_px", "height_px", "visibility", PICTURES["rgb"].name, PICTURES["instance"].name,
-]  # fmt: skip
 
 
 def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
@@ -48,15 +45,14 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
         "licenses": [{"id": 1, "name": record.licence, "url": ""}], "categories": CATEGORIES,
     }  # fmt: skip
     ids, counts, used = itertools.count(1), Counter[str](), list[SplitName]()
-    for split, tracks in itertools.groupby(source.tracks, lambda track: track.split):
+    for split, tracks in itertools.groupby(source.tracks(), lambda track: track.split):
         used.append(split)
         path = folder / f"annotations/instances_{split}.json"
         with atomic_file(path) as file, tempfile.TemporaryFile(dir=folder) as people:
             file.write(dump_json(about)[:-1].encode() + b',"images":[')
-            rows = ((track, row) for track in tracks for row in track.rows(COLUMNS))
-            for number, (track, row) in enumerate(rows):
-                image_id = next(ids)
-                image, annotations = _annotate(track, row, image_id, folder / split)
+            frames = ((track.name, *frame) for track in tracks for frame in track.frames())
+            for number, (name, row, pictures) in enumerate(frames):
+                image, annotations = _annotate(name, row, pictures, next(ids), folder / split)
                 file.write((b",\n" if number else b"") + dump_json(image).encode())
                 for annotation in annotations:
                     people.write((b",\n" if people.tell() else b"") + dump_json(annotation).encode())
@@ -81,17 +77,19 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
     )
 
 
-def _annotate(track: SourceTrack, row: Row, image_id: int, folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def _annotate(
+    track: str, row: Row, pictures: dict[FrameFile, bytes], image_id: int, folder: Path
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Write the picture of a row; return its image and the annotations of its people."""
     if not PART.fullmatch(row["sample_id"]):
-        raise InputError("the sample_id of a frame is not a file name", where=track.name, got=row["sample_id"])
+        raise InputError("the sample_id of a frame is not a file name", where=track, got=row["sample_id"])
     name = f"{row['sample_id']}.png"
-    write_bytes(folder / name, track.picture(row, "rgb"))
+    write_bytes(folder / name, pictures["rgb"])
     image = {
         "id": image_id, "file_name": name, "width": row["width_px"], "height": row["height_px"],
-        "track": track.name, "frame_index": row["frame_index"],
+        "track": track, "frame_index": row["frame_index"],
     }  # fmt: skip
-    instances = colours_of(track.picture(row, "instance"), row["sample_id"])
+    instances = colours_of(pictures["instance"], row["sample_id"])
     return image, list(people_in(row, instances, image_id))
 
 
@@ -99,17 +97,31 @@ def people_in(row: Row, instances: np.ndarray, image_id: int) -> Iterator[dict[s
     """Yield the annotation of each person with a pixel in the instance picture of a row, (h, w, 3) uint8."""
     red, green, blue = np.moveaxis(instances, 2, 0)
     is_person, ids = red == KINDS["Pedestrians"], green | blue.astype(np.uint16) << 8
-    for person in np.unique(ids[is_person]).tolist():
+    people = np.unique(ids[is_person]).tolist()
+    target = PERSON_ID if PERSON_ID in people else _most_in_box(np.where(is_person, ids.astype(np.int64), -1), row)
+    for person in people:
         mask = is_person & (ids == person)
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         x, y = int(columns[0]), int(rows[0])
-        category = TARGET if person == PERSON_ID else OTHER
+        category = TARGET if person == target else OTHER
         found = {
             "id": image_id * IDS + person, "image_id": image_id, "category_id": category,
             "bbox": [x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1], "area": int(mask.sum()), "iscrowd": 0,
             "segmentation": {"size": list(mask.shape), "counts": run_lengths(mask)}, "instance_id": person,
         }  # fmt: skip
         yield found | ({"visibility": row["visibility"]} if category == TARGET else {})
+
+
+def _most_in_box(ids: np.ndarray, row: Row) -> int | None:
+    """Return the person with most pixels in the box of the target. Only pictures of others need the projected box:
+    cosfly's have the id PERSON_ID, and record the outcome of perturbations in each frame."""
+    box = row["target_mask_bbox"] or (row["target_bbox"] if row["perturbation"] is None else None)
+    if box is None:
+        return None
+    xmin, ymin, xmax, ymax = (max(0, round(box[name])) for name in BOX)
+    found, counts = np.unique(ids[ymin:ymax, xmin:xmax], return_counts=True)
+    counts[found < 0] = 0
+    return int(found[counts.argmax()]) if counts.any() else None
 
 
 def run_lengths(mask: np.ndarray) -> list[int]:

@@ -14,7 +14,7 @@ import contextlib
 import io
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,6 @@ import pyarrow.parquet as pq
 
 from cosfly.formats.captions import TOKENS, not_in_set
 from cosfly.formats.frames import FrameFile
-from cosfly.geometry.axes import step_s
 from cosfly.geometry.motion import ACTION, PlannedMotion
 from cosfly.runtime.arrays import parse_array
 from cosfly.runtime.console import Advance
@@ -33,9 +32,10 @@ from cosfly.runtime.errors import EnvironmentMissing, InputError
 from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.png import colours_of
-from release.columns import BOX, CAPTION_FIELDS, PICTURES, POINT, POSE
-from release.export.stage import ExportConfig, ExportSource, FormatFacts, Piece, shards
+from release.columns import BOX, CAPTION_FIELDS, POINT, POSE
+from release.export.stage import ExportConfig, ExportSource, FormatFacts, SourceTrack, shards
 from release.reading import Row, vectors
+from release.record import ReleaseRecord
 
 VERSION = "v3.0"
 CHUNK = 1000  # files of one folder
@@ -63,7 +63,6 @@ VECTORS = {  # feature -> the release's column and its members
     "target_bbox": ("target_bbox", BOX),
     "intrinsics": ("intrinsics", ("fx", "fy", "cx", "cy")),
 }
-COLUMNS = ["time_s", *NUMBERS, *FLAGS, *TEXTS, *(column for column, _ in VECTORS.values())]
 
 
 # --- features ---------------------------------------------------------------------------------------------------------
@@ -186,15 +185,13 @@ def _merge_all(stats: Sequence[dict[str, Summary]]) -> dict[str, Summary]:
 
 @dataclass(frozen=True)
 class Layout:
-    """What a file must know of the whole. file: Its number. episode, index: Numbers of its first episode and frame.
-    tasks: All, in words."""
+    """What a file must know of the whole. file: Its number. episode, index: Numbers of its first episode and frame."""
 
     file: int
     episode: int
     index: int
     fps: int
     size_px: tuple[int, int]
-    tasks: tuple[str, ...]
 
     @property
     def place(self) -> dict[str, int]:
@@ -203,21 +200,32 @@ class Layout:
 
 def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
     """Index episodes and frames; write the data files and `meta/`."""
-    pieces = [Piece(track, start, stop) for track in source.tracks for start, stop in track.runs()]
-    fps, size_px = _fps(pieces), source.tracks[0].size_px
-    if cfg.video and any(side % 2 for side in size_px):
-        got = f"{size_px[0]} x {size_px[1]} px"
-        raise InputError("video needs pictures of even width and height", where=source.folder, got=got)
-    if unknown := {one for track in source.tracks for one in track.decisions} - {"", *TOKENS}:
-        raise not_in_set(", ".join(sorted(unknown))[:200], source.folder)
-    decisions = ("", *TOKENS)
-    tasks = tuple(dict.fromkeys(task_of(t.goal, one) for t in source.tracks for one in decisions if one in t.decisions))
-    features = features_of(source.modalities, size_px, fps, cfg.video)
-    layout, stats, counts = Layout(0, 0, 0, fps, size_px, tasks), list[dict[str, Summary]](), Counter[str]()
-    for split, _, own in shards(pieces, cfg.shard_mb):
-        stats.append(_write_file(source, own, layout, features, folder, advance))
-        counts[split] += len(own)
-        episode, index = layout.episode + len(own), layout.index + sum(piece.frames for piece in own)
+    tasks = dict[str, int]()  # in words -> number
+
+    def episodes() -> Iterator[SourceTrack]:
+        for track in source.tracks():
+            decisions = {row["decision"] or "" for row in track.rows}
+            if unknown := decisions - {"", *TOKENS}:
+                raise not_in_set(", ".join(sorted(unknown))[:200], track.name)
+            for one in ("", *TOKENS):
+                if one in decisions:
+                    tasks.setdefault(task_of(track.rows[0]["goal_en"] or "", one), len(tasks))
+            gaps = np.flatnonzero(np.diff(track.frame_index) != 1) + 1
+            yield from track.cut([0, *gaps.tolist(), len(track)])
+
+    fps, features = _fps(source.record), dict[str, Any]()
+    layout, stats, counts = Layout(0, 0, 0, fps, (0, 0)), list[dict[str, Summary]](), Counter[str]()
+    for name, own in shards(episodes(), cfg.shard_mb):
+        first = next(own)
+        if cfg.video and any(side % 2 for side in first.size_px):
+            got = "{} x {} px".format(*first.size_px)
+            raise InputError("video needs pictures of even width and height", where=source.folder, got=got)
+        features = features or features_of(source.modalities, first.size_px, fps, cfg.video)
+        layout = replace(layout, size_px=first.size_px)
+        rows = _write_file(source, itertools.chain([first], own), layout, features, tasks, folder, advance)
+        stats.append(_merge_all([row["stats"] for row in rows]))
+        counts[name.rpartition("-")[0]] += len(rows)
+        episode, index = layout.episode + len(rows), rows[-1]["dataset_to_index"]
         layout = replace(layout, file=layout.file + 1, episode=episode, index=index)
     ends = dict(zip(counts, itertools.accumulate(counts.values()), strict=True))
     info = {
@@ -232,35 +240,27 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
     import pandas as pd
 
     buffer = io.BytesIO()  # lerobot reads the text as the index of a data frame
-    table = pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(tasks, name="task"))
+    table = pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(list(tasks), name="task"))
     table.to_parquet(buffer)
     write_bytes(folder / "meta/tasks.parquet", buffer.getvalue())
     return _facts(source, layout, cfg)
 
 
-def _fps(pieces: list[Piece]) -> int:
+def _fps(record: ReleaseRecord) -> int:
     """Return the number of frames per second; it must be whole and the same in all tracks."""
-    wrong, found = [], set()
-    for piece in pieces:
-        if piece.frames < 2:
-            continue
-        time_s = np.array(piece.track.time_s[piece.start : piece.stop])
-        steps, dt_s = np.diff(time_s), step_s(time_s)
-        fps = round(1 / dt_s)
-        found.add(fps)
-        if np.abs(steps - dt_s).max() > STEP_TOLERANCE_S or abs(1 / (fps or 1) - dt_s) > STEP_TOLERANCE_S:
-            wrong.append(f"{piece.track.name}: steps of {steps.min():.4f} to {steps.max():.4f} s")
-    if wrong or len(found) > 1:
-        got = "; ".join(wrong[:10]) or f"{' and '.join(map(str, sorted(found)))} frames per second"
+    steps_s = [float(step) for step in record.numbers.of("step_s")]
+    fps = round(1 / steps_s[0]) if steps_s else PAPER_FPS
+    if any(abs(step - 1 / (fps or 1)) > STEP_TOLERANCE_S for step in steps_s):
         what = "LeRobot needs the same whole number of frames per second in all tracks"
-        raise InputError(what, where="time_s", got=got)
-    return found.pop() if found else PAPER_FPS
+        raise InputError(what, where="time_s", got=f"steps of {', '.join(map(str, sorted(steps_s)[:10]))} s")
+    return fps
 
 
 def _write_file(
-    source: ExportSource, pieces: list[Piece], layout: Layout, features: dict[str, Any], folder: Path, advance: Advance
-) -> dict[str, Summary]:
-    """Write a data file, its videos, and its part of the table of episodes; return its statistics."""
+    source: ExportSource, pieces: Iterable[SourceTrack], layout: Layout, features: dict[str, Any],
+    tasks: dict[str, int], folder: Path, advance: Advance,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Write a data file, its videos, and its part of the table of episodes; return what that has of each episode."""
     schema = schema_of(features)
     cameras = [name for name, one in features.items() if one["dtype"] == "video"]
     texts = [field.name for field in schema if pa.types.is_string(field.type)]
@@ -272,12 +272,13 @@ def _write_file(
         paths = {name: folder / VIDEO_PATH.format(video_key=name, **layout.place) for name in cameras}
         videos = {name: stack.enter_context(video_writer(path, layout)) for name, path in paths.items()}
         for number, piece in enumerate(pieces, layout.episode):
-            episodes.append(_write_episode(source, piece, number, first, layout, features, table, videos, advance))
-            first += piece.frames
+            row = _write_episode(source, piece, number, first, layout, features, tasks, table, videos, advance)
+            episodes.append(row)
+            first += len(piece)
     buffer = io.BytesIO()
     pq.write_table(pa.Table.from_pylist([_episode_row(row, layout, cameras) for row in episodes]), buffer)
     write_bytes(folder / EPISODES_PATH.format(**layout.place), buffer.getvalue())
-    return _merge_all([row["stats"] for row in episodes])
+    return episodes
 
 
 @contextlib.contextmanager
@@ -296,22 +297,21 @@ def video_writer(path: Path, layout: Layout) -> Iterator[Callable[[np.ndarray], 
 
 
 def _write_episode(
-    source: ExportSource, piece: Piece, number: int, first: int, layout: Layout, features: dict[str, Any],
-    table: pq.ParquetWriter, videos: dict[str, Callable[[np.ndarray], None]], advance: Advance,
+    source: ExportSource, track: SourceTrack, number: int, first: int, layout: Layout, features: dict[str, Any],
+    numbers: dict[str, int], table: pq.ParquetWriter, videos: dict[str, Callable[[np.ndarray], None]], advance: Advance,
 ) -> dict[str, Any]:  # fmt: skip
     """Write the rows of an episode; return what the table of episodes has of it."""
-    track, n = piece.track, piece.frames
-    tasks = [task_of(track.goal, one) for one in track.decisions[piece.start : piece.stop]]
-    scalars = list(track.rows(COLUMNS, piece.start, piece.stop))
-    values = values_of(scalars, number, first, layout.fps, [layout.tasks.index(task) for task in tasks])
+    n = len(track)
+    tasks = [task_of(row["goal_en"] or "", row["decision"] or "") for row in track.rows]
+    values = values_of(track.rows, number, first, layout.fps, [numbers[task] for task in tasks])
     pixels: dict[str, list[np.ndarray]] = {CAMERAS[file]: [] for file in source.modalities}
     sampled = {int(i) for i in np.linspace(0, n - 1, min(n, SAMPLED_FRAMES)).round()}
-    rows = track.rows(["sample_id", *(PICTURES[f].name for f in source.modalities)], piece.start, piece.stop)
+    frames = track.frames()
     for start in range(0, n, ROWS_HELD):
         images: dict[str, list[Any]] = {name: [] for name in pixels}
-        for i, row in enumerate(itertools.islice(rows, ROWS_HELD), start):
+        for i, (row, pictures) in enumerate(itertools.islice(frames, ROWS_HELD), start):
             for file in source.modalities:
-                name, data = CAMERAS[file], track.picture(row, file)
+                name, data = CAMERAS[file], pictures[file]
                 if name in videos:
                     videos[name](colours_of(data, row["sample_id"]))
                 else:
@@ -328,7 +328,7 @@ def _write_episode(
             stats[name] = summarize(np.asarray(values[name], dtype=np.float64).reshape(n, -1), n)
     return {
         "episode_index": number, "tasks": list(dict.fromkeys(tasks)), "length": n, "track": track.name,
-        "split": track.split, "first_frame": track.frame_index[piece.start], "dataset_from_index": first,
+        "split": track.split, "first_frame": track.frame_index[0], "dataset_from_index": first,
         "dataset_to_index": first + n, "stats": stats,
     }  # fmt: skip
 
@@ -376,8 +376,8 @@ def _facts(source: ExportSource, layout: Layout, cfg: ExportConfig) -> FormatFac
         format_version=VERSION,
         codings=codings,
         notes=[
-            f"{layout.episode} episodes of {len(source.tracks)} tracks at {layout.fps} frames per second; a track with "
-            "gaps is cut there. meta/episodes has the track, split and first frame of each.",
+            f"{layout.episode} episodes of {len(source.record.flights)} tracks at {layout.fps} frames per second; "
+            "a track with gaps is cut there. meta/episodes has the track, split and first frame of each.",
             "action and observation.state are mean velocities: forward, left, up in m/s in the drone's level axes, "
             "turn in degrees/s (counter-clockwise), and the camera's pitch: of the step to the next frame, and of the "
             "step that led here. Zero after the last frame of an episode (next.done) and before its first.",

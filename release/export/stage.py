@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import importlib
 import itertools
+import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -35,15 +36,13 @@ from cosfly.runtime.png import png_size
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.runtime.tables import open_table
 from cosfly.viz.page import markdown
-from release.columns import LANGUAGES, PICTURES, PLACE, SPLIT_NAMES, SplitName, schema
-from release.reading import Row, check_columns, row_lists
+from release.columns import LANGUAGES, PICTURES, PLACE, SPLIT_NAMES, SplitName
+from release.reading import Pictures, Row, check_columns, read_pictures, read_tracks
 from release.record import RECORD, ReleaseRecord, read_record, release_folder, shard_paths
-from release.rules import group_by_size
 
 FormatName = Literal["tree", "lerobot", "webdataset", "coco", "chat", "sharegpt"]
 README = "README.md"
 MB = 1024 * 1024
-PLANNED = [*PLACE, "frame_index", "time_s", "decision", "goal_en", "width_px", "height_px"]  # what plans need of a row
 # What one part of a path may be that rows name: no separator, nothing hidden, no ".."
 PART = re.compile(r"\w[\w.-]{0,200}", re.ASCII)
 BYTES_PER_PIXEL = 6  # of the three pictures of a frame, a typical value
@@ -86,103 +85,98 @@ class ExportConfig(Config):
 # --- the source -------------------------------------------------------------------------------------------------------
 
 
-class Span(NamedTuple):
-    """Rows [start, stop) of row group `group` of a shard, all of one track."""
-
-    shard: Path
-    group: int
-    start: int
-    stop: int
-
-
-@dataclass
+@dataclass(frozen=True)
 class SourceTrack:
-    """One track. It holds what plans need of its frames, and where its rows are.
-
-    decisions: Of the captions, "" for a frame without. goal: In English, "" without one.
-    """
+    """One track, or some of its rows. rows: Without pictures. pictures: Of each row, in order; they are read once."""
 
     place: Place
     split: SplitName
-    spans: list[Span] = field(default_factory=list)
-    frame_index: list[int] = field(default_factory=list)
-    time_s: list[float] = field(default_factory=list)
-    decisions: list[str] = field(default_factory=list)
-    goal: str = ""
-    size_px: tuple[int, int] = (0, 0)
+    rows: list[Row]
+    pictures: Iterator[Pictures]
 
     @property
     def name(self) -> str:
         return "/".join((self.place.run, self.place.town, self.place.trajectory, self.place.variant))
 
     @property
-    def frame_bytes(self) -> int:
-        """Approximate size of the pictures of a frame."""
-        return self.size_px[0] * self.size_px[1] * BYTES_PER_PIXEL
+    def size_px(self) -> tuple[int, int]:
+        return self.rows[0]["width_px"], self.rows[0]["height_px"]
+
+    @property
+    def frame_index(self) -> list[int]:
+        return [row["frame_index"] for row in self.rows]
 
     def __len__(self) -> int:
-        return len(self.frame_index)
+        return len(self.rows)
 
-    def add(self, rows: Iterable[Row]) -> None:
-        """Note the next frames, given their PLANNED columns."""
-        for row in rows:
-            size_px = (row["width_px"], row["height_px"])
-            if self.frame_index and size_px != self.size_px:
-                raise InputError("the pictures of the track differ in size", where=self.name)
-            if self.frame_index and (row["frame_index"] <= self.frame_index[-1] or row["time_s"] <= self.time_s[-1]):
-                raise InputError("the indices and times of the frames do not increase", where=self.name)
-            self.frame_index.append(row["frame_index"])
-            self.time_s.append(row["time_s"])
-            self.decisions.append(row["decision"] or "")
-            self.goal, self.size_px = row["goal_en"] or "", size_px
+    def cut(self, edges: Sequence[int]) -> Iterator[SourceTrack]:
+        """Yield the rows between edges, which begin with 0; the pictures of each part are read before the next."""
+        for start, stop in itertools.pairwise(edges):
+            yield replace(self, rows=self.rows[start:stop], pictures=itertools.islice(self.pictures, stop - start))
 
-    def rows(self, columns: Sequence[str], start: int = 0, stop: int | None = None) -> Iterator[Row]:
-        """Yield rows [start, stop) in order, with the columns, which may be pictures; one row group is in memory."""
-        stop, first = len(self) if stop is None else stop, 0
-        for span in self.spans:
-            size = span.stop - span.start
-            low, high = max(start - first, 0), min(stop - first, size)
-            if low < high:
-                part = span.group, span.start + low, span.start + high
-                (rows,) = row_lists(span.shard, columns, part=part)
-                yield from rows
-            first += size
+    def frames(self) -> Iterator[tuple[Row, dict[FrameFile, bytes]]]:
+        """Yield each row with its pictures, which have the size of the track."""
+        for row, pictures in zip(self.rows, self.pictures, strict=False):
+            yield row, {file: self._checked(row, file, data) for file, data in pictures.items()}
 
-    def runs(self) -> list[tuple[int, int]]:
-        """Return [start, stop) of the rows whose frames follow each other without a gap."""
-        edges = [0, *(np.flatnonzero(np.diff(self.frame_index) != 1) + 1).tolist(), len(self)]
-        return list(itertools.pairwise(edges))
-
-    def picture(self, row: Mapping[str, Any], file: FrameFile) -> bytes:
-        """Return the bytes of a picture of a row."""
-        value, where = row[PICTURES[file].name], f"{row['sample_id']}: {PICTURES[file].name}"
-        data = value if file == "depth" else value and value["bytes"]
+    def _checked(self, row: Row, file: FrameFile, data: bytes | memoryview | None) -> bytes:
+        where = f"{row['sample_id']}: {PICTURES[file].name}"
         if not data:
             raise InputError("the frame has no picture", where=where, got="no data")
+        data, size = bytes(data), png_size(data)
         if file == "depth":
-            height, width = parse_array(data, where, dtype=np.float32, ndim=2, what="depth image", copy=False).shape
-        elif (size := png_size(data)) is None:
+            size = parse_array(data, where, dtype=np.float32, ndim=2, what="depth image", copy=False).shape[::-1]
+        if size is None:
             raise InputError("the frame has no picture", where=where, got="data that are not a PNG")
-        else:
-            width, height = size
-        if (width, height) != self.size_px:
-            got, expected = f"{width} x {height} px", "{} x {} px".format(*self.size_px)
+        if size != self.size_px:
+            got, expected = ("{} x {} px".format(*one) for one in (size, self.size_px))
             raise InputError("the picture has another size than its track", where=where, got=got, expected=expected)
         return data
 
 
 @dataclass(frozen=True)
 class ExportSource:
-    """The release that is exported. modalities: The pictures that the export will hold."""
+    """The release that is exported. modalities: The pictures that the export will hold. files: Those that it reads."""
 
     folder: Path
     record: ReleaseRecord
     modalities: tuple[FrameFile, ...]
-    tracks: list[SourceTrack]
+    files: tuple[FrameFile, ...]
+
+    def tracks(self) -> Iterator[SourceTrack]:
+        """Yield the tracks, splits in their order. The pictures of a track are read before the next track.
+
+        Raises:
+            InputError: The shards are not those of a release.
+        """
+        known = set[Place]()
+        for shard in sorted(self.record.shards, key=lambda shard: (SPLIT_NAMES.index(shard.split), shard.path)):
+            path = self.folder / shard.path
+            with open_table(path, tree=self.folder) as table:
+                if table.metadata.num_rows != shard.rows:
+                    got, expected = f"{table.metadata.num_rows} rows", f"{shard.rows} rows, as in release.json"
+                    raise InputError("the shard has the wrong number of rows", where=path, got=got, expected=expected)
+                check_columns(table.schema_arrow.empty_table(), [PICTURES[file].name for file in self.files], path)
+            pictures = read_pictures(self.folder, shard, self.files)
+            for frames, _ in read_tracks(self.folder, shard):
+                parts = [frames.rows[0][name] for name in PLACE]
+                place = Place(*parts)
+                if not all(map(PART.fullmatch, parts)) or place in known:
+                    what = "the names of the track are not folder names, or it is in two places"
+                    raise InputError(what, where=path, got=shown(parts, 200))
+                known.add(place)
+                for name in ("width_px", "height_px"):
+                    if len({*frames.column(name)}) > 1:
+                        raise InputError("the pictures of the track differ in size", where=frames.name)
+                if (np.diff(frames.index) <= 0).any() or (np.diff(frames.time_s) <= 0).any():
+                    raise InputError("the indices and times of the frames do not increase", where=frames.name)
+                of_track = itertools.islice(pictures, len(frames))
+                yield SourceTrack(place, shard.split, list(frames.rows), of_track)
+                deque(of_track, maxlen=0)  # those that nobody has read
 
 
 def open_release(folder: Path, consecutive: str = "") -> ExportSource:
-    """Open a release, or that of a run, and find the rows of its tracks, splits in their order; reads no picture.
+    """Open a release, or that of a run.
 
     Args:
         consecutive: What needs consecutive frames, if something does.
@@ -205,41 +199,8 @@ def open_release(folder: Path, consecutive: str = "") -> ExportSource:
             "the release is incomplete", where=folder, got=f"missing, or of another name or size: {'; '.join(wrong)}",
             expected="the shards in release.json", fix="run cosfly release verify for details",
         )  # fmt: skip
-    tracks: dict[Place, SourceTrack] = {}
-    for shard in sorted(record.shards, key=lambda shard: (SPLIT_NAMES.index(shard.split), shard.path)):
-        path = folder / shard.path
-        with open_table(path, tree=folder) as table:
-            if table.metadata.num_rows != shard.rows:
-                got, expected = f"{table.metadata.num_rows} rows", f"{shard.rows} rows, as in release.json"
-                raise InputError("the shard has the wrong number of rows", where=path, got=got, expected=expected)
-            check_columns(table.schema_arrow.empty_table(), schema(record.settings.modalities).names, path)
-        for group, rows in enumerate(row_lists(path, PLANNED)):
-            stop = 0
-            for parts, of_track in itertools.groupby(rows, itemgetter(*PLACE)):
-                if not all(map(PART.fullmatch, parts)):
-                    got = shown(list(parts), 200)
-                    raise InputError("the names of the track are not folder names", where=path, got=got)
-                own, start = list(of_track), stop
-                stop = start + len(own)
-                track = tracks.setdefault(Place(*parts), SourceTrack(Place(*parts), shard.split))
-                if track.split != shard.split:
-                    got = f"{track.split} and {shard.split}"
-                    raise InputError("the track is in two splits", where=track.name, got=got)
-                track.spans.append(Span(path, group, start, stop))
-                track.add(own)
-    return ExportSource(folder, record, tuple(record.settings.modalities), list(tracks.values()))
-
-
-class Piece(NamedTuple):
-    """Rows [start, stop) of a track."""
-
-    track: SourceTrack
-    start: int
-    stop: int
-
-    @property
-    def frames(self) -> int:
-        return self.stop - self.start
+    modalities = tuple(record.settings.modalities)
+    return ExportSource(folder, record, modalities, modalities)
 
 
 @dataclass(frozen=True)
@@ -259,13 +220,21 @@ class FormatFacts:
     split_files: dict[str, str] = field(default_factory=dict)
 
 
-def shards(pieces: Sequence[Piece], shard_mb: int) -> Iterator[tuple[SplitName, str, list[Piece]]]:
-    """Yield groups of pieces of each split of about `shard_mb`, each with its split and name, `train-00000`."""
-    for split in SPLIT_NAMES:
-        own = [piece for piece in pieces if piece.track.split == split]
-        sizes = [piece.frames * piece.track.frame_bytes for piece in own]
-        for number, group in enumerate(group_by_size(sizes, shard_mb * MB)):
-            yield split, f"{split}-{number:05d}", [own[k] for k in group]
+def shards(pieces: Iterable[SourceTrack], shard_mb: int) -> Iterator[tuple[str, Iterator[SourceTrack]]]:
+    """Group pieces of each split into files of about `shard_mb`; yield the name of each, `train-00000`, and its pieces,
+    which are read before the next file."""
+    split, number, filled = "", 0, 0
+
+    def name_of(piece: SourceTrack) -> str:
+        nonlocal split, number, filled
+        if piece.split != split:
+            split, number, filled = piece.split, 0, 0
+        elif filled >= shard_mb * MB:
+            number, filled = number + 1, 0
+        filled += len(piece) * math.prod(piece.size_px) * BYTES_PER_PIXEL
+        return f"{split}-{number:05d}"
+
+    return itertools.groupby(pieces, name_of)
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
@@ -283,7 +252,7 @@ def check_needs(source: ExportSource, cfg: ExportConfig) -> ExportSource:
     if unused := set(chosen) - set(export.carries):
         what = f"the {cfg.format} export holds no {' and no '.join(sorted(unused))} pictures"
         raise InputError(what, where="--modalities", expected=", ".join(export.carries))
-    return replace(source, modalities=chosen)
+    return replace(source, modalities=chosen, files=tuple(dict.fromkeys((*chosen, *export.pictures))))
 
 
 def _write_readme(source: ExportSource, facts: FormatFacts, folder: Path, cfg: ExportConfig) -> None:
@@ -295,7 +264,7 @@ def _write_readme(source: ExportSource, facts: FormatFacts, folder: Path, cfg: E
         front["configs"] = [{"config_name": "default", "data_files": files}]
     text = markdown(
         "release/export/readme.md", front_matter=yaml.safe_dump(front, sort_keys=True, allow_unicode=True).rstrip(),
-        release=source.record, facts=facts, format=cfg.format, num_frames=sum(map(len, source.tracks)),
+        release=source.record, facts=facts, format=cfg.format, num_frames=source.record.numbers.frames,
         made_by=f"cosfly {cosfly.__version__}", coordinates=facts.coordinates or source.record.coordinates,
     )  # fmt: skip
     write_bytes(folder / README, (text.rstrip() + "\n").encode())
@@ -318,7 +287,7 @@ def run(cfg: ExportConfig, folder: Path, out: Path, *, resume: Resume = "if-same
     stage = StageFolder.open(
         out, "export", config=cfg, inputs={"release": source.folder / RECORD}, seed=0, resume=resume
     )
-    product, num_frames = out / cfg.format, sum(map(len, source.tracks))
+    product, num_frames = out / cfg.format, source.record.numbers.frames
     if stage.is_complete:
         return product
     format = importlib.import_module(EXPORTS[cfg.format].module)

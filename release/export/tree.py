@@ -9,7 +9,7 @@ name.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -29,7 +29,7 @@ from cosfly.runtime.console import Advance
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes, sha256_file, write_bytes, write_checksums
 from cosfly.runtime.json_io import write_model
-from release.columns import COMPANY_COLUMNS, PICTURES, SCALAR_NAMES, TARGET_PICTURE, matrices_of
+from release.columns import COMPANY_COLUMNS, TARGET_PICTURE, matrices_of
 from release.export.stage import ExportConfig, ExportSource, FormatFacts, SourceTrack
 from release.reading import FlightRows, Row
 
@@ -38,26 +38,20 @@ VERSION = "drone_nav_traj_v7 7.0.0"
 
 def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
     """Write each track, and each town's `map.json`; count the tracks of which strict readers will miss something."""
-    wrong = [
-        f"{track.name}: the name of the {kind} does not begin with {begin}"
-        for track in source.tracks
-        for kind, begin in (("town", TOWN), ("trajectory", "trajectory_"))
-        if not getattr(track.place, kind).startswith(begin)
-    ]
-    if wrong:
-        what = "the source cannot be written as a playback tree"
-        raise InputError(what, where=source.folder, got="; ".join(wrong[:20]))
-    has_runs = len({track.place.run for track in source.tracks}) > 1
+    has_runs = len({one.flight.partition("/")[0] for one in source.record.flights}) > 1
     maps = {entry.town: entry for entry in source.record.maps}
-    groups = defaultdict[tuple[str, str, str], list[SourceTrack]](list)
+    groups = Counter[tuple[str, str, str]]()
     num_gaps = 0
-    for track in source.tracks:
+    for track in source.tracks():
         at = track.place
+        if not at.town.startswith(TOWN) or not at.trajectory.startswith("trajectory_"):
+            what, expected = "the track cannot be written as a playback tree", f"{TOWN}*/trajectory_*"
+            raise InputError(what, where=source.folder, got=track.name, expected=expected)
         group = (at.run, at.town, at.trajectory)
-        groups[group].append(track)
+        groups[group] += 1
         number, place = list(groups).index(group), folder / (at.run if has_runs else "") / at.town
         num_gaps += bool((np.diff(track.frame_index) != 1).any() or track.frame_index[0] != 0)
-        _write_track(source, track, number, place / at.trajectory / at.variant, advance)
+        _write_track(track, number, place / at.trajectory / at.variant, advance)
         shown = maps.get(at.town)
         about = TownMap(name=shown.name, licence=shown.licence, credits=shown.credits) if shown else None
         about = about or TownMap(name=at.town, licence=UNKNOWN_LICENCE, credits="")
@@ -67,9 +61,9 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
         "its track. The layout has no captions: they are in the release. meta.json and missions are not in it."
     ]
     if num_gaps:
-        parts = f"{num_gaps} of {len(source.tracks)} tracks are parts of a track"
+        parts = f"{num_gaps} of {groups.total()} tracks are parts of a track"
         notes.append(f"{parts}: the steps between their frames are uneven, which readers with a strict clock refuse.")
-    if num_alone := sum(len(group) < 2 for group in groups.values()):
+    if num_alone := sum(count < 2 for count in groups.values()):
         notes.append(
             f"{num_alone} of {len(groups)} trajectories have one track only; some public loaders ask for both."
         )
@@ -84,22 +78,21 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
     )
 
 
-def _write_track(source: ExportSource, track: SourceTrack, number: int, out: Path, advance: Advance) -> None:
+def _write_track(track: SourceTrack, number: int, out: Path, advance: Advance) -> None:
     """Write the pictures of a track, then trajectory.json, then the checksums of all."""
-    digests, scalars = dict[str, str](), list[Row]()
+    digests = dict[str, str]()
 
     def put(name: str, data: bytes) -> None:
         write_bytes(out / name, data)
         digests[name] = sha256_bytes(data)
 
-    for i, row in enumerate(track.rows([*SCALAR_NAMES, *(PICTURES[file].name for file in source.modalities)])):
-        for file in source.modalities:
-            put(f"{frame_name(i)}/{FILE_NAMES[file]}", track.picture(row, file))
+    for i, (row, pictures) in enumerate(track.frames()):
+        for file, data in pictures.items():
+            put(f"{frame_name(i)}/{FILE_NAMES[file]}", data)
         if row[TARGET_PICTURE] is not None:
             put(TARGET_FILE, row[TARGET_PICTURE]["bytes"])
-        scalars.append({column: row[column] for column in SCALAR_NAMES})
         advance(1)
-    write_track(out, track_of_rows(scalars, track, number), with_flags=True)
+    write_track(out, track_of_rows(track, number), with_flags=True)
     digests["trajectory.json"] = sha256_file(out / "trajectory.json")
     write_checksums(out, digests)
 
@@ -107,8 +100,9 @@ def _write_track(source: ExportSource, track: SourceTrack, number: int, out: Pat
 # --- trajectory.json --------------------------------------------------------------------------------------------------
 
 
-def track_of_rows(rows: list[Row], placed: SourceTrack, number: int) -> Track:
+def track_of_rows(placed: SourceTrack, number: int) -> Track:
     """Return the track of released rows; `number` is that of its trajectory in the export."""
+    rows = placed.rows
     found = FlightRows(placed.name, rows)
     return replace(
         found.flight,

@@ -23,8 +23,8 @@ from cosfly.runtime.console import Advance
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file
 from cosfly.runtime.json_io import dump_json
-from release.columns import PICTURES, SCALAR_NAMES, SCALARS, SPLIT_NAMES, TARGET_PICTURE, Column
-from release.export.stage import PART, ExportConfig, ExportSource, FormatFacts, Piece, shards
+from release.columns import SCALARS, SPLIT_NAMES, TARGET_PICTURE, Column
+from release.export.stage import PART, ExportConfig, ExportSource, FormatFacts, SourceTrack, shards
 from release.reading import Row
 
 TEXTS = ("string", "texts", "events")
@@ -33,31 +33,27 @@ MOST_FRAMES = 100  # of a piece, the smallest part of a shard
 
 def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
     """Cut each split into shards of about `shard_mb`, and write them."""
-    pieces = [
-        Piece(track, start, min(start + MOST_FRAMES, len(track)))
-        for track in source.tracks
-        for start in range(0, len(track), MOST_FRAMES)
-    ]
+    pieces = (
+        piece for track in source.tracks() for piece in track.cut([*range(0, len(track), MOST_FRAMES), len(track)])
+    )
     counts = Counter[str]()
-    for split, name, own in shards(pieces, cfg.shard_mb):
-        _write_shard(source, folder / f"{name}.tar", own, advance)
-        counts[split] += 1
+    for name, own in shards(pieces, cfg.shard_mb):
+        _write_shard(folder / f"{name}.tar", own, advance)
+        counts[name.rpartition("-")[0]] += 1
     return _facts(source, counts)
 
 
-def _write_shard(source: ExportSource, path: Path, pieces: list[Piece], advance: Advance) -> None:
+def _write_shard(path: Path, pieces: Iterator[SourceTrack], advance: Advance) -> None:
     keys = set[str]()
-    columns = [*SCALAR_NAMES, *(PICTURES[file].name for file in source.modalities)]
-    rows = ((track, row) for track, start, stop in pieces for row in track.rows(columns, start, stop))
     with atomic_file(path) as file, tarfile.open(fileobj=file, mode="w|", format=tarfile.GNU_FORMAT) as tar:
-        for track, row in rows:
+        for row, pictures in (frame for piece in pieces for frame in piece.frames()):
             key = row["sample_id"].replace(".", "_")  # a key ends at its first dot
             if key in keys or not PART.fullmatch(key):
                 what = "the sample_id of a frame is repeated or is not a file name"
                 raise InputError(what, where=path.name, got=key)
             keys.add(key)
-            pictures: dict[str, bytes] = {FILE_NAMES[file]: track.picture(row, file) for file in source.modalities}
-            for ending, data in sorted((pictures | dict(members(row))).items()):
+            files: dict[str, bytes] = {FILE_NAMES[file]: data for file, data in pictures.items()}
+            for ending, data in sorted((files | dict(members(row))).items()):
                 header = tarfile.TarInfo(f"{key}.{ending}")  # without times and owners
                 header.size, header.mode = len(data), 0o644
                 tar.addfile(header, BytesIO(data))

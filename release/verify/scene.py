@@ -19,14 +19,13 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.png import colours_of
 from cosfly.runtime.worker import advance
 from release.columns import PICTURES, TARGET_PICTURE
-from release.reading import FlightRows
+from release.reading import FlightRows, Pictures
 from release.verify.findings import Findings
 
 PERSON, SKY, MOST_KIND = KINDS["Pedestrians"], KINDS["Sky"], max(KINDS.values())
 NOTHING = np.empty((0, 0), np.float32)
 NO_IDS = np.empty((0, 0, 3), np.uint8)
 NUM_IDS, GRID = 65536, 64  # instance ids; rows and columns of points at which kinds are compared
-Pictures = dict[FrameFile, bytes | memoryview | None]  # of a frame
 Decoded = tuple[np.ndarray, np.ndarray]  # depth, instance
 
 

@@ -21,14 +21,13 @@ from cosfly.formats.shown_captions import CaptionReader
 from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.runtime.errors import InputError, shown
 from cosfly.runtime.io import sha256_file
-from cosfly.runtime.tables import open_table, row_batches
 from cosfly.runtime.worker import Item, Outcome
-from release.columns import CAPTION, LANGUAGES, PICTURES, POINT_NAMES, POINTS, SCALARS, WINDOW, Column
+from release.columns import CAPTION, LANGUAGES, POINT_NAMES, POINTS, SCALARS, WINDOW, Column
 from release.counting import count_track
-from release.reading import FlightRows, read_tracks
+from release.reading import FlightRows, Pictures, read_pictures, read_tracks
 from release.record import ReleaseRecord, Shard
 from release.verify.findings import Findings
-from release.verify.scene import Pictures, check_pictures
+from release.verify.scene import check_pictures
 
 PIXEL_PX = 0.5  # a target's pixel: half a pixel is the most that another convention of pixel centres shifts it
 DEPTH_M = 0.02  # z-depth of the target: rounded to centimetres at worst
@@ -206,7 +205,6 @@ def check_captions(flight: FlightRows, window_frames: int, findings: Findings) -
 # --- the worker -------------------------------------------------------------------------------------------------------
 
 Level = Literal["structure", "rows", "pixels"]
-BATCH_ROWS = 2  # whose pictures are in memory at once
 # What a senseless value raises in a check of another value; the cause is reported by a check of its own.
 SENSELESS = (ValueError, KeyError, TypeError, IndexError, ArithmeticError, AttributeError)
 
@@ -241,17 +239,6 @@ class Context:
         window = self.caption_settings(flight).get("window", {})
         return window.get("num_frames", self.record.settings.window_frames)
 
-    def pictures(self, shard: Shard) -> Iterator[Pictures]:
-        """Yield the pictures of the rows of a shard."""
-        names = {file: PICTURES[file].name for file in self.record.settings.modalities}
-        path = self.folder / shard.path
-        with open_table(path, tree=self.folder) as table:
-            for group in range(table.num_row_groups):
-                for batch in row_batches(path, table, group, list(names.values()), BATCH_ROWS):
-                    for row in batch.to_pylist():
-                        cells = ((file, row[name]) for file, name in names.items())
-                        yield {file: cell["bytes"] if isinstance(cell, dict) else cell for file, cell in cells}
-
 
 def make_worker(context: Context) -> Callable[[Item], Outcome]:
     """Return the function that checks a shard in one pass, and returns the counts of its tracks."""
@@ -259,7 +246,8 @@ def make_worker(context: Context) -> Callable[[Item], Outcome]:
     def work(item: Item) -> Outcome:
         findings, counts = Findings(), list[dict[str, Any]]()
         shard: Shard = item.payload
-        pictures = context.pictures(shard) if context.level == "pixels" else iter(())
+        files = context.record.settings.modalities
+        pictures = read_pictures(context.folder, shard, files) if context.level == "pixels" else iter(())
         clean: FlightRows | None = None  # the points of the clean track before this one
         try:
             for frames, points in read_tracks(context.folder, shard, strict=False):
