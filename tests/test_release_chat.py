@@ -126,5 +126,5 @@ def test_sharegpt_is_one_file_a_split_with_its_entry(two_splits, tmp_path):
 
 
 def test_a_training_set_is_not_made_of_a_release(run):
-    with pytest.raises(InputError, match=r"release: a release is not a run directory.*pass the run"):
+    with pytest.raises(InputError, match=r"release: the folder is not a run directory.*pass the run"):
         RunSource.of_run(run / "release")

@@ -29,7 +29,8 @@ class RunSource:
     def of_run(cls, folder: Path) -> RunSource:
         """Return the source of a run directory, the output of `cosfly run`."""
         if not (folder / "render").is_dir():
-            what, fix = "the folder is not a run directory", "pass --data and --captions if they are in other folders"
+            what = "the folder is not a run directory"
+            fix = "pass the run that a release was built from, or --data and --captions for other folders"
             raise InputError(what, where=folder, expected="the folders render/ and caption/", fix=fix)
         captions = folder / "caption/captions.jsonl"
         check_stays_below(captions, captions.parent)
