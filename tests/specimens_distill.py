@@ -10,7 +10,7 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.predictions import Split
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.student_chat import ChatFormat, FrameFormat, write_chat_format
-from cosfly.runtime.json_io import write_json, write_model
+from cosfly.runtime.json_io import write_model
 from cosfly.runtime.run_dir import fingerprint
 from distill.prepare import stage as prepare
 from distill.prepare.sources import RunSource
@@ -97,8 +97,8 @@ def make_adapter(base: Path, folder: Path, **changes) -> Path:
     import torch
     from peft import LoraConfig, get_peft_model
 
-    from distill.student.checkpoint import ADAPTER_FACTS, adapter_facts
     from distill.student.model import load_student
+    from distill.student.saving import write_adapter_facts
     from distill.training.stage import target_modules
 
     student = load_student(base, device="cpu")
@@ -113,6 +113,6 @@ def make_adapter(base: Path, folder: Path, **changes) -> Path:
             if "lora_B" in name:
                 tensor.mul_(0.02)
     student.model.save_pretrained(folder)
-    write_json(folder / ADAPTER_FACTS, adapter_facts(student, ADAPTER_PIXELS, base))
+    write_adapter_facts(folder, base, ADAPTER_PIXELS)
     write_chat_format(folder, TEACHING)
     return folder

@@ -10,7 +10,7 @@ from specimens_distill import make_captions, prepared
 
 from distill.schema import Sample, open_split, resolve_trees
 from distill.student.chat import prompt_batch
-from distill.student.features import Encoded, PictureReader, encode, pictures_of
+from distill.student.features import PictureReader, Tensors, encode, pictures_of
 from distill.student.model import Student, load_student
 from distill.student.random_student import make_tiny_student
 from specimens import make_playback_tree
@@ -57,11 +57,11 @@ def pixels_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Path]
     import torch
 
     reader = PictureReader(own, trees, own.dtype, MAX_PIXELS)
-    read = [reader.read(picture).inputs for sample in samples for picture in pictures_of(sample)]
+    read = [reader.read(picture) for sample in samples for picture in pictures_of(sample)]
     return {name: torch.cat([one[name] for one in read]) for name in (read[0] if read else ())}
 
 
-def features_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Path]) -> list[Encoded]:
+def features_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Path]) -> list[Tensors]:
     """The features of the pictures of some samples, each encoded by itself."""
     import torch
 

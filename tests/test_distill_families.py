@@ -13,7 +13,7 @@ from specimens_students import begun, features_of, log_of, losses_of, pixels_of,
 from tables import each
 
 from cosfly.formats.predictions import read_predictions
-from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
+from cosfly.runtime.errors import EnvironmentMissing, InputError
 from distill.inference import merge
 from distill.inference import stage as infer
 from distill.student.chat import AnswerWeights, padded
@@ -181,7 +181,7 @@ def test_a_head_that_scales_its_logits_is_refused(place, built_once, tmp_path, m
         return found
 
     monkeypatch.setattr(LlamaForCausalLM, "forward", scaled)
-    with pytest.raises(InputError, match=r"head: LlamaForCausalLM changes its logits after the head"):
+    with pytest.raises(InputError, match=r"changes its logits after the head.*LlamaForCausalLM"):
         run(place, tmp_path / "out", folder, max_steps=1)
 
 
@@ -217,11 +217,12 @@ def test_a_template_of_the_settings_is_kept_with_the_adapter(place, tmp_path):
 
 def test_curves_go_to_the_loggers_of_accelerate(place, built_once, tmp_path, monkeypatch):
     from accelerate import tracking
+    from accelerate.utils import LoggerType
 
     seen: list[Any] = []
 
     class Recorder:
-        requires_logging_directory = True
+        name, requires_logging_directory = "tensorboard", True
 
         def __init__(self, run_name: str, logging_dir: Path) -> None:
             seen.append((run_name, logging_dir))
@@ -237,17 +238,15 @@ def test_curves_go_to_the_loggers_of_accelerate(place, built_once, tmp_path, mon
 
     folder = built_once("family_llama", lambda root: make_family("llama", root / "llama")) / "llama"
     monkeypatch.setitem(tracking.LOGGER_TYPE_TO_CLASS, "tensorboard", Recorder)
-    monkeypatch.setattr(tracking, "get_available_trackers", lambda: ["tensorboard"])
+    monkeypatch.setattr(tracking, "get_available_trackers", lambda: [LoggerType.TENSORBOARD])
     run(place, tmp_path / "out", folder, max_steps=2, report_to=["tensorboard"], validation_samples=2)
     assert seen[:2] == [("distill.train", tmp_path / "out" / "curves"), "start"]
     assert [entry[0] for entry in seen[2:-1]] == [0, 1, 2, 2]
     assert {"loss", "learning_rate", "speed/tokens_per_s"} <= seen[3][1].keys()
     assert "validation/loss" in seen[2][1]
     assert seen[-1] == "finish"
-    with pytest.raises(EnvironmentMissing, match=r"logger is not installed.*wandb.*pip install wandb"):
+    with pytest.raises(EnvironmentMissing, match=r"not installed.*wandb.*tensorboard.*pip install wandb"):
         run(place, tmp_path / "other", folder, max_steps=1, report_to=["wandb"])
-    with pytest.raises(ConfigError, match=r"no such logger.*paper.*tensorboard"):
-        run(place, tmp_path / "third", folder, max_steps=1, report_to=["paper"])
 
 
 @pytest.mark.slow

@@ -19,10 +19,10 @@ from cosfly.llm.student_chat import CHAT_FORMAT_FILE
 from distill.inference import merge
 from distill.inference import stage as infer
 from distill.schema import Sample, open_split, resolve_trees
-from distill.student.checkpoint import ADAPTER_FACTS
 from distill.student.generate import generate
 from distill.student.model import load_student
 from distill.student.random_student import make_tiny_student
+from distill.student.saving import ADAPTER_FACTS
 from specimens import make_playback_tree
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -32,12 +32,13 @@ from cosfly.runtime.errors import ConfigError, InputError
 from distill.inference import stage as infer
 from distill.student import model as student
 from distill.student.chat import IGNORED, load_pictures, padded
-from distill.student.checkpoint import Progress, load_checkpoint, newest_checkpoint
 from distill.student.random_student import END_OF_TURN
 from distill.training import fit
 from distill.training import stage as train
-from distill.training.fit import Validation, judged
+from distill.training.checkpoints import Progress, load_checkpoint, newest_checkpoint
+from distill.training.fit import judged
 from distill.training.settings import Steps, TrainConfig
+from distill.training.validation import Validation
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -152,9 +153,6 @@ def test_stopped_and_continued_is_the_same(place, tmp_path):
     assert not (out / "manifest.json").exists()
     with open(out / "log.jsonl", "a") as file:
         file.write('{"step": 9, "lo')
-    damaged = shutil.copytree(out / "checkpoints/step_00000006", out / "checkpoints/step_00000007")
-    moments = damaged / "optimizer.safetensors"
-    moments.write_bytes(moments.read_bytes()[:-7])
     run(place, out, **settings)
     run(place, whole, **settings)
     assert log_of(out) == log_of(whole)
@@ -220,10 +218,6 @@ def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path, monkeyp
     run(place, out, **settings)  # it has ended: nothing is done again
     assert json.loads((out / "manifest.json").read_text())["steps"] == 4
     assert next(losses) == 0.5
-    (out / "manifest.json").unlink()
-    best.write_bytes(best.read_bytes()[:-7])
-    with pytest.raises(InputError, match=r"best validation is damaged.*weights\.safetensors"):
-        run(place, out, **settings)
 
 
 @pytest.mark.slow
@@ -253,8 +247,7 @@ def test_the_best_is_who_decides_best_and_patience_ends():
 
 @pytest.mark.slow
 def test_a_picture_that_does_not_decode_costs_its_samples(place, tmp_path):
-    """Its header is right, so only the step that needs it finds out; the others are learnt from, and once more the
-    same."""
+    """The other samples are learnt from, and again the same."""
     tree = shutil.copytree(place / "tree", tmp_path / "tree")
     sample = samples_of(place)[0]
     path = tree / sample.images[0]
@@ -320,7 +313,7 @@ def test_workers_end_with_a_training_that_was_killed(tmp_path):
     wait_until(lambda: not any(map(is_running, workers)))
 
 
-def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path):
+def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path, caplog):
     good = samples_of(place)
     long = good[0].model_copy(update={"sample_id": "long", "answer": "tree " * 5000})
     spoken = good[1].model_copy(update={"sample_id": "spoken", "answer": f"{good[1].answer}<|im_end|>"})
@@ -331,8 +324,7 @@ def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path):
     dataset = write_set(tmp_path / "set", splits, [place / "tree"])
     run(place, tmp_path / "out", dataset=dataset, max_steps=1)
     counts = json.loads((tmp_path / "out" / "manifest.json").read_text())["counts"]
-    assert counts["dropped"] == {"special_token": 2, "too_long": 1, "unfit_picture": 1}
+    assert counts["dropped"] == {"special_token": 2, "too_long": 1, "unreadable_picture": 1}
     assert (counts["kept"], counts["input"]) == (len(good), len(good) + 4)
-    told = (tmp_path / "out" / "preflight.json").read_text()
-    assert "long/en" in told or "long/zh" in told
-    assert "at most 4096" in told
+    assert "the first one is long/" in caplog.text
+    assert "at most 4096" in caplog.text

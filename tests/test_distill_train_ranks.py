@@ -14,9 +14,6 @@ from later import safetensors
 from simulator_serving import free_port
 from specimens_students import TWELVE, log_of, losses_of
 
-from cosfly.runtime.errors import ConfigError, InputError
-from distill.training.ranks import Ranks, joined
-
 # A usual rate: with one that makes a student learn in 12 steps, rounding grows beyond 1e-5 within few of them.
 SETTINGS = {**TWELVE, "learning_rate": 1e-3, "validation_answers": True, "max_new_tokens": 4}
 
@@ -58,19 +55,6 @@ def start(place: Path, out: Path, size: int, program: Sequence[str] = ("-m", "co
 
 def finish(processes: list[subprocess.Popen]) -> list[int]:
     return [process.wait(timeout=180) for process in processes]
-
-
-def test_one_process_needs_no_group(monkeypatch):
-    monkeypatch.delenv("WORLD_SIZE", raising=False)
-    with joined("cpu") as ranks:
-        assert ranks == Ranks(0, 1, "cpu")
-        assert ranks.total([1.0, 2.0]) == [1.0, 2.0]
-        assert ranks.gathered("a") == ["a"]
-        with pytest.raises(InputError):
-            ranks.first_does(lambda: (_ for _ in ()).throw(InputError("no")))
-    monkeypatch.setenv("WORLD_SIZE", "two")
-    with pytest.raises(ConfigError, match="WORLD_SIZE"), joined("cpu"):
-        pass
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +15,7 @@ from cosfly.cli.options import STAGE, Job, SettingOption, command
 options.add_group("distill", "Train a small student: training set, LoRA, inference, evaluation.")
 
 Dataset = Annotated[Path, Option(help="Training set: the output of `distill prepare`.")]
-STUDENTS = "Model folder, repository such as Qwen/Qwen3.5-2B, or random weights: tiny, tiny:small, tiny:medium, random."
+STUDENTS = "Model folder, GGUF file, repository such as Qwen/Qwen3.5-2B, or random weights: tiny, random."
 JUDGED = "captions.jsonl of `caption --teacher student:PATH`, one per tree; repeat it."
 LIMIT = SettingOption("distill.prepare.limit", "Windows in all splits, chosen at random; 0 for all.", int)
 
@@ -57,10 +58,8 @@ def train(
     data: options.Trees = None,
 ) -> None:
     """Train a student, by LoRA or in full, in one process or many (torchrun); resume from its last checkpoint."""
-    from distill.training.ranks import is_first_process
-
     product = job.call("distill.training.stage", job.cfg.distill.train, dataset, job.trees(data), student, out)
-    if is_first_process():
+    if os.environ.get("RANK", "0") == "0":  # the first of the processes that `torchrun` started
         typer.echo(product)
 
 

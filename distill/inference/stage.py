@@ -7,16 +7,17 @@ import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field
 
+from cosfly.formats.places import flight_of
 from cosfly.formats.predictions import PREDICTIONS, Split
 from cosfly.llm.answer_text import answer_schema
-from cosfly.llm.answers import Answer, AnswerBook, KeptAnswers, answer_key
+from cosfly.llm.answers import AnswerBook, KeptAnswers, answer_key
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import STOP_AFTER_FAILURES, Engine, NoAnswer, Request, started
 from cosfly.llm.student_chat import (
@@ -30,14 +31,15 @@ from cosfly.llm.vllm_engine import VllmConfig, VllmEngine
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.console import Advance, progress_bar
 from cosfly.runtime.errors import ConfigError, InputError, TeacherError
-from cosfly.runtime.io import sha256_bytes
-from cosfly.runtime.run_dir import Resume, StageFolder, read_manifest
-from distill.inference.local import AnswerSchemas, LocalAnswers
-from distill.inference.outcome import ANSWERS, OpenFlights, Results, SampleOutcome, failed, writing_results
+from cosfly.runtime.io import atomic_file, sha256_bytes
+from cosfly.runtime.json_io import dump_json
+from cosfly.runtime.run_dir import Resume, StageFolder, read_manifest, write_failures
+from distill.inference.local import LocalAnswers, schema_matchers
+from distill.inference.outcome import Results, SampleOutcome, failed
 from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
 from distill.student.chat import load_pictures
-from distill.student.checkpoint import read_adapter_facts
 from distill.student.model import Device, load_student, require, student_path, weight_files
+from distill.student.saving import read_adapter_facts
 
 log = logging.getLogger(__name__)
 
@@ -56,52 +58,39 @@ def make_request(
 
 
 class EngineAnswers:
-    """One run of an engine over samples."""
+    """An engine that answers samples."""
 
-    def __init__(
-        self,
-        engine: Engine,
-        book: AnswerBook,
-        trees: Mapping[str, Path],
-        sampling: StudentEndpointConfig,
-        *,
-        max_pixels: int,
-        in_flight: int,
-    ) -> None:
+    def __init__(self, engine: Engine, book: AnswerBook, inputs: Inputs, cfg: InferConfig) -> None:
         """
         Args:
-            engine: started. max_pixels: most of a picture; 0: all. in_flight: most at once.
+            engine: started.
         """
-        self.engine, self.book, self.trees, self.sampling = engine, book, trees, sampling
-        self.max_pixels, self._most = max_pixels, in_flight
-        self._slots = asyncio.Semaphore(in_flight)
+        self.engine, self.book, self.trees, self.sampling = engine, book, inputs.trees, cfg.sampling
+        self.max_pixels = cfg.max_pixels or (inputs.taught_pixels if cfg.engine == "vllm" else 0)
+        self._most = cfg.endpoint.concurrency if cfg.engine == "endpoint" else cfg.vllm.batch
+        self._slots = asyncio.Semaphore(self._most)
         self._kept = KeptAnswers(engine, book)
-        self._flights = OpenFlights(book)
         self._failed_in_row = 0
 
     async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
-        """Yield what becomes of each sample, in their order; `advance` is told of them as they come."""
+        """Yield the outcome of each sample, in their order; `advance` is called for each when it is there."""
         waiting: deque[asyncio.Task[SampleOutcome]] = deque()
         try:
             for sample in samples:
-                waiting.append(asyncio.create_task(self._asked(sample, advance)))
+                waiting.append(asyncio.create_task(self._ask(sample, advance)))
                 if len(waiting) >= WAITING * self._most:
-                    yield await self._next(waiting)
+                    yield await waiting[0]
+                    waiting.popleft()
             while waiting:
-                yield await self._next(waiting)
+                yield await waiting[0]
+                waiting.popleft()
         finally:
             for task in waiting:
                 task.cancel()
             await asyncio.gather(*waiting, return_exceptions=True)
 
-    async def _next(self, waiting: deque[asyncio.Task[SampleOutcome]]) -> SampleOutcome:
-        answered = await waiting[0]
-        waiting.popleft()
-        self._flights.done(answered.sample)
-        return answered
-
-    async def _asked(self, sample: Sample, advance: Advance) -> SampleOutcome:
-        flight = self._flights.begun(sample)
+    async def _ask(self, sample: Sample, advance: Advance) -> SampleOutcome:
+        flight = flight_of(sample.sample_id)
         async with self._slots:
             try:
                 how = self.sampling, self.max_pixels
@@ -116,7 +105,7 @@ class EngineAnswers:
                 advance(1)
         self._failed_in_row = 0
         found = self.book.get(flight, answer_key(self.engine.model, request))
-        assert isinstance(found, Answer), "what was asked is kept"
+        assert found is not None, "the answer was recorded"
         return SampleOutcome(sample, found, is_new=not reply.is_kept)
 
     def _note_failure(self, error: NoAnswer) -> None:
@@ -130,7 +119,7 @@ class EngineAnswers:
 
 
 STAGE = "distill.infer"
-FEATURE_MEMORY_GB = 16.0  # for features of pictures; what has no room is computed each time
+ANSWERS = "answers"  # the folder of journals
 
 
 class InferConfig(Config):
@@ -190,24 +179,6 @@ class Inputs:
         return name if self.adapter is None else f"{name}+{self.adapter.absolute().parent.name}"
 
 
-@contextlib.asynccontextmanager
-async def _answering(
-    cfg: InferConfig, inputs: Inputs, book: AnswerBook, advance: Advance
-) -> AsyncIterator[AsyncGenerator[SampleOutcome, None]]:
-    """Start who answers; gives what becomes of the samples, in their order."""
-    if cfg.engine == "transformers":
-        with local_answers(cfg, inputs, book) as local:
-            yield local.answers(inputs.samples, advance)
-        return
-    engine = _make_engine(cfg, inputs)
-    in_flight = cfg.endpoint.concurrency if cfg.engine == "endpoint" else cfg.vllm.batch
-    async with started(engine):
-        max_pixels = cfg.max_pixels or (inputs.taught_pixels if cfg.engine == "vllm" else 0)
-        how: Any = {"max_pixels": max_pixels, "in_flight": in_flight}
-        asking = EngineAnswers(engine, book, inputs.trees, cfg.sampling, **how)
-        yield asking.answers(inputs.samples, advance)
-
-
 def local_answers(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAnswers:
     model = Path(inputs.model)
     student = load_student(model, device=cfg.device, adapter=inputs.adapter, allow_code=cfg.allow_code)
@@ -222,8 +193,7 @@ def local_answers(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAn
         batch_size=cfg.batch_size,
         max_tokens=cfg.max_new_tokens,
         max_pixels=cfg.max_pixels or inputs.taught_pixels,
-        constrain=AnswerSchemas(student, place) if cfg.constrained else None,
-        feature_bytes=int(FEATURE_MEMORY_GB * 1e9),
+        matchers_of=schema_matchers(student, place) if cfg.constrained else None,
     )
 
 
@@ -306,34 +276,32 @@ def run(
         fix = "pass --set distill.infer.split=val, or prepare more pedestrian trajectories"
         raise InputError("the split is empty", where=dataset, got=cfg.split, fix=fix)
     samples = split[: cfg.max_samples] if cfg.max_samples else split
-    results = _answer_all(cfg, Inputs(samples, trees, model, adapter), out)
+    given = Inputs(samples, trees, model, adapter)
+    start_s = time.monotonic()
+    name = str(cfg.endpoint.model) if cfg.engine == "endpoint" else given.name
+    results = asyncio.run(_answer_all(cfg, given, out, name))
+    speed = {"seconds": round(time.monotonic() - start_s, 3), **results.new}
     outputs = [out / PREDICTIONS, *sorted((out / ANSWERS).glob("*.jsonl"))]
-    stage.finish(outputs, results.tally, **facts, model=results.model, parsed=results.num_parsed, speed=results.speed)
+    stage.finish(outputs, results.tally, **facts, model=name, parsed=results.num_parsed, speed=speed)
     return out / PREDICTIONS
 
 
-def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path) -> Results:
-    """Have all samples answered and write what came of them."""
-    try:
-        return asyncio.run(_write_answers(cfg, inputs, out))
-    except Exception as error:  # torch's class has no name here until torch is loaded; all others go on
-        if type(error).__name__ != "OutOfMemoryError" or not type(error).__module__.startswith("torch"):
-            raise
-        got = f"batch_size {cfg.batch_size}: {str(error)[:120]}"
-    where, fix = "distill.infer.batch_size", "lower batch_size or max_pixels"
-    raise ConfigError("the memory of the accelerator is full", where=where, got=got, fix=fix)
-
-
-async def _write_answers(cfg: InferConfig, inputs: Inputs, out: Path) -> Results:
-    begun_s = time.monotonic()
-    name = str(cfg.endpoint.model) if cfg.engine == "endpoint" else inputs.name
-    with AnswerBook(out / ANSWERS) as book, progress_bar(STAGE, total=len(inputs.samples)) as advance:
-        async with _answering(cfg, inputs, book, advance) as answers:
-            started_s = time.monotonic()
-            with writing_results(out, cfg.split, name) as results:
-                async with contextlib.aclosing(answers) as each:
-                    async for answered in each:
-                        results.add(answered)
-            times_s = {"loading_s": started_s - begun_s, "seconds": time.monotonic() - started_s}
-            results.speed = {**{name: round(time_s, 3) for name, time_s in times_s.items()}, **results.new}
+async def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path, model: str) -> Results:
+    """Answer all samples, and write a record of each and the failures."""
+    results = Results(cfg.split, model)
+    async with contextlib.AsyncExitStack() as stack:
+        book = stack.enter_context(AnswerBook(out / ANSWERS))
+        advance = stack.enter_context(progress_bar(STAGE, total=len(inputs.samples)))
+        answering: LocalAnswers | EngineAnswers
+        if cfg.engine == "transformers":
+            answering = local_answers(cfg, inputs, book)
+        else:
+            engine = _make_engine(cfg, inputs)
+            await stack.enter_async_context(started(engine))
+            answering = EngineAnswers(engine, book, inputs, cfg)
+        outcomes = await stack.enter_async_context(contextlib.aclosing(answering.answers(inputs.samples, advance)))
+        with atomic_file(out / PREDICTIONS) as file:
+            async for outcome in outcomes:
+                file.write((dump_json(results.add(outcome).model_dump(mode="json")) + "\n").encode())
+    write_failures(out / "failures.jsonl", results.failures)
     return results

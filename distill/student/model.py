@@ -29,6 +29,7 @@ HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
 MODEL_FILES = ["*.json", "*.safetensors", "*.jinja", "*.txt", "*.model"]  # of a repository; none of them is code
 GGUF = ".gguf"
 TEMPLATE = "chat_template.jinja"
+FAST_FAMILIES = {"qwen3_5": "distill.student.qwen3_5"}  # families with faster code of ours
 Device = Literal["auto", "cpu", "cuda"]
 Dtype = Literal["auto", "float32", "bfloat16"]
 
@@ -73,11 +74,6 @@ class Student(Processor):
     def width(self) -> int:
         """Width of the language model."""
         return int(self.core.config.get_text_config().hidden_size)
-
-    @property
-    def has_image_features(self) -> bool:
-        """Whether pictures can be encoded apart from the language model, so that each is encoded once."""
-        return hasattr(self.core.base_model, "get_image_features")
 
     def vision_modules(self) -> list[Any]:
         """Return the parts of the model that are not its language model and not its output head."""
@@ -343,7 +339,6 @@ def load_student(
             if not (adapter / "adapter_model.safetensors").is_file():
                 raise InputError("the folder is not an adapter", where=adapter, expected="adapter_model.safetensors")
             model = PeftModel.from_pretrained(model, adapter)
-            check_adapter(model, adapter)
     parts = processor.tokenizer, processor.library, processor.picture_token_id, processor.template
     student = Student(*parts, model=model, device=device_name, dtype=computed)
     known, most = len(student.tokenizer), student.core.get_input_embeddings().weight.shape[0]
@@ -358,23 +353,3 @@ def load_student(
     if family is not None and device_name == "cuda":
         family.fuse_norms(student.core)
     return student
-
-
-def adapter_tensors(adapter: Path) -> list[str]:
-    """Return the names of the tensors of an adapter."""
-    from safetensors import safe_open
-
-    with loading_errors("adapter", adapter), safe_open(adapter / "adapter_model.safetensors", framework="pt") as file:
-        return list(file.keys())
-
-
-def check_adapter(model: Any, adapter: Path) -> None:
-    """Check that each tensor of an adapter has its layer in the model, because peft ignores those without one."""
-    found = len(adapter_tensors(adapter))
-    wanted = sum("lora_" in name for name, _ in model.named_parameters())
-    if found != wanted:
-        words, fix = "the base model lacks a layer that the adapter changes", "pass the base model of this adapter"
-        raise InputError(words, where=adapter, got=f"{found} tensors", expected=f"{wanted}", fix=fix)
-
-
-FAST_FAMILIES = {"qwen3_5": "distill.student.qwen3_5"}  # families with faster code of ours

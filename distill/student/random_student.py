@@ -1,8 +1,5 @@
-"""Students of random weights in Qwen3.5's structure, from 0.3 million parameters up, with a tokenizer trained on a data
-set.
-
-So all of distillation runs anywhere, and experiments can ask what a student learns that knows nothing before.
-"""
+"""Students of random weights in Qwen3.5's structure, from 0.3 million parameters up, with a tokenizer trained on the
+training set: for a try on a laptop, and for experiments with a student that knows nothing before."""
 
 from __future__ import annotations
 
@@ -18,11 +15,11 @@ from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_folder
 from cosfly.runtime.seeding import rng_for
-from distill.student.checkpoint import disk_errors
 from distill.student.model import quiet_transformers, require
+from distill.student.saving import writing_errors
 
 END_OF_TURN, IMAGE_TOKEN = "<|im_end|>", "<|image_pad|>"
-TINY, RANDOM = "tiny", "random"  # what `--student` may say beside folders and names of repositories
+TINY, RANDOM = "tiny", "random"  # values of `--student` beside folders and names of repositories
 _CHAT_TEMPLATE = (
     "{%- for m in messages %}{{ '<|im_start|>' + m.role + '\n' }}"
     "{%- if m.content is string %}{{ m.content }}"
@@ -49,45 +46,29 @@ WIDE = 512
 
 
 class RandomStudent(Config):
-    """Settings of a student of random weights."""
+    """Size of a student of random weights. The vision tower has half its width and half its number of layers."""
 
-    width: int = Field(64, ge=32, multiple_of=32, description="width of the language model")
+    width: int = Field(64, ge=64, multiple_of=64, description="width of the language model")
     layers: int = Field(
         4, ge=4, multiple_of=4, description="layers of the language model; three of four have linear attention"
     )
-    vision_width: int = Field(32, ge=32, multiple_of=32, description="width of the vision tower")
-    vision_layers: int = Field(2, ge=1, description="layers of the vision tower")
-    vocabulary: int = Field(800, ge=300, description="number of tokens of the tokenizer, without special tokens")
 
-
-PRESETS = {
-    TINY: RandomStudent(),
-    f"{TINY}:small": RandomStudent(width=256, layers=8, vision_width=128, vision_layers=4, vocabulary=4096),
-    f"{TINY}:medium": RandomStudent(width=512, layers=12, vision_width=256, vision_layers=8, vocabulary=8192),
-}
+    @property
+    def vocabulary(self) -> int:
+        """Number of tokens of the tokenizer, without special tokens."""
+        return max(800, 8 * self.width)
 
 
 def random_student_settings(name: str, given: RandomStudent) -> RandomStudent | None:
-    """Return the settings of a student of random weights: of a preset's name, or `given` for `random`; None for any
-    other name.
-    """
-    if name == RANDOM:
-        return given
-    if name.startswith(f"{TINY}:") and name not in PRESETS:
-        raise InputError(
-            "there is no random student of this name",
-            where="--student",
-            got=name,
-            expected=", ".join([*PRESETS, RANDOM]),
-        )
-    return PRESETS.get(name)
+    """Return the size of a student of random weights: of `tiny`, or the given one of `random`; None for other names."""
+    return {TINY: RandomStudent(), RANDOM: given}.get(name)
 
 
 def make_tiny_student(folder: Path, seed: int = 0) -> Path:
     """Write a student of about 0.3 million parameters that overfits a handful of captions within minutes on a CPU."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError("the folder is not empty", where=folder, fix="choose another --out")
-    return make_random_student(folder, PRESETS[TINY], seed)
+    return make_random_student(folder, RandomStudent(), seed)
 
 
 def make_random_student(folder: Path, cfg: RandomStudent, seed: int, texts: Iterable[str] = ()) -> Path:
@@ -115,7 +96,7 @@ def make_random_student(folder: Path, cfg: RandomStudent, seed: int, texts: Iter
         # sqrt(width), hence the loss by 0.29 nats in the smallest; twice the length lets it be sure of an answer.
         with torch.no_grad():
             model.model.language_model.embed_tokens.weight.mul_(2.0)
-    with atomic_folder(folder) as partial, disk_errors(partial):
+    with atomic_folder(folder) as partial, writing_errors(partial):
         model.save_pretrained(partial)
         tokenizer.save_pretrained(partial)
         image_processor.save_pretrained(partial)
@@ -174,10 +155,10 @@ def model_config(cfg: RandomStudent, tokenizer: Any) -> Any:
         "pad_token_id": ids["<|endoftext|>"],
     }
     vision = {
-        "depth": cfg.vision_layers,
-        "hidden_size": cfg.vision_width,
-        "intermediate_size": 2 * cfg.vision_width,
-        "num_heads": max(2, cfg.vision_width // 64),
+        "depth": cfg.layers // 2,
+        "hidden_size": cfg.width // 2,
+        "intermediate_size": cfg.width,
+        "num_heads": max(2, cfg.width // 128),
         "out_hidden_size": cfg.width,
         "num_position_embeddings": 64,
     }

@@ -1,371 +1,192 @@
-"""Work that is done ahead by worker processes: samples are counted and checked, steps made ready."""
+"""Data of a training: the summary of a split, tokens and pictures by worker processes, features of pictures on disk."""
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import os
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from cosfly.formats.frames import frame_path
 from cosfly.formats.places import flight_of
 from cosfly.runtime.console import progress_bar
-from cosfly.runtime.errors import CosflyError, EnvironmentMissing, InputError
-from cosfly.runtime.io import inside
+from cosfly.runtime.errors import CosflyError
 from cosfly.runtime.limits import num_cpus
 from cosfly.runtime.worker import end_with_parent
-from cosfly.viz.frame_views import VIEW_FILES
 from distill.schema import Sample
-from distill.student.chat import PLAIN_WEIGHTS, AnswerWeights, EncodedSample, Processor, image_size, special_token_in
-from distill.student.features import (
-    FramePicture,
-    PictureData,
-    PictureReader,
-    VisionFeatures,
-    pack,
-    pictures_of,
-    unpack,
-)
-from distill.training.ranks import Ranks
+from distill.student.chat import PLAIN_WEIGHTS, AnswerWeights, EncodedSample, Processor, special_token_in
+from distill.student.features import FramePicture, PictureReader, Tensors, encode, pictures_of
+from distill.student.model import Student
+from distill.student.saving import save_tensors
+from distill.training.settings import Steps, TrainConfig
 
-log = logging.getLogger(__name__)
-
-ORDERS_AHEAD = 2  # for each worker
 MOST_WORKERS = 16
+SAMPLES_AT_ONCE = 64  # samples that a worker counts at a time
+PICTURES_PER_FILE = 256
+TOO_LONG, SPECIAL_TOKEN, UNREADABLE = "too_long", "special_token", "unreadable_picture"
 
-OrderT = TypeVar("OrderT")
+ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
 
 
 def num_workers(wanted: int) -> int:
-    """Return the number of workers: the wanted one; if it is negative, one per CPU, at most MOST_WORKERS."""
+    """Return the number of worker processes: one per CPU, at most MOST_WORKERS, if the wanted number is negative."""
     return wanted if wanted >= 0 else min(MOST_WORKERS, num_cpus())
 
 
 @dataclass(frozen=True)
-class _Work(Generic[OrderT, ResultT]):
-    """What torch's loader takes for a data set whose items are named by orders. An error comes back as a value: the
-    loader would raise another in its place."""
+class _Work:
+    """A function as a data set whose indices are its arguments. An error is returned, because the loader would raise
+    another one in its place."""
 
-    function: Callable[[OrderT], ResultT]
+    function: Callable[[Any], Any]
 
-    def __getitem__(self, order: OrderT) -> ResultT | CosflyError:
+    def __getitem__(self, item: Any) -> Any:
         try:
-            return self.function(order)
+            return self.function(item)
         except CosflyError as error:
             return error
 
 
-def _begin_worker(parent_pid: int, _: int) -> None:
+def _start_worker(parent_pid: int, _: int) -> None:
     import cv2
     import torch
 
-    # Else one that has something to hand over waits for ever, and with it the lock of the folder.
-    end_with_parent(parent_pid)
+    end_with_parent(parent_pid)  # a worker with a result would wait for a killed parent, and hold the folder's lock
     torch.set_num_threads(1)
     cv2.setNumThreads(0)
 
 
-def _as_it_is(given: Any) -> Any:
-    return given
+def _unchanged(value: Any) -> Any:
+    return value
 
 
-def in_order(function: Callable[[OrderT], ResultT], orders: Iterable[OrderT], workers: int) -> Iterator[ResultT]:
-    """Yield function(order) for each order, in their order; an order is taken only a few before it is its turn.
-
-    Args:
-        workers: processes; 0: everything is done here.
-    """
+def in_order(function: Callable[[ItemT], ResultT], items: Iterable[ItemT], workers: int) -> Iterator[ResultT]:
+    """Yield function(item) for each item, in order, computed ahead by `workers` processes; 0: in this process."""
     import torch
 
-    os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")  # threads of its own would not survive the fork
+    os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")  # threads do not survive the fork
     loader: Any = torch.utils.data.DataLoader(
         _Work(function),  # type: ignore[arg-type]  # all that the loader asks of a data set
         batch_size=None,
-        sampler=orders,
+        sampler=items,
         num_workers=workers,
-        prefetch_factor=ORDERS_AHEAD if workers else None,
-        worker_init_fn=partial(_begin_worker, os.getpid()),
+        worker_init_fn=partial(_start_worker, os.getpid()),
         multiprocessing_context="fork" if workers else None,
-        collate_fn=_as_it_is,
+        collate_fn=_unchanged,
     )
-    with reader_errors():
-        for given in loader:
-            if isinstance(given, CosflyError):
-                raise given
-            yield given
+    for result in loader:
+        if isinstance(result, CosflyError):
+            raise result
+        yield result
 
 
-@contextlib.contextmanager
-def reader_errors() -> Iterator[None]:
-    """Turn torch's word that a process which reads samples was killed into an error for people.
-
-    torch says it from a signal's handler, wherever this process then is, also in the middle of a step.
-    """
-    try:
-        yield
-    except RuntimeError as error:
-        if "DataLoader worker" not in str(error):
-            raise
-        fix = "run the same command again; if memory (or --shm-size) is short, lower distill.train.data_workers"
-        words, got = "the system killed a process that reads samples", str(error).splitlines()[0][:160]
-        raise EnvironmentMissing(words, got=got, fix=fix) from error
+# --- samples ----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Row:
-    """A sample ready to be computed, but for the features of its pictures."""
+class SampleTokens(NamedTuple):
+    """What the summary of a split keeps of a sample. place: its index in the split."""
 
-    encoded: EncodedSample
+    place: int
+    key: str
+    num_tokens: int
+    num_answer_tokens: int
+    decision: str
     pictures: tuple[FramePicture, ...]
-    sample: Sample
+    skip_reason: str = ""
+    skip_detail: str = ""
 
 
 @dataclass(frozen=True)
-class Order:
-    """What a worker is to make: rows of samples, and pictures that are not known yet."""
-
-    step: int
-    samples: Sequence[int]
-    pictures: Sequence[FramePicture]
-
-
-@dataclass(frozen=True)
-class StepData:
-    """What a worker made. packed: the pictures (`unpack`). unreadable: picture -> why it cannot be read."""
-
-    step: int
-    rows: list[Row]
-    packed: Any
-    unreadable: dict[FramePicture, str]
-
-
-@dataclass(frozen=True)
-class Maker:
-    """Makes what is ordered; goes to worker processes."""
-
-    samples: Sequence[Sample]
-    reader: PictureReader
-    weights: AnswerWeights
-
-    def __call__(self, order: Order) -> StepData:
-        samples, reader = [self.samples[index] for index in order.samples], self.reader
-        encode = partial(reader.processor.encode, max_pixels=reader.max_pixels, weights=self.weights)
-        rows = [Row(encode(sample), tuple(pictures_of(sample)), sample) for sample in samples]
-        loaded: list[PictureData] = []
-        unreadable: dict[FramePicture, str] = {}
-        for picture in order.pictures:
-            try:
-                loaded.append(self.reader.read(picture))
-            except InputError as error:
-                unreadable[picture] = str(error)
-        return StepData(order.step, rows, pack(loaded), unreadable)
-
-
-@dataclass(frozen=True)
-class ReadyStep:
-    """The rows of a step. left_out: key of a sample whose pictures cannot be read -> why."""
-
-    step: int
-    rows: list[Row]
-    left_out: dict[str, str]
-
-
-@dataclass
-class Supply:
-    """Gives the rows of one step after the other, features of their pictures at hand, and measures how long it was
-    waited for."""
-
-    features: VisionFeatures
-    reader: PictureReader
-    workers: int
-    weights: AnswerWeights = PLAIN_WEIGHTS
-    waited_s: float = 0.0  # for the last step
-    _unreadable: dict[FramePicture, str] = field(default_factory=dict)
-
-    def steps(
-        self,
-        samples: Sequence[Sample],
-        pictures: Callable[[int], Sequence[FramePicture]],
-        shares: Iterable[tuple[int, Sequence[int]]],
-    ) -> Iterator[ReadyStep]:
-        """Yield what is ready for each (step, indices of samples).
-
-        Args:
-            pictures: gives the pictures of a sample by its index.
-        """
-        plan = self.features.plan()
-        orders = (
-            Order(step, indices, self.features.wanted(plan, (p for index in indices for p in pictures(index))))
-            for step, indices in shares
-        )
-        made_steps = in_order(Maker(samples, self.reader, self.weights), orders, self.workers)
-        begun_s = time.monotonic()
-        for made in made_steps:
-            self._unreadable |= made.unreadable
-            self.features.take(unpack(made.packed))
-            ready = ReadyStep(made.step, [], {})
-            for row in made.rows:
-                bad = next((picture for picture in row.pictures if picture in self._unreadable), None)
-                if bad is None:
-                    ready.rows.append(row)
-                else:
-                    ready.left_out[row.encoded.key] = self._unreadable[bad]
-            self.waited_s = time.monotonic() - begun_s
-            yield ready
-            self.features.end_step()
-            begun_s = time.monotonic()
-
-
-SAMPLES_AT_ONCE = 64  # what a worker is given
-TOO_LONG, SPECIAL_TOKEN, UNFIT_PICTURE = "too_long", "special_token", "unfit_picture"
-
-
-@dataclass
-class SampleCounts:
-    """What was seen of some samples, each picture once, so that a million samples take little. rows: (index, prompt,
-    answer tokens)."""
-
-    rows: list[tuple[int, int, int]] = field(default_factory=list)
-    of_samples: list[np.ndarray] = field(default_factory=list)  # places of the pictures of each row
-    places: dict[FramePicture, int] = field(default_factory=dict)
-    decisions: Counter[str] = field(default_factory=Counter)
-    skipped: Counter[str] = field(default_factory=Counter)
-    examples: dict[str, tuple[int, str]] = field(default_factory=dict)  # reason -> index and words of the first
-
-    def places_of(self, pictures: Iterable[FramePicture]) -> np.ndarray:
-        return np.array([self.places.setdefault(picture, len(self.places)) for picture in pictures], np.int32)
-
-    def add(self, part: SampleCounts) -> None:
-        new_place = self.places_of(part.places)
-        self.of_samples += [new_place[places] for places in part.of_samples]
-        self.rows += part.rows
-        self.decisions += part.decisions
-        self.skipped += part.skipped
-        for reason, example in part.examples.items():
-            self.examples[reason] = min(example, self.examples.get(reason, example))
-
-
-@dataclass(frozen=True)
-class Counting:
-    """Looks at samples; goes to worker processes."""
+class Tokenizer:
+    """Tokenizes samples of a split by their indices, also in worker processes."""
 
     samples: Sequence[Sample]
     processor: Processor
-    trees: Mapping[str, Path]
-    max_tokens: int
     max_pixels: int
+    weights: AnswerWeights = PLAIN_WEIGHTS
 
-    def __call__(self, indices: Sequence[int]) -> SampleCounts:
-        seen, checked = SampleCounts(), dict[FramePicture, str]()
+    def __call__(self, indices: Sequence[int]) -> list[tuple[EncodedSample, Sample]]:
+        samples = [self.samples[index] for index in indices]
+        return [(self.processor.encode(sample, self.max_pixels, self.weights), sample) for sample in samples]
+
+    def count(self, indices: Sequence[int], max_tokens: int) -> list[SampleTokens]:
+        """Count the tokens of samples, and find those that cannot be used."""
+        found = []
         for index in indices:
-            sample = self.samples[index]
-            token = special_token_in(self.processor, sample)
-            row = None if token else self.processor.encode(sample, self.max_pixels)
-            if row is None:
+            sample, reason, detail, prompt, answer = self.samples[index], "", "", 0, 0
+            if token := special_token_in(self.processor, sample):
                 reason, detail = SPECIAL_TOKEN, f"a text contains {token}"
-            elif len(row) > self.max_tokens:
-                counts = f"{len(row.prompt_ids)} prompt + {len(row.answer_ids)} answer tokens"
-                reason, detail = TOO_LONG, f"{counts}, at most {self.max_tokens}"
-            elif detail := self._why_unfit(sample, checked):
-                reason = UNFIT_PICTURE
             else:
-                seen.rows.append((index, len(row.prompt_ids), len(row.answer_ids)))
-                seen.of_samples.append(seen.places_of(pictures_of(sample)))
-                seen.decisions[sample.decision] += 1
-                continue
-            seen.skipped[reason] += 1
-            seen.examples.setdefault(reason, (index, f"{sample.key}: {detail}"))
-        return seen
-
-    def _why_unfit(self, sample: Sample, checked: dict[FramePicture, str]) -> str:
-        """Compare the headers of the pictures' files with the prompt; the empty string: they fit."""
-        for picture in pictures_of(sample):
-            if picture not in checked:
-                checked[picture] = ""
-                try:
-                    path = frame_path(inside(self.trees[picture.run], picture.frame), VIEW_FILES[picture.view])
-                    sample.pictures.check_size(path, image_size(path))
-                except InputError as error:
-                    checked[picture] = str(error)
-            if checked[picture]:
-                return checked[picture]
-        return ""
+                encoded = self.processor.encode(sample, self.max_pixels)
+                prompt, answer = len(encoded.prompt_ids), len(encoded.answer_ids)
+                if prompt + answer > max_tokens:
+                    reason, detail = TOO_LONG, f"{prompt} prompt + {answer} answer tokens, at most {max_tokens}"
+            pictures = tuple(pictures_of(sample))
+            decision = sample.decision
+            found.append(SampleTokens(index, sample.key, prompt + answer, answer, decision, pictures, reason, detail))
+        return found
 
 
-@dataclass
-class Census:
-    """The samples of a split that are learnt from, and how many were left out for what reason.
+@dataclass(frozen=True)
+class DatasetSummary:
+    """The samples of a split that are used, by increasing index, and those that are skipped."""
 
-    indices (n,): their places in the split, increasing. prompt_tokens, answer_tokens (n,). examples: reason -> the
-    first sample left out.
-    """
-
-    indices: np.ndarray
-    prompt_tokens: np.ndarray
-    answer_tokens: np.ndarray
-    num_samples: int
-    decisions: Counter[str]
-    skipped: Counter[str]
-    examples: dict[str, str]
-    pictures: list[FramePicture]  # each once
-    _places: list[np.ndarray] = field(repr=False)  # of the pictures of each sample in `pictures`
+    used: list[SampleTokens]
+    skipped: list[SampleTokens]
 
     def __len__(self) -> int:
-        return len(self.indices)
+        return len(self.used)
 
     @property
-    def tokens(self) -> np.ndarray:
-        return self.prompt_tokens + self.answer_tokens
+    def lengths(self) -> np.ndarray:
+        """Tokens of each used sample, (n,) int64."""
+        return np.array([sample.num_tokens for sample in self.used], dtype=np.int64)
 
-    def pictures_of(self, index: int) -> list[FramePicture]:
-        """Return the pictures of the sample at a place of the split."""
-        return [self.pictures[place] for place in self._places[int(np.searchsorted(self.indices, index))]]
+    @property
+    def decisions(self) -> Counter[str]:
+        return Counter(sample.decision for sample in self.used)
+
+    @property
+    def skip_reasons(self) -> Counter[str]:
+        return Counter(sample.skip_reason for sample in self.skipped)
+
+    def without(self, unreadable: Mapping[FramePicture, str]) -> DatasetSummary:
+        """Skip the samples with a picture that cannot be read."""
+        used, skipped = [], [*self.skipped]
+        for sample in self.used:
+            bad = next((picture for picture in sample.pictures if picture in unreadable), None)
+            if bad is None:
+                used.append(sample)
+            else:
+                skipped.append(sample._replace(skip_reason=UNREADABLE, skip_detail=unreadable[bad]))
+        return DatasetSummary(used, skipped)
 
 
-def take_census(
-    samples: Sequence[Sample],
-    chosen: Sequence[int],
-    processor: Processor,
-    trees: Mapping[str, Path],
-    *,
-    max_tokens: int,
-    max_pixels: int,
-    workers: int,
-    ranks: Ranks,
-    label: str,
-) -> Census:
-    """Look at the chosen samples of a split; each process of the training takes its share."""
+def summarize(
+    tokenizer: Tokenizer, chosen: Sequence[int], max_tokens: int, *, workers: int, accelerator: Any, label: str
+) -> DatasetSummary:
+    """Count the tokens of the chosen samples of a split; each process of the training counts its share."""
+    from accelerate.utils import gather_object
+
     chunks = [chosen[start : start + SAMPLES_AT_ONCE] for start in range(0, len(chosen), SAMPLES_AT_ONCE)]
-    mine, counting = chunks[ranks.rank :: ranks.size], Counting(samples, processor, trees, max_tokens, max_pixels)
-    seen, whole = SampleCounts(), SampleCounts()
+    mine = chunks[accelerator.process_index :: accelerator.num_processes]
+    counted: list[SampleTokens] = []
     with progress_bar(label, total=sum(map(len, mine))) as advance:
-        for counts in in_order(counting, mine, max(0, min(workers, len(mine) - 1))):
-            seen.add(counts)
-            advance(len(counts.rows) + counts.skipped.total())
-    for part in ranks.gathered(seen):
-        whole.add(part)
-    rows = np.array(whole.rows, np.int64).reshape(-1, 3)
-    order = np.argsort(rows[:, 0])  # that of the split
-    return Census(
-        indices=rows[order, 0],
-        prompt_tokens=rows[order, 1],
-        answer_tokens=rows[order, 2],
-        num_samples=len(rows) + whole.skipped.total(),
-        decisions=whole.decisions,
-        skipped=whole.skipped,
-        examples={reason: words for reason, (_, words) in whole.examples.items()},
-        pictures=list(whole.places),
-        _places=[whole.of_samples[place] for place in order],
-    )
+        count = partial(tokenizer.count, max_tokens=max_tokens)
+        for part in in_order(count, mine, max(0, min(workers, len(mine) - 1))):
+            counted += part
+            advance(len(part))
+    known: dict[FramePicture, FramePicture] = {}  # equal pictures become one object
+    whole = [
+        sample._replace(pictures=tuple(known.setdefault(picture, picture) for picture in sample.pictures))
+        for sample in sorted(gather_object(counted))
+    ]
+    return DatasetSummary([s for s in whole if not s.skip_reason], [s for s in whole if s.skip_reason])
 
 
 def choose_over_all(samples: Sequence[Sample], count: int, rng: np.random.Generator) -> list[int]:
@@ -393,3 +214,103 @@ def _by_turns(queues: Sequence[Sequence]) -> list:
     """Take the first of each, then the second of each, and so on."""
     longest = max((len(queue) for queue in queues), default=0)
     return [queue[turn] for turn in range(longest) for queue in queues if turn < len(queue)]
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+class FeatureFiles:
+    """Features of all pictures of a training, in memory-mapped files that its processes share.
+
+    With a vision tower that is trained, the files have the inputs of the tower, which then encodes them at each use.
+    unreadable: picture -> why it cannot be read.
+    """
+
+    def __init__(self, folder: Path, pictures: Iterable[FramePicture]) -> None:
+        self.folder, self.pictures = folder, sorted(set(pictures))
+        self.unreadable: dict[FramePicture, str] = {}
+        self._tensors: dict[FramePicture, tuple[Any, str, list[str]]] = {}  # its file, prefix and names
+
+    def write(
+        self, student: Student, reader: PictureReader, workers: int, accelerator: Any, *, is_frozen: bool
+    ) -> None:
+        """Read and encode the pictures whose files do not exist yet, each process its share, and open all files."""
+        import torch
+
+        size = PICTURES_PER_FILE
+        files = {
+            self.folder / f"{start // size:06d}.safetensors": self.pictures[start : start + size]
+            for start in range(0, len(self.pictures), size)
+        }
+        self.folder.mkdir(parents=True, exist_ok=True)
+        share = list(files)[accelerator.process_index :: accelerator.num_processes]
+        missing = [path for path in share if not path.exists()]
+        wanted = [picture for path in missing for picture in files[path]]
+        read = in_order(reader.try_to_read, wanted, min(workers, len(wanted)))
+        with torch.no_grad(), progress_bar("distill.train: pictures", total=len(wanted)) as advance:
+            for path in missing:
+                found = {str(i): next(read) for i in range(len(files[path]))}
+                errors = {number: one for number, one in found.items() if isinstance(one, str)}
+                good = {number: one for number, one in found.items() if not isinstance(one, str)}
+                if is_frozen:
+                    good = dict(zip(good, encode(student, list(good.values())), strict=True))
+                tensors = {f"{number}/{name}": t for number, one in good.items() for name, t in one.items()}
+                save_tensors(path, tensors, errors)
+                advance(len(found))
+        accelerator.wait_for_everyone()
+        for path, pictures in files.items():
+            self._open(path, pictures)
+
+    def _open(self, path: Path, pictures: Sequence[FramePicture]) -> None:
+        from safetensors import safe_open
+
+        file = safe_open(path, framework="pt")
+        self.unreadable |= {pictures[int(number)]: words for number, words in (file.metadata() or {}).items()}
+        for key in list(file.keys()):
+            number, _, name = key.partition("/")
+            self._tensors.setdefault(pictures[int(number)], (file, number, []))[2].append(name)
+
+    def __getitem__(self, picture: FramePicture) -> Tensors:
+        file, number, names = self._tensors[picture]
+        return {name: file.get_tensor(f"{number}/{name}") for name in names}
+
+
+# --- all together -----------------------------------------------------------------------------------------------------
+
+
+Rows = Sequence[tuple[EncodedSample, Sample]]
+
+
+@dataclass
+class TrainingContext:
+    """A student, what it learns from and is validated on, and the processes of the training."""
+
+    student: Student
+    cfg: TrainConfig
+    seed: int
+    accelerator: Any
+    workers: int
+    train: tuple[Tokenizer, DatasetSummary]
+    val: tuple[Tokenizer, DatasetSummary]
+    features: FeatureFiles
+
+    def __post_init__(self) -> None:
+        self.steps = Steps.make(self.cfg, len(self.train[1]), self.seed)
+
+    def total(self, values: Sequence[float]) -> list[float]:
+        """Add up numbers over all processes."""
+        import torch
+
+        tensor = torch.tensor(values, dtype=torch.float64, device=self.student.device)
+        return self.accelerator.reduce(tensor, "sum").tolist()
+
+    def rows(self, split: tuple[Tokenizer, DatasetSummary], shares: Iterable[Sequence[int]]) -> Iterator[Rows]:
+        """Yield the rows of each share of the used samples of a split."""
+        tokenizer, summary = split
+        indices = ([summary.used[number].place for number in share] for share in shares)
+        return in_order(tokenizer, indices, self.workers)
+
+    def features_of(self, rows: Rows) -> list[Tensors]:
+        """Return the features of the pictures of rows, row after row."""
+        found = [self.features[picture] for _, sample in rows for picture in pictures_of(sample)]
+        return encode(self.student, found) if self.cfg.train_vision else found

@@ -14,7 +14,7 @@ from typing import Any
 
 from cosfly.runtime.errors import ConfigError
 from distill.student.chat import IGNORED, EncodedSample, padded
-from distill.student.features import Encoded, shown
+from distill.student.features import Tensors, shown
 from distill.student.model import Student
 
 
@@ -92,7 +92,7 @@ def output_head(student: Student) -> Any:
 
 
 def answer_loss(
-    student: Student, rows: Sequence[EncodedSample], pictures: Sequence[Encoded], chunk: int
+    student: Student, rows: Sequence[EncodedSample], pictures: Sequence[Tensors], chunk: int
 ) -> tuple[Any, Any]:
     """Run samples forward, padded on the right.
 

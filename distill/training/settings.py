@@ -18,8 +18,8 @@ from distill.student.random_student import RandomStudent
 
 STAGE = "distill.train"
 LOGIT_CHUNK = 512  # answer tokens whose logits exist at a time
-FEATURE_MEMORY_GB = 16.0  # for features of pictures, a process; what has no room is computed each time
 MAX_GRADIENT_NORM = 1.0  # gradients are scaled down to this norm
+WARMUP_FRACTION = 0.03  # share of the steps with a rising learning rate
 
 
 class TrainConfig(Config):
@@ -30,7 +30,7 @@ class TrainConfig(Config):
         "lora", description="lora: train small matrices next to frozen weights; full: train all weights"
     )
     train_vision: bool = Field(
-        False, description="with method full: also train the vision tower, whose features are then not cached"
+        False, description="with method full: also train the vision tower, which then encodes pictures at each use"
     )
     lora_rank: int = Field(16, ge=1, description="rank of the LoRA update")
     lora_alpha: ClassVar[float] = 32.0  # the LoRA update is multiplied by alpha / rank
@@ -39,7 +39,6 @@ class TrainConfig(Config):
     samples_per_step: int = Field(16, ge=1, description="samples of an optimizer step, over all processes")
     learning_rate: float = Field(1e-4, gt=0, description="peak learning rate of AdamW")
     schedule: Literal["cosine", "constant"] = Field("cosine", description="learning rate after the warm-up")
-    warmup_fraction: float = Field(0.03, ge=0, lt=1, description="share of the steps with a rising rate; 0: none")
     weight_decay: float = Field(0.0, ge=0, description="AdamW's decoupled weight decay")
     decision_weight: float = Field(
         20.0, gt=0, le=1000, description="weight of the decision's tokens in the loss; other tokens have weight 1"
@@ -132,7 +131,7 @@ def share_of(chosen: Sequence[int], lengths: np.ndarray, rank: int, num_ranks: i
 
 def learning_rate_at(cfg: TrainConfig, step: int, num_steps: int) -> float:
     """Return the learning rate of a step: a linear rise, then a half cosine to zero or a constant."""
-    warmup = math.ceil(cfg.warmup_fraction * num_steps)
+    warmup = math.ceil(WARMUP_FRACTION * num_steps)
     if step < warmup:
         return cfg.learning_rate * (step + 1) / warmup
     if cfg.schedule == "constant":

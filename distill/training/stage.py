@@ -1,42 +1,57 @@
-"""Training of a student on a training set: LoRA beside frozen weights, or all of them, in one process or many.
+"""Training of a student on a training set: LoRA beside frozen weights, or all weights, in one process or many.
 
-The loss counts answer tokens only, and nothing is ever cut: a sample that does not fit is left out and counted.
+The loss counts answer tokens only, and nothing is ever cut: a sample that does not fit is skipped and counted.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import re
-from collections import Counter
-from collections.abc import Iterable, Sequence
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from cosfly.formats.captions import Language, Place, Prompt
 from cosfly.formats.predictions import Split
 from cosfly.llm.student_chat import ChatFormat, FrameFormat, write_chat_format
-from cosfly.runtime.errors import InputError
+from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.runtime.io import atomic_folder, read_text
-from cosfly.runtime.json_io import write_json
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.runtime.seeding import rng_for
 from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
 from distill.student.chat import AnswerWeights
-from distill.student.checkpoint import ADAPTER_FACTS, Progress, adapter_facts, write_adapter_folder, write_model_folder
-from distill.student.features import PictureReader, VisionFeatures
-from distill.student.model import Student, is_hub_name, load_student, require, student_path, weight_files
+from distill.student.features import PictureReader
+from distill.student.model import Student, is_hub_name, load_student, pick_device, require, student_path, weight_files
 from distill.student.random_student import make_random_student, random_student_settings
-from distill.training.fit import LOG, Lesson, fit, seeded
-from distill.training.loading import Census, Supply, choose_over_all, num_workers, reader_errors, take_census
-from distill.training.preflight import GB, findings, memory_errors, tell
-from distill.training.ranks import Ranks, joined
-from distill.training.settings import FEATURE_MEMORY_GB, STAGE, TrainConfig
-from distill.training.trackers import trackers
+from distill.student.saving import write_adapter, write_model_folder
+from distill.training.checkpoints import newest_checkpoint
+from distill.training.checks import check_before_training
+from distill.training.fit import CHECKPOINTS, LOG, fit, seeded
+from distill.training.loading import (
+    FeatureFiles,
+    Tokenizer,
+    TrainingContext,
+    choose_over_all,
+    num_workers,
+    summarize,
+)
+from distill.training.settings import STAGE, TrainConfig
+
+log = logging.getLogger(__name__)
+
+TAUGHT: tuple[Split, ...] = ("train", "val")
+ADAPTER, MODEL, STUDENT, FEATURES = "adapter", "model", "student", "features"
+TOKENIZER_SAMPLES = 2000  # most samples that the tokenizer of a random student is trained on
+PATIENCE = timedelta(minutes=30)  # for the slowest process: loading weights, counting tokens, validation
+T = TypeVar("T")
 
 
 def taught_by(samples: Iterable[Sample], max_pixels: int) -> ChatFormat:
-    """Return what samples teach.
+    """Return the chat format of a training.
 
     Args:
         max_pixels: limit of a picture; 0: none.
@@ -62,14 +77,6 @@ def taught_by(samples: Iterable[Sample], max_pixels: int) -> ChatFormat:
     )
 
 
-log = logging.getLogger(__name__)
-
-TAUGHT: tuple[Split, ...] = ("train", "val")
-ADAPTER, MODEL, STUDENT, PREFLIGHT = "adapter", "model", "student", "preflight.json"
-UNREADABLE = "unreadable_picture"
-TOKENIZER_SAMPLES = 2000  # what the tokenizer of a student of random weights is trained on, at most
-
-
 def add_adapter(student: Student, cfg: TrainConfig, seed: int) -> Student:
     """Wrap the student's model with a fresh LoRA adapter; only the adapter can be trained."""
     from peft import LoraConfig, get_peft_model
@@ -83,8 +90,7 @@ def add_adapter(student: Student, cfg: TrainConfig, seed: int) -> Student:
     with seeded(student, seed, "adapter"):
         student.model = get_peft_model(student.model, lora)
     for module in student.model.modules():
-        # peft would keep a float32 copy of what each adapted layer is given; autocast converts where it is used
-        # instead.
+        # peft would keep a float32 copy of the input of each adapted layer; autocast converts where it is used instead.
         if hasattr(module, "cast_input_dtype_enabled"):
             module.cast_input_dtype_enabled = False
     return student
@@ -100,23 +106,18 @@ def target_modules(student: Student) -> str:
     return rf"{re.escape(prefix)}\.(.*\.)?({'|'.join(map(re.escape, last))})"
 
 
-def free_weights(student: Student, cfg: TrainConfig) -> Student:
-    """Let all weights learn but those of the vision tower, which stays as it is unless `train_vision`."""
-    student.model.requires_grad_(True)
-    for module in () if cfg.train_vision else student.vision_modules():
-        module.requires_grad_(False)
-        module.to(student.dtype)
-    return student
-
-
 def prepared_student(cfg: TrainConfig, base: Path, seed: int, device: str) -> Student:
     """Load a student and prepare it for training."""
     template = read_text(Path(cfg.chat_template), what="chat template") if cfg.chat_template else ""
     given: Any = {"device": device, "dtype": cfg.dtype, "template": template, "allow_code": cfg.allow_code}
+    student = load_student(base, **given, is_trained=cfg.method == "full")
     if cfg.method == "lora":
-        student = add_adapter(load_student(base, **given), cfg, seed)
+        student = add_adapter(student, cfg, seed)
     else:
-        student = free_weights(load_student(base, **given, is_trained=True), cfg)
+        student.model.requires_grad_(True)
+        for module in () if cfg.train_vision else student.vision_modules():
+            module.requires_grad_(False)
+            module.to(student.dtype)
     if cfg.compile:
         for layer in student.core.get_decoder().layers:
             layer.compile(dynamic=True)
@@ -125,14 +126,80 @@ def prepared_student(cfg: TrainConfig, base: Path, seed: int, device: str) -> St
     return student
 
 
-def made_student(cfg: TrainConfig, samples: Sequence[Sample], folder: Path, seed: int) -> Path:
-    """Make a student of random weights whose tokenizer is trained on the data, unless it is there already."""
+def made_student(cfg: TrainConfig, samples: Sequence[Sample], folder: Path, seed: int) -> None:
+    """Make a random student whose tokenizer is trained on the data, unless the folder exists."""
     if not folder.exists():
         every = max(1, len(samples) // TOKENIZER_SAMPLES)
         chosen = (samples[index] for index in range(0, len(samples), every))
         texts = (text for s in chosen for text in (s.prompt.system, s.prompt.user, s.answer))
         make_random_student(folder, cfg.random_student, seed, texts)
-    return folder
+
+
+# --- processes --------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def processes(cfg: TrainConfig, out: Path) -> Iterator[Any]:
+    """Join the processes that `torchrun` or `accelerate launch` started, as accelerate's `Accelerator`."""
+    from accelerate import Accelerator, InitProcessGroupKwargs
+    from accelerate.tracking import get_available_trackers
+
+    available = [str(name) for name in get_available_trackers()]
+    if missing := [name for name in cfg.report_to if name not in available]:
+        words, fix = "a logger is not known to accelerate, or not installed", f"pip install {missing[0]}"
+        where, expected = f"{STAGE}.report_to", ", ".join(available) or "none"
+        raise EnvironmentMissing(words, where=where, got=missing[0], expected=expected, fix=fix)
+    device = pick_device(cfg.device)
+    accelerator = Accelerator(
+        cpu=device == "cpu",
+        log_with=list(cfg.report_to) or None,
+        project_dir=out / "curves",
+        kwargs_handlers=[InitProcessGroupKwargs(timeout=PATIENCE)],
+    )
+    if not accelerator.is_main_process:
+        logging.getLogger("distill").setLevel(logging.WARNING)
+    is_finished = False
+    try:
+        yield accelerator
+        is_finished = True
+    finally:
+        # After an error, NCCL would wait for the other processes, and threads of gloo would abort the interpreter.
+        if is_finished or device == "cpu":
+            accelerator.end_training()
+
+
+def first_does(accelerator: Any, action: Callable[[], T]) -> T:
+    """Return in all processes the result of an action of the first one."""
+    from accelerate.utils import broadcast_object_list
+
+    return broadcast_object_list([action() if accelerator.is_main_process else None])[0]
+
+
+@contextlib.contextmanager
+def torch_errors(cfg: TrainConfig) -> Iterator[None]:
+    """Convert what torch raises about full memory, killed workers and lost processes into one line with a fix."""
+    import torch
+
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        text = str(error)
+        got = text.splitlines()[0][:160] if text else type(error).__name__
+        again = "run the same command again to resume from the last checkpoint"
+        if isinstance(error, torch.OutOfMemoryError | MemoryError) or "DefaultCPUAllocator" in text:
+            fix = "lower batch_size or max_tokens, or set gradient_checkpointing=true; then " + again
+            got = f"batch_size {cfg.batch_size}: {got}"
+            raise ConfigError("the memory is full", where=f"{STAGE}.batch_size", got=got, fix=fix) from error
+        if "DataLoader worker" in text:
+            fix = f"{again}; if memory (or --shm-size) is short, lower {STAGE}.data_workers"
+            raise EnvironmentMissing("the system killed a process that reads samples", got=got, fix=fix) from error
+        if isinstance(error, torch.distributed.DistError) or "gloo" in text or "Connection" in text:
+            fix = f"read the message of that process, then {again}"
+            raise EnvironmentMissing("another process of this training has ended", got=got, fix=fix) from error
+        raise
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
 
 
 def run(
@@ -145,52 +212,72 @@ def run(
     seed: int = 0,
     resume: Resume = "if-same",
 ) -> Path:
-    """Read a training set, its playback trees and a student; write `adapter/` or `model/`, `log.jsonl`,
-    `preflight.json`, `checkpoints/`.
+    """Read a training set, its playback trees and a student; write `adapter/` or `model/`, `log.jsonl`, `checkpoints/`.
 
     Args:
-        student: a folder, the name of a repository, or `tiny`, `tiny:small`, `tiny:medium`, `random`, which are made in
-            `out`.
+        student: a folder, a GGUF file, the name of a repository, or `tiny` or `random`, which are made in `out`.
+
     Returns:
         The folder of the adapter, which peft loads, or of the model, which transformers loads.
+
     Raises:
         InputError: an input is missing or does not fit. ResumeError: another process is at work in `out`.
         EnvironmentMissing: torch, transformers or peft is missing, or another process of this training has ended.
         ConfigError: the memory is full, or the loss is not finite.
     """
-    require("torch", "transformers", "peft")
+    require("torch", "transformers", "peft", "accelerate")
     base_name = str(student) if is_hub_name(str(student)) else Path(student).absolute().name
     product = out / (ADAPTER if cfg.method == "lora" else MODEL)
-    with joined(cfg.device) as ranks:
+    with torch_errors(cfg), processes(cfg, out) as accelerator:
         trees = resolve_trees(dataset, data)
-        preset = random_student_settings(str(student), cfg.random_student)
-        base = out / STUDENT if preset else student_path(str(student), allow_code=cfg.allow_code)
-        if preset is not None:
-            cfg = cfg.model_copy(update={"random_student": preset})
-        inputs = {"dataset": dataset, **tree_inputs(trees), **({} if preset else weight_files(base))}
+        random_student = random_student_settings(str(student), cfg.random_student)
+        base = out / STUDENT if random_student else student_path(str(student), allow_code=cfg.allow_code)
+        if random_student is not None:
+            cfg = cfg.model_copy(update={"random_student": random_student})
+        inputs = {"dataset": dataset, **tree_inputs(trees), **({} if random_student else weight_files(base))}
         opened: list[StageFolder] = []
 
         def begin() -> bool:
             given: Any = {"config": cfg, "inputs": inputs, "seed": seed, "resume": resume}
-            opened.append(StageFolder.open(out, STAGE, **given, begun=(LOG, STUDENT)))
+            opened.append(StageFolder.open(out, STAGE, **given, begun=(LOG, STUDENT, FEATURES)))
+            if not opened[0].is_complete and random_student is not None:
+                made_student(cfg, open_split(dataset, "train"), base, seed)
+            if newest_checkpoint(out / CHECKPOINTS) is None:
+                shutil.rmtree(out / FEATURES, ignore_errors=True)  # they may be of other settings
             return opened[0].is_complete
 
-        if ranks.first_does(begin):
+        if first_does(accelerator, begin):
             return product
-        if preset is not None:
-            ranks.first_does(lambda: str(made_student(cfg, open_split(dataset, "train"), base, seed)))
-        with memory_errors(cfg), reader_errors():
-            lesson, taught = _lesson(cfg, dataset, trees, base, out, seed, ranks)
-            with trackers(cfg, out, is_first=ranks.is_first) as track:
-                progress = fit(lesson, out, track)
-        ranks.first_does(lambda: _write_product(lesson, progress, taught, product, base, base_name, opened[0]))
+        accelerator.init_trackers(STAGE)
+        context = _context(cfg, dataset, trees, base, out, seed, accelerator)
+        taught = taught_by(context.train[0].samples, cfg.max_pixels)
+        check_before_training(context)
+        progress = fit(context, out)
+        if accelerator.is_main_process:
+            _write_product(context, taught, product, base, base_name)
+            summary, path = context.train[1], opened[0].path
+            tally = Tally(input=len(summary) + len(summary.skipped), kept=len(summary), dropped=summary.skip_reasons)
+            parameters = list(context.student.model.parameters())
+            shutil.rmtree(out / FEATURES)
+            opened[0].finish(
+                [file for file in (path / LOG, *product.iterdir()) if file.is_file()],
+                tally,
+                steps=progress.step,
+                best_step=progress.best_step,
+                tokens=sum(sample.num_tokens for sample in summary.used),
+                answer_tokens=sum(sample.num_answer_tokens for sample in summary.used),
+                trainable_parameters=sum(p.numel() for p in parameters if p.requires_grad),
+                parameters=sum(p.numel() for p in parameters),
+                device=context.student.device,
+                versions=_versions(),
+            )
     return product
 
 
-def _lesson(
-    cfg: TrainConfig, dataset: Path, trees: dict[str, Path], base: Path, out: Path, seed: int, ranks: Ranks
-) -> tuple[Lesson, ChatFormat]:
-    student = prepared_student(cfg, base, seed, ranks.device)
+def _context(
+    cfg: TrainConfig, dataset: Path, trees: dict[str, Path], base: Path, out: Path, seed: int, accelerator: Any
+) -> TrainingContext:
+    student = prepared_student(cfg, base, seed, pick_device(cfg.device))
     samples, validation = (open_split(dataset, split, text_only=not student.has_pictures) for split in TAUGHT)
     chosen = choose_over_all(validation, cfg.validation_samples, rng_for(seed, STAGE, "validation"))
     if not samples:
@@ -198,60 +285,38 @@ def _lesson(
         raise InputError("the training split is empty", where=dataset, fix=fix)
     if not student.has_pictures and open_split(dataset, "train")[0].views:
         log.warning("%s: the student takes no pictures: it is taught with the text state alone", STAGE)
-    taught = taught_by(samples, cfg.max_pixels)
-    processor = student.processor
-    workers, max_pixels = num_workers(cfg.data_workers), cfg.max_pixels
-    counting: Any = {"max_tokens": cfg.max_tokens, "max_pixels": max_pixels, "workers": workers, "ranks": ranks}
-    census = take_census(samples, range(len(samples)), processor, trees, **counting, label=f"{STAGE}: counting tokens")
-    asked = take_census(validation, chosen, processor, trees, **counting, label=f"{STAGE}: counting tokens of val")
-    if not len(census):
-        raise _nothing_to_learn(out, census)
-    memory_bytes = int(FEATURE_MEMORY_GB * GB)
-    kept: Any = {"memory_bytes": memory_bytes, "is_frozen": not cfg.train_vision, "max_pixels": max_pixels}
-    features = VisionFeatures(student, **kept)
-    reader = PictureReader(processor, trees, student.dtype, max_pixels)
+    processor, workers, limit = student.processor, num_workers(cfg.data_workers), cfg.max_pixels
     weights = AnswerWeights(cfg.decision_weight, cfg.reason_weight)
-    supply = Supply(features, reader, workers, weights)
-    lesson = Lesson(student, samples, census, validation, asked, supply, cfg, ranks, seed)
-    found = findings(cfg, student, census, asked, features, samples, lesson.steps)
-    ranks.first_does(lambda: tell(found, out / PREFLIGHT))
-    return lesson, taught
+    train, val = (Tokenizer(part, processor, limit, weights) for part in (samples, validation))
+    counting: Any = {"workers": workers, "accelerator": accelerator, "label": f"{STAGE}: counting tokens"}
+    summaries = [
+        summarize(tokenizer, indices, cfg.max_tokens, **counting)
+        for tokenizer, indices in ((train, range(len(samples))), (val, chosen))
+    ]
+    features = FeatureFiles(out / FEATURES, (p for part in summaries for one in part.used for p in one.pictures))
+    reader = PictureReader(processor, trees, student.dtype, limit)
+    features.write(student, reader, workers, accelerator, is_frozen=not cfg.train_vision)
+    summary, asked = (part.without(features.unreadable) for part in summaries)
+    if not len(summary):
+        tally = Tally(input=len(summary.skipped), dropped=summary.skip_reasons)
+        raise StageFolder(out, STAGE, False).nothing_kept(tally, expected="samples that can be used for training")
+    return TrainingContext(student, cfg, seed, accelerator, workers, (train, summary), (val, asked), features)
 
 
-def _nothing_to_learn(out: Path, census: Census) -> Exception:
-    return StageFolder(out, STAGE, False).nothing_kept(
-        Tally(input=census.num_samples, dropped=census.skipped), expected="samples that can be used for training"
-    )
-
-
-def _write_product(
-    lesson: Lesson,
-    progress: Progress,
-    taught: ChatFormat,
-    product: Path,
-    base: Path,
-    base_name: str,
-    stage: StageFolder,
-) -> None:
-    student, cfg, census = lesson.student, lesson.cfg, lesson.census
-    facts = adapter_facts(student, taught.max_pixels, base)
+def _write_product(context: TrainingContext, taught: ChatFormat, product: Path, base: Path, base_name: str) -> None:
+    student = context.student
     with atomic_folder(product) as partial:
-        if cfg.method == "lora":
-            write_adapter_folder(student, partial, base_name)
-            write_json(partial / ADAPTER_FACTS, facts)
+        if context.cfg.method == "lora":
+            write_adapter(student, partial, base, base_name, taught.max_pixels)
         else:
             student.model.to(student.dtype)
             write_model_folder(student, partial, base)
         write_chat_format(partial, taught)
-    num_unreadable = len(progress.unreadable)
-    dropped = census.skipped + Counter({UNREADABLE: num_unreadable})
-    tally = Tally(input=census.num_samples, kept=len(census) - num_unreadable, dropped=dropped)
-    tokens = {"samples": len(census), "tokens": census.tokens.sum(), "answer_tokens": census.answer_tokens.sum()}
-    stage.finish(
-        [path for path in (stage.path / LOG, stage.path / PREFLIGHT, *product.iterdir()) if path.is_file()],
-        tally,
-        steps=progress.step,
-        best_step=progress.best_step,
-        tokens={name: int(count) for name, count in tokens.items()},
-        **{name: facts[name] for name in ("trainable_parameters", "parameters", "device", "versions")},
-    )
+
+
+def _versions() -> dict[str, str]:
+    import peft
+    import torch
+    import transformers
+
+    return {"torch": torch.__version__, "transformers": transformers.__version__, "peft": peft.__version__}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,21 +10,19 @@ from pydantic import BaseModel
 from cosfly.formats.captions import verdict_on
 from cosfly.llm.answer_text import parse_answer
 from cosfly.runtime.console import progress_bar
-from distill.schema import Sample, Samples
+from distill.schema import Sample
 from distill.student.generate import Completion, generate
-from distill.student.model import Student
-from distill.training.loading import Census, Row, Supply
+from distill.training.loading import TrainingContext
 from distill.training.loss import answer_loss
-from distill.training.ranks import Ranks
-from distill.training.settings import LOGIT_CHUNK, STAGE, TrainConfig
+from distill.training.settings import LOGIT_CHUNK, STAGE, share_of
 
 
 class Validation(BaseModel):
-    """What a validation found. loss: nats an answer token.
+    """Result of a validation. loss: nats per answer token.
 
-    Shares of the samples, None where answers are not asked for; an answer that does not parse counts against both.
-    accuracy: the decision is the teacher's. consistent: it is what the true future calls for, of samples whose future
-    is known. parsed: it parses.
+    Shares of the samples, None where no answers are asked for; an answer that does not parse counts against both.
+    accuracy: the decision is the teacher's. consistent: the decision agrees with the true future, of samples whose
+    future is known. parsed: the answer parses.
     """
 
     samples: int
@@ -34,52 +31,39 @@ class Validation(BaseModel):
     consistent: float | None = None
     parsed: float | None = None
 
-    def score(self) -> tuple[float, float]:
-        """Return what the best checkpoint has most of: decisions or verdicts first, then likelihood."""
-        return (self.accuracy or 0.0, -self.loss)
-
     def __str__(self) -> str:
         shares = {"decisions right": self.accuracy, "consistent": self.consistent, "parsed": self.parsed}
         words = [f"{name} {share:.3f}" for name, share in shares.items() if share is not None]
         return ", ".join([f"loss {self.loss:.4f}", *words])
 
 
-def validate(
-    student: Student, samples: Samples, census: Census, supply: Supply, cfg: TrainConfig, ranks: Ranks
-) -> Validation:
-    """Validate on the samples of a census, each process on its share."""
+def validate(context: TrainingContext) -> Validation | None:
+    """Validate on the chosen samples of val, each process on its share; None if there are none."""
     import torch
 
-    # By length, so that little is padded, and dealt out so that all have about the same to do.
-    order = np.argsort(-census.tokens, kind="stable")[ranks.rank :: ranks.size].tolist()
+    cfg, summary, accelerator = context.cfg, context.val[1], context.accelerator
+    if not len(summary):
+        return None
+    # By length, so that little is padded, and dealt out so that all processes have about the same to do.
+    order = share_of(range(len(summary)), summary.lengths, accelerator.process_index, accelerator.num_processes)
     batches = [order[start : start + cfg.batch_size] for start in range(0, len(order), cfg.batch_size)]
     sums = np.zeros(7)  # nats, their weight, samples, parsed, right, with a known future, consistent with it
-    shares = [(number, census.indices[batch].tolist()) for number, batch in enumerate(batches)]
-    student.model.eval()
+    context.student.model.eval()
     with torch.no_grad(), progress_bar(f"{STAGE}: validation", total=len(order)) as advance:
-        for ready in supply.steps(samples, census.pictures_of, shares):
-            if ready.rows:
-                sums += _validate_batch(student, ready.rows, supply, cfg)
-            advance(len(ready.rows))
-    nats, weight, count, parsed, right, known, consistent = ranks.total(sums.tolist())
+        for rows in context.rows(context.val, batches):
+            encoded, features = [row for row, _ in rows], context.features_of(rows)
+            nats, _ = answer_loss(context.student, encoded, features, LOGIT_CHUNK)
+            sums[:3] += float(nats), sum(float(row.weights.sum()) for row in encoded), len(rows)
+            if cfg.validation_answers:
+                answers = generate(context.student, encoded, features, max_tokens=cfg.max_new_tokens)
+                sums[3:] += sum(_judged_answer(row[1], answer) for row, answer in zip(rows, answers, strict=True))
+            advance(len(rows))
+    nats, weight, count, parsed, right, known, consistent = context.total(sums.tolist())
     found = Validation(samples=int(count), loss=nats / weight if weight else 0.0)
-    if not cfg.validation_answers or not count:
+    if not cfg.validation_answers:
         return found
     of_future = consistent / known if known else None
     return found.model_copy(update={"accuracy": right / count, "parsed": parsed / count, "consistent": of_future})
-
-
-def _validate_batch(student: Student, rows: Sequence[Row], supply: Supply, cfg: TrainConfig) -> Any:
-    features = supply.features.of([picture for row in rows for picture in row.pictures])
-    encoded = [row.encoded for row in rows]
-    nats, _ = answer_loss(student, encoded, features, LOGIT_CHUNK)
-    weight = sum(float(row.weights.sum()) for row in encoded)
-    counts = np.zeros(4)
-    if cfg.validation_answers:
-        answers = generate(student, encoded, features, max_tokens=cfg.max_new_tokens)
-        both = zip(rows, answers, strict=True)
-        counts = sum((_judged_answer(row.sample, answer) for row, answer in both), counts)
-    return np.array([float(nats), weight, len(rows), *counts])
 
 
 def _judged_answer(sample: Sample, answer: Completion) -> Any:

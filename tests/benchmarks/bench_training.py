@@ -22,17 +22,16 @@ from typing import Any
 
 import numpy as np
 import torch
+from accelerate import Accelerator
 from peft import LoraConfig, get_peft_model
 from safetensors.torch import load_file, save_file
 
 from distill.student.chat import EncodedSample, padded
-from distill.student.features import FramePicture, PictureData, VisionFeatures
-from distill.student.model import Student, compute_dtype
+from distill.student.features import FramePicture, Tensors, encode
+from distill.student.model import Student, compute_dtype, pick_device
 from distill.student.qwen3_5 import choose_kernels, fuse_norms
-from distill.training.fit import make_optimizer
+from distill.training.fit import add_gradients, make_optimizer, used_gb
 from distill.training.loss import answer_loss
-from distill.training.preflight import used_gb
-from distill.training.ranks import Ranks, joined
 from distill.training.settings import TrainConfig
 from distill.training.stage import add_adapter, target_modules
 
@@ -132,43 +131,44 @@ def make_rows(shape: str, count: int, seed: int) -> list[tuple[EncodedSample, li
     return rows
 
 
-def noise_of(picture: FramePicture, dtype: Any) -> PictureData:
+def noise_of(picture: FramePicture, dtype: Any) -> Tensors:
     width_px, height_px = picture.size_px
     values = np.random.default_rng(int(picture.frame)).standard_normal((height_px * width_px // 256, 1536), np.float32)
     grid = torch.tensor([[1, height_px // 16, width_px // 16]])
-    return PictureData(picture, {"pixel_values": torch.from_numpy(values).to(dtype), "image_grid_thw": grid})
+    return {"pixel_values": torch.from_numpy(values).to(dtype), "image_grid_thw": grid}
 
 
-def plain_loss(student: Student, rows: list[EncodedSample], read: list[PictureData]) -> Any:
+def plain_loss(student: Student, rows: list[EncodedSample], read: list[Tensors]) -> Any:
     """What plain transformers does: every token's logits, the tower in every step, a padding mask."""
     arrays = {name: array for name, array in padded(student, rows).items() if name != "weights"}
     lengths = np.array([[len(row)] for row in rows])
     arrays["attention_mask"] = (np.arange(arrays["input_ids"].shape[1]) < lengths).astype(np.int64)
     inputs = {name: torch.from_numpy(array).to(student.device) for name, array in arrays.items()}
-    names = read[0].inputs if read else ()
-    pictures = {name: torch.cat([one.inputs[name] for one in read]).to(student.device) for name in names}
+    names = read[0] if read else ()
+    pictures = {name: torch.cat([one[name] for one in read]).to(student.device) for name in names}
     count = sum(len(row.answer_ids) for row in rows)
     return student.model(**inputs, **pictures, use_cache=False).loss * count
 
 
-def backward(student: Student, way: str, rows: list, features: VisionFeatures) -> float:
+def backward(student: Student, way: str, rows: list, features: dict[FramePicture, Tensors]) -> float:
     encoded, pictures = [row for row, _ in rows], [picture for _, found in rows for picture in found]
     if way == "plain":
         with student.computing():
             loss = plain_loss(student, encoded, [noise_of(picture, student.dtype) for picture in pictures])
     else:
-        plan = features.plan()
-        features.take([noise_of(picture, student.dtype) for picture in features.wanted(plan, pictures)])
-        loss, _ = answer_loss(student, encoded, features.of(pictures), ANSWER_TOKENS)
+        new = [picture for picture in dict.fromkeys(pictures) if picture not in features]
+        with torch.no_grad():
+            found = encode(student, [noise_of(picture, student.dtype) for picture in new])
+        features |= {p: {n: t.cpu() for n, t in one.items()} for p, one in zip(new, found, strict=True)}
+        loss, _ = answer_loss(student, encoded, [features[picture] for picture in pictures], ANSWER_TOKENS)
     loss.backward()
-    features.end_step()
     return float(loss.detach())
 
 
-def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
-    shape, dtype = arguments.shape, compute_dtype(arguments.dtype, ranks.device)
+def measure(arguments: argparse.Namespace, accelerator: Accelerator, device: str) -> dict[str, Any]:
+    shape, dtype = arguments.shape, compute_dtype(arguments.dtype, device)
     cfg = TrainConfig(batch_size=arguments.micro or arguments.batch, samples_per_step=arguments.batch)
-    student, way = make_student(shape, ranks.device, dtype), "plain" if arguments.plain else "ours"
+    student, way = make_student(shape, device, dtype), "plain" if arguments.plain else "ours"
     if arguments.plain:
         lora = LoraConfig(r=cfg.lora_rank, lora_alpha=32, target_modules=target_modules(student), task_type="CAUSAL_LM")
         student.model = get_peft_model(student.model, lora)
@@ -181,50 +181,50 @@ def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
     student.model.train()
     optimizer = make_optimizer(student, cfg)
     parameters = [p for p in student.model.parameters() if p.requires_grad]
-    features = VisionFeatures(student, memory_bytes=int(64e9))
+    features: dict[FramePicture, Tensors] = {}
     seconds, tokens = 0.0, 0
     for step in range(WARM_UP + arguments.steps):
         rows = make_rows(shape, arguments.batch, 0 if arguments.same else step)
         rows = rows if arguments.plain else sorted(rows, key=lambda row: -len(row[0]))
-        rows = rows[ranks.rank :: ranks.size]
-        ranks.total([0.0])  # all begin a step together
+        rows = rows[accelerator.process_index :: accelerator.num_processes]
+        accelerator.wait_for_everyone()
         begun_s = time.perf_counter()
         for start in range(0, len(rows), cfg.batch_size):
             backward(student, way, rows[start : start + cfg.batch_size], features)
-        ranks.add_gradients(parameters)
+        add_gradients(parameters, accelerator)
         torch.nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
-        if ranks.device == "cuda":
+        if device == "cuda":
             torch.cuda.synchronize()
         if step >= WARM_UP:
             seconds += time.perf_counter() - begun_s
             tokens += sum(len(row) for row, _ in rows)
-    (all_tokens,) = ranks.total([float(tokens)])
+    all_tokens = float(accelerator.reduce(torch.tensor(float(tokens), device=device), "sum"))
     return {
         "shape": shape, "way": way, "parameters": sum(p.numel() for p in student.model.parameters()),
-        "processes": ranks.size, "samples_per_step": arguments.batch, "batch_size": cfg.batch_size,
+        "processes": accelerator.num_processes, "samples_per_step": arguments.batch, "batch_size": cfg.batch_size,
         "dtype": str(dtype), "step_s": round(seconds / arguments.steps, 4),
-        "tokens_per_s": round(all_tokens / seconds, 1), "memory_gb": round(used_gb(ranks.device), 2),
-        "pictures_looked_at": features.num_encoded,
+        "tokens_per_s": round(all_tokens / seconds, 1), "memory_gb": round(used_gb(device), 2),
+        "pictures_encoded": len(features),
     }  # fmt: skip
 
 
-def check(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
+def check(arguments: argparse.Namespace, device: str) -> dict[str, Any]:
     """Hold our loss and gradients against plain transformers on the same weights and samples.
 
     Both in float32, of one process; in bfloat16 against what a float32 run left in `--kept`, since a process has either
     PyTorch's functions or the fast kernels.
     """
-    cfg, dtype = TrainConfig(), compute_dtype(arguments.dtype, ranks.device)
+    cfg, dtype = TrainConfig(), compute_dtype(arguments.dtype, device)
     if arguments.dtype == "auto":
         dtype = torch.float32
-    student = add_adapter(make_student(arguments.shape, ranks.device, dtype), cfg, 0)
+    student = add_adapter(make_student(arguments.shape, device, dtype), cfg, 0)
     learned = {name: parameter for name, parameter in student.model.named_parameters() if parameter.requires_grad}
     rows = make_rows(arguments.shape, 2, 0)
 
     def gradients_of(way: str) -> dict[str, torch.Tensor]:
-        loss = backward(student, way, rows, VisionFeatures(student))
+        loss = backward(student, way, rows, {})
         gradients = {name: parameter.grad.float().cpu() for name, parameter in learned.items()}
         student.model.zero_grad(set_to_none=True)
         return {"loss": torch.tensor(loss)} | gradients
@@ -269,10 +269,12 @@ def main() -> None:
     parser.add_argument("--check", action="store_true")
     parser.add_argument("--kept", help="a safetensors file of a float32 check's gradients and adapter")
     arguments = parser.parse_args()
-    with joined("auto") as ranks:
-        found = (check if arguments.check else measure)(arguments, ranks)
-        if ranks.is_first:
-            print(json.dumps(found))
+    device = pick_device("auto")
+    accelerator = Accelerator(cpu=device == "cpu")
+    found = check(arguments, device) if arguments.check else measure(arguments, accelerator, device)
+    if accelerator.is_main_process:
+        print(json.dumps(found))
+    accelerator.end_training()
 
 
 if __name__ == "__main__":

@@ -1,0 +1,111 @@
+"""Adapters and whole models on disk: tensors in safetensors, the rest in JSON, nothing that a file could run."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.io import sha256_file, storage_errors, write_bytes
+from cosfly.runtime.json_io import FileFormat, read_model, read_object, write_json, write_model
+from distill.student.model import GGUF, TEMPLATE, Student, weight_files
+
+ADAPTER_FACTS, ADAPTER_FORMAT = "cosfly_adapter.json", FileFormat("cosfly.adapter", "1.0", "adapter")
+COPIED = ("*.json", "*.jinja", "*.txt", "*.model", "LICENSE*")  # files of a model folder without weights and code
+
+
+class AdapterFacts(BaseModel):
+    """What `cosfly_adapter.json` says beside an adapter: digests of its base, most pixels of a picture in training."""
+
+    base_sha256: dict[str, str]
+    max_pixels: int
+
+
+@contextlib.contextmanager
+def writing_errors(path: Path) -> Iterator[None]:
+    """Convert the error of a full or read-only disk, in whichever class a library raises it."""
+    with storage_errors(path):
+        try:
+            yield
+        except Exception as error:  # safetensors and tokenizers give the number of the system's error in their text
+            found = re.search(r"os error (\d+)", str(error))
+            if found is None:
+                raise
+            raise OSError(int(found[1]), os.strerror(int(found[1])), str(path)) from error
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Any], metadata: dict[str, str] | None = None) -> None:
+    """Write tensors by name; the file appears when it is complete."""
+    from safetensors.torch import save_file
+
+    partial = path.with_name(f"{path.name}.partial")
+    with writing_errors(path):
+        save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, partial, metadata)
+        os.replace(partial, path)
+
+
+def write_adapter(student: Student, folder: Path, base: Path, base_name: str, max_pixels: int) -> None:
+    """Write an adapter that peft loads, and what it belongs to.
+
+    Args:
+        base_name: name of the base in place of its path on this machine, which peft writes.
+    """
+    with writing_errors(folder):
+        student.model.save_pretrained(folder)
+    if student.template:
+        write_bytes(folder / TEMPLATE, student.template.encode())
+    (folder / "README.md").unlink(missing_ok=True)
+    path = folder / "adapter_config.json"
+    write_json(path, read_object(path, what="adapter") | {"base_model_name_or_path": base_name})
+    write_adapter_facts(folder, base, max_pixels)
+
+
+def write_adapter_facts(folder: Path, base: Path, max_pixels: int) -> None:
+    facts = AdapterFacts(base_sha256=base_digests(base), max_pixels=max_pixels)
+    write_model(folder / ADAPTER_FACTS, facts, ADAPTER_FORMAT)
+
+
+def write_model_folder(student: Student, folder: Path, base: Path) -> None:
+    """Write a whole model that transformers and vLLM load: its weights, and the other files of its base as they are.
+
+    Args:
+        student: a model without an adapter next to its weights.
+        base: its folder, or the GGUF file that it was read from.
+    """
+    if base.is_dir():
+        for path in sorted({path for pattern in COPIED for path in base.glob(pattern)}):
+            if path.is_file() and "safetensors" not in path.name:
+                shutil.copyfile(path, folder / path.name)  # the content, because a hub's cache has links
+    with writing_errors(folder):
+        student.model.save_pretrained(folder)
+        if not base.is_dir():
+            student.tokenizer.save_pretrained(folder)
+    if student.template:
+        write_bytes(folder / TEMPLATE, student.template.encode())
+
+
+def base_digests(model: Path) -> dict[str, str]:
+    """Return the digests of the weight files that an adapter belongs to."""
+    suffixes = (".safetensors", GGUF)
+    return {path.name: sha256_file(path) for path in weight_files(model).values() if path.suffix in suffixes}
+
+
+def read_adapter_facts(adapter: Path, model: Path) -> AdapterFacts:
+    """Read what stands beside an adapter, and check that it belongs to the model."""
+    path = adapter / ADAPTER_FACTS
+    if not path.is_file():
+        expected = f"{ADAPTER_FACTS} of a finished cosfly distill train"
+        raise InputError("the folder is not an adapter", where=adapter, expected=expected)
+    facts = read_model(path, AdapterFacts, ADAPTER_FORMAT)
+    if facts.base_sha256 != (found := base_digests(model)):
+        got, expected = str(found)[:120], str(facts.base_sha256)[:120]
+        fix = "pass the base model of this adapter"
+        raise InputError("the adapter was trained on another model", where=path, got=got, expected=expected, fix=fix)
+    return facts

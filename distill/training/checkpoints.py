@@ -1,0 +1,103 @@
+"""Checkpoints of a training: the weights that learn, the optimizer's state, the progress; and the log up to them."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.io import atomic_folder, read_lines, write_bytes
+from cosfly.runtime.json_io import FileFormat, parse_json, read_model, write_model
+from distill.student.model import Student
+from distill.student.saving import save_tensors
+
+WEIGHTS, MOMENTS, STATE = "weights.safetensors", "optimizer.safetensors", "state.json"
+CHECKPOINT_FORMAT = FileFormat("cosfly.checkpoint", "3.0", "checkpoint")
+
+
+class Progress(BaseModel):
+    """How far a training is.
+
+    best_step: of the best validation, 0 before the first; stale: number of validations since then.
+    """
+
+    step: int = 0
+    best_step: int = 0
+    best_score: tuple[float, float] | None = None  # the larger, the better
+    stale: int = 0
+    has_ended: bool = False
+
+
+def learning_weights(student: Student) -> dict[str, Any]:
+    """Return the weights that learn, by name: the matrices of an adapter, or those of the model."""
+    return {name: p for name, p in student.model.named_parameters() if p.requires_grad}
+
+
+def checkpoint_path(folder: Path, step: int) -> Path:
+    """Return the folder of a checkpoint, named so that they sort by step."""
+    return folder / f"step_{step:08d}"
+
+
+def newest_checkpoint(folder: Path) -> Path | None:
+    """Return the newest checkpoint."""
+    return max(folder.glob("step_*"), default=None)
+
+
+def save_checkpoint(folder: Path, student: Student, optimizer: Any, progress: Progress, keep: int) -> None:
+    """Write a checkpoint, whole or not at all, and drop all but the newest `keep` checkpoints and the best one."""
+    weights = learning_weights(student)
+    moments = {
+        f"{name}/{key}": value
+        for name, parameter in weights.items()
+        for key, value in optimizer.state.get(parameter, {}).items()
+    }
+    with atomic_folder(checkpoint_path(folder, progress.step)) as partial:
+        save_tensors(partial / WEIGHTS, weights)
+        save_tensors(partial / MOMENTS, moments)
+        write_model(partial / STATE, progress, CHECKPOINT_FORMAT)
+    for path in sorted(folder.glob("step_*"))[:-keep]:
+        if path != checkpoint_path(folder, progress.best_step):
+            shutil.rmtree(path)
+
+
+def load_checkpoint(folder: Path, student: Student, optimizer: Any = None) -> Progress:
+    """Load the weights of a checkpoint into the student, and the optimizer's state if an optimizer is given."""
+    import torch
+    from safetensors.torch import load_file
+
+    weights, found = learning_weights(student), load_file(folder / WEIGHTS)
+    shapes, wanted = ({n: tuple(t.shape) for n, t in tensors.items()} for tensors in (found, weights))
+    if shapes != wanted:
+        name = next(n for n in shapes | wanted if shapes.get(n) != wanted.get(n))
+        got, expected = f"{name}: {shapes.get(name)}", wanted.get(name)
+        raise InputError("the checkpoint belongs to another student", where=folder, got=got, expected=f"{expected}")
+    with torch.no_grad():
+        for name, parameter in weights.items():
+            parameter.copy_(found[name])
+    if optimizer is not None:
+        moments: dict[str, dict[str, Any]] = {}
+        for key, value in load_file(folder / MOMENTS).items():
+            name, _, moment = key.rpartition("/")
+            moments.setdefault(name, {})[moment] = value
+        state = {i: moments[name] for i, name in enumerate(weights) if name in moments}  # in the optimizer's order
+        optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+    return read_model(folder / STATE, Progress, CHECKPOINT_FORMAT)
+
+
+def cut_log(path: Path, num_steps: int) -> None:
+    """Keep the lines of the first `num_steps` steps: what came after the checkpoint is done again."""
+    lines = read_lines(path, what="log") if path.exists() else ()
+    write_bytes(path, b"".join(line for line in lines if _is_of_steps(line, num_steps)))
+
+
+def _is_of_steps(line: bytes, num_steps: int) -> bool:
+    """Return whether a line of the log is of the first steps; a line that a kill cut short is not."""
+    try:
+        record = parse_json(line) if line.endswith(b"\n") else None
+    except ValueError:
+        return False
+    step = record.get("step") if isinstance(record, dict) else None
+    return isinstance(step, int) and step <= num_steps
