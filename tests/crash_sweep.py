@@ -128,7 +128,7 @@ INPUTS: dict[str, Callable[[Place], object]] = {
 
 TRAINING = (
     "max_pixels=4096", "device=cpu", "max_steps=3", "samples_per_step=2", "batch_size=2", "save_every_steps=1",
-    "data_workers=0", "validation_answers=false", "lora_rank=4",
+    "data_workers=0", "lora_rank=4",
 )  # fmt: skip
 SHORT = {  # what commands have in common
     "tiny": " ".join(f"--set {setting}" for setting in TINY),

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 from commands import invoke
-from later import torch
 from specimens_distill import ADAPTER_PIXELS, make_adapter, make_captions, prepared
 from specimens_students import features_of
 from teacher_server import kept_answers
@@ -109,49 +108,6 @@ def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
     assert result.exit_code == 0, result.output
     assert told(read_predictions(tmp_path / "out" / "predictions.jsonl")) == expected
     assert json.loads((tmp_path / "out" / "manifest.json").read_text())["speed"]["answers"] == len(hit)
-
-
-def with_room_for(num_rows: int, sizes: list[int]) -> Any:
-    """A student whose memory holds so many rows: its language model says so as an accelerator would."""
-
-    def load(*args: Any, **more: Any) -> Any:
-        student = load_student(*args, **more)
-
-        def check(module: Any, inputs: Any, given: dict) -> None:
-            sizes.append(len(given["inputs_embeds"]))
-            if sizes[-1] > num_rows:
-                raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
-
-        student.model.get_base_model().model.language_model.register_forward_pre_hook(check, with_kwargs=True)
-        return student
-
-    return load
-
-
-def test_a_full_memory_halves_the_batch(place, clean, tmp_path, monkeypatch, caplog):
-    sizes: list[int] = []
-    monkeypatch.setattr(infer, "load_student", with_room_for(3, sizes))
-    assert told(read_predictions(answer(place, tmp_path / "out", batch_size=12))) == told(read_predictions(clean))
-    assert counts_of(tmp_path / "out")["failed"] == {}
-    assert [size for size in sizes if size > 3] == [12, 6]  # each once: what did not fit is not tried again
-    assert (max(sizes[2:]), caplog.text.count("do not fit into memory")) == (3, 2)
-
-
-@pytest.mark.slow
-def test_constrained_answers_all_parse(place, clean, tmp_path):
-    pytest.importorskip("llguidance")
-    assert all(prediction.coc is None for prediction in read_predictions(clean))  # it knows nothing
-    free = answer(place, tmp_path / "out", constrained=True, max_new_tokens=900, max_samples=2)
-    predictions = read_predictions(free)
-    assert len(predictions) == 2
-    for prediction in predictions:
-        if prediction.is_finished:
-            assert prediction.reason in (None, "critical_components_wrong_language", "reasoning_trace_wrong_language")
-            assert set(json.loads(prediction.raw)) == {"critical_components", "reasoning_trace", "flight_decision"}
-        else:
-            assert prediction.raw.startswith('{"flight_decision":"')  # in the order of the training set
-    again = answer(place, tmp_path / "one", constrained=True, max_new_tokens=900, max_samples=2, batch_size=1)
-    assert told(read_predictions(again)) == told(predictions)
 
 
 def test_a_merged_student_sees_pictures_as_it_was_taught(place, tmp_path):

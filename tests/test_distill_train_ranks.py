@@ -15,7 +15,7 @@ from simulator_serving import free_port
 from specimens_students import TWELVE, log_of, losses_of
 
 # A usual rate: with one that makes a student learn in 12 steps, rounding grows beyond 1e-5 within few of them.
-SETTINGS = {**TWELVE, "learning_rate": 1e-3, "validation_answers": True, "max_new_tokens": 4}
+SETTINGS = {**TWELVE, "learning_rate": 1e-3}
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections import deque
 from collections.abc import AsyncGenerator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,7 +34,7 @@ from cosfly.runtime.errors import ConfigError, InputError, TeacherError
 from cosfly.runtime.io import atomic_file, sha256_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.run_dir import Resume, StageFolder, read_manifest, write_failures
-from distill.inference.local import LocalAnswers, schema_matchers
+from distill.inference.local import LocalAnswers
 from distill.inference.outcome import Results, SampleOutcome, failed
 from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
 from distill.student.chat import load_pictures
@@ -43,8 +43,8 @@ from distill.student.saving import read_adapter_facts
 
 log = logging.getLogger(__name__)
 
-# Times those in flight are begun: pictures are read while others are asked, and a slow answer holds up no other.
-WAITING = 4
+# Samples taken at once, times those in flight: few are waited for at the end, when the rest has an answer.
+WAITING = 16
 
 
 def make_request(
@@ -74,20 +74,10 @@ class EngineAnswers:
 
     async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
         """Yield the outcome of each sample, in their order; `advance` is called for each when it is there."""
-        waiting: deque[asyncio.Task[SampleOutcome]] = deque()
-        try:
-            for sample in samples:
-                waiting.append(asyncio.create_task(self._ask(sample, advance)))
-                if len(waiting) >= WAITING * self._most:
-                    yield await waiting[0]
-                    waiting.popleft()
-            while waiting:
-                yield await waiting[0]
-                waiting.popleft()
-        finally:
-            for task in waiting:
-                task.cancel()
-            await asyncio.gather(*waiting, return_exceptions=True)
+        rest = iter(samples)
+        while part := list(islice(rest, WAITING * self._most)):
+            for outcome in await asyncio.gather(*(self._ask(sample, advance) for sample in part)):
+                yield outcome
 
     async def _ask(self, sample: Sample, advance: Advance) -> SampleOutcome:
         flight = flight_of(sample.sample_id)
@@ -134,7 +124,7 @@ class InferConfig(Config):
         "transformers", description="transformers or vLLM in this process, or a server (endpoint) at the URL in --model"
     )
     constrained: bool = Field(
-        False, description="enforce the JSON schema of answers; the parse rate then says nothing about the student"
+        False, description="endpoint and vllm: enforce the JSON schema of answers; the parse rate then says nothing"
     )
     batch_size: int = Field(
         8, ge=1, description="samples that transformers answers together; rounding may depend on it"
@@ -180,11 +170,13 @@ class Inputs:
 
 
 def local_answers(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAnswers:
+    if cfg.constrained:
+        fix = "use the engine endpoint or vllm"
+        raise ConfigError("the engine transformers cannot enforce a schema", where=f"{STAGE}.constrained", fix=fix)
     model = Path(inputs.model)
     student = load_student(model, device=cfg.device, adapter=inputs.adapter, allow_code=cfg.allow_code)
     if not student.has_pictures and inputs.samples and inputs.samples[0].views:
         log.warning("%s: the student takes no pictures: it answers from the text state alone", STAGE)
-    place = decision_place(inputs.samples[0].answer) if inputs.samples else "last"
     return LocalAnswers(
         student,
         book,
@@ -193,7 +185,6 @@ def local_answers(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAn
         batch_size=cfg.batch_size,
         max_tokens=cfg.max_new_tokens,
         max_pixels=cfg.max_pixels or inputs.taught_pixels,
-        matchers_of=schema_matchers(student, place) if cfg.constrained else None,
     )
 
 

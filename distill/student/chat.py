@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,12 +17,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from cosfly.formats.frames import tree_of
 from cosfly.llm.student_chat import IMAGE_PART, chat_messages, limited_size
-from cosfly.runtime.arrays import array_header
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import inside
-from cosfly.runtime.png import picture_size
 from distill.schema import Sample
 
 IGNORED = -100  # label of tokens without a loss, the convention of PyTorch's cross entropy
@@ -45,14 +42,14 @@ class EncodedSample:
     """The tokens of a sample.
 
     prompt_ids (n,), answer_ids (m,) int64, the end token included in the answer. weights (m,) float32: in the loss.
-    kinds (n,) int64: which tokens of the prompt are pictures, for families that want to know; None for others.
+    kinds (n,) int64: which tokens of the prompt are pictures, for families that want to know; 0 for others.
     """
 
     key: str
     prompt_ids: np.ndarray
     answer_ids: np.ndarray
     weights: np.ndarray
-    kinds: np.ndarray | None = None
+    kinds: np.ndarray
 
     def __len__(self) -> int:
         return len(self.prompt_ids) + len(self.answer_ids)
@@ -210,14 +207,14 @@ class Processor:
             raise InputError("the prompt cannot be encoded", where=sample.key, got=str(error)[:200], fix=fix) from error
         text = self.lead + sample.answer
         answer = self.tokenizer(text, add_special_tokens=False, return_offsets_mapping=self.tokenizer.is_fast)
-        kinds = next((found[name][0] for name in found if name.endswith("token_type_ids")), None)
-        kept = kinds if self.has_pictures and sample.images else None
+        ids = np.array(found["input_ids"][0], dtype=np.int64)
+        kinds = found.get(self.kinds_name) if sample.images else None
         return EncodedSample(
             key=sample.key,
-            prompt_ids=np.array(found["input_ids"][0], dtype=np.int64),
+            prompt_ids=ids,
             answer_ids=np.array([*answer["input_ids"], self.end_token_id], dtype=np.int64),
             weights=sample.weight * _token_weights(text, answer, weights),
-            kinds=None if kept is None else np.array(kept, dtype=np.int64),
+            kinds=np.zeros_like(ids) if kinds is None else np.array(kinds[0], dtype=np.int64),
         )
 
     @cached_property
@@ -284,21 +281,21 @@ def load_pictures(sample: Sample, trees: Mapping[str, Path]) -> list[np.ndarray]
     return [picture for frame in sample.frames for picture in sample.pictures.read(inside(tree, frame))]
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) px of a file of a frame, from its header alone."""
-    if path.name == "depth.npy":
-        height_px, width_px = array_header(path, tree=tree_of(path.parent)).shape
-        return width_px, height_px
-    size = picture_size(path, tree=tree_of(path.parent))
-    if size is None:
-        raise InputError("the file is not an image", where=path, expected="a PNG", fix="render the frame again")
-    return size
-
-
 def special_token_in(processor: Processor, sample: Sample) -> str | None:
     """Return a token of the chat that a text of the sample contains; None: there is none."""
     texts = (sample.prompt.system, sample.prompt.user, sample.answer)
     return next((t for t in processor.chat_tokens if any(t in text for text in texts)), None)
+
+
+def check_template(processor: Processor, sample: Sample) -> None:
+    """Check that prompt, answer and end are, character by character, what the chat template writes for the chat."""
+    whole = processor.chat_text(sample)
+    taught = processor.prompt_text(sample) + processor.lead + sample.answer + processor.end_of_answer
+    if taught != whole:
+        at = next((i for i, pair in enumerate(zip(taught, whole, strict=False)) if len(set(pair)) > 1), len(taught))
+        got, expected = (f"{text[at : at + 40]!r} at character {at}" for text in (taught, whole))
+        words = "the training text differs from that of the chat template"
+        raise InputError(words, where="student", got=got, expected=expected, fix="correct the template")
 
 
 def padded(processor: Processor, rows: Sequence[EncodedSample]) -> dict[str, np.ndarray]:
@@ -306,28 +303,40 @@ def padded(processor: Processor, rows: Sequence[EncodedSample]) -> dict[str, np.
 
     Causal attention never sees what is on the right, so no mask is needed.
     """
-    shape = len(rows), max(len(row) for row in rows)
-    ids, kinds = np.full(shape, processor.pad_token_id, dtype=np.int64), np.zeros(shape, dtype=np.int64)
-    labels, weights = np.full(shape, IGNORED, dtype=np.int64), np.zeros(shape, dtype=np.float32)
-    for i, row in enumerate(rows):
-        begin, end = len(row.prompt_ids), len(row)
-        ids[i, :begin], ids[i, begin:end] = row.prompt_ids, row.answer_ids
-        labels[i, begin:end], weights[i, begin:end] = row.answer_ids, row.weights
-        if row.kinds is not None:
-            kinds[i, :begin] = row.kinds
-    found: dict[str, np.ndarray] = {"input_ids": ids, "labels": labels, "weights": weights}
-    return found | ({processor.kinds_name: kinds} if any(row.kinds is not None for row in rows) else {})
+    prompts, answers = [row.prompt_ids for row in rows], [row.answer_ids for row in rows]
+    labels = [np.full_like(ids, IGNORED) for ids in prompts]
+    weights = [np.zeros(len(ids), np.float32) for ids in prompts]
+    kinds = _kinds(processor, rows, [np.zeros_like(ids) for ids in answers])
+    return kinds | {
+        "input_ids": _stacked(zip(prompts, answers, strict=True), processor.pad_token_id),
+        "labels": _stacked(zip(labels, answers, strict=True), IGNORED),
+        "weights": _stacked(zip(weights, [row.weights for row in rows], strict=True), 0),
+    }
 
 
 def prompt_batch(processor: Processor, rows: Sequence[EncodedSample]) -> dict[str, np.ndarray]:
     """Pad prompts on the left, (b, n), so that all continue at the same place: the model's inputs without pictures."""
-    shape = len(rows), max(len(row.prompt_ids) for row in rows)
-    ids, kinds = np.full(shape, processor.pad_token_id, dtype=np.int64), np.zeros(shape, dtype=np.int64)
-    mask = np.zeros(shape, dtype=np.int64)
-    for i, row in enumerate(rows):
-        begin = shape[1] - len(row.prompt_ids)
-        ids[i, begin:], mask[i, begin:] = row.prompt_ids, 1
-        if row.kinds is not None:
-            kinds[i, begin:] = row.kinds
-    found = {"input_ids": ids, "attention_mask": mask}
-    return found | ({processor.kinds_name: kinds} if any(row.kinds is not None for row in rows) else {})
+    prompts = [row.prompt_ids for row in rows]
+    kinds = _kinds(processor, rows, [np.zeros(0, np.int64)] * len(rows), is_left=True)
+    return kinds | {
+        "input_ids": _stacked(zip(prompts), processor.pad_token_id, is_left=True),
+        "attention_mask": _stacked(zip([np.ones_like(ids) for ids in prompts]), 0, is_left=True),
+    }
+
+
+def _kinds(
+    processor: Processor, rows: Sequence[EncodedSample], ends: Sequence[np.ndarray], *, is_left: bool = False
+) -> dict[str, np.ndarray]:
+    """Return the kinds of tokens by the name of the model's input, if the model wants them and a row has pictures."""
+    if not processor.kinds_name or not any(row.kinds.any() for row in rows):
+        return {}
+    kinds = [row.kinds for row in rows]
+    return {processor.kinds_name: _stacked(zip(kinds, ends, strict=True), 0, is_left=is_left)}
+
+
+def _stacked(rows: Iterable[tuple[np.ndarray, ...]], fill: int, *, is_left: bool = False) -> np.ndarray:
+    """Join the parts of each row, and pad the rows to the longest."""
+    joined = [np.concatenate(parts) for parts in rows]
+    rest = [max(map(len, joined)) - len(row) for row in joined]
+    pads = [(count, 0) if is_left else (0, count) for count in rest]
+    return np.stack([np.pad(row, pad, constant_values=fill) for row, pad in zip(joined, pads, strict=True)])

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -21,7 +22,7 @@ from distill.schema import Sample
 from distill.student.chat import Processor
 from distill.student.model import Student
 
-ENCODED_TOGETHER = 16  # pictures, on an accelerator
+ENCODED_TOGETHER, READ_TOGETHER = 16, 64  # pictures
 # Tensors of one picture by name. Before encoding: the inputs of the model. After it: `pooled`, (tokens, width) or as
 # the family shapes it; `deep.00`, ... for deeper layers of the language model; both with LISTED at the end of the name
 # where the family returns a list with one entry per picture; and the inputs without pixels, such as `image_grid_thw`.
@@ -95,6 +96,32 @@ def encode(student: Student, pictures: Sequence[Tensors]) -> list[Tensors]:
             part = group[start : start + size]
             found |= dict(zip(part, _encode_together(student, [pictures[i] for i in part]), strict=True))
     return [found[i] for i in range(len(pictures))]
+
+
+def read_features(
+    student: Student, pictures: Sequence[FramePicture], read: Iterable[Tensors | str], *, is_frozen: bool = True
+) -> tuple[dict[FramePicture, Tensors], dict[FramePicture, str]]:
+    """Encode pictures as they are read.
+
+    Args:
+        read: what `try_to_read` returns for each picture. is_frozen: False keeps the inputs of a tower that is trained.
+
+    Returns:
+        The features of pictures, on the CPU; and why others cannot be read.
+    """
+    import torch
+
+    features: dict[FramePicture, Tensors] = {}
+    errors: dict[FramePicture, str] = {}
+    results = zip(pictures, read, strict=True)
+    while part := dict(islice(results, READ_TOGETHER)):
+        errors |= {picture: words for picture, words in part.items() if isinstance(words, str)}
+        good = {picture: tensors for picture, tensors in part.items() if not isinstance(tensors, str)}
+        with torch.no_grad():
+            found = encode(student, list(good.values())) if is_frozen else list(good.values())
+        for picture, tensors in zip(good, found, strict=True):
+            features[picture] = {name: tensor.cpu() for name, tensor in tensors.items()}
+    return features, errors
 
 
 def _encode_together(student: Student, pictures: Sequence[Tensors]) -> list[Tensors]:

@@ -12,12 +12,13 @@ import inspect
 import logging
 import re
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE
-from cosfly.runtime.errors import EnvironmentMissing, InputError, shown
+from cosfly.runtime.errors import EnvironmentMissing, InputError
 from cosfly.runtime.io import read_text
 from cosfly.runtime.json_io import read_json, read_object
 from distill.student.chat import Processor
@@ -70,27 +71,6 @@ class Student(Processor):
         """The student without its model, for worker processes."""
         return Processor(self.tokenizer, self.library, self.picture_token_id, self.template)
 
-    @property
-    def width(self) -> int:
-        """Width of the language model."""
-        return int(self.core.config.get_text_config().hidden_size)
-
-    def vision_modules(self) -> list[Any]:
-        """Return the parts of the model that are not its language model and not its output head."""
-        decoder = {id(module) for module in self.core.get_decoder().modules()} if self.has_pictures else set()
-        head = self.core.get_output_embeddings()
-        children = self.core.base_model.children() if self.has_pictures else ()
-        return [child for child in children if id(child) not in decoder and child is not head]
-
-    def language_layers(self) -> tuple[str, list[str]]:
-        """Return the name of the language model inside `core`, and the names of its linear layers below it."""
-        import torch
-
-        decoder, head = self.core.get_decoder(), self.core.get_output_embeddings()
-        prefix = next(name for name, module in self.core.named_modules() if module is decoder)
-        linear = (torch.nn.Linear,)
-        return prefix, [n for n, m in decoder.named_modules() if isinstance(m, linear) and m is not head]
-
     def computing(self) -> contextlib.AbstractContextManager:
         """Compute in `dtype`, whatever the type of the weights; in float32 there is nothing to convert."""
         import torch
@@ -112,28 +92,21 @@ def student_path(name: str, *, allow_code: bool = False) -> Path:
     """Return the folder or the GGUF file of a student.
 
     Args:
-        name: a folder, a GGUF file, a folder with one GGUF file and no configuration, or a repository such as
-            `Qwen/Qwen3.5-2B`, which is downloaded into the hub's cache.
+        name: a folder, a GGUF file, or a repository, such as `Qwen/Qwen3.5-2B`, to download into the hub's cache.
         allow_code: download the code of the repository too.
     """
-    if is_hub_name(name):
-        require("torch", "transformers", "peft")
-        from huggingface_hub import snapshot_download
+    if not is_hub_name(name):
+        return Path(name)
+    require("torch", "transformers", "peft")
+    from huggingface_hub import snapshot_download
 
-        patterns = [*MODEL_FILES, *["*.py"] * allow_code]
-        try:
-            path = Path(snapshot_download(name, allow_patterns=patterns))
-        except (OSError, ValueError, RuntimeError) as error:  # no network, no such repository, no permission
-            words = "the student is neither a folder nor a repository that can be loaded"
-            fix = "correct the name, or download the model elsewhere and pass its folder"
-            raise InputError(words, where=name, got=str(error)[:300], fix=fix) from error
-    else:
-        path = Path(name)
-    found = sorted(path.glob(f"*{GGUF}")) if path.is_dir() and not (path / "config.json").is_file() else []
-    if len(found) > 1:
-        names = ", ".join(file.name for file in found)
-        raise InputError("the folder has several GGUF files", where=path, got=names, fix="pass one of these files")
-    return found[0] if found else path
+    patterns = [*MODEL_FILES, *["*.py"] * allow_code]
+    try:
+        return Path(snapshot_download(name, allow_patterns=patterns))
+    except (OSError, ValueError, RuntimeError) as error:  # no network, no such repository, no permission
+        words = "the student is neither a folder nor a repository that can be loaded"
+        fix = "correct the name, or download the model elsewhere and pass its folder"
+        raise InputError(words, where=name, got=str(error)[:300], fix=fix) from error
 
 
 def weight_files(path: Path) -> dict[str, Path]:
@@ -176,20 +149,22 @@ def compute_dtype(wanted: Dtype, device: str) -> Any:
 
 
 @contextlib.contextmanager
-def loading_errors(what: str, where: Path) -> Any:
-    """Turn what transformers, gguf and safetensors raise about a bad file into one line."""
+def loading_errors(what: str, where: Path) -> Iterator[None]:
+    """Convert what transformers, peft, gguf and safetensors raise about a file into one line."""
     from safetensors import SafetensorError
 
     try:
         yield
     except (ImportError, LookupError, OSError, RuntimeError, TypeError, ValueError, SafetensorError) as error:
-        words = " ".join(str(error).split())[:300] or type(error).__name__
-        fix = "use a file of another quantization, such as Q8_0 or F16" if where.suffix == GGUF else None
-        raise InputError(f"the {what} cannot be loaded", where=where, got=words, fix=fix) from error
+        got = " ".join(str(error).split())[:300] or type(error).__name__
+        fix = "update transformers, use another student, or set allow_code=true if you trust the code that it needs"
+        if where.suffix == GGUF:
+            fix = "use a file of another quantization, such as Q8_0 or F16"
+        raise InputError(f"the {what} cannot be loaded", where=where, got=got, fix=fix) from error
 
 
 def _arguments(path: Path, allow_code: bool) -> dict[str, Any]:
-    """Return what transformers' `from_pretrained` is given for a student."""
+    """Return the arguments of transformers' `from_pretrained` for a student."""
     common = {"local_files_only": True, "trust_remote_code": allow_code}
     if path.suffix != GGUF:
         return {"pretrained_model_name_or_path": path, **common}
@@ -198,43 +173,23 @@ def _arguments(path: Path, allow_code: bool) -> dict[str, Any]:
 
 
 def load_config(path: Path, *, allow_code: bool = False) -> Any:
-    """Load the configuration of a student, and check that transformers knows its family without code of its own."""
+    """Load the configuration of a student."""
     require("torch", "transformers")
     from transformers import AutoConfig
-    from transformers.models.auto.configuration_auto import CONFIG_MAPPING
 
-    if path.suffix != GGUF:
-        value = read_object(path / "config.json", what="student model")
-        kind = value.get("model_type")
-        if kind not in CONFIG_MAPPING and "auto_map" in value and not allow_code:
-            words = "the student needs code from its own repository, which is not run"
-            fix = "use a family that transformers has, or allow it with allow_code=true if you trust the code"
-            raise InputError(words, where=path, got=f"model_type {shown(kind)}", fix=fix)
-        if kind not in CONFIG_MAPPING and "auto_map" not in value:
-            fix = "update transformers, or use another student"
-            raise InputError("transformers does not know the model type", where=path, got=shown(kind), fix=fix)
+    arguments = _arguments(path, allow_code)
     with loading_errors("configuration of the student", path):
-        return AutoConfig.from_pretrained(**_arguments(path, allow_code))
+        return AutoConfig.from_pretrained(**arguments)
 
 
-def model_class(config: Any, path: Path) -> Any:
-    """Return the Auto class of a student: with a vision part for image, text to text, otherwise for text alone."""
+def model_class(config: Any) -> Any:
+    """Return the Auto class of a student: image and text to text if it is a vision-language model, otherwise text."""
     from transformers import AutoModelForCausalLM, AutoModelForImageTextToText
-    from transformers.models.auto.modeling_auto import (
-        MODEL_FOR_CAUSAL_LM_MAPPING,
-        MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING,
-    )
+    from transformers.models.auto.modeling_auto import MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING
 
-    auto_map = getattr(config, "auto_map", None) or {}
-    pairs = (
-        (AutoModelForImageTextToText, MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING),
-        (AutoModelForCausalLM, MODEL_FOR_CAUSAL_LM_MAPPING),
-    )
-    for auto_class, mapping in pairs:
-        if type(config) in mapping or auto_class.__name__ in auto_map:
-            return auto_class
-    words = "the model is neither a language model nor a vision-language model"
-    raise InputError(words, where=path, got=f"model_type {config.model_type!r}", fix="use another student")
+    sees = type(config) in MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING
+    own = getattr(config, "auto_map", None) or {}
+    return AutoModelForImageTextToText if sees or "AutoModelForImageTextToText" in own else AutoModelForCausalLM
 
 
 def load_processor(
@@ -247,7 +202,6 @@ def load_processor(
         template: text of a chat template that takes precedence over all.
     """
     config = load_config(path, allow_code=allow_code)
-    auto_class = model_class(config, path)
     from transformers import AutoTokenizer
 
     quiet_transformers()
@@ -255,7 +209,7 @@ def load_processor(
     with loading_errors("tokenizer of the student", path):
         tokenizer: Any = AutoTokenizer.from_pretrained(**arguments)
     library = None
-    if auto_class.__name__ == "AutoModelForImageTextToText" and hasattr(config, "vision_config"):
+    if model_class(config).__name__ == "AutoModelForImageTextToText" and hasattr(config, "vision_config"):
         with loading_errors("processor of the student", path):
             library = _picture_processor(config, tokenizer, arguments)
     taught = adapter / TEMPLATE if adapter is not None else None
@@ -330,7 +284,7 @@ def load_student(
         family.choose_kernels(computed, device_name)
     model: Any
     with loading_errors("student", adapter or path):
-        model = model_class(config, path).from_pretrained(
+        model = model_class(config).from_pretrained(
             **_arguments(path, allow_code), dtype=torch.float32 if is_trained else computed, use_safetensors=True
         )
         if path.suffix == GGUF:
@@ -341,15 +295,7 @@ def load_student(
             model = PeftModel.from_pretrained(model, adapter)
     parts = processor.tokenizer, processor.library, processor.picture_token_id, processor.template
     student = Student(*parts, model=model, device=device_name, dtype=computed)
-    known, most = len(student.tokenizer), student.core.get_input_embeddings().weight.shape[0]
-    if known > most:
-        words = "the tokenizer has more tokens than the model"
-        raise InputError(words, where=path, got=known, expected=f"at most {most}")
-    try:
-        model.to(device_name)
-    except torch.OutOfMemoryError as error:
-        words = "the weights do not fit into the memory of the accelerator"
-        raise EnvironmentMissing(words, where=path, got=str(error)[:99]) from error
+    model.to(device_name)
     if family is not None and device_name == "cuda":
         family.fuse_norms(student.core)
     return student

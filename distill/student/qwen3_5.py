@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 import sys
 import types
 from functools import cache
 from importlib.machinery import ModuleSpec
 from typing import Any
+
+log = logging.getLogger(__name__)
 
 CONVOLUTION = "causal_conv1d"  # the package whose short convolution transformers calls where it is there
 LINEAR_ATTENTION = "fla"
@@ -25,6 +28,9 @@ def choose_kernels(dtype: Any, device: str) -> None:
 
     if device != "cuda":
         return
+    if missing := [name for name in (LINEAR_ATTENTION, CONVOLUTION) if importlib.util.find_spec(name) is None]:
+        words = "Qwen3.5 is slow without %s: pip install flash-linear-attention tilelang causal-conv1d"
+        log.warning(words, " and ".join(missing))
     if dtype == torch.float32:
         for package in (LINEAR_ATTENTION, CONVOLUTION):
             sys.modules.setdefault(package, None)  # type: ignore[arg-type]  # so that its import fails

@@ -8,7 +8,6 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_folder, read_lines, write_bytes
 from cosfly.runtime.json_io import FileFormat, parse_json, read_model, write_model
 from distill.student.model import Student
@@ -26,7 +25,7 @@ class Progress(BaseModel):
 
     step: int = 0
     best_step: int = 0
-    best_score: tuple[float, float] | None = None  # the larger, the better
+    best_loss: float | None = None
     stale: int = 0
     has_ended: bool = False
 
@@ -69,11 +68,6 @@ def load_checkpoint(folder: Path, student: Student, optimizer: Any = None) -> Pr
     from safetensors.torch import load_file
 
     weights, found = learning_weights(student), load_file(folder / WEIGHTS)
-    shapes, wanted = ({n: tuple(t.shape) for n, t in tensors.items()} for tensors in (found, weights))
-    if shapes != wanted:
-        name = next(n for n in shapes | wanted if shapes.get(n) != wanted.get(n))
-        got, expected = f"{name}: {shapes.get(name)}", wanted.get(name)
-        raise InputError("the checkpoint belongs to another student", where=folder, got=got, expected=f"{expected}")
     with torch.no_grad():
         for name, parameter in weights.items():
             parameter.copy_(found[name])
@@ -89,15 +83,5 @@ def load_checkpoint(folder: Path, student: Student, optimizer: Any = None) -> Pr
 
 def cut_log(path: Path, num_steps: int) -> None:
     """Keep the lines of the first `num_steps` steps: what came after the checkpoint is done again."""
-    lines = read_lines(path, what="log") if path.exists() else ()
-    write_bytes(path, b"".join(line for line in lines if _is_of_steps(line, num_steps)))
-
-
-def _is_of_steps(line: bytes, num_steps: int) -> bool:
-    """Return whether a line of the log is of the first steps; a line that a kill cut short is not."""
-    try:
-        record = parse_json(line) if line.endswith(b"\n") else None
-    except ValueError:
-        return False
-    step = record.get("step") if isinstance(record, dict) else None
-    return isinstance(step, int) and step <= num_steps
+    lines = [line for line in read_lines(path, what="log") if line.endswith(b"\n")] if path.exists() else []
+    write_bytes(path, b"".join(line for line in lines if parse_json(line)["step"] <= num_steps))

@@ -30,17 +30,17 @@ from distill.training.checkpoints import (
     newest_checkpoint,
     save_checkpoint,
 )
-from distill.training.loading import Rows, TrainingContext
+from distill.training.loading import Rows, TrainingContext, num_workers
 from distill.training.loss import answer_loss
 from distill.training.settings import (
     LOGIT_CHUNK,
     MAX_GRADIENT_NORM,
     STAGE,
+    Steps,
     TrainConfig,
     learning_rate_at,
     share_of,
 )
-from distill.training.validation import Validation, validate
 
 log = logging.getLogger(__name__)
 
@@ -124,16 +124,16 @@ def fit(context: TrainingContext, out: Path) -> Progress:
     Writes `log.jsonl` and `checkpoints/` in `out`.
     """
     student, cfg, accelerator, folder = context.student, context.cfg, context.accelerator, out / CHECKPOINTS
+    steps = Steps.make(cfg, len(context.train.used), context.seed)
     optimizer, newest = make_optimizer(student, cfg), newest_checkpoint(folder)
     progress = load_checkpoint(newest, student, optimizer) if newest else Progress()
     if progress.step:
-        log.info("%s: resumed after step %d of %d", STAGE, progress.step, context.steps.num_steps)
+        log.info("%s: resumed after step %d of %d", STAGE, progress.step, steps.num_steps)
     with _open_log(context, out / LOG, progress.step if newest else -1) as note:
-        if newest is None and (found := validate(context)) is not None:
-            note({"step": 0, "validation": found.model_dump()})
-            log.info("%s: before the first step: %s", STAGE, found)
+        if newest is None:
+            validate(context, progress, note)
         if not progress.has_ended:
-            progress = _take_steps(context, optimizer, progress, folder, note)
+            progress = _take_steps(context, steps, optimizer, progress, folder, note)
     accelerator.wait_for_everyone()
     if cfg.keep == "best" and progress.best_step not in (0, progress.step):
         load_checkpoint(checkpoint_path(folder, progress.best_step), student)
@@ -141,14 +141,16 @@ def fit(context: TrainingContext, out: Path) -> Progress:
     return progress
 
 
-def _take_steps(context: TrainingContext, optimizer: Any, progress: Progress, folder: Path, note: Note) -> Progress:
-    cfg, accelerator, steps, lengths = context.cfg, context.accelerator, context.steps, context.train[1].lengths
+def _take_steps(
+    context: TrainingContext, steps: Steps, optimizer: Any, progress: Progress, folder: Path, note: Note
+) -> Progress:
+    cfg, accelerator, lengths = context.cfg, context.accelerator, context.train.lengths
     first, num_steps, start_s = progress.step, steps.num_steps, time.monotonic()
     mine = accelerator.process_index, accelerator.num_processes
     shares = (share_of(steps.samples_of(step), lengths, *mine) for step in range(first, num_steps))
     step_start_s = start_s
     with progress_bar(STAGE, total=num_steps, done=first) as advance:
-        for step, rows in enumerate(context.rows(context.train, shares), first):
+        for step, rows in enumerate(context.train.rows(shares, num_workers(cfg.data_workers)), first):
             waited_s, rate = time.monotonic() - step_start_s, learning_rate_at(cfg, step, num_steps)
             with seeded(context.student, context.seed, f"step_{step}_{accelerator.process_index}"):
                 facts = train_step(context, optimizer, rows, rate)
@@ -166,10 +168,8 @@ def _take_steps(context: TrainingContext, optimizer: Any, progress: Progress, fo
             progress = progress.model_copy(update={"step": done})
             every = cfg.validate_every_steps or steps.steps_per_epoch
             is_validated = done == num_steps or done % every == 0
-            if is_validated and (found := validate(context)) is not None:
-                note({"step": done, "validation": found.model_dump()})
-                progress = judged(progress, found, cfg)
-                log.info("%s: after step %d: %s", STAGE, done, found)
+            if is_validated:
+                progress = validate(context, progress, note)
             is_last = done == num_steps or progress.has_ended
             if accelerator.is_main_process and (is_last or is_validated or done % cfg.save_every_steps == 0):
                 save_checkpoint(folder, context.student, optimizer, progress, cfg.keep_checkpoints)
@@ -180,11 +180,35 @@ def _take_steps(context: TrainingContext, optimizer: Any, progress: Progress, fo
     return progress
 
 
-def judged(progress: Progress, found: Validation, cfg: TrainConfig) -> Progress:
-    """Return the progress after a validation: the best one has most decisions right, and then the lowest loss."""
-    score, stale = (found.accuracy or 0.0, -found.loss), progress.stale + 1
-    if progress.best_score is None or score > progress.best_score:
-        return progress.model_copy(update={"best_step": progress.step, "best_score": score, "stale": 0})
+def validate(context: TrainingContext, progress: Progress, note: Note) -> Progress:
+    """Measure the loss on the samples of val, each process on its share; return the progress with the result."""
+    import torch
+
+    cfg, split, accelerator = context.cfg, context.val, context.accelerator
+    if not split.used:
+        return progress
+    # By length, so that little is padded, and dealt out so that all processes have about the same to do.
+    order = share_of(range(len(split.used)), split.lengths, accelerator.process_index, accelerator.num_processes)
+    batches = [order[start : start + cfg.batch_size] for start in range(0, len(order), cfg.batch_size)]
+    nats, weight = 0.0, 0.0
+    context.student.model.eval()
+    with torch.no_grad(), progress_bar(f"{STAGE}: validation", total=len(order)) as advance:
+        for rows in split.rows(batches, num_workers(cfg.data_workers, len(order))):
+            encoded = [row for row, _ in rows]
+            total, _ = answer_loss(context.student, encoded, context.features_of(rows), LOGIT_CHUNK)
+            nats, weight = nats + float(total), weight + sum(float(row.weights.sum()) for row in encoded)
+            advance(len(rows))
+    nats, weight = context.total([nats, weight])
+    note({"step": progress.step, "validation": {"samples": len(split.used), "loss": nats / weight}})
+    log.info("%s: after step %d: validation loss %.4f", STAGE, progress.step, nats / weight)
+    return judged(progress, nats / weight, cfg) if progress.step else progress
+
+
+def judged(progress: Progress, loss: float, cfg: TrainConfig) -> Progress:
+    """Return the progress after a validation: the best step has the lowest loss; `patience` may end the training."""
+    if progress.best_loss is None or loss < progress.best_loss:
+        return progress.model_copy(update={"best_step": progress.step, "best_loss": loss, "stale": 0})
+    stale = progress.stale + 1
     has_ended = bool(cfg.patience) and stale >= cfg.patience
     if has_ended:
         log.info("%s: ends, because %d validations are not better than the best one", STAGE, stale)

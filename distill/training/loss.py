@@ -118,3 +118,17 @@ def answer_loss(
     )
     row_of = is_target.nonzero()[:, 0]
     return total, torch.zeros(len(rows), device=student.device).index_add_(0, row_of, nats)
+
+
+def check_head(student: Student) -> None:
+    """Check that logits are the product of the last hidden state and the head, from which the loss is computed."""
+    import torch
+
+    ids = torch.full((1, 4), student.end_token_id, device=student.device)
+    with torch.no_grad(), student.computing():
+        logits = student.core(input_ids=ids, use_cache=False).logits.float()
+        hidden = student.core.base_model(input_ids=ids, use_cache=False).last_hidden_state
+        plain = (hidden.to(student.dtype) @ output_head(student).to(student.dtype).T).float()
+    if not torch.allclose(logits, plain, rtol=0.05, atol=0.05 * float(logits.abs().max())):
+        words, got = "the student changes its logits after the head, which the loss lacks", type(student.core).__name__
+        raise ConfigError(words, where="student", got=got, fix="use another student")

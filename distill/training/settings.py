@@ -57,14 +57,8 @@ class TrainConfig(Config):
     dtype: Dtype = Field("auto", description="number type of the computation; auto: bfloat16 on cuda, float32 on a CPU")
     random_student: RandomStudent = Field(RandomStudent(), description="size of the student of `--student random`")
 
-    validation_samples: int = Field(
-        64, ge=0, description="number of samples of val, spread over all decisions and tracks; 0: none"
-    )
+    validation_samples: int = Field(64, ge=0, description="number of samples of val, chosen at random; 0: none")
     validate_every_steps: int = Field(0, ge=0, description="steps between validations; 0: at the end of each epoch")
-    validation_answers: bool = Field(
-        True, description="the student answers these samples; false: only the loss is measured"
-    )
-    max_new_tokens: int = Field(512, ge=1, description="longest answer in validation, tokens")
     patience: int = Field(
         3, ge=0, description="number of validations without an improvement after which training ends; 0: never"
     )

@@ -9,9 +9,9 @@ import contextlib
 import logging
 import math
 import re
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import timedelta
+from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,28 +23,21 @@ from cosfly.runtime.io import atomic_folder, read_text
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.runtime.seeding import rng_for
 from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
-from distill.student.chat import AnswerWeights
+from distill.student.chat import AnswerWeights, check_template
 from distill.student.features import PictureReader
 from distill.student.model import Student, is_hub_name, load_student, pick_device, require, student_path, weight_files
 from distill.student.random_student import make_random_student, random_student_settings
 from distill.student.saving import write_adapter, write_model_folder
-from distill.training.checkpoints import newest_checkpoint
-from distill.training.checks import check_before_training
-from distill.training.fit import CHECKPOINTS, LOG, fit, seeded
-from distill.training.loading import (
-    FeatureFiles,
-    Tokenizer,
-    TrainingContext,
-    choose_over_all,
-    num_workers,
-    summarize,
-)
+from distill.training.checkpoints import learning_weights
+from distill.training.fit import LOG, fit, seeded
+from distill.training.loading import TrainingContext, TrainingSplit
+from distill.training.loss import check_head
 from distill.training.settings import STAGE, TrainConfig
 
 log = logging.getLogger(__name__)
 
 TAUGHT: tuple[Split, ...] = ("train", "val")
-ADAPTER, MODEL, STUDENT, FEATURES = "adapter", "model", "student", "features"
+ADAPTER, MODEL, STUDENT = "adapter", "model", "student"
 TOKENIZER_SAMPLES = 2000  # most samples that the tokenizer of a random student is trained on
 PATIENCE = timedelta(minutes=30)  # for the slowest process: loading weights, counting tokens, validation
 T = TypeVar("T")
@@ -101,9 +94,24 @@ def target_modules(student: Student) -> str:
 
     The vision tower and the output head are not among them: the features of a frozen tower are kept.
     """
-    prefix, names = student.language_layers()
-    last = sorted({name.rpartition(".")[2] for name in names})
-    return rf"{re.escape(prefix)}\.(.*\.)?({'|'.join(map(re.escape, last))})"
+    import torch
+
+    decoder, head = student.core.get_decoder(), student.core.get_output_embeddings()
+    prefix = next(name for name, module in student.core.named_modules() if module is decoder)
+    linear = (torch.nn.Linear,)
+    names = {n.rpartition(".")[2] for n, m in decoder.named_modules() if isinstance(m, linear) and m is not head}
+    return rf"{re.escape(prefix)}\.(.*\.)?({'|'.join(map(re.escape, sorted(names)))})"
+
+
+def vision_modules(student: Student) -> list[Any]:
+    """Return the parts of the model that are not its language model and not its output head."""
+    if not student.has_pictures:
+        return []
+    decoder, head = (
+        {id(module) for module in student.core.get_decoder().modules()},
+        student.core.get_output_embeddings(),
+    )
+    return [child for child in student.core.base_model.children() if id(child) not in decoder and child is not head]
 
 
 def prepared_student(cfg: TrainConfig, base: Path, seed: int, device: str) -> Student:
@@ -115,7 +123,7 @@ def prepared_student(cfg: TrainConfig, base: Path, seed: int, device: str) -> St
         student = add_adapter(student, cfg, seed)
     else:
         student.model.requires_grad_(True)
-        for module in () if cfg.train_vision else student.vision_modules():
+        for module in () if cfg.train_vision else vision_modules(student):
             module.requires_grad_(False)
             module.to(student.dtype)
     if cfg.compile:
@@ -124,15 +132,6 @@ def prepared_student(cfg: TrainConfig, base: Path, seed: int, device: str) -> St
     if cfg.gradient_checkpointing:
         student.model.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
     return student
-
-
-def made_student(cfg: TrainConfig, samples: Sequence[Sample], folder: Path, seed: int) -> None:
-    """Make a random student whose tokenizer is trained on the data, unless the folder exists."""
-    if not folder.exists():
-        every = max(1, len(samples) // TOKENIZER_SAMPLES)
-        chosen = (samples[index] for index in range(0, len(samples), every))
-        texts = (text for s in chosen for text in (s.prompt.system, s.prompt.user, s.answer))
-        make_random_student(folder, cfg.random_student, seed, texts)
 
 
 # --- processes --------------------------------------------------------------------------------------------------------
@@ -239,72 +238,72 @@ def run(
 
         def begin() -> bool:
             given: Any = {"config": cfg, "inputs": inputs, "seed": seed, "resume": resume}
-            opened.append(StageFolder.open(out, STAGE, **given, begun=(LOG, STUDENT, FEATURES)))
-            if not opened[0].is_complete and random_student is not None:
-                made_student(cfg, open_split(dataset, "train"), base, seed)
-            if newest_checkpoint(out / CHECKPOINTS) is None:
-                shutil.rmtree(out / FEATURES, ignore_errors=True)  # they may be of other settings
+            opened.append(StageFolder.open(out, STAGE, **given, begun=(LOG, STUDENT)))
+            if random_student and not opened[0].is_complete and not base.exists():
+                samples = open_split(dataset, "train")
+                chosen = (samples[i] for i in range(0, len(samples), max(1, len(samples) // TOKENIZER_SAMPLES)))
+                texts = (text for s in chosen for text in (s.prompt.system, s.prompt.user, s.answer))
+                make_random_student(base, random_student, seed, texts)
             return opened[0].is_complete
 
         if first_does(accelerator, begin):
             return product
         accelerator.init_trackers(STAGE)
-        context = _context(cfg, dataset, trees, base, out, seed, accelerator)
-        taught = taught_by(context.train[0].samples, cfg.max_pixels)
-        check_before_training(context)
+        context = _context(cfg, dataset, trees, base, seed, accelerator)
         progress = fit(context, out)
         if accelerator.is_main_process:
-            _write_product(context, taught, product, base, base_name)
-            summary, path = context.train[1], opened[0].path
-            tally = Tally(input=len(summary) + len(summary.skipped), kept=len(summary), dropped=summary.skip_reasons)
-            parameters = list(context.student.model.parameters())
-            shutil.rmtree(out / FEATURES)
+            used, skipped = context.train.used, context.train.skip_reasons
+            tally = Tally(input=len(used) + skipped.total(), kept=len(used), dropped=skipped)
+            _write_product(context, product, base, base_name)
             opened[0].finish(
-                [file for file in (path / LOG, *product.iterdir()) if file.is_file()],
+                [out / LOG, *sorted(product.iterdir())],
                 tally,
                 steps=progress.step,
                 best_step=progress.best_step,
-                tokens=sum(sample.num_tokens for sample in summary.used),
-                answer_tokens=sum(sample.num_answer_tokens for sample in summary.used),
-                trainable_parameters=sum(p.numel() for p in parameters if p.requires_grad),
-                parameters=sum(p.numel() for p in parameters),
+                tokens=sum(sample.num_tokens for sample in used),
+                parameters=sum(p.numel() for p in context.student.model.parameters()),
+                trainable_parameters=sum(p.numel() for p in learning_weights(context.student).values()),
                 device=context.student.device,
-                versions=_versions(),
+                versions={name: metadata.version(name) for name in ("torch", "transformers", "peft")},
             )
     return product
 
 
 def _context(
-    cfg: TrainConfig, dataset: Path, trees: dict[str, Path], base: Path, out: Path, seed: int, accelerator: Any
+    cfg: TrainConfig, dataset: Path, trees: dict[str, Path], base: Path, seed: int, accelerator: Any
 ) -> TrainingContext:
+    """Load the student and the data, check them, and log what will be trained."""
     student = prepared_student(cfg, base, seed, pick_device(cfg.device))
     samples, validation = (open_split(dataset, split, text_only=not student.has_pictures) for split in TAUGHT)
-    chosen = choose_over_all(validation, cfg.validation_samples, rng_for(seed, STAGE, "validation"))
     if not samples:
         fix = "prepare the training set with more captions, or with other fractions"
         raise InputError("the training split is empty", where=dataset, fix=fix)
     if not student.has_pictures and open_split(dataset, "train")[0].views:
         log.warning("%s: the student takes no pictures: it is taught with the text state alone", STAGE)
-    processor, workers, limit = student.processor, num_workers(cfg.data_workers), cfg.max_pixels
-    weights = AnswerWeights(cfg.decision_weight, cfg.reason_weight)
-    train, val = (Tokenizer(part, processor, limit, weights) for part in (samples, validation))
-    counting: Any = {"workers": workers, "accelerator": accelerator, "label": f"{STAGE}: counting tokens"}
-    summaries = [
-        summarize(tokenizer, indices, cfg.max_tokens, **counting)
-        for tokenizer, indices in ((train, range(len(samples))), (val, chosen))
-    ]
-    features = FeatureFiles(out / FEATURES, (p for part in summaries for one in part.used for p in one.pictures))
-    reader = PictureReader(processor, trees, student.dtype, limit)
-    features.write(student, reader, workers, accelerator, is_frozen=not cfg.train_vision)
-    summary, asked = (part.without(features.unreadable) for part in summaries)
-    if not len(summary):
-        tally = Tally(input=len(summary.skipped), dropped=summary.skip_reasons)
-        raise StageFolder(out, STAGE, False).nothing_kept(tally, expected="samples that can be used for training")
-    return TrainingContext(student, cfg, seed, accelerator, workers, (train, summary), (val, asked), features)
+    check_template(student, samples[0])
+    check_head(student)
+    processor, weights = student.processor, AnswerWeights(cfg.decision_weight, cfg.reason_weight)
+    train, val = (TrainingSplit(part, processor, cfg.max_pixels, weights) for part in (samples, validation))
+    order = rng_for(seed, STAGE, "validation").permutation(len(validation))
+    train.count(range(len(samples)), cfg.max_tokens, cfg.data_workers)
+    val.count(sorted(order[: cfg.validation_samples].tolist()), cfg.max_tokens, cfg.data_workers)
+    context = TrainingContext(student, cfg, seed, accelerator, train, val)
+    context.read_pictures(PictureReader(processor, trees, student.dtype, cfg.max_pixels))
+    for name, split in (("train", train), ("val", val)):
+        answers, tokens = (sum(counts) for counts in ([s.num_answer_tokens for s in split.used], split.lengths))
+        words = "%s: %s has %d samples with %d tokens, %d of them in answers"
+        log.info(words, STAGE, name, len(split.used), tokens, answers)
+        for reason, count in sorted(split.skip_reasons.items()):
+            first = next(sample.skip_detail for sample in split.skipped if sample.skip_reason == reason)
+            log.warning("%s: %d samples of %s are skipped as %s; the first: %s", STAGE, count, name, reason, first)
+    if not train.used:
+        words, got = "no sample can be used for training", ", ".join(train.skip_reasons)
+        raise InputError(words, where=dataset, got=got, fix="read the warnings above, and change the settings")
+    return context
 
 
-def _write_product(context: TrainingContext, taught: ChatFormat, product: Path, base: Path, base_name: str) -> None:
-    student = context.student
+def _write_product(context: TrainingContext, product: Path, base: Path, base_name: str) -> None:
+    student, taught = context.student, taught_by(context.train.samples, context.cfg.max_pixels)
     with atomic_folder(product) as partial:
         if context.cfg.method == "lora":
             write_adapter(student, partial, base, base_name, taught.max_pixels)
@@ -312,11 +311,3 @@ def _write_product(context: TrainingContext, taught: ChatFormat, product: Path, 
             student.model.to(student.dtype)
             write_model_folder(student, partial, base)
         write_chat_format(partial, taught)
-
-
-def _versions() -> dict[str, str]:
-    import peft
-    import torch
-    import transformers
-
-    return {"torch": torch.__version__, "transformers": transformers.__version__, "peft": peft.__version__}
