@@ -160,7 +160,6 @@ ALLOWED_TO_READ = {
     ("cosfly.runtime.limits", "read_text"),  # the same, and control groups
     ("cosfly.runtime.png", "decompress"),  # of a picture, up to the size that its header gives
     ("cosfly.llm.protocol", "loads"),  # the reply, of a bounded size
-    ("distill.student.random_student", "loads"),  # what the tokenizer's own library gives
     ("distill.training.checkpoints", "load_file"),  # tensors of this training
     ("cosfly.simulators.guard", "loads"),  # lines of the process that started it
 }
