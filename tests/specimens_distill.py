@@ -113,6 +113,6 @@ def make_adapter(base: Path, folder: Path, **changes) -> Path:
             if "lora_B" in name:
                 tensor.mul_(0.02)
     student.model.save_pretrained(folder)
-    write_adapter_facts(folder, base, ADAPTER_PIXELS)
+    write_adapter_facts(folder, base)
     write_chat_format(folder, TEACHING)
     return folder

@@ -21,7 +21,6 @@ from distill.schema import Sample, open_split, resolve_trees
 from distill.student.generate import generate
 from distill.student.model import load_student
 from distill.student.random_student import make_tiny_student
-from distill.student.saving import ADAPTER_FACTS
 from specimens import make_playback_tree
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -112,8 +111,8 @@ def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
 
 def test_a_merged_student_sees_pictures_as_it_was_taught(place, tmp_path):
     adapter = Path(shutil.copytree(place / "trained" / "adapter", tmp_path / "few" / "adapter"))
-    for name in (CHAT_FORMAT_FILE, ADAPTER_FACTS):
-        (adapter / name).write_text(json.dumps(json.loads((adapter / name).read_text()) | {"max_pixels": 32 * 32}))
+    path = adapter / CHAT_FORMAT_FILE
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"max_pixels": 32 * 32}))
     merged = merge.run(place / "student", adapter, tmp_path / "merged")
     given = (settings(max_samples=3), place / "set", [place / "tree"])
     infer.run(*given, place / "student", tmp_path / "beside", adapter=adapter)

@@ -39,7 +39,7 @@ from cosfly.llm.contract import NoAnswer
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE
 from cosfly.runtime.errors import CosflyError
 from cosfly.runtime.seeding import rng_for
-from distill.inference.stage import InferConfig, Inputs, local_answers
+from distill.inference.stage import InferConfig, Inputs, LocalAnswers
 from distill.schema import Sample
 
 NO_SET = "decision_not_in_closed_set"  # of readable answers with an unknown decision
@@ -237,7 +237,7 @@ class LocalEngine(PromptedEngine):
     def _open(self, cfg: FlyConfig, infer: InferConfig, seed: int) -> None:
         model = Path(cfg.student.partition(":")[2])
         inputs = Inputs((), {"": Path(self._scratch.name)}, model, cfg.adapter)
-        self._local = local_answers(infer, inputs, self._book)
+        self._local = LocalAnswers(infer, inputs, self._book)
         self.name = inputs.name
 
     async def _ask_all(self, questions: Sequence[Question]) -> list[EngineDecision]:

@@ -11,7 +11,7 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_folder
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from distill.student.model import GGUF, load_config, load_student, loading_errors, require, student_path, weight_files
-from distill.student.saving import read_adapter_facts, write_model_folder
+from distill.student.saving import check_adapter, write_model_folder
 
 STAGE = "distill.merge"
 
@@ -33,7 +33,7 @@ def run(model: Path, adapter: Path, out: Path, *, resume: Resume = "if-same") ->
         fix = "use this folder as the model"
         raise InputError("the folder has a whole model, so there is nothing to merge", where=adapter, fix=fix)
     model = student_path(str(model))
-    read_adapter_facts(adapter, model)
+    check_adapter(adapter, model)
     files = {f"adapter/{path.name}": path for path in sorted(adapter.iterdir()) if path.is_file()}
     inputs = {**weight_files(model), **files}
     stage = StageFolder.open(out, STAGE, config=Config(), inputs=inputs, seed=0, resume=resume)

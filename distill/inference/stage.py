@@ -17,7 +17,7 @@ from pydantic import Field
 from cosfly.formats.places import flight_of
 from cosfly.formats.predictions import PREDICTIONS, Split
 from cosfly.llm.answer_text import answer_schema
-from cosfly.llm.answers import AnswerBook, KeptAnswers, answer_key
+from cosfly.llm.answers import Answer, AnswerBook, KeptAnswers, answer_key
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import STOP_AFTER_FAILURES, Engine, NoAnswer, Request, started
 from cosfly.llm.student_chat import (
@@ -33,13 +33,14 @@ from cosfly.runtime.console import Advance, progress_bar
 from cosfly.runtime.errors import ConfigError, InputError, TeacherError
 from cosfly.runtime.io import atomic_file, sha256_bytes
 from cosfly.runtime.json_io import dump_json
-from cosfly.runtime.run_dir import Resume, StageFolder, read_manifest, write_failures
-from distill.inference.local import LocalAnswers
+from cosfly.runtime.run_dir import Resume, StageFolder, write_failures
 from distill.inference.outcome import Results, SampleOutcome, failed
 from distill.schema import Sample, decision_place, open_split, resolve_trees, tree_inputs
-from distill.student.chat import load_pictures
+from distill.student.chat import EncodedSample, load_pictures
+from distill.student.features import FramePicture, PictureReader, Tensors, pictures_of, read_features
+from distill.student.generate import Completion, generate
 from distill.student.model import Device, load_student, require, student_path, weight_files
-from distill.student.saving import read_adapter_facts
+from distill.student.saving import check_adapter
 
 log = logging.getLogger(__name__)
 
@@ -55,6 +56,149 @@ def make_request(
     frames = [[next(pictures) for _ in sample.views] for _ in sample.frames]
     schema = answer_schema(language=sample.language, place=decision_place(sample.answer))
     return student_request(sample.prompt, frames, schema, sampling)
+
+
+STAGE = "distill.infer"
+ANSWERS = "answers"  # the folder of journals
+
+
+class InferConfig(Config):
+    """Settings of `distill infer`."""
+
+    split: Split = Field("test", description="split whose samples are answered")
+    max_samples: int = Field(0, ge=0, description="answer only this number of first samples; 0: all")
+    max_new_tokens: int = Field(
+        512, ge=1, description="longest answer, tokens; a longer answer is cut and does not parse"
+    )
+    engine: Literal["transformers", "endpoint", "vllm"] = Field(
+        "transformers", description="transformers or vLLM in this process, or a server (endpoint) at the URL in --model"
+    )
+    constrained: bool = Field(
+        False, description="endpoint and vllm: enforce the JSON schema of answers; the parse rate then says nothing"
+    )
+    batch_size: int = Field(
+        8, ge=1, description="samples that transformers answers together; rounding may depend on it"
+    )
+    max_pixels: int = Field(0, ge=0, description="most pixels of a picture; 0: as in training, if that is known")
+    allow_code: bool = Field(False, description="run code from the student's repository; only if you trust it")
+    device: Device = Field("auto", description="auto, cpu or cuda for transformers; bfloat16 on cuda, float32 on a CPU")
+    endpoint: StudentEndpointConfig = Field(
+        StudentEndpointConfig(),
+        description="requests of endpoint and vllm; max_new_tokens and constrained take precedence",
+    )
+    vllm: MayDiffer[VllmConfig] = Field(VllmConfig(), description="settings of the engine vllm")
+
+    @property
+    def sampling(self) -> StudentEndpointConfig:
+        """How engines are asked."""
+        return self.endpoint.model_copy(update={"max_tokens": self.max_new_tokens, "json_schema": self.constrained})
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a run reads. model: a folder, or the URL of a server, or of several with commas between."""
+
+    samples: Sequence[Sample]
+    trees: Mapping[str, Path]
+    model: str | Path
+    adapter: Path | None
+
+    @property
+    def taught_pixels(self) -> int:
+        """Most pixels of a picture in training; 0: not known, as of a server or a base."""
+        folder = self.adapter or Path(self.model)
+        return read_chat_format(folder).max_pixels if (folder / CHAT_FORMAT_FILE).is_file() else 0
+
+    @property
+    def name(self) -> str:
+        """The model's name where it runs in this process: `model` of `train` and `merge` has that of its folder."""
+        folder = Path(self.model).absolute()
+        name = folder.parent.name if folder.name == "model" else folder.name
+        return name if self.adapter is None else f"{name}+{self.adapter.absolute().parent.name}"
+
+
+class LocalAnswers:
+    """A student that answers samples in this process, in batches of consecutive samples.
+
+    Which samples are in one batch follows from the samples and the settings alone, because rounding may depend on it: a
+    run that was killed and resumed gives the same answers as one that was not.
+    """
+
+    def __init__(self, cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> None:
+        """Load the student."""
+        if cfg.constrained:
+            words, fix = "the engine transformers cannot enforce a schema", "use the engine endpoint or vllm"
+            raise ConfigError(words, where=f"{STAGE}.constrained", fix=fix)
+        if inputs.adapter is not None:
+            check_adapter(inputs.adapter, Path(inputs.model))
+        given: Any = {"device": cfg.device, "adapter": inputs.adapter, "allow_code": cfg.allow_code}
+        self.student = load_student(Path(inputs.model), **given)
+        if not self.student.has_pictures and inputs.samples and inputs.samples[0].views:
+            log.warning("%s: the student takes no pictures: it answers from the text state alone", STAGE)
+        self.book, self.model, self.batch_size, self.max_tokens = book, inputs.name, cfg.batch_size, cfg.max_new_tokens
+        self.max_pixels = cfg.max_pixels or inputs.taught_pixels
+        self._reader = PictureReader(self.student.processor, inputs.trees, self.student.dtype, self.max_pixels)
+
+    async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
+        """Yield the outcome of each sample, in their order; `advance` is called after each batch."""
+        rest = iter(samples if self.student.has_pictures else (sample.without_pictures() for sample in samples))
+        while batch := list(islice(rest, self.batch_size)):
+            answers = {sample.key: self.book.get(flight_of(sample.sample_id), self._key(sample)) for sample in batch}
+            found = {s.key: SampleOutcome(s, known) for s in batch if (known := answers[s.key]) is not None}
+            if len(found) < len(batch):
+                found = await self._answer(batch) | found
+            advance(len(batch))
+            for sample in batch:
+                yield found[sample.key]
+
+    def _key(self, sample: Sample) -> str:
+        """Return a digest of what the answer depends on, besides the inputs in the folder's record."""
+        asked = sample.model_dump(mode="json", include={"run", "window", "views", "picture_px", "prompt", "language"})
+        return sha256_bytes(dump_json([self.model, sample.sample_id, asked, self.max_tokens]).encode())
+
+    async def _answer(self, batch: list[Sample]) -> dict[str, SampleOutcome]:
+        """Answer a batch, and record the answers that are new; they are on the disk when this returns."""
+        pictures = list(dict.fromkeys(picture for sample in batch for picture in pictures_of(sample)))
+        features, errors = read_features(self.student, pictures, map(self._reader.try_to_read, pictures))
+        found: dict[str, SampleOutcome] = {}
+        rows: list[tuple[EncodedSample, Sample]] = []
+        for sample in batch:
+            try:
+                bad = next((picture for picture in pictures_of(sample) if picture in errors), None)
+                if bad is None:
+                    rows.append((self.student.encode(sample, self.max_pixels), sample))
+                else:
+                    found[sample.key] = failed(sample, InputError.code, errors[bad])
+            except InputError as error:
+                found[sample.key] = failed(sample, error.code, error)
+        start_s = time.monotonic()
+        completions = self._decode(rows, features) if rows else []
+        latency_s = round(time.monotonic() - start_s, 3)
+        for (row, sample), completion in zip(rows, completions, strict=True):
+            answer = Answer(
+                key=self._key(sample), sample_id=sample.sample_id, purpose=sample.language, model=self.model,
+                text=completion.text, structured="plain", latency_s=latency_s, time=round(time.time(), 3),
+                usage={"prompt_tokens": len(row.prompt_ids), "completion_tokens": completion.num_tokens},
+                finish_reason="stop" if completion.is_finished else "length",
+            )  # fmt: skip
+            found[sample.key] = SampleOutcome(sample, answer, is_new=True)
+        new = [outcome.found for outcome in found.values() if isinstance(outcome.found, Answer)]
+        new = [answer for answer in new if self.book.get(flight_of(answer.sample_id), answer.key) is None]
+        await asyncio.gather(*(self.book.put(flight_of(answer.sample_id), answer) for answer in new))
+        return found
+
+    def _decode(
+        self, rows: Sequence[tuple[EncodedSample, Sample]], features: Mapping[FramePicture, Tensors]
+    ) -> list[Completion]:
+        import torch
+
+        seen = [features[picture] for _, sample in rows for picture in pictures_of(sample)]
+        try:
+            return generate(self.student, [row for row, _ in rows], seen, max_tokens=self.max_tokens)
+        except torch.OutOfMemoryError as error:
+            where, fix = f"{STAGE}.batch_size", "lower batch_size or max_pixels; recorded answers are kept"
+            got = f"batch_size {self.batch_size}: {str(error)[:120]}"
+            raise ConfigError("the memory is full", where=where, got=got, fix=fix) from error
 
 
 class EngineAnswers:
@@ -108,114 +252,15 @@ class EngineAnswers:
             raise TeacherError(words, where=self.engine.where, got=str(error), fix=fix)
 
 
-STAGE = "distill.infer"
-ANSWERS = "answers"  # the folder of journals
-
-
-class InferConfig(Config):
-    """Settings of `distill infer`."""
-
-    split: Split = Field("test", description="split whose samples are answered")
-    max_samples: int = Field(0, ge=0, description="answer only this number of first samples; 0: all")
-    max_new_tokens: int = Field(
-        512, ge=1, description="longest answer, tokens; a longer answer is cut and does not parse"
-    )
-    engine: Literal["transformers", "endpoint", "vllm"] = Field(
-        "transformers", description="transformers or vLLM in this process, or a server (endpoint) at the URL in --model"
-    )
-    constrained: bool = Field(
-        False, description="endpoint and vllm: enforce the JSON schema of answers; the parse rate then says nothing"
-    )
-    batch_size: int = Field(
-        8, ge=1, description="samples that transformers answers together; rounding may depend on it"
-    )
-    max_pixels: int = Field(0, ge=0, description="most pixels of a picture; 0: as in training, if that is known")
-    allow_code: bool = Field(False, description="run code from the student's repository; only if you trust it")
-    device: Device = Field("auto", description="auto, cpu or cuda for transformers; bfloat16 on cuda, float32 on a CPU")
-    endpoint: StudentEndpointConfig = Field(
-        StudentEndpointConfig(),
-        description="requests of endpoint and vllm; max_new_tokens and constrained take precedence",
-    )
-    vllm: MayDiffer[VllmConfig] = Field(VllmConfig(), description="settings of the engine vllm")
-
-    @property
-    def sampling(self) -> StudentEndpointConfig:
-        """How engines are asked."""
-        return self.endpoint.model_copy(update={"max_tokens": self.max_new_tokens, "json_schema": self.constrained})
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """What a run reads. model: a folder, or the URL of a server, or of several with commas between."""
-
-    samples: Sequence[Sample]
-    trees: Mapping[str, Path]
-    model: str | Path
-    adapter: Path | None
-
-    @property
-    def taught_pixels(self) -> int:
-        """Most pixels of a picture that the student was taught with; 0: nothing here says, as of a server or a base."""
-        if self.adapter is not None:
-            return read_adapter_facts(self.adapter, Path(self.model)).max_pixels
-        folder = Path(self.model)
-        return read_chat_format(folder).max_pixels if (folder / CHAT_FORMAT_FILE).is_file() else 0
-
-    @property
-    def name(self) -> str:
-        """The model's name where it runs in this process: `model` of `train` and `merge` has that of its folder."""
-        folder = Path(self.model).absolute()
-        name = folder.parent.name if folder.name == "model" else folder.name
-        return name if self.adapter is None else f"{name}+{self.adapter.absolute().parent.name}"
-
-
-def local_answers(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAnswers:
-    if cfg.constrained:
-        fix = "use the engine endpoint or vllm"
-        raise ConfigError("the engine transformers cannot enforce a schema", where=f"{STAGE}.constrained", fix=fix)
-    model = Path(inputs.model)
-    student = load_student(model, device=cfg.device, adapter=inputs.adapter, allow_code=cfg.allow_code)
-    if not student.has_pictures and inputs.samples and inputs.samples[0].views:
-        log.warning("%s: the student takes no pictures: it answers from the text state alone", STAGE)
-    return LocalAnswers(
-        student,
-        book,
-        inputs.trees,
-        model=inputs.name,
-        batch_size=cfg.batch_size,
-        max_tokens=cfg.max_new_tokens,
-        max_pixels=cfg.max_pixels or inputs.taught_pixels,
-    )
-
-
-def _make_engine(cfg: InferConfig, inputs: Inputs) -> Engine:
-    if cfg.engine == "endpoint":
-        return ChatClient(str(inputs.model), cfg.sampling)
-    num_images = max(len(sample.images) for sample in inputs.samples)
-    return VllmEngine(Path(inputs.model), cfg.vllm, cfg.sampling, num_images=num_images, settings=STAGE)
-
-
-def _identified(cfg: InferConfig, url: str, out: Path) -> tuple[InferConfig, str]:
-    """Put the name of the model that a server serves into the settings: no folder holds answers of two students.
-
-    A folder that is complete is not asked for again, so its server need not run.
-
-    Returns:
-        The settings, and a digest of the server's address, which itself stays out of records.
-    """
+def _with_model_name(cfg: InferConfig, url: str) -> InferConfig:
+    """Return the settings with the name of the model that a server serves: a folder has the answers of one student."""
     client = ChatClient(url, cfg.sampling)
-    server = sha256_bytes(client.where.encode())[:16]
-    if (out / "manifest.json").exists():
-        facts = read_manifest(out).facts
-        name = str(facts.get("model"))
-        if facts.get("server") == server and cfg.endpoint.model in (None, name):
-            return cfg.model_copy(update={"endpoint": cfg.endpoint.model_copy(update={"model": name})}), server
 
     async def ask() -> str:
         async with started(client):
             return client.model
 
-    return cfg.model_copy(update={"endpoint": cfg.endpoint.model_copy(update={"model": asyncio.run(ask())})}), server
+    return cfg.model_copy(update={"endpoint": cfg.endpoint.model_copy(update={"model": asyncio.run(ask())})})
 
 
 def run(
@@ -230,34 +275,34 @@ def run(
 ) -> Path:
     """Read a split, its playback trees `data`, the model and (if given) its adapter; write `predictions.jsonl`.
 
-    Every answer stands in a journal in `answers/` before anything is made of it, so nothing answered is asked twice.
+    Every answer is recorded in a journal in `answers/` first, so nothing answered is asked twice.
 
     Args:
         model: a folder, the name of a repository, or with engine `endpoint` a URL.
+
     Returns:
-        The path of `predictions.jsonl`: one line per sample, in the order of the split. Of a sample that was not
-        answered it says so, and the manifest counts it as failed; a later run tries it again.
+        The path of `predictions.jsonl`: one line per sample, in the order of the split. A sample without an answer has
+        a line with the reason, and the manifest counts it as failed; a later run tries it again.
+
     Raises:
         InputError: an input is missing or does not fit. EnvironmentMissing: a package is missing.
-        ConfigError: the engine takes no adapter, or the memory is full with one sample.
+        ConfigError: the engine takes no adapter, or the memory is full.
         TeacherError: the engine does not answer. NothingKept: no sample was answered.
     """
     trees = resolve_trees(dataset, data)
     files: dict[str, Path] = {"dataset": dataset, **tree_inputs(trees)}
-    facts: dict[str, Any] = {"split": cfg.split, "has_adapter": adapter is not None}
     if cfg.engine == "transformers":
         require("torch", "transformers", "peft")
     elif adapter is not None:
         fix = "merge the adapter into its model with cosfly distill merge, or pass --engine transformers"
-        where = "distill.infer.engine"
-        raise ConfigError("only the engine transformers can load an adapter", where=where, got=cfg.engine, fix=fix)
+        words = "only the engine transformers can load an adapter"
+        raise ConfigError(words, where=f"{STAGE}.engine", got=cfg.engine, fix=fix)
     if cfg.engine == "endpoint":
-        cfg, facts["server"] = _identified(cfg, str(model), out)
+        cfg = _with_model_name(cfg, str(model))
     else:
         model = student_path(str(model), allow_code=cfg.allow_code)
         files |= weight_files(model)
     if adapter is not None:
-        read_adapter_facts(adapter, Path(model))
         files |= {f"adapter/{path.name}": path for path in sorted(adapter.iterdir()) if path.is_file()}
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=files, seed=0, resume=resume)
     if stage.is_complete:
@@ -273,7 +318,8 @@ def run(
     results = asyncio.run(_answer_all(cfg, given, out, name))
     speed = {"seconds": round(time.monotonic() - start_s, 3), **results.new}
     outputs = [out / PREDICTIONS, *sorted((out / ANSWERS).glob("*.jsonl"))]
-    stage.finish(outputs, results.tally, **facts, model=name, parsed=results.num_parsed, speed=speed)
+    facts = {"split": cfg.split, "has_adapter": adapter is not None, "model": name, "parsed": results.num_parsed}
+    stage.finish(outputs, results.tally, **facts, speed=speed)
     return out / PREDICTIONS
 
 
@@ -285,9 +331,14 @@ async def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path, model: str) -
         advance = stack.enter_context(progress_bar(STAGE, total=len(inputs.samples)))
         answering: LocalAnswers | EngineAnswers
         if cfg.engine == "transformers":
-            answering = local_answers(cfg, inputs, book)
+            answering = LocalAnswers(cfg, inputs, book)
         else:
-            engine = _make_engine(cfg, inputs)
+            engine: Engine
+            if cfg.engine == "endpoint":
+                engine = ChatClient(str(inputs.model), cfg.sampling)
+            else:
+                most = max(len(sample.images) for sample in inputs.samples)
+                engine = VllmEngine(Path(inputs.model), cfg.vllm, cfg.sampling, num_images=most, settings=STAGE)
             await stack.enter_async_context(started(engine))
             answering = EngineAnswers(engine, book, inputs, cfg)
         outcomes = await stack.enter_async_context(contextlib.aclosing(answering.answers(inputs.samples, advance)))

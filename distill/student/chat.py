@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -303,40 +303,30 @@ def padded(processor: Processor, rows: Sequence[EncodedSample]) -> dict[str, np.
 
     Causal attention never sees what is on the right, so no mask is needed.
     """
-    prompts, answers = [row.prompt_ids for row in rows], [row.answer_ids for row in rows]
-    labels = [np.full_like(ids, IGNORED) for ids in prompts]
-    weights = [np.zeros(len(ids), np.float32) for ids in prompts]
-    kinds = _kinds(processor, rows, [np.zeros_like(ids) for ids in answers])
-    return kinds | {
-        "input_ids": _stacked(zip(prompts, answers, strict=True), processor.pad_token_id),
-        "labels": _stacked(zip(labels, answers, strict=True), IGNORED),
-        "weights": _stacked(zip(weights, [row.weights for row in rows], strict=True), 0),
+    found = {
+        "input_ids": _stacked([np.append(r.prompt_ids, r.answer_ids) for r in rows], processor.pad_token_id),
+        "labels": _stacked([np.append(np.full_like(r.prompt_ids, IGNORED), r.answer_ids) for r in rows], IGNORED),
+        "weights": _stacked([np.append(np.zeros(len(r.prompt_ids), np.float32), r.weights) for r in rows], 0),
     }
+    if any(row.kinds.any() for row in rows):
+        found[processor.kinds_name] = _stacked([np.append(r.kinds, np.zeros_like(r.answer_ids)) for r in rows], 0)
+    return found
 
 
 def prompt_batch(processor: Processor, rows: Sequence[EncodedSample]) -> dict[str, np.ndarray]:
     """Pad prompts on the left, (b, n), so that all continue at the same place: the model's inputs without pictures."""
-    prompts = [row.prompt_ids for row in rows]
-    kinds = _kinds(processor, rows, [np.zeros(0, np.int64)] * len(rows), is_left=True)
-    return kinds | {
-        "input_ids": _stacked(zip(prompts), processor.pad_token_id, is_left=True),
-        "attention_mask": _stacked(zip([np.ones_like(ids) for ids in prompts]), 0, is_left=True),
+    ids = [row.prompt_ids for row in rows]
+    found = {
+        "input_ids": _stacked(ids, processor.pad_token_id, is_left=True),
+        "attention_mask": _stacked([np.ones_like(row) for row in ids], 0, is_left=True),
     }
+    if any(row.kinds.any() for row in rows):
+        found[processor.kinds_name] = _stacked([row.kinds for row in rows], 0, is_left=True)
+    return found
 
 
-def _kinds(
-    processor: Processor, rows: Sequence[EncodedSample], ends: Sequence[np.ndarray], *, is_left: bool = False
-) -> dict[str, np.ndarray]:
-    """Return the kinds of tokens by the name of the model's input, if the model wants them and a row has pictures."""
-    if not processor.kinds_name or not any(row.kinds.any() for row in rows):
-        return {}
-    kinds = [row.kinds for row in rows]
-    return {processor.kinds_name: _stacked(zip(kinds, ends, strict=True), 0, is_left=is_left)}
-
-
-def _stacked(rows: Iterable[tuple[np.ndarray, ...]], fill: int, *, is_left: bool = False) -> np.ndarray:
-    """Join the parts of each row, and pad the rows to the longest."""
-    joined = [np.concatenate(parts) for parts in rows]
-    rest = [max(map(len, joined)) - len(row) for row in joined]
-    pads = [(count, 0) if is_left else (0, count) for count in rest]
-    return np.stack([np.pad(row, pad, constant_values=fill) for row, pad in zip(joined, pads, strict=True)])
+def _stacked(rows: Sequence[np.ndarray], fill: int, *, is_left: bool = False) -> np.ndarray:
+    """Pad rows to the longest one."""
+    counts = [max(map(len, rows)) - len(row) for row in rows]
+    pads = [(count, 0) if is_left else (0, count) for count in counts]
+    return np.stack([np.pad(row, pad, constant_values=fill) for row, pad in zip(rows, pads, strict=True)])

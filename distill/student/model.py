@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from cosfly.llm.student_chat import CHAT_FORMAT_FILE
 from cosfly.runtime.errors import EnvironmentMissing, InputError
 from cosfly.runtime.io import read_text
 from cosfly.runtime.json_io import read_json, read_object
@@ -116,14 +115,11 @@ def weight_files(path: Path) -> dict[str, Path]:
             raise InputError("the file does not exist", where=path)
         return {f"model/{path.name}": path}
     read_json(path / "config.json", what="student model (a folder with config.json, or a GGUF file)")
-    weights = sorted(path.glob("*.safetensors"))
-    if not weights:
+    if not any(path.glob("*.safetensors")):
         fix = "download the whole model folder"
         raise InputError("the folder has no weights", where=path, expected="*.safetensors", fix=fix)
-    settings = ("config.json", "tokenizer.json", "tokenizer.model", "tokenizer_config.json", CHAT_FORMAT_FILE)
-    pictures = ("preprocessor_config.json", "processor_config.json")
-    files = [path / name for name in (*settings, *pictures, TEMPLATE, "chat_template.json")]
-    return {f"model/{file.name}": file for file in (*files, *weights) if file.is_file()}
+    files = {file for pattern in MODEL_FILES for file in path.glob(pattern)}
+    return {f"model/{file.name}": file for file in sorted(files)}
 
 
 def pick_device(wanted: Device) -> str:
@@ -192,35 +188,6 @@ def model_class(config: Any) -> Any:
     return AutoModelForImageTextToText if sees or "AutoModelForImageTextToText" in own else AutoModelForCausalLM
 
 
-def load_processor(
-    path: Path, *, adapter: Path | None = None, template: str = "", allow_code: bool = False
-) -> Processor:
-    """Load the tokenizer of a student and, if it has a vision part, its processor.
-
-    Args:
-        adapter: folder whose chat template takes precedence: the one of its training.
-        template: text of a chat template that takes precedence over all.
-    """
-    config = load_config(path, allow_code=allow_code)
-    from transformers import AutoTokenizer
-
-    quiet_transformers()
-    arguments = _arguments(path, allow_code)
-    with loading_errors("tokenizer of the student", path):
-        tokenizer: Any = AutoTokenizer.from_pretrained(**arguments)
-    library = None
-    if model_class(config).__name__ == "AutoModelForImageTextToText" and hasattr(config, "vision_config"):
-        with loading_errors("processor of the student", path):
-            library = _picture_processor(config, tokenizer, arguments)
-    taught = adapter / TEMPLATE if adapter is not None else None
-    if not template and taught is not None and taught.is_file():
-        template = read_text(taught, what="chat template")
-    token = getattr(config, "image_token_id", None) or getattr(config, "image_token_index", None)
-    processor = Processor(tokenizer, library, token, template)
-    processor.check(path)
-    return processor
-
-
 def _picture_processor(config: Any, tokenizer: Any, arguments: dict[str, Any]) -> Any:
     """Put the processor of a family together without its video part, which needs torchvision and is never used."""
     from transformers import AutoImageProcessor
@@ -268,34 +235,43 @@ def load_student(
         path: a model folder or a GGUF file.
         dtype: type of the computation; auto is bfloat16 on an accelerator and float32 on a CPU.
         is_trained: keep all weights in float32, for an optimizer.
-        template: chat template that replaces that of the student.
+        template: chat template that replaces that of the student; by default that of the adapter, if it has one.
     """
     require("torch", "transformers", "peft")
     weight_files(path)
     import torch
     from peft import PeftModel
+    from transformers import AutoModelForImageTextToText, AutoTokenizer
 
+    quiet_transformers()
     device_name = pick_device(device)
     computed = compute_dtype(dtype, device_name)
-    processor = load_processor(path, adapter=adapter, template=template, allow_code=allow_code)
-    config = load_config(path, allow_code=allow_code)
+    config, arguments = load_config(path, allow_code=allow_code), _arguments(path, allow_code)
+    auto_class = model_class(config)
+    with loading_errors("tokenizer of the student", path):
+        tokenizer: Any = AutoTokenizer.from_pretrained(**arguments)
+    library = None
+    if auto_class is AutoModelForImageTextToText and hasattr(config, "vision_config"):
+        with loading_errors("processor of the student", path):
+            library = _picture_processor(config, tokenizer, arguments)
+    if not template and adapter is not None and (adapter / TEMPLATE).is_file():
+        template = read_text(adapter / TEMPLATE, what="chat template")
+    token = getattr(config, "image_token_id", None) or getattr(config, "image_token_index", None)
+    Processor(tokenizer, library, token, template).check(path)
     family = importlib.import_module(FAST_FAMILIES[config.model_type]) if config.model_type in FAST_FAMILIES else None
     if family is not None:
         family.choose_kernels(computed, device_name)
-    model: Any
+    dtypes: Any = {"dtype": torch.float32 if is_trained else computed, "use_safetensors": True}
     with loading_errors("student", adapter or path):
-        model = model_class(config).from_pretrained(
-            **_arguments(path, allow_code), dtype=torch.float32 if is_trained else computed, use_safetensors=True
-        )
+        model: Any = auto_class.from_pretrained(**arguments, **dtypes)
         if path.suffix == GGUF:
             model.config.__dict__.pop("quantization_config", None)  # the weights are plain numbers now
         if adapter is not None:
             if not (adapter / "adapter_model.safetensors").is_file():
                 raise InputError("the folder is not an adapter", where=adapter, expected="adapter_model.safetensors")
             model = PeftModel.from_pretrained(model, adapter)
-    parts = processor.tokenizer, processor.library, processor.picture_token_id, processor.template
-    student = Student(*parts, model=model, device=device_name, dtype=computed)
     model.to(device_name)
+    student = Student(tokenizer, library, token, template, model=model, device=device_name, dtype=computed)
     if family is not None and device_name == "cuda":
         family.fuse_norms(student.core)
     return student

@@ -22,10 +22,9 @@ COPIED = ("*.json", "*.jinja", "*.txt", "*.model", "LICENSE*")  # files of a mod
 
 
 class AdapterFacts(BaseModel):
-    """What `cosfly_adapter.json` says beside an adapter: digests of its base, most pixels of a picture in training."""
+    """`cosfly_adapter.json` beside an adapter: the digests of the weight files of its base."""
 
     base_sha256: dict[str, str]
-    max_pixels: int
 
 
 @contextlib.contextmanager
@@ -51,7 +50,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Any], metadata: dict[str, str
         os.replace(partial, path)
 
 
-def write_adapter(student: Student, folder: Path, base: Path, base_name: str, max_pixels: int) -> None:
+def write_adapter(student: Student, folder: Path, base: Path, base_name: str) -> None:
     """Write an adapter that peft loads, and what it belongs to.
 
     Args:
@@ -64,12 +63,12 @@ def write_adapter(student: Student, folder: Path, base: Path, base_name: str, ma
     (folder / "README.md").unlink(missing_ok=True)
     path = folder / "adapter_config.json"
     write_json(path, read_object(path, what="adapter") | {"base_model_name_or_path": base_name})
-    write_adapter_facts(folder, base, max_pixels)
+    write_adapter_facts(folder, base)
 
 
-def write_adapter_facts(folder: Path, base: Path, max_pixels: int) -> None:
-    facts = AdapterFacts(base_sha256=base_digests(base), max_pixels=max_pixels)
-    write_model(folder / ADAPTER_FACTS, facts, ADAPTER_FORMAT)
+def write_adapter_facts(folder: Path, base: Path) -> None:
+    """Write which base an adapter belongs to."""
+    write_model(folder / ADAPTER_FACTS, AdapterFacts(base_sha256=base_digests(base)), ADAPTER_FORMAT)
 
 
 def write_model_folder(student: Student, folder: Path, base: Path) -> None:
@@ -97,15 +96,13 @@ def base_digests(model: Path) -> dict[str, str]:
     return {path.name: sha256_file(path) for path in weight_files(model).values() if path.suffix in suffixes}
 
 
-def read_adapter_facts(adapter: Path, model: Path) -> AdapterFacts:
-    """Read what stands beside an adapter, and check that it belongs to the model."""
+def check_adapter(adapter: Path, model: Path) -> None:
+    """Check that a folder has an adapter of a model."""
     path = adapter / ADAPTER_FACTS
     if not path.is_file():
         expected = f"{ADAPTER_FACTS} of a finished cosfly distill train"
         raise InputError("the folder is not an adapter", where=adapter, expected=expected)
-    facts = read_model(path, AdapterFacts, ADAPTER_FORMAT)
-    if facts.base_sha256 != (found := base_digests(model)):
-        got, expected = str(found)[:120], str(facts.base_sha256)[:120]
-        fix = "pass the base model of this adapter"
+    wanted, found = read_model(path, AdapterFacts, ADAPTER_FORMAT).base_sha256, base_digests(model)
+    if wanted != found:
+        got, expected, fix = str(found)[:120], str(wanted)[:120], "pass the base model of this adapter"
         raise InputError("the adapter was trained on another model", where=path, got=got, expected=expected, fix=fix)
-    return facts

@@ -306,7 +306,7 @@ def _write_product(context: TrainingContext, product: Path, base: Path, base_nam
     student, taught = context.student, taught_by(context.train.samples, context.cfg.max_pixels)
     with atomic_folder(product) as partial:
         if context.cfg.method == "lora":
-            write_adapter(student, partial, base, base_name, taught.max_pixels)
+            write_adapter(student, partial, base, base_name)
         else:
             student.model.to(student.dtype)
             write_model_folder(student, partial, base)
