@@ -17,7 +17,7 @@ from specimens import make_playback_tree
 
 MAX_PIXELS = 64 * 64
 FAST = {
-    "max_pixels": MAX_PIXELS, "lora_rank": 4, "learning_rate": 1e-2, "schedule": "constant", "device": "cpu",
+    "max_pixels": MAX_PIXELS, "lora_rank": 4, "learning_rate": 1e-2, "device": "cpu",
     "data_workers": 0,
 }  # fmt: skip
 TWELVE = {**FAST, "samples_per_step": 4, "batch_size": 2, "epochs": 6, "max_steps": 12, "save_every_steps": 5}

@@ -166,7 +166,7 @@ def test_stopped_and_continued_is_the_same(place, tmp_path):
 def test_a_student_that_overfits_answers_right(place, tmp_path):
     learnt = samples_of(place)[:2]
     write_set(tmp_path / "set", {"train": learnt, "val": learnt}, [place / "tree"])
-    settings = {**FAST, "lora_rank": 16, "schedule": "cosine", "batch_size": 2, "samples_per_step": 2, "epochs": 80}
+    settings = {**FAST, "lora_rank": 16, "batch_size": 2, "samples_per_step": 2, "epochs": 80}
     cfg = TrainConfig(**settings, keep="last", patience=0)
     given = (tmp_path / "set", [place / "tree"], place / "student")
     adapter = train.run(cfg, *given, tmp_path / "trained")

@@ -137,7 +137,7 @@ class LocalAnswers:
             log.warning("%s: the student takes no pictures: it answers from the text state alone", STAGE)
         self.book, self.model, self.batch_size, self.max_tokens = book, inputs.name, cfg.batch_size, cfg.max_new_tokens
         self.max_pixels = cfg.max_pixels or inputs.taught_pixels
-        self._reader = PictureReader(self.student.processor, inputs.trees, self.student.dtype, self.max_pixels)
+        self._reader = PictureReader(self.student, inputs.trees, self.student.dtype, self.max_pixels)
 
     async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
         """Yield the outcome of each sample, in their order; `advance` is called after each batch."""

@@ -45,7 +45,6 @@ class EncodedSample:
     kinds (n,) int64: which tokens of the prompt are pictures, for families that want to know; 0 for others.
     """
 
-    key: str
     prompt_ids: np.ndarray
     answer_ids: np.ndarray
     weights: np.ndarray
@@ -210,7 +209,6 @@ class Processor:
         ids = np.array(found["input_ids"][0], dtype=np.int64)
         kinds = found.get(self.kinds_name) if sample.images else None
         return EncodedSample(
-            key=sample.key,
             prompt_ids=ids,
             answer_ids=np.array([*answer["input_ids"], self.end_token_id], dtype=np.int64),
             weights=sample.weight * _token_weights(text, answer, weights),

@@ -65,11 +65,6 @@ class Student(Processor):
         """The transformers model, which includes the layers of an adapter."""
         return self.model.get_base_model() if hasattr(self.model, "get_base_model") else self.model
 
-    @property
-    def processor(self) -> Processor:
-        """The student without its model, for worker processes."""
-        return Processor(self.tokenizer, self.library, self.picture_token_id, self.template)
-
     def computing(self) -> contextlib.AbstractContextManager:
         """Compute in `dtype`, whatever the type of the weights; in float32 there is nothing to convert."""
         import torch

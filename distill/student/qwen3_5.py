@@ -12,17 +12,16 @@ from typing import Any
 
 log = logging.getLogger(__name__)
 
-CONVOLUTION = "causal_conv1d"  # the package whose short convolution transformers calls where it is there
+CONVOLUTION = "causal_conv1d"  # a package with a short convolution, which transformers calls if it is installed
 LINEAR_ATTENTION = "fla"
 
 
 def choose_kernels(dtype: Any, device: str) -> None:
-    """Decide what transformers will find when it first loads the model's code, which is when it chooses; call this
-    before.
+    """Decide which kernels transformers finds when it first loads the model's code; call this before.
 
-    In float32 on an accelerator PyTorch's own functions compute, as exactly as is asked for: the fast kernels of linear
-    attention round it to fewer digits or refuse it. Else flash-linear-attention's short convolution stands in where
-    causal-conv1d, which has to be compiled, is not installed.
+    In float32 on an accelerator PyTorch's own functions are used, because the fast kernels of linear attention round to
+    fewer digits or refuse it. Otherwise, where causal-conv1d is not installed, because it has to be compiled, the short
+    convolution of flash-linear-attention takes its place.
     """
     import torch
 

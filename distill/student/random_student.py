@@ -17,7 +17,7 @@ from cosfly.runtime.seeding import rng_for
 from distill.student.model import quiet_transformers, require
 from distill.student.saving import writing_errors
 
-TINY, RANDOM = "tiny", "random"  # values of `--student` beside folders and names of repositories
+TINY, RANDOM = "tiny", "random"  # values of `--student`, as folders and names of repositories are
 START, END_OF_TURN, PAD = "<|im_start|>", "<|im_end|>", "<|endoftext|>"
 VISION_START, VISION_END, IMAGE, VIDEO = "<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>"
 _CHAT_TEMPLATE = (

@@ -22,7 +22,7 @@ COPIED = ("*.json", "*.jinja", "*.txt", "*.model", "LICENSE*")  # files of a mod
 
 
 class AdapterFacts(BaseModel):
-    """`cosfly_adapter.json` beside an adapter: the digests of the weight files of its base."""
+    """`cosfly_adapter.json` of an adapter: digests of the weight files of its base."""
 
     base_sha256: dict[str, str]
 

@@ -65,7 +65,7 @@ def make_optimizer(student: Student, cfg: TrainConfig) -> Any:
 
     parameters = list(learning_weights(student).values())
     is_fused = student.device == "cuda"
-    return torch.optim.AdamW(parameters, lr=cfg.learning_rate, weight_decay=cfg.weight_decay, fused=is_fused)
+    return torch.optim.AdamW(parameters, lr=cfg.learning_rate, weight_decay=0.0, fused=is_fused)
 
 
 def add_gradients(parameters: Sequence[Any], accelerator: Any) -> None:

@@ -37,9 +37,9 @@ class TrainConfig(Config):
     epochs: int = Field(3, ge=1, description="passes over the training split")
     max_steps: int = Field(0, ge=0, description="stop after this many optimizer steps; 0: no limit")
     samples_per_step: int = Field(16, ge=1, description="samples of an optimizer step, over all processes")
-    learning_rate: float = Field(1e-4, gt=0, description="peak learning rate of AdamW")
-    schedule: Literal["cosine", "constant"] = Field("cosine", description="learning rate after the warm-up")
-    weight_decay: float = Field(0.0, ge=0, description="AdamW's decoupled weight decay")
+    learning_rate: float = Field(
+        1e-4, gt=0, description="peak learning rate of AdamW; it rises over 3 % of the steps, then falls as a cosine"
+    )
     decision_weight: float = Field(
         20.0, gt=0, le=1000, description="weight of the decision's tokens in the loss; other tokens have weight 1"
     )
@@ -124,11 +124,9 @@ def share_of(chosen: Sequence[int], lengths: np.ndarray, rank: int, num_ranks: i
 
 
 def learning_rate_at(cfg: TrainConfig, step: int, num_steps: int) -> float:
-    """Return the learning rate of a step: a linear rise, then a half cosine to zero or a constant."""
+    """Return the learning rate of a step: a linear rise, then a half cosine to zero."""
     warmup = math.ceil(WARMUP_FRACTION * num_steps)
     if step < warmup:
         return cfg.learning_rate * (step + 1) / warmup
-    if cfg.schedule == "constant":
-        return cfg.learning_rate
     share = (step - warmup) / max(1, num_steps - warmup)
     return cfg.learning_rate * 0.5 * (1.0 + math.cos(math.pi * share))

@@ -282,13 +282,13 @@ def _context(
         log.warning("%s: the student takes no pictures: it is taught with the text state alone", STAGE)
     check_template(student, samples[0])
     check_head(student)
-    processor, weights = student.processor, AnswerWeights(cfg.decision_weight, cfg.reason_weight)
-    train, val = (TrainingSplit(part, processor, cfg.max_pixels, weights) for part in (samples, validation))
+    weights = AnswerWeights(cfg.decision_weight, cfg.reason_weight)
+    train, val = (TrainingSplit(part, student, cfg.max_pixels, weights) for part in (samples, validation))
     order = rng_for(seed, STAGE, "validation").permutation(len(validation))
     train.count(range(len(samples)), cfg.max_tokens, cfg.data_workers)
     val.count(sorted(order[: cfg.validation_samples].tolist()), cfg.max_tokens, cfg.data_workers)
     context = TrainingContext(student, cfg, seed, accelerator, train, val)
-    context.read_pictures(PictureReader(processor, trees, student.dtype, cfg.max_pixels))
+    context.read_pictures(PictureReader(student, trees, student.dtype, cfg.max_pixels))
     for name, split in (("train", train), ("val", val)):
         answers, tokens = (sum(counts) for counts in ([s.num_answer_tokens for s in split.used], split.lengths))
         words = "%s: %s has %d samples with %d tokens, %d of them in answers"

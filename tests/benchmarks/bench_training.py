@@ -125,7 +125,7 @@ def make_rows(shape: str, count: int, seed: int) -> list[tuple[EncodedSample, li
         ids = np.array(pictures + rng.integers(FIRST_WORD, vocabulary, prompt).tolist())
         answers = np.append(rng.integers(FIRST_WORD, vocabulary, answer), END)
         kinds = (ids == IMAGE).astype(np.int64)
-        encoded = EncodedSample(str(number), ids, answers, np.ones(len(answers), np.float32), kinds)
+        encoded = EncodedSample(ids, answers, np.ones(len(answers), np.float32), kinds)
         frames = [str(seed * count + number + i) for i in range(PICTURES)] if size_px else []
         rows.append((encoded, [FramePicture("run", frame, "rgb", size_px, 100.0) for frame in frames]))
     return rows
