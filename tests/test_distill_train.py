@@ -39,7 +39,7 @@ from distill.training import stage as train
 from distill.training.checkpoints import Progress, load_checkpoint, newest_checkpoint
 from distill.training.fit import judged
 from distill.training.loading import TrainingContext
-from distill.training.settings import Steps, TrainConfig
+from distill.training.settings import TrainConfig, count_steps, steps_from
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -100,13 +100,15 @@ def test_mask_covers_exactly_the_answer(place):
 
 def test_each_epoch_sees_each_sample_once():
     cfg = TrainConfig(samples_per_step=4, epochs=3)
-    steps = Steps.make(cfg, num_samples=10, seed=4)
-    assert (steps.num_steps, steps.steps_per_epoch) == (9, 3)
+    steps = list(steps_from(cfg, num_samples=10, seed=4, first=0))
+    assert (len(steps), 3) == count_steps(cfg, 10) == (9, 3)
     for epoch in range(3):
-        seen = [i for step in range(3) for i in steps.samples_of(3 * epoch + step)]
-        assert sorted(seen) == list(range(10))
-    assert steps.samples_of(0) != steps.samples_of(3)
-    assert Steps.make(TrainConfig(max_steps=2), 100, 0).num_steps == 2
+        assert sorted(i for step in steps[3 * epoch : 3 * epoch + 3] for i in step) == list(range(10))
+    assert steps[0] != steps[3]
+    assert list(steps_from(cfg, num_samples=10, seed=4, first=4)) == steps[4:]
+    assert (
+        len(list(steps_from(TrainConfig(max_steps=2), 100, 0, 0))) == count_steps(TrainConfig(max_steps=2), 100)[0] == 2
+    )
 
 
 def test_loss_falls_and_the_log_tells_how_fast(trained):

@@ -58,7 +58,7 @@ STAGE_FORMAT = FileFormat("cosfly.stage", "1.0", "stage record")
 MANIFEST_FORMAT = FileFormat("cosfly.manifest", "1.0", "manifest")
 RECORDS = {"manifest.json": MANIFEST_FORMAT.schema, "stage.json": STAGE_FORMAT.schema}
 TRACK_FILE = "trajectory.json"
-BEGUN = ("stage.json", "items.jsonl", "failures.jsonl", EVENTS, "preflight.json")  # present before any item is finished
+BEGUN = ("stage.json", "items.jsonl", "failures.jsonl", EVENTS)  # present before any item is finished
 ROLES = {"maps": "boxes", "map": "simplified"}  # input names of some stages -> the name of that product in others
 NUM_NAMED = 5  # most files that an error lists
 

@@ -47,11 +47,6 @@ class RandomStudent(Config):
     )
 
 
-def random_student_settings(name: str, given: RandomStudent) -> RandomStudent | None:
-    """Return the size of a student of random weights: of `tiny`, or the given one of `random`; None for other names."""
-    return {TINY: RandomStudent(), RANDOM: given}.get(name)
-
-
 def make_tiny_student(folder: Path, seed: int = 0) -> Path:
     """Write a student of about 0.3 million parameters that overfits a handful of captions within minutes on a CPU."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

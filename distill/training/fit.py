@@ -36,10 +36,11 @@ from distill.training.settings import (
     LOGIT_CHUNK,
     MAX_GRADIENT_NORM,
     STAGE,
-    Steps,
     TrainConfig,
+    count_steps,
     learning_rate_at,
     share_of,
+    steps_from,
 )
 
 log = logging.getLogger(__name__)
@@ -124,16 +125,15 @@ def fit(context: TrainingContext, out: Path) -> Progress:
     Writes `log.jsonl` and `checkpoints/` in `out`.
     """
     student, cfg, accelerator, folder = context.student, context.cfg, context.accelerator, out / CHECKPOINTS
-    steps = Steps.make(cfg, len(context.train.used), context.seed)
     optimizer, newest = make_optimizer(student, cfg), newest_checkpoint(folder)
     progress = load_checkpoint(newest, student, optimizer) if newest else Progress()
     if progress.step:
-        log.info("%s: resumed after step %d of %d", STAGE, progress.step, steps.num_steps)
+        log.info("%s: resumed after step %d", STAGE, progress.step)
     with _open_log(context, out / LOG, progress.step if newest else -1) as note:
         if newest is None:
             validate(context, progress, note)
         if not progress.has_ended:
-            progress = _take_steps(context, steps, optimizer, progress, folder, note)
+            progress = _take_steps(context, optimizer, progress, folder, note)
     accelerator.wait_for_everyone()
     if cfg.keep == "best" and progress.best_step not in (0, progress.step):
         load_checkpoint(checkpoint_path(folder, progress.best_step), student)
@@ -141,13 +141,11 @@ def fit(context: TrainingContext, out: Path) -> Progress:
     return progress
 
 
-def _take_steps(
-    context: TrainingContext, steps: Steps, optimizer: Any, progress: Progress, folder: Path, note: Note
-) -> Progress:
+def _take_steps(context: TrainingContext, optimizer: Any, progress: Progress, folder: Path, note: Note) -> Progress:
     cfg, accelerator, lengths = context.cfg, context.accelerator, context.train.lengths
-    first, num_steps, start_s = progress.step, steps.num_steps, time.monotonic()
-    mine = accelerator.process_index, accelerator.num_processes
-    shares = (share_of(steps.samples_of(step), lengths, *mine) for step in range(first, num_steps))
+    first, start_s, mine = progress.step, time.monotonic(), (accelerator.process_index, accelerator.num_processes)
+    num_steps, per_epoch = count_steps(cfg, len(lengths))
+    shares = (share_of(step, lengths, *mine) for step in steps_from(cfg, len(lengths), context.seed, first))
     step_start_s = start_s
     with progress_bar(STAGE, total=num_steps, done=first) as advance:
         for step, rows in enumerate(context.train.rows(shares, num_workers(cfg.data_workers)), first):
@@ -163,11 +161,10 @@ def _take_steps(
                 "memory_gb": round(used_gb(context.student.device), 3),
                 "left_s": round((now_s - start_s) / (done - first) * (num_steps - done), 1),
             }
-            record = {"step": done, "epoch": step // steps.steps_per_epoch, "learning_rate": rate}
+            record = {"step": done, "epoch": step // per_epoch, "learning_rate": rate}
             note({**record, **facts, "speed": speed})
             progress = progress.model_copy(update={"step": done})
-            every = cfg.validate_every_steps or steps.steps_per_epoch
-            is_validated = done == num_steps or done % every == 0
+            is_validated = done == num_steps or done % (cfg.validate_every_steps or per_epoch) == 0
             if is_validated:
                 progress = validate(context, progress, note)
             is_last = done == num_steps or progress.has_ended

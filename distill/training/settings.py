@@ -4,8 +4,7 @@ rate."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -89,29 +88,20 @@ class TrainConfig(Config):
         return self
 
 
-@dataclass(frozen=True)
-class Steps:
-    """Steps of one epoch follow a permutation of their own; neither processes nor batches have a part in it."""
+def count_steps(cfg: TrainConfig, num_samples: int) -> tuple[int, int]:
+    """Return the number of steps, and of those of an epoch."""
+    per_epoch = math.ceil(num_samples / cfg.samples_per_step)
+    return min(cfg.epochs * per_epoch, cfg.max_steps or cfg.epochs * per_epoch), per_epoch
 
-    num_samples: int
-    samples_per_step: int
-    num_steps: int
-    seed: int
 
-    @classmethod
-    def make(cls, cfg: TrainConfig, num_samples: int, seed: int) -> Steps:
-        num_steps = cfg.epochs * math.ceil(num_samples / cfg.samples_per_step)
-        return cls(num_samples, cfg.samples_per_step, min(num_steps, cfg.max_steps or num_steps), seed)
-
-    @property
-    def steps_per_epoch(self) -> int:
-        return math.ceil(self.num_samples / self.samples_per_step)
-
-    def samples_of(self, step: int) -> list[int]:
-        """Return the sample indices of a step; the last step of an epoch may be smaller."""
-        epoch, position = divmod(step, self.steps_per_epoch)
-        order = rng_for(self.seed, STAGE, f"epoch_{epoch}").permutation(self.num_samples)
-        return order[position * self.samples_per_step : (position + 1) * self.samples_per_step].tolist()
+def steps_from(cfg: TrainConfig, num_samples: int, seed: int, first: int) -> Iterator[list[int]]:
+    """Yield the sample indices of each step from one on: an epoch is a permutation, cut into steps."""
+    size, (num_steps, per_epoch) = cfg.samples_per_step, count_steps(cfg, num_samples)
+    for epoch in range(first // per_epoch, cfg.epochs):
+        order = rng_for(seed, STAGE, f"epoch_{epoch}").permutation(num_samples).tolist()
+        for step in range(max(first, epoch * per_epoch), min(num_steps, (epoch + 1) * per_epoch)):
+            start = step % per_epoch * size
+            yield order[start : start + size]
 
 
 def share_of(chosen: Sequence[int], lengths: np.ndarray, rank: int, num_ranks: int) -> list[int]:

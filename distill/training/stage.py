@@ -9,11 +9,11 @@ import contextlib
 import logging
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import timedelta
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from cosfly.formats.captions import Language, Place, Prompt
 from cosfly.formats.predictions import Split
@@ -26,7 +26,7 @@ from distill.schema import Sample, decision_place, open_split, resolve_trees, tr
 from distill.student.chat import AnswerWeights, check_template
 from distill.student.features import PictureReader
 from distill.student.model import Student, is_hub_name, load_student, pick_device, require, student_path, weight_files
-from distill.student.random_student import make_random_student, random_student_settings
+from distill.student.random_student import RANDOM, TINY, RandomStudent, make_random_student
 from distill.student.saving import write_adapter, write_model_folder
 from distill.training.checkpoints import learning_weights
 from distill.training.fit import LOG, fit, seeded
@@ -40,7 +40,6 @@ TAUGHT: tuple[Split, ...] = ("train", "val")
 ADAPTER, MODEL, STUDENT = "adapter", "model", "student"
 TOKENIZER_SAMPLES = 2000  # most samples that the tokenizer of a random student is trained on
 PATIENCE = timedelta(minutes=30)  # for the slowest process: loading weights, counting tokens, validation
-T = TypeVar("T")
 
 
 def taught_by(samples: Iterable[Sample], max_pixels: int) -> ChatFormat:
@@ -167,13 +166,6 @@ def processes(cfg: TrainConfig, out: Path) -> Iterator[Any]:
             accelerator.end_training()
 
 
-def first_does(accelerator: Any, action: Callable[[], T]) -> T:
-    """Return in all processes the result of an action of the first one."""
-    from accelerate.utils import broadcast_object_list
-
-    return broadcast_object_list([action() if accelerator.is_main_process else None])[0]
-
-
 @contextlib.contextmanager
 def torch_errors(cfg: TrainConfig) -> Iterator[None]:
     """Convert what torch raises about full memory, killed workers and lost processes into one line with a fix."""
@@ -225,11 +217,13 @@ def run(
         ConfigError: the memory is full, or the loss is not finite.
     """
     require("torch", "transformers", "peft", "accelerate")
+    from accelerate.utils import broadcast_object_list
+
     base_name = str(student) if is_hub_name(str(student)) else Path(student).absolute().name
     product = out / (ADAPTER if cfg.method == "lora" else MODEL)
     with torch_errors(cfg), processes(cfg, out) as accelerator:
         trees = resolve_trees(dataset, data)
-        random_student = random_student_settings(str(student), cfg.random_student)
+        random_student = {TINY: RandomStudent(), RANDOM: cfg.random_student}.get(str(student))
         base = out / STUDENT if random_student else student_path(str(student), allow_code=cfg.allow_code)
         if random_student is not None:
             cfg = cfg.model_copy(update={"random_student": random_student})
@@ -246,7 +240,8 @@ def run(
                 make_random_student(base, random_student, seed, texts)
             return opened[0].is_complete
 
-        if first_does(accelerator, begin):
+        # Only the first process may open the folder, and its error ends all.
+        if broadcast_object_list([begin() if accelerator.is_main_process else None])[0]:
             return product
         accelerator.init_trackers(STAGE)
         context = _context(cfg, dataset, trees, base, seed, accelerator)
