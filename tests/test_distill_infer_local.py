@@ -15,6 +15,7 @@ from teacher_server import kept_answers
 
 from cosfly.formats.predictions import Prediction, read_predictions
 from cosfly.llm.student_chat import CHAT_FORMAT_FILE
+from cosfly.runtime.errors import ConfigError
 from distill.inference import merge
 from distill.inference import stage as infer
 from distill.schema import Sample, open_split, resolve_trees
@@ -107,6 +108,11 @@ def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
     assert result.exit_code == 0, result.output
     assert told(read_predictions(tmp_path / "out" / "predictions.jsonl")) == expected
     assert json.loads((tmp_path / "out" / "manifest.json").read_text())["speed"]["answers"] == len(hit)
+
+
+def test_a_schema_is_enforced_by_servers_and_vllm_only(place, tmp_path):
+    with pytest.raises(ConfigError, match=r"cannot enforce a schema.*endpoint or vllm"):
+        answer(place, tmp_path / "out", constrained=True)
 
 
 def test_a_merged_student_sees_pictures_as_it_was_taught(place, tmp_path):
