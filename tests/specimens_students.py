@@ -12,7 +12,7 @@ from distill.schema import Sample, open_split, resolve_trees
 from distill.student.chat import prompt_batch
 from distill.student.features import PictureReader, Tensors, encode, pictures_of
 from distill.student.model import Student, load_student
-from distill.student.random_student import make_tiny_student
+from distill.student.random_student import make_random_student
 from specimens import make_playback_tree
 
 MAX_PIXELS = 64 * 64
@@ -27,7 +27,7 @@ def make_place(root: Path) -> Path:
     make_playback_tree(root / "tree", num_flights=3, num_points=7)
     make_captions(root / "captions.jsonl", root / "tree")
     prepared(root / "tree", root / "captions.jsonl", root / "set")
-    make_tiny_student(root / "student")
+    make_random_student(root / "student")
     return root
 
 

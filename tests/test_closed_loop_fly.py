@@ -24,7 +24,7 @@ from cosfly.llm.student_chat import write_chat_format
 from cosfly.runtime.errors import NothingKept
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
-from distill.student.random_student import make_tiny_student
+from distill.student.random_student import make_random_student
 from distill.training.stage import taught_by
 from release.verify.verify import verify
 from specimens import make_playback_tree
@@ -177,7 +177,7 @@ def student(tmp_path_factory) -> Path:
     tree = make_playback_tree(root / "tree", num_flights=3, num_points=11, width_px=160, height_px=90)
     captions = caption_tree(CaptionConfig(), tree, root / "captions")
     prepared(tree, captions, root / "set", modalities=("rgb",))
-    make_tiny_student(root / "model")
+    make_random_student(root / "model")
     write_chat_format(root / "model", taught_by(open_split(root / "set", "train"), 64 * 64))
     return root / "model"
 

@@ -21,7 +21,7 @@ from distill.inference import stage as infer
 from distill.schema import Sample, open_split, resolve_trees
 from distill.student.generate import generate
 from distill.student.model import load_student
-from distill.student.random_student import make_tiny_student
+from distill.student.random_student import make_random_student
 from specimens import make_playback_tree
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -35,7 +35,7 @@ def place(tmp_path_factory) -> Path:
     tree = make_playback_tree(root / "tree", num_flights=3, num_points=8)
     make_captions(root / "captions.jsonl", tree)
     prepared(tree, root / "captions.jsonl", root / "set", modalities=("rgb", "depth"))
-    make_tiny_student(root / "student", seed=1)
+    make_random_student(root / "student", seed=1)
     make_adapter(root / "student", root / "trained" / "adapter")
     return root
 

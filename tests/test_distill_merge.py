@@ -9,14 +9,14 @@ from specimens_distill import make_adapter
 
 from distill.inference import merge
 from distill.student.model import load_student
-from distill.student.random_student import make_tiny_student
+from distill.student.random_student import make_random_student
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory) -> Path:
-    folder = make_tiny_student(tmp_path_factory.mktemp("base") / "student", seed=2)
+    folder = make_random_student(tmp_path_factory.mktemp("base") / "student", seed=2)
     # Any file that servers need.
     shutil.copy(folder / "generation_config.json", folder / "video_preprocessor_config.json")
     return folder

@@ -31,7 +31,7 @@ from cosfly.formats.kinds import KIND_NAMES
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
 from cosfly.runtime.config import shipped
-from distill.student.random_student import make_tiny_student
+from distill.student.random_student import make_random_student
 
 # Pages in the order in which what one makes is there for the next; the last one draws the tree of all others anew.
 FIRST, LAST = ("first-runs.md", "commands.md"), ("rendering.md",)
@@ -193,8 +193,9 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "data/b/Bbox_total.json": copy_of("data/b/Bbox.json"), "runs/town1": copy_of("runs/diverse/grid"),
     "runs/town2": copy_of("runs/diverse/old_town"), "work/flown0": copy_of("work/random"),
     "work/flown1": copy_of("work/rules"), "work/copy": copy_of("work/release"),
-    "work/unlabelled/render": copy_of("work/render"), "Qwen/Qwen3.5-2B": lambda root, target: make_tiny_student(target),
-    "models/Qwen3.5-2B": lambda root, target: make_tiny_student(target),
+    "work/unlabelled/render": copy_of("work/render"),
+    "Qwen/Qwen3.5-2B": lambda root, target: make_random_student(target),
+    "models/Qwen3.5-2B": lambda root, target: make_random_student(target),
     "models/roberta-large": lambda root, target: make_encoder(target),
     "models/bert-base-chinese": lambda root, target: make_encoder(target),
     "work/evaluation-4B": copy_of("work/evaluation-2B"), "work/text": copy_of("work/both"),

@@ -11,7 +11,6 @@ from pydantic import Field
 
 from cosfly.formats.captions import FIELDS, TOKENS
 from cosfly.runtime.config import Config
-from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_folder
 from cosfly.runtime.seeding import rng_for
 from distill.student.model import quiet_transformers, require
@@ -47,14 +46,12 @@ class RandomStudent(Config):
     )
 
 
-def make_tiny_student(folder: Path, seed: int = 0) -> Path:
-    """Write a student of about 0.3 million parameters that overfits a handful of captions within minutes on a CPU."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError("the folder is not empty", where=folder, fix="choose another --out")
-    return make_random_student(folder, RandomStudent(), seed)
+TINY_STUDENT = RandomStudent()  # overfits a handful of captions within minutes on a CPU
 
 
-def make_random_student(folder: Path, cfg: RandomStudent, seed: int, texts: Iterable[str] = ()) -> Path:
+def make_random_student(
+    folder: Path, cfg: RandomStudent = TINY_STUDENT, seed: int = 0, texts: Iterable[str] = ()
+) -> Path:
     """Write a randomly initialised student as a model folder.
 
     Args:

@@ -26,7 +26,7 @@ from distill.schema import Sample, decision_place, open_split, resolve_trees, tr
 from distill.student.chat import AnswerWeights, check_template
 from distill.student.features import PictureReader
 from distill.student.model import Student, is_hub_name, load_student, pick_device, require, student_path, weight_files
-from distill.student.random_student import RANDOM, TINY, RandomStudent, make_random_student
+from distill.student.random_student import RANDOM, TINY, TINY_STUDENT, make_random_student
 from distill.student.saving import write_adapter, write_model_folder
 from distill.training.checkpoints import learning_weights
 from distill.training.fit import LOG, fit, seeded
@@ -223,7 +223,7 @@ def run(
     product = out / (ADAPTER if cfg.method == "lora" else MODEL)
     with torch_errors(cfg), processes(cfg, out) as accelerator:
         trees = resolve_trees(dataset, data)
-        random_student = {TINY: RandomStudent(), RANDOM: cfg.random_student}.get(str(student))
+        random_student = {TINY: TINY_STUDENT, RANDOM: cfg.random_student}.get(str(student))
         base = out / STUDENT if random_student else student_path(str(student), allow_code=cfg.allow_code)
         if random_student is not None:
             cfg = cfg.model_copy(update={"random_student": random_student})
