@@ -45,8 +45,8 @@ def newest_checkpoint(folder: Path) -> Path | None:
     return max(folder.glob("step_*"), default=None)
 
 
-def save_checkpoint(folder: Path, student: Student, optimizer: Any, progress: Progress, keep: int) -> None:
-    """Write a checkpoint, whole or not at all, and drop all but the newest `keep` checkpoints and the best one."""
+def save_checkpoint(folder: Path, student: Student, optimizer: Any, progress: Progress) -> None:
+    """Write a checkpoint, whole or not at all."""
     weights = learning_weights(student)
     moments = {
         f"{name}/{key}": value
@@ -57,6 +57,10 @@ def save_checkpoint(folder: Path, student: Student, optimizer: Any, progress: Pr
         save_tensors(partial / WEIGHTS, weights)
         save_tensors(partial / MOMENTS, moments)
         write_model(partial / STATE, progress, CHECKPOINT_FORMAT)
+
+
+def drop_old_checkpoints(folder: Path, progress: Progress, keep: int) -> None:
+    """Remove all but the newest `keep` checkpoints and the best one; what a kill left of an older one goes too."""
     for path in sorted(folder.glob("step_*"))[:-keep]:
         if path != checkpoint_path(folder, progress.best_step):
             shutil.rmtree(path)

@@ -25,6 +25,7 @@ from distill.training.checkpoints import (
     Progress,
     checkpoint_path,
     cut_log,
+    drop_old_checkpoints,
     learning_weights,
     load_checkpoint,
     newest_checkpoint,
@@ -134,6 +135,8 @@ def fit(context: TrainingContext, out: Path) -> Progress:
             validate(context, progress, note)
         if not progress.has_ended:
             progress = _take_steps(context, optimizer, progress, folder, note)
+    if accelerator.is_main_process:  # again, because a kill may have come in the middle of it
+        drop_old_checkpoints(folder, progress, cfg.keep_checkpoints)
     accelerator.wait_for_everyone()
     if cfg.keep == "best" and progress.best_step not in (0, progress.step):
         load_checkpoint(checkpoint_path(folder, progress.best_step), student)
@@ -169,7 +172,8 @@ def _take_steps(context: TrainingContext, optimizer: Any, progress: Progress, fo
                 progress = validate(context, progress, note)
             is_last = done == num_steps or progress.has_ended
             if accelerator.is_main_process and (is_last or is_validated or done % cfg.save_every_steps == 0):
-                save_checkpoint(folder, context.student, optimizer, progress, cfg.keep_checkpoints)
+                save_checkpoint(folder, context.student, optimizer, progress)
+                drop_old_checkpoints(folder, progress, cfg.keep_checkpoints)
             advance(1, f"loss {facts['loss']:.4f}, {speed['tokens_per_s']:.0f} tokens/s, {speed['memory_gb']:.1f} GB")
             if is_last:
                 break
