@@ -159,13 +159,12 @@ def test_one_version_is_named_everywhere_and_every_tag_has_its_heading():
     assert set(tags) <= {f"v{number}" for number, day in found if day != "unreleased"}
 
 
-TOWNS = [f"runs/learning/{name}" for name in ("grid", "old_town", "city_a", "city_b")]
+TOWNS = [f"runs/learning/{name}" for name in ("grid", "old_town", "towers")]
 VARIABLES = {
     "trees": " ".join(f"--data {town}/render" for town in TOWNS),
     "towns": " ".join(TOWNS),
     "name": "both",
     "size": "2B",
-    "DATA": "data",
     "flights": "--map work/town10/maps/boxes_3d.json --simplified work/town10/simplify/step2_simplified.json "
     "--traces work/town10/plan/drone_trace.json",
 }  # of loops in a page
@@ -215,7 +214,7 @@ def parsed(text: str) -> tuple[Any, list[str]]:
 
 def test_the_commands_are_found():
     pages = {name for name, _ in ALL}
-    assert {"commands.md", "distillation.md", "releases.md", "teachers.md", "files.md", "first-runs.md"} <= pages
+    assert {"commands.md", "distillation.md", "releases.md", "model-servers.md", "files.md", "first-runs.md"} <= pages
     assert len(ALL) > 90
     assert any(text.startswith("distill train --dataset work/dataset") for _, text in ALL)
 

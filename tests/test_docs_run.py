@@ -55,7 +55,7 @@ NOT_HERE = {
     "SmolLM2-135M-Instruct.Q4_1.gguf": "a file of 98 MB; tests/test_distill_families.py trains it where it is",
     "--teacher vllm:": "vLLM needs an accelerator; tests/test_engines_contract.py holds its engine to the documents",
     "--engine vllm": "the same",
-    "--out work/students-captions": "of a random student nothing is kept; docs/distillation.md has one that answers",
+    "--out work/students-captions": "a student of random weights writes no caption that is kept",
 }
 
 
@@ -77,7 +77,7 @@ SMALL = {
         *("pedestrians.num_paths=1", "pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25"),
         *("render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]", "inspect.legible_min=0"),
     ),
-    "run quickstart --out runs/five": _set("pedestrians.num_paths=2"),
+    "run quickstart --out runs/five": _set("pedestrians.num_paths=3"),
     "bench": ["--workers", "2"],
     "reproduce": ["--pedestrians", "1", "--workers", "1"],
     "distill train": _set(
@@ -179,7 +179,7 @@ def _delft(root: Path, target: Path) -> None:
 def _others_captions(root: Path, target: Path) -> None:
     lines = [
         {"sample_id": c.sample_id, "en": c.en.model_dump(), "zh": c.zh.model_dump()}
-        for c in read_captions(root / "work/caption/captions.jsonl")
+        for c in read_captions(root / "runs/quickstart/caption/captions.jsonl")
         if c.en and c.zh
     ]
     target.write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -191,16 +191,14 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "town.csv": _table, "town.geojson": _geojson,
     "osm.geojson": _tagged, "buildings.geojson": _tagged, "file:captions.jsonl": _others_captions,
     "../shared/data/simworld-progen/progen_world.json": _world, "../shared/data/delft-bgt-lod1/delft.json.gz": _delft,
-    "data/a/progen_world.json": _world, "data/b/progen_world.json": _world, "data/a/Bbox.json": _world,
-    "data/b/Bbox_total.json": copy_of("data/b/Bbox.json"), "runs/town1": copy_of("runs/diverse/grid"),
-    "runs/town2": copy_of("runs/diverse/old_town"), "work/flown0": copy_of("work/random"),
+    "work/flown0": copy_of("work/random"),
     "work/flown1": copy_of("work/rules"), "work/copy": copy_of("work/release"),
-    "work/unlabelled/render": copy_of("work/render"), "Qwen/Qwen3.5-2B": lambda root, target: make_tiny_student(target),
+    "work/unlabelled/render": copy_of("runs/quickstart/render"),
+    "Qwen/Qwen3.5-2B": lambda root, target: make_tiny_student(target),
     "models/Qwen3.5-2B": lambda root, target: make_tiny_student(target),
     "models/roberta-large": lambda root, target: make_encoder(target),
     "models/bert-base-chinese": lambda root, target: make_encoder(target),
-    "work/evaluation-4B": copy_of("work/evaluation-2B"), "work/text": copy_of("work/both"),
-    "work/pictures": copy_of("work/both"), "work/middle": copy_of("work/both"),
+    "work/infer-4B": copy_of("work/infer-2B"),
 }  # fmt: skip
 
 
@@ -213,7 +211,7 @@ def small_run(name: str) -> dict[str, Any]:
         value["render"].update(frame_stride=2)
     value.setdefault("maps", {}).setdefault("synthetic", {}).update(size_m=150, num_blocks=1)
     value.get("distill", {}).get("train", {}).pop("random_student", None)  # the smallest there is
-    value["towns"] = dict(list(value.get("towns", {}).items())[:2])
+    value["towns"] = dict(list(value.get("towns", {}).items())[:3])  # a split each
     return value
 
 
