@@ -23,7 +23,7 @@ from cosfly.llm.contract import NoAnswer, Reply, Request
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
 
-INSTALL = 'pip install "cosfly[vllm]" on a machine with an accelerator'
+INSTALL = 'pip install -e ".[vllm]" on a machine with an accelerator'
 ADDED_PER_STEP = 8  # requests added between two steps
 FINISHED = ("stop", "length")  # finish reasons of an answer; others are failures of the engine
 
