@@ -1,6 +1,5 @@
 """Every command of the documentation runs, page after page in one folder, as somebody would who reads along."""
 
-import csv
 import glob
 import gzip
 import json
@@ -27,14 +26,13 @@ from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.formats.captions import read_captions
-from cosfly.formats.kinds import KIND_NAMES
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
 from cosfly.runtime.config import shipped
 from distill.student.random_student import make_tiny_student
 
-# Pages in the order in which what one makes is there for the next; the last one draws the tree of all others anew.
-FIRST, LAST = ("first-runs.md", "commands.md"), ("rendering.md",)
+# Pages in the order in which what one makes is there for the next; the last one draws the tree of all others again.
+FIRST, LAST = ("install.md", "commands.md"), ("rendering.md",)
 QUICKSTART = "run quickstart --out runs/quickstart"  # what `make quickstart` does, beside installing
 # What no machine of the tests can do, or another test does: words of the command, and why.
 NOT_HERE = {
@@ -46,12 +44,9 @@ NOT_HERE = {
     "pip install -e": "the tests stand in that environment",
     "pip install --no-deps": "the same",
     "python tests/benchmarks/": "minutes each; what they measure stands beside them in the documents",
-    "python docs/window_card.py": "a page for the browser of the next line",
-    "chromium --headless": "a browser; tests/browser.py drives one for the pages that run a script",
     "--env cosfly/": "1,600 frames each; tests/test_cosfly_envs.py flies a list and policies",
     "--out work/round1": "two short flights are too few walks to split; tests/test_distill_dataset.py has more",
-    "roi edit work/": "it serves until it is stopped; tests/test_cosfly_roi_editor.py draws on its page",
-    "render.carla.server_command=": "CARLA itself; tests/test_render_carla.py starts a server of ours by that setting",
+    "roi edit ": "it serves until it is stopped; tests/test_cosfly_roi_editor.py draws on its page",
     "SmolLM2-135M-Instruct.Q4_1.gguf": "a file of 98 MB; tests/test_distill_families.py trains it where it is",
     "--teacher vllm:": "vLLM needs an accelerator; tests/test_engines_contract.py holds its engine to the documents",
     "--engine vllm": "the same",
@@ -137,22 +132,12 @@ def copy_of(path: str) -> Callable[[Path, Path], object]:
     return lambda root, target: (shutil.copytree if (root / path).is_dir() else shutil.copy)(root / path, target)
 
 
-def _table(root: Path, target: Path) -> None:
-    town = invent(SyntheticConfig(size_m=120.0, num_blocks=1), 0)
-    with target.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["type", "x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_deg"])
-        for kind, center, half, rotation in zip(
-            town.kinds, town.centers, town.half_extents, town.rotations_deg, strict=True
-        ):
-            writer.writerow([KIND_NAMES[kind], *center, *(2 * half), rotation[1]])
-
-
-def _geojson(root: Path, target: Path) -> None:
-    ring = [[0, 0], [40, 0], [40, 30], [0, 30], [0, 0]]
-    shape = {"type": "Polygon", "coordinates": [ring]}
-    house = {"type": "Feature", "properties": {"type": "Buildings", "height_m": 9}, "geometry": shape}
-    target.write_text(json.dumps({"type": "FeatureCollection", "features": [house]}))
+def _shown(page: str, begin: str) -> Callable[[Path, Path], object]:
+    """Return a maker of the file that a page shows in the block with this beginning."""
+    text = next(path for path in PAGES if path.name == page).read_text(encoding="utf-8")
+    shown = re.search(rf"^```\w+\n({re.escape(begin)}.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    assert shown is not None
+    return lambda root, target: target.write_text(shown[1])
 
 
 def _tagged(root: Path, target: Path) -> None:
@@ -188,10 +173,10 @@ def _others_captions(root: Path, target: Path) -> None:
 # What a reader brings: path, as a command names it -> what makes it. The longer path before the shorter.
 BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "CosFly-Track": lambda root, target: write_foreign_tree(target, trajectories=("trajectory_1", "trajectory_2")),
-    "town.csv": _table, "town.geojson": _geojson,
+    "town.csv": _shown("install.md", "type,x_m"), "town.geojson": _shown("maps.md", '{"type": "FeatureCollection"'),
+    "mine.yaml": _shown("commands.md", "name: mine"),
     "osm.geojson": _tagged, "buildings.geojson": _tagged, "file:captions.jsonl": _others_captions,
-    "../shared/data/simworld-progen/progen_world.json": _world, "../shared/data/delft-bgt-lod1/delft.json.gz": _delft,
-    "work/flown0": copy_of("work/random"),
+    "progen_world.json": _world, "delft.json.gz": _delft, "work/flown0": copy_of("work/random"),
     "work/flown1": copy_of("work/rules"), "work/copy": copy_of("work/release"),
     "work/unlabelled/render": copy_of("runs/quickstart/render"),
     "Qwen/Qwen3.5-2B": lambda root, target: make_tiny_student(target),
