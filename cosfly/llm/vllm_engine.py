@@ -1,6 +1,6 @@
 """Engine `vllm`: vLLM in this process, over a model folder (extra `vllm`).
 
-Tested with vLLM 0.26 (docs/teachers.md has the figures). vLLM runs in its own thread: requests join while others are
+Tested with vLLM 0.26 (docs/benchmarks.md has the figures). vLLM runs in its own thread: requests join while others are
 answered (`LLM.enqueue_chat`, `LLMEngine.step`), and a refused request does not affect others.
 """
 
