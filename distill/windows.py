@@ -364,7 +364,7 @@ class WindowDataset(Windows):
 
     def __init__(self, source: str | Path, captions: str | Path | None = None, **options: Any) -> None:
         if importlib.util.find_spec("torch") is None:
-            raise EnvironmentMissing("PyTorch is not installed", fix="pip install -e '.[distill]'")
+            raise EnvironmentMissing("PyTorch is not installed", fix="pip install 'cosfly[distill]'")
         super().__init__(source, captions, **options)
 
     def __getitem__(self, index: int) -> dict[str, Any]:  # type: ignore[override]
