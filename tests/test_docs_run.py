@@ -141,12 +141,22 @@ def _shown(page: str, begin: str) -> Callable[[Path, Path], object]:
 
 
 def _tagged(root: Path, target: Path) -> None:
-    west, south, size = 4.36, 52.01, 0.0004  # degrees
-    corners = [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]
-    ring = [[west + size * x, south + size * y] for x, y in corners]
-    properties = {"building": "yes", "class": "residential", "height": 9}
-    house = {"type": "Feature", "properties": properties, "geometry": {"type": "Polygon", "coordinates": [ring]}}
-    target.write_text(json.dumps({"type": "FeatureCollection", "features": [house]}))
+    """Write four houses along three streets, with the tags of OpenStreetMap and of Overture."""
+    west, south, per_m = 4.36, 52.01, 1.0e-5  # degrees
+
+    def places(*corners_m: tuple[float, float]) -> list[list[float]]:
+        return [[west + x * per_m, south + y * per_m] for x, y in corners_m]
+
+    features = []
+    for x, y in ((20, 20), (80, 20), (20, 80), (80, 80)):
+        ring = places((x, y), (x + 25, y), (x + 25, y + 20), (x, y + 20), (x, y))
+        properties = {"building": "yes", "class": "residential", "height": 9}
+        features.append((properties, {"type": "Polygon", "coordinates": [ring]}))
+    for begin, end in (((0, 0), (120, 0)), ((0, 60), (120, 60)), ((60, 0), (60, 120))):
+        line = {"type": "LineString", "coordinates": places(begin, end)}
+        features.append(({"highway": "residential", "class": "secondary"}, line))
+    listed = [{"type": "Feature", "properties": tags, "geometry": shape} for tags, shape in features]
+    target.write_text(json.dumps({"type": "FeatureCollection", "features": listed}))
 
 
 def _world(root: Path, target: Path) -> None:
