@@ -77,7 +77,7 @@ SMALL = {
     "reproduce": ["--pedestrians", "1", "--workers", "1"],
     "distill train": _set(
         *("distill.train.max_steps=2", "distill.train.max_pixels=4096", "distill.train.samples_per_step=2"),
-        *("distill.train.batch_size=1", "distill.train.validation_samples=0", "distill.train.data_workers=0"),
+        *("distill.train.batch_size=1", "distill.train.validation_samples=2", "distill.train.data_workers=0"),
     ),
     "distill infer": _set(
         *("distill.infer.max_samples=2", "distill.infer.max_new_tokens=8", "distill.infer.max_pixels=4096")
