@@ -20,7 +20,7 @@ NAME = re.compile(r"^# (\S+\.py)$")
 PRODUCTS = (
     "work/blocks/boxes_3d.json", "work/overhead/drone_trace.json", "work/compared/compare.json",
     "work/thermal/manifest.json", "work/echo/captions.jsonl", "work/inspect/report.html",
-    "work/altitudes/dataset/release.json", "work/poses/poses/export.json",
+    "work/altitudes/dataset/release.json", "work/poses/poses/checksums.sha256",
 )  # fmt: skip
 
 
