@@ -192,7 +192,7 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "models/Qwen3.5-2B": lambda root, target: make_tiny_student(target),
     "models/roberta-large": lambda root, target: make_encoder(target),
     "models/bert-base-chinese": lambda root, target: make_encoder(target),
-    "work/infer-4B": copy_of("work/infer-2B"),
+    "work/infer-4B": copy_of("work/infer-2B"), "work/infer-100k-4B": copy_of("work/infer-100k-2B"),
 }  # fmt: skip
 
 
