@@ -82,7 +82,6 @@ SMALL = {
     "distill infer": _set(
         *("distill.infer.max_samples=2", "distill.infer.max_new_tokens=8", "distill.infer.max_pixels=4096")
     ),
-    "distill evaluate": _set("distill.evaluate.bertscore.en.layer=2", "distill.evaluate.bertscore.zh.layer=2"),
 }
 
 
