@@ -31,7 +31,7 @@ format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-site: $(TOOLS)/.installed  ## build/site: docs/ as pages to open; a link that leads nowhere is an error
+site: $(TOOLS)/.installed  ## build/site: docs/ as pages; with search: python -m http.server --directory build/site
 	$(TOOLS)/bin/mkdocs build --strict
 
 audit: $(TOOLS)/.installed $(VENV)/.installed-dev  ## Known weaknesses of what the container and the tests install; asks a public advisory service

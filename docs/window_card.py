@@ -16,7 +16,7 @@ from cosfly.formats.frames import read_rgb
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 
-CROP_PX = (360, 270)  # region round the target that is shown of each frame, at the size it has in a 1280x720 image
+CROP_PX = (360, 270)  # region around the target that is shown of each frame, at the size it has in a 1280x720 image
 
 STYLE = """body{font:15px/1.45 'DejaVu Sans','Noto Sans CJK SC',sans-serif;margin:14px;width:1150px;color:#222}
 .frames{display:flex;gap:6px}.frames div{font-size:12px;color:#666}img{display:block;width:224px}
@@ -25,7 +25,7 @@ STYLE = """body{font:15px/1.45 'DejaVu Sans','Noto Sans CJK SC',sans-serif;margi
 
 
 def crop(run_tree: Path, caption, index: int) -> str:
-    """One observed frame round the target, as a JPEG data URL."""
+    """Return one observed frame around the target, as a JPEG data URL."""
     folders = {(f.parent.name, f.name): f for f in find_tracks(run_tree)}
     flight = read_track(folders[caption.trajectory, caption.variant], strict=False)
     image = read_rgb(flight.frame_folder(index))
@@ -54,7 +54,7 @@ def main(run: Path, sample_id: str, out: Path) -> None:
     facts = f"{sample_id} · label from the future geometry ({caption.label_from}): {caption.label}"
     facts += f" · verdict: {caption.verdict} · teacher: {caption.teacher.kind}"
     if caption.repair:
-        facts += f" · repaired: {caption.repair.strategy}, first decision {caption.repair.first_decision}"
+        facts += f" · regenerated: {caption.repair.strategy}, first decision {caption.repair.first_decision}"
     page = f"<!doctype html><meta charset=utf-8><style>{STYLE}</style><div class=frames>{frames}</div>"
     page += f"<div class=texts>{texts}</div><div class=meta>{facts}</div>"
     out.write_text(page, encoding="utf-8")

@@ -113,7 +113,7 @@ def test_without_ompl_a_line_names_the_extra_and_the_others_fly(inputs, tmp_path
     with pytest.raises(EnvironmentMissing, match="OMPL is not installed"):
         benchmark.run(BenchmarkConfig(planners=("prm", "rrt_star")), *inputs, tmp_path / "none")
     assert [r.message for r in caplog.records if "OMPL" in r.message] == [
-        'OMPL is not installed, so these planners are skipped: prm, rrt_star; to install it: pip install "cosfly[ompl]"'
+        'OMPL is not installed, so these planners are skipped: prm, rrt_star; to install it: pip install -e ".[ompl]"'
     ]
 
 

@@ -165,5 +165,5 @@ def test_where_no_cluster_answers_one_line_says_so(tmp_path, monkeypatch):
         refused(tmp_path, f"{address}: no Ray cluster answers", Watch(RayConfig()))
     monkeypatch.setitem(sys.modules, "ray", None)
     refused(
-        tmp_path, r"the package ray is not installed; pip install 'cosfly\[ray\]', on every node", Watch(RayConfig())
+        tmp_path, r"the package ray is not installed; pip install -e '\.\[ray\]', on every node", Watch(RayConfig())
     )

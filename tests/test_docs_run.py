@@ -1,6 +1,5 @@
 """Every command of the documentation runs, page after page in one folder, as somebody would who reads along."""
 
-import csv
 import glob
 import gzip
 import json
@@ -27,14 +26,13 @@ from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.formats.captions import read_captions
-from cosfly.formats.kinds import KIND_NAMES
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
 from cosfly.runtime.config import shipped
 from distill.student.random_student import make_random_student
 
-# Pages in the order in which what one makes is there for the next; the last one draws the tree of all others anew.
-FIRST, LAST = ("first-runs.md", "commands.md"), ("rendering.md",)
+# Pages in the order in which what one makes is there for the next; the last one draws the tree of all others again.
+FIRST, LAST = ("install.md", "commands.md"), ("rendering.md",)
 QUICKSTART = "run quickstart --out runs/quickstart"  # what `make quickstart` does, beside installing
 # What no machine of the tests can do, or another test does: words of the command, and why.
 NOT_HERE = {
@@ -46,16 +44,13 @@ NOT_HERE = {
     "pip install -e": "the tests stand in that environment",
     "pip install --no-deps": "the same",
     "python tests/benchmarks/": "minutes each; what they measure stands beside them in the documents",
-    "python docs/window_card.py": "a page for the browser of the next line",
-    "chromium --headless": "a browser; tests/browser.py drives one for the pages that run a script",
     "--env cosfly/": "1,600 frames each; tests/test_cosfly_envs.py flies a list and policies",
     "--out work/round1": "two short flights are too few walks to split; tests/test_distill_dataset.py has more",
-    "roi edit work/": "it serves until it is stopped; tests/test_cosfly_roi_editor.py draws on its page",
-    "render.carla.server_command=": "CARLA itself; tests/test_render_carla.py starts a server of ours by that setting",
+    "roi edit ": "it serves until it is stopped; tests/test_cosfly_roi_editor.py draws on its page",
     "SmolLM2-135M-Instruct.Q4_1.gguf": "a file of 98 MB; tests/test_distill_families.py trains it where it is",
     "--teacher vllm:": "vLLM needs an accelerator; tests/test_engines_contract.py holds its engine to the documents",
     "--engine vllm": "the same",
-    "--out work/students-captions": "of a random student nothing is kept; docs/distillation.md has one that answers",
+    "--out work/students-captions": "a student of random weights writes no caption that is kept",
 }
 
 
@@ -77,7 +72,7 @@ SMALL = {
         *("pedestrians.num_paths=1", "pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25"),
         *("render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]", "inspect.legible_min=0"),
     ),
-    "run quickstart --out runs/five": _set("pedestrians.num_paths=2"),
+    "run quickstart --out runs/five": _set("pedestrians.num_paths=3"),
     "bench": ["--workers", "2"],
     "reproduce": ["--pedestrians", "1", "--workers", "1"],
     "distill train": _set(
@@ -135,31 +130,31 @@ def copy_of(path: str) -> Callable[[Path, Path], object]:
     return lambda root, target: (shutil.copytree if (root / path).is_dir() else shutil.copy)(root / path, target)
 
 
-def _table(root: Path, target: Path) -> None:
-    town = invent(SyntheticConfig(size_m=120.0, num_blocks=1), 0)
-    with target.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["type", "x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_deg"])
-        for kind, center, half, rotation in zip(
-            town.kinds, town.centers, town.half_extents, town.rotations_deg, strict=True
-        ):
-            writer.writerow([KIND_NAMES[kind], *center, *(2 * half), rotation[1]])
-
-
-def _geojson(root: Path, target: Path) -> None:
-    ring = [[0, 0], [40, 0], [40, 30], [0, 30], [0, 0]]
-    shape = {"type": "Polygon", "coordinates": [ring]}
-    house = {"type": "Feature", "properties": {"type": "Buildings", "height_m": 9}, "geometry": shape}
-    target.write_text(json.dumps({"type": "FeatureCollection", "features": [house]}))
+def _shown(page: str, begin: str) -> Callable[[Path, Path], object]:
+    """Return a maker of the file that a page shows in the block with this beginning."""
+    text = next(path for path in PAGES if path.name == page).read_text(encoding="utf-8")
+    shown = re.search(rf"^```\w+\n({re.escape(begin)}.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    assert shown is not None
+    return lambda root, target: target.write_text(shown[1])
 
 
 def _tagged(root: Path, target: Path) -> None:
-    west, south, size = 4.36, 52.01, 0.0004  # degrees
-    corners = [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]
-    ring = [[west + size * x, south + size * y] for x, y in corners]
-    properties = {"building": "yes", "class": "residential", "height": 9}
-    house = {"type": "Feature", "properties": properties, "geometry": {"type": "Polygon", "coordinates": [ring]}}
-    target.write_text(json.dumps({"type": "FeatureCollection", "features": [house]}))
+    """Write four houses along three streets, with the tags of OpenStreetMap and of Overture."""
+    west, south, per_m = 4.36, 52.01, 1.0e-5  # degrees
+
+    def places(*corners_m: tuple[float, float]) -> list[list[float]]:
+        return [[west + x * per_m, south + y * per_m] for x, y in corners_m]
+
+    features = []
+    for x, y in ((20, 20), (80, 20), (20, 80), (80, 80)):
+        ring = places((x, y), (x + 25, y), (x + 25, y + 20), (x, y + 20), (x, y))
+        properties = {"building": "yes", "class": "residential", "height": 9}
+        features.append((properties, {"type": "Polygon", "coordinates": [ring]}))
+    for begin, end in (((0, 0), (120, 0)), ((0, 60), (120, 60)), ((60, 0), (60, 120))):
+        line = {"type": "LineString", "coordinates": places(begin, end)}
+        features.append(({"highway": "residential", "class": "secondary"}, line))
+    listed = [{"type": "Feature", "properties": tags, "geometry": shape} for tags, shape in features]
+    target.write_text(json.dumps({"type": "FeatureCollection", "features": listed}))
 
 
 def _world(root: Path, target: Path) -> None:
@@ -177,7 +172,7 @@ def _delft(root: Path, target: Path) -> None:
 def _others_captions(root: Path, target: Path) -> None:
     lines = [
         {"sample_id": c.sample_id, "en": c.en.model_dump(), "zh": c.zh.model_dump()}
-        for c in read_captions(root / "work/caption/captions.jsonl")
+        for c in read_captions(root / "runs/quickstart/caption/captions.jsonl")
         if c.en and c.zh
     ]
     target.write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -186,20 +181,17 @@ def _others_captions(root: Path, target: Path) -> None:
 # What a reader brings: path, as a command names it -> what makes it. The longer path before the shorter.
 BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "CosFly-Track": lambda root, target: write_foreign_tree(target, trajectories=("trajectory_1", "trajectory_2")),
-    "town.csv": _table, "town.geojson": _geojson,
+    "town.csv": _shown("install.md", "type,x_m"), "town.geojson": _shown("maps.md", '{"type": "FeatureCollection"'),
+    "mine.yaml": _shown("commands.md", "name: mine"),
     "osm.geojson": _tagged, "buildings.geojson": _tagged, "file:captions.jsonl": _others_captions,
-    "../shared/data/simworld-progen/progen_world.json": _world, "../shared/data/delft-bgt-lod1/delft.json.gz": _delft,
-    "data/a/progen_world.json": _world, "data/b/progen_world.json": _world, "data/a/Bbox.json": _world,
-    "data/b/Bbox_total.json": copy_of("data/b/Bbox.json"), "runs/town1": copy_of("runs/diverse/grid"),
-    "runs/town2": copy_of("runs/diverse/old_town"), "work/flown0": copy_of("work/random"),
+    "progen_world.json": _world, "delft.json.gz": _delft, "work/flown0": copy_of("work/random"),
     "work/flown1": copy_of("work/rules"), "work/copy": copy_of("work/release"),
-    "work/unlabelled/render": copy_of("work/render"),
+    "work/unlabelled/render": copy_of("runs/quickstart/render"),
     "Qwen/Qwen3.5-2B": lambda root, target: make_random_student(target),
     "models/Qwen3.5-2B": lambda root, target: make_random_student(target),
     "models/roberta-large": lambda root, target: make_encoder(target),
     "models/bert-base-chinese": lambda root, target: make_encoder(target),
-    "work/evaluation-4B": copy_of("work/evaluation-2B"), "work/text": copy_of("work/both"),
-    "work/pictures": copy_of("work/both"), "work/middle": copy_of("work/both"),
+    "work/infer-4B": copy_of("work/infer-2B"), "work/infer-100k-4B": copy_of("work/infer-100k-2B"),
 }  # fmt: skip
 
 
@@ -212,7 +204,7 @@ def small_run(name: str) -> dict[str, Any]:
         value["render"].update(frame_stride=2)
     value.setdefault("maps", {}).setdefault("synthetic", {}).update(size_m=150, num_blocks=1)
     value.get("distill", {}).get("train", {}).pop("random_student", None)  # the smallest there is
-    value["towns"] = dict(list(value.get("towns", {}).items())[:2])
+    value["towns"] = dict(list(value.get("towns", {}).items())[:3])  # a split each
     return value
 
 

@@ -512,7 +512,7 @@ def _same_person(ids: np.ndarray, expected: np.ndarray, px_per_m: float) -> None
 
 def test_a_missing_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrender", None)
-    with pytest.raises(EnvironmentMissing, match=r'pip install "cosfly\[pyrender\]"'):
+    with pytest.raises(EnvironmentMissing, match=r'pip install -e "\.\[pyrender\]"'):
         open_renderer("pyrender", street(), *SIZE)
 
 

@@ -11,7 +11,7 @@ from cosfly.runtime.errors import EnvironmentMissing
 try:
     import gymnasium
 except ImportError as error:
-    fix = 'pip install "cosfly[envs]"'
+    fix = 'pip install -e ".[envs]"'
     raise EnvironmentMissing("Gymnasium is not installed", got=str(error), fix=fix) from None
 
 _FLAT = {"observation": "flat", "size_px": (96, 54)}  # for trainers that take one array

@@ -1,6 +1,6 @@
 """Engine `vllm`: vLLM in this process, over a model folder (extra `vllm`).
 
-Tested with vLLM 0.26 (docs/teachers.md has the figures). vLLM runs in its own thread: requests join while others are
+Tested with vLLM 0.26 (docs/benchmarks.md has the figures). vLLM runs in its own thread: requests join while others are
 answered (`LLM.enqueue_chat`, `LLMEngine.step`), and a refused request does not affect others.
 """
 
@@ -23,7 +23,7 @@ from cosfly.llm.contract import NoAnswer, Reply, Request
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
 
-INSTALL = 'pip install "cosfly[vllm]" on a machine with an accelerator'
+INSTALL = 'pip install -e ".[vllm]" on a machine with an accelerator'
 ADDED_PER_STEP = 8  # requests added between two steps
 FINISHED = ("stop", "length")  # finish reasons of an answer; others are failures of the engine
 

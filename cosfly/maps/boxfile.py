@@ -85,7 +85,7 @@ class BoxesConfig(Config):
     name: str = Field(
         "Boxes", min_length=1, description="name of the map, with which folder names in the playback tree begin"
     )
-    path: Path | None = Field(None, description="boxes_3d.json, .csv or .geojson file; docs/files.md lists the columns")
+    path: Path | None = Field(None, description="boxes_3d.json, .csv or .geojson file; docs/maps.md lists the columns")
     units: Units = Field(
         "auto",
         description="unit of the coordinates: m, degrees (longitude, latitude), ft (0.3048 m) or us-ft (0.3048006 m); "

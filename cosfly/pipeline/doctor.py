@@ -15,16 +15,16 @@ from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.limits import memory_bytes, num_cpus
 
 OPTIONAL_PACKAGES = {  # name: the purpose, and the packages to install
-    "torch": ("students", "cosfly[distill]"),
-    "transformers": ("students", "cosfly[distill]"),
-    "peft": ("students", "cosfly[distill]"),
-    "bert_score": ("evaluation of students", "cosfly[distill]"),
+    "torch": ("students", "-e '.[distill]'"),
+    "transformers": ("students", "-e '.[distill]'"),
+    "peft": ("students", "-e '.[distill]'"),
+    "bert_score": ("evaluation of students", "-e '.[distill]'"),
     "datasets": ("opening the release as a user would", "datasets"),
-    "vllm": ("a teacher in this process", "cosfly[vllm]"),
-    "pyrender": ("the second renderer", "cosfly[pyrender]"),
-    "ompl": ("the sampling planners of plan benchmark", "cosfly[ompl]"),
-    "carla": ("CARLA's maps and pictures", "cosfly[carla]"),
-    "unrealcv": ("UnrealCV's maps and pictures", "cosfly[unrealcv]; then --no-deps unrealcv"),
+    "vllm": ("a teacher in this process", "-e '.[vllm]'"),
+    "pyrender": ("the second renderer", "-e '.[pyrender]'"),
+    "ompl": ("the sampling planners of plan benchmark", "-e '.[ompl]'"),
+    "carla": ("CARLA's maps and pictures", "-e '.[carla]'"),
+    "unrealcv": ("UnrealCV's maps and pictures", "-e '.[unrealcv]'; then --no-deps unrealcv"),
 }
 FRAMES_PER_GIB = 200  # a 1280x720 frame takes about 5 MB, nearly all of it float32 depth
 LEAST_FREE_GIB = 5
@@ -49,7 +49,7 @@ def examine(folder: Path) -> Iterator[Check]:
     yield _check_gpu()
     for name, (purpose, install) in OPTIONAL_PACKAGES.items():
         if importlib.util.find_spec(name) is None:
-            yield Check(name, "optional", f'not installed; for {purpose}: pip install "{install}"')
+            yield Check(name, "optional", f"not installed; for {purpose}: pip install {install}")
         else:
             yield Check(name, "ok", importlib.metadata.version(name.replace("_", "-")))
 

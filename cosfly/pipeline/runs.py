@@ -136,9 +136,9 @@ def _stage(name: str, folder: Path) -> StageSummary:
 
 # --- estimates --------------------------------------------------------------------------------------------------------
 
-# Measured in `cosfly run showcase` (docs/first-runs.md; 2 cores, AMD EPYC, idle): 3 pedestrians, 858 frames of
+# Measured in `cosfly run showcase` (docs/benchmarks.md; 2 cores, AMD EPYC, idle): 3 pedestrians, 858 frames of
 # 0.9216 Mpx, 804 windows by `rules`. Rates of frames are per million pixels; their disk space is that of `quickstart`.
-BASIS = "`cosfly run showcase` on a 2-core machine (docs/first-runs.md)"
+BASIS = "`cosfly run showcase` on a 2-core machine (docs/benchmarks.md)"
 RATES = {  # stage: unit, seconds per unit, MB per unit
     "maps": ("map", 0.2, 1.1),
     "simplify": ("map", 5.6, 1.2),

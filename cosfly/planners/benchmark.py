@@ -57,7 +57,7 @@ CRITERIA = {
     "collision": ("collision_fraction", False, 0.30),
     "clearance": ("clearance_min_m", True, 0.35),
 }
-INSTALL = 'pip install "cosfly[ompl]"'  # this extra holds both OMPL and matplotlib
+INSTALL = 'pip install -e ".[ompl]"'  # this extra holds both OMPL and matplotlib
 
 
 class PaperRow(NamedTuple):

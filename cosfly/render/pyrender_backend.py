@@ -69,7 +69,7 @@ def _open_screen(width_px: int, height_px: int) -> Any:
 
         screen = pyrender.OffscreenRenderer(width_px, height_px)
     except ModuleNotFoundError as error:
-        fix = 'pip install "cosfly[pyrender]"'
+        fix = 'pip install -e ".[pyrender]"'
         raise EnvironmentMissing("the renderer pyrender is not installed", got=str(error), fix=fix) from None
     # Without libEGL, PyOpenGL raises errors of its own or an ImportError, and pyrender's platforms bare assertions.
     except Exception as error:

@@ -256,7 +256,7 @@ def connected(cfg: RayConfig) -> Any:
         import ray
         from ray._private import worker as ray_worker
     except ImportError:
-        fix = "pip install 'cosfly[ray]', on every node"
+        fix = "pip install -e '.[ray]', on every node"
         raise EnvironmentMissing("the package ray is not installed", where="--engine ray", fix=fix) from None
     if ray.is_initialized():
         return ray

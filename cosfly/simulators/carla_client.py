@@ -47,7 +47,7 @@ def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:
     try:
         import carla
     except ModuleNotFoundError as error:
-        fix = 'pip install "cosfly[carla]", on Linux or Windows with Python 3.11 or 3.12'
+        fix = 'pip install -e ".[carla]", on Linux or Windows with Python 3.11 or 3.12'
         raise EnvironmentMissing("the package carla is not installed", got=str(error), fix=fix) from None
     endpoint = f"{cfg.host}:{port}"
     with _server_errors("no CARLA server answers", endpoint, "unknown"):

@@ -23,7 +23,7 @@ from cosfly.runtime.escaping import for_terminal
 PROBE_S = 5.0  # for a server to accept a connection
 LEAST_VERSION = (0, 4, 0)  # the first with bounds, classes, and more than one camera
 MOST_AT_ONCE = 200  # commands of a batch, so that neither side waits for the other with full buffers
-INSTALL = 'pip install "cosfly[unrealcv]" && pip install --no-deps "unrealcv>=1.3.2"'
+INSTALL = 'pip install -e ".[unrealcv]" && pip install --no-deps "unrealcv>=1.3.2"'
 
 
 class UnrealCvConfig(Config):

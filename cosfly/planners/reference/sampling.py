@@ -28,7 +28,7 @@ def sampled(task: Task, method: str, *, is_spline: bool = False) -> np.ndarray |
     try:
         from ompl import base, geometric, util
     except ImportError as error:
-        raise EnvironmentMissing("OMPL is not installed", got=str(error), fix='pip install "cosfly[ompl]"') from None
+        raise EnvironmentMissing("OMPL is not installed", got=str(error), fix='pip install -e ".[ompl]"') from None
     util.setLogLevel(util.LogLevel.LOG_NONE)
     util.RNG.setSeed(int(task.rng.integers(1, 2**31)))
     space_information = _space_information(base, task)

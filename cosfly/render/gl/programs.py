@@ -28,7 +28,7 @@ def open_context() -> Any:
         return moderngl.create_context(require=330, standalone=True, **settings)
     except ImportError as error:
         raise EnvironmentMissing(
-            "the package moderngl is not installed", got=str(error), fix="pip install cosfly"
+            "the package moderngl is not installed", got=str(error), fix="pip install moderngl"
         ) from None
     except Exception as error:  # glcontext raises a bare Exception, and OSError where the library is missing
         fix = f"apt-get install {DEBIAN_PACKAGES} (needed also to render on the CPU)"
