@@ -31,7 +31,7 @@ def prepare(
     """Make a training set from the captions of one or more runs, with splits that share no pedestrian."""
     from distill.prepare.sources import RunSource
 
-    sources = [RunSource.of_run(folder) for folder in runs or []]
+    sources = [RunSource.of_run(folder) for folder in options.each_run(runs)]
     if captions or data or not sources:
         trees = job.trees(data)
         if len(trees) != len(captions or []):
@@ -43,7 +43,7 @@ def prepare(
 @command("cosfly distill dual-track runs/diverse --out windows", "distill", "seed resume")
 def dual_track(job: Job, out: options.Out, runs: options.Runs = None, data: options.Trees = None) -> None:
     """Make windows over clean and perturbed tracks, by split, to learn denoising and prediction from."""
-    trees = [folder / "render" for folder in runs or []]
+    trees = [folder / "render" for folder in options.each_run(runs)]
     if data or not trees:
         trees += job.trees(data)
     job.run("distill.prepare.dual_track", job.cfg.distill.dual_track, trees, out)

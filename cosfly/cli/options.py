@@ -36,6 +36,18 @@ Runs = Annotated[list[Path] | None, typer.Argument(help="Run directories of `cos
 Bystanders = Annotated[Path | None, Option("--others", help="Bystanders: others.json, next to path.json.")]
 
 
+def each_run(runs: list[Path] | None) -> list[Path]:
+    """Return run directories of one map each: those of its towns for a run of several towns."""
+    from cosfly.formats.places import folder_name
+    from cosfly.runtime.config import read_yaml
+
+    folders = list[Path]()
+    for run in runs or []:
+        towns = read_yaml(run / "run.yaml").get("towns", {}) if (run / "run.yaml").is_file() else {}
+        folders += [run / folder_name(name) for name in towns] or [run]
+    return folders
+
+
 def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> Parameter:
     return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option])
 

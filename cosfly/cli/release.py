@@ -34,7 +34,7 @@ def build(
     """Select frames of one or more runs, join captions, write parquet, data-set card and checksums."""
     from release.build.sources import Source
 
-    sources = [Source.of_run(folder) for folder in runs or []]
+    sources = [Source.of_run(folder) for folder in options.each_run(runs)]
     if captions or inspected or data or not sources:
         trees = job.trees(data)
         inspections: list[Path | None] = list(inspected) if inspected else [None for _ in trees]
