@@ -53,9 +53,9 @@ def main() -> None:
             server = open_editor(root / "simple.json", PedestriansConfig(), root / "roi.json", 0, None)
             listens_s = time.perf_counter() - start
             threading.Thread(target=server.serve, daemon=True).start()
-            size = "{} x {}".format(*server.editor.bare.grid.size)
+            size = "{} x {}".format(*server.site.bare.grid.size)
             print(
-                f"editor, {size} cells of {len(server.editor.box_map):,} boxes: listens after {listens_s:.2f} s, ",
+                f"editor, {size} cells of {len(server.site.box_map):,} boxes: listens after {listens_s:.2f} s, ",
                 end="",
             )
             print(f"page after {opened_s(page, server.address):.2f} s, ", end="")
