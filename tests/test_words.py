@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 USER_WORDS = "cosfly/worldgen/words.yaml"  # the words of prompts
-TO_REWRITE = ("distill/", "tests/")
+TO_REWRITE = ("tests/",)
 
 VERBS = frozenset(
     """

@@ -1,1 +1,1 @@
-"""Scores beside their floors."""
+"""Scores next to baselines."""

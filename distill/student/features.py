@@ -146,7 +146,7 @@ def _encode_together(student: Student, pictures: Sequence[Tensors]) -> list[Tens
 
 @contextlib.contextmanager
 def shown(student: Student, pictures: Sequence[Tensors]) -> Iterator[dict[str, Any]]:
-    """Let the model's own forward find encoded pictures where it would encode pixels; yield its further inputs."""
+    """Replace the encoder by encoded pictures in the model's own forward; yield its further inputs."""
     import torch
 
     if not pictures:

@@ -24,7 +24,7 @@ from distill.student.chat import Processor
 
 log = logging.getLogger(__name__)
 
-INSTALL = 'pip install "cosfly[distill]"'
+INSTALL = 'pip install -e ".[distill]"'
 HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
 MODEL_FILES = ["*.json", "*.safetensors", "*.jinja", "*.txt", "*.model"]  # of a repository; none of them is code
 GGUF = ".gguf"

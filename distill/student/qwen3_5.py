@@ -52,8 +52,7 @@ def _convolution(x: Any, weight: Any, bias: Any = None, activation: str | None =
 
 
 def fuse_norms(model: Any) -> None:
-    """Have the norms of a language model computed by one kernel each, which keeps its input and a number a row for its
-    gradient.
+    """Compute each norm of a language model by one kernel, which keeps its input and a number a row for its gradient.
 
     The library computes them step by step in float32 and keeps what each step read. In float32 the numbers are the
     same; in bfloat16 the normed values are rounded once more before they are scaled.

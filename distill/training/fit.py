@@ -52,7 +52,7 @@ Note = Callable[[dict[str, Any]], None]
 
 @contextlib.contextmanager
 def seeded(student: Student, seed: int, item_id: str) -> Iterator[None]:
-    """Seed torch's generators from (seed, item), and restore them afterwards."""
+    """Set torch's generators from (seed, item), and restore them afterwards."""
     import torch
 
     devices = [torch.cuda.current_device()] if student.device == "cuda" else []

@@ -1,4 +1,4 @@
-"""Training of a student on a training set: LoRA beside frozen weights, or all weights, in one process or many.
+"""Training of a student on a training set: LoRA next to frozen weights, or all weights, in one process or many.
 
 The loss counts answer tokens only, and nothing is ever cut: a sample that does not fit is skipped and counted.
 """
