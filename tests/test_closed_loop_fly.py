@@ -205,7 +205,7 @@ def test_a_student_is_asked_with_the_very_prompts_that_it_was_taught_with(town, 
     # As a training set that is made of what was flown has them.
     captions = caption_tree(CaptionConfig(), tmp_path / "render", tmp_path / "captions")
     every: tuple = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
-    cfg = PrepareConfig(modalities=("rgb",), contradicted="keep", verdicts=every)
+    cfg = PrepareConfig(modalities=("rgb",), verdicts=every)
     samples = [make_sample(caption, "en", cfg) for caption in read_captions(captions)]
     taught = {(one.prompt.system, one.prompt.user) for one in samples if isinstance(one, Sample)}
     assert len(taught & asked) == 12  # of each flight the first four: the others have no future there, and no caption
