@@ -184,11 +184,11 @@ def sight_turns(f: Facts, side: int) -> bool:
 
 
 def drifts(f: Facts, side: int) -> bool:
-    """Return whether the target moves to a side in the picture, and is not on the other one."""
+    """Return whether the target moves to a side in the picture, and is there now."""
     first_deg, last_deg = f.bearing_deg[0], f.bearing_deg[-1]
     if first_deg is None or last_deg is None or is_shaken(f) or not f.is_legible_now:
         return False
-    return side * (last_deg - first_deg) >= DRIFT_DEG and not is_across(f, side)
+    return side * (last_deg - first_deg) >= DRIFT_DEG and side * last_deg >= 1.0
 
 
 def is_bearing_steady(f: Facts) -> bool:
