@@ -71,15 +71,16 @@ class SettingOption(NamedTuple):
 GLOB_HELP = "Only tracks whose folder, or one above it, matches: 'Town01/trajectory_17*/ORI', 'Town0[12]'; repeat it."
 ENGINE_HELP = "Where workers run: in processes of this machine, or on the nodes of a Ray cluster."
 ADDRESS_HELP = "Head node for --engine ray, or auto; by default $RAY_ADDRESS, or a cluster on this machine."
+CONFIG_HELP = "Settings: a YAML file, a shipped configuration, or a run directory."
 RESUME_HELP = "With existing work in the output directory: refuse, or resume if settings and inputs agree."
 COMMON_SETTINGS = {
     "seed": SettingOption("seed", "Seed; every random choice derives from it.", int),
-    "workers": SettingOption("workers", "Worker processes; 0 takes one per core.", int),
+    "workers": SettingOption("workers", "Worker processes; 0: one per core, or with Ray as many as fit.", int),
     "engine": SettingOption("engine", ENGINE_HELP, Literal["local", "ray"], default="local"),
     "address": SettingOption("ray.address", ADDRESS_HELP, metavar="HOST:PORT"),
 }
 COMMON_OPTIONS = [  # these set no setting
-    _parameter("config", Path | None, Option("--config", "-c", help="YAML file with the settings of a run.")),
+    _parameter("config", Path | None, Option("--config", "-c", help=CONFIG_HELP)),
     _parameter("overrides", list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Set a setting; repeat it.")),
     _parameter("town", str | None, Option(help="Town of the configuration whose settings and seed are used.")),
     _parameter("resume", Literal["never", "if-same"], Option(help=RESUME_HELP), "if-same"),

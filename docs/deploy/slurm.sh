@@ -1,7 +1,7 @@
 #!/bin/bash
 # cosfly on SLURM, in one of two ways (docs/scaling.md):
 #   sbatch --nodes=4 docs/deploy/slurm.sh CONFIG OUT                  one run on a Ray cluster of the job's nodes
-#   sbatch --nodes=1 --array=0-2 docs/deploy/slurm.sh CONFIG OUT grid park river    a town a task; then, for the release:
+#   sbatch --nodes=1 --array=0-2 docs/deploy/slurm.sh CONFIG OUT grid park river    a town a task, for each town of CONFIG; then the release:
 #   sbatch --nodes=1 --dependency=afterok:JOB docs/deploy/slurm.sh CONFIG OUT       one run on one node
 # CONFIG: a YAML file or the name of one that ships. OUT: a run folder that every node sees.
 #SBATCH --job-name=cosfly
