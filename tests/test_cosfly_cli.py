@@ -98,6 +98,13 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
             assert [part for part in parts if part not in line] == []
 
 
+def test_a_folder_with_the_name_of_a_section_does_not_hide_its_settings(capfd, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "caption").mkdir()  # as in the repository
+    status, _ = answer(capfd, monkeypatch, "config", "show", "--describe", "caption")
+    assert status == 0
+
+
 IMPORTING = """
 import os, signal, sys
 class Interrupts:

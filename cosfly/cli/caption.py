@@ -32,7 +32,7 @@ STUDENT = "Output of `distill train` or `merge`: ask the model in the form that 
     teacher=TEACHER,
     as_student=SettingOption("caption.student.folder", STUDENT, Path),
     model=MODEL,
-    judge=SettingOption("caption.judge.url", "URL of a server that judges conflicts."),
+    judge=SettingOption("caption.judge.url", "URL of a server that judges conflicts; it never accepts a hard one."),
     limit=SettingOption("caption.limit", "Caption at most this many windows; a later run resumes.", int),
     max_cost=SettingOption("caption.budget.max_cost", "Stop before this cost; prices: caption.budget.price_*.", float),
     max_tokens=SettingOption("caption.budget.max_tokens", "Stop before this many tokens, over all runs.", int),
@@ -45,7 +45,7 @@ def caption(
         int | None, Option("--try", min=1, help="Show this many windows: each question, answer, complaint and outcome.")
     ] = None,
     retry_failed: Annotated[
-        bool, Option("--retry-failed", help="Caption the windows in quarantine.jsonl again.")
+        bool, Option("--retry-failed", help="Request windows in quarantine.jsonl again: failed, refused, declined.")
     ] = False,
     check: Annotated[bool, Option(help="Test the server before the first request of a directory.")] = True,
 ) -> None:

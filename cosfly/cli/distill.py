@@ -71,7 +71,7 @@ INFER = "cosfly distill infer --dataset dataset --model Qwen/Qwen3.5-2B --out pr
 def infer(
     job: Job,
     dataset: Dataset,
-    model: Annotated[str, Option(help="Base model: folder or repository; with --engine endpoint a URL.")],
+    model: Annotated[str, Option(help="Base model: folder, repository or GGUF file; with --engine endpoint a URL.")],
     out: options.Out,
     adapter: Annotated[Path | None, Option(help="Adapter folder; none: the base model alone.")] = None,
     data: options.Trees = None,
@@ -84,7 +84,7 @@ def infer(
 @command("cosfly distill merge --model models/Qwen3.5-2B --adapter student/adapter --out merged", common="resume")
 def merge(
     job: Job,
-    model: Annotated[Path, Option(help="Folder of the student's base model.")],
+    model: Annotated[Path, Option(help="Base model of the student: folder, repository or GGUF file.")],
     adapter: Annotated[Path, Option(help="Adapter folder, the output of `distill train`.")],
     out: options.Out,
 ) -> None:

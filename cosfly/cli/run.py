@@ -186,11 +186,14 @@ def config_show(
     import yaml
 
     from cosfly.pipeline import settings_guide
+    from cosfly.pipeline.settings import RunConfig
     from cosfly.runtime.config import shipped
 
     if section is None and config is not None:
         path = Path(config)
-        if not path.exists() and path.suffix not in (".yaml", ".yml") and not shipped(f"{path.name}.yaml").exists():
+        is_config = path.is_file() or (path / "run.yaml").exists() or shipped(f"{path.name}.yaml").exists()
+        is_section = config.partition(".")[0] in RunConfig.model_fields  # also where a folder has this name
+        if not is_config and (is_section or not (path.exists() or path.suffix in (".yaml", ".yml"))):
             config, section = None, config
     cfg = options.resolve(None if config is None else Path(config), overrides)
     explained = (settings_guide.changed if changed else settings_guide.explain)(cfg, section)
