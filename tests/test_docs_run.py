@@ -191,6 +191,7 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "models/Qwen3.5-2B": lambda root, target: make_random_student(target),
     "models/roberta-large": lambda root, target: make_encoder(target),
     "models/bert-base-chinese": lambda root, target: make_encoder(target),
+    "work/students-captions/captions.jsonl": copy_of("runs/five/caption/captions.jsonl"),
     "work/infer-4B": copy_of("work/infer-2B"), "work/infer-100k-4B": copy_of("work/infer-100k-2B"),
 }  # fmt: skip
 
