@@ -99,7 +99,7 @@ class SourceTree(Record):
 
 
 class TrainingSet(Record):
-    """`training_set.json`. samples: number in each split."""
+    """`training_set.json`. trees: Empty without pictures. samples: Number in each split."""
 
     split_by: Literal["walk", "town"]
     trees: list[SourceTree]
@@ -114,7 +114,7 @@ def read_training_set(dataset: Path) -> TrainingSet:
 def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
     """Return which of the given playback trees belongs to which run of a training set: run -> tree."""
     wanted = {tree.sha256: tree.run for tree in read_training_set(dataset).trees}
-    found = {fingerprint(path): path for path in data}
+    found = {fingerprint(path): path for path in data if wanted}  # none for a set without pictures
     for digest, path in found.items():
         if digest not in wanted:
             what = "the training set was not made of this playback tree"
@@ -240,6 +240,7 @@ def write_page(out: Path, title: str, samples: Mapping[Split, int], trees: Seque
     counts = "".join(f"- {names[split]}: {samples[split]} samples\n" for split in found)
     runs = dump_json([tree.run for tree in trees])
     pictures = f"Its pictures are the frames `window` of the playback trees of {runs}, which are not part of it.\n"
+    pictures = pictures if trees else "Its samples have no pictures.\n"
     header = f"---\nconfigs:\n- config_name: default\n  data_files:\n{files}---\n"
     write_bytes(out / PAGE, f"{header}# {title}\n\n{counts}\n{text}\n{pictures}".encode())
     return out / PAGE

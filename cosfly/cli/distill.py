@@ -49,6 +49,13 @@ def dual_track(job: Job, out: options.Out, runs: options.Runs = None, data: opti
     job.run("distill.prepare.dual_track", job.cfg.distill.dual_track, trees, out)
 
 
+def _trees(job: Job, dataset: Path, data: list[Path] | None) -> list[Path]:
+    """Return the playback trees of a training set; none if its samples have no pictures."""
+    from distill.schema import read_training_set
+
+    return job.trees(data) if data or read_training_set(dataset).trees else []
+
+
 @command("cosfly distill train --dataset dataset --student Qwen/Qwen3.5-2B --out student", "distill", "seed resume")
 def train(
     job: Job,
@@ -58,7 +65,8 @@ def train(
     data: options.Trees = None,
 ) -> None:
     """Train a student, by LoRA or in full, in one process or many (torchrun); resume from its last checkpoint."""
-    product = job.call("distill.training.stage", job.cfg.distill.train, dataset, job.trees(data), student, out)
+    trees = _trees(job, dataset, data)
+    product = job.call("distill.training.stage", job.cfg.distill.train, dataset, trees, student, out)
     if os.environ.get("RANK", "0") == "0":  # the first of the processes that `torchrun` started
         typer.echo(product)
 
@@ -78,7 +86,7 @@ def infer(
 ) -> None:
     """Run a student on the samples of a split; resume where it stopped."""
     cfg = job.cfg.distill.infer
-    job.run("distill.inference.stage", cfg, dataset, job.trees(data), model, out, adapter=adapter)
+    job.run("distill.inference.stage", cfg, dataset, _trees(job, dataset, data), model, out, adapter=adapter)
 
 
 @command("cosfly distill merge --model models/Qwen3.5-2B --adapter student/adapter --out merged", common="resume")

@@ -253,7 +253,8 @@ def run(
             decisions[split][sample.decision] += 1
             tracks[split].add((sample.walk, sample.run, sample.town, sample.trajectory, sample.variant))
             writer.add(split, sample)
-    trees = [SourceTree(run=source.run, sha256=fingerprint(source.data)) for source in sources]
+    pictured = sources if cfg.modalities else []
+    trees = [SourceTree(run=source.run, sha256=fingerprint(source.data)) for source in pictured]
     write_model(out / RECORD, TrainingSet(split_by=cfg.split_by, trees=trees, samples=writer.counts), RECORD_FORMAT)
     page = write_page(out, "Training set", writer.counts, trees, PAGE_TEXT.format(cfg.split_by))
     num_kept = sum(writer.counts.values())
