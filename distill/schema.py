@@ -113,7 +113,8 @@ def read_training_set(dataset: Path) -> TrainingSet:
 
 def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
     """Return which of the given playback trees belongs to which run of a training set: run -> tree."""
-    wanted = {tree.sha256: tree.run for tree in read_training_set(dataset).trees}
+    trees = read_training_set(dataset).trees
+    wanted = {tree.sha256: tree.run for tree in trees}
     found = {fingerprint(path): path for path in data if wanted}  # none for a set without pictures
     for digest, path in found.items():
         if digest not in wanted:
@@ -124,7 +125,7 @@ def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
     if missing := [run for digest, run in wanted.items() if digest not in found]:
         what, fix = "a playback tree of the training set is missing", "pass --data once for each of its trees"
         raise InputError(what, where=dataset, expected=f"--data also for the runs {', '.join(missing)}", fix=fix)
-    return {run: found[digest] for digest, run in wanted.items()}
+    return {tree.run: found[tree.sha256] for tree in trees}
 
 
 def tree_inputs(trees: Mapping[str, Path]) -> dict[str, Path]:

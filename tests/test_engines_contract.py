@@ -262,7 +262,7 @@ def engine_of(model, **sections) -> VllmEngine:
 
 @pytest.mark.skipif(importlib.util.find_spec("vllm") is not None, reason="vllm is installed here")
 def test_without_vllm_one_line_says_what_to_install(tree, model, tmp_path):
-    with pytest.raises(EnvironmentMissing, match=r"vLLM engine is not installed.*cosfly\[vllm\]"):
+    with pytest.raises(EnvironmentMissing, match=r"vLLM engine is not installed.*\.\[vllm\]"):
         engine_of(model).load()
     with pytest.raises(EnvironmentMissing, match="not installed"):
         run(CaptionConfig(teacher=f"vllm:{model}"), tree, tmp_path / "out")

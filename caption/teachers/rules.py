@@ -103,6 +103,11 @@ gap_opens = says("trend:distance", "increasing", is_gap_clear)
 gap_closes = says("trend:distance", "decreasing", is_gap_clear)
 
 
+def _or_far(distance_m: float | None) -> float:
+    """Return a distance, infinite where it is not known."""
+    return math.inf if distance_m is None else distance_m
+
+
 def is_crawling(f: Facts, side: int) -> bool:
     return (f.speed_mps[-1] or 0.0) < CRAWLING_MPS
 
@@ -113,11 +118,11 @@ def walks_evenly(f: Facts, side: int) -> bool:
 
 
 def gap_moves(f: Facts, side: int) -> bool:
-    return word_of(f, "trend:distance") != "steady"
+    return word_of(f, "trend:distance") not in ("steady", "decreasing") and not comes(f, side)
 
 
 def is_close(f: Facts) -> bool:
-    return (f.distance_m[-1] or math.inf) <= CLOSE_M
+    return _or_far(f.distance_m[-1]) <= CLOSE_M
 
 
 def sets_off(f: Facts, side: int) -> bool:
@@ -213,8 +218,9 @@ def nose_turns(f: Facts, side: int) -> bool:
 
 
 def is_slowing(f: Facts) -> bool:
-    """Return whether the nose turned less in the last step than in the one before."""
-    return abs(f.yaw_deg[-1] - f.yaw_deg[-2]) < abs(f.yaw_deg[-2] - f.yaw_deg[-3])
+    """Return whether the nose turned the same way in the last step as in the one before, and less."""
+    last_deg, before_deg = f.yaw_deg[-1] - f.yaw_deg[-2], f.yaw_deg[-2] - f.yaw_deg[-3]
+    return not is_shaken(f) and last_deg * before_deg > 0.0 and abs(last_deg) < abs(before_deg)
 
 
 def slides(f: Facts, side: int) -> bool:
@@ -231,7 +237,7 @@ def gap_scatters(f: Facts, side: int) -> bool:
 def bystander_closes(f: Facts, side: int) -> bool:
     """Return whether the nearest bystander comes nearer from frame to frame; a jump is another person."""
     steps_m = [a - b if a and b else 0.0 for a, b in pairwise(f.other_distance_m[-3:])]
-    is_near = f.is_visible_now and (f.other_distance_m[-1] or math.inf) <= COMING_M
+    is_near = f.is_visible_now and _or_far(f.other_distance_m[-1]) <= COMING_M
     return is_near and all(0.0 < step_m < STRIDE_M for step_m in steps_m)
 
 
@@ -300,7 +306,7 @@ CONDITIONS: dict[str, Condition] = {
     "on_its_side": lambda f, side: side * (f.bearing_deg[-1] or 0.0) >= 1.0,
     "strafes_on": strafes_on, "circles_on": circles_on, "bearing_steady": lambda f, side: is_bearing_steady(f),
     "drifts": drifts,
-    "turned": lambda f, side: abs(f.yaw_deg[-1]) >= LEAST_TURN_DEG,
+    "turned": lambda f, side: is_smooth(f, side) and abs(f.yaw_deg[-1]) >= LEAST_TURN_DEG,
     "off_centre_no_turn": lambda f, side: off_centre(f, side) and (side != 0 or not is_turning(f, side)),
     "on_axis": lambda f, side: centred(f, side) and not sight_swings(f, 0) and not is_turning(f, side),
     "gap_steady": says("trend:distance", "steady"),
@@ -318,7 +324,8 @@ CONDITIONS: dict[str, Condition] = {
     "turn_ends": turn_ends, "turns_slightly": is_turning,
     "turning": lambda f, side: abs(f.yaw_rate_dps[-1] or 0.0) >= SLIGHT_DPS,
     "turns_back": lambda f, side: side * (f.yaw_rate_dps[-1] or 0.0) <= -TURNING_DPS,
-    "drone_backs": lambda f, side: f.velocity_mps[0] <= -max(SLOW_MPS, abs(f.velocity_mps[1])),
+    "drone_backs": lambda f, side: f.velocity_mps[0] <= -max(SLOW_MPS, abs(f.velocity_mps[1]))
+    and f.bearing_deg[-1] is not None and abs(f.bearing_deg[-1]) <= LITTLE_DEG,
     "drone_lingers": lambda f, side: max(map(abs, f.velocity_mps[:2])) < DRIFTING_MPS,
     "drone_shifts": lambda f, side: abs(f.velocity_mps[1]) >= abs(f.velocity_mps[0]),
     "climbing": lambda f, side: f.velocity_mps[2] >= CLIMBING_MPS,
@@ -329,7 +336,7 @@ CONDITIONS: dict[str, Condition] = {
     "goes_along": lambda f, side: slides(f, side) and crosses(f, side),
     "slides_past": lambda f, side: slides(f, -side) and sight_turns(f, side),
     "drone_climbs": says("trend:altitude", "increasing", is_smooth),
-    "drone_sinks": says("trend:altitude", "decreasing", is_smooth),
+    "drone_sinks": says("trend:altitude", "decreasing", is_smooth, is_legible),
     "steep": lambda f, side: (f.depression_deg[-1] or 0.0) >= STEEP_DEG,
     "small": lambda f, side: is_legible(f, side) and 0 < (f.box_height_px[-1] or 0) < SMALL_SHARE * f.height_px,
     "large": lambda f, side: is_legible(f, side) and (f.box_height_px[-1] or 0) > LARGE_SHARE * f.height_px,
@@ -339,10 +346,10 @@ CONDITIONS: dict[str, Condition] = {
     "reappeared": lambda f, side: f.is_legible_now and any(word in HIDDEN for word in f.visibility),
     "stays_hidden": lambda f, side: all(word in HIDDEN for word in f.visibility),
     "seen_at_first": lambda f, side: not f.is_visible_now and f.distance_m[0] is not None,
-    "bystander_near": lambda f, side: f.is_visible_now and (f.other_distance_m[-1] or math.inf) <= NEAR_M,
+    "bystander_near": lambda f, side: f.is_visible_now and _or_far(f.other_distance_m[-1]) <= NEAR_M,
     "bystander_closes": bystander_closes,
     "similar_near": lambda f, side: f.is_visible_now and f.alike_differences[-1] in range(MOST_DIFFERENCES + 1)
-    and (f.other_distance_m[-1] or math.inf) <= COMING_M,
+    and _or_far(f.other_distance_m[-1]) <= COMING_M,
     **{f"expects_{name}": expects(family) for name, family in FAMILIES.items()},
     **{kind: is_ordered(kind) for kind in MISSION_KINDS},
 }  # fmt: skip

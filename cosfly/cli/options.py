@@ -43,7 +43,7 @@ def each_run(runs: list[Path] | None) -> list[Path]:
 
     folders = list[Path]()
     for run in runs or []:
-        towns = read_yaml(run / "run.yaml").get("towns", {}) if (run / "run.yaml").is_file() else {}
+        towns = (read_yaml(run / "run.yaml").get("towns") or {}) if (run / "run.yaml").is_file() else {}
         folders += [run / folder_name(name) for name in towns] or [run]
     return folders
 

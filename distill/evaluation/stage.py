@@ -86,7 +86,9 @@ def run(
         )
         raise InputError(what, got=", ".join(files), fix=fix)
     encoders = dict(encoders or {})
-    inputs = {"dataset": dataset, **{f"predictions/{name}": path for name, path in files.items()}}
+    # Without dots, which would begin the name of another run.
+    named = {f"{n}_{name.replace('.', '_')}": path for n, (name, path) in enumerate(files.items(), 1)}
+    inputs = {"dataset": dataset, **{f"predictions/{name}": path for name, path in named.items()}}
     inputs |= {f"judged/{n}": path for n, path in enumerate(judged, 1)}
     inputs |= {
         f"bertscore/{language}/{path.name}": path

@@ -196,9 +196,12 @@ class LocalAnswers:
         try:
             return generate(self.student, [row for row, _ in rows], seen, max_tokens=self.max_tokens)
         except torch.OutOfMemoryError as error:
-            where, fix = f"{STAGE}.batch_size", "lower batch_size or max_pixels; recorded answers are kept"
-            got = f"batch_size {self.batch_size}: {str(error)[:120]}"
-            raise ConfigError("the memory is full", where=where, got=got, fix=fix) from error
+            if len(rows) == 1:
+                where, fix = f"{STAGE}.max_pixels", "lower max_pixels or max_new_tokens, and choose another --out"
+                raise ConfigError("the memory is full", where=where, got=str(error)[:120], fix=fix) from error
+        torch.cuda.empty_cache()  # here, because the exception holds what it refers to
+        half = len(rows) // 2
+        return self._decode(rows[:half], features) + self._decode(rows[half:], features)
 
 
 class EngineAnswers:
@@ -303,6 +306,7 @@ def run(
         model = student_path(str(model), allow_code=cfg.allow_code)
         files |= weight_files(model)
     if adapter is not None:
+        check_adapter(adapter, Path(model))
         files |= {f"adapter/{path.name}": path for path in sorted(adapter.iterdir()) if path.is_file()}
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=files, seed=0, resume=resume)
     if stage.is_complete:

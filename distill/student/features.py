@@ -120,7 +120,8 @@ def read_features(
         with torch.no_grad():
             found = encode(student, list(good.values())) if is_frozen else list(good.values())
         for picture, tensors in zip(good, found, strict=True):
-            features[picture] = {name: tensor.cpu() for name, tensor in tensors.items()}
+            # A copy, because a tensor of a worker process holds a file open as long as it lives.
+            features[picture] = {name: tensor.to("cpu", copy=True) for name, tensor in tensors.items()}
     return features, errors
 
 

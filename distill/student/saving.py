@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from cosfly.llm.student_chat import CHAT_FORMAT_FILE
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_file, storage_errors, write_bytes
 from cosfly.runtime.json_io import FileFormat, read_model, read_object, write_json, write_model
@@ -99,8 +100,8 @@ def base_digests(model: Path) -> dict[str, str]:
 def check_adapter(adapter: Path, model: Path) -> None:
     """Check that a folder has an adapter of a model."""
     path = adapter / ADAPTER_FACTS
-    if not path.is_file():
-        expected = f"{ADAPTER_FACTS} of a finished cosfly distill train"
+    if not path.is_file() or not (adapter / CHAT_FORMAT_FILE).is_file():
+        expected = f"{ADAPTER_FACTS} and {CHAT_FORMAT_FILE} of a finished cosfly distill train"
         raise InputError("the folder is not an adapter", where=adapter, expected=expected)
     wanted, found = read_model(path, AdapterFacts, ADAPTER_FORMAT).base_sha256, base_digests(model)
     if wanted != found:

@@ -8,6 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_folder, read_lines, write_bytes
 from cosfly.runtime.json_io import FileFormat, parse_json, read_model, write_model
 from distill.student.model import Student
@@ -20,7 +21,8 @@ CHECKPOINT_FORMAT = FileFormat("cosfly.checkpoint", "3.0", "checkpoint")
 class Progress(BaseModel):
     """How far a training is.
 
-    best_step: of the best validation, 0 before the first; stale: number of validations since then.
+    best_step: of the best validation, 0 before the first; stale: number of validations since then. samples: digest of
+    the samples that are used, on which the order of the steps depends.
     """
 
     step: int = 0
@@ -28,6 +30,7 @@ class Progress(BaseModel):
     best_loss: float | None = None
     stale: int = 0
     has_ended: bool = False
+    samples: str = ""
 
 
 def learning_weights(student: Student) -> dict[str, Any]:
@@ -69,15 +72,24 @@ def drop_old_checkpoints(folder: Path, progress: Progress, keep: int) -> None:
 def load_checkpoint(folder: Path, student: Student, optimizer: Any = None) -> Progress:
     """Load the weights of a checkpoint into the student, and the optimizer's state if an optimizer is given."""
     import torch
+    from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    weights, found = learning_weights(student), load_file(folder / WEIGHTS)
+    weights = learning_weights(student)
+    try:
+        found = load_file(folder / WEIGHTS)
+        kept_moments = load_file(folder / MOMENTS) if optimizer is not None else {}
+        if found.keys() != weights.keys():
+            raise ValueError("its weights are those of another student")
+    except (SafetensorError, OSError, ValueError) as error:
+        fix = f"remove {folder}, then run the same command again: it resumes from the checkpoint before"
+        raise InputError("the checkpoint is damaged", where=folder, got=str(error)[:200], fix=fix) from error
     with torch.no_grad():
         for name, parameter in weights.items():
             parameter.copy_(found[name])
     if optimizer is not None:
         moments: dict[str, dict[str, Any]] = {}
-        for key, value in load_file(folder / MOMENTS).items():
+        for key, value in kept_moments.items():
             name, _, moment = key.rpartition("/")
             moments.setdefault(name, {})[moment] = value
         state = {i: moments[name] for i, name in enumerate(weights) if name in moments}  # in the optimizer's order

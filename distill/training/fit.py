@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.runtime.console import progress_bar
-from cosfly.runtime.errors import ConfigError
-from cosfly.runtime.io import storage_errors
+from cosfly.runtime.errors import ConfigError, InputError, ResumeError
+from cosfly.runtime.io import sha256_bytes, storage_errors
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.seeding import rng_for
 from distill.student.model import Student
@@ -120,14 +120,30 @@ def train_step(context: TrainingContext, optimizer: Any, rows: Rows, rate: float
     return {"loss": total / weight, "gradient_norm": norm, **{name: int(count) for name, count in counts.items()}}
 
 
+def _digest_of_used(context: TrainingContext) -> str:
+    """Return a digest of the samples that are used, on which the order of the steps depends; equal in all processes."""
+    from accelerate.utils import gather_object
+
+    places = [[sample.place for sample in split.used] for split in (context.train, context.val)]
+    digest = sha256_bytes(dump_json(places).encode())
+    if len(set(gather_object([digest]))) > 1:
+        fix = "check that all processes can read the same pictures, then run the same command again"
+        raise InputError("the processes can use different samples", where=STAGE, fix=fix)
+    return digest
+
+
 def fit(context: TrainingContext, out: Path) -> Progress:
     """Train, from the newest checkpoint of `out` if there is one; leave the student with the weights of the product.
 
     Writes `log.jsonl` and `checkpoints/` in `out`.
     """
     student, cfg, accelerator, folder = context.student, context.cfg, context.accelerator, out / CHECKPOINTS
+    used = _digest_of_used(context)
     optimizer, newest = make_optimizer(student, cfg), newest_checkpoint(folder)
-    progress = load_checkpoint(newest, student, optimizer) if newest else Progress()
+    progress = load_checkpoint(newest, student, optimizer) if newest else Progress(samples=used)
+    if progress.samples != used:
+        fix = "restore the pictures as they were, or choose another --out"
+        raise ResumeError("other samples can be used than when the training began", where=out, fix=fix)
     if progress.step:
         log.info("%s: resumed after step %d", STAGE, progress.step)
     with _open_log(context, out / LOG, progress.step if newest else -1) as note:

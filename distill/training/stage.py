@@ -277,6 +277,7 @@ def _context(
         log.warning("%s: the student takes no pictures: it is taught with the text state alone", STAGE)
     check_template(student, samples[0])
     check_head(student)
+    taught_by(samples, cfg.max_pixels)  # its errors come before the training
     weights = AnswerWeights(cfg.decision_weight, cfg.reason_weight)
     train, val = (TrainingSplit(part, student, cfg.max_pixels, weights) for part in (samples, validation))
     order = rng_for(seed, STAGE, "validation").permutation(len(validation))

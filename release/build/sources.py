@@ -60,12 +60,19 @@ class Source:
 
 
 def told_apart(sources: list[Source]) -> list[Source]:
-    """Add the name of the tree to runs that share a name, as two trees in one folder do: rows and records know a run by
-    its name alone."""
+    """Add to runs that share a name that of the tree, as for two trees in one folder, or of the folder above, as for
+    towns of two runs: rows and records know a run by its name alone."""
     counts = Counter(source.run for source in sources)
     named = [
         replace(one, run=folder_name(f"{one.run}_{one.data.absolute().name}")) if counts[one.run] > 1 else one
         for one in sources
+    ]
+    counts = Counter(source.run for source in named)
+    named = [
+        replace(one, run=folder_name(f"{one.data.absolute().parents[1].name}_{given.run}"))
+        if counts[one.run] > 1
+        else one
+        for given, one in zip(sources, named, strict=True)
     ]
     name, count = Counter(source.run for source in named).most_common(1)[0]
     if count > 1:

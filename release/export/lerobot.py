@@ -221,7 +221,8 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
             got = "{} x {} px".format(*first.size_px)
             raise InputError("video needs pictures of even width and height", where=source.folder, got=got)
         features = features or features_of(source.modalities, first.size_px, fps, cfg.video)
-        layout = replace(layout, size_px=first.size_px)
+        if not layout.file:
+            layout = replace(layout, size_px=first.size_px)
         rows = _write_file(source, itertools.chain([first], own), layout, features, tasks, folder, advance)
         stats.append(_merge_all([row["stats"] for row in rows]))
         counts[name.rpartition("-")[0]] += len(rows)
@@ -249,7 +250,7 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
 def _fps(record: ReleaseRecord) -> int:
     """Return the number of frames per second; it must be whole and the same in all tracks."""
     steps_s = [float(step) for step in record.numbers.of("step_s")]
-    fps = round(1 / steps_s[0]) if steps_s else PAPER_FPS
+    fps = PAPER_FPS if not steps_s else round(1 / steps_s[0]) if steps_s[0] > 0 else 0
     if any(abs(step - 1 / (fps or 1)) > STEP_TOLERANCE_S for step in steps_s):
         what = "LeRobot needs the same whole number of frames per second in all tracks"
         raise InputError(what, where="time_s", got=f"steps of {', '.join(map(str, sorted(steps_s)[:10]))} s")
@@ -301,6 +302,10 @@ def _write_episode(
     numbers: dict[str, int], table: pq.ParquetWriter, videos: dict[str, Callable[[np.ndarray], None]], advance: Advance,
 ) -> dict[str, Any]:  # fmt: skip
     """Write the rows of an episode; return what the table of episodes has of it."""
+    if track.size_px != layout.size_px:
+        problem, fix = "the lerobot export needs pictures of one size", "build one release for each size"
+        got, expected = ("{} x {} px".format(*size) for size in (track.size_px, layout.size_px))
+        raise InputError(problem, where=track.name, got=got, expected=expected, fix=fix)
     n = len(track)
     tasks = [task_of(row["goal_en"] or "", row["decision"] or "") for row in track.rows]
     values = values_of(track.rows, number, first, layout.fps, [numbers[task] for task in tasks])

@@ -191,10 +191,11 @@ def open_release(folder: Path, consecutive: str = "") -> ExportSource:
         record.require_whole_tracks(consecutive, folder)
     names = shard_paths([shard.split for shard in record.shards], record.content_digest)
     wrong = [
-        shard.path for shard, (name, _) in zip(record.shards, names, strict=True)
-        if shard.path != name or not (path := inside(folder, name)).is_file() or path.stat().st_size != shard.bytes
+        file.path for shard, pair in zip(record.shards, names, strict=True)
+        for file, name in zip((shard, shard.points), pair, strict=True)
+        if file.path != name or not (path := inside(folder, name)).is_file() or path.stat().st_size != file.bytes
     ]  # fmt: skip
-    if wrong:
+    if wrong or not record.shards:
         raise InputError(
             "the release is incomplete", where=folder, got=f"missing, or of another name or size: {'; '.join(wrong)}",
             expected="the shards in release.json", fix="run cosfly release verify for details",
