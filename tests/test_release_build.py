@@ -520,7 +520,7 @@ def test_runs_of_other_towns_go_into_one_release_under_ids_of_their_own(release_
     num_captions = sum(row["has_caption"] for row in rows)
     assert num_captions == record.history.captions.released > before.history.captions.released
     with pytest.raises(InputError, match=r"several runs have the same name.*different names"):
-        run(CFG, [source_of(release_inputs), source_of(other)], tmp_path / "r2")
+        run(CFG, [source_of(other), source_of(other)], tmp_path / "r2")
     # Of two trees in one folder each goes by its own name.
     (other / "tree").rename(other / "second")
     _, record = joined(tmp_path / "trees", source_of(release_inputs), replace(source_of(other), data=other / "second"))
