@@ -129,6 +129,11 @@ def sets_off(f: Facts, side: int) -> bool:
     return hurries(f, side) and (f.target_speeds_mps[0] or 0.0) < DRIFTING_MPS
 
 
+def stands(f: Facts, side: int) -> bool:
+    """Return whether the target stands, now and on the whole."""
+    return is_walk_known(f, side) and max(f.target_speed_mps or 0.0, f.target_speeds_mps[-1] or 0.0) < STILL_MPS
+
+
 def turns(f: Facts, side: int) -> bool:
     turn_deg = f.target_turn_deg or 0.0
     return walks(f, side) and not is_shaken(f) and (side * turn_deg if side else abs(turn_deg)) >= BEND_DEG
@@ -178,14 +183,10 @@ def sight_swings(f: Facts, side: int) -> bool:
     return f.is_visible_now and (side * turn if side else abs(turn)) >= 1.0
 
 
-def is_across(f: Facts, side: int) -> bool:
-    """Return whether the target is on the other side of the camera's axis."""
-    return side * (f.bearing_deg[-1] or 0.0) < -ACROSS_SIGHT_DEG
-
-
 def sight_turns(f: Facts, side: int) -> bool:
-    """Return whether the line of sight turns to a side, so that the nose has to follow it."""
-    return f.is_visible_now and not is_across(f, side) and side * sight_rate_dps(f) >= TURNING_DPS
+    """Return whether the line of sight turns to a side on which the target is, or nearly."""
+    is_across = side * (f.bearing_deg[-1] or 0.0) < -ACROSS_SIGHT_DEG
+    return f.is_visible_now and not is_across and side * sight_rate_dps(f) >= TURNING_DPS
 
 
 def drifts(f: Facts, side: int) -> bool:
@@ -236,7 +237,7 @@ def gap_scatters(f: Facts, side: int) -> bool:
 
 def bystander_closes(f: Facts, side: int) -> bool:
     """Return whether the nearest bystander comes nearer from frame to frame; a jump is another person."""
-    steps_m = [a - b if a and b else 0.0 for a, b in pairwise(f.other_distance_m[-3:])]
+    steps_m = [0.0 if a is None or b is None else a - b for a, b in pairwise(f.other_distance_m[-3:])]
     is_near = f.is_visible_now and _or_far(f.other_distance_m[-1]) <= COMING_M
     return is_near and all(0.0 < step_m < STRIDE_M for step_m in steps_m)
 
@@ -285,7 +286,7 @@ def is_ordered(kind: str) -> Condition:
 # The names by which rule_sentences.yaml refers to conditions.
 CONDITIONS: dict[str, Condition] = {
     "always": lambda f, side: True,
-    "stands": says("target_motion", "standing", is_walk_known, lambda f, side: max(f.target_speed_mps or 0.0, f.target_speeds_mps[-1] or 0.0) < STILL_MPS),
+    "stands": stands,
     "lingers": lambda f, side: is_walk_known(f, side) and (f.target_speeds_mps[-1] or 0.0) < DAWDLING_MPS,
     "sets_off": sets_off, "turns": turns, "crosses": crosses, "comes": comes, "walks_away": walks_away, "walks": walks,
     "slows": slows, "stops": lambda f, side: slows(f, side) and (f.target_speeds_mps[-1] or 0.0) < SLOW_MPS,
