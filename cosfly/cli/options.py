@@ -43,8 +43,9 @@ def each_run(runs: list[Path] | None) -> list[Path]:
 
     folders = list[Path]()
     for run in runs or []:
-        towns = (read_yaml(run / "run.yaml").get("towns") or {}) if (run / "run.yaml").is_file() else {}
-        folders += [run / folder_name(name) for name in towns] or [run]
+        towns = read_yaml(run / "run.yaml").get("towns") if (run / "run.yaml").is_file() else None
+        names = map(str, towns) if isinstance(towns, dict) else ()
+        folders += [run / folder_name(name) for name in names] or [run]
     return folders
 
 
