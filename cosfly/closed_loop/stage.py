@@ -151,9 +151,12 @@ class EpisodeRunner:
             "controller_sha256": None if cfg.fly.engine == "planner" else sha256_file(cfg.fly.table),
         }  # fmt: skip
 
-    def fly(self, episodes: Mapping[str, Callable[[], ClosedLoopTrajectory]], map_sha256: str) -> Outcome:
-        """Fly episodes to their ends and write each record; episodes with a record are skipped."""
-        shared = self.shared | {"map_sha256": map_sha256}
+    def fly(self, episodes: Mapping[str, Callable[[], ClosedLoopTrajectory]], maps: Mapping[str, str]) -> Outcome:
+        """Fly episodes to their ends and write each record; episodes with a record are skipped.
+
+        Args:
+            episodes: name -> function that opens the episode. maps: name -> sha256 of its map.
+        """
         active = [
             OpenEpisode(name, open_simulation(), self.controls, self.engine.num_frames)
             for name, open_simulation in episodes.items()
@@ -167,6 +170,7 @@ class EpisodeRunner:
                 episode.step(decision)
                 advance()
             for episode in [episode for episode in active if episode.simulation.ended is not None]:
+                shared = self.shared | {"map_sha256": maps[episode.episode]}
                 write_episode(episode_file(self.out, episode.episode), episode.record(shared))
                 active.remove(episode)
         return Outcome({"flights": list(episodes)})
@@ -276,7 +280,11 @@ def make_worker(
             others=bystanders.get(traces[n].path_id, ()),
         )
 
-    return lambda item: runner.fly({traces[n].path_id: partial(open_simulation, n) for n in item.payload}, map_sha256)
+    def work(item: Item) -> Outcome:
+        episodes = {traces[n].path_id: partial(open_simulation, n) for n in item.payload}
+        return runner.fly(episodes, dict.fromkeys(episodes, map_sha256))
+
+    return work
 
 
 def _drop_reason(trace: DroneTrace, cfg: FlyConfig) -> str | None:

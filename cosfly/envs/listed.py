@@ -30,12 +30,14 @@ def run(
     files = {"controller": cfg.fly.table, "episodes": benchmark.EPISODES_FILE}
     stage = StageFolder.open(out, "fly", config=cfg, inputs={}, seed=seed, resume=resume, package_files=files)
     if not stage.is_complete:
+        # A model answers all towns as one batch; otherwise a worker opens one town at a time.
+        by_town = [list(own) for _, own in groupby(episodes, key=itemgetter(0))]
         items = []
-        for town, town_episodes in groupby(episodes, key=itemgetter(0)):
-            numbers = [number for _, number in town_episodes]
-            for begin in range(0, len(numbers), cfg.fly.batch):
-                batch = numbers[begin : begin + cfg.fly.batch]
-                items.append(Item(f"{town} {batch[0]}", (town, batch), benchmark.NUM_DECISIONS * len(batch)))
+        for group in [list(episodes)] if cfg.fly.asks_model else by_town:
+            for begin in range(0, len(group), cfg.fly.batch):
+                batch = group[begin : begin + cfg.fly.batch]
+                name = benchmark.episode_id(*batch[0])
+                items.append(Item(f"{name} and {len(batch) - 1}", batch, benchmark.NUM_DECISIONS * len(batch)))
         num_workers = 1 if cfg.fly.asks_model else workers
         worker_args = (cfg, stage.path, seed, num_workers)
         run_items(stage, items, make_worker, worker_args, workers=num_workers, watch=watch_of(cfg.fly, watch))
@@ -48,7 +50,7 @@ def make_worker(cfg: ListConfig, out: Path, seed: int, num_workers: int) -> Work
     task, _, digest = benchmark.read_list(cfg.env)
     runner = EpisodeRunner(cfg, out, seed, num_workers, list_sha256=digest)
 
-    @lru_cache(maxsize=1)
+    @lru_cache(maxsize=len(benchmark.HELD_OUT) if cfg.fly.asks_model else 1)
     def airspace_of(town: str) -> tuple[benchmark.BenchmarkWorld, Airspace]:
         world = benchmark.world_of(benchmark.HELD_OUT[town])
         return world, world.airspace(task)
@@ -61,8 +63,8 @@ def make_worker(cfg: ListConfig, out: Path, seed: int, num_workers: int) -> Work
         return episode.simulation(airspace)
 
     def work(item: Item) -> Outcome:
-        town, numbers = item.payload
-        episodes = {benchmark.episode_id(town, number): partial(open_episode, town, number) for number in numbers}
-        return runner.fly(episodes, airspace_of(town)[0].sha256)
+        episodes = {benchmark.episode_id(*episode): partial(open_episode, *episode) for episode in item.payload}
+        maps = {benchmark.episode_id(town, number): airspace_of(town)[0].sha256 for town, number in item.payload}
+        return runner.fly(episodes, maps)
 
     return work
