@@ -133,7 +133,8 @@ def test_another_version_of_the_prompt_is_refused(place, tmp_path):
         folder = taught_otherwise(place, tmp_path / f"{number}", prompts=taught["prompts"] | {"en": changed})
         with pytest.raises(ConfigError, match="another version of the prompt"):
             student_settings(settings("http://127.0.0.1:1/v1", folder), VOCABULARY)
-    mission = {"system": english["system"], "user": english["user"] + "\nMission: the time of the mission is over."}
+    lines = ("Goal: follow the man in the black shorts.", "Other people in view: 4", "Mission: the time is over.")
+    mission = {"system": english["system"], "user": "\n".join((english["user"], *lines))}
     folder = taught_otherwise(place, tmp_path / "mission", prompts={"en": mission})
     assert student_settings(settings("http://127.0.0.1:1/v1", folder), VOCABULARY).endpoint.temperature == 0.0
     folder = taught_otherwise(place, tmp_path / "zh", prompts={"zh": taught["prompts"]["zh"]})

@@ -87,7 +87,7 @@ def _is_of_template(user: str, language: Language, chat_format: ChatFormat, voca
     }
     pattern = re.escape(template.substitute({slot: f"\0{slot}\0" for slot in template.get_identifiers()}))
     pattern = re.sub("\0(.+?)\0", lambda slot: f"(?:{known.get(slot[1], '.+?')})", pattern)
-    return re.fullmatch(pattern + r"(\n.+)?", user) is not None  # the line of a mission may follow
+    return re.fullmatch(pattern + r"(\n.+)*", user) is not None  # lines of goal, other people and mission may follow
 
 
 class TrainedStudent:

@@ -273,7 +273,9 @@ def load_student(
     with loading_errors("student", adapter or path):
         model: Any = auto_class.from_pretrained(**arguments, **dtypes)
         if path.suffix == GGUF:
-            model.config.__dict__.pop("quantization_config", None)  # the weights are plain numbers now
+            # The weights are plain numbers now, which can be saved.
+            model.config.__dict__.pop("quantization_config", None)
+            model.__dict__.pop("hf_quantizer", None)
         if adapter is not None:
             if not (adapter / "adapter_model.safetensors").is_file():
                 raise InputError("the folder is not an adapter", where=adapter, expected="adapter_model.safetensors")
