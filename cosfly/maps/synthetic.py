@@ -19,7 +19,18 @@ from pydantic import Field, model_validator
 
 from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.maps.boxlist import BoxList, Pair
-from cosfly.maps.town_blocks import BLOCKS, ROAD_TOP_M, SLAB_M, WATER_TOP_M, Plot, Range, point
+from cosfly.maps.town_parts import (
+    BLOCKS,
+    RAILING_M,
+    SLAB_M,
+    WATER_BOTTOM_M,
+    WATER_TOP_M,
+    Plot,
+    Range,
+    add_road_paint,
+    furnish,
+    point,
+)
 from cosfly.runtime.config import Config, read_yaml
 from cosfly.runtime.errors import nearest
 from cosfly.runtime.seeding import rng_for
@@ -29,14 +40,7 @@ GENERATOR_VERSION = "1"
 MIN_BLOCK_M = 34.0  # no kind of block fits into a smaller one
 WIDE_M = 26.0  # wider streets have wide pavements and large trees
 VERGE_M = 10.0  # of lawn around the town
-DASH_M, DASH_GAP_M = 3.0, 6.0
-RAILING_M = 0.2
-WATER_BOTTOM_M = -1.2
-PAINT_TOP_M, BASE_TOP_M = -0.03, -0.12  # over and below ROAD_TOP_M
-# Lamps and parked cars: distances from the ends of a stretch, which have zebra crossings, to the next, and to the kerb.
-LAMPS_START_M, LAMPS_END_M, LAMP_SPACING_M, LAMP_FROM_KERB_M = 9.0, 8.0, 8.0, 1.0
-PARKING_START_M, PARKING_END_M, PARKING_SPACING_M, PARKED_FROM_KERB_M = 9.5, 11.0, 6.6, 1.15
-TRUCK_SHARE = 0.06  # of parked cars
+BASE_TOP_M = -0.12  # below ROAD_TOP_M
 
 
 @dataclass(frozen=True)
@@ -164,10 +168,19 @@ def build_town(plan: TownPlan, name: str, seed: int) -> BoxMap:
     town = plot_of(*corners, "verge")
     town.span("Terrain", *corners, BASE_TOP_M - SLAB_M, BASE_TOP_M)
     _add_surfaces(town, streets)
-    _add_road_paint(town, streets)
+    for axis in (0, 1):
+        for strip in streets.along(axis):
+            for stretch in streets.stretches(axis) if strip is not streets.river else []:
+                add_road_paint(town, axis, stretch, strip.road)
     for axis in (0, 1):
         for number, strip in enumerate(streets.along(axis)):
-            _furnish_street(plot_of(*corners, f"street {axis} {number}"), plan, axis, strip, streets)
+            plot = plot_of(*corners, f"street {axis} {number}")
+            is_wide, parked_share = strip.high_m - strip.low_m >= WIDE_M, plan.parked_share
+            for stretch in streets.stretches(axis):
+                furnish(
+                    plot, axis, stretch, strip.road, is_wide=is_wide, tree_share=plan.tree_share,
+                    parked_share=parked_share if strip is not streets.river else 0.0,
+                )  # fmt: skip
     _add_traffic_lights(town, streets)
     _add_sewers(town, streets)
     _add_verge(town, streets)
@@ -237,79 +250,6 @@ def _add_river(town: Plot, plan: TownPlan, streets: Streets, river: Strip) -> No
         for side, kerb, edge in ((-1, strip.road[0], strip.low_m), (1, strip.road[1], strip.high_m)):
             town.lay("Sidewalks", (kerb, low), (edge, high))
             town.span("Fences", (edge - side * RAILING_M, low), (edge, high), -SLAB_M, 1.1)
-
-
-def _add_road_paint(town: Plot, streets: Streets) -> None:
-    """Add centre dashes, and a zebra crossing at both ends of every stretch."""
-    for axis in (0, 1):
-        for strip in streets.along(axis):
-            if strip is streets.river:
-                continue
-            for low, high in streets.stretches(axis):
-                dashes = np.arange(low + 7.0, high - 7.0 - DASH_M, DASH_M + DASH_GAP_M) + DASH_M / 2
-                stripes = np.arange(strip.road[0] + 0.7, strip.road[1] - 0.5, 1.2)
-                paint = [(at, strip.middle_m, DASH_M, 0.16) for at in dashes]
-                paint += [(end, across, 3.0, 0.55) for end in (low + 2.5, high - 2.5) for across in stripes]
-                for along, across, length_m, width_m in paint:
-                    size = point(axis, length_m, width_m)
-                    town.add("RoadLines", point(axis, along, across), size, ROAD_TOP_M - 0.04, PAINT_TOP_M)
-
-
-def _furnish_street(plot: Plot, plan: TownPlan, axis: int, strip: Strip, streets: Streets) -> None:
-    """Add lamps, trees, benches, bins, parked cars and signs along both kerbs of a street.
-
-    `side` is -1 at the low kerb and 1 at the high one: kerb + side lies on the pavement, kerb - side on the road.
-    """
-    is_wide = strip.high_m - strip.low_m >= WIDE_M
-    parked_share = plan.parked_share if strip is not streets.river else 0.0
-    for stretch in streets.stretches(axis):
-        for side, kerb in ((-1, strip.road[0]), (1, strip.road[1])):
-            _add_lamps_and_trees(plot, plan, axis, stretch, side, kerb, is_wide=is_wide)
-            _add_parked_cars(plot, axis, stretch, side, kerb, parked_share)
-            _add_sign(plot, axis, stretch, side, kerb)
-
-
-def _add_lamps_and_trees(
-    plot: Plot, plan: TownPlan, axis: int, stretch: Range, side: int, kerb: float, *, is_wide: bool
-) -> None:
-    """Add a row of lamps, and of trees or benches between them, on the pavement."""
-    rng = plot.rng
-    low, high = stretch
-    across = kerb + side * LAMP_FROM_KERB_M
-    for number, along in enumerate(np.arange(low + LAMPS_START_M, high - LAMPS_END_M, LAMP_SPACING_M)):
-        place = point(axis, along, across)
-        if number % 3 == 0:
-            plot.add("Poles", place, (0.2, 0.2), 0.0, 7.6)
-            arm = point(axis, along, across - side * 0.9)  # over the carriageway
-            plot.add("Poles", arm, point(axis, 0.16, 2.0), 7.45, 7.6)
-        elif (is_wide or number % 3 == 1) and rng.random() < plan.tree_share:
-            crowns_m = (3.4, 4.6) if is_wide else (2.6, 3.4)
-            plot.tree(place, crowns_m, (5.5, 9.5), 1.0 if is_wide else 0.0)
-        elif rng.random() < 0.5:
-            plot.bench(axis, along, across)
-
-
-def _add_parked_cars(plot: Plot, axis: int, stretch: Range, side: int, kerb: float, parked_share: float) -> None:
-    """Add cars and a few trucks along a kerb of the carriageway."""
-    rng = plot.rng
-    low, high = stretch
-    for along in np.arange(low + PARKING_START_M, high - PARKING_END_M, PARKING_SPACING_M):
-        if rng.random() < parked_share:
-            place = point(axis, along + rng.uniform(-0.4, 0.4), kerb - side * PARKED_FROM_KERB_M)
-            if rng.random() < TRUCK_SHARE:
-                plot.add("Truck", place, point(axis, 6.2, 2.2), ROAD_TOP_M, 2.7)
-            else:
-                length_m = rng.uniform(4.0, 4.7)
-                plot.add("Car", place, point(axis, length_m, 1.8), ROAD_TOP_M, rng.uniform(1.4, 1.65))
-
-
-def _add_sign(plot: Plot, axis: int, stretch: Range, side: int, kerb: float) -> None:
-    """Add one traffic sign on the pavement: near the low end of a stretch at its low kerb, else near the high end."""
-    low, high = stretch
-    along = low + 6.0 if side < 0 else high - 6.0
-    across = kerb + side * 0.6
-    plot.add("Poles", point(axis, along, across), (0.08, 0.08), 0.0, 2.9)
-    plot.add("TrafficSigns", point(axis, along + 0.07, across), point(axis, 0.06, 0.65), 2.2, 2.85)
 
 
 def _add_traffic_lights(town: Plot, streets: Streets) -> None:

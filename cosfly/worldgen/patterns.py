@@ -183,19 +183,18 @@ def linear(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> list[Line
     width, depth = size_m
     pitch_m = plan.block_m + plan.street_m
     x = _spaced(width, 1.4 * pitch_m, 0.2, rng)
-    if plan.shore_m:  # the south edge of the pattern lies under the water
-        rows = [Line(np.array([[x[0], y], [x[-1], y]]), plan.street_m) for y in [2 * pitch_m - depth / 2]]
-        return rows + [
-            Line(np.array([[at, -depth / 2], [at, min(depth / 2, 3 * pitch_m - depth / 2)]]), plan.street_m) for at in x
-        ]
-    sway = 0.0 if plan.river_m else min(0.12 * depth, 0.25 * pitch_m)
+    has_water = bool(plan.river_m or plan.shore_m)
+    sway = 0.0 if has_water else min(0.12 * depth, 0.25 * pitch_m)
     main = np.stack([x, sway * rng.uniform(-1.0, 1.0, len(x))], axis=1)
-    lines = [] if plan.river_m else [Line(main, plan.avenue_m)]
+    main[:, 1] -= depth / 2 if plan.shore_m else 0.0  # under the water
+    lines = [] if has_water else [Line(main, plan.avenue_m)]
     side = 1.0 if rng.random() < 0.5 else -1.0
     for number, (a, b) in enumerate(pairwise(main)):
         foot = a + (b - a) * rng.uniform(0.35, 0.65)
-        for way in (1.0, -1.0) if plan.river_m or number % 3 == 2 else (side,):
-            reach_m = min(depth / 2, pitch_m * rng.uniform(0.9, 1.3))
+        both = (1.0, -1.0) if plan.river_m or number % 3 == 2 else (side,)
+        for way in (1.0,) if plan.shore_m else both:
+            reach_m = pitch_m * rng.uniform(0.9, 1.3)
+            reach_m = min(depth, 2.5 * reach_m) if plan.shore_m else min(depth / 2, reach_m)
             tip = foot + np.array([rng.uniform(-0.2, 0.2) * reach_m, way * reach_m])
             lines.append(Line(np.stack([foot, tip]), plan.street_m))
         side = -side
@@ -211,44 +210,42 @@ def network(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> Network:
     """Return the streets and the water of a town of a size."""
     margin_m = VERGE_M + max(plan.avenue_m, plan.street_m) / 2
     below_m = plan.block_m + plan.street_m if plan.shore_m else 0.0  # of the pattern, under the water
-    inner = size_m[0] - 2 * margin_m, size_m[1] - 2 * margin_m
-    shift = np.array([0.0, -below_m / 2])
-    drawn = PATTERNS[plan.pattern](plan, (inner[0], inner[1] + below_m), rng)
-    lines = [Line(line.points + shift, line.width_m) for line in drawn]
     half_x, half_y = size_m[0] / 2, size_m[1] / 2
+    inner = size_m[0] - 2 * margin_m, size_m[1] - 2 * margin_m + below_m
+    shift = np.array([0.0, -below_m / 2])
+    lines = [Line(line.points + shift, line.width_m) for line in PATTERNS[plan.pattern](plan, inner, rng)]
+    window = shapely.box(margin_m - half_x, -half_y, half_x - margin_m, half_y)
     water: BaseGeometry = Polygon()
     bridges: list[Line] = []
     if plan.shore_m:
-        y = -half_y + QUAY_M + plan.avenue_m / 2
-        promenade = LineString([(-half_x + margin_m, y), (half_x - margin_m, y)])
-        beyond = shapely.box(-half_x, -half_y - plan.shore_m, half_x, y)
-        lines = [*_clipped(lines, beyond, [promenade]), Line(np.array(promenade.coords), plan.avenue_m)]
-        water = shapely.box(-half_x, -half_y - plan.shore_m, half_x, -half_y)
+        shore = LineString([(x, -half_y - plan.shore_m / 2) for x in (-half_x, half_x)])
+        lines, _ = _with_banks(lines, shore, plan.shore_m / 2 + QUAY_M + plan.avenue_m / 2, plan.avenue_m, window)
+        water = shapely.buffer(shore, plan.shore_m / 2, cap_style="flat")
     if plan.river_m:
         x = np.linspace(-half_x, half_x, 6)
         sway = min(0.08 * size_m[1], 12.0) * rng.uniform(-1.0, 1.0, len(x))
         sway[0], sway[-1] = sway[1], sway[-2]
         river = LineString(np.stack([x, rng.uniform(-0.1, 0.1) * size_m[1] + sway], axis=1))
         width_m = plan.avenue_m if plan.pattern == "linear" else plan.street_m
-        apart_m = (plan.river_m + width_m) / 2 + 0.3
-        banks = [
-            shapely.intersection(
-                river.offset_curve(side * apart_m), shapely.box(-half_x + margin_m, -half_y, half_x - margin_m, half_y)
-            )
-            for side in (1, -1)
-        ]
         crossings = shapely.get_coordinates([shapely.intersection(LineString(line.points), river) for line in lines])
-        lines = _clipped(lines, shapely.buffer(river, apart_m, cap_style="flat"), banks)
-        lines += [Line(np.array(bank.coords), width_m) for bank in banks]
+        lines, banks = _with_banks(lines, river, (plan.river_m + width_m) / 2 + 0.3, width_m, window)
         bridges = _bridges(plan, river, banks, crossings, inner[0])
         water = shapely.union(water, shapely.buffer(river, plan.river_m / 2, cap_style="flat", join_style="mitre"))
     streets = straight_streets([*lines, *bridges])
     crossing = [
-        street
-        for street in streets
-        if plan.river_m and water.contains(shapely.Point(street.at(street.length_m / 2, 0)))
+        street for street in streets if bridges and water.contains(shapely.Point(street.at(street.length_m / 2, 0)))
     ]
     return Network(streets, water, crossing)
+
+
+def _with_banks(
+    lines: list[Line], course: LineString, apart_m: float, width_m: float, window: Polygon
+) -> tuple[list[Line], list[LineString]]:
+    """Return lines up to streets along both sides of a water, with these streets; and those of them in the window."""
+    sides = [shapely.intersection(course.offset_curve(side * apart_m), window) for side in (1, -1)]
+    banks = [bank for bank in sides if not bank.is_empty]
+    lines = _clipped(lines, shapely.buffer(course, apart_m, cap_style="flat"), banks)
+    return [*lines, *(Line(np.array(bank.coords), width_m) for bank in banks)], banks
 
 
 def _clipped(lines: list[Line], zone: BaseGeometry, edges: list[LineString]) -> list[Line]:

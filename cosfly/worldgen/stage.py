@@ -57,43 +57,33 @@ class WorldConfig(Config):
     model: str | None = Field(None, description="name of the language model; empty: the endpoint's only model")
 
 
-def _buildings_of(box_map: BoxMap) -> tuple[np.ndarray, np.ndarray]:
-    """Return buildings as seen from above, touching boxes joined: their outlines (n,) and their heights (n,), m."""
-    boxes = box_map.select(np.flatnonzero(of_kinds(box_map, "Buildings")))
-    outlines = footprints(boxes)
-    joined = shapely.get_parts(shapely.union_all(shapely.buffer(outlines, 0.02, join_style="mitre")))
-    tops_m = np.zeros(len(joined))
-    part, box = shapely.STRtree(outlines).query(joined, predicate="intersects")
-    np.maximum.at(tops_m, part, boxes.maxs[box, 2])
-    return joined, tops_m
-
-
 def check_world(town: Town, plan: WorldPlan) -> list[dict[str, Any]]:
     """Return each check of a world: its name, the measured value, the accepted range, and whether it is met."""
     world = town.boxes
-    outlines, tops_m = _buildings_of(town.layout)
-    buildings, all_tops_m = _buildings_of(world)
-    num_reached, component_m, component_share = _reach(world, buildings)
+    houses, buildings = (one.select(of_kinds(one, "Buildings")) for one in (town.layout, world))
+    joined = shapely.union_all(shapely.buffer(footprints(buildings), 0.02, join_style="mitre"))
+    num_parts = len(shapely.get_parts(joined))
+    num_reached, component_m, component_share = _reach(world, shapely.get_parts(joined))
     kinds = plan.kinds_of_buildings()
     low, high = min(kind.heights_m[0] for kind in kinds), max(kind.heights_m[1] for kind in kinds)
-    heights_m = tops_m if len(tops_m) else [low]
+    heights_m = houses.maxs[:, 2] if len(houses) else [low]
     checks = [
-        ("overlapping buildings", _num_overlaps(world), 0, 0),
-        ("buildings without a pavement", len(buildings) - num_reached, 0, 0),
+        ("overlapping buildings", _num_overlaps(buildings), 0, 0),
+        ("buildings without a pavement", num_parts - num_reached, 0, 0),
         ("length of the largest walkable component, m", component_m, WALK_M, 1e5),
         ("walkable ground in it", component_share, 0.8, 1.0),
-        ("building share", shapely.area(outlines).sum() / town.land_m2, *plan.building_share),
+        ("building share", shapely.area(footprints(houses)).sum() / town.land_m2, *plan.building_share),
         ("lowest building, m", min(heights_m), low, high),
         ("highest building, m", max(heights_m), low, high),
         ("trees per hectare", trees_of(world).sum() / town.land_m2 * 1e4, *plan.trees_per_ha),
     ]
     for kind in kinds:
         if kind.count is not None:
-            checks.append((f"number of {kind.name}s", town.built.get(kind.name, 0), 0.9 * kind.count, 1.1 * kind.count))
+            checks.append((f"number of {kind.name}s", town.built[kind.name], 0.9 * kind.count, 1.1 * kind.count))
     num_open = plan.plazas + plan.greens
     checks.append(("plazas and green blocks", len(town.open_blocks), num_open, max(num_open, len(town.open_blocks))))
     if plan.highest_m is not None:
-        checks.append(("highest building or object, m", max(all_tops_m, default=0.0), 0.0, plan.highest_m))
+        checks.append(("highest building or object, m", buildings.maxs[:, 2].max(initial=0.0), 0.0, plan.highest_m))
     return [
         {"check": name, "got": round(float(got), 4), "least": least, "most": most,
          "is_met": bool(least - 1e-6 <= got <= most + 1e-6)}
@@ -116,9 +106,8 @@ def _problems(checks: list[dict[str, Any]], town: Town, trace: dict[str, Any]) -
     return "; ".join(parts)
 
 
-def _num_overlaps(box_map: BoxMap) -> int:
-    """Count pairs of boxes of buildings that share more than a sliver of space."""
-    boxes = box_map.select(np.flatnonzero(of_kinds(box_map, "Buildings")))
+def _num_overlaps(boxes: BoxMap) -> int:
+    """Count pairs of boxes that share more than a sliver of space."""
     outlines = shapely.buffer(footprints(boxes), -OVERLAP_M / 2, join_style="mitre")
     first, second = shapely.STRtree(outlines).query(outlines, predicate="intersects")
     shared_m = np.minimum(*boxes.maxs[[first, second], 2]) - np.maximum(*boxes.mins[[first, second], 2])

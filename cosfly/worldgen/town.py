@@ -8,26 +8,27 @@ Source: app:simworld:step1, the layout and the incremental placement layer.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Iterator
 from functools import cache
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
 from shapely.affinity import rotate
-from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
 from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.footprints import Rectangle, footprints, oriented_rectangle, polygons_of, rectangle_polygon
-from cosfly.maps.town_blocks import PAVED_TOP_M, SLAB_M
+from cosfly.maps.town_parts import PAVED_TOP_M, SLAB_M
 from cosfly.runtime.seeding import rng_for
 from cosfly.simulators.assets import ASSETS
-from cosfly.worldgen.patterns import QUAY_M, Network, network
-from cosfly.worldgen.plan import OBJECTS, VERGE_M, Buildings, Object, Range, WorldPlan, assets
-from cosfly.worldgen.streets import GROUND_TOP_M, Stretch, furnish, lay_streets, pave
+from cosfly.worldgen.patterns import QUAY_M, network
+from cosfly.worldgen.plan import VERGE_M, Buildings, Object, Range, WorldPlan, assets
+from cosfly.worldgen.streets import GROUND_TOP_M, lay_streets, pave
 
 CM_PER_M = 100.0
 ROAD_PIECE_M = 200.0  # length of SimWorld's piece of road
@@ -48,45 +49,13 @@ Size = tuple[float, ...]
 
 
 class Placed(NamedTuple):
-    """One placed object: middle, m; scale of its footprint; rows of its boxes in the placement."""
+    """One placed object: middle, m; scale of its footprint."""
 
     name: str
     number: int
     xy: tuple[float, float]
     yaw_deg: float
     scale: float
-    rows: tuple[int, int]
-
-
-@dataclass
-class Town:
-    """A layout and the objects placed in it.
-
-    size_m: from west to east and from south to north. blocks: the ground between streets and water. open_blocks: those
-    of them that are plazas and greens. built: numbers of buildings by kind. not_placed: name of a missing object ->
-    reason, an entry for each.
-    """
-
-    name: str
-    size_m: Range
-    network: Network
-    blocks: BaseGeometry
-    open_blocks: list[Polygon]
-    layout: BoxMap
-    placement: BoxMap
-    built: dict[str, int] = field(default_factory=dict)
-    placed: list[Placed] = field(default_factory=list)
-    not_placed: list[tuple[str, str]] = field(default_factory=list)
-
-    @property
-    def boxes(self) -> BoxMap:
-        return self.layout.joined(self.placement)
-
-    @property
-    def land_m2(self) -> float:
-        """The area without the water."""
-        town = shapely.box(-self.size_m[0] / 2, -self.size_m[1] / 2, self.size_m[0] / 2, self.size_m[1] / 2)
-        return float(shapely.difference(town, self.network.water).area)
 
 
 def of_kinds(box_map: BoxMap, *names: str) -> np.ndarray:
@@ -108,7 +77,7 @@ def build(plan: WorldPlan, name: str, seed: int) -> Town:
     widest_m = max((max(thing.size_m) * thing.least_scale for thing, _ in plan.known_objects()), default=0.0)
     plan = plan.model_copy(update={"block_m": max(plan.block_m, min(widest_m + 2 * SPACE_M, 150.0))})
     if plan.size_m:
-        return _Builder(plan, plan.size_m, name, seed).build()
+        return Town(plan, plan.size_m, name, seed)
     pitch_m = plan.block_m + plan.street_m
     edges_m = 2 * VERGE_M + plan.avenue_m + plan.river_m
     side_m = plan.blocks_along * pitch_m + edges_m
@@ -117,8 +86,8 @@ def build(plan: WorldPlan, name: str, seed: int) -> Town:
         fronts_m = sum((one.count or 0) * (sum(one.footprint_m) / 2 + 1.3 * plan.gap_m) for one in plan.buildings)
         side_m = max(LEAST_TOWN_M, math.sqrt(fronts_m * pitch_m / 3) + edges_m)
     for _ in range(MOST_GROWTH):
-        town = _Builder(plan, _stretched(plan, side_m, seed), name, seed).build()
-        wanted, num_built = sum(counted.values()), sum(town.built.get(kind, 0) for kind in counted)
+        town = Town(plan, _stretched(plan, side_m, seed), name, seed)
+        wanted, num_built = sum(counted.values()), sum(town.built[kind] for kind in counted)
         if num_built < wanted:
             side_m *= min(2.0, 1.05 * math.sqrt(wanted / max(1, num_built)))
         elif any(reason == "no room" for _, reason in town.not_placed):
@@ -130,79 +99,84 @@ def build(plan: WorldPlan, name: str, seed: int) -> Town:
 
 def _stretched(plan: WorldPlan, side_m: float, seed: int) -> Range:
     """Return the sides of a town of about side_m**2; linear towns are long."""
-    ratio = rng_for(seed, "world", "ratio").uniform(1.0, 1.25) * (1.7 if plan.pattern == "linear" else 1.0)
-    is_wide = plan.pattern == "linear" or plan.shore_m or plan.river_m or rng_for(seed, "world", "wide").random() < 0.5
+    rng = rng_for(seed, "world", "ratio")
+    ratio = rng.uniform(1.0, 1.25) * (1.7 if plan.pattern == "linear" else 1.0)
+    is_wide = plan.pattern == "linear" or plan.shore_m or plan.river_m or rng.random() < 0.5
     width, height = side_m * math.sqrt(ratio), side_m / math.sqrt(ratio)
     return (width, height) if is_wide else (height, width)
 
 
 def _footprints(low: float, high: float) -> list[Range]:
-    """Return the footprints of SimWorld's buildings in a range; if fewer than four fit, scale all into it."""
+    """Return the footprints of SimWorld's buildings in a range; if fewer than four fit, others."""
     sizes = [(size[0], size[1]) for name, size in assets().items() if name.startswith("BP_Building")]
     fitting = [size for size in sizes if low <= min(size) and max(size) <= high]
-    if len(fitting) >= 4:
-        return fitting
-    slim = sorted(size for size in sizes if max(size) / min(size) < 2.2)
-    longest = [low + (high - low) * k / (len(slim) - 1) for k in range(len(slim))]
-    return [
-        (round(x * side / max(x, y), 1), round(max(low * 0.6, y * side / max(x, y)), 1))
-        for (x, y), side in zip(slim, longest, strict=True)
-    ]
+    sides = np.linspace(low, high, 6).tolist()
+    return fitting if len(fitting) >= 4 else [(x, max(0.6 * low, x * share)) for x in sides for share in (0.6, 0.9)]
 
 
-class _Builder:
-    """Builds one town of a size: its ground, then objects, buildings, furniture and trees on what is left."""
+class Town:
+    """A town of a size: its ground, then objects, buildings and trees on what is left.
+
+    size_m: from west to east and from south to north. layout: streets and buildings. placement: the objects. built:
+    numbers of buildings by kind. not_placed: name of a missing object -> reason, an entry for each.
+    """
 
     def __init__(self, plan: WorldPlan, size_m: Range, name: str, seed: int) -> None:
-        self.plan, self.seed = plan, seed
-        self.boxes = BoxList()
-        self.placement = BoxList()
-        self.taken = list[BaseGeometry]()  # outlines of buildings and objects
-        x, y = size_m[0] / 2, size_m[1] / 2
-        self.boxes.span("Terrain", (-x, -y), (x, y), GROUND_TOP_M - SLAB_M, GROUND_TOP_M)
-        net = network(plan, size_m, rng_for(seed, "world", "streets"))
-        self.stretches = lay_streets(self.boxes, net)
-        self.paved = shapely.STRtree([stretch.strip for stretch in self.stretches])  # where paths to doors begin
-        strips = shapely.union_all(self.paved.geometries)
-        south = -y
-        if plan.shore_m:
-            south += QUAY_M
-            pave(self.boxes, shapely.difference(shapely.box(-x, -y, x, south), strips))
-            self.boxes.span("Walls", (-x, -y), (x, -y + 0.2), -1.2, 0.4)
-        ground = shapely.box(-x, south, x, y)
-        blocks = shapely.difference(ground, shapely.union(strips, net.water))
-        inner = shapely.box(2.0 - x, south, x - 2.0, y - 2.0)
-        self.buildable = shapely.intersection(blocks, inner)
-        empty = BoxList().box_map()
-        self.town = Town(name, size_m, net, blocks, [], empty, empty)
-        self.town.not_placed += [(missing, "not in the object table") for missing in plan.unknown_objects()]
-        closed = [
-            block for block in polygons_of(blocks)
-            if block.area > LEAST_BLOCK_M2 and ground.boundary.distance(block) > 0.1
-        ]  # fmt: skip
-        if plan.pattern == "campus":
-            self.buildable = shapely.intersection(self.buildable, shapely.union_all(closed))
-        self.closed = sorted(closed, key=lambda block: block.centroid.distance(shapely.Point(0, 0)))
-
-    def build(self) -> Town:
-        plan, town = self.plan, self.town
+        self.plan, self.size_m, self.name, self.seed = plan, size_m, name, seed
+        self.built = Counter[str]()
+        self.placed = list[Placed]()
+        self.not_placed = [(missing, "not in the object table") for missing in plan.unknown_objects()]
+        self.object_nodes = list[tuple[str, str | None]]()  # name and asset of each box of `placement`
+        self._boxes, self._objects = BoxList(), BoxList()
+        self._taken = list[BaseGeometry]()  # outlines of buildings and objects
+        self._lay_ground()
         self._open_blocks()
         for thing, count in sorted(plan.known_objects(), key=lambda pair: -math.prod(pair[0].size_m)):
             self._place_object(thing, count)
         self._build_houses()
         if plan.setback_m < 2.5:
-            for block in self.closed:
-                if block.area < 4 * plan.block_m**2 and block not in town.open_blocks:
-                    pave(self.boxes, block, BLOCK_PIECE_M)
-        rng = rng_for(self.seed, "world", "furniture")
-        for stretch in self.stretches:
-            if stretch.street not in town.network.bridges:
-                furnish(self.boxes, stretch, plan.parked_share, rng)
-        source = MapSource(tool="cosfly world", version="2", seed=self.seed)
-        town.layout = self.boxes.box_map(MapHeader(name=town.name, source=source, licence=OUR_LICENCE, ground_z_m=0.0))
-        town.placement = self.placement.box_map()
-        self._set_trees(rng_for(self.seed, "world", "trees"))
-        return town
+            for block in self._closed:
+                if block.area < 4 * plan.block_m**2 and block not in self.open_blocks:
+                    pave(self._boxes, block, BLOCK_PIECE_M)
+        source = MapSource(tool="cosfly world", version="3", seed=seed)
+        header = MapHeader(name=name, source=source, licence=OUR_LICENCE, ground_z_m=0.0)
+        self.layout, self.placement = self._boxes.box_map(header), self._objects.box_map()
+        self._set_trees(rng_for(seed, "world", "trees"))
+
+    @property
+    def boxes(self) -> BoxMap:
+        return self.layout.joined(self.placement)
+
+    @property
+    def land_m2(self) -> float:
+        """The area without the water."""
+        x, y = self.size_m[0] / 2, self.size_m[1] / 2
+        return float(shapely.difference(shapely.box(-x, -y, x, y), self.network.water).area)
+
+    def _lay_ground(self) -> None:
+        """Add the ground and the streets, and find the blocks: the ground between streets and water."""
+        plan, boxes = self.plan, self._boxes
+        x, y = self.size_m[0] / 2, self.size_m[1] / 2
+        boxes.span("Terrain", (-x, -y), (x, y), GROUND_TOP_M - SLAB_M, GROUND_TOP_M)
+        self.network = network(plan, self.size_m, rng_for(self.seed, "world", "streets"))
+        furniture = rng_for(self.seed, "world", "furniture")
+        self._strips = lay_streets(boxes, self.network, plan.parked_share, furniture)
+        self._paved = shapely.STRtree(self._strips)  # where paths to doors begin
+        strips = shapely.union_all(self._strips)
+        south = -y
+        if plan.shore_m:
+            south += QUAY_M
+            pave(boxes, shapely.difference(shapely.box(-x, -y, x, south), strips))
+            boxes.span("Walls", (-x, -y), (x, -y + 0.2), -1.2, 0.4)
+        ground = shapely.box(-x, south, x, y)
+        self._blocks = shapely.difference(ground, shapely.union(strips, self.network.water))
+        self._closed = [
+            block for block in polygons_of(self._blocks)
+            if block.area > LEAST_BLOCK_M2 and ground.boundary.distance(block) > 0.1
+        ]  # fmt: skip
+        self._closed.sort(key=lambda block: block.centroid.distance(shapely.Point(0, 0)))
+        inside = shapely.union_all(self._closed) if plan.pattern == "campus" else self._blocks
+        self._buildable = shapely.intersection(inside, shapely.box(2.0 - x, south, x - 2.0, y - 2.0))
 
     def _open_blocks(self) -> None:
         """Choose plazas, the nearest to the middle, and greens; pave plazas, and paths across greens."""
@@ -210,63 +184,51 @@ class _Builder:
         rng = rng_for(self.seed, "world", "open")
         has_objects = any(thing.where == "open" for thing, _ in plan.known_objects())
         wanted = max(plan.plazas + plan.greens, int(has_objects))
-        blocks = self.closed[: max(1, len(self.closed) // 2)]
-        chosen = blocks[: plan.plazas or int(has_objects and not plan.greens)]
-        rest = [block for block in blocks if block not in chosen]
-        num_greens = min(len(rest), wanted - len(chosen))
-        chosen += [rest[k] for k in sorted(rng.permutation(len(rest))[:num_greens])]
-        side_m = 0.7 * plan.block_m
+        blocks = self._closed[: max(1, len(self._closed) // 2)]
+        num_plazas = plan.plazas or int(has_objects and not plan.greens)
+        rest = blocks[num_plazas:]
+        chosen = blocks[:num_plazas] + [rest[k] for k in rng.permutation(len(rest))]
         if len(chosen) < wanted:  # open lots along streets
-            lots = self._lots([(side_m, side_m)], rng, setback_m=0.0)
-            lots.sort(key=lambda lot: math.hypot(*lot.center))
-            chosen += [rectangle_polygon(lot) for lot in lots[: wanted - len(chosen)]]
-        paved = chosen[: plan.plazas]
-        for green in chosen[plan.plazas :]:
+            lots = self._lots([(0.7 * plan.block_m,) * 2], rng, setback_m=0.0)
+            chosen += [rectangle_polygon(lot) for lot in islice(lots, wanted - len(chosen))]
+        self.open_blocks = chosen[:wanted]
+        paved = self.open_blocks[: plan.plazas]
+        for green in self.open_blocks[plan.plazas :]:
             shape = oriented_rectangle(green)
             for across, side in enumerate(shape.size):
                 bands = [(-0.6, 0.6), (-1.5 / side, 1.5 / side)]
                 paved.append(shapely.intersection(green, rectangle_polygon(shape, *bands[:: 1 if across else -1])))
         for area in paved:
-            pave(self.boxes, area, BLOCK_PIECE_M)
-        self.paved = shapely.STRtree([*self.paved.geometries, *paved])
-        self.town.open_blocks = chosen
-        self.buildable = shapely.difference(self.buildable, shapely.union_all(chosen).buffer(0.1))
-        shapely.prepare(self.buildable)
+            pave(self._boxes, area, BLOCK_PIECE_M)
+        self._paved = shapely.STRtree([*self._strips, *paved])
+        self._buildable = shapely.difference(self._buildable, shapely.union_all(self.open_blocks).buffer(0.1))
+        shapely.prepare(self._buildable)
 
-    def _lots(
-        self, sizes: list[Range], rng: np.random.Generator, *, setback_m: float, first: bool = False
-    ) -> list[Rectangle]:
-        """Return free lots along the streets, each with one of the sizes; its front is the side with negative y.
+    def _lots(self, sizes: list[Range], rng: np.random.Generator, *, setback_m: float) -> Iterator[Rectangle]:
+        """Yield free lots along the streets, the nearest to the middle of the town first.
 
-        first: only the one that is nearest to the middle of the town.
+        Each has one of the sizes; its front is the side with negative y.
         """
-
-        def from_middle_m(stretch: Stretch) -> float:
-            return float(np.linalg.norm(stretch.street.at(stretch.street.length_m / 2, 0.0)))
-
-        lots = list[Rectangle]()
-        taken = [*self.taken]
-        for stretch in sorted(self.stretches, key=from_middle_m) if first else self.stretches:
-            street = stretch.street
+        streets = zip(self.network.streets, self._strips, strict=True)
+        taken = [*self._taken]
+        for street, strip in sorted(streets, key=lambda pair: np.linalg.norm(pair[0].start + pair[0].end)):
             front_m = street.width_m / 2 + 0.05 + setback_m
             reach_m = max(depth for _, depth in sizes) + setback_m + self.plan.gap_m
-            is_near = shapely.dwithin(np.array(taken, dtype=object), stretch.strip, reach_m)
-            near = [outline for outline, flag in zip(taken, is_near, strict=True) if flag]
+            near = [outline for outline in taken if outline.dwithin(strip, reach_m)]
             for side in (1, -1):
                 along = 0.0
-                while along < street.length_m and not (first and lots):
+                while along < street.length_m:
                     front, depth = sizes[int(rng.integers(len(sizes)))]
                     lot = street.rectangle((along, along + front), (side * front_m, side * (front_m + depth)))
                     outline = rectangle_polygon(lot)
                     is_taken = shapely.dwithin(np.array(near, dtype=object), outline, self.plan.gap_m).any()
-                    if is_taken or not self.buildable.contains(outline):
+                    if is_taken or not self._buildable.contains(outline):
                         along += STEP_M
                         continue
-                    lots.append(lot._replace(yaw_deg=lot.yaw_deg + 90.0 * (1 - side)))
+                    yield lot._replace(yaw_deg=lot.yaw_deg + 90.0 * (1 - side))
                     taken.append(outline)
                     near.append(outline)
                     along += front + self.plan.gap_m * rng.uniform(1.0, 1.6)
-        return lots
 
     def _build_houses(self) -> None:
         """Build the counted buildings on lots spread over the town, then fill the lots that are left."""
@@ -274,9 +236,9 @@ class _Builder:
         kinds = self.plan.kinds_of_buildings()
         for kind in kinds:
             if kind.count is not None:
-                lots = self._lots(_footprints(*kind.footprint_m), rng, setback_m=self.plan.setback_m)
+                lots = list(self._lots(_footprints(*kind.footprint_m), rng, setback_m=self.plan.setback_m))
                 spread = np.linspace(0, len(lots) - 1, min(kind.count, len(lots))).round().astype(int)
-                for number in np.unique(spread):
+                for number in spread:
                     self._build_house(lots[number], kind, rng)
         if fill := [kind for kind in kinds if kind.count is None]:
             sizes = [size for kind in fill for size in _footprints(*kind.footprint_m)]
@@ -288,19 +250,18 @@ class _Builder:
     def _build_house(self, lot: Rectangle, kind: Buildings, rng: np.random.Generator) -> None:
         """Build one house on a lot, and the path to its door."""
         low, high = kind.heights_m
-        fall = 0.0
-        if self.plan.high_center:
-            fall = min(1.0, math.hypot(*lot.center) / (0.5 * min(self.town.size_m)))
+        fall = min(1.0, math.hypot(*lot.center) / (0.5 * min(self.size_m))) if self.plan.high_center else 0.0
         height = low + (high - low) * rng.beta(1.3, 1.7) * (1.0 - 0.9 * fall)
-        self.boxes.add("Buildings", lot.center, lot.size, 0.0, height, lot.yaw_deg)
-        self._take(self.boxes, rectangle_polygon(lot))
-        self.town.built[kind.name] = self.town.built.get(kind.name, 0) + 1
+        self._boxes.add("Buildings", lot.center, lot.size, 0.0, height, lot.yaw_deg)
+        self._add_path(self._boxes, lot)
+        self._taken.append(rectangle_polygon(lot))
+        self.built[kind.name] += 1
 
-    def _take(self, boxes: BoxList, outline: BaseGeometry, *, has_door: bool = True) -> None:
-        """Record the outline of a building or object; a building gets a path to the nearest pavement."""
-        self.taken.append(outline)
-        line = shapely.shortest_line(outline, self.paved.geometries[self.paved.nearest(outline)])
-        if has_door and line.length > 0.5:
+    def _add_path(self, boxes: BoxList, place: Rectangle) -> None:
+        """Add a path from a building to the nearest pavement."""
+        outline = rectangle_polygon(place)
+        line = shapely.shortest_line(outline, self._paved.geometries[self._paved.nearest(outline)])
+        if line.length > 0.5:
             (x, y), (to_x, to_y) = line.coords
             yaw_deg = math.degrees(math.atan2(to_y - y, to_x - x))
             size = (line.length + 0.5, DOOR_M)
@@ -308,45 +269,47 @@ class _Builder:
 
     def _place_object(self, thing: Object, count: int) -> None:
         """Place an object `count` times: in open blocks, at a street, on the quay or in the water."""
-        town = self.town
         if thing.where == "layout":
-            num_built = min(count, len(town.network.bridges))
-            town.placed += [Placed(thing.name, number, (0.0, 0.0), 0.0, 1.0, (0, 0)) for number in range(num_built)]
-            town.not_placed += [(thing.name, "no street to carry it")] * (count - num_built)
+            num_built = min(count, len(self.network.bridges))
+            self.placed += [Placed(thing.name, number, (0.0, 0.0), 0.0, 1.0) for number in range(num_built)]
+            self.not_placed += [(thing.name, "no street to carry it")] * (count - num_built)
             return
         scales = [scale for scale in SCALES if scale >= thing.least_scale - 1e-9]
         for number in range(count):
             if (found := self._find_place(thing, scales)) is None:
-                has_place = thing.where == "open" or not town.network.water.is_empty
-                town.not_placed.append((thing.name, "no room" if has_place else "no water in the plan"))
+                has_place = thing.where == "open" or not self.network.water.is_empty
+                self.not_placed.append((thing.name, "no room" if has_place else "no water in the plan"))
                 continue
             place, scale = found
-            first = len(self.placement)
-            _add_object(self.placement, thing, place, scale)
-            rows = (first, len(self.placement))
-            town.placed.append(Placed(thing.name, number, place.center, place.yaw_deg, scale, rows))
-            is_building = any(part[0] == "Buildings" for part in thing.parts)
-            self._take(self.placement, rectangle_polygon(place), has_door=is_building)
+            _add_object(self._objects, thing, place, scale)
+            node = f"OBJ_{thing.name.replace(' ', '_')}_{number}"
+            self.object_nodes += [(node, thing.asset)] * len(thing.parts)
+            if any(part[0] == "Buildings" for part in thing.parts):
+                self._add_path(self._objects, place)
+            self.object_nodes += [("way", None)] * (len(self._objects) - len(self.object_nodes))
+            self.placed.append(Placed(thing.name, number, place.center, place.yaw_deg, scale))
+            self._taken.append(rectangle_polygon(place))
 
     def _find_place(self, thing: Object, scales: list[float]) -> tuple[Rectangle, float] | None:
         """Return the outline and the scale of an object where there is room, else None."""
-        x, y = self.town.size_m[0] / 2, self.town.size_m[1] / 2
+        x, y = self.size_m[0] / 2, self.size_m[1] / 2
         areas: list[tuple[BaseGeometry, float]] = []
         if thing.where == "open":
-            areas = [(block, oriented_rectangle(block).yaw_deg) for block in self.town.open_blocks]
+            areas = [(block, oriented_rectangle(block).yaw_deg) for block in self.open_blocks]
         elif self.plan.shore_m:
             low, high = (-0.5, QUAY_M - 0.5) if thing.where == "quay" else (-self.plan.shore_m, 0.0)
             areas = [(shapely.box(2 - x, low - y, x - 2, high - y), 0.0)]
         elif thing.where == "water":
-            bridges = [one.strip for one in self.stretches if one.street in self.town.network.bridges]
-            areas = [(shapely.difference(self.town.network.water, shapely.union_all(bridges).buffer(1.0)), 0.0)]
+            over = [one.rectangle((0.0, one.length_m), (-one.width_m, one.width_m)) for one in self.network.bridges]
+            bridges = shapely.union_all([rectangle_polygon(one) for one in over])
+            areas = [(shapely.difference(self.network.water, bridges), 0.0)]
         for area, yaw_deg in areas:
             if not area.is_empty and (place := self._place_in(thing, area, scales, yaw_deg)) is not None:
                 return place
         for scale in scales if thing.where == "open" else ():
-            wide, deep = (side * scale for side in thing.size_m)
-            rng = rng_for(self.seed, "world", thing.name)
-            for lot in self._lots([(wide, deep)], rng, setback_m=self.plan.setback_m, first=True):
+            size = thing.size_m[0] * scale, thing.size_m[1] * scale
+            lots = self._lots([size], rng_for(self.seed, "world", thing.name), setback_m=self.plan.setback_m)
+            if lot := next(lots, None):
                 return lot, scale
         return None
 
@@ -355,54 +318,52 @@ class _Builder:
     ) -> tuple[Rectangle, float] | None:
         """Return a place of an object in an area, along its yaw or across: at the quay's edge, else near the middle."""
         turned = rotate(area, -yaw_deg, origin=(0, 0))
-        near = [outline for outline in self.taken if outline.distance(area) < SPACE_M]
+        near = [outline for outline in self._taken if outline.distance(area) < SPACE_M]
         tree = shapely.STRtree([rotate(outline, -yaw_deg, origin=(0, 0)) for outline in near])
         shapely.prepare(turned)
         low_x, low_y, high_x, high_y = turned.bounds
         x, y = np.meshgrid(np.arange(low_x, high_x, STEP_M), np.arange(low_y, high_y, STEP_M))
         centers = np.stack([x.ravel(), y.ravel()], axis=1)
-        anchor = np.array(turned.centroid.coords[0])
         by_water = thing.where != "open"
         if by_water and self.plan.shore_m:
             centers[:, 1] = high_y - thing.size_m[1] / 2 - 0.3
-        x, y = centers[np.argsort(np.hypot(*(centers - anchor).T), kind="stable")].T
+        away_m = np.hypot(*(centers - np.array(turned.centroid.coords[0])).T)
+        x, y = centers[np.argsort(away_m, kind="stable")].T
         for scale in scales:
+            wide, deep = (side * scale for side in thing.size_m)
             for turn_deg in (0.0,) if by_water else (0.0, 90.0):
-                half_x, half_y = (side * scale / 2 for side in (thing.size_m if turn_deg == 0 else thing.size_m[::-1]))
+                half_x, half_y = (wide / 2, deep / 2) if turn_deg == 0 else (deep / 2, wide / 2)
                 outlines = shapely.box(x - half_x, y - half_y, x + half_x, y + half_y)
                 for outline in outlines[shapely.contains_properly(turned, outlines)]:
                     if not len(tree.query(outline, predicate="dwithin", distance=SPACE_M / 2)):
                         middle = rotate(outline.centroid, yaw_deg, origin=(0, 0))
-                        wide, deep = (side * scale for side in thing.size_m)
                         return Rectangle((middle.x, middle.y), (wide, deep), yaw_deg + turn_deg), scale
         return None
 
     def _set_trees(self, rng: np.random.Generator) -> None:
         """Fell or plant trees until their number is within the plan's range."""
-        town, (low, high) = self.town, self.plan.trees_per_ha
-        hectares = town.land_m2 / 1e4
-        trees = np.flatnonzero(trees_of(town.layout))
+        low, high = self.plan.trees_per_ha
+        hectares = self.land_m2 / 1e4
+        trees = np.flatnonzero(trees_of(self.layout))
         goal = round((0.65 * low + 0.35 * high) * hectares)
         if len(trees) > high * hectares:
             felled = rng.choice(trees, len(trees) - goal, replace=False)
-            town.layout = town.layout.select(np.setdiff1d(np.arange(len(town.layout)), felled))
+            self.layout = self.layout.select(np.setdiff1d(np.arange(len(self.layout)), felled))
         elif len(trees) < goal:
-            town.layout = town.layout.joined(self._planted(goal - len(trees), rng))
+            self.layout = self.layout.joined(self._planted(goal - len(trees), rng))
 
     def _planted(self, count: int, rng: np.random.Generator) -> BoxMap:
         """Return new trees in the blocks, clear of all other boxes and of the paths to doors."""
-        world, boxes = self.town.boxes, BoxList()
+        world, boxes = self.boxes, BoxList()
         is_ground = of_kinds(world, "Roads", "Terrain", "RoadLines") | (world.maxs[:, 2] <= 0.0)
         is_path = of_kinds(world, "Sidewalks") & ((2 * world.half_extents[:, :2]).min(1) < 5.0)
-        outlines = footprints(world)[~is_ground | is_path]
-        obstacles = shapely.STRtree(outlines)
-        blocks = self.town.blocks
-        shapely.prepare(blocks)
-        low_x, low_y, high_x, high_y = blocks.bounds
+        obstacles = shapely.STRtree(footprints(world)[~is_ground | is_path])
+        shapely.prepare(self._blocks)
+        low_x, low_y, high_x, high_y = self._blocks.bounds
         for xy in rng.uniform((low_x, low_y), (high_x, high_y), (40 * count, 2)):
             crown_m = rng.uniform(3.0, 5.5)
             outline = shapely.box(*(xy - crown_m / 2), *(xy + crown_m / 2))
-            if blocks.contains(outline) and not len(obstacles.query(outline, predicate="dwithin", distance=0.4)):
+            if self._blocks.contains(outline) and not len(obstacles.query(outline, predicate="dwithin", distance=0.4)):
                 boxes.add("Vegetation", xy, (crown_m, crown_m * rng.uniform(0.9, 1.1)), 0.0, rng.uniform(5.0, 11.0))
                 if len(boxes) == count:
                     break
@@ -463,13 +424,7 @@ def layout_nodes(town: Town) -> list[dict[str, Any]]:
 
 def placement_nodes(town: Town) -> list[dict[str, Any]]:
     """Return SimWorld's nodes of the placed objects and of the ways to them."""
-    names = ["way"] * len(town.placement)
-    asset_names: list[str | None] = [None] * len(names)
-    for thing in town.placed:
-        for row in range(*thing.rows):
-            names[row] = f"OBJ_{thing.name.replace(' ', '_')}_{thing.number}"
-            asset_names[row] = OBJECTS[thing.name].asset
-    return [_box_node(town.placement, row, names[row], asset_names[row]) for row in range(len(names))]
+    return [_box_node(town.placement, row, *node) for row, node in enumerate(town.object_nodes)]
 
 
 def _box_node(box_map: BoxMap, row: int, name: str, asset: str | None = None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The parts of the synthetic town: trees, benches, and the kinds of building blocks."""
+"""The parts of generated towns: trees, benches, paint and furniture of streets, and the kinds of building blocks."""
 
 from __future__ import annotations
 
@@ -16,6 +16,14 @@ WATER_TOP_M = 0.05  # over the ground, so that water is an obstacle to pedestria
 SLAB_M = 0.3
 PASSAGE_M = 3.2  # clear height of passages and arcades
 ARCADE_M = 3.0  # depth of an arcade
+RAILING_M = 0.2
+WATER_BOTTOM_M = -1.2
+PAINT_TOP_M = -0.03  # over ROAD_TOP_M
+DASH_M, DASH_GAP_M = 3.0, 6.0
+# Lamps and parked cars: distances from the ends of a stretch, which have zebra crossings, to the next, and to the kerb.
+LAMPS_START_M, LAMPS_END_M, LAMP_SPACING_M, LAMP_FROM_KERB_M = 9.0, 8.0, 8.0, 1.0
+PARKING_START_M, PARKING_END_M, PARKING_SPACING_M, PARKED_FROM_KERB_M = 9.5, 11.0, 6.6, 1.15
+TRUCK_SHARE = 0.06  # of parked cars
 
 Range = tuple[float, float]
 
@@ -27,15 +35,29 @@ def point(axis: int, along: float, across: float) -> tuple[float, float]:
 
 class Plot(BoxList):
     """A rectangle of the town, from its low to its high corner, (2,) m. It adds boxes to the town's list and has a
-    random generator of its own."""
+    random generator of its own.
 
-    def __init__(self, town: BoxList, low: Pair, high: Pair, rng: np.random.Generator) -> None:
+    frame: the place of the plot's origin in the town, m, and the yaw of its x axis, degrees.
+    """
+
+    def __init__(
+        self, town: BoxList, low: Pair, high: Pair, rng: np.random.Generator, frame: tuple[Pair, float] | None = None
+    ) -> None:
         super().__init__(town.rows, town.kinds)
+        self.frame = frame
         self.low = np.asarray(low)
         self.high = np.asarray(high)
         self.rng = rng
         self.size = self.high - self.low
         self.middle = (self.low + self.high) / 2
+
+    def add(self, kind: str, center_xy: Pair, size_xy: Pair, low_m: float, high_m: float, yaw_deg: float = 0.0) -> None:
+        if self.frame is not None:
+            origin, turn_deg = self.frame
+            x, y = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+            center_xy = np.add(origin, (x * center_xy[0] - y * center_xy[1], y * center_xy[0] + x * center_xy[1]))
+            yaw_deg += turn_deg
+        super().add(kind, center_xy, size_xy, low_m, high_m, yaw_deg)
 
     def at(self, x: float, y: float) -> np.ndarray:
         """Return the point at x and y, shares of the plot's sides from its low corner."""
@@ -102,6 +124,80 @@ class Plot(BoxList):
             self.lay("Sidewalks", (x - half_m, south), (x + half_m, north))
             for west, east in ((low[0], x - half_m), (x + half_m, high[0])):
                 self.lay("Terrain", (west, south), (east, north))
+
+
+def add_road_paint(
+    plot: Plot, axis: int, stretch: Range, kerbs: Range, crossings: tuple[bool, bool] = (True, True)
+) -> None:
+    """Add centre dashes, and zebra crossings at the low and the high end of a stretch of street."""
+    low, high = stretch
+    middle = (kerbs[0] + kerbs[1]) / 2
+    dashes = np.arange(low + 7.0, high - 7.0 - DASH_M, DASH_M + DASH_GAP_M) + DASH_M / 2
+    stripes = np.arange(kerbs[0] + 0.7, kerbs[1] - 0.5, 1.2)
+    ends = [end for end, is_crossing in zip((low + 2.5, high - 2.5), crossings, strict=True) if is_crossing]
+    paint = [(at, middle, DASH_M, 0.16) for at in dashes]
+    paint += [(end, across, 3.0, 0.55) for end in ends for across in stripes]
+    for along, across, length_m, width_m in paint:
+        size = point(axis, length_m, width_m)
+        plot.add("RoadLines", point(axis, along, across), size, ROAD_TOP_M - 0.04, PAINT_TOP_M)
+
+
+def furnish(
+    plot: Plot, axis: int, stretch: Range, kerbs: Range, *, parked_share: float, tree_share: float,
+    is_wide: bool = False, has_road: bool = True,
+) -> None:  # fmt: skip
+    """Add lamps, trees, benches, bins, parked cars and signs along both kerbs of a stretch of street.
+
+    `side` is -1 at the low kerb and 1 at the high one: kerb + side lies on the pavement, kerb - side on the road.
+    """
+    for side, kerb in zip((-1, 1), kerbs, strict=True):
+        _add_lamps_and_trees(plot, axis, stretch, side, kerb, tree_share, is_wide=is_wide)
+        if has_road:
+            _add_parked_cars(plot, axis, stretch, side, kerb, parked_share)
+            _add_sign(plot, axis, stretch, side, kerb)
+
+
+def _add_lamps_and_trees(
+    plot: Plot, axis: int, stretch: Range, side: int, kerb: float, tree_share: float, *, is_wide: bool
+) -> None:
+    """Add a row of lamps, and of trees or benches between them, on the pavement."""
+    rng = plot.rng
+    low, high = stretch
+    across = kerb + side * LAMP_FROM_KERB_M
+    for number, along in enumerate(np.arange(low + LAMPS_START_M, high - LAMPS_END_M, LAMP_SPACING_M)):
+        place = point(axis, along, across)
+        if number % 3 == 0:
+            plot.add("Poles", place, (0.2, 0.2), 0.0, 7.6)
+            arm = point(axis, along, across - side * 0.9)  # over the carriageway
+            plot.add("Poles", arm, point(axis, 0.16, 2.0), 7.45, 7.6)
+        elif (is_wide or number % 3 == 1) and rng.random() < tree_share:
+            crowns_m = (3.4, 4.6) if is_wide else (2.6, 3.4)
+            plot.tree(place, crowns_m, (5.5, 9.5), 1.0 if is_wide else 0.0)
+        elif rng.random() < 0.5:
+            plot.bench(axis, along, across)
+
+
+def _add_parked_cars(plot: Plot, axis: int, stretch: Range, side: int, kerb: float, parked_share: float) -> None:
+    """Add cars and a few trucks along a kerb of the carriageway."""
+    rng = plot.rng
+    low, high = stretch
+    for along in np.arange(low + PARKING_START_M, high - PARKING_END_M, PARKING_SPACING_M):
+        if rng.random() < parked_share:
+            place = point(axis, along + rng.uniform(-0.4, 0.4), kerb - side * PARKED_FROM_KERB_M)
+            if rng.random() < TRUCK_SHARE:
+                plot.add("Truck", place, point(axis, 6.2, 2.2), ROAD_TOP_M, 2.7)
+            else:
+                length_m = rng.uniform(4.0, 4.7)
+                plot.add("Car", place, point(axis, length_m, 1.8), ROAD_TOP_M, rng.uniform(1.4, 1.65))
+
+
+def _add_sign(plot: Plot, axis: int, stretch: Range, side: int, kerb: float) -> None:
+    """Add one traffic sign on the pavement: near the low end of a stretch at its low kerb, else near the high end."""
+    low, high = stretch
+    along = low + 6.0 if side < 0 else high - 6.0
+    across = kerb + side * 0.6
+    plot.add("Poles", point(axis, along, across), (0.08, 0.08), 0.0, 2.9)
+    plot.add("TrafficSigns", point(axis, along + 0.07, across), point(axis, 0.06, 0.65), 2.2, 2.85)
 
 
 def _park(plot: Plot) -> None:
