@@ -15,17 +15,30 @@ from cosfly.runtime.io import over_limit
 
 Pair = Sequence[float] | np.ndarray  # x and y
 WIDEST_M = 20_000.0  # of a map
+# Tops of the surfaces, m. At least two centimetres apart: a depth buffer separates them at 300 m.
+PAVED_TOP_M, LAWN_TOP_M, ROAD_TOP_M = 0.0, -0.02, -0.06
+PAINT_TOP_M, BASE_TOP_M = -0.03, -0.12  # over and below ROAD_TOP_M
+TOPS_M = {"Sidewalks": PAVED_TOP_M, "Terrain": LAWN_TOP_M, "Roads": ROAD_TOP_M}
+SLAB_M = 0.3
 MOST_CUTS, MOST_CUTS_PER_CORNER = 30_000, 20  # of the polygons of a map; a city model needs 1 for each corner
 
 
 @dataclass
 class BoxList:
-    """A growing list of upright boxes in world metres, with ids from 1 in the order of adding."""
+    """A growing list of upright boxes in world metres, with ids from 1 in the order of adding.
+
+    frame: the place of the origin, m, and the yaw of the x axis, degrees, that positions refer to; None: the world's.
+    """
 
     rows: list[tuple[float, ...]] = field(default_factory=list)  # center 3, half extent 3, yaw_deg
     kinds: list[int] = field(default_factory=list)
     num_cuts: float = 0.0
     most_cuts: float = MOST_CUTS
+    frame: tuple[Pair, float] | None = None
+
+    def framed(self, origin: Pair, yaw_deg: float) -> BoxList:
+        """Return the same list with positions relative to a place and a direction."""
+        return BoxList(self.rows, self.kinds, frame=(origin, yaw_deg))
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -35,6 +48,11 @@ class BoxList:
         if size_xy[0] <= 0 or size_xy[1] <= 0 or high_m <= low_m:
             footprint = f"footprint {size_xy[0]:g} x {size_xy[1]:g}"
             raise ValueError(f"the box has no volume: {kind}, {footprint} m, height {low_m:g} to {high_m:g} m")
+        if self.frame is not None:
+            origin, turn_deg = self.frame
+            x, y = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+            center_xy = np.add(origin, (x * center_xy[0] - y * center_xy[1], y * center_xy[0] + x * center_xy[1]))
+            yaw_deg += turn_deg
         center = (float(center_xy[0]), float(center_xy[1]), (low_m + high_m) / 2)
         self.rows.append((*center, size_xy[0] / 2, size_xy[1] / 2, (high_m - low_m) / 2, float(yaw_deg)))
         self.kinds.append(KINDS[kind])
@@ -51,6 +69,10 @@ class BoxList:
         """Add an unturned box by two opposite corners of its footprint, in any order."""
         center = (a[0] + b[0]) / 2, (a[1] + b[1]) / 2
         self.add(kind, center, (abs(b[0] - a[0]), abs(b[1] - a[1])), low_m, high_m)
+
+    def lay(self, kind: str, a: Pair, b: Pair) -> None:
+        """Add ground at the height of its kind between two opposite corners."""
+        self.span(kind, a, b, TOPS_M[kind] - SLAB_M, TOPS_M[kind])
 
     def box_map(self, header: MapHeader | None = None) -> BoxMap:
         """Return the map of everything added so far."""

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import AliasPath, BaseModel, Field, FiniteFloat
@@ -30,9 +30,14 @@ MOST_VERTICES = 100_000  # of a surface, its holes included
 FLAT_M, STOREY_M, HIGHEST_M = 0.01, 3.0, 2_000.0  # a footprint is flatter; of a storey; of a building
 VERSIONS = ("1.1", "2.0")
 RECORD_SEPARATOR = b"\x1e"  # before each text of a sequence of RFC 7464
-# Nesting of `boundaries` above the surfaces. Of a Solid's shells only the outer one counts.
 VALIDATE = "check the file with `cjio FILE validate`"
-NESTING = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2, "CompositeSolid": 2}
+# Rings are indices of vertices; of a solid's shells only the outer one counts.
+_Ring = Annotated[list[Annotated[int, Field(strict=True, ge=0)]], Field(min_length=3)]
+_Surface = Annotated[list[_Ring], Field(min_length=1)]
+BOUNDARIES: dict[str, Any] = {
+    "MultiSurface": list[_Surface], "CompositeSurface": list[_Surface], "Solid": list[list[_Surface]],
+    "MultiSolid": list[list[list[_Surface]]], "CompositeSolid": list[list[list[_Surface]]],
+}  # fmt: skip
 Form = Literal["solid", "wall", "surface", "green"]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Surface = list[np.ndarray]  # rings of (n, 3) m: the outline, then the holes
@@ -243,7 +248,7 @@ def _city_object(object_id: str, item: _Object, part: _Part, vertices: np.ndarra
         log.warning("%s: dropped, because cosfly has no rule for the type %s", object_id, item.type)
         raise _Dropped("unmapped_type")
     geometries = item.geometry or []
-    usable = [k for k, geometry in enumerate(geometries) if geometry.type in NESTING]
+    usable = [k for k, geometry in enumerate(geometries) if geometry.type in BOUNDARIES]
     if not usable:
         raise _Dropped("no_geometry")
 
@@ -297,50 +302,22 @@ def _raised(surfaces: list[Surface], height_m: float) -> list[Surface]:
 
 def _surfaces(geometry: _Geometry, vertices: np.ndarray, where: str) -> list[Surface]:
     """Return the surfaces of a geometry; for a solid those of its outer shell."""
-    boundaries = geometry.boundaries
-    if (nesting := NESTING[geometry.type]) > 0:
-        solids = boundaries if nesting == 2 else [boundaries]
-        outer_shells = [shell for solid in solids for shell in _require_list(solid, where)[:1]]
-        boundaries = [surface for shell in outer_shells for surface in _require_list(shell, where)]
+    boundaries = validated(BOUNDARIES[geometry.type], geometry.boundaries, where)
+    if geometry.type.endswith("Solid"):
+        solids = [boundaries] if geometry.type == "Solid" else boundaries
+        boundaries = [surface for solid in solids for shell in solid[:1] for surface in shell]
     return [_rings(surface, vertices, f"{where} surface {k}") for k, surface in enumerate(boundaries)]
 
 
-def _require_list(value: Any, where: str) -> list:
-    if not isinstance(value, list):
-        problem = "the field `boundaries` is not nested deeply enough for this type of geometry"
-        raise InputError(problem, where=where, got=shown(value), expected="a list at this level", fix=VALIDATE)
-    return value
-
-
-def _rings(surface: Any, vertices: np.ndarray, where: str) -> Surface:
-    """Return the rings of a surface, the outline first; raise InputError if they are malformed."""
-    rings = Surface()
-    for ring in _require_list(surface, where):
-        if not isinstance(ring, list) or len(ring) < 3 or not all(type(index) is int for index in ring):
-            expected = "a list of at least three vertex indices"
-            raise InputError(
-                "a boundary ring of the surface is invalid",
-                where=where,
-                got=shown(ring),
-                expected=expected,
-                fix=VALIDATE,
-            )
-        low, high = min(ring), max(ring)
-        if low < 0 or high >= len(vertices):
-            raise InputError(
-                "the ring refers to a vertex that does not exist",
-                where=where,
-                got=str(low if low < 0 else high)[:60],
-                expected=f"an index from 0 to {len(vertices) - 1}",
-                fix=VALIDATE,
-            )
-        rings.append(vertices[ring])
-    if not rings:
-        raise InputError("the surface has no rings", where=where, expected="at least one ring", fix=VALIDATE)
+def _rings(surface: _Surface, vertices: np.ndarray, where: str) -> Surface:
+    """Return the rings of a surface, the outline first; raise InputError for vertices that cannot be used."""
+    if (highest := max(map(max, surface))) >= len(vertices):
+        what, expected = "the ring refers to a vertex that does not exist", f"an index from 0 to {len(vertices) - 1}"
+        raise InputError(what, where=where, got=str(highest)[:60], expected=expected, fix=VALIDATE)
+    rings = [vertices[ring] for ring in surface]
     if not all(np.isfinite(ring).all() for ring in rings):
         raise InputError("a coordinate is not finite", where=where, expected="finite coordinates", fix=VALIDATE)
     if (num_vertices := sum(map(len, rings))) > MOST_VERTICES:
-        raise over_limit(
-            where, f"a surface of {num_vertices:,} vertices", f"{MOST_VERTICES:,} vertices", "simplify the surface"
-        )
+        got = f"a surface of {num_vertices:,} vertices"
+        raise over_limit(where, got, f"{MOST_VERTICES:,} vertices", "simplify the surface")
     return rings

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -20,8 +19,8 @@ from pydantic import AliasPath, BaseModel, Field, FiniteFloat, field_validator
 
 from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.formats.columns import LARGEST
-from cosfly.formats.kinds import KIND_NAMES
-from cosfly.maps.boxlist import BoxList, required
+from cosfly.formats.kinds import KINDS
+from cosfly.maps.boxlist import BASE_TOP_M, PAINT_TOP_M, ROAD_TOP_M, SLAB_M, BoxList, required
 from cosfly.maps.footprints import footprints
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
@@ -35,7 +34,6 @@ M_PER_CM = 0.01
 ROAD_LENGTH_M = 200.0  # of a road piece, the default of the generator
 STAND_M = 0.3  # boxes that begin at most this high are extended down to the ground
 PLACEHOLDER_CM = 256.0  # side of the cube that the size table has for assets without a measured size
-PAVEMENT_TOP_M, ROAD_TOP_M, PAINT_TOP_M, BASE_TOP_M, SLAB_M = 0.0, -0.06, -0.03, -0.12, 0.3
 BESIDE_ROAD_M = 60.0  # largest distance of objects that count for the width of roads from a centre line
 KERB_M = 0.5  # from the kerb to the middle of street furniture
 LEAST_FURNITURE = 4  # objects that locate the kerb
@@ -136,12 +134,12 @@ class Centerline(NamedTuple):
     end: np.ndarray
 
     @property
-    def length_m(self) -> float:
-        return float(np.linalg.norm(self.end - self.start))
+    def direction(self) -> np.ndarray:
+        return (self.end - self.start) / ROAD_LENGTH_M
 
     @property
-    def direction(self) -> np.ndarray:
-        return (self.end - self.start) / self.length_m
+    def yaw_deg(self) -> float:
+        return float(np.degrees(np.arctan2(*self.direction[::-1])))
 
 
 def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
@@ -240,39 +238,21 @@ def _centerline(node: _Node) -> Centerline:
     return Centerline(node.xy_m - half, node.xy_m + half)
 
 
-def _distances_m(points: np.ndarray, lines: list[Centerline]) -> np.ndarray:
-    """Return the distances of points, (n, 2), to the nearest centre line."""
-    distances = np.full(len(points), np.inf)
-    for line in lines:
-        along = np.clip((points - line.start) @ line.direction, 0.0, line.length_m)
-        offsets = points - line.start - along[:, None] * line.direction
-        distances = np.minimum(distances, np.linalg.norm(offsets, axis=1))
-    return distances
-
-
 def _half_widths(boxes: BoxList, lines: list[Centerline]) -> tuple[float, float]:
     """Return the distances of the kerb and of the fronts from the centre line, m.
 
     Both are tenth percentiles: fronts of the nearest points of buildings, the kerb of the middles of street furniture.
     """
     box_map = boxes.box_map()
-    kinds = np.array([KIND_NAMES[int(kind)] for kind in box_map.kinds])
-    fronts = [DEFAULT_FRONT_M]
-    rows = np.flatnonzero(kinds == "Buildings")
-    if len(rows):
-        rings = shapely.get_coordinates(footprints(box_map.select(rows))).reshape(-1, 5, 2)
-        shares = np.linspace(0.0, 1.0, 25)[:, None]
-        edges = np.concatenate([a + shares * (b - a) for ring in rings for a, b in pairwise(ring)])
-        nearest = _distances_m(edges, lines).reshape(len(rows), -1).min(axis=1)
-        fronts = nearest[nearest < BESIDE_ROAD_M].tolist() or fronts
+    middles = shapely.multilinestrings([np.stack([line.start, line.end]) for line in lines])
+    nearest = shapely.distance(footprints(box_map.select(box_map.kinds == KINDS["Buildings"])), middles)
+    fronts = nearest[nearest < BESIDE_ROAD_M].tolist() or [DEFAULT_FRONT_M]
     front = float(np.percentile(fronts, 10))
-    furniture = _distances_m(box_map.centers[(kinds == "Static") | (kinds == "Motorcycle"), :2], lines)
+    is_furniture = box_map.is_any_of({KINDS["Static"], KINDS["Motorcycle"]})
+    furniture = shapely.distance(shapely.points(box_map.centers[is_furniture, :2]), middles)
     furniture = furniture[furniture < front]
-    kerb = (
-        float(np.percentile(furniture, 10)) - KERB_M
-        if len(furniture) >= LEAST_FURNITURE
-        else ROAD_SHARE_OF_FRONT * front
-    )
+    has_kerb = len(furniture) >= LEAST_FURNITURE
+    kerb = float(np.percentile(furniture, 10)) - KERB_M if has_kerb else ROAD_SHARE_OF_FRONT * front
     kerb = max(kerb, LEAST_KERB_M)
     return round(kerb, 2), round(max(front, kerb + 1.0), 2)
 
@@ -282,35 +262,24 @@ def _add_roads(boxes: BoxList, lines: list[Centerline]) -> dict[str, float]:
     if not lines:
         return {}
     kerb, front = _half_widths(boxes, lines)
-    middle = (front + kerb) / 2  # of the pavement, from the centre line
-    width = front - kerb  # of the pavement
-
-    def add_slab(kind: str, position: np.ndarray, size: tuple[float, float], x: np.ndarray) -> None:
-        top = ROAD_TOP_M if kind == "Roads" else PAVEMENT_TOP_M
-        boxes.add(kind, position, size, top - SLAB_M, top, float(np.degrees(np.arctan2(x[1], x[0]))))
-
+    bands = (-front, -kerb), (-kerb, kerb), (kerb, front)  # across a road: pavement, carriageway, pavement
     junctions: dict[tuple[int, int], list[np.ndarray]] = {}
     for line in lines:
-        x = line.direction
-        free_m = line.length_m - 2 * front  # the slabs of a junction reach as far as the fronts
-        for end, away in ((line.start, x), (line.end, -x)):
+        for end, away in ((line.start, line.direction), (line.end, -line.direction)):
             junctions.setdefault(tuple(np.round(end).astype(int)), []).append(away)
-        if free_m > 0:
-            add_slab("Roads", (line.start + line.end) / 2, (free_m, 2 * kerb), x)
-            for side in (-1, 1):
-                position = (line.start + line.end) / 2 + side * middle * np.array([-x[1], x[0]])
-                add_slab("Sidewalks", position, (free_m, width), x)
-    for key, arms in junctions.items():  # pavement at the four corners, and across the sides without a road
-        junction = np.array(key, dtype=np.float64)
+        road = boxes.framed(line.start, line.yaw_deg)
+        for band in (1, 0, 2) if 2 * front < ROAD_LENGTH_M else ():  # junctions reach as far as the fronts
+            low, high = bands[band]
+            road.lay("Roads" if band == 1 else "Sidewalks", (front, low), (ROAD_LENGTH_M - front, high))
+    for place, arms in junctions.items():  # pavement at the four corners, and across the sides without a road
         x = arms[0]
         y = np.array([-x[1], x[0]])
-        add_slab("Roads", junction, (2 * kerb, 2 * kerb), x)
-        for a, b in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-            add_slab("Sidewalks", junction + middle * (a * x + b * y), (width, width), x)
-        along, across = (width, 2 * kerb), (2 * kerb, width)
-        for away, size in ((x, along), (-x, along), (y, across), (-y, across)):
-            is_road = any(arm @ away > 0.7 for arm in arms)
-            add_slab("Roads" if is_road else "Sidewalks", junction + middle * away, size, x)
+        junction = boxes.framed(place, float(np.degrees(np.arctan2(x[1], x[0]))))
+        for a, b in ((1, 1), (0, 0), (0, 2), (2, 0), (2, 2), (2, 1), (0, 1), (1, 2), (1, 0)):
+            away = (a - 1) * x + (b - 1) * y
+            is_road = a == b == 1 or (1 in (a, b) and any(arm @ away > 0.7 for arm in arms))
+            first, last = zip(bands[a], bands[b], strict=True)
+            junction.lay("Roads" if is_road else "Sidewalks", first, last)
     return {"carriageway_m": 2 * kerb, "front_to_front_m": 2 * front}
 
 
@@ -319,7 +288,7 @@ def _add_ground_and_paint(boxes: BoxList, lines: list[Centerline], widths: dict)
     low, high = boxes.box_map().bounds()
     boxes.span("Terrain", low[:2] - MAP_MARGIN_M, high[:2] + MAP_MARGIN_M, BASE_TOP_M - SLAB_M, BASE_TOP_M)
     for line in lines:
-        yaw_deg = float(np.degrees(np.arctan2(*line.direction[::-1])))
-        for start_m in np.arange(widths["carriageway_m"], line.length_m - widths["carriageway_m"], DASH_STEP_M):
-            middle = line.start + (start_m + DASH_M / 2) * line.direction
-            boxes.add("RoadLines", middle, (DASH_M, DASH_WIDTH_M), ROAD_TOP_M - 0.04, PAINT_TOP_M, yaw_deg)
+        road = boxes.framed(line.start, line.yaw_deg)
+        for start_m in np.arange(widths["carriageway_m"], ROAD_LENGTH_M - widths["carriageway_m"], DASH_STEP_M):
+            middle, size = (start_m + DASH_M / 2, 0.0), (DASH_M, DASH_WIDTH_M)
+            road.add("RoadLines", middle, size, ROAD_TOP_M - 0.04, PAINT_TOP_M)

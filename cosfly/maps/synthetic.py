@@ -18,11 +18,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
-from cosfly.maps.boxlist import BoxList, Pair
+from cosfly.maps.boxlist import BASE_TOP_M, SLAB_M, BoxList, Pair
 from cosfly.maps.town_parts import (
     BLOCKS,
     RAILING_M,
-    SLAB_M,
     WATER_BOTTOM_M,
     WATER_TOP_M,
     Plot,
@@ -40,7 +39,6 @@ GENERATOR_VERSION = "1"
 MIN_BLOCK_M = 34.0  # no kind of block fits into a smaller one
 WIDE_M = 26.0  # wider streets have wide pavements and large trees
 VERGE_M = 10.0  # of lawn around the town
-BASE_TOP_M = -0.12  # below ROAD_TOP_M
 
 
 @dataclass(frozen=True)

@@ -7,18 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.maps.boxlist import BoxList, Pair
+from cosfly.maps.boxlist import PAINT_TOP_M, ROAD_TOP_M, SLAB_M, TOPS_M, BoxList, Pair
 
-# Tops of the surfaces, m. At least two centimetres apart: a depth buffer separates them at 300 m.
-PAVED_TOP_M, LAWN_TOP_M, ROAD_TOP_M = 0.0, -0.02, -0.06
-TOPS_M = {"Sidewalks": PAVED_TOP_M, "Terrain": LAWN_TOP_M, "Roads": ROAD_TOP_M}
 WATER_TOP_M = 0.05  # over the ground, so that water is an obstacle to pedestrians
-SLAB_M = 0.3
 PASSAGE_M = 3.2  # clear height of passages and arcades
 ARCADE_M = 3.0  # depth of an arcade
 RAILING_M = 0.2
 WATER_BOTTOM_M = -1.2
-PAINT_TOP_M = -0.03  # over ROAD_TOP_M
 DASH_M, DASH_GAP_M = 3.0, 6.0
 # Lamps and parked cars: distances from the ends of a stretch, which have zebra crossings, to the next, and to the kerb.
 LAMPS_START_M, LAMPS_END_M, LAMP_SPACING_M, LAMP_FROM_KERB_M = 9.0, 8.0, 8.0, 1.0
@@ -35,39 +30,19 @@ def point(axis: int, along: float, across: float) -> tuple[float, float]:
 
 class Plot(BoxList):
     """A rectangle of the town, from its low to its high corner, (2,) m. It adds boxes to the town's list and has a
-    random generator of its own.
+    random generator of its own."""
 
-    frame: the place of the plot's origin in the town, m, and the yaw of its x axis, degrees.
-    """
-
-    def __init__(
-        self, town: BoxList, low: Pair, high: Pair, rng: np.random.Generator, frame: tuple[Pair, float] | None = None
-    ) -> None:
-        super().__init__(town.rows, town.kinds)
-        self.frame = frame
+    def __init__(self, town: BoxList, low: Pair, high: Pair, rng: np.random.Generator) -> None:
+        super().__init__(town.rows, town.kinds, frame=town.frame)
         self.low = np.asarray(low)
         self.high = np.asarray(high)
         self.rng = rng
         self.size = self.high - self.low
         self.middle = (self.low + self.high) / 2
 
-    def add(self, kind: str, center_xy: Pair, size_xy: Pair, low_m: float, high_m: float, yaw_deg: float = 0.0) -> None:
-        if self.frame is not None:
-            origin, turn_deg = self.frame
-            x, y = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
-            center_xy = np.add(origin, (x * center_xy[0] - y * center_xy[1], y * center_xy[0] + x * center_xy[1]))
-            yaw_deg += turn_deg
-        super().add(kind, center_xy, size_xy, low_m, high_m, yaw_deg)
-
     def at(self, x: float, y: float) -> np.ndarray:
         """Return the point at x and y, shares of the plot's sides from its low corner."""
         return self.low + self.size * (x, y)
-
-    def lay(self, kind: str, a: Pair | None = None, b: Pair | None = None) -> None:
-        """Add ground at the height of its kind between two opposite corners; None: the corners of the plot."""
-        a = self.low if a is None else a
-        b = self.high if b is None else b
-        self.span(kind, a, b, TOPS_M[kind] - SLAB_M, TOPS_M[kind])
 
     def ring(self, kind: str, outer: Any, inner: Any, heights_m: Range | None = None) -> None:
         """Add four slabs between two rectangles, each by its low and high corner; without heights they are ground."""
@@ -223,7 +198,7 @@ def _park(plot: Plot) -> None:
 
 def _square(plot: Plot) -> None:
     """Build a paved square with a hall, a fountain, kiosks and trees in rows."""
-    plot.lay("Sidewalks")
+    plot.lay("Sidewalks", plot.low, plot.high)
     low, high = plot.low, plot.high
     middle, size = plot.middle, plot.size
     hall = np.array([size[0] * 0.5, min(14.0, size[1] * 0.3)])
@@ -242,7 +217,7 @@ def _square(plot: Plot) -> None:
 
 def _courtyard(plot: Plot) -> None:
     """Build four L-shaped houses around a green yard, with a passage on every side."""
-    plot.lay("Terrain")
+    plot.lay("Terrain", plot.low, plot.high)
     rng = plot.rng
     low, high = plot.low + 1.5, plot.high - 1.5
     middle = (low + high) / 2
@@ -266,7 +241,7 @@ def _courtyard(plot: Plot) -> None:
 
 def _houses(plot: Plot) -> None:
     """Build two rows of slightly turned houses, back to back, with gardens, hedges and garden walls between them."""
-    plot.lay("Terrain")
+    plot.lay("Terrain", plot.low, plot.high)
     rng, middle = plot.rng, plot.middle
     low, high = plot.low, plot.high
     columns = max(2, int((high[0] - low[0]) // 18.0))
@@ -298,7 +273,7 @@ def _houses(plot: Plot) -> None:
 
 def _towers(plot: Plot) -> None:
     """Build two towers on podiums and a lower slab between them, on a paved plot."""
-    plot.lay("Sidewalks")
+    plot.lay("Sidewalks", plot.low, plot.high)
     rng, size = plot.rng, plot.size
     for number, center in enumerate((plot.at(0.27, 0.3), plot.at(0.72, 0.7))):
         podium = size * (0.4, 0.42)
@@ -314,7 +289,7 @@ def _towers(plot: Plot) -> None:
 
 def _lanes(plot: Plot) -> None:
     """Build terraces of narrow old houses with lanes between them; one passage has a building over it."""
-    plot.lay("Sidewalks")
+    plot.lay("Sidewalks", plot.low, plot.high)
     rng = plot.rng
     low, high = plot.low, plot.high
     lane = 5.6
@@ -343,7 +318,7 @@ def _lanes(plot: Plot) -> None:
 
 def _skyscrapers(plot: Plot) -> None:
     """Build three towers of different heights on a plaza, with a colonnade of trees."""
-    plot.lay("Sidewalks")
+    plot.lay("Sidewalks", plot.low, plot.high)
     rng = plot.rng
     for center in (plot.at(0.25, 0.27), plot.at(0.74, 0.34), plot.at(0.42, 0.76)):
         foot = plot.size * rng.uniform(0.24, 0.32, 2)
@@ -360,7 +335,7 @@ def _skyscrapers(plot: Plot) -> None:
 
 def _campus(plot: Plot) -> None:
     """Build two long halls and a library around a lawn, with paths from door to door."""
-    plot.lay("Terrain")
+    plot.lay("Terrain", plot.low, plot.high)
     rng = plot.rng
     low, high = plot.low, plot.high
     middle, size = plot.middle, plot.size
@@ -381,7 +356,7 @@ def _campus(plot: Plot) -> None:
 
 def _farm(plot: Plot) -> None:
     """Build a farmhouse and a barn at a yard, an orchard in rows, a field behind a dry wall."""
-    plot.lay("Terrain")
+    plot.lay("Terrain", plot.low, plot.high)
     rng, size = plot.rng, plot.size
     low, high = plot.low, plot.high
     yaw = rng.uniform(-10.0, 10.0)
@@ -400,7 +375,7 @@ def _farm(plot: Plot) -> None:
 
 def _market(plot: Plot) -> None:
     """Build rows of stalls with awnings around a market hall that has arcades on its long sides."""
-    plot.lay("Sidewalks")
+    plot.lay("Sidewalks", plot.low, plot.high)
     rng, middle = plot.rng, plot.middle
     low, high = plot.low, plot.high
     hall = plot.size * (0.34, 0.26)
@@ -423,7 +398,7 @@ def _market(plot: Plot) -> None:
 
 def _meadow(plot: Plot) -> None:
     """Lay grass with a path along it, two groves and a pavilion: room for a drone to circle."""
-    plot.lay("Terrain")
+    plot.lay("Terrain", plot.low, plot.high)
     middle = plot.middle
     plot.lay("Sidewalks", (plot.low[0], middle[1] - 1.5), (plot.high[0], middle[1] + 1.5))
     for corner in (plot.at(0.18, 0.2), plot.at(0.8, 0.8)):

@@ -12,13 +12,10 @@ import shapely
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
-from cosfly.maps.boxlist import BoxList
+from cosfly.maps.boxlist import ROAD_TOP_M, SLAB_M, TOPS_M, BoxList
 from cosfly.maps.footprints import Rectangle, cover, polygons_of, rectangle_polygon
 from cosfly.maps.town_parts import (
     RAILING_M,
-    ROAD_TOP_M,
-    SLAB_M,
-    TOPS_M,
     WATER_BOTTOM_M,
     WATER_TOP_M,
     Plot,
@@ -73,7 +70,7 @@ def lay_streets(boxes: BoxList, net: Network, parked_share: float, rng: np.rando
         others = shapely.union_all([roads[k] for k in tree.query(strip, predicate="intersects") if k != number])
         clear = _clear_of(street, shapely.intersection(strip, others))
         _add_pavements(boxes, street, ends, clear, shapely.union(others, roads[number]))
-        plot = Plot(boxes, street.start, street.end, rng, (street.start, street.yaw_deg))
+        plot = Plot(boxes.framed(street.start, street.yaw_deg), street.start, street.end, rng)
         _furnish(plot, street, clear, counts[number] > 1, parked_share if street not in net.bridges else None)
         strips.append(strip)
     bridges = [strip for street, strip in zip(net.streets, strips, strict=True) if street in net.bridges]

@@ -21,9 +21,8 @@ from shapely.geometry.base import BaseGeometry
 
 from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.formats.kinds import KIND_NAMES, KINDS
-from cosfly.maps.boxlist import BoxList
+from cosfly.maps.boxlist import PAVED_TOP_M, SLAB_M, BoxList
 from cosfly.maps.footprints import Rectangle, footprints, oriented_rectangle, polygons_of, rectangle_polygon
-from cosfly.maps.town_parts import PAVED_TOP_M, SLAB_M
 from cosfly.runtime.seeding import rng_for
 from cosfly.simulators.assets import ASSETS
 from cosfly.worldgen.patterns import QUAY_M, network
