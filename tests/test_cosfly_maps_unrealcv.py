@@ -129,5 +129,5 @@ def test_where_sizes_come_from_and_what_is_left_out(tmp_path):
     np.testing.assert_allclose(found.half_extents[1:4], [[5.0, 3.0, 5.0], [1.0, 1.0, 3.0], [0.2, 0.2, 0.45]])
     assert found.rotations_deg[:, 1].tolist() == [0.0, -45.0, 0.0, 0.0, 0.0], "at 45 degrees bounds tell no sides"
     assert found.header.ground_z_m == 0.0
-    with pytest.raises(InputError, match="here: the level has no object that can be used"):
+    with pytest.raises(InputError, match="here: the map has no boxes; got 1 objects"):
         level_map(objects[-1:], UnrealCvMapConfig(), "here", "1.1.0", "City")

@@ -58,7 +58,7 @@ OTHER_NAMES = {name.rpartition("_")[0]: name for name in NUMBERS} | {
 DECLARED = ("min_height", "building:levels", "building:min_level", "lanes")
 COLUMNS = ("type", "id", "name", *NUMBERS, *DECLARED)
 SIZES = ("length_m", "width_m", "height_m", "min_height")  # numbers in metres, or texts with a unit
-OTHERS = ("x_m", "y_m", "z_m", "yaw_deg", "building:levels", "building:min_level", "lanes")
+OTHERS = ("z_m", "yaw_deg", "building:levels", "building:min_level", "lanes")
 PLACE = ("x_m", "y_m", "length_m", "width_m")  # every table has them; and height_m, except of surfaces
 TYPES = [kind for kind in KINDS if kind != "NONE"]
 TYPE_RULES = read_yaml(Path(__file__).with_name("feature_rules.yaml"))["rules"]
@@ -137,7 +137,7 @@ class _Row(NamedTuple):
 
     where: str
     values: Mapping[str, Any]
-    shape: Any = None  # a geometry of shapely; None in a table
+    shape: Any = Point()  # a geometry of shapely
     problem: str = ""
     reason: str = "bad_geometry"
 
@@ -210,7 +210,7 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
     rows_by_problem = defaultdict[tuple[str, str], list[str]](list)  # so that each problem is listed once
     notes = defaultdict[str, list[str]](list)
     row_of_box: list[int] = []
-    metric_rows = _in_metres(rows, units, path)
+    metric_rows = _in_metres(rows, units, path, is_table=suffix == ".csv")
     for part in shapely.get_parts([row.shape for row in metric_rows if not row.problem]):
         if isinstance(part, Polygon):
             boxes.reserve(num_cuts(part, OUTLINE_PIECE_M, np.inf, CUT_SHARES), len(part.exterior.coords))
@@ -260,65 +260,47 @@ def _listed(places: list[str], problem: str) -> str:
     return f"{places[0]}: {problem}" + (f" (and {len(places) - 1} more)" if len(places) > 1 else "")
 
 
-def _in_metres(rows: list[_Row], units: Units, path: Path) -> list[_Row]:
+def _in_metres(rows: list[_Row], units: Units, path: Path, *, is_table: bool) -> list[_Row]:
     """Return rows with their places in metres, with a problem if they are far from the middle of the others."""
-    shapes = [row.shape if row.shape is not None else _point_of(row) for row in rows]
-    places = shapely.get_coordinates(shapes)
+    places = shapely.get_coordinates([row.shape for row in rows])
     if not len(places):
         return rows
-    units = _units_of(rows, shapes, places, units, path)
+    units = _units_of(rows, places, units, path, is_table=is_table)
     project = to_metres(units, places)
     middle = np.median(project(places), axis=0)
     moved_rows: list[_Row] = []
-    used: list[np.ndarray] = []
-    for row, geometry in zip(rows, shapes, strict=True):
-        if row.problem or geometry is None:
-            moved_rows.append(row)
-            continue
-        moved = shapely.transform(geometry, project)
-        corners = shapely.get_coordinates(moved)
-        farthest_m = float(np.abs(corners - middle).max())
+    for row in rows:
+        moved = row._replace(shape=shapely.transform(row.shape, project))
+        z = _number(row.values.get("z_m"))
+        if is_table and not math.isnan(z):
+            moved = moved._replace(values={**row.values, "z_m": z * METRES.get(units, 1.0)})
+        farthest_m = float(np.abs(shapely.get_coordinates(moved.shape) - middle).max(initial=0.0))
         if farthest_m > WIDEST_M:
-            problem = f"it is {farthest_m / 1000:,.0f} km from the middle of the map, at {places_text(geometry)}"
-            moved_rows.append(row._replace(problem=problem, reason="far_away"))
-            continue
-        used.append(corners)
-        if row.shape is None:
-            numbers = {"x_m": moved.x, "y_m": moved.y}
-            if "z_m" in row.values:
-                numbers["z_m"] = _number(row.values["z_m"]) * METRES.get(units, 1.0)
-            moved_rows.append(row._replace(values={**row.values, **numbers}))
-        else:
-            moved_rows.append(row._replace(shape=moved))
-    if used:
-        all_corners = np.concatenate(used)
-        origin_m(all_corners.min(axis=0), all_corners.max(axis=0), path)  # refuses a map that is too wide
+            place = ", ".join(f"{value:.6g}" for value in shapely.get_coordinates(row.shape)[0])
+            problem = f"it is {farthest_m / 1000:,.0f} km from the middle of the map, at {place}"
+            moved = moved._replace(problem=problem, reason="far_away")
+        moved_rows.append(moved)
+    corners = shapely.get_coordinates([row.shape for row in moved_rows if not row.problem])
+    if len(corners):
+        origin_m(corners.min(axis=0), corners.max(axis=0), path)  # refuses a map that is too wide
     return moved_rows
 
 
-def places_text(geometry: Any) -> str:
-    """Return the first coordinates of a geometry for a message."""
-    return ", ".join(f"{value:.6g}" for value in shapely.get_coordinates(geometry)[0])
-
-
-def _point_of(row: _Row) -> Point | None:
-    x, y = (_number(row.values.get(name)) for name in ("x_m", "y_m"))
-    return None if row.problem or math.isnan(x + y) else Point(x, y)
-
-
-def _units_of(rows: list[_Row], shapes: list[Any], places: np.ndarray, units: Units, path: Path) -> Units:
+def _units_of(rows: list[_Row], places: np.ndarray, units: Units, path: Path, *, is_table: bool) -> Units:
     """Return the unit of the coordinates: the one that is set or declared, or what they look like."""
-    corners = shapely.bounds([geometry for geometry in shapes if geometry is not None])
+    shapes = [row.shape for row in rows if not row.problem]
+    corners = shapely.bounds(shapes)
     sizes = np.maximum(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
     if not sizes.any():  # points only
-        from scipy.spatial import cKDTree  # imported here: half a second that every command would spend
-
-        sizes = cKDTree(places).query(places, 2)[0][:, 1]  # infinite for a single point
+        places = shapely.get_coordinates(shapes)
+        points = shapely.points(places)
+        sizes = shapely.STRtree(points).query_nearest(points, exclusive=True, all_matches=False, return_distance=True)[
+            1
+        ]
     seen = seen_units(places, sizes)
     if units == "auto" and seen is None:
         what, fix = "the coordinates may be metres or degrees", "pass --set maps.boxes.units=m, or degrees"
         raise InputError(what, where=path, got=f"outlines of {np.median(sizes):.3g} units", fix=fix)
-    is_table = all(row.shape is None for row in rows)
     if units == "auto" and seen is not None and not (is_table and seen == "degrees"):
         return seen
     if seen is not None and len(places) > 1 and (seen == "degrees") != (units == "degrees"):
@@ -364,7 +346,11 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> list[_Row]:
                 continue
             problem = "" if len(cells) == len(names) else f"{len(cells)} cells, but the first line has {len(names)}"
             values = {name: cell for name, cell in zip(names, cells, strict=False) if cell}
-            rows.append(_Row(f"line {lines.line_num}", values, problem=problem, reason="bad_value"))
+            x, y = (_number(values.get(name)) for name in ("x_m", "y_m"))
+            if not problem and math.isnan(x + y):
+                problem = f"x_m and y_m are not finite numbers: {values.get('x_m')!r}, {values.get('y_m')!r}"
+            place = Point() if problem else Point(x, y)
+            rows.append(_Row(f"line {lines.line_num}", values, place, problem=problem, reason="bad_value"))
     except csv.Error as error:
         where, fix = f"{path}: line {lines.line_num}", "export the table again as CSV"
         raise InputError("the file is not a CSV table", where=where, got=str(error), fix=fix) from None
@@ -463,10 +449,10 @@ def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig, notes: dict[str, list[str]
         numbers["height_m"] = numbers["building:levels"] * STOREY_M
         source = "levels"
     above_m = numbers.get("min_height", numbers.get("building:min_level", 0.0) * STOREY_M)
-    parts = [None] if row.shape is None else list(shapely.get_parts(row.shape))
-    is_line, is_point = (any(isinstance(part, form) for part in parts) for form in (LineString, Point | None))
+    parts = list(shapely.get_parts(row.shape))
+    is_line, is_point = (any(isinstance(part, form) for part in parts) for form in (LineString, Point))
     is_slab = "height_m" not in numbers and KINDS[kind] in GROUND_KINDS
-    needed = ["x_m", "y_m"] * (row.shape is None) + ["length_m"] * is_point + ["width_m"] * (is_point or is_line)
+    needed = ["length_m"] * is_point + ["width_m"] * (is_point or is_line)
     needed += ["height_m"] * (not is_slab)
     if is_line and "lanes" in numbers:
         numbers.setdefault("width_m", numbers["lanes"] * LANE_M)
@@ -497,10 +483,9 @@ def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig, notes: dict[str, list[str]
 
 
 def _rectangles(part: Any, numbers: Mapping[str, float], row: _Row, notes: dict[str, list[str]]) -> Iterator[Rectangle]:
-    """Yield the rectangles of a point, a line or an outline; without any, of the row's own place."""
-    if part is None or isinstance(part, Point):
-        x_m, y_m = (numbers["x_m"], numbers["y_m"]) if part is None else (part.x, part.y)
-        yield Rectangle((x_m, y_m), (numbers["length_m"], numbers["width_m"]), numbers.get("yaw_deg", 0.0))
+    """Yield the rectangles of a point, a line or an outline."""
+    if isinstance(part, Point):
+        yield Rectangle((part.x, part.y), (numbers["length_m"], numbers["width_m"]), numbers.get("yaw_deg", 0.0))
     elif isinstance(part, LineString):
         width_m = numbers["width_m"]
         for start, end in pairwise(np.asarray(part.simplify(LINE_M).coords)):

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map
 from cosfly.formats.kinds import KINDS
-from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.errors import ConfigError, InputError, counts_text
 from cosfly.runtime.io import over_limit
+
+log = logging.getLogger(__name__)
 
 Pair = Sequence[float] | np.ndarray  # x and y
 WIDEST_M = 20_000.0  # of a map
@@ -89,6 +92,25 @@ def origin_m(low: np.ndarray, high: np.ndarray, where: str | Path, ground_z_m: f
         fix = "cut out a part of the map, or remove vertices that lie far outside"
         raise InputError("the map is too wide or too high", where=where, got=got, expected="at most 20,000 m", fix=fix)
     return np.array([*np.round((low + high)[:2] / 2), round(float(ground_z_m), 3)])
+
+
+def check_not_empty(box_map: BoxMap, where: str) -> None:
+    """Raise InputError if a map has no boxes."""
+    if not len(box_map):
+        got = f"{box_map.header.num_objects} objects, dropped: {counts_text(box_map.header.dropped_objects)}"
+        expected = "at least one object with a size"
+        raise InputError("the map has no boxes", where=where, got=got, expected=expected)
+
+
+def served(box_map: BoxMap, ground_z_m: float | None, where: str) -> BoxMap:
+    """Return the map of a server with a height of its ground, m; None: the median height of its roads."""
+    check_not_empty(box_map, where)
+    if dropped := box_map.header.dropped_objects:
+        log.warning("%s: dropped objects: %s", where, counts_text(dropped))
+    tops_m = box_map.maxs[box_map.kinds == KINDS["Roads"], 2]
+    if ground_z_m is None:
+        ground_z_m = float(np.median(tops_m)) if len(tops_m) else 0.0
+    return replace(box_map, header=box_map.header.model_copy(update={"ground_z_m": ground_z_m}))
 
 
 def required(path: Path | None, setting: str) -> Path:

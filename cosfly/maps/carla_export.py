@@ -11,7 +11,7 @@ import multiprocessing
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -19,7 +19,8 @@ from pydantic import Field
 
 from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
 from cosfly.formats.kinds import KINDS
-from cosfly.runtime.errors import EnvironmentMissing, InputError, counts_text
+from cosfly.maps.boxlist import served
+from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.io import sha256_bytes
 from cosfly.simulators.carla_client import CarlaConfig, connect
 from cosfly.simulators.conventions import world_pose
@@ -115,27 +116,14 @@ def box_map_of(answers: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
             number = int(sha256_bytes(f"{number} {name} {key}".encode())[:16], 16)
         position_m, rotation_deg = world_pose((*box[:3], *box[6:]))
         rows[number] = position_m, box[3:6], rotation_deg, KINDS[label]
-    if not rows:
-        raise InputError(
-            "the town has no object that can be used as a box",
-            where=where,
-            got=f"{len(answers.rows)} objects, dropped: {counts_text(dropped)}",
-            expected="at least one object with a usable bounding box",
-            fix="load a town whose objects have bounding boxes",
-        )
     header = MapHeader(
         name=cfg.name or answers.town, source=MapSource(tool="CARLA", version=answers.version, file=answers.town),
         licence=cfg.licence, credits=cfg.credits, extent_sources={"engine": len(rows)}, num_objects=len(answers.rows),
         dropped_objects=dict(dropped), empty_labels=answers.empty_labels, repeated_ids=num_repeated,
     )  # fmt: skip
-    centers, halves, turns, kinds = zip(*rows.values(), strict=True)
-    box_map = make_box_map(centers, halves, turns, kinds, list(rows), header)
-    tops_m = box_map.maxs[box_map.kinds == KINDS["Roads"], 2]
-    ground_z_m = cfg.ground_z_m
-    if ground_z_m is None:
-        ground_z_m = float(np.median(tops_m)) if len(tops_m) else 0.0
-    box_map = replace(box_map, header=header.model_copy(update={"ground_z_m": ground_z_m}))
-    _report(answers, box_map, where, tops_m)
+    centers, halves, turns, kinds = zip(*rows.values(), strict=True) if rows else ((),) * 4
+    box_map = served(make_box_map(centers, halves, turns, kinds, list(rows), header), cfg.ground_z_m, where)
+    _report(answers, box_map, where)
     return box_map
 
 
@@ -149,13 +137,12 @@ def _unfit(label: str, box: np.ndarray, cfg: CarlaMapConfig) -> str:
     return "huge" if is_huge else ""
 
 
-def _report(answers: CarlaTown, box_map: BoxMap, where: str, tops_m: np.ndarray) -> None:
+def _report(answers: CarlaTown, box_map: BoxMap, where: str) -> None:
     """Log the known defects of such exports."""
     header = box_map.header
     if answers.empty_labels:
         log.info("%s: the town has no objects with the labels %s", where, ", ".join(answers.empty_labels))
-    if header.dropped_objects:
-        log.warning("%s: dropped objects: %s", where, counts_text(header.dropped_objects))
+    tops_m = box_map.maxs[box_map.kinds == KINDS["Roads"], 2]
     if num := header.model_extra and header.model_extra["repeated_ids"]:
         log.warning("%s: %d objects had the id of another object and got a new id", where, num)
     if len(tops_m) and np.ptp(tops_m) > SLOPE_M:

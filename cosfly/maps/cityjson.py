@@ -306,8 +306,6 @@ def _triangles_of(rings: Surface) -> np.ndarray:
     axes = np.stack([side, np.cross(normal, side)])  # seen from outside the outline turns counter-clockwise
     middle = outline.mean(axis=0)
     flat = [(ring - middle) @ axes.T for ring in rings]
-    if len(rings) == 1 and len(outline) == 4 and _is_convex(flat[0]):
-        return outline[[(0, 1, 2), (0, 2, 3)]]
     polygon = Polygon(flat[0], flat[1:])
     pieces = polygons_of(polygon if polygon.is_valid else shapely.make_valid(polygon))
     flat_corners = map(tuple, np.concatenate(flat).tolist())
@@ -317,13 +315,6 @@ def _triangles_of(rings: Surface) -> np.ndarray:
         positions = shapely.get_coordinates(shapely.orient_polygons(triangle))[:3]
         triangles.append([corner_at.get((x, y), middle + (x, y) @ axes) for x, y in positions.tolist()])
     return np.array(triangles).reshape(-1, 3, 3)
-
-
-def _is_convex(ring: np.ndarray) -> bool:
-    """Return whether a counter-clockwise ring, (n, 2), turns to the left at all corners."""
-    edges = np.roll(ring, -1, axis=0) - ring
-    following = np.roll(edges, -1, axis=0)
-    return bool((edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0] > 0).all())
 
 
 SURFACE_FILL, SURFACE_PIECE_M = 0.8, 2.0

@@ -15,13 +15,13 @@ from cosfly.formats.boxes import BoxMap, check_ground, write_boxes
 from cosfly.formats.meshes import MESHES_FILE
 from cosfly.maps import boxfile, carla_export, cityjson, simworld, synthetic, unrealcv_export
 from cosfly.maps.boxfile import BoxesConfig
+from cosfly.maps.boxlist import check_not_empty
 from cosfly.maps.carla_export import CarlaMapConfig
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig
 from cosfly.runtime.config import Config
-from cosfly.runtime.errors import InputError, counts_text
 from cosfly.runtime.io import LinkedPath, write_bytes
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.viz.topview import TopView, draw_map, png_bytes
@@ -66,14 +66,7 @@ def load_map(cfg: MapsConfig, *, seed: int = 0, follow_links: bool = False) -> B
     follow_links: also read meshes through links that lead out of the map's folder.
     """
     box_map = SOURCES[cfg.source](getattr(cfg, cfg.source), seed)
-    header = box_map.header
-    if not len(box_map):
-        raise InputError(
-            "the map has no boxes",
-            where=", ".join(str(path) for path in getattr(cfg, cfg.source).inputs().values()) or cfg.source,
-            got=f"{header.num_objects} objects, dropped: {counts_text(header.dropped_objects)}",
-            expected="at least one object with an area",
-        )
+    check_not_empty(box_map, ", ".join(map(str, getattr(cfg, cfg.source).inputs().values())) or cfg.source)
     if not follow_links or box_map.meshes.folder is None:
         return box_map
     return replace(box_map, meshes=replace(box_map.meshes, folder=LinkedPath(box_map.meshes.folder)))

@@ -20,6 +20,7 @@ from pydantic import Field
 
 from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
 from cosfly.formats.kinds import KIND_NAMES, KINDS
+from cosfly.maps.boxlist import served
 from cosfly.maps.simworld import read_sizes
 from cosfly.runtime.errors import InputError, counts_text
 from cosfly.runtime.json_io import write_json
@@ -117,14 +118,7 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
         used.append((item.name, item.class_name, source))
     sources = [source for _, _, source in used]
     counts = {source: sources.count(source) for source in SOURCES}
-    if not rows:
-        raise InputError(
-            "the level has no object that can be used as a box",
-            where=where,
-            got=f"{len(objects)} objects of vget /objects, dropped: {counts_text(dropped)}",
-            fix="load another level, or add a table with the sizes of the assets to maps.unrealcv.sizes",
-        )
-    share = counts["default"] / len(rows)
+    share = counts["default"] / max(1, len(rows))
     if cfg.most_default is not None and share > cfg.most_default:
         without_size = Counter(class_name for _, class_name, source in used if source == "default")
         raise InputError(
@@ -133,22 +127,16 @@ def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, versio
             expected=f"at most {cfg.most_default:.1%} of the boxes (maps.unrealcv.most_default)",
             fix="add a table with the sizes of these assets to maps.unrealcv.sizes, or correct their bounds",
         )  # fmt: skip
-    boxes = np.array(rows)
-    roads = boxes[np.array(sources) == "road"]
-    ground_z_m = cfg.ground_z_m
-    if ground_z_m is None:
-        ground_z_m = float(np.median(roads[:, 2] + roads[:, 5])) if len(roads) else 0.0
     header = MapHeader(
         name=cfg.name or level or "Unreal", source=MapSource(tool="UnrealCV", version=version, file=level),
-        licence=cfg.licence, credits=cfg.credits, ground_z_m=ground_z_m, extent_sources=counts,
+        licence=cfg.licence, credits=cfg.credits, extent_sources=counts,
         num_objects=len(objects), dropped_objects=dict(dropped),
     )  # fmt: skip
     log.info("%s: sources of sizes: %s", where, counts_text(counts))
-    if dropped:
-        log.warning("%s: dropped objects: %s", where, counts_text(dropped))
+    boxes = np.reshape(rows, (-1, 9))
     ids = [id_of(name) for name, _, _ in used]
     box_map = make_box_map(boxes[:, :3], boxes[:, 3:6], boxes[:, 6:], kinds, ids, header)
-    return LevelMap(**vars(box_map), objects=tuple(used))
+    return LevelMap(**vars(served(box_map, cfg.ground_z_m, where)), objects=tuple(used))
 
 
 def _unfit(item: _Object, kind: str | None, box: np.ndarray | None, source: str, cfg: UnrealCvMapConfig) -> str:
