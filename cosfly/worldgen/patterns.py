@@ -24,7 +24,8 @@ LANE_M = 9.0  # narrower streets have no carriageway
 WIDE_M = 26.0  # wider streets have wide pavements
 QUAY_M = 10.0  # between the promenade and the open water
 PARALLEL_M = 16.0  # a street that runs nearer to a bank or to the promenade is dropped
-SHORTEST_M = 1.0  # pieces of streets that are dropped
+SHORTEST_M = 1.0  # pieces of clipped streets that are dropped
+GRID_M = 0.05  # of the ends of streets
 
 Size = tuple[float, float]
 
@@ -283,9 +284,9 @@ def straight_streets(lines: list[Line]) -> list[StraightStreet]:
     shapes = np.array([LineString(line.points) for line in lines], dtype=object)
     tree = shapely.STRtree(shapes)
     streets = []
-    for part in shapely.get_parts(shapely.union_all(shapes, grid_size=0.01)):
+    for part in shapely.get_parts(shapely.union_all(shapes, grid_size=GRID_M)):
         for start, end in pairwise(shapely.get_coordinates(part)):
-            if np.linalg.norm(end - start) < SHORTEST_M:
+            if np.linalg.norm(end - start) < GRID_M:
                 continue
             of = tree.query(shapely.Point((start + end) / 2), predicate="dwithin", distance=0.05)
             streets.append(StraightStreet(start, end, max(lines[k].width_m for k in of)))

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
-from shapely.geometry import Polygon
+from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from cosfly.maps.boxlist import ROAD_TOP_M, SLAB_M, TOPS_M, BoxList
@@ -65,11 +65,10 @@ def lay_streets(boxes: BoxList, net: Network, parked_share: float, rng: np.rando
     for number, street in enumerate(net.streets):
         half, dead_end_m = street.width_m / 2, (street.width_m - street.road_m) / 2  # which pavement closes
         first, last = np.where(counts[number], half * tangents[number], dead_end_m).tolist()
-        ends = -first, street.length_m + last
-        strip = rectangle_polygon(street.rectangle(ends, (-half, half)))
+        strip = rectangle_polygon(street.rectangle((-first, street.length_m + last), (-half, half)))
         others = shapely.union_all([roads[k] for k in tree.query(strip, predicate="intersects") if k != number])
-        clear = _clear_of(street, shapely.intersection(strip, others))
-        _add_pavements(boxes, street, ends, clear, shapely.union(others, roads[number]))
+        clear = _clear_of(street, others)
+        pave(boxes, shapely.difference(strip, shapely.union(others, roads[number])))
         plot = Plot(boxes.framed(street.start, street.yaw_deg), street.start, street.end, rng)
         _furnish(plot, street, clear, counts[number] > 1, parked_share if street not in net.bridges else None)
         strips.append(strip)
@@ -84,30 +83,13 @@ def lay_streets(boxes: BoxList, net: Network, parked_share: float, rng: np.rando
     return strips
 
 
-def _clear_of(street: StraightStreet, crossed: BaseGeometry) -> Range:
-    """Return the longest stretch of a street between the parts of it that other carriageways cross."""
-    low, high = 0.0, street.length_m
-    for part in polygons_of(crossed):
-        along = (shapely.get_coordinates(part) - street.start) @ street.direction
-        if (along.min() + along.max()) / 2 < street.length_m / 2:
-            low = max(low, float(along.max()))
-        else:
-            high = min(high, float(along.min()))
-    return low, high
-
-
-def _add_pavements(boxes: BoxList, street: StraightStreet, ends: Range, clear: Range, roads: BaseGeometry) -> None:
-    """Add what is not carriageway of a street: two strips where it is clear, pieces of any shape at its ends."""
-    half, kerb = street.width_m / 2, street.road_m / 2
-    low, high = clear
-    if high - low > PIECE_M:
-        for across in ((-half, -kerb), (kerb, half)) if kerb else ((-half, half),):
-            _lay(boxes, "Sidewalks", street.rectangle((low, high), across))
-    else:
-        low = high = ends[0]
-    for part in ((ends[0], low), (high, ends[1])):
-        if part[1] > part[0]:
-            pave(boxes, shapely.difference(rectangle_polygon(street.rectangle(part, (-half, half))), roads))
+def _clear_of(street: StraightStreet, roads: BaseGeometry) -> Range:
+    """Return the longest stretch of a street that other carriageways do not reach."""
+    line = LineString([street.start, street.end])
+    free = shapely.get_parts(shapely.difference(line, shapely.buffer(roads, street.road_m / 2)))
+    longest = max(free, key=lambda part: part.length)
+    low, high = longest.coords if longest.length else [street.start] * 2
+    return line.project(shapely.Point(low)), line.project(shapely.Point(high))
 
 
 def _furnish(
@@ -134,7 +116,7 @@ def _furnish(
 def pave(boxes: BoxList, area: BaseGeometry, piece_m: float = PIECE_M) -> None:
     """Cover an area of any shape with pavement. piece_m: side of pieces that may reach over its edge."""
     for polygon in polygons_of(area):
-        for piece in cover(polygon, min_fill=0.9, min_size_m=piece_m, max_size_m=80.0):
+        for piece in cover(polygon, min_fill=0.95, min_size_m=piece_m, max_size_m=80.0):
             _lay(boxes, "Sidewalks", piece)
 
 

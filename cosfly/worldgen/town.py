@@ -212,7 +212,7 @@ class Town:
         taken = [*self._taken]
         for street, strip in sorted(streets, key=lambda pair: np.linalg.norm(pair[0].start + pair[0].end)):
             front_m = street.width_m / 2 + 0.05 + setback_m
-            reach_m = max(depth for _, depth in sizes) + setback_m + self.plan.gap_m
+            reach_m = max(map(max, sizes)) + setback_m + self.plan.gap_m
             near = [outline for outline in taken if outline.dwithin(strip, reach_m)]
             for side in (1, -1):
                 along = 0.0
