@@ -23,8 +23,7 @@ from cosfly.worldgen.plan import PATH_M, VERGE_M, WorldPlan
 LANE_M = 9.0  # narrower streets have no carriageway
 WIDE_M = 26.0  # wider streets have wide pavements
 QUAY_M = 10.0  # between the promenade and the open water
-PARALLEL_M = 16.0  # a street that runs nearer to a bank or to the promenade is dropped
-SHORTEST_M = 1.0  # pieces of clipped streets that are dropped
+PARALLEL_M = 16.0  # a street that is nearer to a bank or to the promenade all along is dropped
 GRID_M = 0.05  # of the ends of streets
 
 Size = tuple[float, float]
@@ -245,22 +244,15 @@ def _with_banks(
     """Return lines up to streets along both sides of a water, with these streets; and those of them in the window."""
     sides = [shapely.intersection(course.offset_curve(side * apart_m), window) for side in (1, -1)]
     banks = [bank for bank in sides if not bank.is_empty]
-    lines = _clipped(lines, shapely.buffer(course, apart_m, cap_style="flat"), banks)
-    return [*lines, *(Line(np.array(bank.coords), width_m) for bank in banks)], banks
-
-
-def _clipped(lines: list[Line], zone: BaseGeometry, edges: list[LineString]) -> list[Line]:
-    """Return the lines outside a zone, without those that run next to one of its edges."""
-    outside = []
-    for line in lines:
-        for part in shapely.get_parts(shapely.difference(LineString(line.points), zone)):
-            if not isinstance(part, LineString) or part.length < SHORTEST_M:
-                continue
-            places = shapely.points([part.coords[0], part.interpolate(0.5, normalized=True).coords[0], part.coords[-1]])
-            away_m = [shapely.distance(places, edge) for edge in edges]
-            if not any(away.max() < PARALLEL_M and np.ptp(away) < 0.5 * part.length for away in away_m):
-                outside.append(Line(np.array(part.coords), line.width_m))
-    return outside
+    zone = shapely.buffer(course, apart_m, cap_style="flat")
+    near = shapely.buffer(shapely.union_all(banks), PARALLEL_M)  # streets that lie in it are dropped
+    outside = [
+        Line(np.array(part.coords), line.width_m)
+        for line in lines
+        for part in shapely.get_parts(shapely.difference(LineString(line.points), zone))
+        if part.length > GRID_M and not near.contains(part)
+    ]
+    return [*outside, *(Line(np.array(bank.coords), width_m) for bank in banks)], banks
 
 
 def _bridges(
@@ -268,11 +260,12 @@ def _bridges(
 ) -> list[Line]:
     """Return straight bridges from bank to bank: where streets cross the river, else evenly spaced."""
     count = plan.bridges or int(np.clip(len(crossings), 1, 4))
-    wanted = (np.arange(count) + 0.5) / count * length_m - length_m / 2
+    x = (np.arange(count) + 0.5) / count * length_m - length_m / 2
+    if len(crossings):
+        nearest = crossings[np.abs(crossings[:, 0] - x[:, None]).argmin(axis=1), 0]
+        x = np.unique(np.where(np.abs(nearest - x) < 0.3 * length_m / count, nearest, x))
     lines = []
-    for x in wanted:
-        near = crossings[np.abs(crossings[:, 0] - x) < 0.3 * length_m / count] if len(crossings) else []
-        place = min(near, key=lambda point: abs(point[0] - x))[0] if len(near) else x
+    for place in x:
         middle = shapely.intersection(river, LineString([(place, -1e4), (place, 1e4)]))
         points = [shapely.get_coordinates(shapely.shortest_line(bank, middle))[0] for bank in banks]
         lines.append(Line(np.array(points), plan.street_m))
