@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
-from shapely.geometry import LineString, Polygon
+from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
 from cosfly.maps.boxlist import ROAD_TOP_M, SLAB_M, TOPS_M, BoxList
@@ -67,7 +67,7 @@ def lay_streets(boxes: BoxList, net: Network, parked_share: float, rng: np.rando
         first, last = np.where(counts[number], half * tangents[number], dead_end_m).tolist()
         strip = rectangle_polygon(street.rectangle((-first, street.length_m + last), (-half, half)))
         others = shapely.union_all([roads[k] for k in tree.query(strip, predicate="intersects") if k != number])
-        clear = _clear_of(street, others)
+        clear = _clear_of(street, shapely.intersection(strip, others))
         pave(boxes, shapely.difference(strip, shapely.union(others, roads[number])))
         plot = Plot(boxes.framed(street.start, street.yaw_deg), street.start, street.end, rng)
         _furnish(plot, street, clear, counts[number] > 1, parked_share if street not in net.bridges else None)
@@ -83,13 +83,16 @@ def lay_streets(boxes: BoxList, net: Network, parked_share: float, rng: np.rando
     return strips
 
 
-def _clear_of(street: StraightStreet, roads: BaseGeometry) -> Range:
-    """Return the longest stretch of a street that other carriageways do not reach."""
-    line = LineString([street.start, street.end])
-    free = shapely.get_parts(shapely.difference(line, shapely.buffer(roads, street.road_m / 2)))
-    longest = max(free, key=lambda part: part.length)
-    low, high = longest.coords if longest.length else [street.start] * 2
-    return line.project(shapely.Point(low)), line.project(shapely.Point(high))
+def _clear_of(street: StraightStreet, crossed: BaseGeometry) -> Range:
+    """Return the longest stretch of a street between the parts of it that other carriageways cross."""
+    low, high = 0.0, street.length_m
+    for part in polygons_of(crossed):
+        along = (shapely.get_coordinates(part) - street.start) @ street.direction
+        if (along.min() + along.max()) / 2 < street.length_m / 2:
+            low = max(low, float(along.max()))
+        else:
+            high = min(high, float(along.min()))
+    return low, high
 
 
 def _furnish(
