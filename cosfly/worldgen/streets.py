@@ -12,8 +12,8 @@ import shapely
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
-from cosfly.maps.boxlist import ROAD_TOP_M, SLAB_M, TOPS_M, BoxList
-from cosfly.maps.footprints import Rectangle, cover, polygons_of, rectangle_polygon
+from cosfly.maps.boxlist import PAVED_TOP_M, ROAD_TOP_M, SLAB_M, BoxList
+from cosfly.maps.footprints import cover, polygons_of, rectangle_polygon
 from cosfly.maps.town_parts import (
     RAILING_M,
     WATER_BOTTOM_M,
@@ -59,7 +59,7 @@ def lay_streets(boxes: BoxList, net: Network, parked_share: float, rng: np.rando
         road = street.rectangle((-half * low, street.length_m + half * high), (-half, half))
         roads.append(rectangle_polygon(road) if half else Polygon())
         if half:
-            _lay(boxes, "Roads", road)
+            boxes.add("Roads", road.center, road.size, ROAD_TOP_M - SLAB_M, ROAD_TOP_M, road.yaw_deg)
     tree = shapely.STRtree(roads)
     strips = list[Polygon]()
     for number, street in enumerate(net.streets):
@@ -71,15 +71,14 @@ def lay_streets(boxes: BoxList, net: Network, parked_share: float, rng: np.rando
         pave(boxes, shapely.difference(strip, shapely.union(others, roads[number])))
         plot = Plot(boxes.framed(street.start, street.yaw_deg), street.start, street.end, rng)
         _furnish(plot, street, clear, counts[number] > 1, parked_share if street not in net.bridges else None)
+        for side in (-1, 1) if street in net.bridges else ():
+            railing = (street.length_m / 2, side * (street.width_m - RAILING_M) / 2), (street.length_m, RAILING_M)
+            plot.add("Fences", *railing, -SLAB_M, 1.1)
         strips.append(strip)
     bridges = [strip for street, strip in zip(net.streets, strips, strict=True) if street in net.bridges]
     for polygon in polygons_of(shapely.difference(net.water, shapely.union_all(bridges))):
         for piece in cover(polygon, min_fill=0.97, min_size_m=PIECE_M, max_size_m=400.0):
             boxes.add("Water", piece.center, piece.size, WATER_BOTTOM_M, WATER_TOP_M, piece.yaw_deg)
-    for street in net.bridges:
-        for across in (RAILING_M - street.width_m, street.width_m - RAILING_M):
-            place = street.at(street.length_m / 2, across / 2)
-            boxes.add("Fences", place, (street.length_m, RAILING_M), -SLAB_M, 1.1, street.yaw_deg)
     return strips
 
 
@@ -120,9 +119,4 @@ def pave(boxes: BoxList, area: BaseGeometry, piece_m: float = PIECE_M) -> None:
     """Cover an area of any shape with pavement. piece_m: side of pieces that may reach over its edge."""
     for polygon in polygons_of(area):
         for piece in cover(polygon, min_fill=0.95, min_size_m=piece_m, max_size_m=80.0):
-            _lay(boxes, "Sidewalks", piece)
-
-
-def _lay(boxes: BoxList, kind: str, piece: Rectangle) -> None:
-    """Add ground at the height of its kind."""
-    boxes.add(kind, piece.center, piece.size, TOPS_M[kind] - SLAB_M, TOPS_M[kind], piece.yaw_deg)
+            boxes.add("Sidewalks", piece.center, piece.size, PAVED_TOP_M - SLAB_M, PAVED_TOP_M, piece.yaw_deg)
