@@ -450,7 +450,7 @@ def test_a_bad_object_is_skipped_and_counted_and_an_empty_map_is_an_error(tmp_pa
     model["CityObjects"]["more 4"] |= {"type": "Building", "geometry": [
         {"type": "MultiSurface", "lod": "1", "boundaries": [[[0, 1, len(model["vertices"]) - 1]]]}]}  # fmt: skip
     assert load(tmp_path, document(model)).header.dropped_objects == {"no_geometry": 1, "far_away": 1}
-    assert "more 4: skipped, because" in caplog.text
+    assert "skipped: more 4: it is more than 20 km" in caplog.text
     model["CityObjects"] = {"wall": {"type": "Building", "geometry": [
         {"type": "MultiSurface", "lod": "1", "boundaries": [[[0, 1, 5, 4]]]}]}}  # fmt: skip
     (tmp_path / "upright.json").write_bytes(document(model))

@@ -29,7 +29,7 @@ from shapely.geometry import LineString, Point, Polygon, shape
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource, read_boxes
 from cosfly.formats.columns import LARGEST
 from cosfly.formats.kinds import GROUND_KINDS, KINDS, SURFACE_KINDS
-from cosfly.maps.boxlist import WIDEST_M, BoxList, origin_m, required
+from cosfly.maps.boxlist import WIDEST_M, BoxList, Dropped, listed, origin_m, required
 from cosfly.maps.footprints import (
     CUT_SHARES,
     THINNEST_M,
@@ -43,7 +43,7 @@ from cosfly.maps.footprints import (
 )
 from cosfly.maps.units import METRES, Units, declared_units, length_m, seen_units, to_metres
 from cosfly.runtime.config import Config, read_yaml
-from cosfly.runtime.errors import MOST_NAMED, ConfigError, InputError, counts_text, nearest
+from cosfly.runtime.errors import ConfigError, InputError, counts_text, nearest
 from cosfly.runtime.io import read_text
 from cosfly.runtime.json_io import read_json
 
@@ -207,7 +207,7 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
         raise InputError("the file has no boxes", where=path, expected="at least one row or feature with a box")
     boxes = BoxList()
     sources = Counter[str]()
-    rows_by_problem = defaultdict[tuple[str, str], list[str]](list)  # so that each problem is listed once
+    dropped = Dropped()
     notes = defaultdict[str, list[str]](list)
     row_of_box: list[int] = []
     metric_rows = _in_metres(rows, units, path, is_table=suffix == ".csv")
@@ -224,40 +224,30 @@ def _read_rows(cfg: BoxesConfig, path: Path, suffix: str) -> BoxMap:
             row_of_box += [k] * (len(boxes) - num_before)
         except _Skipped as error:
             del boxes.rows[num_before:], boxes.kinds[num_before:]
-            rows_by_problem[error.reason, str(error)].append(row.where)
-    dropped = Counter[str]()
-    for (reason, _), places in rows_by_problem.items():
-        dropped[reason] += len(places)
-    problems = [_listed(places, problem) for (_, problem), places in rows_by_problem.items()]
+            dropped.add(error.reason, row.where, str(error), is_bad=error.reason != "unmapped_type")
     ids = _ids_of(rows) if cfg.is_plain else []
-    if are_bad_ids := len(set(ids)) < len(ids) or not all(0 <= number < 2**63 for number in ids):
-        problems.append("the ids must be different whole numbers")
-    num_unmapped = dropped["unmapped_type"]
-    is_too_bad = dropped.total() - num_unmapped > cfg.most_skipped * (len(rows) - num_unmapped)
-    if are_bad_ids or is_too_bad or not len(boxes):
-        expected = (
-            f"at most {cfg.most_skipped:.0%} invalid rows (maps.boxes.most_skipped); columns {', '.join(COLUMNS)}; "
-            f"types {', '.join(TYPES)}, or types listed in maps.boxes.types"
-        )
-        raise InputError.of_all(problems, where=path, expected=expected)
-    for problem in problems[:MOST_NAMED]:
-        log.warning("%s: skipped: %s", path.name, problem)
+    if len(set(ids)) < len(ids) or not all(0 <= number < 2**63 for number in ids):
+        dropped.add("bad_id", "id", "the ids must be different whole numbers")
+        dropped.num_bad += len(rows)
+    if not len(boxes):
+        dropped.num_bad += len(rows)
+    expected = (
+        f"at most {cfg.most_skipped:.0%} invalid rows (maps.boxes.most_skipped); columns {', '.join(COLUMNS)}; "
+        f"types {', '.join(TYPES)}, or types listed in maps.boxes.types"
+    )
+    dropped.check(path, len(rows) - dropped.counts["unmapped_type"], cfg.most_skipped, expected)
     for note, places in notes.items():
-        log.warning("%s: %s", path.name, _listed(places, note))
+        log.warning("%s: %s", path.name, listed(places, note))
     if sources["levels"] or sources["default"]:
         log.warning("%s: sources of the sizes of boxes: %s", path.name, counts_text(sources))
     header = MapHeader(name=cfg.name, ground_z_m=cfg.ground_z_m, num_objects=len(rows))
-    update: dict[str, Any] = {"dropped_objects": dict(dropped)} if dropped else {}
+    update: dict[str, Any] = {"dropped_objects": dict(dropped.counts)} if dropped.counts else {}
     if set(sources) != {"file"}:
         update["extent_sources"] = dict(sources)
     box_map = boxes.box_map(header.model_copy(update=update))
     if ids and len(set(row_of_box)) == len(box_map):  # no row became several boxes
         return replace(box_map, ids=np.array([ids[k] for k in row_of_box], dtype=np.uint64))
     return box_map
-
-
-def _listed(places: list[str], problem: str) -> str:
-    return f"{places[0]}: {problem}" + (f" (and {len(places) - 1} more)" if len(places) > 1 else "")
 
 
 def _in_metres(rows: list[_Row], units: Units, path: Path, *, is_table: bool) -> list[_Row]:

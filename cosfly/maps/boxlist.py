@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map
 from cosfly.formats.kinds import KINDS
-from cosfly.runtime.errors import ConfigError, InputError, counts_text
+from cosfly.runtime.errors import MOST_NAMED, ConfigError, InputError, counts_text
 from cosfly.runtime.io import over_limit
 
 log = logging.getLogger(__name__)
@@ -83,6 +84,35 @@ class BoxList:
         rotations_deg = np.zeros((len(rows), 3))
         rotations_deg[:, 1] = rows[:, 6]
         return make_box_map(rows[:, :3], rows[:, 3:6], rotations_deg, self.kinds, header=header)
+
+
+class Dropped:
+    """What a reader does not use of a file: numbers by reason, and the problems of bad entries with their places."""
+
+    def __init__(self) -> None:
+        self.counts = Counter[str]()
+        self.num_bad = 0
+        self._places = defaultdict[str, list[str]](list)  # so that each problem is listed once
+
+    def add(self, reason: str, where: str = "", problem: str = "", *, is_bad: bool = True) -> None:
+        """Count an entry; one with a problem is listed, and counts as bad unless `is_bad` is false."""
+        self.counts[reason] += 1
+        if problem:
+            self._places[problem].append(where)
+            self.num_bad += is_bad
+
+    def check(self, path: Path, num_entries: int, most_share: float, expected: str) -> None:
+        """Raise InputError if more than a share of the entries is bad; log the problems."""
+        problems = [listed(places, problem) for problem, places in self._places.items()]
+        if self.num_bad > most_share * num_entries:
+            raise InputError.of_all(problems, where=path, expected=expected)
+        for problem in problems[:MOST_NAMED]:
+            log.warning("%s: skipped: %s", path.name, problem)
+
+
+def listed(places: list[str], problem: str) -> str:
+    """Return a problem with its first place, and the number of the others."""
+    return f"{places[0]}: {problem}" + (f" (and {len(places) - 1} more)" if len(places) > 1 else "")
 
 
 def origin_m(low: np.ndarray, high: np.ndarray, where: str | Path, ground_z_m: float = 0.0) -> np.ndarray:

@@ -22,8 +22,8 @@ from shapely.geometry import Polygon
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, GroundGrid, LicenceId, MapHeader, MapSource
 from cosfly.formats.meshes import MESHES_FILE, Meshes, MeshRef
 from cosfly.geometry.ground import Ground
-from cosfly.maps.boxlist import WIDEST_M, BoxList, origin_m, required
-from cosfly.maps.cityjson_file import CityModel, CityObject, Surface, read_model
+from cosfly.maps.boxlist import BoxList, origin_m, required
+from cosfly.maps.cityjson_file import CityObject, Surface, read_model
 from cosfly.maps.footprints import (
     CUT_SHARES,
     MIN_AREA_M2,
@@ -37,7 +37,6 @@ from cosfly.maps.footprints import (
     with_derived_ground,
 )
 from cosfly.runtime.config import Config
-from cosfly.runtime.errors import MOST_NAMED, InputError
 
 log = logging.getLogger(__name__)
 
@@ -89,7 +88,7 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     """Read a city model; the seed changes nothing."""
     path = cfg.inputs()["city_model"]
     model = read_model(path, cfg.units, cfg.most_skipped)
-    objects, origin = _centred(_near(model, cfg, path), path)
+    objects, origin = _centred(model.objects, path)
     ground = ground_of(objects)
 
     def lowered(ring: np.ndarray) -> np.ndarray:
@@ -97,7 +96,7 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
 
     if not ground.is_flat:  # heights over the ground below each vertex; solids keep theirs, or their roofs would slope
         objects = [item if item.rule.form == "solid" else item.moved(lowered) for item in objects]
-    city = _boxes_of(objects, cfg, ground, model.dropped)
+    city = _boxes_of(objects, cfg, ground, model.dropped.counts)
     footprint_m2 = city.footprint_m2
     header = MapHeader(
         name=cfg.name, source=MapSource(tool=cfg.tool, version=f"CityJSON {model.version}", file=path.name),
@@ -105,7 +104,7 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
         offset_m=dict(zip("xyz", origin.tolist(), strict=True)), building_footprint_m2=round(footprint_m2, 1),
         building_area_ratio=round(city.boxes_m2 / footprint_m2, 4) if footprint_m2 else None,
         building_covered_share=round(city.covered_m2 / footprint_m2, 4) if footprint_m2 else None,
-        num_objects=model.num_objects, dropped_objects=dict(model.dropped),
+        num_objects=model.num_objects, dropped_objects=dict(+model.dropped.counts),
     )  # fmt: skip
     if not ground.is_flat:
         header = header.model_copy(update={"ground": GroundGrid.of(ground)})
@@ -114,21 +113,6 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
         follows = ~np.isin(np.arange(len(box_map)), city.solid_rows)
         box_map.centers[follows, 2] += ground.height_at(box_map.centers[follows])
     return with_derived_ground(box_map) if cfg.derive_ground else box_map
-
-
-def _near(model: CityModel, cfg: CityJsonConfig, path: Path) -> list[CityObject]:
-    """Return the objects near the middle of the map; the others are counted, and too many of them refuse the file."""
-    middle = np.median([item.corners().mean(axis=0) for item in model.objects], axis=0)
-    far = {item.object_id for item in model.objects if (np.abs(item.corners() - middle) > WIDEST_M).any()}
-    if not far:
-        return model.objects
-    where = f"{path}: {', '.join(sorted(far)[:MOST_NAMED])}"
-    if len(far) > cfg.most_skipped * model.num_objects:
-        expected = f"at most {cfg.most_skipped:.0%} of the objects"
-        raise InputError("objects are more than 20 km from the middle of the map", where=where, expected=expected)
-    log.warning("%s: skipped, because these %d objects are more than 20 km from the others", where, len(far))
-    model.dropped["far_away"] += len(far)
-    return [item for item in model.objects if item.object_id not in far]
 
 
 def _boxes_of(objects: list[CityObject], cfg: CityJsonConfig, ground: Ground, dropped: Counter[str]) -> CityBoxes:
@@ -161,8 +145,6 @@ def _boxes_of(objects: list[CityObject], cfg: CityJsonConfig, ground: Ground, dr
         if item.rule.kind == "Water":
             is_open = shapely.intersection(footprints[item.object_id], water).area > MIN_AREA_M2
             dropped["under_other_surfaces"] += not is_open
-    for reason in [reason for reason, count in dropped.items() if not count]:
-        del dropped[reason]
     return city
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import Counter
 from collections.abc import Callable
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -17,9 +16,10 @@ import numpy as np
 from pydantic import AliasPath, BaseModel, Field, FiniteFloat
 
 from cosfly.formats.columns import numbers
+from cosfly.maps.boxlist import WIDEST_M, Dropped
 from cosfly.maps.units import METRES, Units, declared_units, length_m, refused
 from cosfly.runtime.config import read_yaml
-from cosfly.runtime.errors import MOST_NAMED, InputError, counts_text, json_type, shown
+from cosfly.runtime.errors import InputError, counts_text, json_type, shown
 from cosfly.runtime.io import over_limit, read_unpacked
 from cosfly.runtime.json_io import parse_document, parse_json, validated
 
@@ -87,10 +87,10 @@ class CityObject(NamedTuple):
 
 
 class CityModel(NamedTuple):
-    """The objects that a rule covers, and the number of dropped objects by reason."""
+    """The objects that a rule covers, and those that are not used."""
 
     objects: list[CityObject]
-    dropped: Counter[str]
+    dropped: Dropped
     num_objects: int
     version: str
 
@@ -151,8 +151,7 @@ def read_model(path: Path, units: Units, most_skipped: float) -> CityModel:
     objects = dict[str, CityObject]()
     seen_ids = set[str]()
     num_objects = 0
-    dropped = Counter[str]()
-    problems: list[str] = []
+    dropped = Dropped()
     for where, part in [(str(path), head), *features] if head.objects else features:
         with np.errstate(all="ignore"):  # each ring is checked for finite numbers
             vertices = _vectors(part.vertices, f"{where}: vertices") * head.scale + head.translate
@@ -160,28 +159,24 @@ def read_model(path: Path, units: Units, most_skipped: float) -> CityModel:
         num_objects += len(part.objects)
         for object_id, value in part.objects.items():
             place = f"{where}: CityObjects.{object_id}"
-            reason = ""
-            try:
-                candidate = _city_object(object_id, validated(_Object, value, place), part, vertices, place)
-            except _Dropped as error:
-                reason = str(error)
-            except InputError as error:
-                reason = "invalid"
-                problems.append(str(error))
             if object_id in seen_ids:
-                reason = "repeated_id"
+                dropped.add("repeated_id")
+                continue
             seen_ids.add(object_id)
-            if reason:
-                dropped[reason] += 1
-            else:
-                objects[object_id] = candidate
-    if len(problems) > most_skipped * num_objects:
-        expected = f"at most {most_skipped:.0%} invalid objects"
-        raise InputError.of_all(problems, where=path, expected=expected)
-    for problem in problems[:MOST_NAMED]:
-        log.warning("skipped: %s", problem)
+            try:
+                objects[object_id] = _city_object(object_id, validated(_Object, value, place), part, vertices, place)
+            except _Dropped as error:
+                dropped.add(str(error))
+            except InputError as error:
+                dropped.add("invalid", str(error.where), str(error).removeprefix(f"{error.where}: "))
+    middle = np.median([item.corners().mean(axis=0) for item in objects.values()] or [np.zeros(3)], axis=0)
+    for object_id, item in list(objects.items()):
+        if (np.abs(item.corners() - middle) > WIDEST_M).any():
+            dropped.add("far_away", object_id, "it is more than 20 km from the middle of the map")
+            del objects[object_id]
+    dropped.check(path, num_objects, most_skipped, f"at most {most_skipped:.0%} invalid or far objects")
     if not objects:
-        counts = f"dropped objects: {counts_text(dropped)}" if dropped else "no objects"
+        counts = f"dropped objects: {counts_text(dropped.counts)}" if dropped.counts else "no objects"
         expected = "an object with a geometry and a supported type, such as Building"
         raise InputError("the file has no usable object", where=f"{path}: CityObjects", got=counts, expected=expected)
     return CityModel(list(objects.values()), dropped, num_objects, version)
