@@ -18,15 +18,13 @@ from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from cosfly.maps.footprints import Rectangle
-from cosfly.worldgen.plan import PATH_M, VERGE_M, WorldPlan
+from cosfly.worldgen.plan import PATH_M, VERGE_M, Range, WorldPlan
 
 LANE_M = 9.0  # narrower streets have no carriageway
 WIDE_M = 26.0  # wider streets have wide pavements
 QUAY_M = 10.0  # between the promenade and the open water
 PARALLEL_M = 16.0  # a street that is nearer to a bank or to the promenade all along is dropped
 GRID_M = 0.05  # of the ends of streets
-
-Size = tuple[float, float]
 
 
 class Line(NamedTuple):
@@ -67,7 +65,7 @@ class StraightStreet:
         x, y = self.direction
         return self.start + along_m * np.array([x, y]) + across_m * np.array([-y, x])
 
-    def rectangle(self, along: Size, across: Size) -> Rectangle:
+    def rectangle(self, along: Range, across: Range) -> Rectangle:
         """Return the rectangle between two distances along the street and two to its left, with the street's yaw."""
         x, y = self.at(sum(along) / 2, sum(across) / 2)
         return Rectangle((float(x), float(y)), (along[1] - along[0], abs(across[1] - across[0])), self.yaw_deg)
@@ -87,7 +85,7 @@ def _spaced(length_m: float, pitch_m: float, unevenness: float, rng: np.random.G
     return np.concatenate([[0.0], np.cumsum(shares / shares.sum())]) * length_m - length_m / 2
 
 
-def grid(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> list[Line]:
+def grid(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Line]:
     """Return streets at right angles; the proportions of blocks, the avenues and the offsets of rows vary."""
     stretch = rng.uniform(0.75, 1.35)
     pitch_x, pitch_y = plan.block_m * stretch + plan.street_m, plan.block_m / stretch + plan.street_m
@@ -109,7 +107,7 @@ def grid(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> list[Line]:
     return lines
 
 
-def radial(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> list[Line]:
+def radial(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Line]:
     """Return avenues that meet at a ring around the middle, and streets on rings between them."""
     half = np.array(size_m) / 2
     count = plan.spokes or int(rng.integers(5, 9))
@@ -138,17 +136,17 @@ def _polar(angles: float | np.ndarray, radii: float | list[float], half: np.ndar
     return np.stack([np.cos(turn), np.sin(turn)], axis=1) * share[:, None] * half
 
 
-def organic(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> list[Line]:
+def organic(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Line]:
     """Return streets that wind around blocks of any shape; those around the whole town are main streets."""
     return _winding(plan, size_m, rng, plan.street_m, plan.avenue_m)
 
 
-def campus(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> list[Line]:
+def campus(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Line]:
     """Return footpaths that wind over lawns, and a street around them."""
     return _winding(plan, size_m, rng, PATH_M, plan.street_m)
 
 
-def _winding(plan: WorldPlan, size_m: Size, rng: np.random.Generator, inner_m: float, outer_m: float) -> list[Line]:
+def _winding(plan: WorldPlan, size_m: Range, rng: np.random.Generator, inner_m: float, outer_m: float) -> list[Line]:
     """Return the edges of irregular cells, bent at random: inner ones, and those around all cells."""
     pitch_m = plan.block_m + inner_m
     half = np.array(size_m) / 2
@@ -178,7 +176,7 @@ def _winding(plan: WorldPlan, size_m: Size, rng: np.random.Generator, inner_m: f
     return lines
 
 
-def linear(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> list[Line]:
+def linear(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> list[Line]:
     """Return one long road with short streets to its sides; a river or a shore brings its own roads."""
     width, depth = size_m
     pitch_m = plan.block_m + plan.street_m
@@ -201,12 +199,12 @@ def linear(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> list[Line
     return lines
 
 
-PATTERNS: dict[str, Callable[[WorldPlan, Size, np.random.Generator], list[Line]]] = {
+PATTERNS: dict[str, Callable[[WorldPlan, Range, np.random.Generator], list[Line]]] = {
     "grid": grid, "radial": radial, "organic": organic, "linear": linear, "campus": campus,
 }  # fmt: skip
 
 
-def network(plan: WorldPlan, size_m: Size, rng: np.random.Generator) -> Network:
+def network(plan: WorldPlan, size_m: Range, rng: np.random.Generator) -> Network:
     """Return the streets and the water of a town of a size."""
     margin_m = VERGE_M + max(plan.avenue_m, plan.street_m) / 2
     below_m = plan.block_m + plan.street_m if plan.shore_m else 0.0  # of the pattern, under the water

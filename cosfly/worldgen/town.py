@@ -21,7 +21,7 @@ from shapely.geometry.base import BaseGeometry
 
 from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.formats.kinds import KIND_NAMES, KINDS
-from cosfly.maps.boxlist import PAVED_TOP_M, SLAB_M, BoxList
+from cosfly.maps.boxlist import SLAB_M, BoxList
 from cosfly.maps.footprints import Rectangle, footprints, oriented_rectangle, polygons_of, rectangle_polygon
 from cosfly.runtime.seeding import rng_for
 from cosfly.simulators.assets import ASSETS
@@ -262,9 +262,8 @@ class Town:
         line = shapely.shortest_line(outline, self._paved.geometries[self._paved.nearest(outline)])
         if line.length > 0.5:
             (x, y), (to_x, to_y) = line.coords
-            yaw_deg = math.degrees(math.atan2(to_y - y, to_x - x))
-            size = (line.length + 0.5, DOOR_M)
-            boxes.add("Sidewalks", ((x + to_x) / 2, (y + to_y) / 2), size, PAVED_TOP_M - SLAB_M, PAVED_TOP_M, yaw_deg)
+            path = boxes.framed((x, y), math.degrees(math.atan2(to_y - y, to_x - x)))
+            path.lay("Sidewalks", (-0.25, -DOOR_M / 2), (line.length + 0.25, DOOR_M / 2))
 
     def _place_object(self, thing: Object, count: int) -> None:
         """Place an object `count` times: in open blocks, at a street, on the quay or in the water."""
@@ -371,12 +370,10 @@ class Town:
 
 def _add_object(boxes: BoxList, thing: Object, place: Rectangle, scale: float) -> None:
     """Add an object's boxes; the heights of its high parts are scaled like its footprint."""
-    cos, sin = math.cos(math.radians(place.yaw_deg)), math.sin(math.radians(place.yaw_deg))
+    placed = boxes.framed(place.center, place.yaw_deg)
     for kind, x, y, wide, deep, low, high in thing.parts:
-        middle = place.center[0] + scale * (cos * x - sin * y), place.center[1] + scale * (sin * x + cos * y)
-        height_scale = scale if high > 1.0 else 1.0
-        scaled_low = low * height_scale if low > 0 else low
-        boxes.add(kind, middle, (wide * scale, deep * scale), scaled_low, high * height_scale, place.yaw_deg)
+        tall = scale if high > 1.0 else 1.0
+        placed.add(kind, (scale * x, scale * y), (wide * scale, deep * scale), min(low, low * tall), high * tall)
 
 
 @cache
