@@ -41,7 +41,7 @@ def _ends(streets: list[StraightStreet]) -> tuple[np.ndarray, np.ndarray]:
     """
     places = shapely.points([end for street in streets for end in (street.start, street.end)])
     away = np.array([sign * street.direction for street in streets for sign in (1.0, -1.0)])
-    one, other = shapely.STRtree(places).query(places, predicate="dwithin", distance=0.1)
+    one, other = shapely.STRtree(places).query(places, predicate="dwithin", distance=0.01)  # on a grid
     one, other = one[one != other], other[one != other]
     straightest = np.full(len(away), -1.0)
     np.maximum.at(straightest, one, -(away[one] * away[other]).sum(axis=1))
