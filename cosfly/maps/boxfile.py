@@ -314,36 +314,31 @@ def _ids_of(rows: Sequence[_Row]) -> list[int]:
 
 
 def _table_rows(cfg: BoxesConfig, path: Path) -> list[_Row]:
-    rows: list[_Row] = []
-    lines = csv.reader(io.StringIO(read_text(path, what="table of boxes").removeprefix("\ufeff")), strict=True)
-    names: list[str] = []
+    reader = csv.reader(io.StringIO(read_text(path, what="table of boxes").removeprefix("\ufeff")), strict=True)
     try:
-        for line in lines:
-            cells = [cell.strip() for cell in line]
-            if not any(cells):
-                continue
-            if not names:
-                names = [OTHER_NAMES.get(cell, cell) for cell in cells]
-                problems = _unknown(names, cfg)
-                problems += [f"the column {name} is missing" for name in PLACE if name not in names]
-                if not set(cfg.type_columns) & set(names):
-                    problems.insert(0, f"the column {cfg.type_column} is missing")
-                problems += [f"the column {name} occurs twice" for name, count in Counter(names).items() if count > 1]
-                if problems:
-                    raise InputError.of_all(
-                        problems, where=path, expected=f"columns {', '.join(COLUMNS)}, separated by commas"
-                    )
-                continue
-            problem = "" if len(cells) == len(names) else f"{len(cells)} cells, but the first line has {len(names)}"
-            values = {name: cell for name, cell in zip(names, cells, strict=False) if cell}
-            x, y = (_number(values.get(name)) for name in ("x_m", "y_m"))
-            if not problem and math.isnan(x + y):
-                problem = f"x_m and y_m are not finite numbers: {values.get('x_m')!r}, {values.get('y_m')!r}"
-            place = Point() if problem else Point(x, y)
-            rows.append(_Row(f"line {lines.line_num}", values, place, problem=problem, reason="bad_value"))
+        lines = [(f"line {reader.line_num}", [cell.strip() for cell in line]) for line in reader]
     except csv.Error as error:
-        where, fix = f"{path}: line {lines.line_num}", "export the table again as CSV"
+        where, fix = f"{path}: line {reader.line_num}", "export the table again as CSV"
         raise InputError("the file is not a CSV table", where=where, got=str(error), fix=fix) from None
+    lines = [(where, cells) for where, cells in lines if any(cells)]
+    if not lines:
+        return []
+    names = [OTHER_NAMES.get(cell, cell) for cell in lines[0][1]]
+    problems = [] if set(cfg.type_columns) & set(names) else [f"the column {cfg.type_column} is missing"]
+    problems += _unknown(names, cfg)
+    problems += [f"the column {name} is missing" for name in PLACE if name not in names]
+    problems += [f"the column {name} occurs twice" for name, count in Counter(names).items() if count > 1]
+    if problems:
+        raise InputError.of_all(problems, where=path, expected=f"columns {', '.join(COLUMNS)}, separated by commas")
+    rows: list[_Row] = []
+    for where, cells in lines[1:]:
+        problem = "" if len(cells) == len(names) else f"{len(cells)} cells, but the first line has {len(names)}"
+        values = {name: cell for name, cell in zip(names, cells, strict=False) if cell}
+        x, y = (_number(values.get(name)) for name in ("x_m", "y_m"))
+        if not problem and math.isnan(x + y):
+            got = ", ".join(repr(str(values.get(name))[:40]) for name in ("x_m", "y_m"))
+            problem = f"x_m and y_m are not finite numbers: {got}"
+        rows.append(_Row(where, values, Point() if problem else Point(x, y), problem, "bad_value"))
     return rows
 
 
