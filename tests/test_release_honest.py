@@ -2,15 +2,15 @@
 release tells of lies about them.
 
 Real maps stand first: a check of looks that holds in a synthetic town alone is found here. Each kind is a run of a few
-short flights that shares maps, walks and plans with the kinds of its map. The table of all kinds is looked through to
-its end, so that one run names everything that is wrong.
+short flights that shares maps, walks and plans with the kinds of its map. Simulators send poses and depth in less than
+double precision, so their town lies kilometres from the origin, where that shows.
 """
 
 import os
 import re
 import shutil
-import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -19,10 +19,13 @@ import pytest
 from conftest import SHARED_DATA
 from release_lies import Lie, Row, box_moved, captioned, ids_of_things_exchanged
 from release_tampering import depth_of, errors_in, forge, set_depth
+from simulator_serving import serving
 from teacher_server import TeacherServer
 
 from caption.stage.released import read_released
+from cosfly.formats.boxes import BoxMap
 from cosfly.formats.captions import write_captions
+from cosfly.maps import synthetic
 from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
@@ -60,6 +63,8 @@ MAPS = {
             "pedestrians.pace={hurry: 1, stop_and_look: 1}"]),
     "crowd": (None, ["maps.synthetic.preset=market", "pedestrians.others=6", "pedestrians.traffic=4"]),
     "one": (None, ["pedestrians.num_paths=1"]),
+    "carla": (None, ["maps.source=carla", "maps.carla.port=CARLA_PORT"]),
+    "unrealcv": (None, ["maps.source=unrealcv", "maps.unrealcv.port=UNREALCV_PORT"]),
 }  # fmt: skip
 
 
@@ -70,7 +75,7 @@ def weather(name: str, time_of_day: str) -> list[str]:
 
 
 SMALL, HD = ["render.width_px=160", "render.height_px=90"], ["render.width_px=1280", "render.height_px=720"]
-NARROW = ["render.fovs_deg=[30]"]
+NARROW, WIDE = ["render.fovs_deg=[30]"], ["render.fovs_deg=[110]"]
 ZOOM = ["render.fovs_deg=[30, 60, 90]", "render.zoom.mode=dynamic", "render.zoom.part_s=5", "render.zoom.ramp_s=2"]
 FAR = [
     "render.perturbation.pedestrian_radius_m=6", "render.perturbation.drone_radius_m=6",
@@ -78,6 +83,11 @@ FAR = [
     "render.perturbation.view_radius_m=6",
 ]  # fmt: skip
 TEACHER = "caption.teacher=TEACHER"
+CARLA = [*SMALL, "render.backend=carla", "render.carla.port=CARLA_PORT"]
+UNREALCV = [
+    *SMALL, "render.backend=unrealcv", "render.unrealcv.port=UNREALCV_PORT", "render.unrealcv.animate=false",
+    "render.unrealcv.settle_delay_s=0",
+]  # fmt: skip
 # kind -> map, what its run is told
 KINDS = {
     "simworld as shipped": ("simworld", []),
@@ -88,15 +98,20 @@ KINDS = {
     "simworld zoom": ("simworld", ZOOM),
     "simworld far perturbation": ("simworld", FAR),
     "simworld robotics towers": ("simworld_towers", []),
+    "simworld robotics dusk": ("simworld_towers", [*SMALL, *weather("snow_haze", "dusk")]),
     "delft 160 px": ("delft", SMALL),
     "delft 1280 px": ("delft", [*HD, "render.tracks=[clean]", "release.tracks=[clean]"]),
     "delft rain": ("delft", weather("medium_rain", "noon")),
+    "delft 110 degrees": ("delft", [*SMALL, *WIDE]),
+    "delft far perturbation": ("delft", [*SMALL, *FAR]),
     "delft second renderer": ("delft", ["render.backend=pyrender", *SMALL]),
     "3D BAG campus": ("campus_3dbag", []),
+    "3D BAG campus zoom": ("campus_3dbag", [*SMALL, *ZOOM]),
     "town": ("town", []),
     "town second renderer": ("town", ["render.backend=pyrender"]),
     "town 1280 px": ("one", HD),
     "town random weather": ("town", ["render.look={}", "render.weather_mode=random_per_path"]),
+    "town fog at night": ("town", [*SMALL, *weather("dense_fog", "night")]),
     "town cubic perturbation": ("town",
         [*FAR, "render.perturbation.sampling=cubic", "render.perturbation.position_probability=1"]),
     "town colours alone": ("town", ["release.modalities=[rgb]"]),
@@ -110,6 +125,11 @@ KINDS = {
     "park of styles": ("park_styles", []),
     "crowd": ("crowd", []),
     "single flight": ("one", ["render.tracks=[clean]", "release.tracks=[clean]"]),
+    "CARLA": ("carla", CARLA),
+    "CARLA in rain": ("carla", [*CARLA, *weather("medium_rain", "noon")]),
+    "CARLA zoom": ("carla", [*CARLA, *ZOOM]),
+    "UnrealCV": ("unrealcv", UNREALCV),
+    "UnrealCV narrow": ("unrealcv", [*UNREALCV, *NARROW]),
 }  # fmt: skip
 
 
@@ -124,15 +144,14 @@ def work(stages: list[pipeline.Stage]) -> None:
 
 
 class Runs:
-    def __init__(self, root: Path, data: Path, teacher_url: str) -> None:
-        self._root, self._data, self._teacher_url = root, data, teacher_url
+    def __init__(self, root: Path, names: dict[str, str]) -> None:
+        self._root, self._names = root, names
         self._made = dict[str, Path]()
 
     def settings(self, map_name: str, told: list[str]) -> RunConfig:
         config, own = MAPS[map_name]
-        names = {"DATA": str(self._data), "TEACHER": self._teacher_url}
         texts = [*SHORT, *own, *told]
-        for name, value in names.items():
+        for name, value in self._names.items():
             texts = [text.replace(name, value) for text in texts]
         return load(RunConfig, None if config is None else CONFIGS / f"{config}.yaml", texts)
 
@@ -157,27 +176,29 @@ class Runs:
         return package.run(cfg.release, [source], out / "release")
 
 
+def far_town() -> BoxMap:
+    town = synthetic.load(synthetic.SyntheticConfig(), 0)
+    return replace(town, centers=town.centers + np.array([4000.137, -3000.291, 0.0]))
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory) -> Iterator[Runs]:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"the real maps are not here: {SHARED_DATA}")
-    with TeacherServer() as teacher:
-        yield Runs(tmp_path_factory.mktemp("honest"), SHARED_DATA, teacher.url)
+    town, root = far_town(), tmp_path_factory.mktemp("honest")
+    with (
+        TeacherServer() as teacher,
+        serving(town, root / "carla") as carla,
+        serving(town, root / "unrealcv", protocol="unrealcv") as unrealcv,
+    ):
+        names = {"CARLA_PORT": str(carla), "UNREALCV_PORT": str(unrealcv)}
+        yield Runs(root, names | {"DATA": str(SHARED_DATA), "TEACHER": teacher.url})
 
 
-def test_honest_releases_of_every_kind_verify(runs, capsys):
-    wrong = []
-    for kind in KINDS:
-        begun = time.monotonic()
-        report = verify(runs.made(kind), reader=read_released)
-        found = [issue for issue in report.issues if issue.severity == "error"]
-        lines = [
-            f"{kind}: {one.code} x{one.count}: {one.where}: got {one.got}, expected {one.expected}" for one in found
-        ]
-        wrong += lines
-        with capsys.disabled():
-            print(f"\n{kind}: {time.monotonic() - begun:.0f} s", *lines, sep="\n    ", end="", flush=True)
-    assert not wrong, "\n".join(wrong)
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_honest_release_verifies(runs, kind):
+    report = verify(runs.made(kind), reader=read_released)
+    assert report.is_ok, str(report)
 
 
 def depth_of_all(factor: float, offset_m: float) -> Lie:

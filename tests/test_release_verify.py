@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from commands import invoke
 from release_lies import LIES, at, captioned, change, everything, put
-from release_tampering import errors_in, forge, read_all, set_depth
+from release_tampering import depth_of, errors_in, forge, read_all, set_depth
 from specimens_foreign import hub_snapshot
 from specimens_png import png_around
 from tables import each
@@ -54,6 +54,18 @@ def test_an_honest_release_passes(honest, level):
 
 def test_a_release_that_the_kit_wrote_again_passes(honest, tmp_path):
     assert errors_in(forge(honest, tmp_path / "again", lambda rows: None)) == {}
+
+
+def test_depth_in_half_precision_passes(honest, tmp_path):
+    """A server of Unreal sends such depth, in centimetres."""
+
+    def rounded(rows: list[dict]) -> None:
+        for row in rows:
+            depth = depth_of(row)
+            half = (depth * 100).astype(np.float16).astype(np.float32) / 100
+            set_depth(row, np.where(depth < 600.0, half, depth))
+
+    assert errors_in(forge(honest, tmp_path / "forged", rounded)) == {}
 
 
 @pytest.mark.slow

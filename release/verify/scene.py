@@ -153,12 +153,18 @@ SAME_LEAST = 0.95  # of the instances, of ground the kinds; honest 0.985
 # of ground; depth that is scaled by 2 % 1.8e-4 and more of what stands; pixels on a round tower 1e-4 at most.
 FLAT_MOST, STANDING_MOST = 2e-5, 1e-4
 LEAST_FRAMES = 5  # for a median
+# UnrealCV sends depth in half precision. Two half-precision numbers differ by 2 ** -11 of the greater one or more; the
+# conversion to metres in single precision changes that by 2 ** -23 at most. Rounding changes a depth by 2 ** -11 at
+# most, half of the greatest difference of neighbouring numbers, and a pair of frames compares two rounded depths.
+HALF_STEP = 2.0**-11
+SAME_STEP = 0.99 * HALF_STEP
+LEAST_DEPTHS = 100  # different ones in a picture, for their distances to mean something
 Pair = tuple[int, int, Agreement]  # of neighbouring frames: row of the later one, frames between them
 
 
 def check_pictures(flight: FlightRows, pictures: Iterator[Pictures], findings: Findings) -> None:
     """Check all pictures of a flight, one after the other; memory holds two frames."""
-    pairs, kinds = list[Pair](), np.full(NUM_IDS, -1, np.int64)
+    pairs, kinds, steps = list[Pair](), np.full(NUM_IDS, -1, np.int64), list[float]()
     before: tuple[int, View] | None = None
     for i, files in enumerate(pictures):
         advance()
@@ -175,15 +181,29 @@ def check_pictures(flight: FlightRows, pictures: Iterator[Pictures], findings: F
             k, previous = before
             agreement = compare_views(previous, view, flight.intrinsics[k], flight.intrinsics[i])
             pairs.append((i, int(flight.index[i] - flight.index[k]), agreement))
+        if decoded[0].size:
+            steps += _step_of(decoded[0])
         before = (i, view)
     if pairs and not flight.is_foreign:  # depth of others may be rough
-        _judge_pairs(flight, pairs, findings)
+        is_half = min(steps, default=0.0) >= SAME_STEP
+        _judge_pairs(flight, pairs, 2 * HALF_STEP if is_half else 0.0, findings)
+
+
+def _on_grid(picture: np.ndarray) -> np.ndarray:
+    """Return the values of a picture at GRID x GRID points."""
+    return picture[np.ix_(*(np.linspace(0, size - 1, GRID).astype(int) for size in picture.shape[:2]))]
+
+
+def _step_of(depth: np.ndarray) -> list[float]:
+    """Return the least distance of two depths at a grid of points, as a share; nothing where few differ."""
+    depths = np.unique(_on_grid(depth)).astype(np.float64)
+    depths = depths[(depths > 0.0) & (depths < SKY_DEPTH_M)]
+    return [float((np.diff(depths) / depths[1:]).min())] if len(depths) >= LEAST_DEPTHS else []
 
 
 def _check_kinds(flight: FlightRows, i: int, instance: np.ndarray, kinds: np.ndarray, findings: Findings) -> None:
     """Check at a grid of points that a thing has one kind in all frames. kinds: (NUM_IDS,), -1: not seen yet."""
-    rows, columns = (np.linspace(0, size - 1, GRID).astype(int) for size in instance.shape[:2])
-    kind, low, high = np.moveaxis(instance[np.ix_(rows, columns)].astype(np.int64), 2, 0)
+    kind, low, high = np.moveaxis(_on_grid(instance).astype(np.int64), 2, 0)
     ids = low | high << 8
     is_new = (ids != 0) & (ids != SHARED_ID) & (kinds[ids] != kind)
     for own, found in np.unique(np.stack([ids, kind], axis=-1)[is_new], axis=0):
@@ -193,11 +213,12 @@ def _check_kinds(flight: FlightRows, i: int, instance: np.ndarray, kinds: np.nda
         kinds[own] = found
 
 
-def _judge_pairs(flight: FlightRows, pairs: list[Pair], findings: Findings) -> None:
-    """Find depth that is scaled or shifted, whose planes move with the camera, and pairs that do not show one world."""
+def _judge_pairs(flight: FlightRows, pairs: list[Pair], rounding: float, findings: Findings) -> None:
+    """Find depth that is scaled or shifted, whose planes move with the camera, and pairs that do not show one world.
+    rounding: Of two depths, as a share."""
     for what, most, errors in (
-        ("ground", FLAT_MOST, [pair.error_flat for *_, pair in pairs]),
-        ("objects on it", STANDING_MOST, [pair.error_off_flat for *_, pair in pairs]),
+        ("ground", FLAT_MOST + rounding, [pair.error_flat for *_, pair in pairs]),
+        ("objects on it", STANDING_MOST + rounding, [pair.error_off_flat for *_, pair in pairs]),
     ):
         known = [error for error in errors if np.isfinite(error)]
         if len(known) >= LEAST_FRAMES and (error := float(np.median(known))) > most:
@@ -205,19 +226,19 @@ def _judge_pairs(flight: FlightRows, pairs: list[Pair], findings: Findings) -> N
             expected = f"at most {most:.4%}, for depth in metres along the optical axis"
             findings.error("scene_depth", flight.name, got, expected)
     for i, gap, pair in pairs:
-        if pair.seen >= LEAST_SEEN and (odd := _odd_pair(pair, gap <= NEAR_FRAMES)):
+        if pair.seen >= LEAST_SEEN and (odd := _odd_pair(pair, gap <= NEAR_FRAMES, ERROR_MOST + rounding)):
             findings.error(odd[0], flight.where(i), *odd[1:])
 
 
-def _odd_pair(pair: Agreement, is_near: bool) -> tuple[str, str, str] | None:
+def _odd_pair(pair: Agreement, is_near: bool, error_most: float) -> tuple[str, str, str] | None:
     """Return code, got and expected of two frames that do not show one world, else None."""
     is_known, off = pair.agree >= LEAST_AGREE, ""
     if np.isfinite(pair.error):
         off = f", and an error of {pair.error:.2%} in planes"
     rules = (
-        (pair.error > ERROR_MOST or (is_near and pair.missing_share > GONE_MOST), "scene_depth",
+        (pair.error > error_most or (is_near and pair.missing_share > GONE_MOST), "scene_depth",
          f"{pair.missing_share:.1%} of the points in front of the surfaces of this or the previous frame{off}",
-         f"at most {GONE_MOST:.1%}, and an error of at most {ERROR_MOST:.2%}, for depth, pose and camera that agree "
+         f"at most {GONE_MOST:.1%}, and an error of at most {error_most:.2%}, for depth, pose and camera that agree "
          "with the previous frame"),
         (is_near and pair.moved, "scene_depth",
          f"an object of {pair.moved} points that is farther away than in the previous frame",
