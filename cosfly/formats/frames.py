@@ -43,6 +43,7 @@ LEVEL_NAMES: dict[float, str] = {110: "wide-angle", 90: "standard", 60: "narrow"
 SKY_DEPTH_M = 1000.0  # depth of the sky and of everything beyond
 INVALID_DEPTH_M = 0.0
 PERSON_ID = 65535  # instance id of the target in `instance.png`
+SHARED_ID = 65534  # of all boxes beyond the range of ids: docs/files.md
 META_FORMAT = FileFormat("cosfly.frame", "1.0", "frame annotation")
 # A visible target is legible if it reaches these minima.
 LEGIBLE_HEIGHT_PX = 16.0

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cosfly.formats.frames import SHARED_ID
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
 from cosfly.runtime.compiled import njit
 
@@ -20,7 +21,6 @@ LEAST_PLANES = 30  # points; the depth error of fewer is not reported
 LEAST_OF_OBJECT = 12  # points of an object; fewer are not reported
 SEEN, AGREE, HIDDEN, MISSING, SAME = range(5)  # indices of the counts of `_reproject`; names as in `Agreement`
 FIRM, MOVED, OTHER_ID = 1, 2, 3  # states of a point, see `_reproject`
-SHARED_ID = 65534  # instance id of several objects: docs/files.md
 # Kinds of objects that may be elsewhere in the next frame, (256,) bool by kind.
 MOVING = np.isin(np.arange(256), [KINDS[kind] for kind in (
     "Pedestrians", "Rider", "Car", "Truck", "Bus", "Train", "Motorcycle", "Bicycle", "Dynamic",

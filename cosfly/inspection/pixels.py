@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.formats.frames import DEPTH_NPY, INVALID_DEPTH_M, SKY_DEPTH_M, depth_values, public_name
+from cosfly.formats.frames import DEPTH_NPY, INVALID_DEPTH_M, SHARED_ID, SKY_DEPTH_M, depth_values, public_name
 from cosfly.formats.kinds import KINDS
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
@@ -23,7 +23,6 @@ NO_DEPTH.flags.writeable = False
 NO_IDS = np.empty((0, 0, 3), np.uint8)
 NUM_IDS = 1 << 16
 PERSON, NOTHING, SKY = KINDS["Pedestrians"], KINDS["NONE"], KINDS["Sky"]
-SHARED_ID = 65534  # the id of all boxes beyond the range of ids (docs/files.md)
 MAGENTA_LEAST = 200  # least red and blue
 MAGENTA_MOST = 60  # most green
 DARK = 16  # grey levels; darker surfaces have one colour at night

@@ -20,6 +20,7 @@ import numpy as np
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import PERSON_ID as PERSON_ID
+from cosfly.formats.frames import SHARED_ID as SHARED_ID
 from cosfly.formats.frames import SKY_DEPTH_M
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
 from cosfly.formats.people import COLORS, Appearance
@@ -32,7 +33,7 @@ NEAR_M = 0.3  # near clip plane (sec:step5)
 FAR_M = SKY_DEPTH_M  # far clip plane
 
 # Instance ids, 16 bits in instance.png, in addition to PERSON_ID: 0 is no instance (sky, ground plane).
-SHARED_ID, MAX_BOX_ID = 65534, 65533
+MAX_BOX_ID = 65533
 NO_INSTANCE = 0
 
 GROUND_PLANE_HALF_M = 1500.0

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.formats.frames import PERSON_ID, SKY_DEPTH_M, FrameFile, depth_values
+from cosfly.formats.frames import PERSON_ID, SHARED_ID, SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.formats.kinds import KINDS
 from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.geometry.goals import SeenFrame, meant, target_picture, words_of
-from cosfly.geometry.reprojection import LEAST_SEEN, SHARED_ID, Agreement, View, compare_views
+from cosfly.geometry.reprojection import LEAST_SEEN, Agreement, View, compare_views
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.png import colours_of
