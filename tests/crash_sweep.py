@@ -182,7 +182,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "study weather": ["study weather --map {maps} --traces {traces} --out {out} {tiny}"],
     "study zoom": ["study zoom {three} --out {out} --every 10"],
     "view map": ["view {simple} --out {out}/scene.html --paths {walks} --traces {traces} --data {tree}"],
-    "view release": ["view {release} --out {out}/viewer.html"],
+    "view run": ["view {base} --out {out}/viewer.html"],
     "view tree": ["view {tree} --out {out}/sheet.png"],
     "view frame": ["view {tree} --out {out}/sample.png --frame best --map {maps}"],
     "inspect": ["inspect --map {simple} --traces {traces} --data {tree} --out {out} {tiny}"],

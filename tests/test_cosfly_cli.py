@@ -64,6 +64,7 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
         (tmp_path / name).write_text("a file")
     for folder in ("stage", "deep/stage"):
         write_json(tmp_path / folder / "stage.json", {})
+    write_json(tmp_path / "released/dataset/release.json", {})
     (tmp_path / "zero.json").symlink_to("/dev/zero")
     (tmp_path / "quickstart").mkdir()  # hides the configuration of its name from nobody
     assert resolve(Path("quickstart"), None).name == "quickstart"
@@ -79,6 +80,7 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
         (("run", "stage"), ("stage: this folder is not", "no run.yaml", "cosfly list stage")),
         (("config", "check", "deep/stage"), ("deep/stage: this folder is not", "no run.yaml", "quickstart")),
         (("view", "town", "--out", "x"), ("town", "the directory of rendered tracks does not exist", "check the path")),
+        (("view", "released", "--out", "x"), ("released/dataset", "a release has no page", "datasets.load_dataset")),
         (("simplify", "--map", "zero.json", "--out", "x"), ("zero.json", "a device", "a regular file")),
         (("caption", "prompts", "--export", "taken"), ("taken", "cannot be written", "--out")),
         (

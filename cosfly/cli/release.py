@@ -10,6 +10,7 @@ from typer import Argument, Option
 
 from cosfly.cli import options
 from cosfly.cli.options import WORKERS, Job, SettingOption, command, track_options
+from cosfly.runtime.errors import InputError
 
 options.add_group("release", "Package captions and frames as a data set that opens with one line.")
 SELECTION = "Frames of each track: a uniform stride, runs that keep windows of captions whole, or all."
@@ -120,6 +121,14 @@ def view(
     picture_px: Annotated[int, Option(min=32, max=1280, help="Width of a frame on a page, px.")] = 320,
 ) -> None:
     """Make a page or a picture of a map, a playback tree or a run; pages work offline."""
+    from release.record import RECORD
+
+    for dataset in (source, source / "dataset"):
+        if (dataset / RECORD).is_file():
+            raise InputError(
+                "a release has no page", where=dataset, expected="a map, a playback tree or a run directory",
+                fix=f'open it with data = datasets.load_dataset("{dataset}"), or view the run that it is made of',
+            )  # fmt: skip
     if source.is_file():
         job.call(
             "cosfly.viz.scene_page", source, out, paths=paths, traces=traces or [], data=data, picture_px=picture_px
