@@ -24,7 +24,6 @@ from cosfly.formats.frames import (
     MOST_FOV_DEG,
     PERSON_ID,
     FrameFile,
-    Look,
 )
 from cosfly.formats.places import sample_id
 from cosfly.formats.playback import EVENTS, Track
@@ -36,7 +35,6 @@ from cosfly.runtime.json_io import dump_json
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")
 POINT = ("x_m", "y_m", "z_m")
 INTRINSICS = ("fx", "fy", "cx", "cy")
-LOOK = tuple(Look.model_fields)
 WEATHER_PARAMS = tuple(WeatherParams.model_fields)
 BOX = ("xmin_px", "ymin_px", "xmax_px", "ymax_px")
 LANGUAGES: tuple[Language, ...] = get_args(Language)
@@ -66,14 +64,12 @@ LISTS = {"indices": "int32", "texts": "string", "numbers": "float64"}  # types t
 class Placement:
     """What the rows of a flight say of its place in the release: the columns of these names.
 
-    pair: the name of its twin in the records, None where that is not released. look: (4,) sun and air (LOOK), None
-    where nobody says.
+    pair: the name of its twin in the records, None where that is not released.
     """
 
     walk: str
     split: SplitName
     pair: str | None = None
-    look: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -201,13 +197,6 @@ FRAME = (  # everything of a frame but pictures and depth
         ranges={
             **dict.fromkeys(("cloudiness", "precipitation", "fog_density"), (0.0, 100.0)), "fog_distance": (1e-9, 1e6),
             "sun_altitude_angle": (-90.0, 90.0), "sun_azimuth_angle": (0.0, 360.0),
-        },
-    ),
-    Column(
-        "look", LOOK, constant=True,
-        ranges={
-            "sun_azimuth_deg": (0.0, 360.0), "sun_elevation_deg": (-90.0, 90.0), "haze_m": (0.0, 1e6),
-            "exposure": (0.0, 100.0),
         },
     ),
     Column("frame_index", "int32", lambda f, i: i, required=True),

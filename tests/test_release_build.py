@@ -217,11 +217,6 @@ def of_no_frame(root: Path) -> None:
     rewrite_captions(root, lambda lines: lines[0].update(names, sample_id=lines[0]["sample_id"][:-5] + "00099"))
 
 
-def time_of_1e999(root: Path) -> None:
-    path = first_flight(root) / FIFTH / "meta.json"
-    path.write_text(path.read_text().replace('"time_s": 2.5', '"time_s": 1e999'))
-
-
 def not_finite(root: Path) -> None:
     path = first_flight(root) / "trajectory.json"
     text = path.read_text()
@@ -242,7 +237,6 @@ DAMAGES = {
     "a frame that is missing": (lambda r: shutil.rmtree(first_flight(r) / FIFTH), "missing or empty"),
     "a picture that is missing": (lambda r: (first_flight(r) / FIFTH / "instance.png").unlink(), "missing or empty"),
     "1e999 in a trajectory": (not_finite, "is not finite"),
-    "1e999 in an annotation": (time_of_1e999, "is not finite"),
     "pictures of two sizes": (other_size, "the tracks differ in the size of pictures"),
     "another version": (lambda r: change_json(first_flight(r) / "trajectory.json",
         lambda v: v.update(schema_version="8.0.0")), "schema_version"),

@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import BaseModel
@@ -25,7 +23,6 @@ from cosfly.formats.frames import (
     depth_values,
     frame_name,
     frame_path,
-    read_meta,
     tree_of,
 )
 from cosfly.formats.playback import TARGET_FILE, Track
@@ -43,7 +40,6 @@ from release.record import StoredFile
 # Values between two looks at the size of a page: with more a page takes a whole row group, twice in memory.
 VALUES_A_BATCH = 4
 MOST_ROWS = 1000  # of a row group: of small pictures it would hold more rows than memory should
-META = "meta.json"
 RENDER = "render the track again, or restore the file"
 RESTORE = "restore the file, or inspect and caption the changed tree"
 
@@ -150,10 +146,8 @@ def _write_track(chosen: Chosen, track: Track, files: Collection[FrameFile], row
         frame = track.frame_folder(i)
         if frame.is_symlink():
             check_stays_below(frame, tree)
-        _check_digest(folder, f"{frame_name(i)}/{META}", None, digests)
-        placement = replace(chosen.placement, look=_look_of(track, i))
         caption = caption_values(chosen.captions.read(i)) if i in chosen.captions.spans else None
-        row, num_bytes = columns.scalar_row(track, i, caption, placement), 0
+        row, num_bytes = columns.scalar_row(track, i, caption, chosen.placement), 0
         for file in files:
             path = frame_path(frame, FILE_NAMES[file])
             inside = tree if path.is_symlink() else None  # its folder was looked at
@@ -168,18 +162,6 @@ def _write_track(chosen: Chosen, track: Track, files: Collection[FrameFile], row
             num_bytes += len(data)
         rows.add(row, num_bytes)
         advance()
-
-
-def _look_of(track: Track, i: int) -> np.ndarray | None:
-    """Return sun and air of a frame, (4,), None where its annotation does not have them."""
-    folder = track.frame_folder(i)
-    if not (folder / META).is_file():
-        return None
-    meta = read_meta(folder)
-    if meta.index != i:
-        what, got = "the annotation belongs to another frame", f"index {meta.index}"
-        raise InputError(what, where=folder / META, got=got)
-    return None if meta.look is None else np.array(list(meta.look.model_dump().values()))
 
 
 # --- checks of the files ----------------------------------------------------------------------------------------------

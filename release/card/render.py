@@ -7,22 +7,19 @@ prints is escaped.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from cosfly.formats.captions import FIELDS, TOKENS
-from cosfly.formats.frames import FrameFile
 from cosfly.geometry.coverage import NAMED
 from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.io import read_text
 from cosfly.viz.coverage_page import ranges, shares
 from cosfly.viz.page import markdown
 from release.card.tables import shown, tables_of
-from release.columns import PICTURES, SCALARS, SPLIT_NAMES, schema
+from release.columns import SPLIT_NAMES
 from release.record import FRAMES_FOLDER, POINTS_FOLDER, ReleaseRecord, SourceRecord, shard_pattern
 
 FEW_WALKS = 10
@@ -56,7 +53,6 @@ def render_card(record: ReleaseRecord) -> str:
         most_decided=max(decided.items(), key=lambda pair: pair[1], default=("none", 0)),
         repaired=repairs.total() - repairs["none"],
         small_splits=[name for name, own in splits.items() if len(own.walks) < FEW_WALKS],
-        columns=_columns(record.settings.modalities),
         coordinates=_coordinates(record),
         citation=read_text(Path(__file__).with_name("citation.bib")).strip(),
     )
@@ -70,13 +66,6 @@ def _is_rendered_by_us(source: SourceRecord) -> bool:
 def first_split(record: ReleaseRecord) -> str:
     """Return the first split that has rows."""
     return next((name for name in SPLIT_NAMES if name in record.splits.splits), SPLIT_NAMES[0])
-
-
-def size_category(num_frames: int) -> str:
-    """Return the hub's size category."""
-    limits = ("1K", "10K", "100K", "1M", "10M")
-    k = sum(num_frames >= 10 ** (3 + i) for i in range(len(limits)))
-    return f"n<{limits[0]}" if k == 0 else f"n>{limits[-1]}" if k == len(limits) else f"{limits[k - 1]}<n<{limits[k]}"
 
 
 def _front_matter(record: ReleaseRecord) -> str:
@@ -96,7 +85,6 @@ def _front_matter(record: ReleaseRecord) -> str:
         "license": for_terminal(record.licence),
         "language": ["en", "zh"],
         "pretty_name": for_terminal(record.name),
-        "size_categories": [size_category(record.numbers.frames)],
         "task_categories": ["image-text-to-text", "robotics"],
         "tags": tags,
         "configs": [{"config_name": name, "data_files": files} for name, files in configs.items()],
@@ -110,21 +98,4 @@ def _coordinates(record: ReleaseRecord) -> str:
     if record.depth is not None:
         values["depth"] = record.depth.model_dump(mode="json")
     text = yaml.safe_dump(values, sort_keys=False, width=150).strip()  # what is not ASCII as escapes
-    fence = "`" * max(3, 1 + max(map(len, re.findall("`+", text)), default=0))  # no text of the record ends the block
-    return f"{fence}yaml\n{text}\n{fence}"
-
-
-def _columns(files: list[FrameFile]) -> Iterable[tuple[str, str, str]]:
-    """Return of each column its name, type, and the words that it may hold."""
-    words = {column.name: column.words for column in SCALARS}
-    for member in schema(files):
-        kind = "float64" if str(member.type) == "double" else str(member.type)
-        if member.name in (PICTURES["rgb"].name, PICTURES["instance"].name):
-            kind = "image"
-        elif kind.startswith("struct"):
-            kind = "texts " if member.type[0].type == "string" else "numbers "
-            kind += ", ".join(child.name for child in member.type)
-        elif kind.startswith("list"):
-            kind = f"list of {member.type.value_type}"
-        allowed = words.get(member.name, ())
-        yield member.name, kind, "a decision" if allowed == "actions" else ", ".join(allowed)
+    return f"```yaml\n{text}\n```"
