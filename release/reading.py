@@ -6,7 +6,7 @@ Memory holds a row group and the points of one shard, however large the release 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, groupby
@@ -44,10 +44,8 @@ from release.columns import (
     between_of,
     flight_name,
     matrices_of,
-    points_schema,
-    schema,
 )
-from release.record import POINTS_FOLDER, Shard
+from release.record import Shard
 
 Row = dict[str, Any]
 Pictures = dict[FrameFile, bytes | memoryview | None]  # of a frame
@@ -238,12 +236,10 @@ def row_lists(shard: Path, columns: Sequence[str], *, strict: bool = True) -> It
     """Yield the rows of a parquet file of a release, a row group at a time.
 
     Args:
-        strict: Raise InputError if a column is not that of a release, a value that must be there is null, or a number
-            is not finite.
+        strict: Raise InputError if a value that must be there is null, or a number is not finite.
     """
     for group in row_groups(shard, list(columns), tree=shard.parents[1]):
         if strict:
-            check_columns(group, columns, shard)
             _check_values(group, shard)
         with arrow_errors(shard):  # text that is no UTF-8 shows here
             rows = group.to_pylist()
@@ -265,17 +261,6 @@ def _check_values(group: pa.Table, shard: Path) -> None:
         for part in parts or [column]:
             if pa.types.is_floating(part.type) and pc.all(pc.is_finite(part)).as_py() is False:
                 raise InputError("a number is not finite", where=f"{shard}: {member.name}")
-
-
-def check_columns(group: pa.Table, columns: Iterable[str], shard: Path) -> None:
-    """Check that columns of a row group are those of a release."""
-    wanted = points_schema() if shard.parent.name == POINTS_FOLDER else schema(tuple(PICTURES))
-    for name in columns:
-        found = group.schema.field(name).type if group.schema.get_field_index(name) >= 0 else None
-        if found != wanted.field(name).type:
-            what, where = "the columns of the shard are not those of a release", f"{shard}: {name}"
-            got = "no column of this name" if found is None else str(found)
-            raise InputError(what, where=where, got=got, expected=str(wanted.field(name).type))
 
 
 def read_tracks(

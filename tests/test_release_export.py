@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import itertools
 import json
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ from public_reader import read_public
 from specimens_release import NUM_POINTS, all_bytes, make_release, rows_by_id
 from tables import each
 
+import specimens
 from cosfly.formats.playback import read_track
 from cosfly.formats.town import read_town_map
 from cosfly.formats.tracks import find_tracks
@@ -159,6 +161,12 @@ def test_a_flight_with_gaps_is_several_episodes(tmp_path, tmp_path_factory):
     assert info["total_frames"] == 60
 
 
+def test_sixty_frames_per_second(tmp_path, monkeypatch):
+    monkeypatch.setattr(specimens, "DT_S", 1 / 60)
+    product = export(config("lerobot"), make_release(tmp_path), tmp_path / "out")
+    assert json.loads((product / "meta/info.json").read_text())["fps"] == 60
+
+
 def test_splits_reach_every_format(two_splits, tmp_path):
     numbers = read_record(two_splits / "release.json").splits.splits
     assert set(numbers) == {"train", "validation"}
@@ -240,8 +248,6 @@ def tell_size(folder: Path, path: Path) -> None:
     (lambda rows: rows[3]["image"].update(bytes=b"GIF89a"), "not a PNG"),
     (lambda rows: rows[3].update(depth=None), "the frame has no picture"),
     (lambda rows: rows[3]["pose"].update(x_m=float("inf")), "not finite"),
-    (lambda rows: rows[3].update(sample_id="../../escaped"), "is not a file name"),
-    (lambda rows: rows[3].update(sample_id=rows[2]["sample_id"]), "the sample_id of a frame is repeated"),
 ])  # fmt: skip
 def test_an_export_that_fails_publishes_nothing(broken, tmp_path, change, words):
     rewrite(broken, change)
@@ -249,6 +255,14 @@ def test_an_export_that_fails_publishes_nothing(broken, tmp_path, change, words)
         export(config("webdataset"), broken, tmp_path / "out")
     assert not (tmp_path / "out/webdataset").exists()
     assert not list((tmp_path / "out").glob("*.partial"))
+
+
+@each(("format", "name"), itertools.product(EXPORTS, ["../../escaped", "trajectory_1"]))
+def test_a_sample_id_is_a_file_name_of_one_frame(broken, tmp_path, format, name):
+    rewrite(broken, lambda rows: [row.update(sample_id=name) for row in rows[3:5]])
+    with pytest.raises(InputError, match="the sample_id of a frame is repeated or is not a file name"):
+        export(config(format), broken, tmp_path / "out")
+    assert not (tmp_path / "out" / format).exists()
 
 
 def test_a_missing_size_is_found(broken, tmp_path):

@@ -60,9 +60,6 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
         got = f"no caption; {reasons}" if reasons else "no caption"
         what, expected = "the source has no caption to export", "accepted captions"
         raise NothingKept(what, where=source.folder, got=got, expected=expected)
-    first = next(iter(names.values()))
-    run_here = "Names of pictures are relative to this folder: start the training in it."
-    opened = f'from datasets import load_dataset\nsamples = load_dataset("json", data_files="{first}", split="train")'
     if cfg.format == "sharegpt":
         columns = {"messages": "conversations", "system": "system", "images": "images"}
         about = {
@@ -70,17 +67,7 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
             for split, name in names.items()
         }
         write_bytes(folder / DATASET_INFO, (dump_json(about, indent=1) + "\n").encode())
-        run_here = "dataset_dir and media_dir of LLaMA-Factory are this folder, which has the dataset_info.json."
-        opened = "# llamafactory-cli train --dataset_dir . --media_dir . --dataset cosfly_train ..."
-    return FormatFacts(
-        format_version="messages and images" if cfg.format == "chat" else "ShareGPT",
-        codings={
-            "images": "PNG; the released bytes, or scaled down to the size of the teacher's pictures",
-            "answer": "JSON text of the three fields of a caption",
-        },
-        notes=[f"{total} samples, one per window and language. Skipped: {reasons or 'none'}.", run_here],
-        how_to_open=opened,
-    )
+    return FormatFacts({"num_samples": total, "skipped": reasons, "first_file": next(iter(names.values()))})
 
 
 def _samples(

@@ -11,7 +11,6 @@ from __future__ import annotations
 import itertools
 import shutil
 import tempfile
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,12 +20,11 @@ import numpy as np
 from cosfly.formats.frames import PERSON_ID, FrameFile
 from cosfly.formats.kinds import KINDS
 from cosfly.runtime.console import Advance
-from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.png import colours_of
 from release.columns import BOX, SplitName
-from release.export.stage import PART, ExportConfig, ExportSource, FormatFacts
+from release.export.stage import ExportConfig, ExportSource, FormatFacts
 from release.reading import Row
 
 TARGET, OTHER = 1, 2
@@ -44,7 +42,7 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
         "info": {"description": record.name, "contributor": record.credits, "version": record.content_digest},
         "licenses": [{"id": 1, "name": record.licence, "url": ""}], "categories": CATEGORIES,
     }  # fmt: skip
-    ids, counts, used = itertools.count(1), Counter[str](), list[SplitName]()
+    ids, num_people, used = itertools.count(1), 0, list[SplitName]()
     for split, tracks in itertools.groupby(source.tracks(), lambda track: track.split):
         used.append(split)
         path = folder / f"annotations/instances_{split}.json"
@@ -56,33 +54,19 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
                 file.write((b",\n" if number else b"") + dump_json(image).encode())
                 for annotation in annotations:
                     people.write((b",\n" if people.tell() else b"") + dump_json(annotation).encode())
-                counts.update(frames=1, people=len(annotations))
+                num_people += len(annotations)
                 advance(1)
             file.write(b'],\n"annotations":[')
             people.seek(0)
             shutil.copyfileobj(people, file)
             file.write(b"]}\n")
-    num_people, num_frames = counts["people"], counts["frames"]
-    return FormatFacts(
-        format_version="instances",
-        codings={
-            "pictures": "PNG, the released bytes",
-            "masks": "run lengths of the pixels in instance.png; boxes enclose these pixels",
-        },
-        notes=[
-            f"{num_people:,} people in {num_frames:,} pictures. file_name is relative to the folder of the split; "
-            "instance_id is the same person through a track.",
-        ],
-        how_to_open=f'from pycocotools.coco import COCO\ncoco = COCO("annotations/instances_{used[0]}.json")',
-    )
+    return FormatFacts({"num_people": num_people, "first_split": used[0]})
 
 
 def _annotate(
     track: str, row: Row, pictures: dict[FrameFile, bytes], image_id: int, folder: Path
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Write the picture of a row; return its image and the annotations of its people."""
-    if not PART.fullmatch(row["sample_id"]):
-        raise InputError("the sample_id of a frame is not a file name", where=track, got=row["sample_id"])
     name = f"{row['sample_id']}.png"
     write_bytes(folder / name, pictures["rgb"])
     image = {

@@ -244,13 +244,15 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
     table = pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(list(tasks), name="task"))
     table.to_parquet(buffer)
     write_bytes(folder / "meta/tasks.parquet", buffer.getvalue())
-    return _facts(source, layout, cfg)
+    return FormatFacts({"num_episodes": layout.episode, "fps": fps}, split_files={"train": "data/*/*.parquet"})
 
 
 def _fps(record: ReleaseRecord) -> int:
     """Return the number of frames per second; it must be whole and the same in all tracks."""
-    steps_s = [float(step) for step in record.numbers.of("step_s")]
-    fps = PAPER_FPS if not steps_s else round(1 / steps_s[0]) if steps_s[0] > 0 else 0
+    steps_s = [float(step) for step in record.numbers.of("step_s")]  # rounded: the mean of all is not
+    duration = record.numbers.spreads["track_duration_s"]
+    num_steps = sum(one.frames_available - 1 for one in record.flights)
+    fps = round(num_steps / (duration.mean * duration.count)) if duration.mean else PAPER_FPS
     if any(abs(step - 1 / (fps or 1)) > STEP_TOLERANCE_S for step in steps_s):
         what = "LeRobot needs the same whole number of frames per second in all tracks"
         raise InputError(what, where="time_s", got=f"steps of {', '.join(map(str, sorted(steps_s)[:10]))} s")
@@ -368,28 +370,3 @@ def _episode_row(row: dict[str, Any], layout: Layout, cameras: list[str]) -> dic
     return found | {
         f"stats/{name}/{kind}": values for name, summary in row["stats"].items() for kind, values in summary.items()
     }
-
-
-def _facts(source: ExportSource, layout: Layout, cfg: ExportConfig) -> FormatFacts:
-    """Return what the README says. layout: After the last file."""
-    picture_form = f"{CODEC} in mp4, with loss" if cfg.video else "PNG, the released bytes"
-    codings: dict[str, str] = dict.fromkeys(source.modalities, picture_form)
-    if "depth" in codings:
-        codings["depth"] = "TIFF of float32 metres, the released numbers"
-    codings["poses and points"] = "float32 of the released float64"
-    return FormatFacts(
-        format_version=VERSION,
-        codings=codings,
-        notes=[
-            f"{layout.episode} episodes of {len(source.record.flights)} tracks at {layout.fps} frames per second; "
-            "a track with gaps is cut there. meta/episodes has the track, split and first frame of each.",
-            "action and observation.state are mean velocities: forward, left, up in m/s in the drone's level axes, "
-            "turn in degrees/s (counter-clockwise), and the camera's pitch: of the step to the next frame, and of the "
-            "step that led here. Zero after the last frame of an episode (next.done) and before its first.",
-            "task is the goal of the track and the decision of the caption in words. A missing number is NaN, a "
-            "missing text empty.",
-        ],
-        how_to_open="from lerobot.datasets.lerobot_dataset import LeRobotDataset\n"
-        "frames = LeRobotDataset('cosfly/tracks', root='.')",
-        split_files={"train": "data/*/*.parquet"},
-    )

@@ -31,14 +31,15 @@ from cosfly.runtime.arrays import parse_array
 from cosfly.runtime.config import Config
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError, shown
-from cosfly.runtime.io import CHECKSUMS, atomic_folder, inside, sha256_file, write_bytes, write_checksums
+from cosfly.runtime.io import CHECKSUMS, atomic_folder, sha256_file, write_bytes, write_checksums
 from cosfly.runtime.png import png_size
 from cosfly.runtime.run_dir import Resume, StageFolder, Tally
-from cosfly.runtime.tables import open_table
 from cosfly.viz.page import markdown
 from release.columns import LANGUAGES, PICTURES, PLACE, SPLIT_NAMES, SplitName
-from release.reading import Pictures, Row, check_columns, read_pictures, read_tracks
-from release.record import RECORD, ReleaseRecord, read_record, release_folder, shard_paths
+from release.reading import Pictures, Row, read_pictures, read_tracks
+from release.record import RECORD, ReleaseRecord, read_record, release_folder
+from release.verify.findings import Findings
+from release.verify.verify import check_footers, check_names
 
 FormatName = Literal["tree", "lerobot", "webdataset", "coco", "chat", "sharegpt"]
 README = "README.md"
@@ -149,14 +150,9 @@ class ExportSource:
         Raises:
             InputError: The shards are not those of a release.
         """
-        known = set[Place]()
+        known, keys = set[Place](), set[str]()
         for shard in sorted(self.record.shards, key=lambda shard: (SPLIT_NAMES.index(shard.split), shard.path)):
             path = self.folder / shard.path
-            with open_table(path, tree=self.folder) as table:
-                if table.metadata.num_rows != shard.rows:
-                    got, expected = f"{table.metadata.num_rows} rows", f"{shard.rows} rows, as in release.json"
-                    raise InputError("the shard has the wrong number of rows", where=path, got=got, expected=expected)
-                check_columns(table.schema_arrow.empty_table(), [PICTURES[file].name for file in self.files], path)
             pictures = read_pictures(self.folder, shard, self.files)
             for frames, _ in read_tracks(self.folder, shard):
                 parts = [frames.rows[0][name] for name in PLACE]
@@ -165,6 +161,11 @@ class ExportSource:
                     what = "the names of the track are not folder names, or it is in two places"
                     raise InputError(what, where=path, got=shown(parts, 200))
                 known.add(place)
+                for name in frames.column("sample_id"):
+                    if not PART.fullmatch(name) or key_of(name) in keys:
+                        what = "the sample_id of a frame is repeated or is not a file name"
+                        raise InputError(what, where=frames.name, got=name)
+                    keys.add(key_of(name))
                 for name in ("width_px", "height_px"):
                     if len({*frames.column(name)}) > 1:
                         raise InputError("the pictures of the track differ in size", where=frames.name)
@@ -173,6 +174,11 @@ class ExportSource:
                 of_track = itertools.islice(pictures, len(frames))
                 yield SourceTrack(place, shard.split, list(frames.rows), of_track)
                 deque(of_track, maxlen=0)  # those that nobody has read
+
+
+def key_of(sample_id: str) -> str:
+    """Return a sample_id without dots: where it begins the name of a file, readers end it at its first dot."""
+    return sample_id.replace(".", "_")
 
 
 def open_release(folder: Path, consecutive: str = "") -> ExportSource:
@@ -189,15 +195,11 @@ def open_release(folder: Path, consecutive: str = "") -> ExportSource:
     record = read_record(folder / RECORD)
     if consecutive:
         record.require_whole_tracks(consecutive, folder)
-    names = shard_paths([shard.split for shard in record.shards], record.content_digest)
-    wrong = [
-        file.path for shard, pair in zip(record.shards, names, strict=True)
-        for file, name in zip((shard, shard.points), pair, strict=True)
-        if file.path != name or not (path := inside(folder, name)).is_file() or path.stat().st_size != file.bytes
-    ]  # fmt: skip
-    if wrong or not record.shards:
+    findings = Findings()
+    good = check_names(folder, record, findings)
+    if not (check_footers(folder, record, good, findings) and record.shards):
         raise InputError(
-            "the release is incomplete", where=folder, got=f"missing, or of another name or size: {'; '.join(wrong)}",
+            "the release is incomplete", where=folder, got="; ".join(map(str, findings.issues)) or "no shards",
             expected="the shards in release.json", fix="run cosfly release verify for details",
         )  # fmt: skip
     modalities = tuple(record.settings.modalities)
@@ -206,17 +208,13 @@ def open_release(folder: Path, consecutive: str = "") -> ExportSource:
 
 @dataclass(frozen=True)
 class FormatFacts:
-    """What a format states about itself.
+    """What README.md says of an export.
 
-    codings: How each thing is stored. notes: Conventions, and what the format cannot carry. how_to_open: Lines of
-    Python. coordinates: If the format has other axes than the release. split_files: Split -> pattern of its files,
-    where `datasets` opens the folder.
+    values: Of the format's section of `readme.md`. coordinates: If the format has other axes than the release.
+    split_files: Split -> pattern of its files, where `datasets` opens the folder.
     """
 
-    format_version: str
-    codings: dict[str, str]
-    notes: list[str]
-    how_to_open: str
+    values: dict[str, Any] = field(default_factory=dict)
     coordinates: dict[str, str] = field(default_factory=dict)
     split_files: dict[str, str] = field(default_factory=dict)
 
@@ -257,7 +255,7 @@ def check_needs(source: ExportSource, cfg: ExportConfig) -> ExportSource:
 
 
 def _write_readme(source: ExportSource, facts: FormatFacts, folder: Path, cfg: ExportConfig) -> None:
-    """Write README.md: front matter as the hub reads it, what was exported, and what the format states about itself."""
+    """Write README.md: front matter as the hub reads it, what was exported, and how the format stores it."""
     tags = ["cosfly", "LeRobot" if cfg.format == "lerobot" else cfg.format]  # the hub knows LeRobot by this tag
     front: dict[str, Any] = {"license": source.record.licence, "pretty_name": source.record.name, "tags": tags}
     if facts.split_files:
@@ -265,8 +263,9 @@ def _write_readme(source: ExportSource, facts: FormatFacts, folder: Path, cfg: E
         front["configs"] = [{"config_name": "default", "data_files": files}]
     text = markdown(
         "release/export/readme.md", front_matter=yaml.safe_dump(front, sort_keys=True, allow_unicode=True).rstrip(),
-        release=source.record, facts=facts, format=cfg.format, num_frames=source.record.numbers.frames,
+        release=source.record, cfg=cfg, format=cfg.format, num_frames=source.record.numbers.frames,
         made_by=f"cosfly {cosfly.__version__}", coordinates=facts.coordinates or source.record.coordinates,
+        pictures=", ".join(FILE_NAMES[file] for file in source.modalities), **facts.values,
     )  # fmt: skip
     write_bytes(folder / README, (text.rstrip() + "\n").encode())
 

@@ -33,8 +33,6 @@ from release.columns import COMPANY_COLUMNS, TARGET_PICTURE, matrices_of
 from release.export.stage import ExportConfig, ExportSource, FormatFacts, SourceTrack
 from release.reading import FlightRows, Row
 
-VERSION = "drone_nav_traj_v7 7.0.0"
-
 
 def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
     """Write each track, and each town's `map.json`; count the tracks of which strict readers will miss something."""
@@ -56,26 +54,11 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
         about = TownMap(name=shown.name, licence=shown.licence, credits=shown.credits) if shown else None
         about = about or TownMap(name=at.town, licence=UNKNOWN_LICENCE, credits="")
         write_model(place / TOWN_FILE, about, TOWN_FORMAT)
-    notes = [
-        "Frames count from 0 as the layout asks; source.released_frames of trajectory.json has the index of each in "
-        "its track. The layout has no captions: they are in the release. meta.json and missions are not in it."
-    ]
-    if num_gaps:
-        parts = f"{num_gaps} of {groups.total()} tracks are parts of a track"
-        notes.append(f"{parts}: the steps between their frames are uneven, which readers with a strict clock refuse.")
-    if num_alone := sum(count < 2 for count in groups.values()):
-        notes.append(
-            f"{num_alone} of {len(groups)} trajectories have one track only; some public loaders ask for both."
-        )
-    return FormatFacts(
-        format_version=VERSION,
-        codings={file: f"{FILE_NAMES[file]}, the released bytes" for file in source.modalities},
-        coordinates=COORDINATES,
-        notes=notes,
-        how_to_open="from cosfly.formats.tracks import find_tracks\n"
-        "from cosfly.formats.playback import read_track\n"
-        "tracks = [read_track(folder, strict=False) for folder in find_tracks(Path('.'))]",
-    )
+    values = {
+        "num_gaps": num_gaps, "num_tracks": groups.total(), "num_trajectories": len(groups),
+        "num_alone": sum(count < 2 for count in groups.values()),
+    }  # fmt: skip
+    return FormatFacts(values, COORDINATES)
 
 
 def _write_track(track: SourceTrack, number: int, out: Path, advance: Advance) -> None:

@@ -20,11 +20,10 @@ import numpy as np
 
 from cosfly.formats.frames import FILE_NAMES
 from cosfly.runtime.console import Advance
-from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file
 from cosfly.runtime.json_io import dump_json
-from release.columns import SCALARS, SPLIT_NAMES, TARGET_PICTURE, Column
-from release.export.stage import PART, ExportConfig, ExportSource, FormatFacts, SourceTrack, shards
+from release.columns import SCALARS, TARGET_PICTURE, Column
+from release.export.stage import ExportConfig, ExportSource, FormatFacts, SourceTrack, key_of, shards
 from release.reading import Row
 
 TEXTS = ("string", "texts", "events")
@@ -40,21 +39,19 @@ def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advanc
     for name, own in shards(pieces, cfg.shard_mb):
         _write_shard(folder / f"{name}.tar", own, advance)
         counts[name.rpartition("-")[0]] += 1
-    return _facts(source, counts)
+    first = next(iter(counts))
+    last = counts[first] - 1
+    names = f"{first}-{{00000..{last:05d}}}.tar" if last else f"{first}-00000.tar"
+    values = {"num_shards": counts, "first_split": first, "first_shards": names}
+    return FormatFacts(values, split_files={split: f"{split}-*.tar" for split in counts})
 
 
 def _write_shard(path: Path, pieces: Iterator[SourceTrack], advance: Advance) -> None:
-    keys = set[str]()
     with atomic_file(path) as file, tarfile.open(fileobj=file, mode="w|", format=tarfile.GNU_FORMAT) as tar:
         for row, pictures in (frame for piece in pieces for frame in piece.frames()):
-            key = row["sample_id"].replace(".", "_")  # a key ends at its first dot
-            if key in keys or not PART.fullmatch(key):
-                what = "the sample_id of a frame is repeated or is not a file name"
-                raise InputError(what, where=path.name, got=key)
-            keys.add(key)
             files: dict[str, bytes] = {FILE_NAMES[file]: data for file, data in pictures.items()}
             for ending, data in sorted((files | dict(members(row))).items()):
-                header = tarfile.TarInfo(f"{key}.{ending}")  # without times and owners
+                header = tarfile.TarInfo(f"{key_of(row['sample_id'])}.{ending}")  # without times and owners
                 header.size, header.mode = len(data), 0o644
                 tar.addfile(header, BytesIO(data))
             advance(1)
@@ -92,27 +89,3 @@ def _numbers(column: Column, value: object) -> np.ndarray:
     if column.type in ("numbers", "indices"):
         return np.array(value or [], np.float64)
     return np.array([value], np.float64)
-
-
-def _facts(source: ExportSource, counts: Counter[str]) -> FormatFacts:
-    """Return how the shards are opened. counts: Of each split."""
-    first = next(split for split in SPLIT_NAMES if counts[split])
-    last = counts[first] - 1
-    names = f"{first}-{{00000..{last:05d}}}.tar" if last else f"{first}-00000.tar"
-    codings: dict[str, str] = {file: f"{FILE_NAMES[file]}, the released bytes" for file in source.modalities}
-    return FormatFacts(
-        format_version="tar, keys sorted",
-        codings={
-            **codings,
-            "json": "texts, flags and numbers that no frame lacks; an empty text is a missing one",
-            "*.npy": "float64: a column whose values may be missing (NaN), the members of a struct in order, or a list",
-        },
-        notes=[
-            f"Shards: {', '.join(f'{split} {count}' for split, count in counts.items())}. A key is the sample_id, dots "
-            "replaced by _.",
-        ],
-        how_to_open=f'from datasets import load_dataset\nrows = load_dataset("webdataset", data_files="{first}-*.tar", '
-        f'split="train", streaming=True)\n\nimport webdataset\n'
-        f'rows = webdataset.WebDataset("{names}", shardshuffle=False).decode("rgb8")',
-        split_files={split: f"{split}-*.tar" for split in counts},
-    )
