@@ -18,7 +18,7 @@ from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import FileFormat, read_model, write_model
 from release.columns import SPLIT_NAMES, SplitName
 
-RELEASE_FORMAT = FileFormat("cosfly.release", "6.0", "release record")
+RELEASE_FORMAT = FileFormat("cosfly.release", "6.1", "release record")
 RECORD = "release.json"
 
 Counts = dict[str, int]
