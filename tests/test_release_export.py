@@ -248,6 +248,7 @@ def tell_size(folder: Path, path: Path) -> None:
     (lambda rows: rows[3]["image"].update(bytes=b"GIF89a"), "not a PNG"),
     (lambda rows: rows[3].update(depth=None), "the frame has no picture"),
     (lambda rows: rows[3]["pose"].update(x_m=float("inf")), "not finite"),
+    (lambda rows: rows[3].update(width_px=None), "width_px: a required value is missing"),
 ])  # fmt: skip
 def test_an_export_that_fails_publishes_nothing(broken, tmp_path, change, words):
     rewrite(broken, change)
@@ -263,13 +264,6 @@ def test_a_sample_id_is_a_file_name_of_one_frame(broken, tmp_path, format, name)
     with pytest.raises(InputError, match="the sample_id of a frame is repeated or is not a file name"):
         export(config(format), broken, tmp_path / "out")
     assert not (tmp_path / "out" / format).exists()
-
-
-def test_a_missing_size_is_found(broken, tmp_path):
-    rewrite(broken, lambda rows: rows[3].update(width_px=None))
-    with pytest.raises(InputError, match="width_px: a required value is missing"):
-        export(config("webdataset"), broken, tmp_path / "out")
-    assert not (tmp_path / "out/webdataset").exists()
 
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
