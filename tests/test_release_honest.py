@@ -230,7 +230,7 @@ def test_sealed_lies_about_real_maps_are_found(runs, tmp_path):
     everywhere by little."""
     missed = [
         f"{kind}: {name}"
-        for kind in ("simworld 160 px", "delft 160 px", "town")
+        for kind in ("simworld 160 px", "delft 160 px", "town", "CARLA", "UnrealCV")
         for name, lie in SEALED.items()
         if not errors_in(forge(runs.made(kind), tmp_path / "forged", lie))
     ]
