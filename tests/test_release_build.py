@@ -372,6 +372,12 @@ def test_a_frame_between_captions_was_not_asked_for(tmp_path):
     assert without == {"no whole window, at an end of the track": 2 * 9, "not asked for": 2 * 14}
 
 
+def test_tracks_without_captions_are_named(copy, tmp_path, caplog):
+    rewrite_captions(copy, lambda lines: lines.__delitem__(slice(len(lines) // 2, None)))
+    record_of(copy, tmp_path / "r")
+    assert "2 of 4 tracks have no caption" in caplog.text
+
+
 UNLICENSED = CFG.model_copy(update={"licence": None})
 
 

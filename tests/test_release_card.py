@@ -19,7 +19,7 @@ from cosfly.formats.frames import (
     SKY_DEPTH_M,
 )
 from cosfly.geometry.axes import BODY_FROM_CAMERA
-from release.card.render import first_split, render_card
+from release.card.render import render_card
 from release.columns import CONTRACT
 from release.counting import Sum, action_class, count_track, numbers_of
 from release.reading import FlightRows
@@ -71,7 +71,7 @@ def test_every_snippet_of_the_card_runs(built, tmp_path, monkeypatch):
     for block in blocks:
         exec(block, values)
     assert set(values["splits"]) == set(record.splits.splits)
-    assert values["poses"].num_rows == record.splits.splits[first_split(record)].frames
+    assert values["poses"].num_rows == next(iter(record.splits.splits.values())).frames
     assert values["poses"].column_names == ["sample_id", "pose"]
     window = values["window"](0)
     assert len(window["facts"]["time_s"]) == record.settings.window_frames

@@ -7,6 +7,7 @@ of the stage are next to it: they hold local paths and are not published.
 
 from __future__ import annotations
 
+import logging
 import os
 import platform
 import shutil
@@ -67,6 +68,8 @@ from release.record import (
 )
 from release.rules import SPLIT_RULE, stated_rules
 from release.verify.verify import verify
+
+log = logging.getLogger(__name__)
 
 DATASET, PARTS = "dataset", "parts"  # in the folder of the stage: what gets published, and shards on the way there
 SOURCE_FILES = ("data", "captions", "inspect", "review")  # roles whose digests the record has
@@ -286,6 +289,9 @@ def run(
         return dataset
     shutil.rmtree(dataset, ignore_errors=True)  # of another attempt: until this one is whole, nothing is published
     plan = make_plan(cfg, sources, stage)
+    if bare := [track.name for track in plan.tracks if not track.captioned]:
+        what = "release: %d of %d tracks have no caption of a released frame, such as %s; the card has the reasons"
+        log.warning(what, len(bare), len(plan.tracks), bare[0])
     written = _write_parts(cfg, plan, stage, parts, workers, watch)
     with atomic_folder(dataset) as folder:
         shards = name_shards(written, folder)

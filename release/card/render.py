@@ -19,7 +19,6 @@ from cosfly.runtime.io import read_text
 from cosfly.viz.coverage_page import ranges, shares
 from cosfly.viz.page import markdown
 from release.card.tables import shown, tables_of
-from release.columns import SPLIT_NAMES
 from release.record import FRAMES_FOLDER, POINTS_FOLDER, ReleaseRecord, SourceRecord, shard_pattern
 
 FEW_WALKS = 10
@@ -41,7 +40,7 @@ def render_card(record: ReleaseRecord) -> str:
         front_matter=_front_matter(record),
         ours=[source.run for source in record.provenance.sources if _is_rendered_by_us(source)],
         others=[source.run for source in record.provenance.sources if not _is_rendered_by_us(source)],
-        first_split=first_split(record),
+        first_split=next(iter(splits), "train"),
         points=sum(shard.points.rows for shard in record.shards),
         is_whole=all(one.frames == one.frames_available for one in record.flights),
         tables=tables_of(record),
@@ -61,11 +60,6 @@ def render_card(record: ReleaseRecord) -> str:
 def _is_rendered_by_us(source: SourceRecord) -> bool:
     """Return whether a stage of cosfly drew the frames of a source."""
     return any(stage.stage == "render" for stage in source.stages)
-
-
-def first_split(record: ReleaseRecord) -> str:
-    """Return the first split that has rows."""
-    return next((name for name in SPLIT_NAMES if name in record.splits.splits), SPLIT_NAMES[0])
 
 
 def _front_matter(record: ReleaseRecord) -> str:
