@@ -62,7 +62,7 @@ LISTS = {"indices": "int32", "texts": "string", "numbers": "float64"}  # types t
 
 @dataclass(frozen=True)
 class Placement:
-    """What the rows of a flight say of its place in the release: the columns of these names.
+    """What the rows of a track say of its place in the release: the columns of these names.
 
     pair: the name of its twin in the records, None where that is not released.
     """
@@ -82,7 +82,7 @@ class Column:
     words: those that it may hold, empty: any; "actions": the decisions of the release. ranges: of its numbers, by
     member ("" where it has none).
     required: it is null in no row (of a caption's: in no row with a caption). constant: it does not change within a
-    flight.
+    track.
     title: what the card calls it, which counts the captions by its values; empty: it does not.
     """
 
@@ -96,12 +96,12 @@ class Column:
     constant: bool = False
     title: str = ""
 
-    def cell(self, flight: Track, i: int, caption: ReleasedCaption | None, placement: Placement) -> Any:
+    def cell(self, track: Track, i: int, caption: ReleasedCaption | None, placement: Placement) -> Any:
         value: Any
         if self.of_caption is not None:
             value = None if caption is None else caption[self.name]
         else:
-            value = getattr(placement, self.name) if self.of_frame is None else self.of_frame(flight, i)
+            value = getattr(placement, self.name) if self.of_frame is None else self.of_frame(track, i)
         if isinstance(self.type, tuple):  # of few numbers Python's own are faster than an array
             numbers = [] if value is None else value.tolist()
             is_null = not numbers or any(map(math.isnan, numbers))
@@ -113,14 +113,14 @@ class Column:
         return bool(value) if self.type == "bool" and (value is not None or self.required) else value
 
 
-def _knobs(flight: Track) -> np.ndarray | None:
+def _knobs(track: Track) -> np.ndarray | None:
     """Return the six knobs of weather, (6,), None where the file has none."""
-    record = flight.weather_record
+    record = track.weather_record
     return None if record is None else np.array([getattr(record.params, name) for name in WEATHER_PARAMS])
 
 
-def _of_company(k: int, flight: Track, i: int) -> int | None:
-    value = math.nan if flight.bystanders is None else flight.bystanders[i, k]
+def _of_company(k: int, track: Track, i: int) -> int | None:
+    value = math.nan if track.bystanders is None else track.bystanders[i, k]
     return None if math.isnan(value) else int(value)
 
 
@@ -320,7 +320,7 @@ def caption_values(caption: Caption) -> ReleasedCaption:
 
 
 def between_of(rows: Collection[Mapping[str, Any]]) -> np.ndarray | None:
-    """Return `Track.between` of the rows of a flight; None where it was planned at the rate of its frames."""
+    """Return `Track.between` of the rows of a track; None where it was planned at the rate of its frames."""
     found = [row.get("poses_between") for row in rows]
     most = max((len(one) // len(POSE) for one in found if one), default=0)
     nothing = np.full(most * len(POSE), np.nan)
@@ -369,21 +369,21 @@ def _schema(names: tuple[str, ...]) -> pa.Schema:
     return Features({name: feature(types[name]) for name in names}).arrow_schema
 
 
-def scalar_row(flight: Track, i: int, caption: ReleasedCaption | None, placement: Placement) -> dict[str, Any]:
+def scalar_row(track: Track, i: int, caption: ReleasedCaption | None, placement: Placement) -> dict[str, Any]:
     """Return the row of one frame without its pictures, right-handed axes."""
-    return {column.name: column.cell(flight, i, caption, placement) for column in SCALARS}
+    return {column.name: column.cell(track, i, caption, placement) for column in SCALARS}
 
 
-def point_row(flight: Track, i: int, placement: Placement) -> dict[str, Any]:
+def point_row(track: Track, i: int, placement: Placement) -> dict[str, Any]:
     """Return the row of one point, right-handed axes."""
-    return {column.name: column.cell(flight, i, None, placement) for column in POINTS}
+    return {column.name: column.cell(track, i, None, placement) for column in POINTS}
 
 
-# --- flights ----------------------------------------------------------------------------------------------------------
+# --- tracks -----------------------------------------------------------------------------------------------------------
 
 
-def flight_name(place: Place) -> str:
-    """Return the name of a flight in the records."""
+def track_name(place: Place) -> str:
+    """Return the name of a track in the records."""
     return "/".join(map(str, place))
 
 

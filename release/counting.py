@@ -22,7 +22,7 @@ from cosfly.formats.weather import preset_token
 from cosfly.geometry.coverage import Coverage
 from cosfly.geometry.trajectory_metrics import ACCEL_RMS_MAX_MPS2, JERK_RMS_MAX_MPS3, smoothness_score
 from release.columns import CAPTION_FIELDS, COUNTED, LANGUAGES, VALUE_COLUMNS
-from release.reading import FlightRows, bounded, read_tracks
+from release.reading import TrackRows, bounded, read_tracks
 from release.record import Counts, Numbers, Shard, Spread
 
 DIGITS = 4
@@ -129,7 +129,7 @@ def frames_digest(indices: np.ndarray) -> str:
     return hashlib.sha256(indices.astype(np.int64).tobytes()).hexdigest()
 
 
-def count_track(frames: FlightRows, points: FlightRows) -> TrackCount:
+def count_track(frames: TrackRows, points: TrackRows) -> TrackCount:
     """Count the rows of a track, n frames. Raise InputError where a number is out of range."""
     first, rows = frames.rows[0], frames.rows
     offsets_m = frames.pose[:, :3] - frames.target_m
@@ -159,7 +159,7 @@ def count_track(frames: FlightRows, points: FlightRows) -> TrackCount:
     )  # fmt: skip
 
 
-def _motion(points: FlightRows) -> dict[str, float | None]:
+def _motion(points: TrackRows) -> dict[str, float | None]:
     """Return duration, length, and RMS acceleration and jerk of the motion without perturbation."""
     clean_m, steps_s = points.pose[:, :3] - points.drone_offset[:, :3], np.diff(points.time_s)
     found: dict[str, float | None] = {"duration_s": bounded(float(points.time_s[-1] - points.time_s[0]))}
@@ -185,7 +185,7 @@ def action_class(action: Mapping[str, float]) -> str:
     return "hover" if abs(turn) < TURN_DEGPS else "turn left" if turn > 0 else "turn right"
 
 
-def _counts(frames: FlightRows, points: FlightRows, captioned: list[dict[str, Any]]) -> dict[str, Counter[str]]:
+def _counts(frames: TrackRows, points: TrackRows, captioned: list[dict[str, Any]]) -> dict[str, Counter[str]]:
     rows, first = frames.rows, frames.rows[0]
     counts = {name: Counter(row[name] or "none" for row in captioned) for name in COUNTED}
     counts["flags"] = Counter(name for row in rows for name in FLAGS if row[name])

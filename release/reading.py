@@ -42,8 +42,8 @@ from release.columns import (
     SCALAR_NAMES,
     VALUES,
     between_of,
-    flight_name,
     matrices_of,
+    track_name,
 )
 from release.record import Shard
 
@@ -51,7 +51,7 @@ Row = dict[str, Any]
 Pictures = dict[FrameFile, bytes | memoryview | None]  # of a frame
 BATCH_ROWS = 2  # whose pictures are in memory at once
 NEAR_M = 0.3  # the renderers' near plane
-MOST_FRAMES = 10_000_000  # of a flight
+MOST_FRAMES = 10_000_000  # of a track
 LEAST_ZOOMED = 3  # rows whose camera is not that of most rows
 LARGEST = 1e9  # of a value: beyond any town, track and picture
 
@@ -63,12 +63,12 @@ def vectors(rows: Sequence[Row], name: str, members: tuple[str, ...]) -> np.ndar
 
 
 def _vectors(name: str, members: tuple[str, ...]) -> cached_property[np.ndarray]:
-    return cached_property(lambda flight: vectors(flight.rows, name, members))
+    return cached_property(lambda track: vectors(track.rows, name, members))
 
 
 @dataclass(frozen=True)
-class FlightRows:
-    """The rows of one flight in the order of their frames, with the columns of a release; a column that a format lacks
+class TrackRows:
+    """The rows of one track in the order of their frames, with the columns of a release; a column that a format lacks
     is None everywhere.
 
     name: `run/town/trajectory/variant`. given_id: what its sample ids must begin with, None where nobody knows.
@@ -159,7 +159,7 @@ class FlightRows:
 
     @cached_property
     def goal(self) -> Goal | None:
-        """Whom to follow; its frame is that of the whole flight."""
+        """Whom to follow; its frame is that of the whole track."""
         told = {name: self.rows[0].get(f"goal_{name}") for name in ("frame", "en", "zh", "says")}
         is_told = told["frame"] is not None
         return read_goal(told, MOST_FRAMES, self.where(0, "goal_en")) if is_told else None
@@ -169,8 +169,8 @@ class FlightRows:
         return self.rows[0].get("track") == "clean"
 
     @cached_property
-    def flight(self) -> Track:
-        """The same as a flight of the playback tree, for those who know that."""
+    def track(self) -> Track:
+        """The same as a track of the playback tree, for those who know that."""
         first = self.rows[0]
         matrices = matrices_of(self.intrinsics)
         camera = Camera(int(self.size_px[0, 0]), int(self.size_px[0, 1]), matrices[0])
@@ -193,12 +193,12 @@ class FlightRows:
             else np.stack([self.numbers(name) for name in COMPANY_COLUMNS], axis=1),
         )  # fmt: skip
 
-    def shown(self, points: FlightRows, twin: FlightRows | None, settings: dict[str, Any]) -> ReleasedTrack:
+    def shown(self, points: TrackRows, twin: TrackRows | None, settings: dict[str, Any]) -> ReleasedTrack:
         """Return what a checker of captions needs. points, twin: All points of this track and of its clean one.
         settings: Of the captions, as the record has them."""
         captions = [shown_caption(row) for row in self.rows if row.get("has_caption")]
         same = twin is not None and len(twin) == len(points)
-        return ReleasedTrack(points.flight, captions, twin.flight if twin is not None and same else None, settings)
+        return ReleasedTrack(points.track, captions, twin.track if twin is not None and same else None, settings)
 
 
 def shown_caption(row: Row) -> ShownCaption:
@@ -265,7 +265,7 @@ def _check_values(group: pa.Table, shard: Path) -> None:
 
 def read_tracks(
     folder: Path, shard: Shard, columns: Sequence[str] = SCALAR_NAMES, *, strict: bool = True
-) -> Iterator[tuple[FlightRows, FlightRows]]:
+) -> Iterator[tuple[TrackRows, TrackRows]]:
     """Yield the tracks of a shard in order: the rows of the released frames, and those of all points.
 
     Args:
@@ -282,14 +282,14 @@ def read_tracks(
     for place, frames in both[0]:
         own, of_points = next(points, (None, ()))
         if own != place:
-            got = "no track" if own is None else flight_name(own)
+            got = "no track" if own is None else track_name(own)
             what = "the points of a shard are not those of its tracks"
-            raise InputError(what, where=folder / shard.points.path, got=got, expected=flight_name(place))
-        name = flight_name(place)
-        yield FlightRows(name, list(frames)), FlightRows(name, list(of_points))
+            raise InputError(what, where=folder / shard.points.path, got=got, expected=track_name(place))
+        name = track_name(place)
+        yield TrackRows(name, list(frames)), TrackRows(name, list(of_points))
     if (more := next(points, None)) is not None:
         what = "the points of a shard are not those of its tracks"
-        raise InputError(what, where=folder / shard.points.path, got=flight_name(more[0]), expected="no further track")
+        raise InputError(what, where=folder / shard.points.path, got=track_name(more[0]), expected="no further track")
 
 
 def read_pictures(folder: Path, shard: Shard, files: Sequence[FrameFile]) -> Iterator[Pictures]:

@@ -48,9 +48,9 @@ class Shard(StoredFile):
 
 
 class ReleasedFlight(Strict):
-    """One flight, `run/town/trajectory/variant`; `frames_available` is the number of its points.
+    """One track, `run/town/trajectory/variant`; `frames_available` is the number of its points.
 
-    pair: the other track's flight of the same trajectory, null where that is not released. five_ray_mean: share of five
+    pair: the other track of the same trajectory, null where that is not released. five_ray_mean: share of five
     rays that reach the person, as the inspection measured it on the map, which the shards do not hold; null where
     nobody did.
     """
@@ -262,19 +262,19 @@ class ReleaseRecord(Strict):
 
 
 def numbers_of_splits(
-    flights: Sequence[ReleasedFlight], captions: Mapping[SplitName, int]
+    tracks: Sequence[ReleasedFlight], captions: Mapping[SplitName, int]
 ) -> dict[SplitName, SplitNumbers]:
-    """Return the numbers of each split that has flights. captions: of each split."""
+    """Return the numbers of each split that has tracks. captions: of each split."""
     found = {}
     for split in SPLIT_NAMES:
-        if own := [flight for flight in flights if flight.split == split]:
+        if own := [track for track in tracks if track.split == split]:
             found[split] = SplitNumbers(
-                frames=sum(flight.frames for flight in own),
+                frames=sum(track.frames for track in own),
                 captions=captions.get(split, 0),
                 flights=len(own),
-                trajectories=len({flight.trajectory for flight in own}),
-                walks=sorted({flight.walk for flight in own}),
-                towns=sorted({flight.town for flight in own}),
+                trajectories=len({track.trajectory for track in own}),
+                walks=sorted({track.walk for track in own}),
+                towns=sorted({track.town for track in own}),
             )
     return found
 

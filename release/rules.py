@@ -48,7 +48,7 @@ def select_frames(num_points: int, num_frames: int, selection: Selection, window
 
 NAME_OF: dict[Split, SplitName] = {"train": "train", "val": "validation", "test": "test"}
 SPLIT_RULE = (
-    "whole walks (a walk: flights of one town, in any of its builds, whose person is at the same places at the "
+    "whole walks (a walk: tracks of one town, in any of its builds, whose person is at the same places at the "
     "same seconds), or whole towns; ranked by sha256 of the seed and the name, the first to test, the next to "
     "validation, the rest to train, one at least for each split that has a share; fewer than splits fill train, "
     "then validation"
@@ -58,7 +58,7 @@ SPLIT_RULE = (
 def split_flights(
     flights: Mapping[str, tuple[str, str]], by: SplitBy, fractions: Mapping[SplitName, float], seed: int
 ) -> dict[str, SplitName]:
-    """Return the split of each flight, given its walk and town. Walks, or families of towns, of which no flight is
+    """Return the split of each track, given its walk and town. Walks, or families of towns, of which no track is
     released have no rank.
     """
     shares: dict[Split, float] = {"val": fractions["validation"], "test": fractions["test"]}

@@ -22,12 +22,12 @@ from cosfly.geometry.axes import BODY_FROM_CAMERA
 from release.card.render import render_card
 from release.columns import CONTRACT
 from release.counting import Sum, action_class, count_track, numbers_of
-from release.reading import FlightRows
+from release.reading import TrackRows
 from release.record import read_record
 from release.rules import select_frames
 
 TRACKS = [
-    FlightRows(f"one/Town01/trajectory_{k}/{variant}", [make_row(i, variant, f"trajectory_{k}") for i in range(12)])
+    TrackRows(f"one/Town01/trajectory_{k}/{variant}", [make_row(i, variant, f"trajectory_{k}") for i in range(12)])
     for k in (1, 2)
     for variant in ("ORI", "aug_001")
 ]

@@ -18,7 +18,7 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.goals import SIDES, SLOTS, words_of
 from release.columns import SCALARS, Placement
-from release.reading import FlightRows, Row
+from release.reading import Row, TrackRows
 from release.verify.findings import Findings
 from release.verify.scene import check_goal, decode
 
@@ -26,17 +26,17 @@ pytestmark = [needs_gl]
 
 
 @pytest.fixture(scope="module")
-def flights(crowded_tree) -> list[tuple[FlightRows, Path]]:  # noqa: F811
+def flights(crowded_tree) -> list[tuple[TrackRows, Path]]:  # noqa: F811
     found = []
     for folder in find_tracks(crowded_tree):
         flight, placement = read_track(folder), Placement(walk="w", split="train")
         rows = [{one.name: one.cell(flight, i, None, placement) for one in SCALARS} for i in range(len(flight))]
-        found.append((FlightRows("a/b/c/d", rows), folder))
+        found.append((TrackRows("a/b/c/d", rows), folder))
     return found
 
 
 def told(rows: list[Row], folder: Path) -> list[str]:
-    flight, findings = FlightRows("a/b/c/d", rows), Findings()
+    flight, findings = TrackRows("a/b/c/d", rows), Findings()
     for i in range(len(rows)):
         files = {file: frame_path(folder / f"frames_playback/frame_{i:05d}", name) for file, name in FILE_NAMES.items()}
         pictures = {file: path.read_bytes() for file, path in files.items()}
@@ -46,7 +46,7 @@ def told(rows: list[Row], folder: Path) -> list[str]:
     return [f"{kind.where}: {kind.got}" for kind in findings.issues]
 
 
-def changed(flight: FlightRows, says: list[str] | None = None, people: People | None = None, **values) -> list[Row]:
+def changed(flight: TrackRows, says: list[str] | None = None, people: People | None = None, **values) -> list[Row]:
     says, people = says or list(flight.goal.says), people or flight.people
     words = {f"goal_{language}": text for language, text in words_of(says, people.target).items()}
     new = {**words, "goal_says": says, "people": json.dumps(asdict(people))} | values

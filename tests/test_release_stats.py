@@ -12,7 +12,7 @@ from cosfly.runtime.json_io import read_json
 from release.card.tables import tables_of
 from release.columns import POINT, POSE
 from release.counting import count_track
-from release.reading import FlightRows
+from release.reading import TrackRows
 from release.record import read_record
 
 
@@ -34,7 +34,7 @@ def rows_of(positions: np.ndarray, frames: list[int], offsets: np.ndarray | None
 def test_motion_is_that_of_the_plan_whatever_the_perturbation(seed, num):
     rng = np.random.default_rng(seed)
     plan = np.cumsum(rng.normal(0, 1, (num, 3)), axis=0)
-    rows = FlightRows("one/Town01/trajectory_1/aug_001", rows_of(plan, list(range(num)), rng.normal(0, 2, (num, 3))))
+    rows = TrackRows("one/Town01/trajectory_1/aug_001", rows_of(plan, list(range(num)), rng.normal(0, 2, (num, 3))))
     flight = count_track(rows, rows)
     assert flight.motion["length_m"] == pytest.approx(length_m(plan), rel=1e-9)
     assert flight.motion["accel_rms_mps2"] == pytest.approx(derivative_rms(plan, 2), rel=1e-6)

@@ -1,1 +1,1 @@
-"""Accepted flights and captions to a release."""
+"""Accepted tracks and captions to a release."""

@@ -116,7 +116,7 @@ def survey_tracks(
     wanted = [one for one in candidates if one.dropped is None]
 
     def courses() -> Iterator[Course]:
-        with progress_bar("release: flights read", total=len(wanted)) as advance:
+        with progress_bar("release: tracks read", total=len(wanted)) as advance:
             for one in wanted:
                 advance(1)
                 track = open_track(one)
@@ -205,7 +205,7 @@ def _no_track(sources: list[Source], material: Material, dropped: Counter[str], 
         fix = "release single tracks too with --set release.pairs=any, or choose others with release.tracks"
     inspected = next((source.inspect.parent for source in [*waiting, *sources] if source.inspect), None)
     if inspected is None:
-        return stage.nothing_kept(tally, expected="a flight", fix=fix)
+        return stage.nothing_kept(tally, expected="a track", fix=fix)
     fix = f"fix what {inspected / 'report.html'} lists and inspect again, or {fix}"
     if waiting:
         again = "then run the same command again; or release them without a decision with another --out and"

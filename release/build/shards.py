@@ -186,7 +186,7 @@ def _check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where
 
 
 def _digests(candidate: Candidate) -> dict[str, str]:
-    """Return the sha256 of each file of a flight, as far as they are known, once it is clear that they are those that
+    """Return the sha256 of each file of a track, as far as they are known, once it is clear that they are those that
     were inspected.
     """
     folder = candidate.folder

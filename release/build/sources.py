@@ -1,4 +1,4 @@
-"""What goes into a release: the runs it is made of, their flights, maps and licence, and what each flight is called."""
+"""What goes into a release: the runs it is made of, their tracks, maps and licence, and what each track is called."""
 
 from __future__ import annotations
 
@@ -175,15 +175,15 @@ def _funnel_of(inspections: list[Inspection]) -> TrajectoryFunnel | None:
 
 
 def maps_of(candidates: list[Candidate]) -> list[ReleasedMap]:
-    """Return the maps that flights show, each once."""
-    towns = {(flight.place.town, flight.folder.parent.parent) for flight in candidates}
+    """Return the maps that tracks show, each once."""
+    towns = {(track.place.town, track.folder.parent.parent) for track in candidates}
     shown = {ReleasedMap(town=town, **dict(read_town_map(folder))) for town, folder in towns}
     return sorted(shown, key=lambda one: (one.town, one.name, one.licence, one.credits))
 
 
 def _place(source: Source, folder: Path) -> Place:
-    """Tell a place by a flight's folder in its tree. Folders above the town, in a tree of several, count as part of the
-    run's name."""
+    """Return the place of a track by its folder in the tree. Folders above the town, in a tree of several, are part of
+    the run's name."""
     town, trajectory, variant = ("", "", *folder.parts)[-3:]
     return Place("_".join((source.run, *folder.parts[:-3])), town, trajectory, variant)
 

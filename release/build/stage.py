@@ -1,4 +1,4 @@
-"""`cosfly release build`: flights and captions to a folder that `datasets.load_dataset` opens.
+"""`cosfly release build`: tracks and captions to a folder that `datasets.load_dataset` opens.
 
 Reads the playback trees, captions and inspections of one run or several; writes `dataset/` (parquet shards, README.md,
 release.json, checksums.sha256), which is published whole or not at all and holds nothing of this machine. The records

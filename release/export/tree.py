@@ -31,7 +31,7 @@ from cosfly.runtime.io import sha256_bytes, sha256_file, write_bytes, write_chec
 from cosfly.runtime.json_io import write_model
 from release.columns import COMPANY_COLUMNS, TARGET_PICTURE, matrices_of
 from release.export.stage import ExportConfig, ExportSource, FormatFacts, SourceTrack
-from release.reading import FlightRows, Row
+from release.reading import Row, TrackRows
 
 
 def write(source: ExportSource, folder: Path, cfg: ExportConfig, advance: Advance) -> FormatFacts:
@@ -86,9 +86,9 @@ def _write_track(track: SourceTrack, number: int, out: Path, advance: Advance) -
 def track_of_rows(placed: SourceTrack, number: int) -> Track:
     """Return the track of released rows; `number` is that of its trajectory in the export."""
     rows = placed.rows
-    found = FlightRows(placed.name, rows)
+    found = TrackRows(placed.name, rows)
     return replace(
-        found.flight,
+        found.track,
         intrinsics=None if (found.intrinsics == found.intrinsics[0]).all() else matrices_of(found.intrinsics),
         segments=_segments([row["style"] for row in rows]),
         source={
@@ -104,7 +104,7 @@ def track_of_rows(placed: SourceTrack, number: int) -> Track:
     )
 
 
-def _goal(rows: FlightRows, placed: SourceTrack) -> Goal | None:
+def _goal(rows: TrackRows, placed: SourceTrack) -> Goal | None:
     """Return the goal if its frame is released, with the number of that frame in the tree."""
     at = np.flatnonzero(np.equal(placed.frame_index, rows.goal.frame if rows.goal else -1))
     return replace(rows.goal, frame=int(at[0])) if rows.goal and len(at) else None
@@ -131,7 +131,7 @@ def _weather(row: Row) -> dict[str, Any]:
 
 
 def _segments(styles: list[str]) -> tuple[Segment, ...]:
-    """Return the parts of a flight by style; none where it follows from end to end."""
+    """Return the parts of a track by style; none where it follows from end to end."""
     if set(styles) == {FOLLOW}:
         return ()
     parts, begin = [], 0

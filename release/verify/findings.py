@@ -11,7 +11,7 @@ from pydantic import ConfigDict
 
 from cosfly.formats.issues import Issue, Report, Severity, sort_key
 from cosfly.runtime.escaping import cut, for_terminal
-from release.reading import FlightRows
+from release.reading import TrackRows
 
 EXAMPLES = 3  # places of a kind that are named
 Words = str | Callable[[int], Any]  # of all rows alike, or of each
@@ -61,13 +61,13 @@ class Findings(Report):
         elif got != expected:
             self.error(code, where, got, str(expected))
 
-    def judge(self, flight: FlightRows, rules: Iterable[tuple[str, str, np.ndarray, Words, Words]]) -> None:
+    def judge(self, track: TrackRows, rules: Iterable[tuple[str, str, np.ndarray, Words, Words]]) -> None:
         """Add an error for each row that is wrong. rules: code, column, which rows are wrong (n,) bool, what was found,
         what was expected."""
         for code, column, wrong, *words in rules:
             for i in np.flatnonzero(wrong).tolist():
                 got, expected = (one if isinstance(one, str) else one(i) for one in words)
-                self.error(code, flight.where(i, column), got, str(expected))
+                self.error(code, track.where(i, column), got, str(expected))
 
     def as_json(self) -> dict[str, Any]:
         """Return what `--json` writes."""

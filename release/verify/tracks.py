@@ -24,7 +24,7 @@ from cosfly.runtime.io import sha256_file
 from cosfly.runtime.worker import Item, Outcome
 from release.columns import CAPTION, LANGUAGES, POINT_NAMES, POINTS, SCALARS, WINDOW, Column
 from release.counting import count_track
-from release.reading import FlightRows, Pictures, read_pictures, read_tracks
+from release.reading import Pictures, TrackRows, read_pictures, read_tracks
 from release.record import ReleaseRecord, Shard
 from release.verify.findings import Findings
 from release.verify.scene import check_pictures
@@ -38,14 +38,14 @@ SQUARE = 1e-6  # square pixels: fx = fy
 STRIDE_SHARE = 0.1  # of the box's longer side: how far a figure in full stride reaches beyond it
 
 
-def check_camera(flight: FlightRows, findings: Findings) -> None:
+def check_camera(track: TrackRows, findings: Findings) -> None:
     """Check the camera: of the first row alone where it is constant, which `check_values` checks."""
-    is_first = np.arange(len(flight)) < (len(flight) if flight.zooms else 1)
-    (fx, fy, cx, cy), (width, height), fovs = flight.intrinsics.T, flight.size_px.T, flight.numbers("fov_deg")
+    is_first = np.arange(len(track)) < (len(track) if track.zooms else 1)
+    (fx, fy, cx, cy), (width, height), fovs = track.intrinsics.T, track.size_px.T, track.numbers("fov_deg")
     fov = np.degrees(2.0 * np.arctan(width / (2.0 * fx)))
     is_middle = (np.abs(cx - width / 2) <= CENTRE_PX) & (np.abs(cy - height / 2) <= CENTRE_PX)
     is_square = (fx > 0) & (np.abs(fx - fy) <= SQUARE * fx)
-    findings.judge(flight, (
+    findings.judge(track, (
         ("intrinsics", "intrinsics", is_first & ~(is_square & is_middle),
          lambda i: f"focal lengths ({fx[i]}, {fy[i]}), principal point ({cx[i]}, {cy[i]})",
          lambda i: f"equal focal lengths above 0, the middle ({width[i] / 2:g}, {height[i] / 2:g})"),
@@ -55,17 +55,17 @@ def check_camera(flight: FlightRows, findings: Findings) -> None:
     ))  # fmt: skip
 
 
-def check_projection(flight: FlightRows, findings: Findings) -> None:
+def check_projection(track: TrackRows, findings: Findings) -> None:
     """Check the pixel and depth of the target against pose and camera."""
-    body = np.einsum("nji,nj->ni", flight.rotations, flight.target_m - flight.pose[:, :3])
+    body = np.einsum("nji,nj->ni", track.rotations, track.target_m - track.pose[:, :3])
     x, y, z = (body @ BODY_FROM_CAMERA).T
-    fx, fy, cx, cy = flight.intrinsics.T
-    off_px = np.hypot(flight.uv[:, 0] - (fx * x / z + cx), flight.uv[:, 1] - (fy * y / z + cy))
+    fx, fy, cx, cy = track.intrinsics.T
+    off_px = np.hypot(track.uv[:, 0] - (fx * x / z + cx), track.uv[:, 1] - (fy * y / z + cy))
     off_px[~(z > 0)] = np.nan
-    has_target, depth_m = ~np.isnan(flight.target_m[:, 0]), flight.numbers("target_depth_m")
-    wrong_px = has_target & ~np.isnan(flight.uv[:, 0]) & ~(off_px <= PIXEL_PX)
+    has_target, depth_m = ~np.isnan(track.target_m[:, 0]), track.numbers("target_depth_m")
+    wrong_px = has_target & ~np.isnan(track.uv[:, 0]) & ~(off_px <= PIXEL_PX)
     wrong_m = has_target & ~np.isnan(depth_m) & ~(np.abs(depth_m - z) <= DEPTH_M)
-    findings.judge(flight, (
+    findings.judge(track, (
         ("projection", "target_uv", wrong_px, lambda i: f"{off_px[i]:.3f} px from the projected target",
          f"at most {PIXEL_PX} px"),
         ("target_depth", "target_depth_m", wrong_m, lambda i: f"{depth_m[i]:.3f} m",
@@ -73,12 +73,12 @@ def check_projection(flight: FlightRows, findings: Findings) -> None:
     ))  # fmt: skip
 
 
-def check_boxes(flight: FlightRows, findings: Findings) -> None:
+def check_boxes(track: TrackRows, findings: Findings) -> None:
     """Check that boxes are inside the picture, min before max; those of our renderers are the projected person's."""
-    box, mask, size = flight.box, flight.mask_box, np.tile(flight.size_px, 2)
-    is_ours, slack = not flight.is_foreign, np.inf if flight.is_foreign else 0.5
+    box, mask, size = track.box, track.mask_box, np.tile(track.size_px, 2)
+    is_ours, slack = not track.is_foreign, np.inf if track.is_foreign else 0.5
     has_box, has_mask = ~np.isnan(box[:, 0]), ~np.isnan(mask[:, 0])
-    corners = flight.projected_corners
+    corners = track.projected_corners
     expected = np.clip(np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1), 0.0, size)
     is_other = is_ours & has_box & (np.abs(box - expected).max(axis=1) > BOX_PX)
     slack_px = 1.5 + STRIDE_SHARE * (box[:, 2:] - box[:, :2]).max(axis=1, keepdims=True)  # a mask's edges lie on pixels
@@ -87,7 +87,7 @@ def check_boxes(flight: FlightRows, findings: Findings) -> None:
     def turned(one: np.ndarray) -> Any:
         return (one[:, 2:] <= one[:, :2]).any(axis=1) | (one < -slack).any(axis=1) | (one > size + slack).any(axis=1)
 
-    findings.judge(flight, (("box", *rule) for rule in (
+    findings.judge(track, (("box", *rule) for rule in (
         ("target_bbox", has_box & turned(box), lambda i: box[i].tolist(), "min before max, inside the picture"),
         ("target_bbox", is_other, lambda i: box[i].round(1).tolist(),
          lambda i: f"{expected[i].round(1).tolist()}, the projected box of the person"),
@@ -97,17 +97,17 @@ def check_boxes(flight: FlightRows, findings: Findings) -> None:
     )))  # fmt: skip
 
 
-def check_flags(flight: FlightRows, findings: Findings) -> None:
-    in_view, visible = flight.flags("target_in_view"), flight.flags("target_visible")
-    visibility = flight.numbers("visibility")
-    has_target = ~np.isnan(flight.target_m[:, 0])
-    has_box, has_mask = ~np.isnan(flight.box[:, 0]), ~np.isnan(flight.mask_box[:, 0])
-    legible, height_px = flight.flags("target_legible"), flight.numbers("target_height_px")
+def check_flags(track: TrackRows, findings: Findings) -> None:
+    in_view, visible = track.flags("target_in_view"), track.flags("target_visible")
+    visibility = track.numbers("visibility")
+    has_target = ~np.isnan(track.target_m[:, 0])
+    has_box, has_mask = ~np.isnan(track.box[:, 0]), ~np.isnan(track.mask_box[:, 0])
+    legible, height_px = track.flags("target_legible"), track.numbers("target_height_px")
     reads = visible & (height_px >= LEGIBLE_HEIGHT_PX) & (visibility >= LEGIBLE_SHARE)
-    reads &= flight.numbers("target_contrast") >= LEGIBLE_CONTRAST
-    box_px = np.nan_to_num(flight.box[:, 3] - flight.box[:, 1])
-    is_ours = not flight.is_foreign
-    findings.judge(flight, (("flags", *rule) for rule in (
+    reads &= track.numbers("target_contrast") >= LEGIBLE_CONTRAST
+    box_px = np.nan_to_num(track.box[:, 3] - track.box[:, 1])
+    is_ours = not track.is_foreign
+    findings.judge(track, (("flags", *rule) for rule in (
         ("target_visible", visible & ~in_view, "true, but target_in_view is false", "false for a target out of view"),
         ("target_in_view", in_view & ~has_target, "true, but target is null", "false without a target"),
         ("target_legible", (legible != reads) & ~np.isnan(height_px), "a value that contradicts the limits",
@@ -126,61 +126,61 @@ FREE = [column for column in SCALARS if column.name not in POINT_NAMES]  # the o
 LARGEST = 1e7  # of any number: farther than any town reaches, m
 
 
-def check_values(flight: FlightRows, columns: Sequence[Column], findings: Findings) -> None:
+def check_values(track: TrackRows, columns: Sequence[Column], findings: Findings) -> None:
     """Check constants, nulls, closed sets and numbers of the columns of a track's rows, by the table of columns."""
     for column in columns:
-        values = flight.column(column.name)
+        values = track.column(column.name)
         allowed: Sequence[str] = TOKENS if column.words == "actions" else column.words
-        differs = column.constant and not (flight.zooms and column.name in OF_ZOOM)
+        differs = column.constant and not (track.zooms and column.name in OF_ZOOM)
         for i, value in enumerate(values):
             if differs and value != values[0]:
                 expected = f"{values[0]}, as in the first row of the track"
-                findings.error("constant", flight.where(i, column.name), value, expected)
+                findings.error("constant", track.where(i, column.name), value, expected)
                 differs = False
             if value is None and column.required and column.of_caption is None:
-                findings.error("null", flight.where(i, column.name), "null", "a value in every row")
+                findings.error("null", track.where(i, column.name), "null", "a value in every row")
             elif value is not None and allowed and value not in allowed:
                 expected = f"one of {len(allowed)} words: {', '.join(allowed[:4])} ..."
-                findings.error("closed_set", flight.where(i, column.name), repr(value), expected)
+                findings.error("closed_set", track.where(i, column.name), repr(value), expected)
             elif isinstance(value, float):
-                _check_number(flight, i, column, "", value, findings)
+                _check_number(track, i, column, "", value, findings)
             elif isinstance(value, dict) and isinstance(column.type, tuple):
                 for member, number in value.items():
-                    _check_number(flight, i, column, member, number, findings)
+                    _check_number(track, i, column, member, number, findings)
 
 
 def _check_number(
-    flight: FlightRows, i: int, column: Column, member: str, number: float | None, findings: Findings
+    track: TrackRows, i: int, column: Column, member: str, number: float | None, findings: Findings
 ) -> None:
     """Check that a number of a group or column is there, finite and within its range."""
     low, high = column.ranges.get(member, (-LARGEST, LARGEST))
     if number is None or not low <= number <= high:  # NaN is not
         code = "null" if number is None else "range" if math.isfinite(number) else "not_finite"
-        findings.error(code, flight.where(i, f"{column.name}.{member}".rstrip(".")), number, f"{low:g} to {high:g}")
+        findings.error(code, track.where(i, f"{column.name}.{member}".rstrip(".")), number, f"{low:g} to {high:g}")
 
 
-def check_points(flight: FlightRows, points: FlightRows, findings: Findings) -> None:
+def check_points(track: TrackRows, points: TrackRows, findings: Findings) -> None:
     """Check ids, that a track has all of its points in time, and that each row has the values of its point."""
-    for i, row in enumerate(flight.rows):
-        found, expected = row["sample_id"], f"{flight.given_id}_frame_{row['frame_index'] or 0:05d}"
-        if flight.given_id is not None and found != expected:
-            findings.error("sample_id", flight.where(i, "sample_id"), repr(found), f"{expected}, by its track")
+    for i, row in enumerate(track.rows):
+        found, expected = row["sample_id"], f"{track.given_id}_frame_{row['frame_index'] or 0:05d}"
+        if track.given_id is not None and found != expected:
+            findings.error("sample_id", track.where(i, "sample_id"), repr(found), f"{expected}, by its track")
     if (points.time_s[1:] <= points.time_s[:-1]).any():
         findings.error("time", points.where(0, "time_s"), "times that do not increase", "increasing times")
     if not np.array_equal(points.index, np.arange(len(points))):
-        findings.error("points", f"{flight.name}: points", "frame indices with gaps", f"0 to {len(points) - 1}")
+        findings.error("points", f"{track.name}: points", "frame indices with gaps", f"0 to {len(points) - 1}")
         return
-    for i, row in enumerate(flight.rows):
-        point = points.rows[flight.index[i]] if 0 <= flight.index[i] < len(points) else {}
+    for i, row in enumerate(track.rows):
+        point = points.rows[track.index[i]] if 0 <= track.index[i] < len(points) else {}
         for name in (name for name in POINT_NAMES if row.get(name) != point.get(name)):
             got = f"{shown(row.get(name))}, and {shown(point.get(name))} in the table of points"
-            findings.error("points", flight.where(i, name), got, "the same value in both")
+            findings.error("points", track.where(i, name), got, "the same value in both")
 
 
-def check_captions(flight: FlightRows, window_frames: int, findings: Findings) -> None:
+def check_captions(track: TrackRows, window_frames: int, findings: Findings) -> None:
     """Check that captions are whole or null, their windows, and the verdict against label and decision. window_frames:
     Of every window of the track."""
-    for i, row in enumerate(flight.rows):
+    for i, row in enumerate(track.rows):
         has_caption, index, decision = row["has_caption"], row["frame_index"], row["decision"]
         odd = [
             column.name for column in CAPTION
@@ -188,18 +188,18 @@ def check_captions(flight: FlightRows, window_frames: int, findings: Findings) -
         ]  # fmt: skip
         if odd:
             expected = f"{'a value' if has_caption else 'null'}, because has_caption is {has_caption}"
-            findings.error("caption", flight.where(i, odd[0]), shown(row[odd[0]]), expected)
+            findings.error("caption", track.where(i, odd[0]), shown(row[odd[0]]), expected)
         if odd or not has_caption:
             continue
         if row[WINDOW] != list(range(index - window_frames + 1, index + 1)) or row[WINDOW][0] < 0:
             expected = f"{window_frames} consecutive frames up to {index}"
-            findings.error("window", flight.where(i, WINDOW), row[WINDOW], expected)
+            findings.error("window", track.where(i, WINDOW), row[WINDOW], expected)
         if any(row[f"caption_{language}_flight_decision"] != decision for language in LANGUAGES):
-            findings.error("decision", flight.where(i, "decision"), decision, "the same decision in all columns")
+            findings.error("decision", track.where(i, "decision"), decision, "the same decision in all columns")
         if (row["verdict"] == "CONSISTENT") != (decision == row["label"]):
             got = f"{row['verdict']}, decision {decision}, label {row['label']}"
             expected = "CONSISTENT if and only if the decision is the label"
-            findings.error("verdict", flight.where(i, "verdict"), got, expected)
+            findings.error("verdict", track.where(i, "verdict"), got, expected)
 
 
 # --- the worker -------------------------------------------------------------------------------------------------------
@@ -226,17 +226,17 @@ class Context:
         ids = flight_ids(list(places.values()))
         return {name: ids[place] for name, place in places.items()}
 
-    def caption_settings(self, flight: FlightRows) -> dict[str, Any]:
+    def caption_settings(self, track: TrackRows) -> dict[str, Any]:
         """Return the settings of a track's captions; folders above a town are part of a run's name."""
-        name = flight.name.split("/")[0]
+        name = track.name.split("/")[0]
         sources = [one for one in self.record.provenance.sources if f"{name}_".startswith(f"{one.run}_")]
         stages = max(sources, key=lambda one: len(one.run)).stages if sources else []
         configs = [stage.config for stage in stages if stage.stage == "caption"]
         return configs[0] if len(configs) == 1 else {}
 
-    def window_frames(self, flight: FlightRows) -> int:
+    def window_frames(self, track: TrackRows) -> int:
         """Return the frames of a window of a track; captions of several sources may differ in it."""
-        window = self.caption_settings(flight).get("window", {})
+        window = self.caption_settings(track).get("window", {})
         return window.get("num_frames", self.record.settings.window_frames)
 
 
@@ -248,7 +248,7 @@ def make_worker(context: Context) -> Callable[[Item], Outcome]:
         shard: Shard = item.payload
         files = context.record.settings.modalities
         pictures = read_pictures(context.folder, shard, files) if context.level == "pixels" else iter(())
-        clean: FlightRows | None = None  # the points of the clean track before this one
+        clean: TrackRows | None = None  # the points of the clean track before this one
         try:
             for frames, points in read_tracks(context.folder, shard, strict=False):
                 own = replace(frames, given_id=context.ids.get(frames.name))
@@ -286,7 +286,7 @@ def _reported(name: str, findings: Findings) -> Iterator[None]:
 
 
 def _check_track(
-    frames: FlightRows, points: FlightRows, twin: FlightRows | None, pictures: Iterator[Pictures], context: Context,
+    frames: TrackRows, points: TrackRows, twin: TrackRows | None, pictures: Iterator[Pictures], context: Context,
     findings: Findings,
 ) -> None:  # fmt: skip
     """Run all checks of a track."""
