@@ -206,13 +206,8 @@ def test_one_version_is_named_everywhere_and_every_tag_has_its_heading():
     assert set(tags) <= {f"v{number}" for number, day in found if day != "unreleased"}
 
 
-TOWNS = [f"runs/learning/{name}" for name in ("grid", "old_town", "towers")]
-VARIABLES = {
-    "trees": " ".join(f"--data {town}/render" for town in TOWNS),
-    "towns": " ".join(TOWNS),
-    "name": "both",
-    "size": "2B",
-}  # of loops in a page
+TOWNS = [f"runs/diverse/{name}" for name in ("grid", "old_town", "towers")]
+VARIABLES = {"trees": " ".join(f"--data {town}/render" for town in TOWNS), "size": "2B"}  # of loops in a page
 COMMAND = re.compile(r"^(?:\$ )?(?:.*; )?(?:[A-Z_]+=\S+ )*(?:.* -m )?cosfly (.*)$")
 
 

@@ -190,6 +190,7 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "work/unlabelled/render": copy_of("runs/quickstart/render"),
     "Qwen/Qwen3.5-2B": lambda root, target: make_random_student(target),
     "models/Qwen3.5-2B": lambda root, target: make_random_student(target),
+    "work/seeing": lambda root, target: make_random_student(target),
     "models/roberta-large": lambda root, target: make_encoder(target),
     "models/bert-base-chinese": lambda root, target: make_encoder(target),
     "work/students-captions/captions.jsonl": copy_of("runs/five/caption/captions.jsonl"),
@@ -226,10 +227,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
     root.mkdir()
     monkeypatch.chdir(root)
     monkeypatch.setenv("COLUMNS", "200")
-    for name in "quickstart showcase simworld delft diverse learning".split():  # before one that ships  # noqa: SIM905
+    for name in "quickstart showcase simworld delft diverse".split():  # before one that ships  # noqa: SIM905
         (root / name).write_text(yaml.safe_dump(small_run(name)))
-    (root / "configs").mkdir()
-    shutil.copy(root / "learning", root / "configs/learning.yaml")
     town = invent(SyntheticConfig(name="Town10HD_Opt", size_m=150.0, num_blocks=1), 0)
     with (
         TeacherServer(respond=answer) as teacher,

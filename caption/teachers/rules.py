@@ -21,7 +21,7 @@ from caption.verification.references import Fact, look_up, parse_reference
 from cosfly.formats.segments import MISSION_KINDS
 from cosfly.runtime.config import read_yaml
 
-MODEL = "rules-14"  # its name in the records; counts changes of decisions and wording
+MODEL = "rules-15"  # its name in the records; counts changes of decisions and wording
 Both = tuple[str, str]  # English, Chinese
 Condition = Callable[[Facts, int], bool]  # of the facts and the side of the decision: 1 left, -1 right, 0 neither
 
@@ -303,7 +303,7 @@ CONDITIONS: dict[str, Condition] = {
     "hovers_on": lambda f, side: (f.target_speed_mps or 0.0) < DAWDLING_MPS and expects(FAMILIES["hover"])(f, side),
     "turns_with_sight": lambda f, side: side * (f.yaw_rate_dps[-1] or 0.0) >= TURNING_DPS
     and f.is_visible_now and side * sight_rate_dps(f) >= TURNING_DPS
-    and side * (f.bearing_deg[-1] or 0.0) >= -LITTLE_DEG,
+    and side * (f.bearing_deg[-1] or 0.0) >= -ACROSS_SIGHT_DEG,
     "on_its_side": lambda f, side: side * (f.bearing_deg[-1] or 0.0) >= 1.0,
     "strafes_on": strafes_on, "circles_on": circles_on, "bearing_steady": lambda f, side: is_bearing_steady(f),
     "drifts": drifts,
@@ -352,6 +352,7 @@ CONDITIONS: dict[str, Condition] = {
     "similar_near": lambda f, side: f.is_visible_now and f.alike_differences[-1] in range(MOST_DIFFERENCES + 1)
     and _or_far(f.other_distance_m[-1]) <= COMING_M,
     **{f"expects_{name}": expects(family) for name, family in FAMILIES.items()},
+    "expects_slow_down": lambda f, side: not gap_opens(f, side) and expects(FAMILIES["slow_down"])(f, side),
     **{kind: is_ordered(kind) for kind in MISSION_KINDS},
 }  # fmt: skip
 

@@ -15,7 +15,7 @@ from cosfly.cli.options import STAGE, WORKERS, Job, command
 if TYPE_CHECKING:
     from cosfly.pipeline.settings import RunConfig
 
-CONFIG = "YAML file, a shipped one (quickstart, showcase, diverse, learning, simworld, delft), or a run directory."
+CONFIG = "YAML file, a shipped one (quickstart, showcase, diverse, simworld, delft), or a run directory."
 Until = Literal["maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release"]
 PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 
