@@ -21,10 +21,10 @@ from caption.schema import CaptionConfig, ObservedFrame, ObservedWindow
 from caption.teachers.prompt_files import Vocabulary
 from caption.teachers.prompts import MAX_RETURNED_CHARACTERS, Correction, make_question, question_messages
 from cosfly.llm.answer_text import answer_schema
-from cosfly.llm.client import ChatClient
+from cosfly.llm.client import LEFT_OUT, ChatClient
 from cosfly.llm.contract import Reply, run_until_interrupted
-from cosfly.llm.protocol import BadReply, read_body, thoughts_of
-from cosfly.llm.refusals import MEANINGS, RefusedRequest
+from cosfly.llm.protocol import BadReply
+from cosfly.llm.refusals import MEANINGS, Refusal
 from cosfly.llm.student_chat import EncodedImage, encoded_image
 from cosfly.runtime.console import Advance, progress_bar
 from cosfly.runtime.errors import TeacherError
@@ -48,7 +48,6 @@ MIN_TOKENS = 64  # the smallest `max_tokens`
 BLOCK_PX = 8  # the JPEG of a random picture with such blocks takes 44 kB at 640 x 360 px, a rendered frame 49 to 57 kB
 PADDING = "Nothing has to change. " * 100  # makes a prompt longer by several hundred tokens
 READY = "Reply with the one word: ready"
-NO_SYSTEM = "the instructions are sent with the question"
 NO_THINKING = "endpoint.extra_body={chat_template_kwargs: {enable_thinking: false}}"
 
 
@@ -77,28 +76,6 @@ def examine_endpoint(
         return run_until_interrupted(examination.run(), keeps_work=False)
 
 
-@dataclass(frozen=True)
-class _Probe:
-    """The result of one request.
-
-    reply: None if the request failed. detail: Why it failed. refuses_schema: The server refused the schema.
-    thoughts: Characters before the answer.
-    """
-
-    reply: Reply | None
-    detail: str = ""
-    refuses_schema: bool = False
-    thoughts: int = 0
-
-    @property
-    def text(self) -> str:
-        return "" if self.reply is None else self.reply.text.strip()
-
-    @property
-    def prompt_tokens(self) -> int | None:
-        return None if self.reply is None or self.reply.usage is None else self.reply.usage.prompt_tokens
-
-
 class _LimitReached(Exception):
     """The examination has sent as many requests as it may."""
 
@@ -115,7 +92,6 @@ class _Examination:
         self.client, self.cfg, self.advance = client, cfg, advance
         self.num_requests, self.most_requests = 0, most_requests
         self.largest = largest_messages(cfg, vocabulary)
-        self.takes_schema = cfg.endpoint.json_schema
         self.findings: list[Finding] = []
 
     async def run(self) -> list[Finding]:
@@ -132,81 +108,72 @@ class _Examination:
             self._add("limit", "warning", f"stopped after {self.num_requests} requests; further checks are not made")
         finally:
             await self.client.close()
+        if refusal := self.client.left_out.get("no_system"):
+            self._add("system role", "warning", LEFT_OUT["no_system"] % refusal.summary)
         return self.findings
 
     def _add(self, name: str, state: State, detail: str) -> None:
         self.findings.append(Finding(name, state, detail))
 
-    async def _ask(self, messages: list[dict], max_tokens: int, schema: dict | None = None) -> _Probe:
-        endpoint = self.cfg.endpoint.model_copy(update={"max_tokens": max_tokens})
-        request = endpoint.request(messages, [], schema or {}, seed=0)  # sampled as a run samples
+    async def _ask(self, messages: list[dict], max_tokens: int, schema: dict | None = None) -> Reply | str:
+        """Return the reply to one request, or why it failed."""
         if self.num_requests == self.most_requests:
             raise _LimitReached
         self.num_requests += 1
         self.advance(1, f"{self.num_requests} requests sent")
-        had_system = not self.client.joins_system
+        endpoint = self.cfg.endpoint.model_copy(update={"max_tokens": max_tokens})
         try:
-            response, reply = await self.client.ask_once(request, schema)
+            return await self.client.ask(endpoint.request(messages, [], schema or {}, seed=0))
         except (TimeoutError, httpx.RequestError) as error:
-            return _Probe(None, self.client.message_of(error))
-        except RefusedRequest as error:
-            refusal = error.refusal
-            if had_system and self.client.leaves_out_system(refusal, request):
-                self._add("system role", "warning", f"refused ({refusal.summary}); {NO_SYSTEM}")
-                return await self._ask(messages, max_tokens, schema)
-            fix = "" if refusal.kind == "unknown" else f"; {refusal.meaning.fix}"
-            return _Probe(None, refusal.summary + fix, refusal.kind == "schema")
+            return self.client.message_of(error)
+        except Refusal as refusal:
+            return refusal.summary + ("" if refusal.kind == "unknown" else f"; {refusal.meaning.fix}")
         except BadReply as error:
-            return _Probe(None, str(error))
-        return _Probe(reply, thoughts=thoughts_of(read_body(response.body)))
+            return str(error)
 
     async def _answers(self) -> bool:
-        probe = await self._ask([_user(READY)], self.cfg.endpoint.max_tokens)
-        if not probe.text:
-            is_cut = probe.reply is not None and probe.reply.finish_reason == "length"
-            thoughts = f"{probe.thoughts} characters of thinking and no answer"
-            if not probe.thoughts:
-                thoughts = "cut short at endpoint.max_tokens before the text begins, probably by thinking"
-            thoughts = f"{thoughts}; switch thinking off with {NO_THINKING}, or raise endpoint.max_tokens"
-            empty = thoughts if probe.thoughts or is_cut else "an empty answer"
-            self._add("answers", "unusable", probe.detail or empty)
+        reply = await self._ask([_user(READY)], self.cfg.endpoint.max_tokens)
+        problem = reply if isinstance(reply, str) else _problem_of(reply)
+        if isinstance(reply, str) or problem is not None:
+            self._add("answers", "unusable", problem or "")
             return False
-        if probe.reply is not None and probe.reply.finish_reason == DECLINED:
-            self._add("answers", "unusable", f"the model declines to answer: {probe.text[:MAX_SHOWN]!r}")
-            return False
-        self._add("answers", "ok", f"{probe.text[:40]!r}")
-        is_off = not probe.thoughts and "<think" not in probe.text
+        text = reply.text.strip()
+        self._add("answers", "ok", f"{text[:40]!r}")
+        is_off = not reply.num_thoughts and "<think" not in text
         fix = f"the model thinks before it answers; switch thinking off with {NO_THINKING}"
         self._add("thinking", "ok" if is_off else "warning", "off" if is_off else fix)
         return True
 
     async def _try_schema(self) -> None:
-        probe = await self._ask([_user("Hello! How are you today?")], 256, ODD_SCHEMA)
+        reply = await self._ask([_user("Hello! How are you today?")], 256, ODD_SCHEMA)
+        plain = "so answers are parsed from plain text"
+        if refusal := self.client.left_out.get("schema"):
+            self._add("JSON schema", "warning", f"refused, {plain}: {refusal.summary}; {refusal.meaning.fix}")
+            return
+        if isinstance(reply, str):
+            self._add("JSON schema", "warning", f"not tested: {reply}")
+            return
         answer: object = None
         with contextlib.suppress(ValueError):
-            answer = parse_json(probe.text)
-        if probe.reply is None:
-            self.takes_schema &= not probe.refuses_schema
-            problem = "refused, so answers are parsed from plain text" if probe.refuses_schema else "not tested"
-            self._add("JSON schema", "warning", f"{problem}: {probe.detail}")
-        elif answer == {"animal": ODD_WORD, "legs": 7}:
+            answer = parse_json(reply.text.strip())
+        if answer == {"animal": ODD_WORD, "legs": 7}:
             self._add("JSON schema", "ok", "applied: the answer has the unusual shape of the schema")
         else:
-            got = f"accepted but ignored: asked for {{animal: {ODD_WORD}}}, got {probe.text[:40]!r}"
-            effect = "so answers are parsed from plain text, and an anchored decision is not enforced"
+            got = f"accepted but ignored: asked for {{animal: {ODD_WORD}}}, got {reply.text.strip()[:40]!r}"
+            effect = f"{plain}, and an anchored decision is not enforced"
             self._add("JSON schema", "warning", f"{got}; {effect}")
 
     async def _takes_images(self) -> bool:
         """Send as many pictures as a prompt of ours holds."""
         limit = self.cfg.endpoint.max_tokens
         pictures = [part for part in self.largest[1]["content"] if part["type"] == "image_url"]
-        probe, tokens = await self._ask([_user(READY, pictures)], limit), None
+        reply, tokens = await self._ask([_user(READY, pictures)], limit), None
         count = f"{len(pictures)} pictures in a prompt"
-        if probe.prompt_tokens is not None:
-            without = (await self._ask([_user(READY)], limit)).prompt_tokens
-            tokens = None if without is None else probe.prompt_tokens - without
-        if probe.reply is None:
-            self._add("image input", "unusable", f"a prompt with {len(pictures)} pictures is refused: {probe.detail}")
+        if (num_tokens := _prompt_tokens(reply)) is not None:
+            without = _prompt_tokens(await self._ask([_user(READY)], limit))
+            tokens = None if without is None else num_tokens - without
+        if isinstance(reply, str):
+            self._add("image input", "unusable", f"a prompt with {len(pictures)} pictures is refused: {reply}")
         elif tokens is None:
             detail = "but it is unknown whether the model sees them, because token usage is not reported"
             self._add("image input", "warning", f"{count} are accepted, {detail}")
@@ -221,44 +188,60 @@ class _Examination:
         """Send a prompt as long as ours get, with our answer limit and schema; report context and time."""
         limit, context = self.cfg.endpoint.max_tokens, self.client.context
         start_s = time.monotonic()
-        probe = await self._ask(self.largest, limit, answer_schema(more=THEREFORE) if self.takes_schema else None)
+        reply = await self._ask(self.largest, limit, answer_schema(more=THEREFORE))
         seconds = time.monotonic() - start_s
-        used, known = probe.prompt_tokens, f" of the context of {context}" if context else ""
+        if isinstance(reply, str):
+            self._add("context length", "unusable", f"the largest prompt is refused: {reply}")
+            return
+        used, known = _prompt_tokens(reply), f" of the context of {context}" if context else ""
         detail = f"{used or 'unknown'} tokens of the largest prompt and {limit} for the answer"
-        if probe.reply is None:
-            self._add("context length", "unusable", f"the largest prompt is refused: {probe.detail}")
-        elif context and used is not None and used + limit > context:
+        if context and used is not None and used + limit > context:
             self._add("context length", "unusable", f"{detail}, more than {context}: {MEANINGS['too_long'].fix}")
         elif await self._cuts_prompts(used):
             cut = f"{used} tokens are counted for the largest prompt and for a longer one: the server drops the rest"
             self._add("context length", "unusable", f"{cut} without an error; {MEANINGS['too_long'].fix}")
         else:
             self._add("context length", "ok", f"{detail}{known}")
-        if probe.reply is not None:
-            self._add_speed(seconds)
+        self._add_speed(seconds)
 
     async def _cuts_prompts(self, used: int | None) -> bool:
         """Return whether a longer prompt counts no more tokens than the largest one."""
         system, question, *correction = self.largest
         padded = question | {"content": [*question["content"], {"type": "text", "text": PADDING}]}
-        longer = [system, padded, *correction]
-        probe = await self._ask(longer, MIN_TOKENS)
-        return used is not None and probe.prompt_tokens is not None and probe.prompt_tokens <= used
+        num_tokens = _prompt_tokens(await self._ask([system, padded, *correction], MIN_TOKENS))
+        return used is not None and num_tokens is not None and num_tokens <= used
 
     def _add_speed(self, seconds: float) -> None:
         """Report the time of one answer, and what it means if the server answers one request at a time."""
         endpoint = self.cfg.endpoint
         queued_s = endpoint.concurrency * seconds
         detail = f"{seconds:.1f} s for one answer to the largest prompt"
-        if queued_s <= endpoint.timeout_s:
-            self._add("speed", "ok", detail)
-            return
-        meaning = (
-            f"a server with one slot needs {queued_s:.0f} s for endpoint.concurrency={endpoint.concurrency} requests"
-        )
-        limit = f"more than endpoint.timeout_s={endpoint.timeout_s:g}"
-        effect = "a run begins with two requests and sends more only while answers are quick"
-        self._add("speed", "ok", f"{detail}; {meaning}, {limit}, so {effect}")
+        if queued_s > endpoint.timeout_s:
+            detail += (
+                f"; a server with one slot needs {queued_s:.0f} s for endpoint.concurrency={endpoint.concurrency} "
+                f"requests, more than endpoint.timeout_s={endpoint.timeout_s:g}, so a run begins with two requests and "
+                "sends more only while answers are quick"
+            )
+        self._add("speed", "ok", detail)
+
+
+def _prompt_tokens(reply: Reply | str) -> int | None:
+    return None if isinstance(reply, str) or reply.usage is None else reply.usage.prompt_tokens
+
+
+def _problem_of(reply: Reply) -> str | None:
+    """Return why a reply to a simple question is not an answer; None if it is."""
+    text = reply.text.strip()
+    if reply.finish_reason == DECLINED:
+        return f"the model declines to answer: {text[:MAX_SHOWN]!r}"
+    if text:
+        return None
+    thoughts = "cut short at endpoint.max_tokens before the text begins, probably by thinking"
+    if reply.num_thoughts:
+        thoughts = f"{reply.num_thoughts} characters of thinking and no answer"
+    elif reply.finish_reason != "length":
+        return "an empty answer"
+    return f"{thoughts}; switch thinking off with {NO_THINKING}, or raise endpoint.max_tokens"
 
 
 def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary) -> list[dict]:

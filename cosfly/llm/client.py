@@ -25,7 +25,7 @@ from pydantic import Field
 from cosfly.llm import protocol
 from cosfly.llm.contract import NoAnswer, Reply, Request, Troubles
 from cosfly.llm.protocol import KEY_VARIABLE, BadReply, Response
-from cosfly.llm.refusals import MEANINGS, Refusal, RefusedRequest, kind_of
+from cosfly.llm.refusals import MEANINGS, Kind, Refusal, kind_of
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import TeacherError
 from cosfly.runtime.model_json import CONTEXT_FULL
@@ -46,6 +46,10 @@ MOST_REPLY_MB = 4.0  # of one answer, uncompressed
 MOST_ERROR_TEXT = 300  # characters of a server's error text; the rest is dropped
 HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
 RETRY_AFTER = re.compile(r"[0-9]{1,20}(\.[0-9]*)?(e[0-9]{1,2})?")  # in seconds
+LEFT_OUT: dict[Kind, str] = {
+    "schema": "the server refuses a JSON schema (%s); requests are sent without one",
+    "no_system": "the server has no system role (%s); the instructions are sent with the question",
+}
 _tls = functools.cache(httpx.create_ssl_context)  # certificates are read once: it takes longer than a request
 
 
@@ -148,9 +152,8 @@ class ChatClient:
         self.troubles = troubles or Troubles()
         self.concurrency = ConcurrencyLimit(cfg.concurrency)
         self.context: int | None = None  # most tokens of prompt and answer together, if the server reports it
-        self._asks_for_schema = cfg.json_schema
-        self.joins_system = False  # whether the system text begins the first question
-        self._has_warned_of_context = self._has_warned_of_cuts = self._has_reported_slowness = False
+        self.left_out: dict[Kind, Refusal] = {}  # what requests are sent without, and the refusals that say why
+        self._told = set[str]()  # what was reported once
         self._prompts: dict[int, deque[tuple[int, int]]] = {}  # tokens and characters of the last, by pictures
         self._key = os.environ.get(KEY_VARIABLE, "")
         if not (self._key.isascii() and self._key.isprintable()):  # an error of httpx would quote it
@@ -207,7 +210,7 @@ class ChatClient:
     async def _try(self, request: Request, sent_s: float) -> Reply:
         """Try once to get the answer of a request; NoAnswer fails this try, TeacherError all requests."""
         try:
-            reply = await self._ask(request)
+            reply = await self.ask(request)
         except (TimeoutError, httpx.RequestError) as error:  # also a compressed body
             is_late = isinstance(error, TimeoutError | httpx.TimeoutException)
             if is_late:  # requests that wait in the server's queue time out, and would wait behind themselves
@@ -215,78 +218,52 @@ class ChatClient:
             raise NoAnswer("timeout" if is_late else "connection", self.message_of(error)) from None
         except BadReply as error:
             raise NoAnswer("bad_reply", str(error)) from None
-        except RefusedRequest as error:
-            raise self._refused(error.refusal, sent_s, error.wait_s) from None
+        except Refusal as refusal:
+            raise self._refused(refusal, sent_s) from None
         seconds = time.monotonic() - sent_s
         is_quick = seconds < HEADROOM * self.cfg.timeout_s
         self.concurrency.succeeded(is_quick)
         num_at_once = int(self.concurrency.limit)
-        if not is_quick and num_at_once < self.cfg.concurrency and not self._has_reported_slowness:
-            self._has_reported_slowness = True
+        if not is_quick and num_at_once < self.cfg.concurrency:
             limit = f"at most {num_at_once} requests are sent at once until answers take less than a third of "
             limit += "endpoint.timeout_s; raise it if the server can answer more requests at once"
-            log.info("%s: an answer took %.0f s, so %s", self.where, seconds, limit)
+            self._tell_once("slow", logging.INFO, f"an answer took {seconds:.0f} s, so {limit}")
         self._watch_prompts(reply, request)
         return self._with_full_context(reply, request)
 
-    async def _ask(self, request: Request) -> Reply:
-        """Send a request once, and again without what the server refuses: a schema, a system role.
-
-        Raises as `ask_once`.
-        """
-        schema = request.schema if self._asks_for_schema else None
-        refused_schema = None
-        while True:
-            had_system = not self.joins_system
-            try:
-                _, reply = await self.ask_once(request, schema)
-                break
-            except RefusedRequest as error:
-                if error.refusal.kind == "schema" and schema is not None:
-                    schema, refused_schema = None, error.refusal
-                elif not (had_system and self.leaves_out_system(error.refusal, request)):
-                    raise
-        if refused_schema is not None and self._asks_for_schema:
-            change = "the server refuses a JSON schema (%s); requests are sent without one"
-            log.warning(f"%s: {change}", self.where, refused_schema.summary)
-            self._asks_for_schema = False
-        return reply
-
-    def leaves_out_system(self, refusal: Refusal, request: Request) -> bool:
-        """Return whether a request that was refused for its system role is sent again without one, as all later ones.
-
-        Requests in flight at the first refusal are refused, too. Call it only if the request was sent with the role.
-        """
-        if refusal.kind != "no_system" or request.messages[0]["role"] != "system":
-            return False
-        if not self.joins_system:
-            change = "the server has no system role (%s); the instructions are sent with the question"
-            log.warning(f"%s: {change}", self.where, refusal.summary)
-        self.joins_system = True
-        return True
-
-    async def ask_once(self, request: Request, schema: dict | None) -> tuple[Response, Reply]:
-        """Send one request once; return the response and the reply in it.
+    async def ask(self, request: Request) -> Reply:
+        """Send a request once, and again without what the server refuses of it: a schema, a system role.
 
         Raises:
-            RefusedRequest: The server refuses the request.
+            Refusal: The server refuses the request.
             BadReply: The response holds no reply.
             TimeoutError, httpx.TimeoutException: The response was not complete in time.
             httpx.RequestError: The connection failed, or the body is compressed.
         """
-        if self.joins_system:
-            request = replace(request, messages=protocol.without_system(request.messages))
-        body = protocol.encode_body(protocol.request_body(self.model, request, schema))
-        response = await self._exchange("chat/completions", body)
-        try:
-            return response, self._read(response, is_structured=schema is not None)
-        except RefusedRequest as error:
-            if error.refusal.kind != "num_images":
-                raise
-            message = f"{error.refusal.message} (the request has {len(body) / 1e6:.1f} MB)"
-            raise RefusedRequest(replace(error.refusal, message=message), error.wait_s) from None
+        while True:
+            left_out = set(self.left_out)  # requests in flight at the first refusal are refused, too
+            with_schema = self.cfg.json_schema and bool(request.schema) and "schema" not in left_out
+            with_system = "no_system" not in left_out
+            body = protocol.request_body(self.model, request, with_schema=with_schema, with_system=with_system)
+            response = await self._exchange("chat/completions", body)
+            try:
+                return self._read(response, "json_schema" if with_schema else "plain")
+            except Refusal as refusal:
+                has_system = with_system and request.messages[0]["role"] == "system"
+                if not {"schema": with_schema, "no_system": has_system}.get(refusal.kind):
+                    if refusal.kind == "num_images":
+                        refusal.message += f" (the request has {len(body) / 1e6:.1f} MB)"
+                    raise
+                self.left_out[refusal.kind] = refusal
+                self._tell_once(refusal.kind, logging.WARNING, LEFT_OUT[refusal.kind] % refusal.summary)
 
-    def _refused(self, refusal: Refusal, sent_s: float, wait_s: float | None) -> NoAnswer | TeacherError:
+    def _tell_once(self, topic: str, level: int, message: str) -> None:
+        """Write a line about a topic to the log, once."""
+        if topic not in self._told:
+            self._told.add(topic)
+            log.log(level, "%s: %s", self.where, message)
+
+    def _refused(self, refusal: Refusal, sent_s: float) -> NoAnswer | TeacherError:
         """Return the error of a refused request: NoAnswer for this try or this request, TeacherError for all."""
         if refusal.meaning.ends_run:
             return self._error(refusal.meaning.what, got=refusal.summary, fix=refusal.meaning.fix)
@@ -294,6 +271,7 @@ class ChatClient:
             if refusal.is_loading:
                 return NoAnswer(LOADING, refusal.summary, wait_s=LOADING_PAUSE_S)
             # A longer wait ends this request, but does not delay the others.
+            wait_s = refusal.wait_s
             is_long = wait_s is not None and wait_s > TOTAL_TIMEOUT_S
             if refusal.status in BUSY_STATUS:
                 self.concurrency.was_busy(sent_s, None if is_long else wait_s)
@@ -313,26 +291,23 @@ class ChatClient:
         is_short = 0 < usage.completion_tokens < most
         if not is_short or (self.context and usage.total < self.context - 1):
             return reply
-        if not self._has_warned_of_context:
-            self._has_warned_of_context = True
-            problem = f"an answer was cut after {usage.completion_tokens} of {most} tokens"
-            meaning = MEANINGS["too_long"]
-            log.warning("%s: %s: %s; %s", self.where, problem, meaning.what, meaning.fix)
+        problem = f"an answer was cut after {usage.completion_tokens} of {most} tokens"
+        meaning = MEANINGS["too_long"]
+        self._tell_once("context", logging.WARNING, f"{problem}: {meaning.what}; {meaning.fix}")
         return replace(reply, finish_reason=CONTEXT_FULL)
 
     def _watch_prompts(self, reply: Reply, request: Request) -> None:
         """Warn once if prompts of different lengths all count the same tokens: the server cuts them."""
-        if reply.usage is None or self._has_warned_of_cuts:
+        if reply.usage is None:
             return
         num_characters = sum(_num_characters(message["content"]) for message in request.messages)
         seen = self._prompts.setdefault(len(request.digests), deque(maxlen=NUM_EQUAL_PROMPTS))
         seen.append((reply.usage.prompt_tokens, num_characters))
         tokens, lengths = {counted for counted, _ in seen}, [length for _, length in seen]
         if len(seen) == NUM_EQUAL_PROMPTS and len(tokens) == 1 and max(lengths) - min(lengths) >= LEAST_SPREAD:
-            self._has_warned_of_cuts = True
             count = reply.usage.prompt_tokens
             problem = f"{len(seen)} prompts of different lengths all count {count} tokens: the server drops the rest"
-            log.warning("%s: %s; %s", self.where, problem, MEANINGS["too_long"].fix)
+            self._tell_once("cuts", logging.WARNING, f"{problem}; {MEANINGS['too_long'].fix}")
 
     async def start(self) -> None:
         """Read the server's list of models and choose the one of the settings; TeacherError if that fails."""
@@ -351,7 +326,7 @@ class ChatClient:
                 log.warning("%s: %s; waiting for the server", self.where, refusal.summary)
             await asyncio.sleep(LOADING_PAUSE_S)
         if response.status in (401, 403):
-            raise self._refused(self._refusal(response), 0.0, None)
+            raise self._refused(refusal, 0.0)
         entries = None if response.is_cut else protocol.read_models(response)
         names = [entry["id"] for entry in entries or ()]
         if wanted in names or (wanted is None and len(names) == 1):
@@ -362,7 +337,7 @@ class ChatClient:
             self.model = wanted  # some hosts list no models; the first request shows whether it exists
         elif entries is None:
             what = "the server does not return a list of models, so it may not be an OpenAI-compatible endpoint"
-            raise self._error(what, got=self._refusal(response).summary, fix="correct the URL, or pass --model")
+            raise self._error(what, got=refusal.summary, fix="correct the URL, or pass --model")
         elif not names:
             raise self._error("the endpoint lists no model with a usable name", fix="pass --model")
         else:
@@ -372,24 +347,21 @@ class ChatClient:
 
     # --- responses ---
 
-    def _read(self, response: Response, *, is_structured: bool) -> Reply:
-        """Return the reply in a response; raises RefusedRequest or BadReply.
-
-        Some servers send a refusal with status 200.
-        """
+    def _read(self, response: Response, structured: str) -> Reply:
+        """Return the reply in a response; raises Refusal, which some servers send with status 200, or BadReply."""
         if response.status != 200:
-            raise RefusedRequest(self._refusal(response), response.retry_after_s)
+            raise self._refusal(response)
         if response.is_cut:
             raise BadReply(f"the response is longer than {MOST_REPLY_MB:g} MB")
         try:
-            return protocol.read_completion(response, "json_schema" if is_structured else "plain")
+            return protocol.read_completion(response, structured)
         except BadReply as error:
-            problem = str(error)
-            status, text = error.status, self._clean(problem)
-        refusal = Refusal(status or 200, kind_of(status or 200, problem) if status else "unknown", text)
-        if refusal.kind == "unknown" and not refusal.may_pass:
-            raise BadReply(text)
-        raise RefusedRequest(refusal, response.retry_after_s)
+            problem, status = str(error), error.status
+        kind = kind_of(status, problem) if status else "unknown"
+        refusal = Refusal(status or 200, kind, self._clean(problem), response.retry_after_s)
+        if kind == "unknown" and not refusal.may_pass:
+            raise BadReply(refusal.message)
+        raise refusal
 
     def _refusal(self, response: Response) -> Refusal:
         """Return the refusal in a response whose status is not 200."""
@@ -398,7 +370,8 @@ class ChatClient:
             message = protocol.error_words(protocol.read_body(response.body))
         except ValueError:
             message = text
-        return Refusal(response.status, kind_of(response.status, text), self._clean(message))
+        kind = kind_of(response.status, text)
+        return Refusal(response.status, kind, self._clean(message), response.retry_after_s)
 
     def _error(self, what: str, **parts: Any) -> TeacherError:
         return TeacherError(what, where=self.where, **parts)

@@ -46,13 +46,15 @@ class Reply:
     """One answer.
 
     structured: how its form was enforced, json_schema, plain, or native (written by rules). usage: None if not
-    reported. finish_reason: the server's, or CONTEXT_FULL. is_kept: read from the journal.
+    reported. finish_reason: the server's, or CONTEXT_FULL. num_thoughts: characters of thoughts that the server sends
+    in a field of their own. is_kept: read from the journal.
     """
 
     text: str
     usage: Usage | None
     structured: str
     finish_reason: str | None = None
+    num_thoughts: int = field(default=0, compare=False)
     is_kept: bool = field(default=False, compare=False)
 
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import httpx
+from pydantic_core import to_json
 
 from cosfly.formats.captions import Usage
 from cosfly.llm.contract import MOST_TOKENS, Reply, Request
 from cosfly.runtime.escaping import without_keys
-from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.model_json import DECLINED
 
 KEY_VARIABLE = "COSFLY_API_KEY"
@@ -64,13 +64,14 @@ def base_url(url: str) -> str:
 # --- requests ---------------------------------------------------------------------------------------------------------
 
 
-def request_body(model: str, request: Request, schema: dict | None = None) -> dict[str, Any]:
-    """Return the body of a request. schema: The JSON schema that the server must enforce; None enforces none."""
-    body = {"model": model, "messages": request.messages, "stream": False, **request.sampling}
-    if schema is None:
-        return body
-    json_schema = {"name": "chain_of_cause", "strict": True, "schema": schema}
-    return body | {"response_format": {"type": "json_schema", "json_schema": json_schema}}
+def request_body(model: str, request: Request, *, with_schema: bool = True, with_system: bool = True) -> bytes:
+    """Return the body of a request as JSON. Without its schema, the server enforces none."""
+    messages = request.messages if with_system else without_system(request.messages)
+    body = {"model": model, "messages": messages, "stream": False, **request.sampling}
+    if with_schema:
+        json_schema = {"name": "chain_of_cause", "strict": True, "schema": request.schema}
+        body["response_format"] = {"type": "json_schema", "json_schema": json_schema}
+    return to_json(body)  # ten times as fast as the json module with a megabyte of pictures
 
 
 def without_system(messages: list[dict]) -> list[dict]:
@@ -79,33 +80,9 @@ def without_system(messages: list[dict]) -> list[dict]:
         return messages
     system, question, *others = messages
     content = question["content"]
-    parts = [{"type": "text", "text": content}] if isinstance(content, str) else content
-    joined = [{"type": "text", "text": system["content"]}, *parts]
     if isinstance(content, str):
         return [question | {"content": f"{system['content']}\n\n{content}"}, *others]
-    return [question | {"content": joined}, *others]
-
-
-def encode_body(payload: dict) -> bytes:
-    """Return a request as JSON. Data URLs (a megabyte per request) need no escaping, so they are inserted unscanned."""
-    urls: list[str] = []
-
-    def with_placeholder(part: dict) -> dict:
-        if part["type"] != "image_url" or not part["image_url"]["url"].startswith("data:image/"):
-            return part
-        urls.append(part["image_url"]["url"])
-        return part | {"image_url": part["image_url"] | {"url": f"\x00{len(urls) - 1}"}}
-
-    messages = [
-        message
-        if isinstance(message["content"], str)
-        else message | {"content": [with_placeholder(part) for part in message["content"]]}
-        for message in payload["messages"]
-    ]
-    pieces = re.split(rb'"\\u0000(\d+)"', dump_json(payload | {"messages": messages}).encode())
-    for index in range(1, len(pieces), 2):  # every other piece is the number of a URL
-        pieces[index] = b'"' + urls[int(pieces[index])].encode("ascii") + b'"'
-    return b"".join(pieces)
+    return [question | {"content": [{"type": "text", "text": system["content"]}, *content]}, *others]
 
 
 # --- responses --------------------------------------------------------------------------------------------------------
@@ -228,7 +205,8 @@ def read_completion(response: Response, structured: str) -> Reply:
         text = ""  # thoughts that the server does not return took all tokens
     if text is None:
         raise BadReply("the message has no text")
-    return Reply(text, usage, structured, _name(finish_reason))
+    thoughts = max(len(thought) for name in THOUGHT_FIELDS if isinstance(thought := message.get(name, ""), str))
+    return Reply(text, usage, structured, _name(finish_reason), num_thoughts=thoughts)
 
 
 def _error_instead(value: dict[str, Any]) -> BadReply:
@@ -250,13 +228,6 @@ def _final_text(message: dict[str, Any]) -> str | None:
     if isinstance(text, str) and text:
         return text
     return "" if isinstance(text, str) or any(message.get(name) for name in THOUGHT_FIELDS) else None
-
-
-def thoughts_of(completion: Any) -> int:
-    """Return the number of characters of thoughts in a completion from which a reply was read."""
-    message = completion["choices"][0].get("message")
-    thoughts = [message.get(name) for name in THOUGHT_FIELDS] if isinstance(message, dict) else []
-    return max((len(text) for text in thoughts if isinstance(text, str)), default=0)
 
 
 def _usage(value: Any) -> Usage | None:

@@ -60,18 +60,19 @@ def kind_of(status: int, text: str) -> Kind:
     return "unknown" if is_other or (status in AWAY and kind != "account") else kind
 
 
-@dataclass(frozen=True)
-class Refusal:
+@dataclass(eq=False)
+class Refusal(Exception):
     """A request that a server refused.
 
-    message: the server's text, short, in one line, without the key. code: the cause, as tallies count it. summary:
-    status and message. may_pass: whether the same request may be answered later, because the server is busy, away or
-    broken.
+    message: the server's text, short, in one line, without the key. wait_s: how long the server asks to wait, if it
+    does. code: the cause, as tallies count it. summary: status and message. may_pass: whether the same request may be
+    answered later, because the server is busy, away or broken.
     """
 
     status: int
     kind: Kind
     message: str
+    wait_s: float | None = None
 
     @property
     def code(self) -> str:
@@ -94,12 +95,3 @@ class Refusal:
     @property
     def may_pass(self) -> bool:
         return self.kind == "unknown" and (self.status in AWAY or self.status >= 500)
-
-
-class RefusedRequest(Exception):
-    """A request was refused. wait_s: How long the server asks to wait, if it does."""
-
-    def __init__(self, refusal: Refusal, wait_s: float | None) -> None:
-        super().__init__(refusal.summary)
-        self.refusal = refusal
-        self.wait_s = wait_s

@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import httpx
@@ -91,7 +92,7 @@ def _client(
     tracks, _ = find_inputs(cfg, tree)
     bodies: list[bytes] = []
     teachers: list[AskingTeacher] = []
-    plain_init, plain_encode = AskingTeacher.__init__, protocol.encode_body
+    plain_init, plain_body = AskingTeacher.__init__, protocol.request_body
 
     def init(self: AskingTeacher, *args) -> None:
         plain_init(self, *args)
@@ -99,18 +100,18 @@ def _client(
             self.encoder = encoder
         teachers.append(self)
 
-    def recording(payload: dict) -> bytes:
-        bodies.append(plain_encode(payload))
+    def recording(*args: Any, **options: bool) -> bytes:
+        bodies.append(plain_body(*args, **options))
         return bodies[-1]
 
     AskingTeacher.__init__ = init  # type: ignore[method-assign, assignment]
-    protocol.encode_body = recording if encoder is None else plain_encode
+    protocol.request_body = recording if encoder is None else plain_body
     try:
         start_s = time.monotonic()
         asked = asyncio.run(Asking(stage, cfg, VOCABULARY, 0).run(tracks))
         seconds = time.monotonic() - start_s
     finally:
-        AskingTeacher.__init__, protocol.encode_body = plain_init, plain_encode  # type: ignore[method-assign, assignment]
+        AskingTeacher.__init__, protocol.request_body = plain_init, plain_body  # type: ignore[method-assign, assignment]
     assert not asked.unanswered, asked.unanswered[:3]
     return seconds, bodies, teachers[0].encoder
 
